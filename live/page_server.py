@@ -31,14 +31,13 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidMessage
 from websockets.http11 import Request, Response
 
-from trilat_net.errors import UsageError, WireError
+from trilat_net.errors import UsageError, WireError, count_nouns
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
 from trilat_net.net.member_keys import CERTIFICATE, HERE, PRIVATE_KEY, read_member_keys
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import raise_priority
-from trilat_net.wording import count_nouns
 
 from .page_entrance import Strangers, choose_to_leave, is_full
 from .page_files import PageFiles

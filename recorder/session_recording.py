@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
-from trilat_net.errors import WireError
+from trilat_net.errors import WireError, count_nouns
 from trilat_net.log.accounting import LAST, Account
 from trilat_net.log.log_writer import LogParts, LogWriter
 from trilat_net.net import topics
@@ -19,7 +19,6 @@ from trilat_net.net.membership import Epoch, EventPublisher
 from trilat_net.net.messages import Event, RecorderStats
 from trilat_net.net.wire import decode, encode, split_states
 from trilat_net.scenario import Scenario
-from trilat_net.wording import count_nouns
 
 from .backfill import GapRepair
 from .site_reception import InboundQueue, SiteMessage, SiteReception

@@ -14,7 +14,7 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-from trilat_net.errors import WireError
+from trilat_net.errors import WireError, count_nouns
 from trilat_net.log.accounting import Account, StartGap
 from trilat_net.log.log_layout import CHANNEL_TYPES, SITE_CHANNELS
 from trilat_net.net import topics
@@ -25,7 +25,6 @@ from trilat_net.net.topics import count_messages, count_under_way, number_messag
 from trilat_net.net.wire import make_decoder
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks
-from trilat_net.wording import count_nouns
 
 CAPACITY = 60_000
 """Capacity in messages: minutes of three sites at 1 kHz, whose records come in blocks."""

@@ -16,8 +16,8 @@ from types import FrameType
 from typing import Any, TypeVar
 
 from trilat_net.core.ticks import NS_PER_S
+from trilat_net.errors import count_nouns
 from trilat_net.net.clock import Clock
-from trilat_net.wording import count_nouns
 
 try:
     import resource

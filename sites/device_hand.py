@@ -19,10 +19,10 @@ from collections.abc import Callable
 import numpy as np
 
 from trilat_net.core.live_hand import GRIP_NS, SILENCE_NS, HandReach
+from trilat_net.errors import count_nouns
 from trilat_net.net.arm_client import Hand
 from trilat_net.net.clock import Clock
 from trilat_net.scenario.operators.kernel_operators import DeviceSettings
-from trilat_net.wording import count_nouns
 
 from .devices import Device, DeviceState, Vector
 

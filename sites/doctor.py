@@ -24,7 +24,7 @@ from trilat_net import process
 from trilat_net.core.jit import is_core_cached
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import NS_PER_S, Arrival, TickInput, TickRecord
-from trilat_net.errors import RunFailed, SessionError, UsageError
+from trilat_net.errors import RunFailed, SessionError, UsageError, count_nouns
 from trilat_net.files import find_rights_of_others
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import (
@@ -41,7 +41,6 @@ from trilat_net.net.timing import LoopStats, SiteTiming
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 from trilat_net.results import Result
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.wording import count_nouns
 
 from .machine_load import describe_load, measure_busy_share
 from .session_ping import ping_session

@@ -13,7 +13,7 @@ import numpy as np
 
 from trilat_net.core.own_hand import HandProgram, HandView
 from trilat_net.core.user_law import PeerView
-from trilat_net.errors import RunFailed, SessionError, UsageError
+from trilat_net.errors import RunFailed, SessionError, UsageError, count_nouns
 from trilat_net.net import topics
 from trilat_net.net.arm_client import SiteClient, make_hand_sender
 from trilat_net.net.bus import Bus
@@ -24,7 +24,6 @@ from trilat_net.net.requests import HandMessage, HandViewMessage
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.operators.program_hand import HandSite, make_program, place_own_hand
-from trilat_net.wording import count_nouns
 
 POLL_NS = 500_000
 HERE_NS = 100_000_000

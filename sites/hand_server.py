@@ -17,7 +17,7 @@ from trilat_net.core.site_arrays import SiteArrays
 from trilat_net.core.site_setup import MotionLimits
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import tick_ns
-from trilat_net.errors import SessionError, WireError
+from trilat_net.errors import SessionError, WireError, count_nouns
 from trilat_net.net.bus import Inbox
 from trilat_net.net.clock import Clock
 from trilat_net.net.requests import HandMessage, HandViewMessage, PeerSeen
@@ -25,7 +25,6 @@ from trilat_net.net.wire import decode, encode
 from trilat_net.scenario.arms import ArmModel
 from trilat_net.scenario.operators.kernel_operators import LiveHand
 from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
-from trilat_net.wording import count_nouns
 
 MESSAGES_KEPT = 32
 """Capacity of the inbox, and most messages that a tick reads: newer ones push older ones out."""

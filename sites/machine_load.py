@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from trilat_net import process
+from trilat_net.errors import count_nouns
 from trilat_net.net.clock import Clock
-from trilat_net.wording import count_nouns
 
 MEASURED_NS = 200_000_000
 """Time over which the load is measured."""

@@ -12,7 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from trilat_net import process
-from trilat_net.wording import count_nouns
+from trilat_net.errors import count_nouns
 
 FIFO_PRIORITY = 50
 NICE = -10

@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 
 from trilat_net.core.ticks import NS_PER_S
-from trilat_net.errors import TrilatError, UsageError
+from trilat_net.errors import TrilatError, UsageError, count_nouns
 from trilat_net.log.ros2 import cdr
 from trilat_net.log.ros2.published import COMMON_TOPICS, pack_session_diagnostics
 from trilat_net.log.ros2.ros2_messages import SESSION_CHANNELS, Ros2SiteChannels, pack_event
@@ -30,7 +30,6 @@ from trilat_net.net.ros2_graph import Attachment, Refusals, Ros2Graph, TopicPubl
 from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.net.zenoh_config import BRIDGE
 from trilat_net.scenario import Scenario, parse_embedded
-from trilat_net.wording import count_nouns
 
 from .ros2_topics import RELIABLE, Ends, SiteTopics
 from .running_session import RunningSession, open_hand

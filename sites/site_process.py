@@ -27,7 +27,7 @@ from trilat_net.core.ticks import (
     find_life_reason,
     tick_ns,
 )
-from trilat_net.errors import CodeFailed, PeerLeft, RunFailed, SessionError
+from trilat_net.errors import CodeFailed, PeerLeft, RunFailed, SessionError, count_nouns
 from trilat_net.log.site_log import find_task_errors
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
@@ -46,7 +46,6 @@ from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks, describe_change
 from trilat_net.scenario.scenario_types import Change
 from trilat_net.scenario.validate import check_outside_arms
-from trilat_net.wording import count_nouns
 
 from . import realtime
 from .external_arm import ExternalArm

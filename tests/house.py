@@ -7,7 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 TOPS = ("trilat_net", "sites", "recorder", "live")
-BELOW_ALL = {"errors", "wording", "process", "files", "results", "fields"}
+BELOW_ALL = {"errors", "process", "files", "results", "fields"}
 
 
 def files() -> list[Path]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests import house
-from trilat_net.wording import count_nouns, pluralise
+from trilat_net.errors import count_nouns, pluralise
 
 NOUNS = " ".join(
     [
@@ -79,4 +79,4 @@ def find_bare_plurals(path: Path) -> Iterator[str]:
 
 def test_no_text_counts_by_a_bare_plural() -> None:
     found = [place for path in house.files() for place in find_bare_plurals(path)]
-    assert not found, "\n".join(["use count_nouns of trilat_net/wording.py:", *found])
+    assert not found, "\n".join(["use count_nouns of trilat_net/errors.py:", *found])

@@ -2,7 +2,8 @@
 
 Invariant: an error carries its data and one sentence that names the problem, its place and the remedy. The
 command line prints that sentence and nothing else; `exit_code` is the code that a command ends with. Options
-that it names are those of a command in a command, and arguments in Python.
+that it names are those of a command in a command, and arguments in Python. Every text of the program that
+counts things goes through `count_nouns`, as in "1 record" and "2 records" (`tests/test_wording.py`).
 """
 
 import re
@@ -10,6 +11,7 @@ from functools import partial
 from typing import ClassVar
 
 _OPTION = re.compile(r"(trilat [a-z][^;:,)]*)|(?<![\w-])(--[a-z][a-z-]*|-o\b)( [\d*'\[{]\S*| [A-Z]{2,}\b)?")
+_IRREGULAR = {"axis": "axes", "datum": "data", "is": "are", "was": "were", "has": "have"}
 _SWITCHES = ("--force", "--insecure", "--full", "--closed-loop")
 _ARGUMENTS = {
     "-o": "out", "--resume": "the same out", "--duration": "duration_s", "--longest": "longest_s",
@@ -159,3 +161,32 @@ class PlantFailed(CodeFailed):
 
 class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in docs/design.md
     """A state that the program must never reach: a bug."""
+
+
+def count_nouns(count: object, singular: str, plural: str = "") -> str:
+    """Returns a number and what it counts, in the singular for 1.
+
+    >>> count_nouns(1, "record"), count_nouns(2, "record"), count_nouns(1, "mark waits", "marks wait")
+    ('1 record', '2 records', '1 mark waits')
+
+    Args:
+        count: the number, or its text, as in "1,000".
+        singular: the noun, with words before it if there are any, as in "late sample".
+        plural: the same for other numbers; by default `pluralise` of the singular.
+    """
+    words = singular if str(count) == "1" else plural or pluralise(singular)
+    return f"{count} {words}"
+
+
+def pluralise(singular: str) -> str:
+    """Returns the plural of a noun, of which the last word is that noun."""
+    *before, noun = singular.split(" ")
+    if noun in _IRREGULAR:
+        plural = _IRREGULAR[noun]
+    elif noun.endswith("y") and noun[-2:-1] not in "aeiou":
+        plural = f"{noun[:-1]}ies"
+    elif noun.endswith(("s", "x", "ch", "sh")):
+        plural = f"{noun}es"
+    else:
+        plural = f"{noun}s"
+    return " ".join([*before, plural])

@@ -15,7 +15,7 @@ from typing import Literal, cast, get_args
 import msgspec
 
 from trilat_net import process
-from trilat_net.errors import LogError, ScenarioError, UsageError
+from trilat_net.errors import LogError, ScenarioError, UsageError, count_nouns
 from trilat_net.files import reading
 from trilat_net.log.log_layout import (
     ALL_CHANNELS,
@@ -30,7 +30,6 @@ from trilat_net.net import topics
 from trilat_net.net.clock import NS_PER_S
 from trilat_net.net.topics import number_message
 from trilat_net.scenario import Scenario, parse_embedded
-from trilat_net.wording import count_nouns
 
 from .batch import BatchBuilder, MessageBatch, PlayedMessage
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..core.ticks import NS_PER_S
-from ..errors import LogError
+from ..errors import LogError, count_nouns
 from ..files import reading
 from ..log.accounting import Account
 from ..log.log_layout import SESSION
@@ -33,7 +33,6 @@ from ..net.topics import count_messages, number_message
 from ..results import JsonObject, Result, finite_or_none
 from ..scenario.describe import list_arm_notes
 from ..scenario.expect import END_WINDOW_S
-from ..wording import count_nouns
 from .link_summary import (
     ONE_WAY_SCHEMA_VERSION,
     LinkSummary,

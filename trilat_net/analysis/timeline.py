@@ -12,6 +12,7 @@ import numpy as np
 
 from ..core.session_life import HELD_OVERRUN_TICKS
 from ..core.ticks import find_alarm
+from ..errors import count_nouns
 from ..log.log_reader import Log
 from ..log.site_log import SiteLog
 from ..net.messages import MODES, ModeMeaning
@@ -20,7 +21,6 @@ from ..scenario.delay_models import LinkBase
 from ..scenario.event_text import describe_event
 from ..scenario.run_changes import describe_change, find_orderer
 from ..scenario.scenario_types import Change
-from ..wording import count_nouns
 
 
 class AppliedChange(NamedTuple):

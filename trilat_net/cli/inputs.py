@@ -6,10 +6,10 @@ from typing import Annotated
 
 import typer
 
+from ..errors import count_nouns
 from ..files import refuse_existing, write_whole
 from ..reporting import terminal_output as terminal
 from ..reporting.result_text import TextTable
-from ..wording import count_nouns
 from . import options
 from .options import value
 

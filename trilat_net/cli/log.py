@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
+from ..errors import count_nouns
 from ..reporting import terminal_output as terminal
 from ..reporting.exports import list_export_formats
-from ..wording import count_nouns
 from . import options
 
 _LOSSY_EXIT_CODE = 3

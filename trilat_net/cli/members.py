@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..errors import CodeWithheld, RunFailed, UsageError
+from ..errors import CodeWithheld, RunFailed, UsageError, count_nouns
 from ..net.clock import Clock, SystemClock, make_system_clock
 from ..process import Interrupt
 from ..reporting import terminal_output as terminal
 from ..reporting.result_text import TextTable
-from ..wording import count_nouns
 from . import options
 from .options import flag, seconds, value
 

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..errors import UsageError
+from ..errors import UsageError, count_nouns
 from ..net.clock import SystemClock
 from ..reporting import terminal_output as terminal
-from ..wording import count_nouns
 from . import options
 from .options import flag, value
 

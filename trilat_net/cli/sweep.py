@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..errors import UsageError
+from ..errors import UsageError, count_nouns
 from ..process import join_words
 from ..reporting import terminal_output as terminal
-from ..wording import count_nouns
 from . import options
 from .options import flag, value
 from .studies import parse_seeds, run_apart, show_progress

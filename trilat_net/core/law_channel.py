@@ -9,7 +9,7 @@ the sender's record.
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
-from ..wording import count_nouns
+from ..errors import count_nouns
 
 MAX_SENT = 16
 """Most numbers per joint that a law sends to a peer."""

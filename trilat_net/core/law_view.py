@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..wording import count_nouns
+from ..errors import count_nouns
 from . import chain_stages, two_link_stages
 from .jit import bind_leaf, leaf
 from .law_channel import SentVector

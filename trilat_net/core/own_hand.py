@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..wording import count_nouns
+from ..errors import count_nouns
 from .live_hand import SILENCE_NS, HandCommand, HandMemory, HandRules, HandStep, advance_hand, glide
 from .site_arrays import SiteArrays
 from .site_setup import Layout

@@ -12,8 +12,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ..errors import LawFailed
-from ..wording import count_nouns
+from ..errors import LawFailed, count_nouns
 from .vectors import Vector
 
 MAX_LAW_MEMORY = 1024

@@ -40,7 +40,7 @@ from ..core.site_arrays import SiteArrays, select_site, stack_site_arrays, take_
 from ..core.site_setup import SiteSetup
 from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange, Mode, tick_ns
 from ..core.vectors import Array, IntArray, Row, RowArray
-from ..errors import LawFailed, ScenarioError
+from ..errors import LawFailed, ScenarioError, count_nouns
 from ..log.log_reader import Log
 from ..scenario import Scenario
 from ..scenario.code_consent import find_user_laws
@@ -48,7 +48,6 @@ from ..scenario.operators.kernel_operators import Wall
 from ..scenario.operators.program_hand import make_hand_players
 from ..scenario.own_plant import PlantPlayer
 from ..scenario.validate import refuse_external_arms
-from ..wording import count_nouns
 
 
 def _float_words(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:

@@ -8,14 +8,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import ScenarioError
+from ..errors import ScenarioError, count_nouns
 from ..log.accounting import MIN_COVERAGE, describe_unknown_ends
 from ..log.findings import CheckReport, Finding
 from ..log.log_reader import Log, open_log
 from ..log.mcap_reader import Progress
 from ..scenario.code_consent import find_user_laws
 from ..scenario.imported_code import CodeConsents, allowed_code
-from ..wording import count_nouns
 from .verify import VerifyResult, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 

@@ -22,7 +22,7 @@ from .. import process
 from ..core.fingerprint import compute_fingerprint
 from ..core.ticks import NS_PER_S, Mode
 from ..core.vectors import Array
-from ..errors import LogError
+from ..errors import LogError, count_nouns
 from ..files import digest_file
 from ..log.log_file import LogFile
 from ..log.log_layout import EXECUTED_SITES_KEY, MAX_TIME_NS, RERUN_DRIVER
@@ -37,7 +37,6 @@ from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..results import Result, finite_or_none
 from ..scenario.code_consent import find_user_laws
-from ..wording import count_nouns
 from .rerun_execution import (
     RerunExecution,
     RerunOverrides,

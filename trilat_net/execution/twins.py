@@ -20,11 +20,10 @@ import numpy as np
 from ..core.site_setup import Law
 from ..core.ticks import BUCKETS_PER_S, NS_PER_S
 from ..core.vectors import Array
-from ..errors import NotRepeatable, UsageError
+from ..errors import NotRepeatable, UsageError, count_nouns
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..scenario import Scenario
-from ..wording import count_nouns
 from .fused import FusedRun, RunInputs, explain_no_repetition, read_run_inputs
 
 PUSH_RAD = 1e-6

@@ -28,7 +28,7 @@ from ..core.ticks import (
     describe_divergence,
     describe_mode,
 )
-from ..errors import CodeFailed
+from ..errors import CodeFailed, count_nouns
 from ..log.accounting import Account
 from ..log.log_file import LogFile
 from ..log.log_layout import MAX_TIME_NS, SITE_CHANNELS
@@ -49,7 +49,6 @@ from ..scenario.operators.program_hand import make_hand_players
 from ..scenario.own_plant import PlantPlayer, make_plant_players
 from ..scenario.run_changes import count_skipped_ticks
 from ..scenario.validate import refuse_external_arms
-from ..wording import count_nouns
 from .resumption import read_output, take_parts
 from .virtual_network import Network, PromptNetwork
 

@@ -5,9 +5,8 @@ from typing import Any, ClassVar
 
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
-from ..errors import ScenarioError
+from ..errors import ScenarioError, count_nouns
 from ..fields import NotNegative, NotNegativeCoordinates, NotNegativeJoints
-from ..wording import count_nouns
 from .conditions import LawSituation
 from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 

@@ -17,9 +17,8 @@ from msgspec import Meta
 from ..core.chain import MAX_JOINTS
 from ..core.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
 from ..core.site_setup import Layout
-from ..errors import ScenarioError
+from ..errors import ScenarioError, count_nouns
 from ..fields import Frozen, reword_problem
-from ..wording import count_nouns
 
 
 class SentVectorSpec(Frozen, frozen=True):

@@ -13,13 +13,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
-from ..errors import ScenarioError, WireError
+from ..errors import ScenarioError, WireError, count_nouns
 from ..net import topics
 from ..net.messages import READABLE, Event
 from ..net.topics import count_messages, count_under_way, number_message, skipped_numbers
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
-from ..wording import count_nouns
 from .log_layout import PART, SCENARIO, SESSION, SITE_CHANNELS
 
 

@@ -16,11 +16,10 @@ from io import FileIO
 from pathlib import Path
 from typing import IO, Any
 
-from ..errors import LogRefused, UsageError
+from ..errors import LogRefused, UsageError, count_nouns
 from ..files import publish_file, refuse_existing, sync_folder
 from ..net import topics
 from ..net.clock import SystemClock
-from ..wording import count_nouns
 from .log_layout import active_path
 from .mcap_records import MAGIC
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from ..core.delay import MAX_DELAY_US
 from ..core.ticks import NS_PER_S, CoreChange
-from ..errors import LogError, ScenarioError, UnknownName, WireError
+from ..errors import LogError, ScenarioError, UnknownName, WireError, count_nouns
 from ..fields import suggest_nearest
 from ..files import open_regular
 from ..net import topics
@@ -38,7 +38,6 @@ from ..scenario import Scenario, parse_core_change, parse_embedded
 from ..scenario.code_consent import LawFiles, allow_logged_code
 from ..scenario.delay_traces import TracePoint
 from ..scenario.sample_uses import PictureDelay
-from ..wording import count_nouns
 from .accounting import LAST, SessionAccounts, describe_unknown_ends
 from .data_tables import (
     EVENTS_TABLE,

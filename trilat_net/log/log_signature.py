@@ -18,9 +18,8 @@ from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
-from ..errors import LogError, UsageError
+from ..errors import LogError, UsageError, count_nouns
 from ..files import find_rights_of_others, open_regular, reading, refuse_existing, write_whole
-from ..wording import count_nouns
 from .findings import Finding
 from .mcap_reader import McapReader, Progress
 from .running_digest import DIGESTS, DigestState, Integrity

@@ -13,7 +13,7 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from ..wording import count_nouns
+from ..errors import count_nouns
 from . import mcap_records
 from .findings import Findings
 

@@ -17,10 +17,9 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from ..errors import LogError, ScenarioError
+from ..errors import LogError, ScenarioError, count_nouns
 from ..net import topics
 from ..scenario import parse_embedded
-from ..wording import count_nouns
 from . import mcap_records
 from .log_layout import CHANNEL_TYPES, PART, SCENARIO, SESSION
 from .running_digest import DIGESTS, Integrity, RunningDigest

@@ -24,7 +24,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from ..wording import count_nouns
+from ..errors import count_nouns
 
 MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of a file."""

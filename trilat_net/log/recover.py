@@ -21,13 +21,12 @@ from typing import Any, BinaryIO
 
 from mcap.opcode import Opcode
 
-from ..errors import LogError, NothingSaved, UsageError
+from ..errors import LogError, NothingSaved, UsageError, count_nouns
 from ..files import describe_write_error, open_regular
 from ..net import topics
 from ..net.messages import VERSION, json_schema
 from ..results import Result
 from ..scenario import parse_embedded
-from ..wording import count_nouns
 from . import mcap_records
 from .accounting import Coverage, SessionAccounts, open_session_accounts, parse_counts
 from .content_check import ContentCheck

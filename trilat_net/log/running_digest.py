@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import NamedTuple
 
-from ..wording import count_nouns
+from ..errors import count_nouns
 from .log_layout import SESSION
 
 DIGESTS = "trilat.chain"

@@ -17,13 +17,12 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from ..core.ticks import NS_PER_S
-from ..errors import LogError, ScenarioError, WireError
+from ..errors import LogError, ScenarioError, WireError, count_nouns
 from ..files import open_regular
 from ..net import messages, topics
 from ..net.wire import decode
 from ..scenario import Scenario, parse_embedded
 from ..scenario.run_changes import count_skipped_ticks
-from ..wording import count_nouns
 from .accounting import Account, SessionAccounts, describe_unknown_ends, parse_counts
 from .findings import CheckReport, Finding, Findings
 from .log_layout import (

@@ -18,11 +18,10 @@ from ..core.site_setup import Layout
 from ..core.task_space import PLACE, POSE
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
-from ..errors import LogError, WireError
+from ..errors import LogError, WireError, count_nouns
 from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..scenario.run_changes import count_skipped_ticks
-from ..wording import count_nouns
 from . import record_columns
 from .orientations import align_signs, find_quaternions, split_quaternions
 from .record_columns import Ints

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
-from ..wording import count_nouns
+from ..errors import count_nouns
 from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber, Torques
 
 BACKFILL_MESSAGES = 64

@@ -19,8 +19,7 @@ import msgspec
 from ..core.chain import MAX_JOINTS
 from ..core.site_setup import Layout
 from ..core.ticks import Arrival, TickRecord
-from ..errors import WireError
-from ..wording import count_nouns
+from ..errors import WireError, count_nouns
 from .messages import (
     MODE_WORDS,
     STATE_VECTORS,

@@ -27,9 +27,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from ..errors import UsageError
+from ..errors import UsageError, count_nouns
 from ..files import open_regular
-from ..wording import count_nouns
 from . import topics
 
 LEASE_MS = 5_000

@@ -14,7 +14,7 @@ from ..analysis.certificate.stability_certificate import Certificate, StabilityF
 from ..analysis.envelope_trend import EnvelopeTrend
 from ..analysis.run_end import Stability
 from ..analysis.twin_growth import PushedTwins, TwinGrowth
-from ..wording import count_nouns
+from ..errors import count_nouns
 from .result_text import MARKS, Block, MarkedText, TextTable
 
 MIN_ENERGY_SHARE = 1e-6

@@ -9,13 +9,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..core.vectors import Array
+from ..errors import count_nouns
 from ..theory.frequency_search import FrequencyBand
 from ..theory.linear_analysis import LinearAnalysis
 from ..theory.linear_edge import EdgeScan
 from ..theory.port_analysis import PortAnalysis, TwoPort
 from ..theory.port_passivity import Passivity
 from ..theory.port_response import QUOTED_AT_HZ, Transparency
-from ..wording import count_nouns
 from .result_text import Block, MarkedText, TextTable
 
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}

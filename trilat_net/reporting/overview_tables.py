@@ -7,9 +7,9 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 
 from ..analysis.file_overview import FileOverview
+from ..errors import count_nouns
 from ..log.accounting import describe_unknown_ends
 from ..results import JsonObject
-from ..wording import count_nouns
 from .result_text import Block, MarkedText, TextTable
 from .terminal_output import sanitize
 

@@ -15,6 +15,7 @@ from ..analysis import link_summary
 from ..analysis.metrics.log_metrics import LogMetrics
 from ..analysis.metrics.measures import Metric, Quantity, quantities
 from ..analysis.timeline import StatedModel, find_mode_intervals, list_alarms, list_changes
+from ..errors import count_nouns
 from ..execution.log_checks import LogCheckReport
 from ..execution.rerun import Rerun
 from ..execution.rerun_execution import describe_rerun_changes
@@ -22,7 +23,6 @@ from ..log.log_reader import Log
 from ..log.recover import Recovery
 from ..log.session_check import LogCheckResult
 from ..results import Result
-from ..wording import count_nouns
 from .result_text import MARKS, Block, MarkedText, TextTable
 from .terminal_output import sanitize
 

@@ -18,8 +18,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.text import Text
 
+from ..errors import count_nouns
 from ..process import join_words
-from ..wording import count_nouns
 
 if TYPE_CHECKING:
     from ..log.log_reader import Log

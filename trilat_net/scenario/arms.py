@@ -30,8 +30,7 @@ from ..core.rotation import rotation_matrix, turn_between
 from ..core.site_setup import ChainSetup, Gains, Law, MotionLimits, RestGains, TaskSetup
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
 from ..core.vectors import Array, RowArray, Vector
-from ..errors import ScenarioError
-from ..wording import count_nouns
+from ..errors import ScenarioError, count_nouns
 from .link_inertia import LinkInertia, TensorEntries, ThreeReals
 from .urdf import UrdfChain, UrdfPayload, read_urdf
 

@@ -28,10 +28,9 @@ import numpy as np
 from ..core.channel import LOST
 from ..core.delay import MAX_DELAY_US
 from ..core.vectors import Array, Points
-from ..errors import ScenarioError, UsageError
+from ..errors import ScenarioError, UsageError, count_nouns
 from ..files import decode_text, open_regular
 from ..results import Result
-from ..wording import count_nouns
 from .ping_output import read_ping
 
 MAX_TRACE_POINTS = 200_000

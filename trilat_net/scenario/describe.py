@@ -17,9 +17,9 @@ from ..core.delay import DelayKind
 from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
 from ..core.philox import link_key
 from ..core.vectors import Array
+from ..errors import count_nouns
 from ..laws.conditions import LawSituation, StabilityCondition
 from ..laws.interface import LawSettings
-from ..wording import count_nouns
 from .arms import TASK_AXES, Arm, read_arm
 from .delay_models import LinkBase
 from .rest_bounds import find_rest_bounds

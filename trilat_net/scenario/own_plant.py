@@ -17,10 +17,9 @@ from msgspec import Meta, field
 
 from ..core.ticks import PlantState
 from ..core.vectors import Array
-from ..errors import PlantFailed, ScenarioError
+from ..errors import PlantFailed, ScenarioError, count_nouns
 from ..fields import Frozen, is_number
 from ..laws.interface import make_instance
-from ..wording import count_nouns
 from .imported_code import CLASS_PATTERN, CodeKey, Watch, call_plainly, import_class, read_code
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.vectors import Array
-from ..wording import count_nouns
+from ..errors import count_nouns
 
 _SEQUENCE_NUMBERS = 2**16
 """After so many probes `ping` counts from 0 again."""

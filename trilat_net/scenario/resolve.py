@@ -17,7 +17,7 @@ import numpy as np
 
 from ..core import dominance
 from ..core.two_link_arm import ArmLinks
-from ..errors import ScenarioError
+from ..errors import ScenarioError, count_nouns
 from ..fields import (
     Frozen,
     TomlTable,
@@ -36,7 +36,6 @@ from ..fields import (
 )
 from ..files import open_regular
 from ..laws.sent_vectors import read_sends
-from ..wording import count_nouns
 from .arms import BASE_KEYS, CHAIN_KEYS, Arm, ArmModel, Task, build_arm, read_arm
 from .delay_models import DELAY_MODELS
 from .delay_traces import read_trace

@@ -14,11 +14,10 @@ import numpy as np
 
 from ..core.dominance import is_irreducible
 from ..core.site_arrays import MAX_LINKS_BYTES, links_bytes, needed_pages
-from ..errors import ScenarioError
+from ..errors import ScenarioError, count_nouns
 from ..fields import TomlTable, reword_problem, split_refusal
 from ..files import find_page
 from ..laws.sent_vectors import check_sends
-from ..wording import count_nouns
 from . import operators
 from .arms import START_MARGIN_M, START_MARGIN_RAD, TASK_AXES, start_margin
 from .delay_models import LinkBase

@@ -23,7 +23,7 @@ from ..core.own_hand import HandView
 from ..core.site_arrays import SiteArrays
 from ..core.ticks import tick_ns
 from ..core.vectors import Array
-from ..errors import UsageError
+from ..errors import UsageError, count_nouns
 from ..execution.fused import FusedRun
 from ..execution.virtual import record_virtual
 from ..files import import_extra
@@ -32,7 +32,6 @@ from ..scenario import Scenario, find_site, load_scenario
 from ..scenario.operators.kernel_operators import LiveHand
 from ..scenario.operators.program_hand import HandPlayer, HandSite
 from ..scenario.own_plant import make_plant_players
-from ..wording import count_nouns
 from .reachable_places import can_reach
 
 if TYPE_CHECKING:

@@ -31,7 +31,7 @@ from ..analysis.aligned import AlignedRecords, align_records
 from ..analysis.torque_sources import compute_operator_script, split_torque
 from ..core.exogenous import SCRIPTED_KINDS
 from ..core.vectors import Array
-from ..errors import UsageError
+from ..errors import UsageError, count_nouns
 from ..log.log_reader import Log, open_log
 from ..reporting.result_text import Block, TextTable
 from ..results import Result
@@ -39,7 +39,6 @@ from ..scenario import Scenario, find_site
 from ..scenario.operators.kernel_operators import Multisine
 from ..theory.characteristic_roots import Complex
 from ..theory.port_passivity import HandMatrices
-from ..wording import count_nouns
 
 LEAST_SEGMENTS, LEAST_KNOWN = 5, 0.98
 """How many segments an interval needs; which share of a segment's records."""

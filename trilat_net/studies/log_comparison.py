@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..analysis.metrics.log_metrics import MetricComparison, compare_metrics, comparison_to_json
-from ..errors import UsageError
+from ..errors import UsageError, count_nouns
 from ..log.log_reader import Log, open_log
 from ..reporting.certificate_text import describe_judgement
 from ..reporting.result_text import Block, MarkedText, TextTable, format_number
@@ -18,7 +18,6 @@ from ..results import Result
 from ..scenario.describe import ScenarioDifference, compare_scenarios
 from ..scenario.scenario_reader import reseed_scenario
 from ..theory.linear_analysis import certify_run
-from ..wording import count_nouns
 from .intervals import MeanInterval, mean_interval
 from .tuning.candidate import check_final_posture
 

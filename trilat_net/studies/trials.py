@@ -35,7 +35,7 @@ from msgspec.structs import asdict
 
 from ..analysis.metrics.log_metrics import find_quantity
 from ..core.jit import is_core_cached
-from ..errors import LawFailed, LogError, ScenarioError, TrilatError
+from ..errors import LawFailed, LogError, ScenarioError, TrilatError, count_nouns
 from ..execution import virtual
 from ..execution.verify import verify
 from ..fields import is_distribution
@@ -46,7 +46,6 @@ from ..results import Result
 from ..scenario import Scenario, load_scenario
 from ..scenario.code_consent import list_imported_code
 from ..scenario.scenario_reader import read_experiment, reseed_scenario
-from ..wording import count_nouns
 from .executor import MAX_LOSSES, Workers, open_worker_pool
 from .intervals import MeanInterval, mean_interval
 from .measure_run import (

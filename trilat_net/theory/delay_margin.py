@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.vectors import Array
-from ..wording import count_nouns
+from ..errors import count_nouns
 from . import characteristic_roots
 from .linear_loop import DelayedTerm, LinearLoop
 

@@ -15,12 +15,11 @@ from ..analysis.run_end import EQUILIBRIUM_SPEED_RAD_S
 from ..core.site_setup import Law, SiteSetup
 from ..core.ticks import BUCKETS_PER_S
 from ..core.vectors import Array
-from ..errors import ScenarioError, UsageError
+from ..errors import ScenarioError, UsageError, count_nouns
 from ..execution.fused import FusedRun
 from ..scenario import Scenario
 from ..scenario.imported_code import ImportedLaw
 from ..scenario.operators.kernel_operators import Chirp, Multisine
-from ..wording import count_nouns
 from . import linear_loop
 from .characteristic_roots import limit_blas_threads
 from .numeric_law import NumericLaw

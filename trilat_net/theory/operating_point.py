@@ -21,7 +21,7 @@ from ..core.philox import link_key
 from ..core.site_setup import Gains, Scheme, SiteSetup, StaleAction
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
-from ..errors import ScenarioError
+from ..errors import ScenarioError, count_nouns
 from ..files import find_page
 from ..laws.conditions import LinearForm, LinearSituation
 from ..scenario import Scenario
@@ -30,7 +30,6 @@ from ..scenario.imported_code import ImportedLaw
 from ..scenario.sample_uses import draw_uses
 from ..scenario.scenario_types import scheduled_links
 from ..scenario.validate import refuse_external_arms
-from ..wording import count_nouns
 from .numeric_law import NumericLaw
 from .site_dynamics import SiteRates, evaluate_site_rates
 

@@ -26,11 +26,10 @@ from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
 from ..core.task_space import PLACE
 from ..core.vectors import Array
-from ..errors import UsageError
+from ..errors import UsageError, count_nouns
 from ..results import finite_or_none
 from ..scenario import Scenario
 from ..scenario.arms import TASK_AXES
-from ..wording import count_nouns
 from . import frequency_search, port_response
 from .characteristic_roots import compute_delay_spectrum
 from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop

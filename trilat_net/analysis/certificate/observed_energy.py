@@ -14,10 +14,10 @@ import numpy as np
 from ...core.law_energy import LawEnergies, LawRecords, PeerRecords, sum_work
 from ...core.site_setup import Scheme, StaleAction
 from ...core.vectors import Array
+from ...errors import count_nouns
 from ...log.log_reader import Log
 from ...results import JsonObject
 from ...scenario.imported_code import ImportedLaw
-from ...wording import count_nouns
 from ..aligned import hold_torque
 from ..arm_rows import build_arm_rows
 from .premises import Premise

@@ -13,13 +13,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...errors import count_nouns
 from ...log.accounting import Coverage
 from ...log.log_reader import Log
 from ...log.running_digest import Integrity
 from ...log.session_check import judge_integrity
 from ...net.messages import HALTED_MODES
 from ...scenario import Scenario
-from ...wording import count_nouns
 from ..aligned import Bools, find_unlimited
 from ..dominance_history import compute_lyapunov_weights, find_closed_groups, find_kd_scales, list_losses
 from ..following import TaskFollowing

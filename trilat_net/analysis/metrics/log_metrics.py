@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...core.task_space import PLACE
+from ...errors import count_nouns
 from ...fields import suggest_nearest
 from ...log.log_reader import Log
 from ...results import Result
 from ...scenario.arms import TASK_AXES
-from ...wording import count_nouns
 from ..run_view import RunView
 from ..site_signals import follows_in_task_space
 from . import static_windows

@@ -23,14 +23,13 @@ from ...analysis.dominance_history import find_user_shares, find_users, trace_do
 from ...core.task_space import PLACE
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
-from ...errors import LogError, UsageError
+from ...errors import LogError, UsageError, count_nouns
 from ...files import import_extra
 from ...log.log_layout import collect_provenance
 from ...log.log_reader import Log
 from ...log.orientations import MATRIX_ENTRIES, expand_poses
 from ...log.record_columns import Ints
 from ...scenario.arms import TASK_AXES
-from ...wording import count_nouns
 from ..export import EXPORT_MANIFEST, ExportFormat, Written
 
 _EXTRA = ("pyarrow.parquet", "lerobot", "datasets of LeRobot")

@@ -18,8 +18,7 @@ from ...core.chain import MAX_JOINTS
 from ...core.exogenous import TorqueKind, TorqueSource
 from ...core.live_hand import HandReach, HandRules
 from ...core.site_setup import MotionLimits
-from ...errors import ScenarioError
-from ...wording import count_nouns
+from ...errors import ScenarioError, count_nouns
 from ..arms import ArmModel
 from ..operators import ActorBase, Holding, SampledActor, TimedActor
 

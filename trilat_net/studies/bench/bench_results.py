@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 
 from ...analysis.run_end import EndBehaviour, Stability
+from ...errors import count_nouns
 from ...reporting.result_text import Block, TextTable, format_number
 from ...results import Result
-from ...wording import count_nouns
 from ..intervals import MeanInterval, mean_interval, wilson_interval
 from ..study_folder import encode_csv
 from .bench_plan import STUDIES, TASKS, BenchCell, BenchPlan, explain_no_cell

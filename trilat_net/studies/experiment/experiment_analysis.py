@@ -20,12 +20,11 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from ...errors import UsageError
+from ...errors import UsageError, count_nouns
 from ...files import find_version, make_folder, make_subfolder, write_whole
 from ...reporting import style
 from ...reporting.result_text import Block, TextTable, compose, format_number
 from ...results import Result
-from ...wording import count_nouns
 from ..study_folder import encode_csv
 from .completion_times import (
     COMPLETION,

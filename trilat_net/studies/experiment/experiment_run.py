@@ -14,12 +14,11 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ...errors import UsageError
+from ...errors import UsageError, count_nouns
 from ...files import digest_file, make_results_folder, make_subfolder, write_whole
 from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import parse_scenario
-from ...wording import count_nouns
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from ..study_folder import RunJournal, build_resume_hint, encode_csv
 from .completion_times import COMPLETION, find_median, is_completed

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...core.vectors import Array
-from ...errors import UsageError
-from ...wording import count_nouns
+from ...errors import UsageError, count_nouns
 
 ONSET_SHARE = 0.05
 """Of its peak: a movement begins and ends where its speed crosses it."""

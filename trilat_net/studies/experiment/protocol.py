@@ -18,12 +18,11 @@ import numpy as np
 from msgspec import Meta, field
 from msgspec.structs import replace
 
-from ...errors import ScenarioError, TrilatError, UsageError
+from ...errors import ScenarioError, TrilatError, UsageError, count_nouns
 from ...fields import Frozen, Positive
 from ...reporting.result_text import Block, TextTable
 from ...results import Result
 from ...scenario import Scenario, load_scenario
-from ...wording import count_nouns
 from .questionnaires import Name, Questionnaire, find_form
 from .staircase import COMPARISON, STANDARD, Staircase
 from .synthetic_participant import ParticipantModel, Share

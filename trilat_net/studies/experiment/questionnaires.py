@@ -17,9 +17,8 @@ import numpy as np
 from msgspec import Meta, field
 from msgspec.structs import replace
 
-from ...errors import UsageError
+from ...errors import UsageError, count_nouns
 from ...fields import Frozen
-from ...wording import count_nouns
 from .movement_measures import raw_tlx, sus_score
 
 Name = Annotated[str, Meta(pattern=r"^[a-z][a-z0-9_]{0,39}$")]

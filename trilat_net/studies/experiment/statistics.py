@@ -21,10 +21,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...core.vectors import Array
-from ...errors import UsageError
+from ...errors import UsageError, count_nouns
 from ...fields import split_unit
 from ...files import import_extra
-from ...wording import count_nouns
 from ..intervals import mean_interval, wilson_interval
 
 Row = Mapping[str, Any]

@@ -17,14 +17,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...analysis.metrics.log_metrics import find_quantity
-from ...errors import ScenarioError, UsageError
+from ...errors import ScenarioError, UsageError, count_nouns
 from ...fields import is_number, split_unit, suggest_nearest
 from ...scenario import Scenario, apply_overrides
 from ...scenario.code_consent import allow_own_code
 from ...scenario.imported_code import name_law_classes
 from ...scenario.laws import LAWS, identify_law
 from ...scenario.scenario_reader import ExperimentText, read_experiment
-from ...wording import count_nouns
 from ..study_folder import format_command, format_toml_value, set_options
 from . import sweep_cell
 

@@ -21,12 +21,11 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ...analysis.metrics.log_metrics import find_quantity
-from ...errors import ScenarioError, UsageError
+from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution.fused import RunTotals
 from ...files import write_whole
 from ...results import Result
 from ...scenario.scenario_reader import read_source
-from ...wording import count_nouns
 from ..intervals import MeanInterval, mean_interval, wilson_interval
 from ..study_folder import encode_csv, format_command, set_options
 from .sweep_cell import CellClass, CellResult, CellRun, apply_diff, diff_lines

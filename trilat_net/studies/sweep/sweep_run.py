@@ -15,14 +15,13 @@ from typing import Any, NamedTuple
 import msgspec
 
 from ...analysis.metrics.log_metrics import measure_whole
-from ...errors import ScenarioError, UsageError
+from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution.virtual import simulate_scenario
 from ...files import make_results_folder, write_whole
 from ...net.clock import SystemClock
 from ...process import count_cores
 from ...scenario.code_consent import list_imported_code
 from ...scenario.laws import identify_law
-from ...wording import count_nouns
 from .. import executor
 from ..study_folder import RunJournal, StudyFolder, build_resume_hint, describe_program
 from . import sweep_cell

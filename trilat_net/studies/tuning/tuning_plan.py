@@ -19,14 +19,13 @@ import numpy as np
 
 from ...core.jit import is_core_cached
 from ...core.vectors import Array
-from ...errors import ScenarioError, UsageError
+from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution.fused import FusedRun
 from ...net.clock import SystemClock
 from ...process import count_cores
 from ...results import Result
 from ...scenario import Scenario
 from ...scenario.imported_code import name_law_classes
-from ...wording import count_nouns
 from ..executor import Progress, Workers, ignore_progress, open_worker_pool
 from . import search_space
 from .candidate import (

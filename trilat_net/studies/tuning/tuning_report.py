@@ -17,11 +17,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ...errors import count_nouns
 from ...files import write_whole
 from ...reporting import style
 from ...reporting.appearance import REPORT_SIZE, SITE_COLOURS
 from ...reporting.result_text import Block, TextTable, format_number
-from ...wording import count_nouns
 from ..intervals import MeanInterval
 from .candidate import CLASS_MEANINGS, CandidateClass, CandidateScore
 from .search_space import SEARCH_SPACES, weigh_joints
