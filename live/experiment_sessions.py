@@ -70,7 +70,8 @@ class ExperimentSessions:
             LogRefused: a disk refused something; all that was done is kept.
             UsageError: its trials are of synthetic participants.
         """
-        trials, notes = self.experiment.open_trials(people=True), self.experiment.open_notes()
+        trials = self.experiment.open_trials(people=True)
+        notes = self.experiment.open_notes()
         with trials as self._trials, notes as self._notes:
             done = {entry.cell for entry in self._trials.done.values()}
             for step in self.experiment.plan.list_steps():
@@ -106,7 +107,8 @@ class ExperimentSessions:
 
     def _make_trial(self, step: Step) -> bool:
         """Makes a trial until one counts; false if the experiment was ended before."""
-        plan, planned = self.experiment.plan, step.planned
+        plan = self.experiment.plan
+        planned = step.planned
         scenario = plan.find_scenario(planned, self.experiment.list_choices())
         trial = ExperimentTrial(plan.protocol, scenario, planned, plan.digest)
         path = make_subfolder(self.experiment.folder / LOGS) / planned.file
@@ -135,10 +137,12 @@ class ExperimentSessions:
 
     def _try(self, step: Step, trial: ExperimentTrial, path: Path, rest_s: float) -> bool:
         """Runs the session of a trial, once all users are ready; false if it does not count."""
-        number, begun_ns = len(self._list_tries(step.planned)) + 1, self.clock.monotonic_ns()
+        number = len(self._list_tries(step.planned)) + 1
+        begun_ns = self.clock.monotonic_ns()
         tries = make_subfolder(self.experiment.folder / TRIES)
         folder = make_subfolder(tries / f"{step.planned.number:05d}-{number:02d}")
-        watch, asked = TrialWatch(trial, self.clock), self.stage.ask(step, rest_s)
+        watch = TrialWatch(trial, self.clock)
+        asked = self.stage.ask(step, rest_s)
         ready: list[str] = []
 
         def begins() -> bool:
@@ -182,7 +186,8 @@ class ExperimentSessions:
             shutil.rmtree(folder, ignore_errors=True)
         self.stage.tell(entry)
         self.experiment.write_tables()
-        planned, took_s = trial.planned, entry.measures["completion_s"]
+        planned = trial.planned
+        took_s = entry.measures["completion_s"]
         how = f"{'succeeded' if entry.succeeded else 'failed'} after {took_s:.2f} s"
         whose = f"trial {planned.number} of {len(self.experiment.plan.trials)}, {', '.join(planned.group)}"
         self.say(f"{whose}, {planned.condition}: {how}")
@@ -205,8 +210,10 @@ def run_with_people(experiment: Experiment, options: PageOptions, say: Callable[
         LogRefused: a disk refused something; all that was done is kept.
         UsageError: its trials are of synthetic participants.
     """
-    clock, plan = SystemClock(), experiment.plan
-    stage, name = Stage(plan, clock), plan.protocol.name
+    clock = SystemClock()
+    plan = experiment.plan
+    stage = Stage(plan, clock)
+    name = plan.protocol.name
     with Interrupt() as interrupt, closing(ZenohBus()) as idle:
         for scenario in plan.scenarios.values():
             compile_core(scenario, say, interrupt)

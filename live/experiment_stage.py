@@ -40,8 +40,12 @@ class TrialWatch:
     """
 
     def __init__(self, trial: ExperimentTrial, clock: Clock) -> None:
-        self.trial, self.judge, self.aborted = trial, TrialJudge(trial), ""
-        self._clock, self._next, self._ended_ns = clock, 0, 0
+        self.trial = trial
+        self.judge = TrialJudge(trial)
+        self.aborted = ""
+        self._clock = clock
+        self._next = 0
+        self._ended_ns = 0
         self._appeared = self.diverged = False
 
     @property
@@ -65,13 +69,17 @@ class TrialWatch:
         return self._judge(view)
 
     def _judge(self, view: SessionView) -> list[str]:
-        slave, number, moments = view.sites[self.trial.slave], self.trial.planned.number, list[str]()
-        first, last = max(self._next, slave.window.first), slave.complete
+        slave = view.sites[self.trial.slave]
+        number = self.trial.planned.number
+        moments = list[str]()
+        first = max(self._next, slave.window.first)
+        last = slave.complete
         if last < first:
             return []
         if self._next == 0:
             moments.append(f"trial {number} begins")
-        self._next, rows = last + 1, slave.window.rows(first, last)
+        self._next = last + 1
+        rows = slave.window.rows(first, last)
         told = rows.known.tolist(), rows.q.tolist(), rows.tau_x.tolist()
         for tick, known, q, tau_x in zip(range(first, last + 1), *told, strict=True):
             t_s = tick_ns(tick, slave.window.rate_hz) / NS_PER_S
@@ -85,8 +93,11 @@ class TrialWatch:
 
     def describe(self, t_s: float, site: str) -> Json:
         """Returns what a page draws at a time of its arms, s; a user's page as that user is shown it."""
-        goal, trial, users = self.judge.goal, self.trial, self.trial.protocol.users
-        at, way = goal.place(t_s, users.index(site) if site in users else None), goal.find_corridor(t_s)
+        goal = self.judge.goal
+        trial = self.trial
+        users = self.trial.protocol.users
+        at = goal.place(t_s, users.index(site) if site in users else None)
+        way = goal.find_corridor(t_s)
         return {
             "target": {"site": trial.slave, "at": at.tolist(), "width_m": goal.width_m},
             **({} if way is None else {"way": {"from": way[0].tolist(), "width_m": way[1]}}),
@@ -119,7 +130,9 @@ class Stage:
     """
 
     def __init__(self, plan: ExperimentPlan, clock: Clock) -> None:
-        self.users, self._plan, self._clock = plan.protocol.users, plan, clock
+        self.users = plan.protocol.users
+        self._plan = plan
+        self._clock = clock
         self.shows_ages = plan.protocol.staircase is None
         self._asked: Asked | None = None
         self._watch: TrialWatch | None = None
@@ -133,16 +146,22 @@ class Stage:
         """Asks users for a step, but those who have `done` it; returns what they reply, as it comes."""
         asked = Asked(step, self._clock.monotonic_ns() + int(rest_s * NS_PER_S))
         asked.replies |= {site: ({}, 0) for site in done}
-        self._step, self._watch, self._phase, self._asked = step, None, step.kind, asked
+        self._step = step
+        self._watch = None
+        self._phase = step.kind
+        self._asked = asked
         return asked
 
     def begin(self, watch: TrialWatch) -> None:
         """Shows a trial whose session is about to begin."""
-        self._asked, self._watch, self._phase = None, watch, "starting"
+        self._asked = None
+        self._watch = watch
+        self._phase = "starting"
 
     def check(self) -> None:
         """Shows that a trial has ended, and its log is looked at."""
-        self._watch, self._phase = None, "checking"
+        self._watch = None
+        self._phase = "checking"
 
     def tell(self, entry: TrialEntry | None, why: str = "") -> None:
         """Shows the feedback on a trial, as far as the protocol has any; or why it is made again."""
@@ -156,11 +175,14 @@ class Stage:
 
     def close(self) -> None:
         """Shows that all is done."""
-        self._asked, self._step, self._phase = None, None, "over"
+        self._asked = None
+        self._step = None
+        self._phase = "over"
 
     def poll(self, view: SessionView, pages: Sequence[tuple[str, int]]) -> list[str]:
         """Takes in what has come, and site and number of each user's page; returns moments for the log."""
-        now_ns, asked = self._clock.monotonic_ns(), self._asked
+        now_ns = self._clock.monotonic_ns()
+        asked = self._asked
         self._holders = {site: min(n for at, n in pages if at == site) for site, _ in pages}
         self._seen_ns |= dict.fromkeys(self._holders, now_ns)
         if asked is not None and asked.step.kind == "trial":  # who leaves is not ready any more
@@ -177,12 +199,14 @@ class Stage:
     def take(self, site: str, page: int, message: StageMessage) -> bool:
         """Takes a message of a user's page, or of an experimenter's, ""; false: nobody asked for it."""
         if isinstance(message, AbortTrial):
-            watch, who = self._watch, site or "the experimenter"
+            watch = self._watch
+            who = site or "the experimenter"
             if watch is None or watch.over or (site and self._holders.get(site) != page):
                 return False
             watch.aborted = f"{who} stopped it" + (f": {message.why}" if message.why else "")
             return True
-        asked, early = self._asked, self._asked and self._clock.monotonic_ns() < self._asked.from_ns
+        asked = self._asked
+        early = self._asked and self._clock.monotonic_ns() < self._asked.from_ns
         if asked is None or early or self._holders.get(site) != page or message.key != asked.step.key:
             return False
         try:
@@ -193,11 +217,15 @@ class Stage:
 
     def describe(self, role: str, site: str, page: int, t_s: float | None) -> Json:
         """Returns what a page shows, by role, site and number, at a time of its arms, s, if there are any."""
-        step, asked, watch, protocol = self._step, self._asked, self._watch, self._plan.protocol
+        step = self._step
+        asked = self._asked
+        watch = self._watch
+        protocol = self._plan.protocol
         found: Json = {"phase": self._phase, "title": protocol.title or protocol.name, "told": self._told}
         if step is None:
             return found
-        planned, replies = step.planned, {} if asked is None else asked.replies
+        planned = step.planned
+        replies = {} if asked is None else asked.replies
         names = dict(zip(self.users, planned.group, strict=True))
         states = {at: "done" if at in replies else "here" if at in self._holders else "" for at in self.users}
         found |= {

@@ -258,7 +258,10 @@ class PageHands:
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, source: str) -> None:
-        self._bus, self._clock, self._session, self._source = bus, clock, session, source
+        self._bus = bus
+        self._clock = clock
+        self._session = session
+        self._source = source
         self._senders: dict[str, SiteSender] = {}
         self._held: set[str] = set()
 
@@ -293,7 +296,9 @@ class OrderDesk:
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, refused: Counter[str] | None = None) -> None:
-        self._bus, self._clock, self._session = bus, clock, session
+        self._bus = bus
+        self._clock = clock
+        self._session = session
         self._waiting: dict[tuple[str, str], ChangeRequest] = {}
         self._open: dict[tuple[str, str], tuple[Inbox, int, ChangeRequest]] = {}
         self.replies: list[tuple[str, str, bool, str]] = []
@@ -309,10 +314,14 @@ class OrderDesk:
             source: who orders it, for the site's event.
         """
         if isinstance(order, SetLink):
-            what, site, known = "link", order.link.partition("->")[2], order.link in links
+            what = "link"
+            site = order.link.partition("->")[2]
+            known = order.link in links
             request = _link_request(order)
         else:
-            what, site, known = "site", order.site, order.site in sites
+            what = "site"
+            site = order.site
+            known = order.site in sites
             request = ChangeRequest(dominance=site, to={**order.to}, ramp_s=LEAST_RAMP_S)
         if not known:
             self.refused[f"no such {what}"] += 1

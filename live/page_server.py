@@ -149,15 +149,19 @@ class Page:
     def __init__(
         self, connection: ServerConnection, number: int, role: Role, hands: PageHands, *, takes_part: bool
     ) -> None:
-        self.connection, self.number, self.role = connection, number, role
-        self.hands, self.takes_part = hands, takes_part
+        self.connection = connection
+        self.number = number
+        self.role = role
+        self.hands = hands
+        self.takes_part = takes_part
         self.asks: tuple[set[Page], int] | None = None
         self.wake = asyncio.Event()
         self.drawn = self.sent = self.notified = 0
         self.unseen: deque[int] = deque()
         self.points = self.energies = self.events = 0
         self.greeted = False
-        self.limits, self.excess = MessageLimits(), 0
+        self.limits = MessageLimits()
+        self.excess = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,15 +239,22 @@ class PageServer:
         say: Callable[[str], None] = lambda _: None,
         stage: "Stage | None" = None,
     ) -> None:
-        self._clock, self._ends, self._say, self._stage = clock, ends, say, stage
-        self._host, self._port, self._tls = options.host, options.port, options.make_context()
+        self._clock = clock
+        self._ends = ends
+        self._say = say
+        self._stage = stage
+        self._host = options.host
+        self._port = options.port
+        self._tls = options.make_context()
         self._scheme = "http" if self._tls is None else "https"
         self._pages: set[Page] = set()
         self.refused: Counter[str] = Counter()
         self._next: tuple[Bus, str] | None = None
         self._turn_to(bus, session)
-        self._is_local, self._opens = options.host in HERE, options.opens
-        self._links, self._told = RoleLinks(), False
+        self._is_local = options.host in HERE
+        self._opens = options.opens
+        self._links = RoleLinks()
+        self._told = False
         self.files = PageFiles()
         self._ages = stage is None or stage.shows_ages
         self._met = self._n = 0
@@ -292,7 +303,8 @@ class PageServer:
                 self._next = None
 
     def _turn_to(self, bus: Bus, session: str) -> None:
-        self._bus, self.view = bus, SessionView(bus, self._clock, session)
+        self._bus = bus
+        self.view = SessionView(bus, self._clock, session)
         self._frames = SessionFrames(self.view)
         self._desk = OrderDesk(bus, self._clock, session, self.refused)
         self._frame: dict[str, Any] | None = None
@@ -331,7 +343,8 @@ class PageServer:
                 self._say(f"the page goes on, though its {reason}: {error}")
 
     async def _serve(self) -> None:
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+        self._stop = asyncio.Event()
         counted = {"refused": self.refused, "strangers": Strangers(self.refused)}
         timeouts: dict[str, Any] = {}
         if self._tls is not None:
@@ -543,7 +556,8 @@ class PageServer:
     def _ask_to_take_part(self, page: Page, want: bool) -> None:
         """Lets a page take part, or no longer; while others hold an arm they are asked first."""
         if not want:
-            page.takes_part, page.asks = False, None
+            page.takes_part = False
+            page.asks = None
             page.hands.release()
         elif not page.takes_part and page.asks is None:
             holders = {other for other in self.experimenters - {page} if self._list_held(other)}
@@ -558,7 +572,8 @@ class PageServer:
     def _let_take_part(self, page: Page, answer: AnswerPage) -> None:
         for other in self._pages:
             if other.number == answer.page and other.asks is not None and page in other.asks[0]:
-                other.takes_part, other.asks = answer.yes, None
+                other.takes_part = answer.yes
+                other.asks = None
                 return
         self.refused["was not asked"] += 1
 
@@ -568,7 +583,8 @@ class PageServer:
         for page in self._pages:
             here = page.asks[0] & self._pages if page.asks is not None else set()
             if page.asks is not None and (not here or now_ns - page.asks[1] > ANSWER_NS):
-                page.takes_part, page.asks = not any(map(self._list_held, here)), None
+                page.takes_part = not any(map(self._list_held, here))
+                page.asks = None
 
     def _list_held(self, page: Page) -> list[str]:
         sites = (self._frame or {}).get("sites", {})
@@ -589,7 +605,8 @@ class PageServer:
                 scenario = self.view.scenario
                 if scenario is not None and page.role.site not in ("", *scenario.names):
                     return await page.connection.close(_POLICY_VIOLATION, "the session has no such site")
-                page.notified, page.sent = page.sent, self._n
+                page.notified = page.sent
+                page.sent = self._n
                 page.unseen.append(page.sent)
                 try:
                     payload = encode(self._frame_for(page) if page.greeted and begins else self._greet(page))
@@ -642,13 +659,15 @@ class PageServer:
 
     def _show_all(self, page: Page) -> dict[str, Any]:
         """Returns what is, and what has been added to plots and events since the page's last frame."""
-        frames, view = self._frames, self.view
+        frames = self._frames
+        view = self.view
         first = page.points == 0 and page.energies == 0
         most = 100_000 if first else POINTS_PER_FRAME
         points = frames.points.since(page.points, most)
         energies = frames.energies.since(page.energies, most)
         events = [show_event(event) for event in view.events.since(page.events, 100)]
-        page.points, page.energies = frames.points.count, frames.energies.count
+        page.points = frames.points.count
+        page.energies = frames.energies.count
         page.events = view.events.count
         return {**(self._frame or {}), "points": points, "energies": energies, "events": events}
 
@@ -658,7 +677,8 @@ class PageAttendant(ExitStack):
 
     def __init__(self, options: PageOptions, clock: Clock) -> None:
         super().__init__()
-        self._options, self._clock = options, clock
+        self._options = options
+        self._clock = clock
         self._page: PageServer | None = None
 
     @contextmanager
@@ -677,7 +697,8 @@ class PageAttendant(ExitStack):
 
         The address of a file cannot be guessed, and only these pages are told.
         """
-        page, clock = self._page, self._clock
+        page = self._page
+        clock = self._clock
         assert page is not None  # a session was attended
         page.view.finish()  # its processes are gone, whatever they could still say
         page.files.offer(paths)

@@ -49,9 +49,12 @@ class ArmFrames:
     """One arm in frames: its fixed shape, and its pose, ghost and forces in some records."""
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        self._scenario, self._site = scenario, site
-        self._model, self._spec = scenario.arms[site], scenario.sites[site]
-        self._walls, self._hand = list_walls(self._spec), self._spec.find_live_hand()
+        self._scenario = scenario
+        self._site = site
+        self._model = scenario.arms[site]
+        self._spec = scenario.sites[site]
+        self._walls = list_walls(self._spec)
+        self._hand = self._spec.find_live_hand()
         counts = self._model.counts.joints
         limits = np.broadcast_to(np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64), (counts,))
         self._tau_limit = limits
@@ -59,7 +62,8 @@ class ArmFrames:
 
     def describe(self) -> Json:
         """Returns what never changes."""
-        chain, places = self._model.chain, self._scenario.order_palette(COLOURS)
+        chain = self._model.chain
+        places = self._scenario.order_palette(COLOURS)
         start = joint_positions_m(self._model, np.array([self._spec.q0_rad], dtype=np.float64))[0]
         reach = float(np.linalg.norm(np.diff(start, axis=0), axis=1).sum())
         return {
@@ -84,7 +88,8 @@ class ArmFrames:
     def _describe_hand(self) -> Json | None:
         if (hand := self._hand) is None:
             return None
-        how, rows = hand.device, hand.device.rows(self._model.counts.axes)
+        how = hand.device
+        rows = hand.device.rows(self._model.counts.axes)
         device = {"rows": rows, "scale": how.scale, "jump_m_s": how.jump_m_s}
         centre, _, outer_m, *_ = self._model.reach
         reach = {"centre": list(centre), "most": outer_m if outer_m < math.inf else None}
@@ -102,8 +107,10 @@ class ArmFrames:
         """Returns the arm in the last of some records, and extremes over all: |e|, torque, hand, wall."""
         split = split_torque(own, self._scenario)
         last = slice(len(own.known) - 1, None)
-        hand, wall = self._hand_force(own, split), self._wall_force(own, split)
-        e, tau = np.linalg.norm(own.e, axis=1), np.abs(own.tau)
+        hand = self._hand_force(own, split)
+        wall = self._wall_force(own, split)
+        e = np.linalg.norm(own.e, axis=1)
+        tau = np.abs(own.tau)
         if self._model.shares_pose:
             ghost = own.q_des[-1, :3][np.newaxis] / self._spec.task.scale
         else:
@@ -126,7 +133,8 @@ class ArmFrames:
         if not own.hand.size:
             return {}
         held = HandInForce.read(own.hand[-1].tolist())
-        hand, limited = self._hand, False
+        hand = self._hand
+        limited = False
         if hand is not None and hand.mode != "joint" and held.source:
             limited = float(np.linalg.norm(force)) >= held.grip * hand.force_limit_n * (1.0 - 1e-6)
         shown = held.target if hand is not None and hand.mode == "tip" and held.grip > 0.0 else None
@@ -179,7 +187,8 @@ class SessionFrames:
 
     def describe(self) -> Json:
         """Returns the session as a page needs it once: sites, links, columns of the plots."""
-        view, scenario = self._view, self._view.scenario
+        view = self._view
+        scenario = self._view.scenario
         if scenario is not None and not self._arms:  # before it runs: the compiled arms take seconds to load
             self._arms = {site: ArmFrames(scenario, site) for site in scenario.names}
             self._shapes = {site: arm.describe() for site, arm in self._arms.items()}
@@ -210,7 +219,9 @@ class SessionFrames:
             return None
         if not self._arms:
             self.describe()
-        sites, row, t_s = {}, [], 0.0
+        sites = {}
+        row = []
+        t_s = 0.0
         for name, site in view.sites.items():
             sites[name], extremes = self._site_now(name, site)
             t_s = max(t_s, sites[name]["t"])
@@ -281,7 +292,9 @@ class SessionFrames:
         return known
 
     def _site_now(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
-        window, record, stats = site.window, site.record, site.stats
+        window = site.window
+        record = site.record
+        stats = site.stats
         assert record is not None
         newest = max(window.newest, 0)
         longest = round(LONGEST_FRAME_S * window.rate_hz)
@@ -311,8 +324,11 @@ class SessionFrames:
     def _link_now(self, name: str) -> Json:
         view = self._view
         peer, _, receiver = name.partition("->")
-        own, other = view.sites[receiver], view.sites[peer]
-        record, stats, table = own.record, own.stats, view.links[name]
+        own = view.sites[receiver]
+        other = view.sites[peer]
+        record = own.record
+        stats = own.stats
+        table = view.links[name]
         used = -1 if record is None else record.used.get(peer, -1)
         rate_hz = other.window.rate_hz
         age_ms = None

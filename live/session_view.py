@@ -73,10 +73,12 @@ class SiteView:
         self, bus: Bus, session: str, scenario: Scenario, name: str, boot: int, window: RecordWindow
     ) -> None:
         rule = scenario.sites[name].on_stale
-        self.glides, self.peers = rule.action == "glide", scenario.peers(name)
+        self.glides = rule.action == "glide"
+        self.peers = scenario.peers(name)
         self.layout = scenario.layout(name) if rule.rule.degrades else None
         self.hand = scenario.sites[name].find_live_hand(is_open=True)
-        self.reception, self.window = SiteReception(scenario, name, boot), window
+        self.reception = SiteReception(scenario, name, boot)
+        self.window = window
         self.holder = ""
         self.stopped_by = ""
         self.bodies: dict[int, list[float]] = {}
@@ -122,7 +124,9 @@ class SessionView:
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
-        self.session, self.bus, self._clock = session, bus, clock
+        self.session = session
+        self.bus = bus
+        self._clock = clock
         self.scenario: Scenario | None = None
         self.sites: dict[str, SiteView] = {}
         self.met: dict[str, Info] = {}
@@ -245,7 +249,8 @@ class SessionView:
 
     def _begin_start(self, name: str, payload: bytes) -> bool:
         """Goes over to another start of a site, if that says that it joins."""
-        event, site = decode(payload, Event), self.sites[name]
+        event = decode(payload, Event)
+        site = self.sites[name]
         joins = event.kind == "join" and event.member == name and event.boots.get(name) == event.boot
         if not joins or self.scenario is None or not self.scenario.sites_may_return:
             return False

@@ -46,7 +46,8 @@ def watch_session(
         UsageError: an endpoint cannot be used.
     """
     with Interrupt() as interrupt:
-        names, stopped = embedded_names_reader(session), interrupt.requested
+        names = embedded_names_reader(session)
+        stopped = interrupt.requested
         reached = connect_to_session(
             connection, clock, session, names, stopped=stopped, timeout_s=timeout_s, say=say
         )
@@ -72,7 +73,8 @@ class SessionWatch:
 
     def __init__(self, bus: Bus, clock: Clock, session: str, as_site: str = "") -> None:
         self.view = SessionView(bus, clock, session)
-        self._V, self._as_site = "", as_site
+        self._V = ""
+        self._as_site = as_site
 
     def update(self) -> None:
         """Takes in what has come, and computes V as far as all records are there."""
@@ -110,7 +112,9 @@ class SessionWatch:
 
     def rows(self) -> list[SiteRow]:
         """Returns the row of each site; of a peer of the site that is watched, what its user is shown."""
-        view, scenario, own = self.view, self.view.scenario, self._as_site
+        view = self.view
+        scenario = self.view.scenario
+        own = self._as_site
         every = {
             name: describe_site(
                 scenario,
@@ -125,7 +129,8 @@ class SessionWatch:
         }
         record = view.sites[own].record if own in every else None
         for peer, tick in view.find_shown(own, record.tick, record.used).items() if record else ():
-            window, seen = view.sites[peer].window, {"site": peer}
+            window = view.sites[peer].window
+            seen = {"site": peer}
             if window.knows(tick):
                 angles = describe_angles(window.rows(tick, tick).q[0].tolist())
                 seen |= {"time": f"{tick / window.rate_hz:.3f} s", "angles": angles}
@@ -138,7 +143,8 @@ def show_in_terminal(
     clock: Clock, session: str, as_site: str, console: Console, bus: Bus
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
     """The `SessionOnlooker` of a terminal."""
-    watch, desk = SessionWatch(bus, clock, session, as_site), OrderDesk(bus, clock, session)
+    watch = SessionWatch(bus, clock, session, as_site)
+    desk = OrderDesk(bus, clock, session)
     with _read_keys() as read_keys, SessionDisplay(console, clock) as display:
         if read_keys is not None:
             display.say("S or space: stop every arm")

@@ -44,8 +44,10 @@ class GapRepair:
         self, bus: Bus, session: str, reception: SiteReception, dropped: Counter[str], now_ns: int = 0
     ) -> None:
         self._progress_ns = self._polled_ns = now_ns
-        self._bus, self._key = bus, topics.key(session, reception.name, topics.PAST)
-        self._reception, self._dropped = reception, dropped
+        self._bus = bus
+        self._key = topics.key(session, reception.name, topics.PAST)
+        self._reception = reception
+        self._dropped = dropped
         self._turns = list(SITE_CHANNELS)
         self._probes: set[str] = set()
         self._probed_ns = now_ns
@@ -54,7 +56,8 @@ class GapRepair:
         self._open: tuple[BackfillRequest, Inbox, int] | None = None  # its answers, when it was sent
         self._due_ns: int | None = None
         # fewer messages per request while answers do not arrive
-        self._timeout_ns, self._chunk = ANSWER_NS[0], BACKFILL_MESSAGES
+        self._timeout_ns = ANSWER_NS[0]
+        self._chunk = BACKFILL_MESSAGES
         self._ended_ns: int | None = None
 
     def probe(self) -> None:

@@ -63,8 +63,12 @@ class Recorder:
         say: Callable[[str], None],
         is_ending: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._bus, self._clock, self._session, self._storage = bus, clock, session, storage
-        self._stopped, self._say = stopped, say
+        self._bus = bus
+        self._clock = clock
+        self._session = session
+        self._storage = storage
+        self._stopped = stopped
+        self._say = say
         self._is_ending = is_ending
         self._queue = InboundQueue(clock)
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
@@ -138,7 +142,8 @@ class Recorder:
         return recording
 
     def _begin(self, recording: Recording, epoch: Epoch, path: Path) -> None:
-        own, now_ns = self._publisher.info, self._clock.monotonic_ns()
+        own = self._publisher.info
+        now_ns = self._clock.monotonic_ns()
         self._publisher.update(running=True)
         text = "the session begins"
         if epoch.boots.get(own.member) != own.boot:

@@ -58,9 +58,13 @@ class Recording:
     ) -> None:
         self.dropped: Counter[str] = Counter()
         self._writer = writer
-        self.session, self.epoch, self.publisher = session, epoch, publisher
-        self._scenario, self._bus = scenario, bus
-        self._boots, self._candidates = dict(epoch.boots), dict[str, int]()
+        self.session = session
+        self.epoch = epoch
+        self.publisher = publisher
+        self._scenario = scenario
+        self._bus = bus
+        self._boots = dict(epoch.boots)
+        self._candidates = dict[str, int]()
         self._confirmed: set[int] = set()
         self._vanished: set[tuple[str, str]] = set()
         self._end_ns = epoch.mono_ns + round(scenario.duration_s * 1e9) + LAST_NS
@@ -143,7 +147,8 @@ class Recording:
     def _admit_starts(self) -> None:
         """Goes over to starts of sites that others admit, or where the one before is gone or has ended."""
         for name, boot in list(self._candidates.items()):
-            before, left = self._sites[name], name in self._gone or name not in self._boots
+            before = self._sites[name]
+            left = name in self._gone or name not in self._boots
             if not (left or before.made is not None or boot in self._confirmed):
                 continue
             del self._candidates[name]
@@ -153,7 +158,8 @@ class Recording:
             repair.probe()
             for channel in site.accounts:
                 key = topics.key(self.session, name, channel)
-                self._channels[key], self.accounts[key] = (site, channel), site.accounts[channel]
+                self._channels[key] = (site, channel)
+                self.accounts[key] = site.accounts[channel]
             self._stored.discard(name)
             self._gone_ns.pop(name, None)
             (self._gone.add if (name, str(boot)) in self._vanished else self._gone.discard)(name)
@@ -206,21 +212,29 @@ class Recording:
 
     def _take_block(self, key: str, block: bytes, mono_ns: int) -> None:
         """Writes the records of a block; one that is none drops those after it."""
-        site, since_ns = self._channels[key][0], mono_ns - self.epoch.mono_ns
-        site.since_ns, log_time_ns, add = since_ns, self.epoch.unix_ns + since_ns, self._writer.add
+        site = self._channels[key][0]
+        since_ns = mono_ns - self.epoch.mono_ns
+        site.since_ns = since_ns
+        log_time_ns = self.epoch.unix_ns + since_ns
+        add = self._writer.add
         for payload, record in site.take_records(split_states(block), mono_ns):
             add(key, payload, record.sent_ns, log_time_ns, record.tick, record)
 
     def _take_own(self, key: str, payload: bytes, mono_ns: int) -> None:
-        account, since_ns = self._own[key], mono_ns - self.epoch.mono_ns
+        account = self._own[key]
+        since_ns = mono_ns - self.epoch.mono_ns
         if key.endswith(topics.STATS):
             stats = decode(payload, RecorderStats)
-            boot, number, content = stats.boot, account.expected, None
+            boot = stats.boot
+            number = account.expected
+            content = None
         else:
             event = decode(payload, Event)
             if event.member != topics.RECORDER:
                 raise WireError("stranger", key)
-            boot, number, content = event.boot, event.n, event
+            boot = event.boot
+            number = event.n
+            content = event
         if boot != self.publisher.info.boot:
             raise WireError("another recorder", key)
         if number >= 0 and account.take(number, mono_ns):
@@ -357,7 +371,10 @@ class RecorderReport:
     def __init__(
         self, bus: Bus, clock: Clock, recording: Recording, queue: InboundQueue, size: Callable[[], int]
     ) -> None:
-        self._clock, self._recording, self._queue, self._size = clock, recording, queue, size
+        self._clock = clock
+        self._recording = recording
+        self._queue = queue
+        self._size = size
         self._key = topics.key(recording.session, topics.RECORDER, topics.STATS)
         self._publish = bus.publisher(self._key)
         self._flush_max_ns = 0

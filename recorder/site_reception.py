@@ -28,7 +28,8 @@ from trilat_net.scenario.run_changes import count_skipped_ticks
 
 CAPACITY = 60_000
 """Capacity in messages: minutes of three sites at 1 kHz, whose records come in blocks."""
-CAPACITY_BYTES, KEY_BYTES = 96 << 20, 32 << 20
+CAPACITY_BYTES = 96 << 20
+KEY_BYTES = 32 << 20
 """Capacity in bytes, and of messages of one key: a planar arm at 1 kHz makes half a megabyte a second."""
 OVERHEAD_BYTES = 200
 """What a message takes besides its payload."""
@@ -50,7 +51,8 @@ class InboundQueue:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._queue: deque[InboundMessage] = deque()
-        self._taken, self._drained = Counter[str](), Counter[str]()  # each of one thread, bytes by key
+        self._taken = Counter[str]()
+        self._drained = Counter[str]()  # each of one thread, bytes by key
         self._taken_bytes = self._drained_bytes = 0
         self._taking = threading.Lock()  # a bus may have several threads
         self.overflowed: Counter[str] = Counter()
@@ -83,9 +85,11 @@ class InboundQueue:
 
 
 CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
-_LEAD_NS, _DRIFT = 2_000_000_000, 1e-3
+_LEAD_NS = 2_000_000_000
+_DRIFT = 1e-3
 """By so much, and this share of the session's time, clocks of sites may be ahead of the recorder's."""
-EVENT_BYTES, EVENT_BYTES_PER_S = 512 << 10, 4 << 10
+EVENT_BYTES = 512 << 10
+EVENT_BYTES_PER_S = 4 << 10
 """Bytes of a site's events that a log takes, and more for each of its seconds: ten events a second."""
 _LEAST_EVENT_BYTES = 128
 """No event is shorter."""
@@ -123,7 +127,8 @@ class SiteReception:
     def __init__(
         self, scenario: Scenario, name: str, boot: int | None, before: "SiteReception | None" = None
     ) -> None:
-        self.name, self._before = name, before
+        self.name = name
+        self._before = before
         self.accounts = {channel: Account() for channel in SITE_CHANNELS}
         self.event_accounts: tuple[Account, ...] = ()
         if before is not None:
@@ -133,7 +138,8 @@ class SiteReception:
         self.heard_ns: int | None = None
         self.since_ns: float = math.inf if before is None else before.since_ns
         self._boot = boot
-        self._rate_hz, layout = scenario.sites[name].rate_hz, scenario.layout(name)
+        self._rate_hz = scenario.sites[name].rate_hz
+        layout = scenario.layout(name)
         self._decoders = {name: make_decoder(CHANNEL_TYPES[name], layout=layout) for name in SITE_CHANNELS}
         self.period_ns = 1_000_000_000 // self._rate_hz
         self._gaps = {
@@ -155,7 +161,8 @@ class SiteReception:
         if channel == topics.EVENT:
             event = self._decoders[channel](payload)
             message = SiteMessage(event.n, event.n, event.t_ns, event)
-            sender, ticks = event.member, event.ticks if event.kind in ("join", "end") else 0
+            sender = event.member
+            ticks = event.ticks if event.kind in ("join", "end") else 0
             if event.kind == "end" and not 0 <= event.ticks <= self._ticks:
                 raise WireError(
                     "out of range", f"{self.name} says it made {count_nouns(event.ticks, 'tick')}"
@@ -165,7 +172,8 @@ class SiteReception:
             number = number_message(channel, tick.tick, self._rate_hz)
             t_ns = tick.sent_ns if channel == topics.STATE else tick.t_ns
             message = SiteMessage(number, tick.tick, t_ns, tick)
-            sender, ticks = tick.site, tick.tick + 1
+            sender = tick.site
+            ticks = tick.tick + 1
         self._check(channel, sender, message.content.boot, message.number, ticks)
         if isinstance(message.content, Event):
             self._take_room(message.content, len(payload))
@@ -185,8 +193,11 @@ class SiteReception:
         Raises:
             WireError: one is no record of this site; those before it count.
         """
-        decode, account = self._decoders[topics.STATE], self.accounts[topics.STATE]
-        name, boot, possible = self.name, self._boot, self._possible_ticks
+        decode = self._decoders[topics.STATE]
+        account = self.accounts[topics.STATE]
+        name = self.name
+        boot = self._boot
+        possible = self._possible_ticks
         for payload in payloads:
             record: State = decode(payload)
             tick = record.tick

@@ -57,8 +57,12 @@ class ChangeServer:
         held: Callable[[], bool] = lambda: True,
         stops: QueryInbox | None = None,
     ) -> None:
-        self._scenario, self._site, self._queries, self._stops = scenario, site, queries, stops
-        self._mode, self._held = mode, held
+        self._scenario = scenario
+        self._site = site
+        self._queries = queries
+        self._stops = stops
+        self._mode = mode
+        self._held = held
         self._rate_hz = scenario.sites[site].rate_hz
         self._ticks = scenario.ticks(site)
         self._links = LinkTables(scenario.links, scenario.timeline)
@@ -86,14 +90,17 @@ class ChangeServer:
                 if request.stop_s is not None:
                     text, tick = self._stop(k, request.stop_s)
                 elif request.mark:
-                    text, tick = self._mark(k, request.mark), k
+                    text = self._mark(k, request.mark)
+                    tick = k
                 elif request.order:
                     changes.append(self._order(k, request.order))
                     ordered = True
-                    text, tick = f"{self._site}: {request.order} at tick {k}", k
+                    text = f"{self._site}: {request.order} at tick {k}"
+                    tick = k
                 else:
                     changes.append(self._resolve(request, first))
-                    text, tick = f"{self._site} takes it in at tick {k}; it holds from tick {first} on", first
+                    text = f"{self._site} takes it in at tick {k}; it holds from tick {first} on"
+                    tick = first
                 if isinstance(request.source, str) and changes:
                     self.sources[changes[-1].text] = request.source
                 reply = ChangeReply(member=self._site, accepted=True, text=text, tick=tick)
@@ -104,7 +111,8 @@ class ChangeServer:
 
     def _poll(self) -> Query | None:
         if (query := self._poll_stop()) is None:
-            query, self._held_up = self._held_up or self._queries.poll(), None
+            query = self._held_up or self._queries.poll()
+            self._held_up = None
         return query
 
     def _poll_stop(self) -> Query | None:
@@ -125,9 +133,11 @@ class ChangeServer:
         return f"{self._site} marks tick {k}"
 
     def _order(self, k: int, order: SiteOrder) -> CoreChange:
-        mode, needed = self._mode(), _NEEDED_MODES.get(order)
+        mode = self._mode()
+        needed = _NEEDED_MODES.get(order)
         if needed is not None and mode is not needed:
-            doing, only = MODE_WORDS[mode], MODE_WORDS[needed]
+            doing = MODE_WORDS[mode]
+            only = MODE_WORDS[needed]
             raise ScenarioError(f"{self._site} is in {doing}; {order} is for a site in {only}")
         if needed is not None and not self._held():
             raise ScenarioError(f"the dead-man switch of {self._site} is not held; {order} it while it is")

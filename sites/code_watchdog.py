@@ -31,7 +31,8 @@ SHARE = 0.75
 MOST_NS = 500_000_000
 HICCUP_NS = 50_000_000
 CHECK_S = 1.0
-CHECKS, FIRST_CHECKS = 3, 61
+CHECKS = 3
+FIRST_CHECKS = 61
 """Code in the same call at so many checks in a row, one every `CHECK_S`, hangs; the second is of its first
 tick, in which it may compile."""
 
@@ -65,7 +66,10 @@ class WatchedCode:
     ) -> None:
         self.hiccups = self.longest_ns = 0
         self.longest_tick = -1
-        self._name, self._fail, self._clock, self._usage = name, fail, clock, usage
+        self._name = name
+        self._fail = fail
+        self._clock = clock
+        self._usage = usage
         self._period_ns = NS_PER_S // rate_hz
         self._owed_ns = self._sum_ns = self._count = self._checks = 0
         self._running = self._first = -1  # the ticks of the call under way and of the first one
@@ -79,7 +83,8 @@ class WatchedCode:
         """
         computed_ns, switches = self._usage()
         began_ns = self._clock.monotonic_ns()
-        self._running, self._first = k, k if self._first < 0 else self._first
+        self._running = k
+        self._first = k if self._first < 0 else self._first
         try:
             result = call()
         finally:
@@ -97,11 +102,13 @@ class WatchedCode:
         self._sum_ns += took_ns
         self._count += 1
         if took_ns > self.longest_ns:
-            self.longest_ns, self.longest_tick = took_ns, k
+            self.longest_ns = took_ns
+            self.longest_tick = k
         self._owed_ns += min(took_ns, HICCUP_NS) - int(SHARE * self._period_ns)
         self._owed_ns = max(self._owed_ns, 0)
         if self._owed_ns > MOST_NS:
-            mean_ms, period_ms = self._sum_ns / self._count * 1e-6, self._period_ns * 1e-6
+            mean_ms = self._sum_ns / self._count * 1e-6
+            period_ms = self._period_ns * 1e-6
             problem = (
                 f"it is too slow: {mean_ms:.3g} ms a call, of {period_ms:.3g} ms between two of them it may "
                 f"take {SHARE:.0%}; make it faster, or lower rate_hz"

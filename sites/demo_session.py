@@ -46,7 +46,8 @@ from .site_parts import warm_up
 POLL_NS = 100_000_000
 START_S = 10
 """Time for a site to start, s, where many share a few processors."""
-JOIN_S, WAIT_S = 60, 600
+JOIN_S = 60
+WAIT_S = 600
 """For so long sites wait for each other and for the recorder, s; the second where people begin a session."""
 END_TIMEOUT_NS = 45 * NS_PER_S
 """Time for a child to end after its signal; then it is killed. A site waits 10 s for the recorder, and as
@@ -72,10 +73,12 @@ class SessionProcess:
     """A process of a session: its number once it has begun, its exit code once it has ended."""
 
     def __init__(self, starter: "ProcessStarter", name: str, output: Path) -> None:
-        self.name, self.output = name, output
+        self.name = name
+        self.output = output
         self.pid: int | None = None
         self.code: int | None = None
-        self._starter, self._signalled = starter, False
+        self._starter = starter
+        self._signalled = False
 
     def end(self, number: int) -> None:
         """Sends it a signal, unless it has ended."""
@@ -101,7 +104,8 @@ class ProcessStarter:
     """Starts the processes of a scenario's session on this machine; what each prints is kept in a folder."""
 
     def __init__(self, scenario_file: Path, folder: Path) -> None:
-        self._folder, self._output = folder, folder / "starter.txt"
+        self._folder = folder
+        self._output = folder / "starter.txt"
         self._processes: dict[str, SessionProcess] = {}
         self._orders, theirs = Pipe()
         with theirs, create_file(self._output) as sink:
@@ -137,12 +141,14 @@ class ProcessStarter:
         try:
             while self._orders.poll():
                 name, pid, code = self._orders.recv()
-                self._processes[name].pid, self._processes[name].code = pid, code
+                self._processes[name].pid = pid
+                self._processes[name].code = code
         except (EOFError, OSError):
             code = self._starter.wait()
             for left in self._processes.values():
                 if left.code is None:
-                    left.code, left.output = code, self._output
+                    left.code = code
+                    left.output = self._output
                     if left.pid is not None:
                         with suppress(ProcessLookupError):
                             os.kill(left.pid, signal.SIGINT)
@@ -178,7 +184,8 @@ def run_demo(
     """
     check_outside_arms(scenario)
     result = SessionResult(folder / "run.mcap")
-    session, clock = scenario.name, SystemClock()
+    session = scenario.name
+    clock = SystemClock()
     with SessionDisplay(console, clock) as display, Interrupt() as interrupt, ExitStack() as reserved:
         compile_core(scenario, display.say, interrupt)
         if warning := describe_load(measure_busy_share(clock)):
@@ -227,11 +234,14 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
 def _start(
     scenario: Scenario, folder: Path, reserved: ExitStack, endpoints: list[str], wait_s: int
 ) -> tuple[ProcessStarter, list[SessionProcess], Callable[[], SessionProcess]]:
-    file, log, output = folder / "scenario.toml", folder / "run.mcap", folder / "processes"
+    file = folder / "scenario.toml"
+    log = folder / "run.mcap"
+    output = folder / "processes"
     write_whole(file, scenario.text)
     make_subfolder(output)
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
-    starter, session = reserved.enter_context(closing(ProcessStarter(file, output))), scenario.name
+    starter = reserved.enter_context(closing(ProcessStarter(file, output)))
+    session = scenario.name
     connect = [["--connect", endpoint] for endpoint in endpoints]
     patience = ["--join-timeout", str(max(wait_s, START_S * len(endpoints)))]
     sites = [

@@ -27,7 +27,8 @@ from trilat_net.scenario.operators.kernel_operators import DeviceSettings
 from .devices import Device, DeviceState, Vector
 
 RETRY_NS = 1_000_000_000
-LEAST_S, MOST_S = 0.005, 0.05
+LEAST_S = 0.005
+MOST_S = 0.05
 """Within these a jump is judged by the time since the state before: machines hand over late."""
 TRIPS_KEPT = 60_000
 
@@ -50,13 +51,17 @@ class DeviceHand:
     def __init__(
         self, hand: Hand, device: Device, how: DeviceSettings, clock: Clock, reach: HandReach
     ) -> None:
-        self._hand, self._device, self._how, self._clock = hand, device, how, clock
+        self._hand = hand
+        self._device = device
+        self._how = how
+        self._clock = clock
         self._reach = reach
         self._rows = how.rows(len(hand.pose))
         self.states = self.jumps = self.unreadable = 0
         self.trips_ns = deque[int](maxlen=TRIPS_KEPT)
         self._asked = deque[tuple[int, int]](maxlen=TRIPS_KEPT)
-        self._period_ns, self._due_ns = 1_000_000_000 // device.rate_hz, 0
+        self._period_ns = 1_000_000_000 // device.rate_hz
+        self._due_ns = 0
         self.let_go()
 
     def let_go(self) -> None:
@@ -64,7 +69,8 @@ class DeviceHand:
         self._hand.release()
         self._target: list[float] = []
         self._place: Vector | None = None
-        self._was_pressed, self._since_ns = True, 0
+        self._was_pressed = True
+        self._since_ns = 0
         self._came_ns = self._clock.monotonic_ns()
         self._asked.clear()
 
@@ -87,14 +93,19 @@ class DeviceHand:
         self._measure_trips()
 
     def _follow(self, state: DeviceState, now_ns: int) -> None:
-        how, before, passed_s = self._how, self._place, (now_ns - self._came_ns) * 1e-9
-        self._place, self._came_ns = state.position_m, now_ns
+        how = self._how
+        before = self._place
+        passed_s = (now_ns - self._came_ns) * 1e-9
+        self._place = state.position_m
+        self._came_ns = now_ns
         pressed = state.buttons.get(how.clutch, False)
-        closes, self._was_pressed = pressed and not self._was_pressed, pressed
+        closes = pressed and not self._was_pressed
+        self._was_pressed = pressed
         if state.buttons.get(how.release, False):
             self.let_go()
         elif closes:
-            self._target, self._since_ns = self._target or list(self._hand.pose), now_ns
+            self._target = self._target or list(self._hand.pose)
+            self._since_ns = now_ns
         elif not pressed:
             self._since_ns = 0
         elif self._since_ns and before is not None:
@@ -117,7 +128,8 @@ class DeviceHand:
         return x, y, z
 
     def _measure_trips(self) -> None:
-        number, now_ns = self._hand.number, self._clock.monotonic_ns()
+        number = self._hand.number
+        now_ns = self._clock.monotonic_ns()
         while self._asked and self._asked[0][0] <= number:
             self.trips_ns.append(now_ns - self._asked.popleft()[1])
 

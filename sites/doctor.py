@@ -49,13 +49,18 @@ from .site_parts import warm_up
 
 FindingState = Literal["ok", "warn", "fail"]
 CONNECT_S = 2.0
-LEAST_BYTES, FEW_BYTES = 100 << 20, 2 << 30
+LEAST_BYTES = 100 << 20
+FEW_BYTES = 2 << 30
 """Free room with which a recording is likely to end early, and room for an hour and a half of three sites."""
-STEADY_NS, STEP_NS, BOUND_US = 100_000_000, 1_000_000, 1_000
+STEADY_NS = 100_000_000
+STEP_NS = 1_000_000
+BOUND_US = 1_000
 """How long the clocks are compared, by how much they may part meanwhile, and an offset's largest bound."""
 PINGS = 20
-RATES_HZ, REHEARSAL_S = (1000, 500, 200, 100), 1.0
-HELD_PERIODS, HELD_SHARE = 0.5, 0.99
+RATES_HZ = (1000, 500, 200, 100)
+REHEARSAL_S = 1.0
+HELD_PERIODS = 0.5
+HELD_SHARE = 0.99
 """A rate is held if this share of its ticks begins in this part of a period, from when each is due."""
 
 
@@ -188,7 +193,8 @@ def _examine_quic(place: str, owned: MemberKeys | None) -> DoctorFinding:
 def _tls_context(folder: Path | None) -> ssl.SSLContext:
     if folder is None:
         context = ssl.create_default_context()
-        context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+        context.check_hostname = False
+        context.verify_mode = ssl.CERT_NONE
         return context
     context = ssl.create_default_context(cafile=str(folder / AUTHORITY))
     context.load_cert_chain(folder / CERTIFICATE, folder / PRIVATE_KEY)
@@ -202,8 +208,11 @@ def _split_address(place: str) -> tuple[str, int] | None:
 
 def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
     """Yields whether this machine's clocks are steady."""
-    begun, wall = clock.monotonic_ns(), clock.unix_ns()
-    before, backwards, coarsest_ns = begun, 0, 0
+    begun = clock.monotonic_ns()
+    wall = clock.unix_ns()
+    before = begun
+    backwards = 0
+    coarsest_ns = 0
     while before - begun < STEADY_NS:
         now = clock.monotonic_ns()
         backwards += now < before
@@ -235,7 +244,8 @@ def examine_offsets(connection: Connection, clock: Clock, session: str) -> Itera
         elif "offset_ns" not in facts:
             yield DoctorFinding("clock", "warn", f"{facts['member']} answered too few pings")
         else:
-            offset_s, bound_us = facts["offset_ns"] / 1e9, facts["bound_us"]
+            offset_s = facts["offset_ns"] / 1e9
+            bound_us = facts["bound_us"]
             text = f"{facts['member']} is {offset_s:+.6f} s, known to {bound_us:.0f} us"
             yield DoctorFinding("clock", "ok" if bound_us <= BOUND_US else "warn", text)
 
@@ -276,7 +286,8 @@ class Rehearsal(LoopStats):
     """The live loop of a site alone: all that it does in a tick but for the network."""
 
     def __init__(self, scenario: Scenario, name: str) -> None:
-        self._stepped, self._ticks = Site(scenario.setup(name)), scenario.ticks(name)
+        self._stepped = Site(scenario.setup(name))
+        self._ticks = scenario.ticks(name)
         super().__init__(self._stepped, 1)
         self._late_us: list[int] = []
 
@@ -363,7 +374,8 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
     warning = describe_load(measure_busy_share(SystemClock()))
     is_short = cores < 2 or load >= cores or bool(warning)
     yield DoctorFinding("processors", "warn" if is_short else "ok", f"{text}; {warning}" if warning else text)
-    cached, late = is_core_cached(), "not yet compiled: the first session here begins half a minute later"
+    cached = is_core_cached()
+    late = "not yet compiled: the first session here begins half a minute later"
     yield DoctorFinding("core", "ok" if cached else "warn", "compiled" if cached else late)
 
 

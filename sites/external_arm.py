@@ -52,11 +52,15 @@ class ExternalArm:
     ) -> None:
         self.newest: PlantState | None = None
         self.taken = 0
-        self._site, self._layout, self._ring, self._dropped = site.name, site.layout, ring, dropped
+        self._site = site.name
+        self._layout = site.layout
+        self._ring = ring
+        self._dropped = dropped
         self._speed_limits = site.speed_limits
         self._taken_ns = 0
         self._told = ""
-        self._clock, self._place = clock, place
+        self._clock = clock
+        self._place = place
         self._boot = self._n = -1
         self._bound = self._counting = False
         self._silent_ns = 0
@@ -115,7 +119,8 @@ class ExternalArm:
 
     def take_order(self, mode: Mode) -> SiteOrder:
         """Returns what its arm's silence asks of the site, which is in some mode; "": nothing new."""
-        told, self._told = self._told, ""
+        told = self._told
+        self._told = ""
         if self._silent_ns > SILENCE_LIMIT_NS:
             self._told = "arm_lost"
             return "" if told == "arm_lost" and mode is Mode.FAULT else "arm_lost"
@@ -135,7 +140,8 @@ class ExternalArm:
             self._dropped["stranger"] += 1
             return
         if message.boot != self._boot:
-            self._boot, self._n = message.boot, message.n - 1
+            self._boot = message.boot
+            self._n = message.n - 1
         if message.n <= self._n:
             self._dropped["old measurement"] += 1
             return
@@ -181,7 +187,10 @@ class DeadManSwitch:
     """
 
     def __init__(self, site: str, ring: StampedInbox[bytes], clock: Clock, dropped: Counter[str]) -> None:
-        self._site, self._ring, self._clock, self._dropped = site, ring, clock, dropped
+        self._site = site
+        self._ring = ring
+        self._clock = clock
+        self._dropped = dropped
         self._programs: dict[int, _Holder] = {}
         self._was_let_go = False
 
@@ -205,7 +214,8 @@ class DeadManSwitch:
 
     def take_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
         """Returns what the switch asks of its site, which is in some mode for a reason; "": nothing."""
-        was_let_go, self._was_let_go = self._was_let_go, False
+        was_let_go = self._was_let_go
+        self._was_let_go = False
         if was_let_go or not self.held:
             return "" if mode in (Mode.STOPPED, Mode.FAULT) else "released"
         return "held" if (mode, reason) == (Mode.STOPPED, LifeReason.RELEASED) else ""
@@ -242,4 +252,5 @@ class DeadManSwitch:
             return
         if one.counts and one.pressed_ns is not None:
             self._let_go([one])
-        one.pressed_ns, one.counts = None, True
+        one.pressed_ns = None
+        one.counts = True

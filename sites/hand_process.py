@@ -42,11 +42,14 @@ class HandProcess(SiteClient):
     def __init__(self, at: HandSite, program: HandProgram, bus: Bus, clock: Clock, session: str) -> None:
         super().__init__(bus, clock, session, at.name)
         self.asked = self.skipped = 0
-        self._program, self._code, self._pushes = program, at.source, at.spec.mode == "force"
+        self._program = program
+        self._code = at.source
+        self._pushes = at.spec.mode == "force"
         self._every = at.scenario.sites[at.name].rate_hz // at.rate_hz
         self._sender = make_hand_sender(bus, clock, session, at.name)
         self._views = bus.inbox(topics.key(session, at.name, topics.VIEW), VIEWS_KEPT)
-        self._here_ns, self._waiting = 0, deque[HandViewMessage]()
+        self._here_ns = 0
+        self._waiting = deque[HandViewMessage]()
         self._most = max(1, int(at.delay_s * at.rate_hz))
 
     def serve(self) -> None:
@@ -113,7 +116,9 @@ def run_hand(
     if at is None or not at.runs_alone:
         problem = "has no hand of kind 'own' with process = true"
         raise UsageError(f"{name} {problem}: its site runs such a hand itself, or there is none")
-    program, clock, stopped = make_program(at), SystemClock(), interrupt.requested
+    program = make_program(at)
+    clock = SystemClock()
+    stopped = interrupt.requested
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
     bus = open_bus(connection, clock, stopped, timeout_s, say)
     if bus is None:

@@ -65,7 +65,10 @@ class HandServer:
         dropped: Counter[str],
         limits: MotionLimits | None = None,
     ) -> None:
-        self._site, self._hand, self._inbox, self._dropped = site.name, hand, inbox, dropped
+        self._site = site.name
+        self._hand = hand
+        self._inbox = inbox
+        self._dropped = dropped
         self._rules = hand.rules(site.rate_hz, arm, limits)
         self._place = lambda: site.q if hand.mode == "joint" else arm.end_effector(site.q)
         self._memory = HandMemory()
@@ -123,8 +126,13 @@ class RemoteHand(HandPlayer):
         clock: Clock,
     ) -> None:
         super().__init__(at, None)
-        self._boot, self._inbox, self._publish, self._dropped = boot, inbox, publish, dropped
-        self._clock, self._asked, self._source = clock, -1, at.source
+        self._boot = boot
+        self._inbox = inbox
+        self._publish = publish
+        self._dropped = dropped
+        self._clock = clock
+        self._asked = -1
+        self._source = at.source
 
     def track(self, site: Site, k: int) -> list[float]:
         """Returns what it does in tick k, by the decisions that have come."""

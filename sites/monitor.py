@@ -27,7 +27,8 @@ from trilat_net.scenario import Scenario
 AGES = "age of each peer's sample"
 HEADS = ("site", "time", "mode", "angles", "|e|", "torque", AGES, "held", "late", "overruns")
 NUMBERS = frozenset(("time", "|e|", "torque", "late", "overruns"))
-TABLE_NS, LINES_NS = NS_PER_S // 4, 2 * NS_PER_S
+TABLE_NS = NS_PER_S // 4
+LINES_NS = 2 * NS_PER_S
 """Between two updates of a table, and of lines."""
 LOUD_EVENTS = frozenset(
     ("lost", "left", "join", "unheard", "heard", "diverged", "failed", "refused", "clock fault")
@@ -113,9 +114,11 @@ class SessionDisplay:
     """Shows rows of sites in a terminal; a context, which restores it."""
 
     def __init__(self, console: Console, clock: Clock) -> None:
-        self._console, self._clock = console, clock
+        self._console = console
+        self._clock = clock
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
-        self._shown_ns, self._title = clock.monotonic_ns(), ""
+        self._shown_ns = clock.monotonic_ns()
+        self._title = ""
 
     def __enter__(self) -> "SessionDisplay":
         return self
@@ -138,7 +141,8 @@ class SessionDisplay:
         self._shown_ns = self._clock.monotonic_ns()
         if self._live is None:
             shouted = [f"*** {name} {alarm}" for name, alarm in alarms]
-            titled, self._title = [title] if title != self._title else [], title
+            titled = [title] if title != self._title else []
+            self._title = title
             for line in [*titled, *shouted, *(describe_row(row) for row in rows if row["time"])]:
                 self.say(line)
             return
@@ -157,7 +161,8 @@ class SessionMonitor:
     def __init__(self, bus: Bus, session: str, scenario: Scenario, display: SessionDisplay) -> None:
         self.latest: dict[str, LinkStats] = {}
         self.records: dict[str, State] = {}
-        self._scenario, self._display = scenario, display
+        self._scenario = scenario
+        self._display = display
         self._links = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
         self._states = {

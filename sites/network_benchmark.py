@@ -36,7 +36,8 @@ from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay
 
 SESSION = "benchmark"
-NEAR, FAR = "near", "far"
+NEAR = "near"
+FAR = "far"
 """Names of the ends that have no keys."""
 PROTOCOLS = ("tcp", "tls", "quic")
 SIZES = (1, 4, 16)
@@ -74,7 +75,9 @@ class NearEnd:
     """The end that measures."""
 
     def __init__(self, bus: Bus, clock: Clock, member: str) -> None:
-        self._clock, self._owner, self._number = clock, int.from_bytes(os.urandom(8), "little"), 0
+        self._clock = clock
+        self._owner = int.from_bytes(os.urandom(8), "little")
+        self._number = 0
         self._put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
         key = topics.key(SESSION, "*", topics.SAMPLE)
         self._inbox: StampedInbox[tuple[int, ...] | None] = bus.stamped(key, clock.monotonic_ns, _read)
@@ -105,8 +108,10 @@ class NearEnd:
 
     def measure(self, size_bytes: int, rate_hz: float, duration_s: float) -> Array:
         """Returns the round trips of samples sent at a rate, s; NaN for those that did not come back."""
-        count, clock = max(10, round(rate_hz * duration_s)), self._clock
-        trips_s, first = np.full(count, np.nan), self._number
+        count = max(10, round(rate_hz * duration_s))
+        clock = self._clock
+        trips_s = np.full(count, np.nan)
+        first = self._number
 
         def take() -> int:
             for number, trip_ns in self._answers():
@@ -152,7 +157,8 @@ def run_far_end(
     Raises:
         UsageError: an endpoint or the keys cannot be used.
     """
-    known, clock = None if keys is None else read_member_keys(keys), SystemClock()
+    known = None if keys is None else read_member_keys(keys)
+    clock = SystemClock()
     begun_ns = clock.monotonic_ns()
     with ExitStack() as stack:
         for endpoint in endpoints:
@@ -250,7 +256,8 @@ def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any
     if times is None:
         nothing = dict.fromkeys(("p99_ms", "age_ms", "spare_ms", "playout_ms"))
         return {**facts, "hidden": False, **nothing}
-    period_ms, p99_ms = 1e3 / needs.rate_hz, times["p99"] / 1e3
+    period_ms = 1e3 / needs.rate_hz
+    p99_ms = times["p99"] / 1e3
     ticks = max(1, math.ceil(max(p99_ms, needs.held_ms) / period_ms - 1e-9))
     age_ms = max(period_ms * ticks, needs.in_use_ms or 0.0)
     hidden = p99_ms <= needs.held_ms
@@ -350,7 +357,8 @@ def _measure_endpoint(
                 "over tls or quic with --keys of another site"
             )
         for times, part in product(SIZES, RATES):
-            size_bytes, rate_hz = times * needs.sample_bytes, part * needs.rate_hz
+            size_bytes = times * needs.sample_bytes
+            rate_hz = part * needs.rate_hz
             trips_s = near.measure(size_bytes, rate_hz, share_s)
             came_us = trips_s[np.isfinite(trips_s)] / 2 * 1e6  # half a round trip
             p50, p99 = np.percentile(came_us, (50, 99)) if len(came_us) else (0.0, 0.0)

@@ -38,7 +38,8 @@ class PeerMonitor:
         self.away: dict[str, tuple[int, str]] = {}
         self.admitted: list[Event] = []
         self.changed = False
-        self._site, self._admits = site, admits
+        self._site = site
+        self._admits = admits
         self._events = {peer: bus.inbox(topics.key(session, peer, topics.EVENT), 256) for peer in peers}
         self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
         self._presence = bus.presence(topics.presence_key(session, "*"))
@@ -95,7 +96,8 @@ class PeerMonitor:
             elif event.kind == "change":
                 self.changed = True
             elif event.kind in ("diverged", "failed"):
-                self.ended_by, self.ended_member = event.text, event.member
+                self.ended_by = event.text
+                self.ended_member = event.member
             elif event.kind == "end":
                 self._ended.add(event.boot)
                 if event.about and self._admits:
@@ -108,7 +110,8 @@ class PeerMonitor:
             self.ended_member = self._site
 
     def _consider(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
-        member, before = event.member, self.boots.get(event.member)
+        member = event.member
+        before = self.boots.get(event.member)
         if event.boots.get(member) != event.boot or self._firsts.get(event.boot) == event.ticks:
             return
         if before not in (event.boot, *self._ended) and (member, str(before)) in self._alive:

@@ -20,7 +20,9 @@ SITES_PER_PROCESSOR = 2
 """More loops with priority would keep Zenoh and recorders from running, and connections would be lost."""
 
 _PR_SET_TIMERSLACK = 29
-_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+_MCL_CURRENT = 1
+_MCL_FUTURE = 2
+_MCL_ONFAULT = 4
 
 
 def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:

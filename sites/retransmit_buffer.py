@@ -21,7 +21,8 @@ RECORD_BYTES = 640
 """Largest mean size of a record of two joints at which a minute of them is kept."""
 FLOAT_BYTES = 9
 STATISTICS_BYTES = 4_096
-EVENTS_KEPT, EVENTS_BYTES = 4_096, 4_000_000
+EVENTS_KEPT = 4_096
+EVENTS_BYTES = 4_000_000
 
 
 class ChannelBuffer:
@@ -32,9 +33,11 @@ class ChannelBuffer:
 
     def __init__(self, capacity: int, size_bytes: int) -> None:
         self.made = self.oldest = 0
-        self._capacity, self._size = capacity, size_bytes
+        self._capacity = capacity
+        self._size = size_bytes
         self._bytes = bytearray().ljust(size_bytes, b"\xff")  # touched, so that the pages exist
-        self._starts, self._lengths = array("q", bytes(8 * capacity)), array("q", bytes(8 * capacity))
+        self._starts = array("q", bytes(8 * capacity))
+        self._lengths = array("q", bytes(8 * capacity))
         self._head = 0  # bytes written since the start, with those skipped at the end of the memory
 
     def begin_at(self, number: int) -> None:
@@ -43,13 +46,15 @@ class ChannelBuffer:
 
     def keep(self, payload: bytes) -> None:
         """Adds the next message; drops the oldest ones to make room."""
-        length, at = len(payload), self._head % self._size
+        length = len(payload)
+        at = self._head % self._size
         if at + length > self._size:  # a message is contiguous
             self._head += self._size - at
             at = 0
         self._bytes[at : at + length] = payload
         slot = self.made % self._capacity
-        self._starts[slot], self._lengths[slot] = self._head, length
+        self._starts[slot] = self._head
+        self._lengths[slot] = length
         self._head += length
         self.made += 1
         self.oldest = max(self.oldest, self.made - self._capacity)
@@ -68,7 +73,8 @@ class ChannelBuffer:
         size = 0
         for number in range(first, min(last + 1, self.made, first + BACKFILL_MESSAGES)):
             slot = number % self._capacity
-            at, length = self._starts[slot] % self._size, self._lengths[slot]
+            at = self._starts[slot] % self._size
+            length = self._lengths[slot]
             size += length
             if payloads and size > BACKFILL_BYTES:
                 break
@@ -80,8 +86,11 @@ class RetransmitBuffer:
     """The recently published messages of a site, by channel."""
 
     def __init__(self, site: Site, boot: int, queries: QueryInbox) -> None:
-        self._site, self._boot, self._queries = site, boot, queries
-        records, statistics = min(KEPT_S * site.rate_hz, RECORDS_KEPT), KEPT_S * STATS_PER_SECOND
+        self._site = site
+        self._boot = boot
+        self._queries = queries
+        records = min(KEPT_S * site.rate_hz, RECORDS_KEPT)
+        statistics = KEPT_S * STATS_PER_SECOND
         record_bytes = RECORD_BYTES + FLOAT_BYTES * (site.layout.floats - Layout().floats)
         self.channels = {
             topics.STATE: ChannelBuffer(records, max(records * record_bytes, EVENTS_BYTES)),

@@ -44,7 +44,8 @@ RIVAL_NS = NS_PER_S
 """A publisher that was heard within this time has not gone."""
 SAFE_NS = 10_000_000
 """Between two commands that say to a robot what is safe."""
-DRIVE_S, ASK_S = 0.001, 0.05
+DRIVE_S = 0.001
+ASK_S = 0.05
 """Between two looks for a torque; for shares that are wanted."""
 TRIGGER = "std_srvs/srv/Trigger"
 
@@ -53,7 +54,8 @@ class OneSender:
     """Of several publishers that send on one topic none counts, until all but one are gone."""
 
     def __init__(self, clock: Clock) -> None:
-        self._clock, self._gid = clock, b""
+        self._clock = clock
+        self._gid = b""
         self._heard_ns = self._mixed_ns = clock.monotonic_ns() - RIVAL_NS
 
     def admit(self, gid: bytes) -> int:
@@ -62,7 +64,8 @@ class OneSender:
         silent_ns = now_ns - self._heard_ns
         if self._gid not in (b"", gid) and silent_ns < RIVAL_NS:
             self._mixed_ns = now_ns
-        self._gid, self._heard_ns = gid, now_ns
+        self._gid = gid
+        self._heard_ns = now_ns
         if now_ns - self._mixed_ns < RIVAL_NS:
             raise ValueError("has two publishers: neither moves the arm until the other is gone")
         return silent_ns
@@ -77,8 +80,12 @@ class TargetTopic:
     def __init__(
         self, hand: Hand, read: Callable[[bytes], Sequence[float]], act: Callable[..., int], clock: Clock
     ) -> None:
-        self.hand, self._read, self._act, self._clock = hand, read, act, clock
-        self._sender, self._lock = OneSender(clock), threading.Lock()
+        self.hand = hand
+        self._read = read
+        self._act = act
+        self._clock = clock
+        self._sender = OneSender(clock)
+        self._lock = threading.Lock()
         self._held_ns: int | None = None
 
     def take(self, data: bytes, attachment: Attachment) -> None:
@@ -114,7 +121,9 @@ class DominanceTopic:
     def __init__(
         self, peers: Sequence[str], change: Callable[[dict[str, float]], object], clock: Clock
     ) -> None:
-        self._peers, self._change, self._sender = peers, change, OneSender(clock)
+        self._peers = peers
+        self._change = change
+        self._sender = OneSender(clock)
         self._wanted: dict[str, float] | None = None
         self._asked: dict[str, float] | None = None
 
@@ -158,7 +167,9 @@ class RobotArm:
         clock: Clock,
     ) -> None:
         self.armed = False
-        self._make, self._client, self._joints = make, make(), joints
+        self._make = make
+        self._client = make()
+        self._joints = joints
         order = robot.controller or [called[0] for called in joints]
         self._order = [n for name in order for n, called in enumerate(joints) if name in called]
         self._safe = robot.safe or [0.0] * len(joints)
@@ -167,8 +178,10 @@ class RobotArm:
             named = ", ".join(called[0] for called in joints)
             raise UsageError(f"--names: `controller` and `safe` have one of each joint: {named}")
         self._pack = cdr.make_float_array_packer((" ".join(order), len(order)))
-        self._commands, self._clock = commands, clock
-        self._sender, self._lock = OneSender(clock), threading.Lock()
+        self._commands = commands
+        self._clock = clock
+        self._sender = OneSender(clock)
+        self._lock = threading.Lock()
         self._sent: tuple[int, int] | None = None  # boot and tick of the record whose torque went out last
         self._safe_ns = clock.monotonic_ns() - SAFE_NS
 
@@ -193,7 +206,8 @@ class RobotArm:
         if self._client.over:  # the site may come again
             with self._lock:
                 self._client = self._make()
-        record, torque = self._client.record, self._client.torque()  # of that record, or a newer one
+        record = self._client.record
+        torque = self._client.torque()  # of that record, or a newer one
         if not self.armed or torque is None or record is None or len(torque) != len(self._order):
             if self._clock.monotonic_ns() - self._safe_ns >= SAFE_NS:
                 self.brake()
@@ -259,7 +273,8 @@ class Bridge:
             for channel in (topics.STATE, topics.EVENT, topics.LINK)
         )
         self._presence = bus.presence(topics.presence_key(session, "*"))
-        self._present, self._met = set[topics.KeyParts](), False
+        self._present = set[topics.KeyParts]()
+        self._met = False
         self._epoch_unix_ns = epoch_unix_ns
         frames, self._diagnostics = (
             graph.publisher(topic, COMMON_TOPICS[topic].kind, RELIABLE) for topic in (FRAMES, DIAGNOSTICS)
@@ -272,11 +287,13 @@ class Bridge:
             name: SiteTopics(ends, scenario, name, epoch_unix_ns, frames) for name in scenario.names
         }
         running = RunningSession(session, Connection(), bus)
-        self.targets, self.dominance = dict[str, TargetTopic](), dict[str, DominanceTopic]()
+        self.targets = dict[str, TargetTopic]()
+        self.dominance = dict[str, DominanceTopic]()
         for name, shown in self._sites.items():
             for event in list_past_events(bus, clock, session, name):
                 shown.shares.take(event.command)
-            topic, change = ends.topic(name, "set_dominance"), partial(running.set_dominance, name)
+            topic = ends.topic(name, "set_dominance")
+            change = partial(running.set_dominance, name)
             self.dominance[topic] = DominanceTopic(scenario.peers(name), change, clock)
             graph.subscribe(topic, cdr.FLOAT64_ARRAY, self.dominance[topic].take)
         for name in scenario.open_hands:
@@ -292,7 +309,8 @@ class Bridge:
 
         Returns True if another session has begun under its name.
         """
-        clock, connected = self._ends.clock, True
+        clock = self._ends.clock
+        connected = True
         wake_ns = looked_ns = diagnosed_ns = clock.monotonic_ns()
         poll_ns = max(POLL_NS, int(NS_PER_S / (5.0 * rate_hz)))
         while not (stopped() or (self._met and not self._present)):
@@ -302,7 +320,9 @@ class Bridge:
                 target.watch()
             now_ns = clock.monotonic_ns()
             if now_ns - looked_ns > LOOK_NS:
-                looked_ns, before, connected = now_ns, connected, self._ends.graph.connected
+                looked_ns = now_ns
+                before = connected
+                connected = self._ends.graph.connected
                 if connected != before:
                     say(f"the router of ROS {'is back' if connected else 'is gone: waiting for it'}")
             if now_ns - diagnosed_ns > NS_PER_S:
@@ -419,7 +439,8 @@ def serve_ros2(
     """
     clock = SystemClock()
     with running.reach(BRIDGE, timeout_s) as bus:
-        began_anew, told = True, False
+        began_anew = True
+        told = False
         while began_anew and not stopped():
             try:
                 graph = open_graph(Refusals(say))
@@ -451,7 +472,8 @@ def show_session(ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: C
         refuse_other_robots(ends.table, scenario)
         for site in scenario.outside:
             if site not in robots:
-                robot, names = ends.table.robots.get(site, RobotTable()), list_joint_names(scenario, site)
+                robot = ends.table.robots.get(site, RobotTable())
+                names = list_joint_names(scenario, site)
                 robots[site] = stack.enter_context(open_robot(ends, site, robot, names))
             robots[site].armed = True
         if (begun := await_site(ends, stopped, running=True)) is None:

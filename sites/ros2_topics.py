@@ -17,7 +17,8 @@ from trilat_net.scenario import Scenario
 
 from .running_session import ShareHistory
 
-RELIABLE, LATCHED = QualityOfService(), QualityOfService(latched=True, depth=1)
+RELIABLE = QualityOfService()
+LATCHED = QualityOfService(latched=True, depth=1)
 
 
 class Ends(NamedTuple):
@@ -43,8 +44,10 @@ class SiteTopics:
     def __init__(
         self, ends: Ends, scenario: Scenario, site: str, epoch_unix_ns: int, frames: TopicPublisher
     ) -> None:
-        self._messages, self._frames = SiteMessages(scenario, site, epoch_unix_ns), frames
-        self.frame, self.shares = self._messages.frame, ShareHistory(scenario, site)
+        self._messages = SiteMessages(scenario, site, epoch_unix_ns)
+        self._frames = frames
+        self.frame = self._messages.frame
+        self.shares = ShareHistory(scenario, site)
         self._publishers = {
             name: ends.graph.publisher(
                 ends.topic(site, name), channel.kind, LATCHED if channel.latched else RELIABLE

@@ -52,7 +52,8 @@ class ShareHistory:
     """The shares of a site in its peers, by the changes that are known."""
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        self._scenario, self._site = scenario, site
+        self._scenario = scenario
+        self._site = site
         self._later = scenario.scripted_ramps(site)
         self._ramp = scenario.ramp(site, scenario.dominance[site], -1, 0.0)
         self._before = self._ramp.alpha
@@ -67,7 +68,8 @@ class ShareHistory:
     def at(self, t_ns: int) -> tuple[float, ...]:
         """Returns the shares at a time since the epoch, ns, which never goes back."""
         for ramp in sorted(one for one in self._later if one.start_ns <= t_ns):
-            self._before, self._ramp = self._find(ramp.start_ns), ramp
+            self._before = self._find(ramp.start_ns)
+            self._ramp = ramp
         self._later = [one for one in self._later if one.start_ns > t_ns]
         return self._find(t_ns)
 
@@ -88,7 +90,9 @@ class RunningSession:
     def __init__(
         self, name: str, connection: Connection, bus: Bus | None = None, clock: Clock | None = None
     ) -> None:
-        self.name, self._connection, self._bus = name, connection, bus
+        self.name = name
+        self._connection = connection
+        self._bus = bus
         self._clock = clock or SystemClock()
 
     @contextmanager
@@ -202,7 +206,8 @@ class RunningSession:
             return [send_change(bus, self._clock, self.name, name, request).text for name in asked]
 
     def _meet_sites(self, bus: Bus) -> tuple[Scenario, dict[str, Info]]:
-        clock, session = self._clock, self.name
+        clock = self._clock
+        session = self.name
         found: dict[str, Info] = {}
         scenario: Scenario | None = None
         begun_ns = 0
@@ -227,7 +232,9 @@ class RunningSession:
         Raises:
             SessionError: the session has no such site, or has not begun, or the site does not answer in time.
         """
-        clock, session, names = self._clock, self.name, embedded_names_reader(self.name)
+        clock = self._clock
+        session = self.name
+        names = embedded_names_reader(self.name)
         for info in find_members(bus, clock, session, stopped=lambda: False, timeout_s=REPLY_TIMEOUT_S):
             if info.member == site and not info.running:
                 raise SessionError(f"session {session!r} has not begun: {site} waits for the others")
@@ -343,7 +350,8 @@ class RunningSession:
             info = self._find_running(bus, site)
             kinds = topics.STATE, topics.EVENT
             records, events = (bus.inbox(topics.key(self.name, site, kind), 256) for kind in kinds)
-            scenario, now_ns = parse_embedded(info.scenario, self.name), 0
+            scenario = parse_embedded(info.scenario, self.name)
+            now_ns = 0
             history = ShareHistory(scenario, site)
             for event in list_past_events(bus, self._clock, self.name, site):
                 history.take(event.command)

@@ -51,7 +51,9 @@ class SessionPing:
     def __init__(self, bus: Bus, clock: Clock, session: str, count: int) -> None:
         self.infos: dict[str, Info] = {}
         self.links: dict[str, LinkStats] = {}
-        self._clock, self._session, self._count = clock, session, count
+        self._clock = clock
+        self._session = session
+        self._count = count
         self._members = MemberQuery(bus, clock, session)
         self._stats = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self.pinger = Pinger(bus, clock, session, count)
@@ -98,7 +100,8 @@ class SessionPing:
         return PingReport(self._session, members, links)
 
     def _describe(self, info: Info) -> dict[str, Any]:
-        trips, shared = self.pinger.trips.get(info.boot), info.clock == self._clock.identity()
+        trips = self.pinger.trips.get(info.boot)
+        shared = info.clock == self._clock.identity()
         rtts_ns = tuple(trips.rtts_ns) if trips else ()
         facts: dict[str, Any] = {
             "member": info.member,
@@ -109,7 +112,8 @@ class SessionPing:
             "same_clock": shared,
         }
         if rtts_ns:
-            steps, ordered = [abs(b - a) for a, b in pairwise(rtts_ns)], sorted(rtts_ns)
+            steps = [abs(b - a) for a, b in pairwise(rtts_ns)]
+            ordered = sorted(rtts_ns)
             facts["rtt_us"] = {
                 "min": ordered[0] / 1000,
                 "p50": ordered[len(ordered) // 2] / 1000,
@@ -148,7 +152,8 @@ def ping_session(
         with connect_to_session(*there, stopped=stopped, timeout_s=timeout_s) as bus:
             if bus is None:
                 return None
-            ping, begun_ns = SessionPing(bus, clock, session, count), clock.monotonic_ns()
+            ping = SessionPing(bus, clock, session, count)
+            begun_ns = clock.monotonic_ns()
             while not ping.over(int(timeout_s * 1e9), begun_ns):
                 if stopped():
                     return None

@@ -61,8 +61,12 @@ class PeerInbox:
         dropped: Counter[str],
         from_ns: int = 0,
     ) -> None:
-        self._links, self._rings, self._from_ns = links, rings, from_ns
-        self._boots, self._monitors, self._dropped = list(boots), monitors, dropped
+        self._links = links
+        self._rings = rings
+        self._from_ns = from_ns
+        self._boots = list(boots)
+        self._monitors = monitors
+        self._dropped = dropped
         self._last = [first_tick_at(from_ns, link.rate_hz) - 1 for link in links]
         self._passed_over = list(self._last)
         self._newest: list[PeerSample | None] = [None] * len(links)
@@ -71,7 +75,8 @@ class PeerInbox:
 
     def admit(self, index: int, boot: int, first: int) -> None:
         """Takes from now on the samples of another start of a peer, which begins at a tick of its own."""
-        self._boots[index], self._newest[index] = boot, None
+        self._boots[index] = boot
+        self._newest[index] = None
         self._last[index] = max(self._last[index], first - 1)
         self._passed_over[index] = self._last[index]
 
@@ -118,7 +123,8 @@ class PeerInbox:
         return Arrival(index, sample.tick, sample.q, sample.qd, delay_ns // 1000, sample.tau_x, ch)
 
     def _is_plausible(self, index: int, sample: PeerSample) -> bool:
-        link, newest = self._links[index], self._newest[index]
+        link = self._links[index]
+        newest = self._newest[index]
         for speed, limit in zip(sample.qd, link.speed_limit, strict=True):
             if not abs(speed) <= limit:
                 return False
@@ -134,7 +140,8 @@ class PeerInbox:
 
 BLOCKS_PER_S = 100
 """Recorders get the records of 10 ms together."""
-HELD_PER_S, HELD_DELAY_US = 200, 100_000
+HELD_PER_S = 200
+HELD_DELAY_US = 100_000
 """Peers on the same machine get the samples of 5 ms together where none is due sooner after its stamp."""
 
 
@@ -169,7 +176,9 @@ class StateBlock:
         *,
         single: bool = False,
     ) -> None:
-        self._site, self._boot, self._send = site, boot, send
+        self._site = site
+        self._boot = boot
+        self._send = send
         self._ticks = 1 if single else max(1, site.rate_hz // BLOCKS_PER_S)
         self._turn = 3 * turn % self._ticks
         self._held = max(1, site.rate_hz // HELD_PER_S)
@@ -198,7 +207,9 @@ class StateBlock:
     def flush(self, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
         """Sends the samples and the records so far."""
         self._add_stamps(send)
-        site, records, self._records = self._site, self._records, []
+        site = self._site
+        records = self._records
+        self._records = []
         if records:
             self._send([encode_state(site.name, self._boot, site.peers, *record) for record in records])
 
@@ -227,8 +238,13 @@ def run_loop(
 ) -> TickRecord | None:
     """Runs a site in real time, from its first tick, and returns its last record; None without a tick."""
     send = partial(_send_sample, site.name, boot, clock, timing, io)
-    quarter_ns, deadline_ns = NS_PER_S // (4 * site.rate_hz), timing.deadline(first)
-    busy_us, mode, last, asked, k = 0, Mode.RUN, None, False, first
+    quarter_ns = NS_PER_S // (4 * site.rate_hz)
+    deadline_ns = timing.deadline(first)
+    busy_us = 0
+    mode = Mode.RUN
+    last = None
+    asked = False
+    k = first
     while k < ticks:
         clock.sleep_until(deadline_ns)
         if io.should_stop():

@@ -81,12 +81,18 @@ class SiteParts:
         interrupt: Interrupt,
         say: Callable[[str], None],
     ) -> None:
-        self.scenario, self.name, self.options = scenario, name, options
-        self.bus, self.clock, self.interrupt = bus, clock, interrupt
+        self.scenario = scenario
+        self.name = name
+        self.options = options
+        self.bus = bus
+        self.clock = clock
+        self.interrupt = interrupt
         self.say: Callable[[str], None] = lambda text: say(f"{name}: {text}")
         self.setup = scenario.setup(name)
-        self.site, self.boot = Site(self.setup), new_boot()
-        peers, session = self.site.peers, options.session
+        self.site = Site(self.setup)
+        self.boot = new_boot()
+        peers = self.site.peers
+        session = options.session
         self.stats = LoopStats(self.site, self.boot)
         self.watchdog, self.step = watch_law(scenario, self.site, clock)
         self.rings = [
@@ -124,15 +130,19 @@ class SiteParts:
         return code.run
 
     def _meet_hand(self) -> None:
-        name, bus, session = self.name, self.bus, self.options.session
-        live, at = self.scenario.sites[name].find_live_hand(), place_own_hand(self.scenario, name)
+        name = self.name
+        bus = self.bus
+        session = self.options.session
+        live = self.scenario.sites[name].find_live_hand()
+        at = place_own_hand(self.scenario, name)
         if live is None:
             return
         if at is not None and not at.runs_alone:
             watch = self._watch(f"the hand {at.program}", at.rate_hz)
             self.hand = HandPlayer(at, make_program(at), watch)
             return
-        inbox, dropped = bus.inbox(topics.key(session, name, topics.HAND), MESSAGES_KEPT), self.stats.dropped
+        inbox = bus.inbox(topics.key(session, name, topics.HAND), MESSAGES_KEPT)
+        dropped = self.stats.dropped
         if at is not None:
             publish = bus.publisher(topics.key(session, name, topics.VIEW))
             self.hand = RemoteHand(at, self.boot, inbox, publish, dropped, self.clock)
@@ -147,7 +157,9 @@ class SiteParts:
         )
 
     def _meet_outside_arm(self) -> None:
-        name, session, dropped = self.name, self.options.session, self.stats.dropped
+        name = self.name
+        session = self.options.session
+        dropped = self.stats.dropped
         measured, enable = (topics.key(session, name, one) for one in (topics.MEASURED, topics.ENABLE))
         if name in self.scenario.outside:
             ring = self.bus.stamped(measured, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)

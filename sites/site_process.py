@@ -88,7 +88,11 @@ def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[
     share_threads()
     with Interrupt() as interrupt:
         clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
-        named, timeout_s = (lambda text: say(f"{name}: {text}")), options.join_timeout_s
+
+        def named(text: str) -> None:
+            say(f"{name}: {text}")
+
+        timeout_s = options.join_timeout_s
         bus = open_bus(options.connection, clock, interrupt.requested, timeout_s, named)
         if bus is None:
             return interrupt.exit_code
@@ -125,14 +129,16 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
     Raises:
         SessionError: the session did not begin in time, or this site cannot be part of it.
     """
-    scenario, options = parts.scenario, parts.options
+    scenario = parts.scenario
+    options = parts.options
     needs = {"needs_recorder": options.needs_recorder}
     info = describe_member(parts.name, parts.boot, parts.clock, scenario.text, **needs)
     late = LateSites(scenario.sites_may_return, options.without, parts.site.rate_hz)
     keep = parts.buffer.channels[topics.EVENT].keep
     publisher = EventPublisher(parts.bus, options.session, info, keep)
     joining = SessionJoin(parts.bus, parts.clock, options.session, publisher, scenario.names, late)
-    membership, pinger = joining.membership, joining.pinger
+    membership = joining.membership
+    pinger = joining.pinger
     parts.say(f"waiting for {', '.join(membership.missing()) or 'the epoch'}")
     begins = 0
     while not parts.interrupt.requested():
@@ -165,15 +171,21 @@ class RunningSite:
     """
 
     def __init__(self, parts: SiteParts, publisher: EventPublisher, pinger: Pinger, epoch: Epoch) -> None:
-        scenario, site = parts.scenario, parts.site
-        self._parts, self._publisher, self._epoch = parts, publisher, epoch
+        scenario = parts.scenario
+        site = parts.site
+        self._parts = parts
+        self._publisher = publisher
+        self._epoch = epoch
         self._failure: RunFailed | None = None
-        self._mode, self._skipped = Mode.RUN, list[str]()
+        self._mode = Mode.RUN
+        self._skipped = list[str]()
         self._output: TickRecord | None = None
         self._status_s = self._told_s = 0
-        self._given_up, self._held_s = False, -1
+        self._given_up = False
+        self._held_s = -1
         self._came_ns = tick_ns(epoch.first, site.rate_hz)
-        self.publish_sample, self.publish_link = parts.publish_sample, parts.publish_link
+        self.publish_sample = parts.publish_sample
+        self.publish_link = parts.publish_link
         self.use_slack = parts.buffer.answer_query
         parts.monitor.boots = epoch.boots
         boots = [epoch.boots.get(peer, NOBODY) for peer in site.peers]
@@ -206,7 +218,8 @@ class RunningSite:
         parts = self._parts
         parts.states.holds_samples &= all(meter.peer.is_own for meter in self._timing.meters)
         self._publish_setup()
-        order, name = encode(ChangeRequest(order="stop", source="the operator")), parts.name
+        order = encode(ChangeRequest(order="stop", source="the operator"))
+        name = parts.name
         here = (parts.options.session, name, parts.scenario.names, parts.boot, parts.options.connection)
         with make_site_known(*here, order), parts.watchdog:
             ticks = parts.scenario.ticks(name)
@@ -220,7 +233,8 @@ class RunningSite:
             self._tell_skipped(output.tick, output.t_ns)
 
     def _publish_setup(self) -> None:
-        parts, texts = self._parts, self._clock_texts
+        parts = self._parts
+        texts = self._clock_texts
         obtained = realtime.prepare(parts.options.cpu, len(self._here))
         obtained["turn"] = f"{self._timing.turn_ns // 1000} us after the grid"
         self._publisher.publish(
@@ -232,7 +246,8 @@ class RunningSite:
         begins = "the session begins"
         if first := self._epoch.first:
             begins = f"joins the running session at t = {tick_ns(first, parts.site.rate_hz) * 1e-9:.3f} s"
-            text, about = f"{parts.name} {begins}", {"boots": self._epoch.boots, "ticks": first}
+            text = f"{parts.name} {begins}"
+            about = {"boots": self._epoch.boots, "ticks": first}
             self._publisher.publish("join", text, t_ns=tick_ns(first, parts.site.rate_hz), **about)
         parts.say(f"{begins}; {obtained['scheduling']}, memory {obtained['memory']}")
         self._publish_clocks(self._timing.opening(), 0)
@@ -300,7 +315,8 @@ class RunningSite:
 
     def _tell_skipped(self, k: int, t_ns: int) -> None:
         if self._skipped:
-            ticks, self._skipped = " ".join(self._skipped), []
+            ticks = " ".join(self._skipped)
+            self._skipped = []
             text = f"{self._parts.name} did not make ticks {ticks}"
             self._publisher.publish("overrun", text, t_ns=t_ns, ticks=k + 1, command=ticks)
 
@@ -317,7 +333,8 @@ class RunningSite:
             self._parts.say(text)
 
     def _watch_members(self, t_ns: int) -> None:
-        parts, monitor = self._parts, self._parts.monitor
+        parts = self._parts
+        monitor = self._parts.monitor
         monitor.watch(self._publisher, t_ns)
         if monitor.changed:  # 100 ms ago at most: no sample so far is due sooner than before
             parts.states.holds_samples = False
@@ -325,7 +342,8 @@ class RunningSite:
             if meter.is_heard(parts.clock.monotonic_ns()):
                 monitor.meet_again(meter.peer.name, t_ns)
         for event in monitor.admitted:
-            index, rate_hz = parts.site.peers.index(event.member), parts.scenario.sites[event.member].rate_hz
+            index = parts.site.peers.index(event.member)
+            rate_hz = parts.scenario.sites[event.member].rate_hz
             bound_ns = None if event.clock == parts.clock.identity() else event.bound_ns
             joins = (tick_ns(event.ticks, rate_hz), event.epoch_mono_ns, bound_ns)
             self._tell_last(index, event, t_ns)
@@ -339,7 +357,8 @@ class RunningSite:
 
     def _come_again(self, t_ns: int) -> None:
         """Says once a second that this site has come, while a peer that was cut off then ignores it."""
-        coming, now_ns = self._epoch.coming, self._parts.clock.monotonic_ns()
+        coming = self._epoch.coming
+        now_ns = self._parts.clock.monotonic_ns()
         if coming is None or t_ns < self._came_ns + NS_PER_S:
             return
         if any(meter.is_heard(now_ns) and meter.hears(now_ns) is None for meter in self._timing.meters):
@@ -360,7 +379,8 @@ class RunningSite:
         axes = self._parts.scenario.arms[self._parts.name].axes
         apart = np.abs(find_task_errors(own, desired, axes) if output.x else own - desired).max()
         unit = "m or rad" if output.x else "rad"
-        torque_nm, stats = max(map(abs, output.tau)), self._parts.stats
+        torque_nm = max(map(abs, output.tau))
+        stats = self._parts.stats
         dropped = sum(stats.dropped.values())
         return (
             f"t = {output.t_ns / NS_PER_S:.0f} s, {MODE_WORDS[output.mode]}, |e| {apart:.3g} {unit}, torque "
@@ -370,7 +390,8 @@ class RunningSite:
 
     def report(self, output: TickRecord) -> None:
         """Tells of a tick that took a command in, or at which the mode changed."""
-        name, at = self._parts.name, {"t_ns": output.t_ns, "ticks": output.tick}
+        name = self._parts.name
+        at = {"t_ns": output.t_ns, "ticks": output.tick}
         if skipped := count_skipped_ticks(output.cmd):  # told together, in `attend`
             self._skipped.append(f"{output.tick - skipped}-{output.tick - 1}")
         for change in output.cmd:
@@ -389,7 +410,9 @@ class RunningSite:
 
     def _raise_alarm(self, output: TickRecord) -> None:
         """Says that the arm is stopped, or at most once a second that it holds; why, and what to do."""
-        parts, mode, rule = self._parts, output.mode, self._parts.setup.on_stale
+        parts = self._parts
+        mode = output.mode
+        rule = self._parts.setup.on_stale
         second = output.t_ns // NS_PER_S
         if mode is Mode.HOLD and second <= self._held_s:
             return
@@ -408,10 +431,13 @@ class RunningSite:
         Raises:
             RunFailed: the run ended badly, here or at a peer; as `PeerLeft`, without a peer.
         """
-        parts, interrupt, output = self._parts, self._parts.interrupt, self._output
+        parts = self._parts
+        interrupt = self._parts.interrupt
+        output = self._output
         kind = "failed"
         if output is not None and output.mode is Mode.DIVERGED:
-            kind, self._failure = "diverged", RunFailed(describe_divergence(parts.name, output))
+            kind = "diverged"
+            self._failure = RunFailed(describe_divergence(parts.name, output))
         if self._failure is not None:
             self._publish(kind, str(self._failure))
         for hiccups in filter(None, (code.describe_hiccups() for code in parts.watchdog.codes)):
@@ -447,7 +473,8 @@ class RunningSite:
 
     def _find_cause(self) -> tuple[str, str]:
         """Returns whose end it was if the run ends before its time, and why, to be put behind a sentence."""
-        parts, monitor = self._parts, self._parts.monitor
+        parts = self._parts
+        monitor = self._parts.monitor
         if self._failure is not None:
             return parts.name, f": {self._failure}"
         if monitor.ended_by:
@@ -469,9 +496,12 @@ class RunningSite:
         A signal does not shorten the first wait, since records that are not stored are lost with this
         process; a second signal ends it.
         """
-        parts, clock, monitor = self._parts, self._parts.clock, self._parts.monitor
+        parts = self._parts
+        clock = self._parts.clock
+        monitor = self._parts.monitor
         begun_ns = clock.monotonic_ns()
-        give_up_ns, queried_ns = begun_ns + LINGER_NS, 0
+        give_up_ns = begun_ns + LINGER_NS
+        queried_ns = 0
         is_announced = False
         while clock.monotonic_ns() < give_up_ns and not self._may_leave():
             while not parts.interrupt.insists() and parts.buffer.answer_query():

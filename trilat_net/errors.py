@@ -140,7 +140,10 @@ class CodeFailed(RunFailed):
     def __init__(self, problem: str, *, site: str, code: str, tick: int | None) -> None:
         when = "as it was resumed" if tick is None else f"at tick {tick}"
         super().__init__(f"the {self.kind} {code} of {site} failed {when}: {problem}")
-        self.problem, self.site, self.code, self.tick = problem, site, code, tick
+        self.problem = problem
+        self.site = site
+        self.code = code
+        self.tick = tick
 
     def __reduce__(self) -> tuple[object, ...]:
         """Restores the error of another process."""

@@ -124,7 +124,8 @@ _OWNERS = {
 def find_count_problem(table: TomlTable, kind: StructType, counts: VectorCounts) -> KeyProblem | None:
     """Returns the first vector of a table that has too few or too many numbers, or None."""
     for key, per in {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}.items():
-        wanted, value = getattr(counts, per), table.get(key)
+        wanted = getattr(counts, per)
+        value = table.get(key)
         if isinstance(value, list) and len(value) != wanted:
             owner = f"{_OWNERS[per]} {wanted} {per if per != 'shared' else 'coordinates'}"
             return KeyProblem(key, f"has {len(value)} number{'s' * (len(value) != 1)}, and {owner}")
@@ -155,7 +156,8 @@ def reword_problem(problem: str) -> str:
     return problem
 
 
-MOST_LETTERS, MOST_COMPARED = 80, 500
+MOST_LETTERS = 80
+MOST_COMPARED = 500
 """Of a word that is compared with others, and how many these are: the time grows by more than the product."""
 
 

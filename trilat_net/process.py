@@ -102,7 +102,8 @@ class Interrupt:
     """
 
     def __init__(self, *, compiles: bool = False) -> None:
-        self.number, self.compiles = 0, compiles
+        self.number = 0
+        self.compiles = compiles
         self._asked_s: float | None = None  # when the first SIGINT or SIGTERM came
         self._insists = False
         self._before: dict[int, Any] = {}

@@ -56,13 +56,15 @@ class TrilatRobot(Robot):
         if not live:
             raise ValueError(f"the scenario has no operator of kind 'live' at {config.site}")
         self._act, what = _ACTS[live[0].mode]
-        arms, q0 = scenario.arms, scenario.sites[config.site].q0_rad
+        arms = scenario.arms
+        q0 = scenario.sites[config.site].q0_rad
         axes = ["x", "y", "z"][: len(arms[config.site].end_effector(q0))]
         axes = list(arms[config.site].joint_names) if live[0].mode == "joint" else axes
         self._actions = [f"{axis}.{what}" for axis in axes]
         self._places = [f"{axis}.pos" for axis in axes]
         self._felt = [f"{axis}.felt" for axis in axes]
-        self._sites, whats = (config.slave, config.site), ("pos", "vel", "tau_x")
+        self._sites = (config.slave, config.site)
+        whats = ("pos", "vel", "tau_x")
         names = {site: arms[site].joint_names for site in self._sites}
         self._joints = [f"{site}.{one}.{what}" for site in names for what in whats for one in names[site]]
         self._hand: Any = None
@@ -100,7 +102,8 @@ class TrilatRobot(Robot):
         """Joins the session, and waits for the first record of both sites."""
         if self._hand is not None:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
-        own, reach = self.config, {"connect": self.config.connect or None, "keys": self.config.keys or None}
+        own = self.config
+        reach = {"connect": self.config.connect or None, "keys": self.config.keys or None}
         with ExitStack() as stack:
             hand = tn.hand(own.session, own.site, source="policy", timeout_s=own.timeout_s, **reach)
             entered = stack.enter_context(hand)
@@ -111,7 +114,8 @@ class TrilatRobot(Robot):
                     raise DeviceNotConnectedError(f"no records of both {' and '.join(self._sites)}")
                 time.sleep(0.002)
                 self._update()
-            self._hand, self._stack = entered, stack.pop_all()
+            self._hand = entered
+            self._stack = stack.pop_all()
 
     def _update(self) -> None:
         self._records.update({record.site: record for record in self._take()})

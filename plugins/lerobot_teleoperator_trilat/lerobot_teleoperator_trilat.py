@@ -96,12 +96,14 @@ class TrilatTeleoperator(Teleoperator):
         """Joins the session; nobody holds the arm by that."""
         if self._hand is not None:
             raise DeviceAlreadyConnectedError(f"{self} is already connected.")
-        own, reach = self.config, {"connect": self.config.connect or None, "keys": self.config.keys or None}
+        own = self.config
+        reach = {"connect": self.config.connect or None, "keys": self.config.keys or None}
         with ExitStack() as stack:
             hand = tn.hand(own.session, own.site, source="teleoperator", timeout_s=own.timeout_s, **reach)
             entered = stack.enter_context(hand)
             self._find_shares = stack.enter_context(tn.session(own.session, **reach).shares(own.slave))
-            self._hand, self._stack = entered, stack.pop_all()
+            self._hand = entered
+            self._stack = stack.pop_all()
 
     def get_action(self) -> dict[str, float]:
         """Returns where the arm is."""
@@ -129,7 +131,8 @@ class TrilatTeleoperator(Teleoperator):
 
     def get_teleop_events(self) -> dict[TeleopEvents, bool]:
         """Says whether the person leads the slave, and whether the session is over."""
-        hand, shares = self._held(), self._find_shares()
+        hand = self._held()
+        shares = self._find_shares()
         return {
             TeleopEvents.IS_INTERVENTION: shares[self.config.site] > shares[self.config.program],
             TeleopEvents.TERMINATE_EPISODE: bool(hand.over),

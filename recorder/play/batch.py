@@ -39,7 +39,8 @@ def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints,
         than the message's time.
     """
     places = np.arange(len(times_ns), dtype=np.int64)
-    due_ns, file_places = times_ns.copy(), places.copy()
+    due_ns = times_ns.copy()
+    file_places = places.copy()
     for channel in np.unique(channels):
         own = np.flatnonzero(channels == channel)
         own = own[np.argsort(numbers[own], kind="stable")]
@@ -106,7 +107,8 @@ class MessageBatch:
         """Returns the messages over bytes of their own, one payload behind the other."""
         rows = self.rows.copy()
         rows[:, 4] = np.cumsum(self.rows[:, 4] - self.rows[:, 3])
-        rows[1:, 3], rows[:1, 3] = rows[:-1, 4], 0
+        rows[1:, 3] = rows[:-1, 4]
+        rows[:1, 3] = 0
         view = memoryview(self.data)
         return MessageBatch(rows, b"".join(view[start:end] for start, end in self.rows[:, 3:].tolist()))
 

@@ -66,7 +66,8 @@ class MessageSource:
         self.whole = batch is not None
         self.ended = False
         self.strays = 0
-        self._header, self._batch = header, batch
+        self._header = header
+        self._batch = batch
         self._ahead: deque[ReadPiece | RoundEnd | LogError] = deque()
         self._ahead_bytes = 0
         self._received = bytearray()
@@ -169,7 +170,8 @@ def sort_messages(
     def release(until_ns: int | None) -> tuple[MessageBatch, int]:
         """Returns the messages that are due until then, or half of all, and keeps the rest."""
         nonlocal waiting
-        ordered, strays = waiting.ordered(), 0
+        ordered = waiting.ordered()
+        strays = 0
         count = (len(ordered) + 1) // 2
         if until_ns is not None:
             count = int(np.searchsorted(ordered.times_ns, until_ns, side="right"))
@@ -182,7 +184,8 @@ def sort_messages(
             given[channel] = max(last, int(numbers.max()))
         return released, strays
 
-    newest_ns, next_ns = -(2**62), None
+    newest_ns = -(2**62)
+    next_ns = None
     for message in messages:
         waiting.add(*message)
         newest_ns = max(newest_ns, message[0])
@@ -209,7 +212,8 @@ def feed_player(pipe: Connection, paths: Sequence[Path], selection: PlaySelectio
     with suppress(BrokenPipeError), process.pause_gc(), open(pipe.fileno(), "wb", closefd=False) as sink:
         try:
             while True:
-                reader, strays = SessionReader(paths, selection), 0
+                reader = SessionReader(paths, selection)
+                strays = 0
                 for batch, further in sort_messages(reader.messages()):
                     strays += further
                     for piece in batch.pieces():

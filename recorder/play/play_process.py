@@ -115,7 +115,8 @@ class Playback:
 
         It stays until all recorders have everything.
         """
-        clock, options = self.clock, self.options
+        clock = self.clock
+        options = self.options
         first_ns = self._player.prepare()
         self._await_recorders()
         begun_ns = clock.monotonic_ns() + AHEAD_NS
@@ -142,7 +143,8 @@ class Playback:
         )
 
     def _await_recorders(self) -> None:
-        clock, stand_ins = self.clock, self._stand_ins
+        clock = self.clock
+        stand_ins = self._stand_ins
         if self.options.needs_recorder:
             self.say("waiting for a recorder")
         give_up_ns = clock.monotonic_ns() + LISTEN_NS
@@ -157,7 +159,8 @@ class Playback:
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
     def _linger(self) -> None:
-        clock, stand_ins = self.clock, self._stand_ins
+        clock = self.clock
+        stand_ins = self._stand_ins
         give_up_ns = clock.monotonic_ns() + LINGER_NS
         while clock.monotonic_ns() < give_up_ns and not self.stopped():
             if stand_ins.attend():

@@ -22,7 +22,8 @@ from .site_stand_ins import PlayedHistory
 
 SPIN_NS = 150_000
 """Time before a deadline at which sleep must end: it oversleeps by some 60 us as a rule."""
-SLOWEST, FASTEST = 1e-3, 1e3
+SLOWEST = 1e-3
+FASTEST = 1e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,8 +165,12 @@ class Player:
         self.counts: list[int] = []
         self.stalls = self.rounds = self.held_ns = 0
         self.lateness = LatenessHistogram()
-        self._source, self._history, self._clock, self._publisher = source, history, clock, publisher
-        self._attend, self._stopped = attend, stopped
+        self._source = source
+        self._history = history
+        self._clock = clock
+        self._publisher = publisher
+        self._attend = attend
+        self._stopped = stopped
         self._spin_ns = 0 if low_cpu else SPIN_NS
         self._publish: list[Publish] = []
         self._served_ns = self._position_ns = self._published = 0
@@ -199,7 +204,8 @@ class Player:
 
     def _next(self) -> MessageBatch | None:
         """Waits for the next messages; None at the end of the round, or if stopped."""
-        batch, self._first = self._first, None
+        batch = self._first
+        self._first = None
         while batch is None and not (self._source.ended or self._stopped()):
             batch = self._source.poll()
             if batch is None and not self._source.ended and not self._source.fill():
@@ -208,10 +214,14 @@ class Player:
         return batch
 
     def _play(self, piece: MessageBatch, pace: Pace) -> None:
-        clock, add_lateness, made = self._clock, self.lateness.add, self._history.made
+        clock = self._clock
+        add_lateness = self.lateness.add
+        made = self._history.made
         now_ns = clock.monotonic_ns
         for t_ns, channel, number, payload in piece.messages():
-            self._position_ns, due_ns, begun_ns = t_ns, pace.due_ns(t_ns), now_ns()
+            self._position_ns = t_ns
+            due_ns = pace.due_ns(t_ns)
+            begun_ns = now_ns()
             if begun_ns < due_ns:
                 if not self._use_slack(due_ns, begun_ns):
                     return

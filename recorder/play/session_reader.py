@@ -147,7 +147,8 @@ class _PlayedChannel:
     """One channel of a file: its number if it is played, else -1, and the numbers of its messages."""
 
     def __init__(self, topic: str, header: SessionHeader, selection: PlaySelection) -> None:
-        parsed, sites = topics.parse_key(topic.strip("/")), header.scenario.sites
+        parsed = topics.parse_key(topic.strip("/"))
+        sites = header.scenario.sites
         own = parsed is not None and parsed.member in sites and parsed.session == header.session
         self.site, self.kind = (parsed.member, parsed.channel) if parsed is not None and own else ("", "")
         self.rate_hz = sites[self.site].rate_hz if self.site else 0
@@ -183,7 +184,9 @@ class SessionReader:
         self, paths: Sequence[Path], selection: PlaySelection, progress: Progress | None = None
     ) -> None:
         self.header: SessionHeader | None = None
-        self._paths, self._selection, self._progress = paths, selection, progress
+        self._paths = paths
+        self._selection = selection
+        self._progress = progress
 
     def messages(self) -> Iterator[PlayedMessage]:
         """Yields the messages to play, in file order.
@@ -198,7 +201,8 @@ class SessionReader:
     def _read_file(self, path: Path, reader: McapReader) -> Iterator[PlayedMessage]:
         epoch_ns: int | None = None
         channels: dict[str, _PlayedChannel] = {}
-        by_log, stop_ns = self._selection.time == "log", self._selection.stop_ns
+        by_log = self._selection.time == "log"
+        stop_ns = self._selection.stop_ns
         holds = self._selection.holds
         for item in reader.messages():
             if epoch_ns is None:
@@ -212,7 +216,8 @@ class SessionReader:
             channel = channels.get(item.topic)
             if channel is None:
                 channel = channels[item.topic] = _PlayedChannel(item.topic, header, self._selection)
-            header.first_ns, header.last_ns = min(header.first_ns, t_ns), max(header.last_ns, t_ns)
+            header.first_ns = min(header.first_ns, t_ns)
+            header.last_ns = max(header.last_ns, t_ns)
             if channel.site and channel.site not in header.boots:
                 boot = _decode_header(item.payload).boot
                 header.boots.update({channel.site: boot} if boot >= 0 else {})

@@ -72,7 +72,9 @@ class PlayedHistory:
         runs = list(self._runs.get(channel, ()))
         made = self.made.get(channel, 0)
         payloads: list[bytes] = []
-        size, wanted, begun = 0, first, first
+        size = 0
+        wanted = first
+        begun = first
         for numbers, places, batch in runs[bisect_left(runs, first, key=lambda run: int(run[0][-1])) :]:
             begin = int(np.searchsorted(numbers, wanted))
             part = slice(begin, begin + BACKFILL_MESSAGES + 1)
@@ -107,7 +109,9 @@ class SiteStandIns:
     ) -> None:
         self.recorders: set[str] = set()
         self.refilled = 0
-        self._clock, self._header, self._history = clock, header, history
+        self._clock = clock
+        self._header = header
+        self._history = history
         self._stored: dict[str, set[str]] = {}
         self._met: set[str] = set()
         self._boots: dict[str, tuple[int, int]] = {}

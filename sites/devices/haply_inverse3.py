@@ -55,7 +55,8 @@ class HaplyInverse3:
         except (OSError, ValueError, WebSocketException) as error:
             raise ConnectionError(f"no service of an Inverse3 at {self._address}: {error}") from None
         self._was_there = True
-        self._first, self._id = {"session": {"configure": {"profile": {"name": "trilat-net"}}}}, ""
+        self._first = {"session": {"configure": {"profile": {"name": "trilat-net"}}}}
+        self._id = ""
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -70,7 +71,8 @@ class HaplyInverse3:
             message = msgspec.json.decode(self._socket.recv(SILENCE_S))
             if not message.get("inverse3"):
                 raise ConnectionError(f"the service at {self._address} has no Inverse3")
-            self._id, state = str(message["inverse3"][0]["device_id"]), message["inverse3"][0]["state"]
+            self._id = str(message["inverse3"][0]["device_id"])
+            state = message["inverse3"][0]["state"]
             grips = [grip["state"].get("buttons", {}) for grip in message.get("wireless_verse_grip", [])]
             buttons = {name: bool(pressed) for grip in grips for name, pressed in grip.items()}
             return DeviceState(_read(state["cursor_position"]), _read(state["cursor_velocity"]), buttons)

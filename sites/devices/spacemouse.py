@@ -36,12 +36,15 @@ class SpaceMouse:
     rate_hz: ClassVar[int] = 125
 
     def __init__(self, address: str = "", clock: Clock | None = None) -> None:
-        self._address, self._clock, self._file = address, clock or SystemClock(), -1
+        self._address = address
+        self._clock = clock or SystemClock()
+        self._file = -1
 
     def __enter__(self) -> Self:
         self._file = os.open(self._address or find_spacemouse(), os.O_RDONLY | os.O_NONBLOCK)
         self._place: Vector = (0.0, 0.0, 0.0)
-        self._speed, self._pressed = self._place, 0
+        self._speed = self._place
+        self._pressed = 0
         self._heard_ns = self._read_ns = self._clock.monotonic_ns()
         return self
 
@@ -55,8 +58,10 @@ class SpaceMouse:
             pass
         if now_ns - self._heard_ns > STILL_NS:
             self._speed = (0.0, 0.0, 0.0)
-        passed_s, self._read_ns = (now_ns - self._read_ns) * 1e-9, now_ns
-        (x, y, z), (u, v, w) = self._place, self._speed
+        passed_s = (now_ns - self._read_ns) * 1e-9
+        self._read_ns = now_ns
+        (x, y, z) = self._place
+        (u, v, w) = self._speed
         self._place = x + passed_s * u, y + passed_s * v, z + passed_s * w
         return DeviceState(
             self._place, self._speed, {"a": bool(self._pressed & 1), "b": bool(self._pressed & 2)}
@@ -71,7 +76,8 @@ class SpaceMouse:
             raise ConnectionError("the SpaceMouse is gone")
         if report[0] == 1 and len(report) >= 7:
             right, near, down = struct.unpack_from("<3h", report, 1)
-            self._speed, self._heard_ns = (SPEED_M_S * right, -SPEED_M_S * near, -SPEED_M_S * down), now_ns
+            self._speed = (SPEED_M_S * right, -SPEED_M_S * near, -SPEED_M_S * down)
+            self._heard_ns = now_ns
         elif report[0] == 3 and len(report) >= 2:
             self._pressed = report[1]
         return True

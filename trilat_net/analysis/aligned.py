@@ -242,26 +242,33 @@ class PeerTrajectory:
         q is the cubic through angles and velocities, qd runs straight from record to record, and the
         integral is the exact one of the trapezoid rule.
         """
-        records, h = self.records, self.records.h_s
+        records = self.records
+        h = self.records.h_s
         place = t_s * records.rate_hz - records.first
         nearest = np.round(place)
         place = np.where(np.abs(place - nearest) < 1e-5, nearest, place)
         low = np.clip(np.floor(place), 0, len(records.known) - 2).astype(np.int64)
         x = np.clip(place - low, 0.0, 1.0)[:, np.newaxis]
-        at, rate = records.shared, records.shared_rate
-        qa, qb, va, vb = at[low], at[low + 1].copy(), rate[low], rate[low + 1]
+        at = records.shared
+        rate = records.shared_rate
+        qa = at[low]
+        qb = at[low + 1].copy()
+        va = rate[low]
+        vb = rate[low + 1]
         if self.records.x.shape[1] == POSE:  # between two rotation vectors of different branches lies nothing
             qb[:, PLACE:] = bring_nearer(qb[:, PLACE:], qa[:, PLACE:])
         q = qa + x * (h * va + x * (3 * (qb - qa) - h * (2 * va + vb) + x * (2 * (qa - qb) + h * (va + vb))))
         qd = va + x * (vb - va)
-        sa, sb = va**2, vb**2
+        sa = va**2
+        sb = vb**2
         squares = self._squares[low] + h * x * (sa + 0.5 * x * (sb - sa))
         x0 = x[:, 0]
         known = (records.known[low] | (x0 == 1.0)) & (records.known[low + 1] | (x0 == 0.0))
         known &= (place >= 0.0) | (records.first == 0)
         q = np.where(x == 1.0, qb, q)
         at_rest = place < 0.0
-        qd[at_rest], squares[at_rest] = 0.0, 0.0
+        qd[at_rest] = 0.0
+        squares[at_rest] = 0.0
         return PeerMotion(q, qd, squares, known)
 
 

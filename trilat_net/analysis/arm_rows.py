@@ -123,8 +123,11 @@ class PlacedArm:
 
     def end_effector_position(self) -> Numbers:
         """Returns the position of the end effector from the base, shape (2, ...), m."""
-        (l1_m, l2_m), inner, outer = self.lengths_m, self.q[0], self.q[0] + self.q[1]
-        x, y = l1_m * np.cos(inner) + l2_m * np.cos(outer), l1_m * np.sin(inner) + l2_m * np.sin(outer)
+        (l1_m, l2_m) = self.lengths_m
+        inner = self.q[0]
+        outer = self.q[0] + self.q[1]
+        x = l1_m * np.cos(inner) + l2_m * np.cos(outer)
+        y = l1_m * np.sin(inner) + l2_m * np.sin(outer)
         return np.array([x, y])
 
     def position_jacobian(self) -> Numbers:
@@ -266,17 +269,22 @@ def _put_end_effectors(
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
         at[k, 0], at[k, 1], at[k, 2] = place_end_effector(chain, tip)
-        p_x, p_y, p_z = 0.0, 0.0, 0.0
+        p_x = 0.0
+        p_y = 0.0
+        p_z = 0.0
         energy[k] = 0.0
         for i in range(n):
             row: Row = chain[i]
             step = three(row.p) if i == 0 else rotate(chain[i - 1].R_base, three(row.p))
-            p_x, p_y, p_z = p_x + step[0], p_y + step[1], p_z + step[2]
+            p_x = p_x + step[0]
+            p_y = p_y + step[1]
+            p_z = p_z + step[2]
             first = LINK_PARAMETERS * i
             mc = rotate(row.R_base, (theta[first + 1], theta[first + 2], theta[first + 3]))
             energy[k] -= theta[first] * dot(three(gravity), (p_x, p_y, p_z)) + dot(three(gravity), mc)
             for j in range(3):
-                J[k, j, i], J[k, 3 + j, i] = row.J_lin[j], row.J_ang[j]
+                J[k, j, i] = row.J_lin[j]
+                J[k, 3 + j, i] = row.J_ang[j]
 
 
 class ChainArmRows(NamedTuple):
@@ -351,7 +359,8 @@ class ChainArmRows(NamedTuple):
 
     def _place(self, q: Array) -> tuple[Array, Array, Array]:
         found = np.zeros((len(q), 3)), np.zeros((len(q), 6, q.shape[1])), np.zeros(len(q))
-        gravity, tip = np.array(self.chain.gravity_m_s2), np.array(self.chain.tip_m)
+        gravity = np.array(self.chain.gravity_m_s2)
+        tip = np.array(self.chain.tip_m)
         _put_end_effectors(self._rows, self.theta, gravity, tip, np.ascontiguousarray(q), *found)
         return found
 
@@ -366,7 +375,8 @@ class ChainArmRows(NamedTuple):
 
     def stop_torque(self, q: Array, qd: Array) -> Array:
         """Returns the torque of the joints' stops ON them, shape (K, n), N m: springs that never pull."""
-        stiffness, damping = self._column("stop_stiffness"), self._column("stop_damping")
+        stiffness = self._column("stop_stiffness")
+        damping = self._column("stop_damping")
         under = np.maximum(self._column("lower") - q, 0.0)
         over = np.maximum(q - self._column("upper"), 0.0)
         up = np.where(under > 0.0, np.maximum(stiffness * under - damping * qd, 0.0), 0.0)
@@ -385,7 +395,8 @@ class ChainArmRows(NamedTuple):
         Column i turns with all joints up to i; of those after it the end effector moves about its axis.
         """
         J = self._place(q)[1].transpose(0, 2, 1)
-        linear, axis = J[:, :, :3], J[:, :, 3:]
+        linear = J[:, :, :3]
+        axis = J[:, :, 3:]
         speed, turn = (qd[:, :, np.newaxis] * x for x in (linear, axis))
         later = speed.sum(axis=1, keepdims=True) - np.cumsum(speed, axis=1)
         found: Array = np.cross(np.cumsum(turn, axis=1), linear) + np.cross(axis, later)
@@ -397,7 +408,8 @@ class ChainArmRows(NamedTuple):
         The least and the largest energy are looked for from this pose on, joint by joint; stops do not count.
         What has no weight never hangs: infinity.
         """
-        low, high = self._find_extreme_energy(q, 1.0), self._find_extreme_energy(q, -1.0)
+        low = self._find_extreme_energy(q, 1.0)
+        high = self._find_extreme_energy(q, -1.0)
         if high - low <= _NO_WEIGHT_J:
             return math.inf
         share = (float(self.potential_energy(q[np.newaxis])[0]) - low) / (high - low)
@@ -427,7 +439,8 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
     model = scenario.arms[site]
     if model.chain is None:
         return PlanarArmRows(model.theta, scenario.sites[site].arm.g_m_s2, model.lengths_m)
-    chain, task = model.chain, model.chain.task
+    chain = model.chain
+    task = model.chain.task
     if task is not None and not task.posture:
         chain = chain._replace(task=task._replace(posture=scenario.sites[site].q0_rad))
     return ChainArmRows(model.theta, chain)
@@ -440,15 +453,18 @@ def joint_positions_m(arm: ArmModel, q: Array) -> Array:
         for pose, angles in zip(points, q, strict=True):
             pose[1:] = forward_kinematics(arm.lengths_m, angles)
         return points
-    rows, tip_m = build_chain(arm.chain.joints), np.array(arm.chain.tip_m)
+    rows = build_chain(arm.chain.joints)
+    tip_m = np.array(arm.chain.tip_m)
     points = np.zeros((len(q), len(rows) + 2, 3))
     for pose, angles in zip(points, q, strict=True):
         place_joints(rows, np.ascontiguousarray(angles))
         pose[-1] = place_end_effector(rows, tip_m)
-        at, turned = np.zeros(3), np.eye(3)
+        at = np.zeros(3)
+        turned = np.eye(3)
         for n, row in enumerate(rows, 1):
             at = at + turned @ row.p
-            pose[n], turned = at, row.R_base.copy()
+            pose[n] = at
+            turned = row.R_base.copy()
     return points
 
 
@@ -481,7 +497,8 @@ class BaseParameters(NamedTuple):
 
 def stack_regressors(arm: ChainArmRows, states: int) -> Array:
     """Returns regressors of so many random states, one below the other, shape (states n, 10 n)."""
-    random, (n, count) = np.random.default_rng(1), (len(arm.chain.joints), len(arm.theta))
+    random = np.random.default_rng(1)
+    (n, count) = (len(arm.chain.joints), len(arm.theta))
     q = random.uniform(-np.pi, np.pi, (states, n))
     qd, a = random.normal(size=(2, states, n))
     each = np.repeat(np.arange(states), count)

@@ -56,8 +56,11 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     there = ~find_lost_peers(log, site, t_s)
     if there.all():
         return planned
-    alpha, rate, before = planned.alpha * there, planned.rate * there, planned.before * there[:-1]
-    whole, whole_rate = alpha.sum(axis=1, keepdims=True), rate.sum(axis=1, keepdims=True)
+    alpha = planned.alpha * there
+    rate = planned.rate * there
+    before = planned.before * there[:-1]
+    whole = alpha.sum(axis=1, keepdims=True)
+    whole_rate = rate.sum(axis=1, keepdims=True)
     rate = (rate * whole - alpha * whole_rate) / whole**2
     return DominanceHistory(alpha / whole, rate, before / before.sum(axis=1, keepdims=True))
 
@@ -100,14 +103,16 @@ def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> Use
     slave, users = find_users(scenario)
     if (program := program or users[-1]) not in users:
         raise UsageError(f"the program holds one of {', '.join(users)}, not {program!r}")
-    shares, place = alpha[:, [scenario.peers(slave).index(user) for user in users]], users.index(program)
+    shares = alpha[:, [scenario.peers(slave).index(user) for user in users]]
+    place = users.index(program)
     tied = shares[:, place] >= shares.max(axis=1)
     return UserShares(shares, np.where(tied, place, shares.argmax(axis=1)), place)
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     """Returns which peers a site goes on without at some times, s, shape (K, P): see `core.lost_peers`."""
-    part, peers = log[site], len(log[site].peers)
+    part = log[site]
+    peers = len(log[site].peers)
     lost = np.zeros((len(t_s), peers), dtype=bool)
     if not log.scenario.sites[site].on_stale.rule.degrades or not len(part):
         return lost
@@ -151,16 +156,23 @@ def forget_ramps(
 
 def evaluate_ramps(start: Array, ramps: Sequence[DominanceRamp], t_s: Array, h_s: float) -> DominanceHistory:
     """Returns dominance factors, at the epoch `start`, shape (P,), at ascending times, `h_s` apart, s."""
-    alpha, rate = np.tile(start, (len(t_s), 1)), np.zeros((len(t_s), len(start)))
-    before, start_s, end_s, after = start, 0.0, 0.0, start
+    alpha = np.tile(start, (len(t_s), 1))
+    rate = np.zeros((len(t_s), len(start)))
+    before = start
+    start_s = 0.0
+    end_s = 0.0
+    after = start
     for ramp in sorted(ramps, key=lambda ramp: ramp.start_ns):
         at_s = ramp.start_ns * 1e-9
         share = 1.0 if at_s >= end_s else (at_s - start_s) / (end_s - start_s)
         before = after if share == 1.0 else before + (after - before) * share
-        start_s, end_s, after = at_s, ramp.end_ns * 1e-9, np.array(ramp.alpha)
+        start_s = at_s
+        end_s = ramp.end_ns * 1e-9
+        after = np.array(ramp.alpha)
         later = t_s >= start_s - RAMP_TIME_TOLERANCE_S
         climbs = later & (t_s < end_s - RAMP_TIME_TOLERANCE_S)
-        alpha[later], rate[later] = after, 0.0
+        alpha[later] = after
+        rate[later] = 0.0
         if climbs.any():
             slope = (after - before) / ((ramp.end_ns - ramp.start_ns) * 1e-9)
             alpha[climbs] = before + slope * (t_s[climbs, np.newaxis] - start_s)

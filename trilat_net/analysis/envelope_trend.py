@@ -124,7 +124,8 @@ def _fit_maxima(maxima: Array, window_s: float, dead: float) -> list[EnvelopeFit
 
     `dead` is the logarithm below which nothing moves.
     """
-    n, values = len(maxima), np.log(maxima)
+    n = len(maxima)
+    values = np.log(maxima)
     x = np.arange(n) - 0.5 * (n - 1)
     spread = float(x @ x)
     slopes = (x[:, np.newaxis] * values).sum(axis=0) / spread  # a matrix product's last bits may vary
@@ -133,7 +134,8 @@ def _fit_maxima(maxima: Array, window_s: float, dead: float) -> list[EnvelopeFit
     quarters = np.log(maxima.reshape(4, n // 4, -1).max(axis=1))
     fits = []
     for slope, bound, quarter in zip(slopes.tolist(), bounds.tolist(), quarters.T, strict=True):
-        steps, last = np.diff(quarter), float(quarter[-1])
+        steps = np.diff(quarter)
+        last = float(quarter[-1])
         trend = _name_trend(slope * n, bound * n, steps, dead=last <= dead)
         falls = trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
         calm = (falls or (slope + bound) * n <= _CALM) and float(steps[-1]) <= _CALM_STEP

@@ -139,7 +139,9 @@ def _numbers(
     of_a_site = where is not None and where.session == session and where.member in rates_hz
     if where is None or not of_a_site or where.channel not in (topics.STATE, topics.LINK):
         return {"missing": None, "gaps": None, "duplicates": None}
-    account, channel, rate_hz = Account(), where.channel, rates_hz[where.member]
+    account = Account()
+    channel = where.channel
+    rate_hz = rates_hz[where.member]
     for tick in sequence:
         account.take(number_message(channel, tick, rate_hz))
     for first, last in absences.get(where.member, ()):  # not made: they are not missing
@@ -190,7 +192,9 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
     inventory = FileInventory(paths, report(0))
     facts: JsonObject = {"files": inventory.files, "kind": "mcap", "problem": None, "session": None}
     facts |= {"sites": {}, "links": {}}
-    name, rates_hz, absences = "", {}, {}
+    name = ""
+    rates_hz = {}
+    absences = {}
     if SESSION in inventory.metadata:
         try:
             log = open_log(*paths, progress=report(1))
@@ -204,7 +208,8 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
                     for peer in log[site].peers
                 },
             }
-            name, absences = log.session["session"], log.absences
+            name = log.session["session"]
+            absences = log.absences
             rates_hz = {site: log.scenario.sites[site].rate_hz for site in log.sites}
         except LogError as error:
             facts["problem"] = str(error)
@@ -218,7 +223,8 @@ _LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S  # the year 9999
 
 def describe_session(log: Log) -> JsonObject:
     """Returns the facts of a log's session."""
-    session, scenario = log.session, log.scenario
+    session = log.session
+    scenario = log.scenario
     epoch_ns = _number(session.get("epoch_unix_ns", ""))
     seconds = [int(log[site].tick[-1]) / log[site].rate_hz for site in log.sites if len(log[site])]
     began_utc = None
@@ -252,7 +258,9 @@ def describe_session(log: Log) -> JsonObject:
 
 def describe_site_health(log: Log, site: str) -> JsonObject:
     """Returns the facts of a site's records and of its loop."""
-    part, spec, timed = log[site], log.scenario.sites[site], log.driver == "live"
+    part = log[site]
+    spec = log.scenario.sites[site]
+    timed = log.driver == "live"
     return {
         "role": spec.role,
         "rate_hz": spec.rate_hz,
@@ -350,11 +358,14 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
 
 
 def _describe_site(log: Log, name: str, twin: Log | None) -> JsonObject:
-    part, spec = log[name], log.scenario.sites[name]
+    part = log[name]
+    spec = log.scenario.sites[name]
     end = part.t_s > part.t_s[-1] - END_WINDOW_S if len(part) else np.zeros(0, dtype=bool)
     moved = operator_displacement(log, twin, name)[2] if twin is not None else part.q[:0]
-    made, expected = made_ticks(log, name), log.scenario.ticks(name)
-    late, busy = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}, PERCENTILES
+    made = made_ticks(log, name)
+    expected = log.scenario.ticks(name)
+    late = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}
+    busy = PERCENTILES
     at_limit = np.abs(part.tau) >= spec.limits.tau_limit_nm
     return {
         "role": spec.role,
@@ -380,7 +391,8 @@ def _describe_site(log: Log, name: str, twin: Log | None) -> JsonObject:
 
 
 def _describe_link(log: Log, use: LinkSummary) -> JsonObject:
-    counts, clock = use.counts, summarise_clock(log, use.peer, use.site)
+    counts = use.counts
+    clock = summarise_clock(log, use.peer, use.site)
     return {
         "delay_ms": finite_or_none(use.stated[0].link.moments().mean_ms),
         "stated": [

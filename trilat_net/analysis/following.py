@@ -130,7 +130,8 @@ class TaskFollowing:
 
     def miss(self, rows: Rows, e: Array) -> tuple[Array, Array]:
         """Returns J r - x' - Lambda e, shape (K, m), and a - v', shape (K, n): 0 where nothing is damped."""
-        damping, rate = self.damping[rows, np.newaxis], self.damping_rate[rows, np.newaxis]
+        damping = self.damping[rows, np.newaxis]
+        rate = self.damping_rate[rows, np.newaxis]
         if not (damping.any() or rate.any()):
             return np.zeros_like(e), np.zeros_like(self.psi[rows])
         y = self._solve(rows, -self.Lambda * e - np.einsum("kij,kj->ki", self.J[rows], self.psi[rows]))
@@ -152,12 +153,14 @@ def follow_rows(arm: ArmRows, q: Array, qd: Array, Lambda: Array) -> Following:
     turn, basis = np.linalg.eigh(A)
     inverse = (basis / np.maximum(turn, _LEAST_EIGENVALUE)[:, np.newaxis]) @ basis.transpose(0, 2, 1)
     trace = np.trace(axes * inverse, axis1=1, axis2=2)
-    limit, least = task.singular_value**2, 1.0 / trace
+    limit = task.singular_value**2
+    least = 1.0 / trace
     damping = np.maximum(limit - least, 0.0)
     half = J @ Jd.transpose(0, 2, 1)
     bent = -np.trace(inverse @ (half + half.transpose(0, 2, 1)) @ inverse, axis1=1, axis2=2)
     if damping.any():
         inverse = np.linalg.inv(A + damping[:, np.newaxis, np.newaxis] * np.eye(len(axes)))
     damping_rate = np.where(damping > 0.0, bent / trace**2, 0.0)
-    psi, psi_rate = task.posture_rate * (np.array(task.posture) - q), -task.posture_rate * qd
+    psi = task.posture_rate * (np.array(task.posture) - q)
+    psi_rate = -task.posture_rate * qd
     return TaskFollowing(Lambda, J, Jd, psi, psi_rate, inverse, damping, damping_rate, np.sqrt(least))

@@ -72,9 +72,13 @@ def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDel
     index = log[site].peers.index(peer)
     commands = (command for batch in log.commands(site).values() for command in batch)
     ordered = [one.model for one in commands if one.peer == index and one.model is not None]
-    whole, alone = LinkSchedule(setup, ordered), LinkSchedule(setup, ordered)
-    alone.models["duplicate"], alone.models["in_order"], alone.models["playout_us"] = 0.0, 0, 0
-    models, due_ns = whole.models, whole.draw(count)
+    whole = LinkSchedule(setup, ordered)
+    alone = LinkSchedule(setup, ordered)
+    alone.models["duplicate"] = 0.0
+    alone.models["in_order"] = 0
+    alone.models["playout_us"] = 0
+    models = whole.models
+    due_ns = whole.draw(count)
     drawn_ns = due_ns if np.array_equal(alone.models, models) else alone.draw(count)
     stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // setup.rate_hz
     kind = models["kind"][np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")]
@@ -110,7 +114,9 @@ def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
     found = {}
     for index, peer in enumerate(part.peers):
         here = entries[:, 0] == index
-        at, sample, delay_us = tick[here], entries[here, 1], entries[here, 2]
+        at = tick[here]
+        sample = entries[here, 1]
+        delay_us = entries[here, 2]
         # a link accepts no stamp before the epoch, and none further ahead than the limit
         latest_ns = at * NS_PER_S // part.rate_hz + AHEAD_LIMIT_NS
         peer_hz = log.scenario.sites[peer].rate_hz
@@ -136,7 +142,8 @@ def mark_judged_samples(log: Log, site: str, stamp_ns: Ints, came: Arrivals) -> 
     took; except those that may have arrived in a tick whose record is missing. Given are the stamps of the
     samples 0 to M - 1, ns since the epoch, and their first arrivals.
     """
-    part, count = log[site], len(stamp_ns)
+    part = log[site]
+    count = len(stamp_ns)
     if not len(part):
         return np.zeros(count, dtype=np.bool_)
     prompt = first_ticks(stamp_ns + 1, part.rate_hz)
@@ -303,7 +310,8 @@ def summarise_links(log: Log) -> list[LinkSummary]:
 
 def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
     """Returns the effective delay at every tick from the first sample in use on, ns."""
-    part, used = log[site], log[site].used[peer]
+    part = log[site]
+    used = log[site].used[peer]
     known = used >= 0
     stamp_ns = used[known] * NS_PER_S // log.scenario.sites[peer].rate_hz
     return part.tick[known] * NS_PER_S // part.rate_hz - stamp_ns
@@ -322,7 +330,8 @@ def bin_ages(age_ns: Ints) -> AgeHistogram | None:
     """Returns a histogram of ages, ns, in at most `MOST_AGE_BINS` bins of 1, 2 or 5 times 10^n ms."""
     if not len(age_ns):
         return None
-    low, high = int(age_ns.min()), int(age_ns.max())
+    low = int(age_ns.min())
+    high = int(age_ns.max())
     widths = (step * 10**power for power in range(4, 15) for step in (1, 2, 5))  # ns, from 10 us
     width_ns = next(width for width in widths if high // width - low // width < MOST_AGE_BINS)
     ticks = np.bincount(age_ns // width_ns - low // width_ns).tolist()
@@ -332,7 +341,8 @@ def bin_ages(age_ns: Ints) -> AgeHistogram | None:
 def _summarise_link(
     log: Log, states: list[StatedModel], peer: str, site: str, sent: int, came: Arrivals
 ) -> LinkSummary:
-    part, used = log[site], log[site].used[peer]
+    part = log[site]
+    used = log[site].used[peer]
     fate = predict_delivery(log, peer, site, sent)
     age_ns = sample_ages_ns(log, peer, site)
     known = mark_judged_samples(log, site, fate.stamp_ns, came.first)
@@ -341,7 +351,8 @@ def _summarise_link(
     gone = np.ones(len(known), dtype=np.bool_)  # judged samples that could not come into use
     gone[came.first.sample] = False
     gone = (gone | fate.lost) & known
-    lost, judged = int(np.count_nonzero(gone)), int(np.count_nonzero(known))
+    lost = int(np.count_nonzero(gone))
+    judged = int(np.count_nonzero(known))
     bursts = int(np.count_nonzero(gone[1:] & ~gone[:-1])) + int(gone[:1].any())
     pairs = (np.diff(part.tick) == 1) & (used[:-1] >= 0)
     stamped = log.driver == "live" and len(part) > 0 and part.record(0).v >= ONE_WAY_SCHEMA_VERSION

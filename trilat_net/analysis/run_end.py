@@ -148,7 +148,9 @@ class RunEnd(NamedTuple):
 
     @property
     def _behaviour_text(self) -> str:
-        behaviour, error, speed = self.behaviour, self.error, self.speed
+        behaviour = self.behaviour
+        error = self.error
+        speed = self.speed
         error_text = f"|e| {self.end_error_rad:.3g} {self.error_unit}"
         end = f"{error_text} and |qd| {self.end_speed_rad_s:.3g} rad/s in the last second"
         if self.diverged_at_s is not None:
@@ -249,15 +251,18 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     ]
     count = max(min(map(len, sites)) - 1, 0)
     kept = np.flatnonzero(np.all([site[:count, 0, 0] >= 0.0 for site in sites], axis=0))
-    span_s, t_s = count / BUCKETS_PER_S, kept / BUCKETS_PER_S
+    span_s = count / BUCKETS_PER_S
+    t_s = kept / BUCKETS_PER_S
     acted_s = max(trace.pushed_until_s, find_last_operator_action(scenario, span_s))
     changed_s = max(trace.changed_until_s, find_last_change(scenario, span_s))
     first, late = _choose_judged_part(t_s, max(acted_s, changed_s))
     acts = late and _choose_judged_part(t_s, acted_s)[1]
-    t_s, columns = t_s[first:], [site[kept[first:]] for site in sites]
+    t_s = t_s[first:]
+    columns = [site[kept[first:]] for site in sites]
     missing = tuple(name for name, site in zip(scenario.names, sites, strict=True) if not len(site))
     end = _find_worst_joint(scenario, t_s, columns, sites)
-    counts_from_s, quiet_from_s = float(t_s[0]) if len(t_s) else 0.0, max(acted_s, changed_s)
+    counts_from_s = float(t_s[0]) if len(t_s) else 0.0
+    quiet_from_s = max(acted_s, changed_s)
     end = end._replace(missing_sites=missing, counts_from_s=counts_from_s, quiet_from_s=quiet_from_s)
     if scenario.sites[scenario.names[0]].task.space == "position":
         end = end._replace(error_unit="m")

@@ -41,7 +41,8 @@ class RunView:
     """
 
     def __init__(self, log: Log) -> None:
-        self.log, self.scenario = log, log.scenario
+        self.log = log
+        self.scenario = log.scenario
         self._made: dict[Callable[[RunView], Any], Any] = {}
 
     def once(self, make: Callable[["RunView"], T]) -> T:
@@ -97,7 +98,8 @@ def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
     follows = follow_rows(arm, records.q, records.qd, np.array(records.axes))
     if isinstance(follows, JointFollowing):
         return run
-    axes, script = np.array(records.axes), torque.script
+    axes = np.array(records.axes)
+    script = torque.script
     forces = torque._replace(
         operator_now=follows.project(torque.operator_now),
         operator_held=follows.project(torque.operator_held),

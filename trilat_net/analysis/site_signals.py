@@ -104,7 +104,8 @@ def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, 
 
     Before it stand the ticks that both logs have, and their times, s.
     """
-    part, other = log[site], twin[site]
+    part = log[site]
+    other = twin[site]
     tick, ours, theirs = np.intersect1d(part.tick, other.tick, assume_unique=True, return_indices=True)
     return tick, part.t_s[ours], joint_angles(part)[ours] - joint_angles(other)[theirs]
 

@@ -47,10 +47,14 @@ def wall_force(wall: TorqueSource, t_s: Array, end_effector: EndEffectorRows) ->
 def follow_target(source: TorqueSource, t_s: Array) -> tuple[Array, Array]:
     """Returns the target of a spring, which moves from a to b with minimum jerk, and its velocity, (K, n)."""
     span_s = source.move_end_s - source.move_start_s
-    x, per_s = (t_s > source.move_start_s).astype(np.float64), 0.0
+    x = (t_s > source.move_start_s).astype(np.float64)
+    per_s = 0.0
     if span_s > 0.0:
-        x, per_s = np.clip((t_s - source.move_start_s) / span_s, 0.0, 1.0), 1.0 / span_s
-    a, way, x = np.array(source.a), np.array(source.b) - np.array(source.a), x[:, None]
+        x = np.clip((t_s - source.move_start_s) / span_s, 0.0, 1.0)
+        per_s = 1.0 / span_s
+    a = np.array(source.a)
+    way = np.array(source.b) - np.array(source.a)
+    x = x[:, None]
     return a + x**3 * (10.0 + x * (6.0 * x - 15.0)) * way, 30.0 * x**2 * (1.0 - x) ** 2 * per_s * way
 
 
@@ -95,7 +99,8 @@ def compute_live_torque(
 ) -> Array:
     """Returns the torque of a live hand ON the arm, shape (K, n), N m, by the `hand` of its records."""
     size = (hand.shape[1] - 3) // 2
-    target, rate = hand[:, 3 : 3 + size], hand[:, 3 + size :]
+    target = hand[:, 3 : 3 + size]
+    rate = hand[:, 3 + size :]
     at_joints = source.acts is TorqueKind.LIVE_JOINT
     at, speed = (q, qd) if at_joints else (end_effector.at, end_effector.speed)
     pull = target
@@ -138,7 +143,8 @@ class TorqueSplit(NamedTuple):
 
 def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     """Returns the torque on a site's arm by its sources, held and not; without the script."""
-    spec, t_s = scenario.sites[records.site], records.nominal_s
+    spec = scenario.sites[records.site]
+    t_s = records.nominal_s
     end_effector = build_arm_rows(scenario, records.site).place_end_effector(records.q, records.qd)
 
     def add(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
@@ -151,7 +157,8 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
             total = total + torque
         return total
 
-    now, held = add(spec.environment, sampled=False), add(spec.environment, sampled=True)
+    now = add(spec.environment, sampled=False)
+    held = add(spec.environment, sampled=True)
     operator_held = add(spec.hands, sampled=True)
     operator_now = -records.tau_x - now - held - operator_held
     return TorqueSplit(end_effector, operator_now, operator_held, now, held)
@@ -169,11 +176,13 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
         x = np.clip((t_s - source.start_s) / (source.end_s - source.start_s), 0.0, 1.0)
         intent = np.sin(np.pi * x)[:, None] ** 2 * np.array(source.a)
     elif source.acts is TorqueKind.RECORDED and source.table is not None:
-        at_s, rows = source.table[:, 0], source.table[:, 1:]
+        at_s = source.table[:, 0]
+        rows = source.table[:, 1:]
         columns = [np.interp(t_s, at_s, column, left=0.0, right=0.0) for column in rows.T]
         intent = np.stack(columns, axis=1)
     elif source.acts is TorqueKind.CHIRP:
-        span_s, (first_hz, last_hz) = source.move_end_s - source.move_start_s, source.b
+        span_s = source.move_end_s - source.move_start_s
+        (first_hz, last_hz) = source.b
         x = np.mod(t_s - source.start_s, span_s)
         turns = first_hz * x + (last_hz - first_hz) * x**2 / (2.0 * span_s)
         intent = np.sin(2.0 * np.pi * turns)[:, None] * np.array(source.a)
@@ -198,8 +207,11 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
 
     Without an operator in the scenario, the operator's torque is exactly zero where only rounding is left.
     """
-    split, t_s, spec = split_torque(records, scenario), records.nominal_s, scenario.sites[records.site]
-    expected, scripts = np.zeros_like(records.q), np.zeros_like(records.q)
+    split = split_torque(records, scenario)
+    t_s = records.nominal_s
+    spec = scenario.sites[records.site]
+    expected = np.zeros_like(records.q)
+    scripts = np.zeros_like(records.q)
     for source in (one.actor for one in spec.hands):
         if source.acts in LIVE_KINDS:
             at_start = np.broadcast_to(records.q[0], records.q.shape)

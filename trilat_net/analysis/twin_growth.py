@@ -189,13 +189,15 @@ class TwinGrowth(NamedTuple):
         if worst is None:
             return f"twins: {self.why}"
         if (left := self.left) is not None:
-            when, rate = f"from {left.from_s:.4g} to {left.to_s:.4g} s", f"{left.rate_per_s:+.3g} /s"
+            when = f"from {left.from_s:.4g} to {left.to_s:.4g} s"
+            rate = f"{left.rate_per_s:+.3g} /s"
             return f"twins: {when} the run and its twins left a rest by themselves, {rate} at {left.joint}"
         if worst.factor == 0.0:
             return "twins: every push died down to the rounding of the numbers"
         if math.isnan(worst.rate_per_s):
             return "twins: the run is too short to tell"
-        what, in_s = worst.push.name, f"in {self.to_s - self.from_s:.4g} s ({worst.rate_per_s:+.3g} /s)"
+        what = worst.push.name
+        in_s = f"in {self.to_s - self.from_s:.4g} s ({worst.rate_per_s:+.3g} /s)"
         changed = f"x {worst.factor:.3g} {in_s}, most at {worst.joint}"
         if self.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY):
             return (
@@ -227,7 +229,8 @@ def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool | None, 
         settles: whether small motions settle, by roots that are exact or by the theorem; None: not known.
         rises: V rose by what nobody gave.
     """
-    own, trend = end.stability, twins.trend
+    own = end.stability
+    trend = twins.trend
     if not twins.pushes or end.behaviour is EndBehaviour.DIVERGED:
         return TwinVerdict(own)
     falls = (
@@ -288,7 +291,8 @@ def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_fr
     rows = np.flatnonzero(twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1))
     end = int(rows[-1]) if len(rows) else 0  # the last interval may be of one tick
     first = min(int(np.searchsorted(t_s, counts_from_s)), end)
-    pushes, left = [], []
+    pushes = []
+    left = []
     firsts = np.cumsum([0, *(scenario.layout(name).joints for name in scenario.names)]).tolist()
     for place, sites in enumerate(find_coupled_sites(scenario)):
         group = [joint for site in sites for joint in range(firsts[site], firsts[site + 1])]
@@ -354,7 +358,9 @@ def _judge_push(
 
     One that died down and was pushed anew counts from the last time, if that is long enough ago.
     """
-    t_s, first, end = path.t_s, part.start, part.stop
+    t_s = path.t_s
+    first = part.start
+    end = part.stop
     if not path.push.again:  # it may have died, or left its limits
         end = min(end, int(np.flatnonzero(np.isfinite(amplitude))[-1]) + 1)
     legs = [*(at for at in path.pushed if at < end), end]
@@ -424,7 +430,8 @@ class PushedTwins(Result):
     def describe(self, one: PushGrowth) -> str:
         """Returns what became of a push, in one sentence."""
         rate = "" if math.isnan(one.rate_per_s) else f" ({one.rate_per_s:+.3g} /s)"
-        pushed, to_s = f"a push of {one.push.name} at {self.at_s:.4g} s", self.growth.to_s
+        pushed = f"a push of {one.push.name} at {self.at_s:.4g} s"
+        to_s = self.growth.to_s
         if one.ended_s is not None:
             died = "dies down to the rounding of the numbers"
             ends = died if one.trend is EnvelopeTrend.DECAYS else "makes the run diverge"
@@ -476,7 +483,8 @@ def twin(
         CodeWithheld: a law of it may not run.
     """
     log = log if isinstance(log, Log) else open_log(log)
-    scenario, asked = log.scenario, push.items() if isinstance(push, Mapping) else [*map(_read_push, push)]
+    scenario = log.scenario
+    asked = push.items() if isinstance(push, Mapping) else [*map(_read_push, push)]
     end_s = max(len(log[name]) / log[name].rate_hz for name in log.sites)
     if not 0.0 <= at_s < end_s and end_s > 0.0:
         raise UsageError(f"--at {at_s:g}: a push is within the run, from 0 s until before {end_s:g} s")
@@ -485,7 +493,8 @@ def twin(
             f"--delta sweeps the size of one push, not of {', '.join(what for what, _ in asked)}"
         )
     if delta:
-        (what, _), sizes = next(iter(asked), ("q", 0.0)), _read_sizes(delta)
+        (what, _) = next(iter(asked), ("q", 0.0))
+        sizes = _read_sizes(delta)
         pushes = [aim_push(scenario, what, size, at_s)._replace(largest=math.inf) for size in sizes]
     else:
         usual = [one._replace(at_s=at_s, again=False) for one in choose_pushes(scenario, TWINS)]
@@ -515,9 +524,11 @@ def _read_sizes(text: str) -> list[float]:
 
 def _find_linear_sizes(scenario: Scenario, growth: TwinGrowth, sizes: Sequence[float]) -> LinearSizes:
     assert growth.twins is not None
-    paths, every = growth.twins.paths, range(len(growth.twins.joints))
+    paths = growth.twins.paths
+    every = range(len(growth.twins.joints))
     largest = [_running_maximum(measure_amplitude(path, every)) for path in paths]
-    unit, beyond = paths[0].push.name.partition(" ")[2], ""
+    unit = paths[0].push.name.partition(" ")[2]
+    beyond = ""
     for n, (small, big) in enumerate(pairwise(largest)):
         ratio = np.full(len(big), math.log(sizes[n + 1] / sizes[n]))
         known = (small > math.log(10.0 * SMALLEST)) & np.isfinite(big)

@@ -141,7 +141,8 @@ def _lead_by_device(
     from sites.running_session import RunningSession
 
     running = RunningSession(options.check_session_name(session or ""), reach.resolve())
-    opened, say = open_device(device), terminal.print_line
+    opened = open_device(device)
+    say = terminal.print_line
     with Interrupt() as interrupt:
         running.lead(name, opened, stopped=interrupt.requested, say=say, timeout_s=timeout_s)
     if interrupt.requested():
@@ -447,7 +448,8 @@ def _warn_of(outcome: "PlaybackSummary", reported: set[Path]) -> None:
         )
 
 
-LOOPBACK, ANY_ADDRESS = "tcp/127.0.0.1:7447", "tls/0.0.0.0:7447"
+LOOPBACK = "tcp/127.0.0.1:7447"
+ANY_ADDRESS = "tls/0.0.0.0:7447"
 
 
 @options.command("--keys keys/router")

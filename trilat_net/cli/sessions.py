@@ -89,7 +89,8 @@ def live_command(
     from live.page_server import LONGEST_S, PageAttendant, PageOptions, show_on_page
     from live.terminal_watch import watch_session
 
-    clock, say = SystemClock(), terminal.print_line
+    clock = SystemClock()
+    say = terminal.print_line
     page = PageOptions(*serving)
     page.check()
     if session is not None:
@@ -98,7 +99,8 @@ def live_command(
             raise UsageError(
                 f"--session shows a session that runs already: leave out {', '.join(sorted(extra))}"
             )
-        connection, name = reach.resolve(), options.check_session_name(session)
+        connection = reach.resolve()
+        name = options.check_session_name(session)
         show = partial(show_on_page, page, clock, name, say)
         raise typer.Exit(watch_session(name, connection, clock, show, say, 10.0))
     if any(reach):
@@ -226,7 +228,8 @@ def _ping_topic(topic: str, routers: list[str] | None, domain: int, lasts_s: flo
     from ..net.ros2_graph import Refusals, Ros2Graph
     from ..net.ros2_names import check_ros_name
 
-    name, clock = check_ros_name(topic, "topic"), SystemClock()
+    name = check_ros_name(topic, "topic")
+    clock = SystemClock()
     graph = Ros2Graph(
         Refusals(terminal.print_note), routers or [options.ROS_ROUTER], "", "trilat_ping", clock, domain
     )
@@ -241,7 +244,8 @@ def _answer(endpoints: list[str], keys: Path | None, seconds: float | None, *, i
     from sites.network_benchmark import run_far_end
 
     with Interrupt() as interrupt:
-        stopped, last_s = interrupt.requested, seconds or inf
+        stopped = interrupt.requested
+        last_s = seconds or inf
         run_far_end(endpoints, keys, stopped, last_s, insecure=insecure, say=terminal.print_line)
     if interrupt.requested():
         raise typer.Exit(interrupt.exit_code)
@@ -264,7 +268,8 @@ def watch_command(
     """
     from live.terminal_watch import show_in_terminal, watch_session
 
-    name, clock = options.check_session_name(session), SystemClock()
+    name = options.check_session_name(session)
+    clock = SystemClock()
     show = partial(show_in_terminal, clock, name, as_site, terminal.out)
     raise typer.Exit(watch_session(name, reach.resolve(), clock, show, terminal.print_line, timeout))
 

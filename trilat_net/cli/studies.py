@@ -173,12 +173,15 @@ def show_progress(
     from ..studies.sweep.sweep_run import format_wall_time
 
     clock = SystemClock()
-    began_ns, first, printed = -1, 0, 0
+    began_ns = -1
+    first = 0
+    printed = 0
 
     def line(done: int, total: int) -> None:
         nonlocal began_ns, first, printed
         if began_ns < 0:  # the start of processes takes seconds and is not counted
-            began_ns, first = clock.monotonic_ns(), done
+            began_ns = clock.monotonic_ns()
+            first = done
         if done in (total, first) or done * _LINES // total <= printed:
             return
         printed = done * _LINES // total
@@ -466,7 +469,8 @@ def experiment_run_command(
 
     from ..studies.experiment.experiment_run import begin_experiment, open_experiment
 
-    page, code = PageOptions(*serving), 0
+    page = PageOptions(*serving)
+    code = 0
     if live:
         page.check()
     begun = open_experiment(file) if file.is_dir() else begin_experiment(file, out)

@@ -130,10 +130,13 @@ def _run_sweep(
     from ..studies.executor import count_workers
     from ..studies.sweep import sweep_results, sweep_run
 
-    begun, plan, done = None, asked, []
+    begun = None
+    plan = asked
+    done = []
     if path is not None and (plan is None or (path / sweep_results.PLAN_FILE).exists()):
         begun = sweep_run.open_sweep_folder(path, plan)
-        plan, done = begun.plan, begun.read_done()
+        plan = begun.plan
+        done = begun.read_done()
     assert plan is not None
     terminal.print_texts(sweep_results.describe_sweep_plan(plan))
     if begun is not None:
@@ -274,7 +277,8 @@ def sweep_command(
     else:
         within = None if margin is None else parse_search_range(margin, tolerance)
         axes = [*(over or []), *([] if within is None else [format_range_axis(within)])]
-        laws, texts = options.split_names(law), options.list_overrides(overrides, duration)
+        laws = options.split_names(law)
+        texts = options.list_overrides(overrides, duration)
         more: dict[str, Any] = {"longest_s": longest, "judge": judge, "metrics": metric or ()}
         asked = plan_sweep(scenario, texts, over=axes, seeds=parse_seed_count(seeds), laws=laws, **more)
         if within is not None:

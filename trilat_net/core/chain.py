@@ -102,7 +102,9 @@ def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
         x, y, z = joint.axis
         across = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
         turned = joint.rotation
-        row.prismatic, row.axis, row.origin = int(joint.prismatic), joint.axis, joint.origin_m
+        row.prismatic = int(joint.prismatic)
+        row.axis = joint.axis
+        row.origin = joint.origin_m
         row.at_rest = turned
         if joint.prismatic:
             row.slide = apply(turned, joint.axis)
@@ -222,8 +224,12 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> tuple[Three, 
 def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> tuple[Three, Three]:
     """Returns I(pi) times a spatial velocity, pi beginning at index `first`."""
     mc = (pi[first + 1], pi[first + 2], pi[first + 3])
-    xx, xy, yy = pi[first + 4], pi[first + 5], pi[first + 6]
-    xz, yz, zz = pi[first + 7], pi[first + 8], pi[first + 9]
+    xx = pi[first + 4]
+    xy = pi[first + 5]
+    yy = pi[first + 6]
+    xz = pi[first + 7]
+    yz = pi[first + 8]
+    zz = pi[first + 9]
     turned = (
         xx * angular[0] + xy * angular[1] + xz * angular[2],
         xy * angular[0] + yy * angular[1] + yz * angular[2],
@@ -271,7 +277,8 @@ def propagate_motion(chain: RowArray, gravity: Vector, qd: Vector, v: Vector, a:
     A = ((-gravity[0], -gravity[1], -gravity[2]), still)
     for i in range(chain.shape[0]):
         row: Row = chain[i]
-        V, W = _move(row, V[0], V[1], qd[i]), _move(row, W[0], W[1], v[i])
+        V = _move(row, V[0], V[1], qd[i])
+        W = _move(row, W[0], W[1], v[i])
         A = _move(row, A[0], A[1], a[i])
         along = scale(v[i], three(row.axis))
         if row.prismatic == 0:
@@ -332,7 +339,8 @@ def _add_products(
     factor: float, x: tuple[Three, Three], y: tuple[Three, Three], first: int, gradient: Array
 ) -> None:
     """Adds factor times the gradient of x' I(pi) y by pi to ten entries of `gradient`."""
-    (x_lin, x_ang), (y_lin, y_ang) = x, y
+    (x_lin, x_ang) = x
+    (y_lin, y_ang) = y
     lever = add(cross(y_lin, x_ang), cross(x_lin, y_ang))
     gradient[first] += factor * dot(x_lin, y_lin)
     for j in range(3):
@@ -365,8 +373,11 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
 @leaf
 def _add_composite(row: Row, before: Row) -> None:
     """Adds a composite body to the one of the link before, about the origin of that link's frame."""
-    pi, total, R = row.composite, before.composite, row.R
-    m, p = pi[0], three(row.p)
+    pi = row.composite
+    total = before.composite
+    R = row.R
+    m = pi[0]
+    p = three(row.p)
     h = rotate(R, (pi[1], pi[2], pi[3]))
     x = rotate(R, (pi[4], pi[5], pi[7]))
     y = rotate(R, (pi[5], pi[6], pi[8]))
@@ -433,7 +444,8 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
     A = ((-gravity[0], -gravity[1], -gravity[2]), still)
     for i in range(n):
         row: Row = chain[i]
-        V, A = _move(row, V[0], V[1], qd[i]), _move(row, A[0], A[1], 0.0)
+        V = _move(row, V[0], V[1], qd[i])
+        A = _move(row, A[0], A[1], 0.0)
         along = scale(qd[i], three(row.axis))
         if row.prismatic == 0:
             A = (add(A[0], cross(V[0], along)), add(A[1], cross(V[1], along)))
@@ -510,7 +522,8 @@ def place_end_effector(chain: RowArray, tip: Vector) -> Three:
     place = (0.0, 0.0, 0.0)
     for i in range(n):
         row: Row = chain[i]
-        R, R_base = row.R, row.R_base
+        R = row.R
+        R_base = row.R_base
         if i == 0:
             place = three(row.p)
             for j in range(3):

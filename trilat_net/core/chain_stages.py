@@ -183,7 +183,8 @@ def advance_arm(
     """Advances q and qd by one period under the torque `s.u`; false where the result is not finite."""
     n = chain.shape[0]
     for i in range(n):
-        s.stage_q[i], s.stage_qd[i] = s.q[i], s.qd[i]
+        s.stage_q[i] = s.q[i]
+        s.stage_qd[i] = s.qd[i]
         s.sum_qd[i] = s.sum_qdd[i] = 0.0
     half = 0.5 * h_s
     _put_acceleration(t_s, s, chain, actors, table)
@@ -201,5 +202,6 @@ def advance_arm(
         finite = finite and isfinite(s.stage_q[i]) and isfinite(s.stage_qd[i])
     if finite:
         for i in range(n):
-            s.q[i], s.qd[i] = s.stage_q[i], s.stage_qd[i]
+            s.q[i] = s.stage_q[i]
+            s.qd[i] = s.stage_qd[i]
     return finite

@@ -26,8 +26,11 @@ from .vectors import IntArray, Points, Row
 LOST = -1
 """Stands for the time of a sample that is lost."""
 
-_AR1, _SINE = int(DelayKind.AR1), int(DelayKind.SINE)
-_TRACE, _MEASURED, _OWN = int(DelayKind.TRACE), int(DelayKind.MEASURED), int(DelayKind.OWN)
+_AR1 = int(DelayKind.AR1)
+_SINE = int(DelayKind.SINE)
+_TRACE = int(DelayKind.TRACE)
+_MEASURED = int(DelayKind.MEASURED)
+_OWN = int(DelayKind.OWN)
 
 
 @leaf

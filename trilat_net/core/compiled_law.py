@@ -132,8 +132,12 @@ def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np
 @cache
 def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     """Returns a compiled function of the law's numbers, the site, its links, what came and what is sent."""
-    law_dtype, received_dtype, to_all_dtype, sent_dtype = form.law, form.received, form.to_all, form.sent
-    numbers, peers = form.law.itemsize // 8, form.peers
+    law_dtype = form.law
+    received_dtype = form.received
+    to_all_dtype = form.to_all
+    sent_dtype = form.sent
+    numbers = form.law.itemsize // 8
+    peers = form.peers
     common = 0 if to_all_dtype is None else to_all_dtype.itemsize // 8
     own = 0 if sent_dtype is None else sent_dtype.itemsize // 8
     compute = numba.njit(**_CHECKED)(torque)
@@ -255,7 +259,10 @@ class CompiledLaw:
         for name, value in numbers.items():
             whole[0][name] = value
         self.row: Array = whole.view(np.float64)
-        self._law, self._name, self._arrays, self._sent = law, setup.name, arrays, sent
+        self._law = law
+        self._name = setup.name
+        self._arrays = arrays
+        self._sent = sent
         self._stage = law_stage
         self._remembered = sum(numbers[name].size for name in list_remembered(law))
         arrays.site["remembered"] = self._remembered

@@ -99,13 +99,17 @@ LINK_MODEL_DTYPE = np.dtype(
 )
 
 
-_LARGEST_NORMAL, _LARGEST_EXPONENTIAL = 8.6, 36.8
+_LARGEST_NORMAL = 8.6
+_LARGEST_EXPONENTIAL = 36.8
 """No draw is larger in magnitude: that of Box and Muller, and -log, of 2^-53, see `unit_interval`."""
 
 
 def _longest_us(model: LinkModel, trace: Points | None) -> float:
     """Returns a delay that no sample exceeds, us, by the least and the largest uniform numbers."""
-    location, scale, extra, weight = model.location, model.scale, model.extra, abs(model.weight)
+    location = model.location
+    scale = model.scale
+    extra = model.extra
+    weight = abs(model.weight)
     if model.kind == DelayKind.GAMMA:
         d = extra + (extra < 1.0) - 1.0 / 3.0
         return scale * d * (1.0 + _LARGEST_NORMAL / math.sqrt(9.0 * d)) ** 3
@@ -135,11 +139,17 @@ def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -
     return min(MAX_DELAY_US, max(longest))
 
 
-LOSS, DUPLICATE, DELAY, COPY = 0, 1, 2, 5
+LOSS = 0
+DUPLICATE = 1
+DELAY = 2
+COPY = 5
 """Purposes of draws; a delay takes up to three, see `standard_gamma`."""
 
-_UNIFORM, _NORMAL, _GAMMA = int(DelayKind.UNIFORM), int(DelayKind.NORMAL), int(DelayKind.GAMMA)
-_LOG_NORMAL, _HYPER = int(DelayKind.LOG_NORMAL), int(DelayKind.HYPER_EXPONENTIAL)
+_UNIFORM = int(DelayKind.UNIFORM)
+_NORMAL = int(DelayKind.NORMAL)
+_GAMMA = int(DelayKind.GAMMA)
+_LOG_NORMAL = int(DelayKind.LOG_NORMAL)
+_HYPER = int(DelayKind.HYPER_EXPONENTIAL)
 _LOOP = int(TraceEnd.LOOP)
 
 
@@ -191,7 +201,8 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
 
     The last point lasts as long as the one before it; after that the trace holds it or begins again.
     """
-    first, count = model.trace_first, model.trace_count
+    first = model.trace_first
+    count = model.trace_count
     t_us = stamp_ns // 1000
     if model.at_end == _LOOP and count > 1:
         end_us = points[first + count - 1, 0]
@@ -210,8 +221,11 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 @leaf
 def own_delay_us(key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points) -> float:
     """Returns the delay of an own kind, us, not rounded; its numbers stand in the table, two a row."""
-    model.key, model.sample, model.stamp_ns = np.int64(key), sample, stamp_ns
-    first, count = model.trace_first, model.trace_count
+    model.key = np.int64(key)
+    model.sample = sample
+    model.stamp_ns = stamp_ns
+    first = model.trace_first
+    count = model.trace_count
     call_at(model.call, (points[first : first + count].reshape(-1).view(np.float64), model))
     drawn_us: float = min(model.drawn_us, model.location)
     return drawn_us

@@ -64,7 +64,8 @@ def find_balancing_weights(alpha: Array) -> Array | None:
         while waiting:
             i = waiting.pop()
             for j in np.flatnonzero(followed[i]).tolist():
-                here, there = D[i] * alpha[i, j], alpha[j, i]
+                here = D[i] * alpha[i, j]
+                there = alpha[j, i]
                 if not D[j] and there:
                     D[j] = here / there
                     waiting.append(j)
@@ -119,7 +120,8 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
     for j in range(links.shape[0]):
         link: Row = links[j]
         column = RAMP_COLUMNS + j
-        before, current = ramps[0, column], 0
+        before = ramps[0, column]
+        current = 0
         for n in range(1, count):
             if t_ns < ramps[n, 0]:
                 break
@@ -127,7 +129,9 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
                 ramps[n, 0], ramps[current, 0], ramps[current, 1], before, ramps[current, column]
             )
             current = n
-        start_ns, end_ns, after = ramps[current, 0], ramps[current, 1], ramps[current, column]
+        start_ns = ramps[current, 0]
+        end_ns = ramps[current, 1]
+        after = ramps[current, column]
         link.alpha = _interpolate(t_ns, start_ns, end_ns, before, after)
         link.alpha_rate = (after - before) / ((end_ns - start_ns) * 1e-9) if t_ns < end_ns else 0.0
 
@@ -141,7 +145,8 @@ def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
     last = int(np.searchsorted(ramps[1:count, 0], t_ns, side="right"))
     if last < 2:
         return count
-    before, current = ramps[0, RAMP_COLUMNS:].copy(), 0
+    before = ramps[0, RAMP_COLUMNS:].copy()
+    current = 0
     for n in range(1, last + 1):
         start_ns, end_ns = ramps[current, :RAMP_COLUMNS]
         for j, after in enumerate(ramps[current, RAMP_COLUMNS:]):
@@ -152,9 +157,13 @@ def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
     return count - last + 1
 
 
-_RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
-_HOLD, _BRAKE, _RETURN = int(Mode.HOLD), int(Mode.BRAKE), int(Mode.RETURN)
-_USE, _ACT_BRAKE = int(StaleAction.USE), int(StaleAction.BRAKE)
+_RUN = int(Mode.RUN)
+_DIVERGED = int(Mode.DIVERGED)
+_HOLD = int(Mode.HOLD)
+_BRAKE = int(Mode.BRAKE)
+_RETURN = int(Mode.RETURN)
+_USE = int(StaleAction.USE)
+_ACT_BRAKE = int(StaleAction.BRAKE)
 
 
 @leaf
@@ -216,4 +225,6 @@ def update_reference(t_ns: int, site: Row, links: RowArray, ramps: Array) -> Non
             q_des += link.alpha * link.q[i]
             qd_des += link.alpha * link.qd[i] + link.alpha_rate * link.q[i]
             felt -= link.alpha * link.tau_x[i]
-        site.q_des[i], site.qd_des[i], site.felt[i] = q_des, qd_des, felt
+        site.q_des[i] = q_des
+        site.qd_des[i] = qd_des
+        site.felt[i] = felt

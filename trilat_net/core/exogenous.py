@@ -120,9 +120,14 @@ TorqueTable = Array
 SourceTorque = tuple[float, float, float]
 """Torque ON each joint, N m, and the largest force of a wall in it, N."""
 
-_PULSE, _HAND, _TASK_HAND = int(TorqueKind.PULSE), int(TorqueKind.HAND), int(TorqueKind.TASK_HAND)
-_RECORDED, _VISCOUS, _WALL = int(TorqueKind.RECORDED), int(TorqueKind.VISCOUS), int(TorqueKind.WALL)
-_CHIRP, _MULTISINE = int(TorqueKind.CHIRP), int(TorqueKind.MULTISINE)
+_PULSE = int(TorqueKind.PULSE)
+_HAND = int(TorqueKind.HAND)
+_TASK_HAND = int(TorqueKind.TASK_HAND)
+_RECORDED = int(TorqueKind.RECORDED)
+_VISCOUS = int(TorqueKind.VISCOUS)
+_WALL = int(TorqueKind.WALL)
+_CHIRP = int(TorqueKind.CHIRP)
+_MULTISINE = int(TorqueKind.MULTISINE)
 _OWN_JOINTS, _OWN_TIP = map(int, OWN_KINDS)
 _LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
 
@@ -143,7 +148,8 @@ def torque_source_rows(
             row[name] = getattr(actor, name)
         for name in _NUMBERS:
             row[name][: len(getattr(actor, name))] = getattr(actor, name)
-        row.acts, row.sampled = int(actor.acts), int(actor.sampled)
+        row.acts = int(actor.acts)
+        row.sampled = int(actor.sampled)
         row.coordinates = axes if actor.acts is TorqueKind.OWN_TIP else joints
         given = actor.table
         if actor.acts in OWN_KINDS:
@@ -154,7 +160,8 @@ def torque_source_rows(
             table = np.zeros((len(given), 1 + joints))
             table[:, : np.shape(given)[1]] = given
             tables.append(table)
-            row.table_first, row.table_count = first, len(table)
+            row.table_first = first
+            row.table_count = len(table)
             first += len(table)
     return rows, np.ascontiguousarray(np.concatenate(tables))
 
@@ -207,7 +214,8 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
     if actor.acts < _LIVE_TIP:
         return x, y
     if actor.acts == _LIVE_FORCE:
-        x, y = actor.a[0], actor.a[1]
+        x = actor.a[0]
+        y = actor.a[1]
     share = _live_share(actor, x * x + y * y)
     return share * x, share * y
 
@@ -215,7 +223,8 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
 @leaf
 def _table_place(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, float]:
     """Returns the two rows of a table around a time and the part of the way between; -1 outside of it."""
-    first, count = actor.table_first, actor.table_count
+    first = actor.table_first
+    count = actor.table_count
     if count < 1 or t_s < table[first, 0] or t_s > table[first + count - 1, 0]:
         return -1, -1, 0.0
     before = count_begun(table, first, count, t_s) - 1
@@ -305,7 +314,8 @@ def _ask_own(actor: Row, t_s: float, table: TorqueTable) -> None:
 def _own_pair(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTable) -> Pair:
     """Returns the effort of an own kind along two joints or axes."""
     for i in range(2):
-        actor.at[i], actor.speed[i] = at[i], speed[i]
+        actor.at[i] = at[i]
+        actor.speed[i] = speed[i]
     _ask_own(actor, t_s, table)
     return actor.effort[0], actor.effort[1]
 
@@ -379,7 +389,8 @@ def _force_in_space(actor: Row, t_s: float, at: Three, speed: Three, table: Torq
     """Returns the force of a spring, a wall or an own kind on an end effector in three dimensions, N."""
     if actor.acts == _OWN_TIP:
         for i in range(3):
-            actor.at[i], actor.speed[i] = at[i], speed[i]
+            actor.at[i] = at[i]
+            actor.speed[i] = speed[i]
         _ask_own(actor, t_s, table)
         return three(actor.effort)
     if actor.acts != _WALL:
@@ -393,7 +404,8 @@ def _force_in_space(actor: Row, t_s: float, at: Three, speed: Three, table: Torq
             x, y, z = three(actor.a)
         share = _live_share(actor, x * x + y * y + z * z)
         return share * x, share * y, share * z
-    normal, point = three(actor.b), three(actor.a)
+    normal = three(actor.b)
+    point = three(actor.a)
     depth = dot(point, normal) - dot(at, normal)
     if not depth > 0.0:
         return 0.0, 0.0, 0.0
@@ -408,7 +420,8 @@ def _add_joint_torque(
     """Adds the torque of an actor that acts on the joints themselves."""
     if actor.acts == _HAND or actor.acts == _LIVE_JOINT:
         progress, rate = _target_progress(actor, t_s)
-        share, square = 1.0, 0.0
+        share = 1.0
+        square = 0.0
         if actor.acts == _LIVE_JOINT:
             for i in range(joints):
                 pull = _spring_along(actor, i, progress, rate, q[i], qd[i])
@@ -426,7 +439,8 @@ def _add_joint_torque(
                 torque[i] += table[low, 1 + i] + x * (table[high, 1 + i] - table[low, 1 + i])
     elif actor.acts == _OWN_JOINTS:
         for i in range(joints):
-            actor.at[i], actor.speed[i] = q[i], qd[i]
+            actor.at[i] = q[i]
+            actor.speed[i] = qd[i]
         _ask_own(actor, t_s, table)
         for i in range(joints):
             torque[i] += actor.effort[i]
@@ -443,7 +457,9 @@ def _tip_motion(qd: Vector, tip: Vector, chain: RowArray) -> tuple[Three, Three]
     v_0 = v_1 = v_2 = 0.0
     for i in range(chain.shape[0]):
         J = chain[i].J_lin
-        v_0, v_1, v_2 = v_0 + J[0] * qd[i], v_1 + J[1] * qd[i], v_2 + J[2] * qd[i]
+        v_0 = v_0 + J[0] * qd[i]
+        v_1 = v_1 + J[1] * qd[i]
+        v_2 = v_2 + J[2] * qd[i]
     return at, (v_0, v_1, v_2)
 
 
@@ -467,7 +483,8 @@ def put_torque_on_chain(
     for i in range(n):
         torque[i] = 0.0
     at = speed = (0.0, 0.0, 0.0)
-    placed, largest_n = False, 0.0
+    placed = False
+    largest_n = 0.0
     for m in range(actors.shape[0]):
         actor: Row = actors[m]
         if actor.sampled != sampled or not actor.start_s <= t_s < actor.end_s:

@@ -93,10 +93,16 @@ class RecordedFeed(NamedTuple):
 @leaf
 def _accept_made(k: int, rate_hz: int, peer: Row, sample: int, sent: KeptRecords, link: LinkArrays) -> None:
     """Accepts a sample that its sender has made."""
-    n, m = peer.joints, peer.shared
-    q, qd, tau_x, sent_at = 0, n, 3 * n + 2 * m, _first_sent(peer)
+    n = peer.joints
+    m = peer.shared
+    q = 0
+    qd = n
+    tau_x = 3 * n + 2 * m
+    sent_at = _first_sent(peer)
     if peer.task:
-        q, qd, tau_x = sent_at - 3 * m, sent_at - 2 * m, sent_at - m
+        q = sent_at - 3 * m
+        qd = sent_at - 2 * m
+        tau_x = sent_at - m
     row = sent.rows[sample & (sent.t_ns.shape[0] - 1)]
     accept_sample(k, rate_hz, sample, row[q:], row[qd:], row[tau_x:], row[sent_at:], link)
 
@@ -138,7 +144,8 @@ def _update_peaks(
 ) -> None:
     """Updates the present bucket by a record, see `run_until`; a full bucket is left."""
     error = 0.0
-    bucket, joints = progress.bucket, peaks.shape[1] // 3
+    bucket = progress.bucket
+    joints = peaks.shape[1] // 3
     here = _first_sent(s) - 3 * s.shared if s.task else 0
     for i in range(joints):  # where a task has more or fewer coordinates than there are joints, zeros stand
         e = speed = angle = 0.0
@@ -147,7 +154,8 @@ def _update_peaks(
             if i >= PLACE and s.task:  # of an orientation
                 e = s.e[i]
         if i < s.joints:
-            speed, angle = abs(row[s.joints + i]), row[i]
+            speed = abs(row[s.joints + i])
+            angle = row[i]
         sums.errors[i] += e * e
         apart = abs(e)
         error = max(error, apart)
@@ -199,7 +207,9 @@ def _update_sums(
     sums: Row,
 ) -> None:
     """Adds a record to the effort, and the period before it to the work of the environments."""
-    n, t_s, first = s.joints, t_ns * 1e-9, sums.first_environment
+    n = s.joints
+    t_s = t_ns * 1e-9
+    first = sums.first_environment
     _put_gravity_torque(s, chain, row, sums.G)
     tau = 2 * (n + s.shared)
     effort = 0.0
@@ -220,7 +230,9 @@ def _update_sums(
         if k > 0:
             mean = 0.5 * (sums.now_before[i] + sums.now[i]) + sums.held_before[i]
             sums.environment_j += mean * (row[i] - sums.q[i])
-        sums.q[i], sums.now_before[i], sums.held_before[i] = row[i], sums.now[i], sums.held[i]
+        sums.q[i] = row[i]
+        sums.now_before[i] = sums.now[i]
+        sums.held_before[i] = sums.held[i]
 
 
 class LawArrays(NamedTuple):
@@ -249,8 +261,11 @@ def _find_torque(
     if laws.addresses[i] == 0 or channel is None:
         torque_stage(arrays.site[i], chain)
         return
-    site, links = arrays.site[i], arrays.links[i]
-    row, sent, address = laws.rows[i], laws.sent[i], laws.addresses[i]
+    site = arrays.site[i]
+    links = arrays.links[i]
+    row = laws.rows[i]
+    sent = laws.sent[i]
+    address = laws.addresses[i]
     law_stage(own.tick, own.t_ns, address, row, site, links, chain, channel, sent)
 
 
@@ -274,8 +289,11 @@ def sense_site(
 ) -> None:
     """Stages 1 to 5 of a site's next tick."""
     own: Row = progress[i]
-    k, t_ns, rate_hz = own.tick, own.t_ns, own.rate_hz
-    site, links = arrays.site[i], arrays.links[i]
+    k = own.tick
+    t_ns = own.t_ns
+    rate_hz = own.rate_hz
+    site = arrays.site[i]
+    links = arrays.links[i]
     for p in range(links.shape[0]):
         j = p if p < i else p + 1
         peer: Row = progress[j]
@@ -313,7 +331,10 @@ def finish_site(
 ) -> int:
     """Stages 6 to 8 of a site's next tick, and what is kept of it; returns its mode."""
     own: Row = progress[i]
-    k, t_ns, rate_hz, site = own.tick, own.t_ns, own.rate_hz, arrays.site[i]
+    k = own.tick
+    t_ns = own.t_ns
+    rate_hz = own.rate_hz
+    site = arrays.site[i]
     _find_torque(i, own, arrays, chain, laws)
     page = k & (sent.t_ns.shape[1] - 1)
     sent.t_ns[i, page] = t_ns

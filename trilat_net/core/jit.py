@@ -131,7 +131,8 @@ class _Place:
     """Where the machine code of a function is kept, as Numba asks for it; its source counts by content."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
-        self._line, self._py_file = function.__code__.co_firstlineno, Path(file)
+        self._line = function.__code__.co_firstlineno
+        self._py_file = Path(file)
 
     from_function = classmethod(lambda cls, function, file: cls(function, file))
 
@@ -158,7 +159,9 @@ class _Placed(CompileResultCacheImpl):
         if kind != _WITHIN:
             return super().rebuild(context, kept)
         library = _LeafLibrary(context.codegen(), name)
-        library.within, library._finalized, library._final_module = True, True, parse_bitcode(code)
+        library.within = True
+        library._finalized = True
+        library._final_module = parse_bitcode(code)
         names = ("fndesc", "environment", "signature", "objectmode", "lifted", "type_annotation")
         fields = dict(zip((*names, "reload_init", "referenced_envs"), kept[1:], strict=True))
         contexts = {"target_context": context, "typing_context": context.typing_context}
@@ -193,7 +196,9 @@ class _LeafCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        base, stamp, place = self._impl.filename_base, self._cache_file._source_stamp, Path(self._cache_path)
+        base = self._impl.filename_base
+        stamp = self._cache_file._source_stamp
+        place = Path(self._cache_path)
         files = cast(Any, _CodeFiles)
         self._cache_file = files(str(place), base, stamp)
         self._shipped = files(str(_SHIPPED / place.name), base, stamp)
@@ -262,7 +267,8 @@ class _LeafCompiler(Compiler):
     depth = 0
 
     def compile_extra(self, function: Any) -> Any:
-        state, within = self.state, _LeafCompiler.depth > 0
+        state = self.state
+        within = _LeafCompiler.depth > 0
         state.library = _LeafLibrary(state.targetctx.codegen(), function.__qualname__)
         state.library.enable_object_caching()
         state.library.within = within

@@ -21,11 +21,13 @@ from .task_space import POSE, update_orientation_reference
 from .ticks import LifeReason, Mode, tick_ns
 from .vectors import Array, IntArray, Points, Row, RowArray, Vector, put
 
-_DIVERGED, _FAULT = int(Mode.DIVERGED), int(Mode.FAULT)
+_DIVERGED = int(Mode.DIVERGED)
+_FAULT = int(Mode.FAULT)
 _NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
 _DIGITAL = int(Scheme.DIGITAL)
-_ADAPTIVE, _OWN = int(Law.ADAPTIVE), int(Law.OWN)
+_ADAPTIVE = int(Law.ADAPTIVE)
+_OWN = int(Law.OWN)
 
 
 @leaf
@@ -116,7 +118,9 @@ def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
 @leaf
 def _write_record(s: Row, row: Array) -> None:
     """Writes the record's floats, see `Layout.columns`; one that is not finite diverges the run and is 0."""
-    n, m, P = s.joints, s.shared, s.parameters
+    n = s.joints
+    m = s.shared
+    P = s.parameters
     at = 2 * n
     for i in range(n):
         row[i] = s.q[i]
@@ -225,7 +229,8 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
     for n in range(count):
         arrival: Row = buffers.arrivals[n]
         link = link_arrays(arrays, arrival.peer)
-        forces, sent = buffers.forces[n], buffers.sent[n]
+        forces = buffers.forces[n]
+        sent = buffers.sent[n]
         accept_sample(k, rate_hz, arrival.tick, arrival.q, arrival.qd, forces, sent, link)
 
 

@@ -86,7 +86,8 @@ class LawChannel(NamedTuple):
 
     def find_places(self, vectors: Sequence[SentVector]) -> list[int]:
         """Returns where each number of some vectors stands in a peer's part; -1: it is not sent."""
-        first, firsts = 0, {}
+        first = 0
+        firsts = {}
         for vector in self.vectors:
             firsts[vector.name] = first
             first += vector.length
@@ -106,7 +107,8 @@ class LawChannel(NamedTuple):
 
     def part(self, sent: Sequence[float], place: int) -> Sequence[float]:
         """Returns what the peer at a place among the sender's peers gets of a record's numbers."""
-        own, common = self.numbers(per_peer=True), self.numbers(per_peer=False)
+        own = self.numbers(per_peer=True)
+        common = self.numbers(per_peer=False)
         if not own:
             return sent
         first = common + place * own

@@ -33,7 +33,9 @@ def _update_model(s: Row, chain: RowArray | None) -> None:
 def update_law_view(k: int, t_ns: int, site: RowArray, links: RowArray, chain: RowArray | None) -> None:
     """Writes what a law sees of a tick that no stage wrote: time, model, peers; and no torque yet."""
     s: Row = site[0]
-    s.k, s.t_s, s.h_s = k, k / s.rate_hz, 1.0 / s.rate_hz
+    s.k = k
+    s.t_s = k / s.rate_hz
+    s.h_s = 1.0 / s.rate_hz
     for i in range(s.tau.shape[0]):
         s.tau_x[i] = 0.0 - s.on_arm[i]
         s.tau[i] = np.nan
@@ -53,7 +55,8 @@ _IN_ROW = {"gravity": "G"}
 
 def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> SimpleNamespace:
     """Returns numbers by the names of the vectors that they are."""
-    named, first = SimpleNamespace(), 0
+    named = SimpleNamespace()
+    first = 0
     for vector in vectors:
         setattr(named, vector.name, LawVector(numbers[first : first + vector.length]))
         first += vector.length
@@ -71,10 +74,15 @@ class PlainLaw:
     """
 
     def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
-        self._law, self._setup, self._arrays, self._sent = law, setup, arrays, sent
+        self._law = law
+        self._setup = setup
+        self._arrays = arrays
+        self._sent = sent
         self._update = update_law_view
-        site, layout = arrays.site[0], setup.layout
-        n, m = layout.joints, layout.shared
+        site = arrays.site[0]
+        layout = setup.layout
+        n = layout.joints
+        m = layout.shared
         views = {name: site[_IN_ROW.get(name, name)][:n] for name in _PER_JOINT}
         views |= {name: site[name][:m] for name in _PER_COORDINATE}
         self._views = {**views, "theta_hat": site["theta_hat"][: layout.parameters]}
@@ -99,11 +107,13 @@ class PlainLaw:
         Raises:
             LawFailed: it failed.
         """
-        a, setup = self._arrays, self._setup
+        a = self._arrays
+        setup = self._setup
         self._update(k, t_ns, a.site, a.links, a.chain)
         results = call_law(self._law, setup.name, self._read(k), self._collect_sent)
         self._views["tau"][:] = np.clip(results.torque, -self._limit, self._limit)
-        self._views["theta_hat"][:], self._sent[:] = results.theta_hat, results.sent
+        self._views["theta_hat"][:] = results.theta_hat
+        self._sent[:] = results.sent
         return results.memory
 
     @property
@@ -121,7 +131,9 @@ class PlainLaw:
         columns: list[Any] = [column.tolist() for column in self._of_peers]
         columns[4:] = [map(LawVector, rows) for rows in columns[4:]]  # q, qd, tau_x
         received = () if self._received is None else self._received.tolist()
-        sent, common, own = self._sent.tolist(), self._common, self._own
+        sent = self._sent.tolist()
+        common = self._common
+        own = self._own
         return LawInput(
             k=k,
             t_s=k / setup.rate_hz,

@@ -168,7 +168,8 @@ def accept_sample(
     `sent` is what the peer's law sends besides its motion; a site whose law does not look at it takes any.
     """
     row: Row = link.state[0]
-    dues, calendar = link.dues, link.calendar
+    dues = link.dues
+    calendar = link.calendar
     row.accepted += 1
     if tick < 0 or (tick > row.foreseen and _far_ahead(k, rate_hz, tick, row.rate_hz)):
         row.refused += 1
@@ -224,7 +225,9 @@ def recall_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
         return
     slot.tick = -1
     if newest > row.used:
-        row.used, row.used_ns, row.new = newest, tick_ns(k, rate_hz), 1
+        row.used = newest
+        row.used_ns = tick_ns(k, rate_hz)
+        row.new = 1
         put(row.q, slot.q)
         put(row.qd, slot.qd)
         put(row.tau_x, slot.tau_x)

@@ -40,7 +40,9 @@ GLIDE_NS = 50_000_000
 
 ANOTHER_HOLDS = "hand: another one holds the arm"
 OUT_OF_ORDER = "hand: out of order"
-TAKEN, RELEASED, SILENT = "takes hold", "lets go", "is silent: let go"
+TAKEN = "takes hold"
+RELEASED = "lets go"
+SILENT = "is silent: let go"
 """What a tick changed in who holds an arm."""
 
 
@@ -215,7 +217,8 @@ def advance_hand(
         commands: the messages that came in since the tick before, in order.
         place: returns where the arm is now, in the coordinates of the target.
     """
-    h_s, firmer = 1.0 / rules.rate_hz, 1e9 / (GRIP_NS * rules.rate_hz)
+    h_s = 1.0 / rules.rate_hz
+    firmer = 1e9 / (GRIP_NS * rules.rate_hz)
     refused: list[str] = []
     changes: list[tuple[int, str]] = []
     now = memory
@@ -276,7 +279,9 @@ def glide(
 
     A row is as `HandInForce`, but for number and source. Target and rate are changed; returns the grip.
     """
-    h_s, firmer, size = 1.0 / rate_hz, 1e9 / (GRIP_NS * rate_hz), target.shape[0]
+    h_s = 1.0 / rate_hz
+    firmer = 1e9 / (GRIP_NS * rate_hz)
+    size = target.shape[0]
     for n in range(rows.shape[0]):
         t_ns = (first + n) * 1_000_000_000 // rate_hz
         grip = min(grip + firmer, 1.0)
@@ -295,7 +300,8 @@ def glide(
                 rate[i] *= share
         rows[n, 0] = grip
         for i in range(size):
-            rows[n, 3 + i], rows[n, 3 + size + i] = target[i], rate[i]
+            rows[n, 3 + i] = target[i]
+            rows[n, 3 + size + i] = rate[i]
     return grip
 
 

@@ -15,13 +15,15 @@ from .vectors import Row, RowArray
 BACK_NS = 250_000_000
 """One that was dropped has its share again when it was heard for so long."""
 
-_DROPPED, _RESTORED = int(LifeReason.DROPPED), int(LifeReason.RESTORED)
+_DROPPED = int(LifeReason.DROPPED)
+_RESTORED = int(LifeReason.RESTORED)
 
 
 @leaf
 def _can_go_without(lost: int, t_ns: int, site: Row, links: RowArray) -> bool:
     """True if those that are left, without this peer, follow each other, and the site one of them."""
-    everyone, own = site.bit, 0
+    everyone = site.bit
+    own = 0
     for j in range(links.shape[0]):
         link: Row = links[j]
         if j != lost and link.gone == 0.0 and link.used >= 0 and t_ns - link.used_ns <= site.stale_ns:
@@ -46,7 +48,9 @@ def _is_turned_little(back: int, site: Row, links: RowArray) -> bool:
 
     The turn between two orientations is no longer than the difference of their vectors from the own one.
     """
-    own, whole, sum_of_turns = rotation_matrix(three(site.x[3:])), 0.0, (0.0, 0.0, 0.0)
+    own = rotation_matrix(three(site.x[3:]))
+    whole = 0.0
+    sum_of_turns = (0.0, 0.0, 0.0)
     for j in range(links.shape[0]):
         link: Row = links[j]
         if link.gone == 0.0:
@@ -117,13 +121,15 @@ def regroup(t_ns: int, site: Row, links: RowArray) -> None:
         silent = t_ns - link.used_ns > site.stale_ns
         if link.gone == 0.0:
             if silent and link.dispensable and _can_go_without(j, t_ns, site, links):
-                link.gone, site.regrouped = -1.0, _DROPPED
+                link.gone = -1.0
+                site.regrouped = _DROPPED
         elif silent:
             link.gone = -1.0
         elif link.gone < 0.0:
             link.gone = float(t_ns)
         elif t_ns - link.gone >= BACK_NS and _is_near(j, site, links):
-            link.gone, site.regrouped = 0.0, _RESTORED
+            link.gone = 0.0
+            site.regrouped = _RESTORED
     if not _share_out(links):  # the shares were changed meanwhile
         for j in range(links.shape[0]):
             link = links[j]

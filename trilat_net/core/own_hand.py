@@ -112,7 +112,9 @@ class OwnHand:
         delay: int,
         place: Callable[[Sequence[float]], Sequence[float]],
     ) -> None:
-        self._rules, self.every, self.delay = rules, every, delay
+        self._rules = rules
+        self.every = every
+        self.delay = delay
         self._place = place
         self._due: deque[tuple[int, HandCommand]] = deque()
         self._memory = HandMemory()
@@ -129,9 +131,13 @@ class OwnHand:
 
     def view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
         """Returns what it sees at tick k, which its site is about to make."""
-        own, links = np.asarray(arrays.site), np.asarray(arrays.links)  # records are slow to read
-        n, m, rate_hz = layout.joints, layout.shared, self._rules.rate_hz
-        q, now_ns = own["q"][0, :n].copy(), tick_ns(k, rate_hz)
+        own = np.asarray(arrays.site)
+        links = np.asarray(arrays.links)  # records are slow to read
+        n = layout.joints
+        m = layout.shared
+        rate_hz = self._rules.rate_hz
+        q = own["q"][0, :n].copy()
+        now_ns = tick_ns(k, rate_hz)
         numbers = [links[name].tolist() for name in ("alpha", "used", "rate_hz", "new")]
         shared = [links[name][:, :m].copy() for name in ("q", "qd", "tau_x")]
         peers = tuple(
@@ -168,7 +174,8 @@ class OwnHand:
             raise ValueError(f"it acts with a norm of {size:g}, at most {self._rules.farthest:g} is taken")
         if k <= self._newest:
             return
-        self._newest, due = k, k + self.delay
+        self._newest = k
+        due = k + self.delay
         command = HandCommand(
             PROGRAM, k // self.every, goal is not None, numbers, tick_ns(due, self._rules.rate_hz)
         )
@@ -195,7 +202,8 @@ class OwnHand:
 
         Of each tick there is a row, as `HandInForce`. The same as `advance` tick by tick, bit for bit.
         """
-        size, rate_hz = self._rules.size, self._rules.rate_hz
+        size = self._rules.size
+        rate_hz = self._rules.rate_hz
         first = self.advance(k, angles).vector
         rows = np.zeros((max(min(self.find_next(k), end), k + 1) - k, 3 + 2 * size))
         rows[0] = first
@@ -214,7 +222,8 @@ class OwnHand:
                 rate,
                 rows[1:],
             )
-            rows[1:, 1], rows[1:, 2] = held.number, held.source
+            rows[1:, 1] = held.number
+            rows[1:, 2] = held.source
             ends = tuple(target.tolist()), tuple(rate.tolist())
             self._memory = held._replace(grip=grip, target=ends[0], rate=ends[1])
         else:

@@ -15,13 +15,17 @@ import numpy as np
 
 from .jit import leaf
 
-_M0, _M1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
-_W0, _W1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
-_LOW, _SHIFT = np.uint64(0xFFFFFFFF), np.uint64(32)
+_M0 = np.uint64(0xD2511F53)
+_M1 = np.uint64(0xCD9E8D57)
+_W0 = np.uint64(0x9E3779B9)
+_W1 = np.uint64(0xBB67AE85)
+_LOW = np.uint64(0xFFFFFFFF)
+_SHIFT = np.uint64(32)
 _ROUNDS = 10
 
 _TO_26 = np.uint64(6)
-_TWO_26, _TWO_52 = 67_108_864.0, 4_503_599_627_370_496.0
+_TWO_26 = 67_108_864.0
+_TWO_52 = 4_503_599_627_370_496.0
 
 PhiloxWords = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 DrawKey = np.uint64
@@ -38,9 +42,14 @@ def philox(
 ) -> PhiloxWords:
     """Returns four 32-bit words for a 128-bit counter and a 64-bit key, all as 32-bit words in uint64."""
     for _ in range(_ROUNDS):
-        p0, p1 = _M0 * c0, _M1 * c2
-        c0, c1, c2, c3 = (p1 >> _SHIFT) ^ c1 ^ k0, p1 & _LOW, (p0 >> _SHIFT) ^ c3 ^ k1, p0 & _LOW
-        k0, k1 = (k0 + _W0) & _LOW, (k1 + _W1) & _LOW
+        p0 = _M0 * c0
+        p1 = _M1 * c2
+        c0 = (p1 >> _SHIFT) ^ c1 ^ k0
+        c1 = p1 & _LOW
+        c2 = (p0 >> _SHIFT) ^ c3 ^ k1
+        c3 = p0 & _LOW
+        k0 = (k0 + _W0) & _LOW
+        k1 = (k1 + _W1) & _LOW
     return c0, c1, c2, c3
 
 

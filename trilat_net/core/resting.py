@@ -49,11 +49,15 @@ REST_RATE_1_S = 3.0
 _ROUNDING_S = 1e-9
 """By less than this the last step of a reference misses the end of its time."""
 
-_WAITING, _HOLD = int(Mode.WAITING), int(Mode.HOLD)
-_FAULT, _STOPPED = int(Mode.FAULT), int(Mode.STOPPED)
+_WAITING = int(Mode.WAITING)
+_HOLD = int(Mode.HOLD)
+_FAULT = int(Mode.FAULT)
+_STOPPED = int(Mode.STOPPED)
 _NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
-_ADAPTIVE, _OWN, _KNOWN = int(Law.ADAPTIVE), int(Law.OWN), int(Law.KNOWN)
+_ADAPTIVE = int(Law.ADAPTIVE)
+_OWN = int(Law.OWN)
+_KNOWN = int(Law.KNOWN)
 
 
 @leaf
@@ -92,7 +96,8 @@ def rests_by_law(site: Row) -> bool:
 def begin_rest(t_ns: int, mode: int, reason: int, site: Row) -> None:
     """Enters a mode in which the arm comes to rest; what rests already goes on, unless its law failed."""
     goes_on = rests(site) and reason != _NOT_FINITE and site.reason != _NOT_FINITE
-    site.mode, site.reason = mode, reason
+    site.mode = mode
+    site.reason = reason
     if goes_on:
         return
     site.return_from_ns = t_ns
@@ -112,9 +117,11 @@ def _read_reference(site: Row, i: int) -> tuple[float, float]:
 def _write_reference(site: Row, i: int, q: float, qd: float) -> None:
     """Writes the reference of a joint where the record's `mem` keeps it from tick to tick."""
     if site.task:
-        site.q_rest[i], site.qd_rest[i] = q, qd
+        site.q_rest[i] = q
+        site.qd_rest[i] = qd
     else:
-        site.q_held[i], site.qd_held[i] = q, qd
+        site.q_held[i] = q
+        site.qd_held[i] = qd
 
 
 @leaf
@@ -167,7 +174,8 @@ def put_rest_reference(site: Row, q: Array, qd: Array) -> None:
     """Writes the reference of an arm that comes to rest; in task space where its end effector is."""
     for i in range(q.shape[0]):
         if site.task:
-            q[i], qd[i] = site.x[i], site.xd[i]
+            q[i] = site.x[i]
+            qd[i] = site.xd[i]
         else:
             q[i], qd[i] = _read_reference(site, i)
             site.felt[i] = 0.0
@@ -220,7 +228,9 @@ def limit_torque_rate(site: Row) -> None:
     braking = rests(site)
     for i in range(site.joints):
         if site.tau_rate[i] < inf:
-            most, before = site.tau_rate[i] / site.rate_hz, site.tau_before[i]
+            most = site.tau_rate[i] / site.rate_hz
+            before = site.tau_before[i]
             brake = site.damping[i] * site.qd[i] if braking else 0.0
-            low, high = before - most - max(brake, 0.0), before + most - min(brake, 0.0)
+            low = before - most - max(brake, 0.0)
+            high = before + most - min(brake, 0.0)
             site.tau[i] = min(max(site.tau[i], low), high)

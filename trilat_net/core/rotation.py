@@ -24,7 +24,8 @@ def arctan(x: float) -> float:
     """Returns the arc tangent of a number from 0 to 1, rad."""
     turned = 0.0
     if x > 0.66:
-        turned, x = 0.25 * math.pi, (x - 1.0) / (x + 1.0)
+        turned = 0.25 * math.pi
+        x = (x - 1.0) / (x + 1.0)
     z = x * x
     P = -8.750608600031904122785e-1
     P = P * z - 1.615753718733365076637e1
@@ -44,13 +45,21 @@ def rotation_matrix(vector: Three) -> Matrix:
     """Returns the rotation by a vector, three rows (Rodrigues)."""
     angle = math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
     s, c = sincos(angle)
-    by_sine, by_cosine = 1.0, 0.5
+    by_sine = 1.0
+    by_cosine = 0.5
     if angle > _SMALL:
-        by_sine, by_cosine = s / angle, (1.0 - c) / (angle * angle)
+        by_sine = s / angle
+        by_cosine = (1.0 - c) / (angle * angle)
     x, y, z = vector
-    xx, yy, zz = by_cosine * x * x, by_cosine * y * y, by_cosine * z * z
-    xy, xz, yz = by_cosine * x * y, by_cosine * x * z, by_cosine * y * z
-    sx, sy, sz = by_sine * x, by_sine * y, by_sine * z
+    xx = by_cosine * x * x
+    yy = by_cosine * y * y
+    zz = by_cosine * z * z
+    xy = by_cosine * x * y
+    xz = by_cosine * x * z
+    yz = by_cosine * y * z
+    sx = by_sine * x
+    sy = by_sine * y
+    sz = by_sine * z
     return (
         (1.0 - yy - zz, xy - sz, xz + sy),
         (xy + sz, 1.0 - xx - zz, yz - sx),
@@ -61,16 +70,22 @@ def rotation_matrix(vector: Three) -> Matrix:
 @leaf
 def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
     """Returns the quaternion of a rotation with w >= 0, from its largest part (Shepperd, 1978)."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R[0], R[1], R[2]
+    (xx, xy, xz) = R[0]
+    (yx, yy, yz) = R[1]
+    (zx, zy, zz) = R[2]
     trace = xx + yy + zz
     if trace >= max(xx, yy, zz):
-        w, v = 1.0 + trace, (zy - yz, xz - zx, yx - xy)
+        w = 1.0 + trace
+        v = (zy - yz, xz - zx, yx - xy)
     elif xx >= yy and xx >= zz:
-        w, v = zy - yz, (1.0 + xx - yy - zz, xy + yx, xz + zx)
+        w = zy - yz
+        v = (1.0 + xx - yy - zz, xy + yx, xz + zx)
     elif yy >= zz:
-        w, v = xz - zx, (xy + yx, 1.0 + yy - xx - zz, yz + zy)
+        w = xz - zx
+        v = (xy + yx, 1.0 + yy - xx - zz, yz + zy)
     else:
-        w, v = yx - xy, (xz + zx, yz + zy, 1.0 + zz - xx - yy)
+        w = yx - xy
+        v = (xz + zx, yz + zy, 1.0 + zz - xx - yy)
     length = math.sqrt(w * w + v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     if w < 0.0:
         length = -length
@@ -91,7 +106,9 @@ def rotation_vector(R: Array | Matrix) -> Three:
 @leaf
 def turn_between(R: Array | Matrix, other: Array | Matrix) -> Three:
     """Returns the vector of R other': the turn from the other orientation to this one, in base axes."""
-    a, b, c = other[0], other[1], other[2]
+    a = other[0]
+    b = other[1]
+    c = other[2]
     rows = (
         _times_rows(R[0], a, b, c),
         _times_rows(R[1], a, b, c),
@@ -135,10 +152,12 @@ def turning_velocity(turn: Three, rate: Three) -> Three:
     angle = length(turn)
     a2 = angle * angle
     if angle < _SHORT:
-        by_cross, by_twice = 0.5 - a2 / 24.0 + a2 * a2 / 720.0, 1.0 / 6.0 - a2 / 120.0 + a2 * a2 / 5040.0
+        by_cross = 0.5 - a2 / 24.0 + a2 * a2 / 720.0
+        by_twice = 1.0 / 6.0 - a2 / 120.0 + a2 * a2 / 5040.0
     else:
         s, c = sincos(angle)
-        by_cross, by_twice = (1.0 - c) / a2, (angle - s) / (a2 * angle)
+        by_cross = (1.0 - c) / a2
+        by_twice = (angle - s) / (a2 * angle)
     across = cross(turn, rate)
     return add(rate, add(scale(by_cross, across), scale(by_twice, cross(turn, across))))
 

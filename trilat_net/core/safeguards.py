@@ -28,7 +28,8 @@ def limit_reference(k: int, site: Row) -> None:
         limit = site.qd_des_limit[i]
         if limit == inf:
             continue
-        step, most = site.q_des[i] - site.q_followed[i], limit / site.rate_hz
+        step = site.q_des[i] - site.q_followed[i]
+        most = limit / site.rate_hz
         if abs(step) > most:
             forward = step > 0.0
             site.q_des[i] = site.q_followed[i] + (most if forward else -most)

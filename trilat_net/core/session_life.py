@@ -42,21 +42,40 @@ HELD_OVERRUN_TICKS = 20
 FAULT_OVERRUN_TICKS = 200
 """One that missed more than these is in FAULT."""
 
-_RUN, _DIVERGED, _HOLD = int(Mode.RUN), int(Mode.DIVERGED), int(Mode.HOLD)
-_ALIGN, _WAITING = int(Mode.RETURN), int(Mode.WAITING)
-_FAULT, _STOPPED = int(Mode.FAULT), int(Mode.STOPPED)
-_START, _DROPPED, _RESTORED = int(LifeReason.START), int(LifeReason.DROPPED), int(LifeReason.RESTORED)
-_PEERS_HERE, _ALIGNED = int(LifeReason.PEERS_HERE), int(LifeReason.ALIGNED)
-_PEER_SILENT, _PEERS_BACK = int(LifeReason.PEER_SILENT), int(LifeReason.PEERS_BACK)
-_ALIGN_LIMIT, _OVERRUN = int(LifeReason.ALIGN_LIMIT), int(LifeReason.OVERRUN)
-_LIMIT_Q, _LIMIT_QD = int(LifeReason.LIMIT_Q), int(LifeReason.LIMIT_QD)
-_NOT_FINITE, _STOP = int(LifeReason.NOT_FINITE), int(LifeReason.STOP)
-_ENABLE, _RESET = int(LifeReason.ENABLE), int(LifeReason.RESET)
-_ARM_SILENT, _ARM_BACK = int(LifeReason.ARM_SILENT), int(LifeReason.ARM_BACK)
-_RELEASED, _HELD = int(LifeReason.RELEASED), int(LifeReason.HELD)
-_TO_STOP, _TO_ENABLE, _TO_RESET = int(LifeOrder.STOP), int(LifeOrder.ENABLE), int(LifeOrder.RESET)
-_HEAR_SILENCE, _LOSE_ARM = int(LifeOrder.ARM_SILENT), int(LifeOrder.ARM_LOST)
-_HEAR_ARM, _LET_GO, _TAKE_HOLD = int(LifeOrder.ARM_BACK), int(LifeOrder.RELEASED), int(LifeOrder.HELD)
+_RUN = int(Mode.RUN)
+_DIVERGED = int(Mode.DIVERGED)
+_HOLD = int(Mode.HOLD)
+_ALIGN = int(Mode.RETURN)
+_WAITING = int(Mode.WAITING)
+_FAULT = int(Mode.FAULT)
+_STOPPED = int(Mode.STOPPED)
+_START = int(LifeReason.START)
+_DROPPED = int(LifeReason.DROPPED)
+_RESTORED = int(LifeReason.RESTORED)
+_PEERS_HERE = int(LifeReason.PEERS_HERE)
+_ALIGNED = int(LifeReason.ALIGNED)
+_PEER_SILENT = int(LifeReason.PEER_SILENT)
+_PEERS_BACK = int(LifeReason.PEERS_BACK)
+_ALIGN_LIMIT = int(LifeReason.ALIGN_LIMIT)
+_OVERRUN = int(LifeReason.OVERRUN)
+_LIMIT_Q = int(LifeReason.LIMIT_Q)
+_LIMIT_QD = int(LifeReason.LIMIT_QD)
+_NOT_FINITE = int(LifeReason.NOT_FINITE)
+_STOP = int(LifeReason.STOP)
+_ENABLE = int(LifeReason.ENABLE)
+_RESET = int(LifeReason.RESET)
+_ARM_SILENT = int(LifeReason.ARM_SILENT)
+_ARM_BACK = int(LifeReason.ARM_BACK)
+_RELEASED = int(LifeReason.RELEASED)
+_HELD = int(LifeReason.HELD)
+_TO_STOP = int(LifeOrder.STOP)
+_TO_ENABLE = int(LifeOrder.ENABLE)
+_TO_RESET = int(LifeOrder.RESET)
+_HEAR_SILENCE = int(LifeOrder.ARM_SILENT)
+_LOSE_ARM = int(LifeOrder.ARM_LOST)
+_HEAR_ARM = int(LifeOrder.ARM_BACK)
+_LET_GO = int(LifeOrder.RELEASED)
+_TAKE_HOLD = int(LifeOrder.HELD)
 
 
 @leaf
@@ -95,12 +114,15 @@ def _begin_aligning(t_ns: int, site: Row, reason: int, q: Array, qd: Array) -> N
         site.reason = _ALIGN_LIMIT
         return
     for i in range(straight_coordinates(site)):
-        site.q_held[i], site.qd_held[i] = q[i] - site.q_des[i], qd[i] - site.qd_des[i]
+        site.q_held[i] = q[i] - site.q_des[i]
+        site.qd_held[i] = qd[i] - site.qd_des[i]
     if has_orientation(site):
         put_three(site.q_held[3:], turn)
         put_three(site.qd_held[3:], rate)
     put(site.tau_held, site.tau_before)
-    site.mode, site.reason, site.return_from_ns = _ALIGN, reason, t_ns
+    site.mode = _ALIGN
+    site.reason = reason
+    site.return_from_ns = t_ns
 
 
 @leaf
@@ -142,7 +164,8 @@ def latch(t_ns: int, site: Row, mode: int, reason: int) -> None:
 def _find_fault(site: Row) -> int:
     """Returns the reason for a fault that the arm's motion gives, or -1."""
     for i in range(site.joints):
-        q, qd = site.q[i], site.qd[i]
+        q = site.q[i]
+        qd = site.qd[i]
         if not (isfinite(q) and isfinite(qd)):
             return _NOT_FINITE
         if not site.q_min[i] <= q <= site.q_max[i]:
@@ -155,7 +178,9 @@ def _find_fault(site: Row) -> int:
 @leaf
 def _obey(t_ns: int, site: Row) -> None:
     """Carries out what is ordered, and what the ticks that were not made ask for."""
-    order, skipped, mode = site.order, site.skipped, site.mode
+    order = site.order
+    skipped = site.skipped
+    mode = site.mode
     site.order = site.skipped = 0
     moves = mode in (_RUN, _ALIGN)
     if order == _TO_RESET and mode == _FAULT:
@@ -201,7 +226,9 @@ def _update_mode(t_ns: int, site: Row, links: RowArray) -> None:
         _carry_on(site)
         _begin_aligning(t_ns, site, site.regrouped, site.q_followed, site.qd_followed)
     elif site.mode == _ALIGN and (t_ns - site.return_from_ns) * 1e-9 >= _align_s(site):
-        site.mode, site.reason, site.return_from_ns = _RUN, _ALIGNED, t_ns
+        site.mode = _RUN
+        site.reason = _ALIGNED
+        site.return_from_ns = t_ns
 
 
 @leaf
@@ -230,7 +257,8 @@ def update_session_life(t_ns: int, site: Row, links: RowArray) -> None:
 def _find_way(t_ns: int, takes_s: float, site: Row, i: int) -> tuple[float, float]:
     """Returns what is left of the way from the peers' reference, and its rate."""
     x = (t_ns - site.return_from_ns) * 1e-9 / takes_s
-    way, rate = site.q_held[i], takes_s * site.qd_held[i]
+    way = site.q_held[i]
+    rate = takes_s * site.qd_held[i]
     left = way * (1.0 - x * x * (3.0 - 2.0 * x)) + rate * x * (1.0 - x) * (1.0 - x)
     return left, (rate * (1.0 - x) * (1.0 - 3.0 * x) - way * 6.0 * x * (1.0 - x)) / takes_s
 

@@ -182,9 +182,11 @@ def build_site_arrays(
         layout: of the arrays, if they are to be larger than the site needs.
         plugged: with the arrays of a plugged law, also if the site's is none.
     """
-    links, layout = setup.links, layout or setup.layout
+    links = setup.links
+    layout = layout or setup.layout
     peers = len(links)
-    kept, pages = pages or _kept_dues(setup), pages or needed_pages(setup)
+    kept = pages or _kept_dues(setup)
+    pages = pages or needed_pages(setup)
     calendars = np.zeros((peers, pages), sample_dtype(layout.shared))
     calendars["tick"] = -1
     rows, models, points = _build_links(links, spare[0], layout.shared)
@@ -223,7 +225,8 @@ def _kept_dues(setup: SiteSetup) -> int:
 def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
     """Returns the arrays of a site before tick k with calendars of more pages, and in them all that waits."""
     ticks = np.arange(k, k + arrays.calendars.shape[1])
-    old, new = ticks & (len(ticks) - 1), ticks & (pages - 1)
+    old = ticks & (len(ticks) - 1)
+    new = ticks & (pages - 1)
     calendars = np.zeros((len(arrays.links), pages), arrays.calendars.dtype)
     calendars["tick"] = -1
     calendars[:, new] = arrays.calendars[:, old]
@@ -245,7 +248,8 @@ class LinkRoom:
     """
 
     def __init__(self, setup: SiteSetup) -> None:
-        self._rate_hz, self._peer_hz = setup.rate_hz, [link.rate_hz for link in setup.links]
+        self._rate_hz = setup.rate_hz
+        self._peer_hz = [link.rate_hz for link in setup.links]
         self._delay_us = [max_delay_us(link.models, link.traces) for link in setup.links]
         self.newest = [-1] * len(setup.links)
         self.most_pages = needed_pages(setup)
@@ -279,7 +283,8 @@ class LinkRoom:
 def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
     """Adds a change of the dominance factors to those that are planned, in the order of their starts."""
     site: Row = arrays.site[0]
-    count, ramps = int(site.ramps), arrays.ramps
+    count = int(site.ramps)
+    ramps = arrays.ramps
     place = 1 + int(np.searchsorted(ramps[1:count, 0], ramp.start_ns, side="right"))
     ramps[place + 1 : count + 1] = ramps[place:count].copy()
     ramps[place] = (ramp.start_ns, ramp.end_ns, *ramp.alpha)
@@ -289,7 +294,8 @@ def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
 def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     """Adds a change of a link to those that are planned, in the order of their first stamps."""
     link: Row = arrays.links[peer]
-    models, count = arrays.models[peer], int(link.models)
+    models = arrays.models[peer]
+    count = int(link.models)
     place = 1 + int(np.searchsorted(models["from_ns"][1:count], model.from_ns, side="right"))
     models[place + 1 : count + 1] = models[place:count].copy()
     models[place] = model
@@ -425,23 +431,40 @@ def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
 def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     site = np.zeros(1, site_dtype(layout))
     s: Row = site[0]
-    gains, rule, own = setup.gains, setup.on_stale, setup.layout
-    s.rate_hz, s.scheme, s.law, s.mode = setup.rate_hz, setup.scheme, gains.law, Mode.RUN
-    s.joints, s.shared, s.parameters, s.task = own.joints, own.shared, own.parameters, own.task
+    gains = setup.gains
+    rule = setup.on_stale
+    own = setup.layout
+    s.rate_hz = setup.rate_hz
+    s.scheme = setup.scheme
+    s.law = gains.law
+    s.mode = Mode.RUN
+    s.joints = own.joints
+    s.shared = own.shared
+    s.parameters = own.parameters
+    s.task = own.task
     s.sent = own.sent
-    s.external, s.ramps = int(setup.external), 1
+    s.external = int(setup.external)
+    s.ramps = 1
     s.theta_known = setup.theta_known
-    s.on_stale, s.stale_ns, s.return_ns = rule.action, rule.age_ns, rule.return_ns
-    s.align_speed, s.align_limit = rule.align_speed, rule.align_limit
-    s.degrades, s.bit = rule.degrades, setup.bit
+    s.on_stale = rule.action
+    s.stale_ns = rule.age_ns
+    s.return_ns = rule.return_ns
+    s.align_speed = rule.align_speed
+    s.align_limit = rule.align_limit
+    s.degrades = rule.degrades
+    s.bit = setup.bit
     if setup.chain is None:
-        s.g, s.lengths = setup.g_m_s2, setup.lengths_m
+        s.g = setup.g_m_s2
+        s.lengths = setup.lengths_m
     else:
-        s.gravity, s.tip = setup.chain.gravity_m_s2, setup.chain.tip_m
+        s.gravity = setup.chain.gravity_m_s2
+        s.tip = setup.chain.tip_m
         s.tip_back = np.transpose(setup.chain.tip_rotation)
     if setup.chain is not None and setup.chain.task is not None:
         task = setup.chain.task
-        s.scale, s.posture_rate, s.singular_value = task.scale, task.posture_rate, task.singular_value
+        s.scale = task.scale
+        s.posture_rate = task.posture_rate
+        s.singular_value = task.singular_value
         s.axes[: own.shared] = task.axes
         s.posture[: own.joints] = task.posture or setup.q0
     vectors = {name: getattr(gains, name) for name in _GAINS}
@@ -462,7 +485,8 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
 
 
 def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
-    vectors, links = setup.received_vectors, setup.links
+    vectors = setup.received_vectors
+    links = setup.links
     numbers = sum(vector.length for vector in vectors)
     places = np.array([link.channel.find_places(vectors) for link in links], dtype=np.int64)
     shape = (len(links), numbers)
@@ -476,14 +500,21 @@ def _build_links(links: Sequence[LinkSetup], spare: int, shared: int) -> tuple[R
     traces = [trace for link in links for trace in link.traces if trace is not None]
     outages = [outage for link in links for outage in link.outages]
     points = np.array([pair for trace in traces for pair in trace] + outages, dtype=np.int64).reshape(-1, 2)
-    trace_first, outage_first = 0, sum(map(len, traces))
+    trace_first = 0
+    outage_first = sum(map(len, traces))
     row: Row
     for row, models, link in zip(rows, all_models, links, strict=True):
-        row.alpha, row.rate_hz, row.key = link.alpha, link.rate_hz, link.key
-        row.bit, row.followed, row.dispensable = link.bit, link.followed, link.dispensable
-        row.used, row.foreseen = -1, -1
+        row.alpha = link.alpha
+        row.rate_hz = link.rate_hz
+        row.key = link.key
+        row.bit = link.bit
+        row.followed = link.followed
+        row.dispensable = link.dispensable
+        row.used = -1
+        row.foreseen = -1
         row.q[: len(link.q0)] = link.q0
-        row.outage_first, row.outage_count = outage_first, len(link.outages)
+        row.outage_first = outage_first
+        row.outage_count = len(link.outages)
         outage_first += len(link.outages)
         row.models = len(link.models)
         for n, (model, trace) in enumerate(zip(link.models, link.traces, strict=True)):

@@ -200,7 +200,8 @@ class Layout(NamedTuple):
 
     def lengths(self) -> dict[str, int]:
         """Returns how many numbers the vectors of a record have, in their order."""
-        n, m = self.joints, self.shared
+        n = self.joints
+        m = self.shared
         vectors = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
         shared = {"x": m, "xd": m, "wrench": m} if self.task else {}
         others = {"ch": self.sent, "hand": self.hand, "bodies": self.bodies}

@@ -46,7 +46,8 @@ from .ticks import (
 from .vectors import Array, Row
 
 _MODES = {int(mode): mode for mode in Mode}
-_RUN, _DIVERGED = int(Mode.RUN), int(Mode.DIVERGED)
+_RUN = int(Mode.RUN)
+_DIVERGED = int(Mode.DIVERGED)
 _NO_TASK: tuple[tuple[float, ...], ...] = ((), (), ())
 
 
@@ -79,11 +80,14 @@ class Site:
         self._columns = motion[:7], motion[7:]
         self._buffers = build_tick_buffers(setup)
         arrival = struct.Struct(f"<qq{2 * self.layout.shared}d")
-        self._pack_arrival, self._arrival_size = arrival.pack_into, arrival.size
+        self._pack_arrival = arrival.pack_into
+        self._arrival_size = arrival.size
         self._tick_arrays = (*self._arrays, *self._buffers)
         self._tick: Callable[..., None] | None = None  # of a user's law the stages are called
-        self._site, self._links = self._arrays.site, self._arrays.links
-        self._mode, self._used = self._site["mode"], self._links["used"]
+        self._site = self._arrays.site
+        self._links = self._arrays.links
+        self._mode = self._site["mode"]
+        self._used = self._links["used"]
         self._arrival_bytes = self._buffers.arrivals.view(np.uint8).data
         self._force_bytes = self._buffers.forces.view(np.uint8).reshape(-1).data
         self._sent = self._buffers.record[self.layout.floats - self.layout.sent :]
@@ -92,7 +96,8 @@ class Site:
         self._hand = self._find_hand(live[0]) if live else None
         counts = [link.channel.received for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None
-        self._glides, self._degrades = setup.on_stale.action is StaleAction.GLIDE, setup.on_stale.degrades
+        self._glides = setup.on_stale.action is StaleAction.GLIDE
+        self._degrades = setup.on_stale.degrades
         self._law_memory: list[float] = [] if self._law is None or not self._glides else self._law.memory
         self._remembers = self._glides or self._user_law is not None
         s = self._site  # its fields are looked up once: that takes longer than to read them
@@ -104,7 +109,8 @@ class Site:
 
     def _find_hand(self, place: int) -> tuple[Array, Array, Array]:
         """Returns grip, target, and target a second later of the live hand at a place among the actors."""
-        actors, size = self._arrays.actors, (self.layout.hand - 3) // 2
+        actors = self._arrays.actors
+        size = (self.layout.hand - 3) // 2
         return actors["grip"][place : place + 1], actors["a"][place, :size], actors["b"][place, :size]
 
     def _plug_law(self, setup: SiteSetup) -> None:
@@ -113,7 +119,8 @@ class Site:
         self._law = None
         self.law_failure: LawFailed | None = None
         if self._user_law is not None:
-            a, b = self._arrays, self._buffers
+            a = self._arrays
+            b = self._buffers
             self._law = plug_law(self._user_law, setup, a, self._sent)
             self._law.bind()  # compiled now, and not within the time that the law has for a tick
             self._sense = bind_leaf(sense_stages, 0, 0, 0, a, b)
@@ -158,7 +165,8 @@ class Site:
             ValueError: more than MAX_ARRIVALS arrivals, or more changes than `order` takes.
             LawFailed: a user's law did, and the site does not go on without it, as under `glide`.
         """
-        t_ns, count = tick.k * NS_PER_S // self.rate_hz, len(tick.arrivals)
+        t_ns = tick.k * NS_PER_S // self.rate_hz
+        count = len(tick.arrivals)
         for command in tick.commands:
             self.order(command, t_ns)
         packed = self._pack(tick.k, tick.arrivals)
@@ -166,7 +174,8 @@ class Site:
         if tick.measured is not None and self._external:
             s: Row = self._site[0]
             bodies = tick.measured.bodies
-            s.q, s.qd = tick.measured.q, tick.measured.qd
+            s.q = tick.measured.q
+            s.qd = tick.measured.qd
             s.sensed = [-torque for torque in tick.measured.tau_x] or 0.0
         hand = self._take_hand(tick.hand)
         memory: list[float] = []
@@ -245,7 +254,8 @@ class Site:
         grip, target, ahead = self._hand
         taken = list(vector) or free_hand(len(target))
         hand = HandInForce.read(taken)
-        grip[0], target[:] = hand.grip, hand.target
+        grip[0] = hand.grip
+        target[:] = hand.target
         ahead[:] = [x + v for x, v in zip(hand.target, hand.rate, strict=True)]
         return taken
 
@@ -303,21 +313,33 @@ class Site:
         s: Row = self._site[0]
         held = self.layout.shared
         s.mode = int(last.mode)
-        s.q, s.qd, s.theta_hat = last.q, last.qd, last.theta_hat
-        s.q_des, s.qd_des, s.tau, s.tau_before = last.q_des, last.qd_des, last.tau, before.tau
+        s.q = last.q
+        s.qd = last.qd
+        s.theta_hat = last.theta_hat
+        s.q_des = last.q_des
+        s.qd_des = last.qd_des
+        s.tau = last.tau
+        s.tau_before = before.tau
         if last.mem:
-            s.q_held, s.return_from_ns = last.mem[:held], int(last.mem[held])
+            s.q_held = last.mem[:held]
+            s.return_from_ns = int(last.mem[held])
         rest = last.mem[held + 1 :]
         if self._glides and rest:
-            s.qd_held, s.reason = rest[:held], int(rest[held])
+            s.qd_held = rest[:held]
+            s.reason = int(rest[held])
             rest = rest[held + 1 :]
-            peers, joints = len(self.peers), self.layout.joints
-            self._links["used_ns"], s.tau_held = rest[:peers], rest[peers : peers + joints]
+            peers = len(self.peers)
+            joints = self.layout.joints
+            self._links["used_ns"] = rest[:peers]
+            s.tau_held = rest[peers : peers + joints]
             rest = rest[peers + joints :]
             if self.layout.task:
-                s.q_rest, s.qd_rest, rest = rest[:joints], rest[joints : 2 * joints], rest[2 * joints :]
+                s.q_rest = rest[:joints]
+                s.qd_rest = rest[joints : 2 * joints]
+                rest = rest[2 * joints :]
             if self._degrades:
-                self._links["gone"], rest = rest[:peers], rest[peers:]
+                self._links["gone"] = rest[:peers]
+                rest = rest[peers:]
             s.order = s.skipped = 0
         self._sent[:] = last.ch or 0.0
         self._take_hand(last.hand)
@@ -342,11 +364,18 @@ class Site:
         link: Row
         for n, (link, start, sample) in enumerate(zip(self._links, self._starts, in_use, strict=True)):
             # the channel's memory is a function of what went before
-            link.foreseen, link.model, link.due_before = -1, 0, 0
+            link.foreseen = -1
+            link.model = 0
+            link.due_before = 0
             if sample is None:
-                link.used, link.q, link.qd, link.tau_x = -1, start, 0.0, 0.0
+                link.used = -1
+                link.q = start
+                link.qd = 0.0
+                link.tau_x = 0.0
             else:
-                link.used, link.q, link.qd = sample.tick, sample.q, sample.qd
+                link.used = sample.tick
+                link.q = sample.q
+                link.qd = sample.qd
                 link.tau_x = sample.tau_x or 0.0
             if (channel := self._arrays.channel) is not None:
                 sent = np.append(() if sample is None else sample.ch, 0.0)  # place -1 is this zero
@@ -358,7 +387,8 @@ class Site:
         """Writes arrivals at tick k into their buffers and makes room for them; returns their bytes there."""
         if len(arrivals) > MAX_ARRIVALS:
             raise ValueError(f"a tick takes at most {MAX_ARRIVALS} arrivals, got {len(arrivals)}")
-        offset, newest = 0, self._room.newest
+        offset = 0
+        newest = self._room.newest
         for peer, tick, q, qd, *_ in arrivals:
             if tick > newest[peer]:
                 self._arrays = self._room.make(self._arrays, k, peer, tick)

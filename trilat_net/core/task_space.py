@@ -24,7 +24,8 @@ from .jit import leaf
 from .rotation import add_turn, rotation_matrix, turn_between
 from .vectors import Array, Row, RowArray
 
-PLACE, POSE = 3, 6
+PLACE = 3
+POSE = 6
 """Numbers of a task without and with an orientation."""
 TINY = 1e-12
 """A pivot of J J' below this is of an axis along which the end effector cannot move at all."""
@@ -72,7 +73,8 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
         tip_speed = add(tip_speed, scale(s.qd[i], three(chain[i].J_lin)))
     for i in range(chain.shape[0]):
         row: Row = chain[i]
-        axis, place = three(row.axis_base), three(row.p_base)
+        axis = three(row.axis_base)
+        place = three(row.p_base)
         speed = add(speed, cross(turning, subtract(place, before)))
         before = place
         if row.prismatic == 0:
@@ -82,7 +84,8 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
             linear = add(cross(angular, subtract(tip, place)), away)
         else:
             speed = add(speed, scale(s.qd[i], axis))
-            angular, linear = still, cross(turning, axis)
+            angular = still
+            linear = cross(turning, axis)
         for j in range(3):
             s.Jd[j, i] = s.scale * linear[j]
             if s.shared == POSE:
@@ -159,9 +162,11 @@ def _factor_damped(s: Row) -> None:
 @leaf
 def update_task_errors(s: Row) -> None:
     """Writes e and ed of the followed axes, v and a of the joints, and r."""
-    n, m = s.joints, s.shared
+    n = s.joints
+    m = s.shared
     for j in range(m):
-        s.e[j], s.ed[j] = s.x[j] - s.q_des[j], s.xd[j] - s.qd_des[j]
+        s.e[j] = s.x[j] - s.q_des[j]
+        s.ed[j] = s.xd[j] - s.qd_des[j]
     if m == POSE:
         reference = rotation_matrix(three(s.q_des[3:]))
         put_three(s.e[3:], turn_between(rotation_matrix(three(s.x[3:])), reference))

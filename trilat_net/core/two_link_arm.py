@@ -127,7 +127,8 @@ def forward_kinematics(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
     """Returns the positions of elbow and end effector, m, as (x, y), base at the origin."""
     s1, c1 = sincos(q[0])
     s12, c12 = sincos(q[0] + q[1])
-    x, y = lengths[0] * c1, lengths[0] * s1
+    x = lengths[0] * c1
+    y = lengths[0] * s1
     return (x, y), (x + lengths[1] * c12, y + lengths[1] * s12)
 
 
@@ -136,5 +137,6 @@ def end_effector_jacobian(lengths: Vector, q: Vector) -> tuple[Pair, Pair]:
     """Returns the end effector's Jacobian, m/rad: rows x and y, columns the joints."""
     s1, c1 = sincos(q[0])
     s12, c12 = sincos(q[0] + q[1])
-    outer_x, outer_y = lengths[1] * c12, lengths[1] * s12
+    outer_x = lengths[1] * c12
+    outer_y = lengths[1] * s12
     return (-lengths[0] * s1 - outer_y, -outer_y), (lengths[0] * c1 + outer_x, outer_x)

@@ -19,7 +19,9 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 @leaf
 def update_errors(s: Row) -> None:
     """Writes e, ed, r, the regressor of Eq. (12) and Y' r from q, qd and the reference."""
-    q, qd, Lambda = pair(s.q), pair(s.qd), pair(s.Lambda)
+    q = pair(s.q)
+    qd = pair(s.qd)
+    Lambda = pair(s.Lambda)
     e, ed, r = control.control_errors(q, qd, s.q_des, s.qd_des, Lambda)
     v = (-Lambda[0] * e[0], -Lambda[1] * e[1])
     a = (-Lambda[0] * ed[0], -Lambda[1] * ed[1])
@@ -76,7 +78,8 @@ def update_model(s: Row) -> None:
     """Writes what a law may know of the arm in this tick: G, and if it wants them M and C qd + G."""
     put_gravity(s, s.known, s.G)
     if s.needs_model != 0:
-        q, qd = pair(s.q), pair(s.qd)
+        q = pair(s.q)
+        qd = pair(s.qd)
         M = inertia(s.known, q)
         put(s.M[0], M[0])
         put(s.M[1], M[1])
@@ -98,7 +101,8 @@ def put_source_torque(
     torque: Array,
 ) -> None:
     """Writes the torque of actors with this `sampled` ON the arm whose q and qd are `state`."""
-    q, qd = (state[0], state[1]), (state[2], state[3])
+    q = (state[0], state[1])
+    qd = (state[2], state[3])
     on_arm = torque_on_arm(t_s, q, qd, pair(s.lengths), actors, table, sampled)
     put(torque, (on_arm[0], on_arm[1]))
 
@@ -106,7 +110,9 @@ def put_source_torque(
 @leaf
 def update_external_torque(t_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable) -> None:
     """Writes the torque of operators and environments now, the part of it held, and the force of a wall."""
-    q, qd, lengths = pair(s.q), pair(s.qd), pair(s.lengths)
+    q = pair(s.q)
+    qd = pair(s.qd)
+    lengths = pair(s.lengths)
     held = torque_on_arm(t_s, q, qd, lengths, actors, table, 1)
     now = torque_on_arm(t_s, q, qd, lengths, actors, table, 0)
     put(s.held, (held[0], held[1]))
@@ -157,14 +163,19 @@ def rk4_step(
 
     u, shape (2,), N m, is the torque that is held over the period: control and sampled actors.
     """
-    half, sixth = 0.5 * h_s, h_s / 6.0
-    q1, v1 = (q[0], q[1]), (qd[0], qd[1])
+    half = 0.5 * h_s
+    sixth = h_s / 6.0
+    q1 = (q[0], q[1])
+    v1 = (qd[0], qd[1])
     a1 = _acceleration(t_s, q1, v1, u, theta, g, lengths, acts, table)
-    q2, v2 = add_scaled(q1, half, v1), add_scaled(v1, half, a1)
+    q2 = add_scaled(q1, half, v1)
+    v2 = add_scaled(v1, half, a1)
     a2 = _acceleration(t_s + half, q2, v2, u, theta, g, lengths, acts, table)
-    q3, v3 = add_scaled(q1, half, v2), add_scaled(v1, half, a2)
+    q3 = add_scaled(q1, half, v2)
+    v3 = add_scaled(v1, half, a2)
     a3 = _acceleration(t_s + half, q3, v3, u, theta, g, lengths, acts, table)
-    q4, v4 = add_scaled(q1, h_s, v3), add_scaled(v1, h_s, a3)
+    q4 = add_scaled(q1, h_s, v3)
+    v4 = add_scaled(v1, h_s, a3)
     a4 = _acceleration(t_s + h_s, q4, v4, u, theta, g, lengths, acts, table)
     v_sum = (v1[0] + 2.0 * v2[0] + 2.0 * v3[0] + v4[0], v1[1] + 2.0 * v2[1] + 2.0 * v3[1] + v4[1])
     a_sum = (a1[0] + 2.0 * a2[0] + 2.0 * a3[0] + a4[0], a1[1] + 2.0 * a2[1] + 2.0 * a3[1] + a4[1])

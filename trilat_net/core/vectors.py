@@ -42,7 +42,8 @@ def put(a: Any, values: Any) -> None:
 @leaf
 def count_begun(table: Any, first: int, count: int, now: float) -> int:
     """Returns how many of so many rows, in the order of their times, begin at a time or before it."""
-    low, high = first, first + count
+    low = first
+    high = first + count
     while low < high:
         half = (low + high) // 2
         if table[half, 0] <= now:

@@ -79,7 +79,8 @@ class RunState:
                 own[:] = its
                 continue
             changed = np.flatnonzero((own != its) & floats)
-            x, y = own.view(np.float64)[changed], its.view(np.float64)[changed]
+            x = own.view(np.float64)[changed]
+            y = its.view(np.float64)[changed]
             mixed: Array = y + factor * (x - y)
             own[:] = its
             own.view(np.float64)[changed] = np.where(np.isfinite(mixed), mixed, y)
@@ -213,7 +214,8 @@ class FusedRun:
         self._taken_ticks = [0] * count
         self._plants = {i: plants[name] for i, name in enumerate(scenario.names) if name in plants}
         self._torques = {i: self._layouts[i].columns()["tau"] for i in self._plants}
-        self._acted, self._moved = dict[int, int](), dict.fromkeys(self._plants, 0)
+        self._acted = dict[int, int]()
+        self._moved = dict.fromkeys(self._plants, 0)
         self._selected: dict[int, SiteArrays] = {}
         self.ran_s = 0.0
 
@@ -228,7 +230,8 @@ class FusedRun:
             self._inputs = self._inputs._replace(feed=feed)
 
     def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
-        tables, count = self._tables, len(setups)
+        tables = self._tables
+        count = len(setups)
         self._laws: dict[int, PlainLaw | CompiledLaw] = {}
         self._law_arrays: LawArrays | None = None
         if tables.channel is None:
@@ -244,7 +247,8 @@ class FusedRun:
         rows = np.zeros((count, max((len(one.row) for one in compiled.values()), default=0)))
         for i, one in compiled.items():
             rows[i, : len(one.row)] = one.row
-            one.row, addresses[i] = rows[i], one.address
+            one.row = rows[i]
+            addresses[i] = one.address
         self._law_arrays = LawArrays(addresses, rows, sent)
 
     def step_to(self, last_ns: int) -> None:
@@ -280,18 +284,25 @@ class FusedRun:
 
     def _let_move(self, i: int) -> int:
         """Lets the plant of a site move on to the site's next tick; returns the time of the one after, ns."""
-        k, plant, own = int(self._progress[i]["tick"]), self._plants[i], self.arrays(i).site[0]
+        k = int(self._progress[i]["tick"])
+        plant = self._plants[i]
+        own = self.arrays(i).site[0]
         if k > self._moved[i]:
             plant.move(k - 1, self._last_row(i)[self._torques[i]].tolist())
-        self._moved[i], n = k, self._layouts[i].joints
-        own["q"][:n], own["qd"][:n] = plant.state.q, plant.state.qd
+        self._moved[i] = k
+        n = self._layouts[i].joints
+        own["q"][:n] = plant.state.q
+        own["qd"][:n] = plant.state.qd
         own["sensed"][:n] = [-torque for torque in plant.state.tau_x] or 0.0
         return NEVER_NS if self._progress[i]["t_ns"] == NEVER_NS else tick_ns(k + 1, plant.rate_hz)
 
     def _let_act(self, i: int) -> int:
         """Lets the hand of a site act at the ticks before it is asked again; returns the time of that, ns."""
-        progress, hand, acts = self._progress[i], self._hands[i], self._inputs.feed.hands
-        k, rate_hz = int(progress["tick"]), int(progress["rate_hz"])
+        progress = self._progress[i]
+        hand = self._hands[i]
+        acts = self._inputs.feed.hands
+        k = int(progress["tick"])
+        rate_hz = int(progress["rate_hz"])
         if progress["t_ns"] == NEVER_NS:
             return NEVER_NS
         if k < self._acted.get(i, 0):
@@ -317,7 +328,9 @@ class FusedRun:
 
     def _run_plain_until(self, last_ns: int) -> None:
         """Does as `run_until`, and asks laws in plain Python between the stages."""
-        kept, tables, laws = (self._peaks, self._sums), self._tables, self._law_arrays
+        kept = (self._peaks, self._sums)
+        tables = self._tables
+        laws = self._law_arrays
         asked = (self._progress, self._taken, self._sent, self._inputs.feed)
         progress = self._progress
         while (t_ns := int(progress["t_ns"].min())) <= last_ns and t_ns != NEVER_NS:
@@ -358,7 +371,8 @@ class FusedRun:
 
     @cached_property
     def _state(self) -> RunState:
-        laws, arrays = self._law_arrays, self._tables
+        laws = self._law_arrays
+        arrays = self._tables
         held = [self._progress, self._taken, *self._sent, self._sums]
         held += [array for array in arrays if isinstance(array, np.ndarray)]
         held += [] if arrays.channel is None else [*arrays.channel]
@@ -380,10 +394,12 @@ class FusedRun:
         """
         assert not self.has_programs
         self._state.approach(other._state, factor)
-        self._changes, self._taken_ticks = deque(other._changes), list(other._taken_ticks)
+        self._changes = deque(other._changes)
+        self._taken_ticks = list(other._taken_ticks)
         for i, law in self._laws.items():
             if isinstance(law, PlainLaw):
-                own, its = np.array(law.memory), np.array(other._laws[i].memory)
+                own = np.array(law.memory)
+                its = np.array(other._laws[i].memory)
                 law.recall((its + factor * (own - its)).tolist())
 
     def arrays(self, i: int) -> SiteArrays:
@@ -541,7 +557,8 @@ def read_run_inputs(log: Log) -> RunInputs:
     changes = [one for _, one in sorted(listed, key=lambda timed: timed[0])]
     models = [change.model for _, _, change in changes if change.model is not None]
     longest_us = max_delay_us(models, [None] * len(models)) if models else 0
-    feed, late_ns = make_prompt_inputs(len(log.scenario.names)).feed, 0
+    feed = make_prompt_inputs(len(log.scenario.names)).feed
+    late_ns = 0
     if log.driver != "virtual":
         first, samples, late_ns = _list_arrivals(log, ticks)
         feed = feed._replace(first=first, samples=samples)
@@ -559,7 +576,8 @@ def _list_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
         came = np.repeat(part.tick, counts)
         for p, peer in enumerate(part.peers):
             known = (rows[:, 0] == p) & (rows[:, 1] >= 0) & (rows[:, 1] <= log[peer].last_tick)
-            sent, stamps_ns = rows[known, 1], rows[known, 1] * NS_PER_S // log[peer].rate_hz
+            sent = rows[known, 1]
+            stamps_ns = rows[known, 1] * NS_PER_S // log[peer].rate_hz
             at = np.maximum(came[known], -(-(stamps_ns + 1) * part.rate_hz // NS_PER_S))
             order = np.argsort(at, kind="stable")
             first[i, p] = total + np.searchsorted(at[order], np.arange(ticks + 1))
@@ -584,9 +602,12 @@ def _add_hands(feed: RecordedFeed, log: Log, ticks: int) -> RecordedFeed:
 
 def _write_actions(acts: Array, k: int, block: Array) -> None:
     """Writes what a hand does from tick k on, a row as `HandInForce`, as a feed has it."""
-    own, size = (block.shape[1] - 3) // 2, (acts.shape[1] - 1) // 2
-    target, part = block[:, 3 : 3 + own], acts[k : k + len(block)]
-    part[:, 0], part[:, 1 : 1 + own] = block[:, 0], target
+    own = (block.shape[1] - 3) // 2
+    size = (acts.shape[1] - 1) // 2
+    target = block[:, 3 : 3 + own]
+    part = acts[k : k + len(block)]
+    part[:, 0] = block[:, 0]
+    part[:, 1 : 1 + own] = target
     part[:, 1 + size : 1 + size + own] = target + block[:, 3 + own :]
 
 

@@ -45,7 +45,8 @@ class LogCheckReport(CheckReport):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat verify --json`: every gap, the first difference."""
-        result, first = self.result, self.result.first
+        result = self.result
+        first = self.result.first
         return {
             "files": list(self.log.sources),
             "passed": self.passed,
@@ -131,14 +132,16 @@ def _checks(log: Log, result: VerifyResult, *, virtual: bool, progress: Progress
         if why and log.driver != "virtual":
             yield Finding("plain virtual time", f"is another run: {why}", True)
             return
-        late, gone = twins.late, twins.lost
+        late = twins.late
+        gone = twins.lost
         came = f"{count_nouns(len(late), 'late sample')}" + (f", the first: {late[0]}" if late else "")
         lost = f"; {len(gone)} lost on the way, the first: {gone[0]}" if gone else ""
         yield _virtual_line(f"plain virtual time ({came}{lost})", twins.plain, twins.excused_from)
 
 
 def _records_line(log: Log, result: VerifyResult) -> Finding:
-    have, coverage = sum(len(log[name]) for name in result.coverage.expected), result.coverage
+    have = sum(len(log[name]) for name in result.coverage.expected)
+    coverage = result.coverage
     text = f"{have}/{sum(coverage.expected.values())} in the file"
     text += f"; {coverage.describe(result.min_coverage)}" if coverage.expected else ""
     text += f"; {', '.join(result.withheld)} not judged" if result.withheld else ""

@@ -117,9 +117,11 @@ def compare_site_rerun(
     log: Log, request: RerunRequest, site: RerunSite, ticks: Sequence[RerunTick]
 ) -> tuple[SiteEffect, list[LinkEffect]]:
     """Returns the effect of a rerun on a site after its last tick, and on the links on which it receives."""
-    before, executed = log[site.name], [tick for tick in ticks if not tick.kept]
+    before = log[site.name]
+    executed = [tick for tick in ticks if not tick.kept]
     rate_hz = request.scenario.sites[site.name].rate_hz
-    payloads, layout = [tick.payload for tick in executed], request.scenario.layout(site.name)
+    payloads = [tick.payload for tick in executed]
+    layout = request.scenario.layout(site.name)
     axes = request.scenario.arms[site.name].axes
     after = SiteLog(site.name, before.peers, rate_hz, payloads, "rerun", layout=layout, axes=axes)
     _, rows, rows_here = np.intersect1d(before.t_ns, after.t_ns, return_indices=True)
@@ -141,7 +143,8 @@ def compare_site_rerun(
     with np.errstate(over="ignore"):  # a damaged log holds any finite numbers
         moved = after.q[rows_here] - before.q[rows]
         place = int(np.abs(moved).max(axis=1).argmax())
-        errors, torques = (before.e[rows], after.e[rows_here]), (before.tau[rows], after.tau[rows_here])
+        errors = (before.e[rows], after.e[rows_here])
+        torques = (before.tau[rows], after.tau[rows_here])
         return effect._replace(
             q_rms_rad=_rms(moved),
             q_max_rad=_largest(moved),
@@ -213,15 +216,18 @@ class Rerun(Result):
             LogError: the log's epoch is no time.
             LogRefused: the disk refused.
         """
-        log, request = self.before, self.request
-        session, epoch = log.session["session"], log.session.get("epoch_unix_ns", "0")
+        log = self.before
+        request = self.request
+        session = log.session["session"]
+        epoch = log.session.get("epoch_unix_ns", "0")
         if not epoch.isdecimal() or (epoch_unix_ns := int(epoch)) > MAX_TIME_NS:
             raise LogError(f"{log.source}: its epoch_unix_ns is no time: {epoch[:40]!r}")
         metadata = rerun_metadata(log, request)
         writer = LogWriter(
             stream, request.scenario, session, RERUN_DRIVER, epoch_unix_ns, metadata, views_hz=views_hz
         )
-        channels, entries = {}, []
+        channels = {}
+        entries = []
         for name in log.sites:
             boot = log[name].states[0].boot if len(log[name]) else 0
             own = channels[name] = SiteChannels(request.scenario, session, name, boot)
@@ -373,7 +379,8 @@ def _nest(value: Any) -> Any:
 
 
 def _describe_limits(again: Rerun) -> Iterator[str]:
-    log, request = again.before, again.request
+    log = again.before
+    request = again.request
     if request.recorded and request.changes:
         sites = " and ".join(request.recorded)
         are, do = ("are", "they do") if len(request.recorded) > 1 else ("is", "it does")

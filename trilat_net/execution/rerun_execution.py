@@ -192,7 +192,8 @@ def _describe_parts(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
 
 def _describe_whole(request: RerunRequest, group: str, owner: str, key: str) -> tuple[str, str, str] | None:
     """Describes a link, or a law of another kind, as a whole; None if single values say it all."""
-    before, after = request.original, request.scenario
+    before = request.original
+    after = request.scenario
     if group == "links":
         links = [scenario.links[owner].describe() for scenario in (before, after)]
         return None if links[0] == links[1] else ("link", owner, " -> ".join(links))
@@ -250,14 +251,19 @@ class RerunSite:
         deliveries: Deliveries,
         samples: Mapping[str, Mapping[int, ReceivedMotion]],
     ) -> None:
-        self.name, scenario, part = name, request.scenario, log[name]
+        self.name = name
+        scenario = request.scenario
+        part = log[name]
         self.k = deliveries.first
         self.first: RecordDifference | None = None
         self.lacking = 0
         self.diverged = False
         setup = scenario.setup(name)
-        self._site, self._channel = Site(setup), setup.channel
-        self._part, self.deliveries, self._changed = part, deliveries, bool(request.changes)
+        self._site = Site(setup)
+        self._channel = setup.channel
+        self._part = part
+        self.deliveries = deliveries
+        self._changed = bool(request.changes)
         self._inputs = RecordedInputs(part, samples, log.last_ticks, log.commands(name), setup.links)
         self._last = min(deliveries.last, scenario.ticks(name) - 1)
         same_rate = self._site.rate_hz == part.rate_hz
@@ -311,7 +317,8 @@ class RerunSite:
         stats = self._stats.take(output) if self._stats.due(self.k) else None
         same = False
         if n is not None:
-            state, peers = self._part.states[n], self._part.peers
+            state = self._part.states[n]
+            peers = self._part.peers
             # arrivals have another CRC if peers are changed or the log lacks a sample
             comparable = output._replace(rx_crc=state.rx_crc) if self._changed or missing else output
             same = equal_record(state, comparable, peers)
@@ -342,7 +349,8 @@ class RerunExecution:
     """
 
     def __init__(self, log: Log, request: RerunRequest) -> None:
-        self._log, self._request = log, request
+        self._log = log
+        self._request = request
         self._recent: dict[str, dict[int, Arrival]] = {name: {} for name in request.replaced}
         samples: dict[str, Mapping[int, ReceivedMotion]] = {
             name: log[name].by_tick for name in request.recorded
@@ -354,7 +362,9 @@ class RerunExecution:
         }
 
     def _find_deliveries(self, name: str) -> Deliveries:
-        part, original, scenario = self._log[name], self._log.scenario, self._request.scenario
+        part = self._log[name]
+        original = self._log.scenario
+        scenario = self._request.scenario
         if not self._request.changes:
             return recorded_deliveries(part)
         before = [original.sites[peer].rate_hz for peer in part.peers]
@@ -378,13 +388,15 @@ class RerunExecution:
         sites = list(self.sites.values())
         total = sum(site.deliveries.last + 1 - site.deliveries.first for site in sites)
         pending = sorted((site.t_ns, place, site.k) for place, site in enumerate(sites) if not site.done)
-        done, last_ns = 0, None
+        done = 0
+        last_ns = None
         while pending and (last_ns is None or pending[0][0] <= last_ns):
             first = next((n for n, (_, at, k) in enumerate(pending) if self._is_ready(at, k)), 0)
             t_ns, place, _ = pending.pop(first)
             site = sites[place]
             made = site.advance()
-            output, recent = site.output, self._recent[site.name]
+            output = site.output
+            recent = self._recent[site.name]
             recent[output.tick] = make_arrival(0, output.tick, output)
             if len(recent) > MEMORY_S * self._request.scenario.sites[site.name].rate_hz:
                 del recent[next(iter(recent))]

@@ -82,7 +82,8 @@ class RecordedInputs(Generic[Change]):
         changes: Mapping[int, Sequence[Change]],
         links: Sequence[LinkSetup],
     ) -> None:
-        self._part, self._links = part, links
+        self._part = part
+        self._links = links
         self.samples = [samples[peer] for peer in part.peers]
         self.ends = [ends[peer] for peer in part.peers]
         self._changes = sorted(changes.items(), reverse=True)
@@ -132,7 +133,8 @@ class RecordedInputs(Generic[Change]):
 
     def resume(self, site: Site, n: int, changes: Sequence[CoreChange] = ()) -> None:
         """Brings a site into its state at record n, after `changes`, if it `can_resume` there."""
-        states, peers = self._part.states, self._part.peers
+        states = self._part.states
+        peers = self._part.peers
         for change in changes:
             site.order(change, states[n].t_ns)
         before, last = (read_output(states[m], peers) for m in (n - 2, n - 1))

@@ -119,7 +119,8 @@ def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
     return [one._replace(again=True, largest=LARGEST) for one in pushes]
 
 
-LEAST_PUSH, MOST_PUSH = 1e-11, 1.0
+LEAST_PUSH = 1e-11
+MOST_PUSH = 1.0
 """A smaller push is lost in the rounding of the numbers; a larger one is another run."""
 _TARGET = re.compile(r"(?:([a-z][a-z0-9_]*)\.)?(qd?|theta)([1-9]\d*)?")
 
@@ -133,7 +134,8 @@ def aim_push(scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: floa
         UsageError: there is no such number, or no such size.
     """
     site, kind, number = found.groups() if (found := _TARGET.fullmatch(target)) else (None, "", "1")
-    layouts, adaptive = {name: scenario.layout(name) for name in scenario.names}, Law.ADAPTIVE
+    layouts = {name: scenario.layout(name) for name in scenario.names}
+    adaptive = Law.ADAPTIVE
     joints = [one.joints for one in layouts.values()]
     estimates = [one.parameters * (scenario.gains(name).law is adaptive) for name, one in layouts.items()]
     part, counts = ("estimate", estimates) if kind == "theta" else ("joint", joints)
@@ -149,13 +151,15 @@ def aim_push(scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: floa
         raise UsageError(
             f"--push {target}={size:g}: a push is of a size from {LEAST_PUSH:g} to {MOST_PUSH:g}"
         )
-    chance, by = np.random.Generator(np.random.Philox(0)), np.zeros((len(counts), max(counts)))
+    chance = np.random.Generator(np.random.Philox(0))
+    by = np.zeros((len(counts), max(counts)))
     for n in owners:
         one = np.arange(counts[n]) == int(number or 0) - 1
         by[n, : counts[n]] = size * (one if number else chance.uniform(-1.0, 1.0, counts[n]))
     unit = {"q": "rad at", "qd": "rad/s at", "theta": "of"}[kind]
     of = f"{site} {part} {number}" if number else f"all {part}s{f' of {site}' if site else ''}"
-    field, largest = "theta_hat" if kind == "theta" else kind, LARGEST if abs(size) < LARGEST else math.inf
+    field = "theta_hat" if kind == "theta" else kind
+    largest = LARGEST if abs(size) < LARGEST else math.inf
     return Push(f"{size:g} {unit} {of}", field, by, at_s, False, largest)
 
 
@@ -194,7 +198,8 @@ class _TwinRuns:
         inputs: RunInputs | None = None,
         log: Log | None = None,
     ) -> None:
-        self._log, self._pushes = log, pushes
+        self._log = log
+        self._pushes = pushes
         self._layouts = [scenario.layout(name) for name in scenario.names]
         rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
         end_s = max(n / hz for n, hz in zip(ticks, rates_hz, strict=True))
@@ -206,7 +211,8 @@ class _TwinRuns:
         runs = [FusedRun(scenario, keep=keep, inputs=inputs) for _ in range(1 + len(pushes))]
         for run in runs:
             run.plan(ticks)
-        self._run, self._twins = runs[0], runs[1:]
+        self._run = runs[0]
+        self._twins = runs[1:]
         self._joints = list_joints(scenario)
         shape = math.ceil(self._ends[-1] * BUCKETS_PER_S) + 1, len(self._joints)
         self._largest = np.full((len(pushes), *shape), -np.inf)
@@ -256,7 +262,8 @@ class _TwinRuns:
 
     def _compare(self, log: Log, kept: Sequence[tuple[Ints, Array]]) -> None:
         for name, layout, (t_ns, rows) in zip(log.sites, self._layouts, kept, strict=True):
-            part, columns = log[name], layout.columns()
+            part = log[name]
+            columns = layout.columns()
             first = int(np.searchsorted(part.t_ns, t_ns[0])) if len(t_ns) else 0
             here = slice(first, first + len(t_ns))
             for signal, recorded in (("q", part.q[here]), ("qd", part.qd[here]), ("tau", part.tau[here])):
@@ -273,7 +280,8 @@ class _TwinRuns:
     ) -> Iterator[tuple[tuple[Ints, ...], Ints, Array, Array]]:
         place = 0
         for layout, (t_ns, rows), (own_ns, own_rows) in zip(self._layouts, kept, own, strict=True):
-            qd, made = layout.columns()["qd"], min(len(t_ns), len(own_ns))
+            qd = layout.columns()["qd"]
+            made = min(len(t_ns), len(own_ns))
             if made:
                 buckets = t_ns[:made] * BUCKETS_PER_S // NS_PER_S
                 starts = np.flatnonzero(np.diff(buckets, prepend=-1))
@@ -290,7 +298,9 @@ class _TwinRuns:
             self._scales[n, at[0].reshape(-1)] = self._scale[n]
 
     def _renew(self, n: int, end_s: float) -> None:
-        twin, last, push = self._twins[n], round(end_s * BUCKETS_PER_S), self._pushes[n]
+        twin = self._twins[n]
+        last = round(end_s * BUCKETS_PER_S)
+        push = self._pushes[n]
         q, qd = (twin.measure_distance(self._run, field) for field in ("q", "qd"))
         pushed = float(np.abs(push.by).max())  # nothing is made larger than it is
         recent = self._largest[n, max(0, last - BUCKETS_PER_S) : last].max(initial=-np.inf) - self._scale[n]

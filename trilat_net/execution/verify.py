@@ -85,7 +85,8 @@ def _pack(a: State | TickRecord) -> bytes:
 
 def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) -> bool:
     """True if every computed field of a record has the same bits; fast, for the common case."""
-    a, b = logged, computed
+    a = logged
+    b = computed
     return (
         _pack(a) == _pack(b)
         and a.used == dict(zip(peers, b.used, strict=True))
@@ -121,7 +122,8 @@ def _compare_fields(
     yield "mode", logged.mode, mode, logged.mode == mode
     sent = [f"ch.{entry}" for entry in channel.entries(peers)]
     for vector in STATE_VECTORS:
-        before, now = getattr(logged, vector), getattr(computed, vector)
+        before = getattr(logged, vector)
+        now = getattr(computed, vector)
         if len(before) != len(now):
             yield f"{vector} (how many numbers)", len(before), len(now), False
             continue
@@ -130,7 +132,8 @@ def _compare_fields(
             yield name, float(a), b, equal(float(a), b)
     used = dict(zip(peers, computed.used, strict=True))
     for peer in sorted({*logged.used, *used}):
-        a, b = logged.used.get(peer), used.get(peer)
+        a = logged.used.get(peer)
+        b = used.get(peer)
         yield f"used[{peer}]", a, b, a == b
     yield "rx (its CRC-32)", logged.rx_crc, computed.rx_crc, logged.rx_crc == computed.rx_crc
     yield "cmd", logged.cmd, computed.cmd, logged.cmd == computed.cmd
@@ -221,17 +224,21 @@ class SiteVerifier:
         result: VerifyResult,
         resume_every: int = 0,
     ) -> None:
-        self._resume_every, self._first = resume_every, 0
+        self._resume_every = resume_every
+        self._first = 0
         self._taken: list[CoreChange] = []
         self._setup = setup = log.scenario.setup(site)
-        self._site, self._channel = Site(setup), setup.channel
+        self._site = Site(setup)
+        self._channel = setup.channel
         self._starts = {boot: first for first, boot in log.starts.get(site, ())}
         self._absences = {last + 1: first for first, last in log.absences.get(site, ())}
         reflects = setup.own is not None or any(setup.gains.k_f)
         self._apart = setup.on_stale.action is StaleAction.GLIDE and not reflects
         self._boot: int | None = None
         self._began = 0  # the place of the first record of this start
-        self._scenario, self._log, self._result = log.scenario, log[site], result
+        self._scenario = log.scenario
+        self._log = log[site]
+        self._result = result
         self._external = site in log.scenario.external
         self._law_failed = False
         self._own_end = log.last_ticks[site]
@@ -241,7 +248,9 @@ class SiteVerifier:
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
         """Executes every record; `report` gets the number of records of all sites so far, now and then."""
-        result, states, name = self._result, self._log.states, self._log.name
+        result = self._result
+        states = self._log.states
+        name = self._log.name
         before = result.records - result.unjudged
         expected = 0
         for n, state in enumerate(states):
@@ -283,7 +292,8 @@ class SiteVerifier:
 
     def _begin_start(self, n: int, expected: int) -> int:
         """Goes over to the start of the site that made record n; returns its first tick."""
-        self._boot, self._began = self._log.states[n].boot, n
+        self._boot = self._log.states[n].boot
+        self._began = n
         first = self._starts.get(self._boot)
         if first is None or first < expected:
             return expected
@@ -293,7 +303,9 @@ class SiteVerifier:
         if absent < first:
             self._result.absences.append((self._log.name, absent, first - 1))
         self._inputs.take_changes(first - 1)  # the start before took them in
-        self._site, self._certain, self._first = Site(self._setup), True, first
+        self._site = Site(self._setup)
+        self._certain = True
+        self._first = first
         self._taken.clear()
         self._site.begin_at(first)
         return first
@@ -303,7 +315,8 @@ class SiteVerifier:
         known = self._certain and n - 2 >= self._began
         if not known or self._law_failed or not self._inputs.can_resume(n, apart=self._apart):
             return
-        self._site, self._certain = Site(self._setup), False
+        self._site = Site(self._setup)
+        self._certain = False
         if self._first:
             self._site.begin_at(self._first)
         for change in self._taken:
@@ -316,7 +329,9 @@ class SiteVerifier:
         return None if state.site == name else RecordDifference(name, state.tick, "site", state.site, name)
 
     def _verify_record(self, n: int, state: State) -> None:
-        result, states, peers = self._result, self._log.states, self._log.peers
+        result = self._result
+        states = self._log.states
+        peers = self._log.peers
         difference = self._find_other_sender(state)
         if not result.whole_run and n - 2 >= self._began and states[n - 2].tick == state.tick - 2:
             self._site.resume(read_output(states[n - 2], peers), read_output(states[n - 1], peers))
@@ -361,7 +376,8 @@ class SiteVerifier:
                 invalid = RecordDifference(state.site, state.tick, "rx (peer)", peer, "an index of a peer")
                 return state.rx[:n], invalid
             if tick not in self._inputs.samples[peer] and not 0 <= tick <= self._inputs.ends[peer]:
-                valid, where = f"a tick from 0 to {self._inputs.ends[peer]}", f"rx[{self._log.peers[peer]}]"
+                valid = f"a tick from 0 to {self._inputs.ends[peer]}"
+                where = f"rx[{self._log.peers[peer]}]"
                 return state.rx[:n], RecordDifference(state.site, state.tick, where, tick, valid)
         return state.rx, None
 

@@ -69,9 +69,12 @@ class SiteChannels:
     """Turns the ticks and messages of one site into entries, writes them, and keeps their accounts."""
 
     def __init__(self, scenario: Scenario, session: str, site: str, boot: int) -> None:
-        self.peers, rate_hz = scenario.peers(site), scenario.sites[site].rate_hz
+        self.peers = scenario.peers(site)
+        rate_hz = scenario.sites[site].rate_hz
         self._glides = scenario.sites[site].on_stale.action == "glide"
-        self._site, self._boot, self._rate_hz = site, boot, rate_hz
+        self._site = site
+        self._boot = boot
+        self._rate_hz = rate_hz
         self.keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
         self.accounts = {channel: Account() for channel in SITE_CHANNELS}
         self._mode = Mode.RUN
@@ -83,7 +86,8 @@ class SiteChannels:
         self, output: TickRecord, stats: LinkStats | None, law_failure: Exception | None = None
     ) -> Sequence[SiteEntry]:
         """Returns the entries after the record of an executed tick: statistics if any, change of mode."""
-        self.ticks, self._t_ns = output.tick + 1, output.t_ns
+        self.ticks = output.tick + 1
+        self._t_ns = output.t_ns
         self._excuse_skipped(output.tick, output.cmd)
         entries = [] if stats is None else [self.stats(stats)]
         if output.mode is not self._mode:
@@ -123,7 +127,8 @@ class SiteChannels:
         if state.v != VERSION:
             arrivals = [Arrival(peer, tick, (), (), us) for peer, tick, us in state.rx]
             output = read_output(state, self.peers)
-            late_us, busy_us = state.late_us, state.busy_us
+            late_us = state.late_us
+            busy_us = state.busy_us
             payload = encode_state(
                 state.site, state.boot, self.peers, output, arrivals, late_us, busy_us, sent_ns, state.echo
             )
@@ -233,8 +238,10 @@ def execute_virtual(
         t_ns, index, k = pending.pop(place)
         site = sites[index]
         arrivals = take_parts(joined.deliver(site.name, k), setups[index].links)
-        ordered, arm = commands.get(site.name, {}), measured.get(site.name, {})
-        hand, plant = hands[site.name](site, k) if site.name in hands else (), plants.get(site.name)
+        ordered = commands.get(site.name, {})
+        arm = measured.get(site.name, {})
+        hand = hands[site.name](site, k) if site.name in hands else ()
+        plant = plants.get(site.name)
         at = arm.get(k) if plant is None else plant.state
         output = site.step(TickInput(k, arrivals, ordered.get(k, ()), at, hand))
         if plant is not None:
@@ -259,7 +266,8 @@ class _VirtualChannels(SiteChannels):
     def __init__(self, scenario: Scenario, site: Site, writer: LogWriter) -> None:
         boot = virtual_boot(scenario, site.name)
         super().__init__(scenario, scenario.name, site.name, boot)
-        self._writer, self._runs = writer, site
+        self._writer = writer
+        self._runs = site
         self._stats = LoopStats(site, boot)
 
     def tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
@@ -303,7 +311,8 @@ def write_virtual_log(
         LawFailed: a user law failed; the log holds an event with the reason.
     """
     check_virtual(scenario)
-    own, plants = make_hand_players(scenario), make_plant_players(scenario)
+    own = make_hand_players(scenario)
+    plants = make_plant_players(scenario)
     acts = {**{name: player.track for name, player in own.items()}, **hands}
     writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, views_hz=views_hz)
     members: dict[str, _VirtualChannels] = {}

@@ -87,7 +87,8 @@ def find_absent_samples(log: Log) -> list[LateSample]:
     absent = []
     for name in log.sites:
         site = Site(log.scenario.setup(name)._replace(own=None))  # only its links matter: no law runs
-        part, ordered = log[name], log.commands(name)
+        part = log[name]
+        ordered = log.commands(name)
         _, rows = part.arrivals
         ticks = [log.scenario.ticks(peer) for peer in part.peers]
         came = [set(rows[rows[:, 0] == j, 1].tolist()) for j in range(len(part.peers))]

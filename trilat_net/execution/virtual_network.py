@@ -83,7 +83,8 @@ class RecordedNetwork:
 
     def ready(self, receiver: str, k: int) -> bool:
         """See `Network`. A loop that was late received samples of ticks ahead of its own."""
-        peers, entries = self._peers[receiver], self._schedule[receiver].get(k, ())
+        peers = self._peers[receiver]
+        entries = self._schedule[receiver].get(k, ())
         asked, came = self._came[receiver]
         n = came if asked == k else 0
         while n < len(entries) and (peers[entries[n][0]], entries[n][1]) in self._sent:
@@ -139,7 +140,8 @@ def complete_deliveries(part: SiteLog, rates_hz: Sequence[int], ends: Sequence[i
         LogError: fewer than half of those ticks have a record.
     """
     known = recorded_deliveries(part)
-    at, ticks = known.at, known.last + 1 - known.first
+    at = known.at
+    ticks = known.last + 1 - known.first
     if len(at) == ticks:
         return known
     if 2 * len(at) < ticks:

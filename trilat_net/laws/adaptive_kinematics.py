@@ -35,10 +35,13 @@ LEAST_SINE = 0.1
 @leaf
 def _solve(l1: float, l2: float, q0: float, q1: float, b0: float, b1: float) -> tuple[float, float]:
     """Returns J^-1 b of the planar arm with these lengths."""
-    (s0, c0), (s01, c01), (bend, _) = sincos(q0), sincos(q0 + q1), sincos(q1)
+    (s0, c0) = sincos(q0)
+    (s01, c01) = sincos(q0 + q1)
+    (bend, _) = sincos(q1)
     if abs(bend) < LEAST_SINE:
         bend = LEAST_SINE if bend >= 0.0 else -LEAST_SINE
-    x, y = l1 * c0 + l2 * c01, l1 * s0 + l2 * s01
+    x = l1 * c0 + l2 * c01
+    y = l1 * s0 + l2 * s01
     determinant = l1 * l2 * bend
     return l2 * (c01 * b0 + s01 * b1) / determinant, -(x * b0 + y * b1) / determinant
 
@@ -48,9 +51,12 @@ def _move(
     lengths: tuple[float, float], q: tuple[float, float], qd: tuple[float, float]
 ) -> tuple[float, float, float, float]:
     """Returns place and velocity of the end effector."""
-    (s0, c0), (s01, c01) = sincos(q[0]), sincos(q[0] + q[1])
-    inner, outer = lengths[0] * qd[0], lengths[1] * (qd[0] + qd[1])
-    x, y = lengths[0] * c0 + lengths[1] * c01, lengths[0] * s0 + lengths[1] * s01
+    (s0, c0) = sincos(q[0])
+    (s01, c01) = sincos(q[0] + q[1])
+    inner = lengths[0] * qd[0]
+    outer = lengths[1] * (qd[0] + qd[1])
+    x = lengths[0] * c0 + lengths[1] * c01
+    y = lengths[0] * s0 + lengths[1] * s01
     return x, y, -s0 * inner - s01 * outer, c0 * inner + c01 * outer
 
 
@@ -63,8 +69,10 @@ def _turn(
     v: tuple[float, float],
 ) -> tuple[float, float]:
     """Returns the derivative of the Jacobian, with the joints and the lengths at these rates, times v."""
-    (s0, c0), (s01, c01) = sincos(q[0]), sincos(q[0] + q[1])
-    inner, outer = lengths[0] * qd[0], lengths[1] * (qd[0] + qd[1])
+    (s0, c0) = sincos(q[0])
+    (s01, c01) = sincos(q[0] + q[1])
+    inner = lengths[0] * qd[0]
+    outer = lengths[1] * (qd[0] + qd[1])
     v01 = v[0] + v[1]
     return (
         -(inner * c0 + rates[0] * s0) * v[0] - (outer * c01 + rates[1] * s01) * v01,
@@ -116,26 +124,38 @@ class AdaptiveKinematics(ControlLaw):
 
     def begin(self, facts: LawContext) -> None:
         """Makes both estimates and their rates."""
-        self.theta_hat, self.lengths_m = list(self.theta_hat0), list(self.lengths0_m)
-        self.Yr, self.rate_m_s = [0.0] * len(self.theta_hat), [0.0, 0.0]
+        self.theta_hat = list(self.theta_hat0)
+        self.lengths_m = list(self.lengths0_m)
+        self.Yr = [0.0] * len(self.theta_hat)
+        self.rate_m_s = [0.0, 0.0]
         self.measured = list(facts.lengths_m)  # what an instrument at the end effector goes by
         self.g_m_s2 = facts.g_m_s2
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque, the estimate, and what peers get of the end effector."""
-        q, qd = (now.q[0], now.q[1]), (now.qd[0], now.qd[1])
+        q = (now.q[0], now.q[1])
+        qd = (now.qd[0], now.qd[1])
         x, y, xd, yd = _move((self.measured[0], self.measured[1]), q, qd)
-        now.to_all.x[0], now.to_all.x[1], now.to_all.xd[0], now.to_all.xd[1] = x, y, xd, yd
-        e0, e1, ed0, ed1 = 0.0, 0.0, xd, yd
+        now.to_all.x[0] = x
+        now.to_all.x[1] = y
+        now.to_all.xd[0] = xd
+        now.to_all.xd[1] = yd
+        e0 = 0.0
+        e1 = 0.0
+        ed0 = xd
+        ed1 = yd
         for j in range(len(now.peers)):
-            peer, came = now.peers[j], now.received[j]
+            peer = now.peers[j]
+            came = now.received[j]
             if peer.tick >= 0:  # a peer of whom nothing came yet is where the arm itself is, and stands
                 e0 += peer.alpha * (x - came.x[0])
                 e1 += peer.alpha * (y - came.x[1])
                 ed0 -= peer.alpha * came.xd[0]
                 ed1 -= peer.alpha * came.xd[1]
-        (s0, c0), (s01, c01) = sincos(q[0]), sincos(q[0] + q[1])
-        f0, f1 = self.Kd[0] * ed0, self.Kd[1] * ed1
+        (s0, c0) = sincos(q[0])
+        (s01, c01) = sincos(q[0] + q[1])
+        f0 = self.Kd[0] * ed0
+        f1 = self.Kd[1] * ed1
         pull = (c0 * f1 - s0 * f0, c01 * f1 - s01 * f0)
         for i in range(2):
             rate = self.length_gain_m_n * pull[i] * (qd[0] + i * qd[1])  # Y_k' Kd ed
@@ -143,7 +163,8 @@ class AdaptiveKinematics(ControlLaw):
                 length = self.lengths_m[i] + 0.5 * now.h_s * (self.rate_m_s[i] + rate)
                 self.lengths_m[i] = min(max(length, self.least_m), self.most_m)
             self.rate_m_s[i] = rate
-        l1, l2 = self.lengths_m[0], self.lengths_m[1]
+        l1 = self.lengths_m[0]
+        l2 = self.lengths_m[1]
         g1 = self.rate_m_s[0] if self.least_m < l1 < self.most_m else 0.0
         g2 = self.rate_m_s[1] if self.least_m < l2 < self.most_m else 0.0
         v = _solve(l1, l2, q[0], q[1], -self.Lambda[0] * e0, -self.Lambda[1] * e1)

@@ -88,7 +88,9 @@ def judge_position_exchange(situation: LawSituation, stiffness: str, damping: st
     h / 2 later: d is K h / 2 less and T is h / 2 more, for arms whose least inertia is above d h / 2
     (docs/laws.md).
     """
-    T, laws, h = situation.longest_s, situation.laws, situation.hold_s
+    T = situation.longest_s
+    laws = situation.laws
+    h = situation.hold_s
     K, d = (np.array([getattr(law, key, [np.nan]) for law in laws]) for key in (stiffness, damping))
     if np.isnan(T) or np.isnan(K).any():
         return StabilityCondition(None, "known for constant delays, and with this law at all sites")
@@ -97,7 +99,8 @@ def judge_position_exchange(situation: LawSituation, stiffness: str, damping: st
     scope = f"sufficient for arms above d h / 2 = {0.5 * float(d.max()) * h:.3g} kg m^2" if h else ""
     if h and any(np.any(getattr(law, "Kd", 0.0)) for law in laws):
         scope = "sufficient for heavy arms"
-    scope, own = scope or "sufficient whatever the masses", d - 0.5 * K * h
+    scope = scope or "sufficient whatever the masses"
+    own = d - 0.5 * K * h
     if len(laws) == 2:
         both = float(situation.delay_s.sum()) + h
         pulls = situation.alpha[0, 1] * situation.alpha[1, 0] * K[0] * K[1]
@@ -167,7 +170,9 @@ class LinearForm:
     """
 
     def __init__(self, joints: int, states: Sequence[str] = (), *, sends_acceleration: bool = False) -> None:
-        self.joints, self.states, self.sends_acceleration = joints, tuple(states), sends_acceleration
+        self.joints = joints
+        self.states = tuple(states)
+        self.sends_acceleration = sends_acceleration
         self.blocks: dict[tuple[Place, Place], Array] = {}
 
     def add(self, row: Place, column: Place, gain: Any) -> None:

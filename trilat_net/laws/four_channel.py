@@ -78,7 +78,8 @@ class FourChannel(ControlLaw):
             now.tau[i] = tau
         if self.acceleration == 0.0:
             return
-        rows, width = self.rows, n + 1
+        rows = self.rows
+        width = n + 1
         for i in range(n):
             for j in range(n):
                 rows[i * width + j] = now.inertia[i][j]

@@ -74,7 +74,8 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
         )
         raise ScenarioError(problem, path=f"{path}.sends")
     if channel.floats > MAX_RECORD_SENT:
-        count, most = channel.floats, MAX_RECORD_SENT
+        count = channel.floats
+        most = MAX_RECORD_SENT
         problem = (
             f"sends {count_nouns(count, 'number')} to "
             f"{count_nouns(channel.peers, 'peer')} together, and a record holds at most {most}"

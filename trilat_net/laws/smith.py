@@ -77,7 +77,9 @@ class Smith(ControlLaw):
 
     def linear_form(self, at: LinearSituation) -> LinearForm | None:
         """Returns the model, which the master has under its own pose and the slave under what came."""
-        (peer,), K, m = at.peers, np.array(self.K), np.array(self.inertia)
+        (peer,) = at.peers
+        K = np.array(self.K)
+        m = np.array(self.inertia)
         form = LinearForm(len(at.inertia), ("x", "xd"))
         form.add("x", "xd", 1.0)
         form.add("xd", "x", -K / m)

@@ -53,11 +53,15 @@ class Sync(ControlLaw):
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque and the estimate."""
-        q0, q1, w0, w1 = now.q[0], now.q[1], now.qd[0], now.qd[1]
+        q0 = now.q[0]
+        q1 = now.q[1]
+        w0 = now.qd[0]
+        w1 = now.qd[1]
         v = (-self.Lambda[0] * q0, -self.Lambda[1] * q1)
         a = (-self.Lambda[0] * w0, -self.Lambda[1] * w1)
         first, second = regressor(self.g_m_s2, (q0, q1), (w0, w1), v, a)
-        r0, r1 = w0 - v[0], w1 - v[1]
+        r0 = w0 - v[0]
+        r1 = w1 - v[1]
         now.tau[0] = self.K[0] * (now.qd_des[0] + self.Lambda[0] * now.q_des[0] - r0)
         now.tau[1] = self.K[1] * (now.qd_des[1] + self.Lambda[1] * now.q_des[1] - r1)
         for p in range(len(self.Yr)):

@@ -64,7 +64,8 @@ class Tanks(EnergyLaw):
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque, and sends the packets."""
-        n, peers = now.joints, len(now.peers)
+        n = now.joints
+        peers = len(now.peers)
         H = now.to_all.H[0]
         for i in range(n):
             H -= (now.tau_before[i] - self.carried[i]) * (now.q[i] - now.q_before[i])
@@ -79,11 +80,13 @@ class Tanks(EnergyLaw):
         now.to_all.H[0] = H
         power = force = 0.0
         for i in range(n):
-            error, rate = now.q[i] - now.q_des[i], now.qd[i] - now.qd_des[i]
+            error = now.q[i] - now.q_des[i]
+            rate = now.qd[i] - now.qd_des[i]
             now.tau[i] = -self.K[i] * error - self.Kd[i] * rate - self.d[i] * now.qd[i]
             power += now.tau[i] * now.qd[i]
             force += abs(now.tau[i])
-        affordable, damping = 1.0, 0.0
+        affordable = 1.0
+        damping = 0.0
         if self.guarded:
             affordable = (
                 0.0 if H <= 0.0 else min(1.0, H / max(abs(power) * now.h_s + force * self.farther, H))

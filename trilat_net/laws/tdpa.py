@@ -41,7 +41,8 @@ def book(now: LawInput, j: int, i: int, torque: float, step: float) -> float:
 @compiled
 def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
     """Brings what the leader's end knows of the coupling by which peer j follows up to the present."""
-    at, sent = j * now.joints + i, now.sent[j]
+    at = j * now.joints + i
+    sent = now.sent[j]
     observed = sent.W_led[i] if now.k > 0 else law.reserve_J
     observed += now.received[j].E_followed[i] - law.E_known[at]
     law.E_known[at] = now.received[j].E_followed[i]
@@ -53,7 +54,8 @@ def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
 @compiled
 def invert_inertia(law: Any, now: LawInput) -> None:
     """Writes M^-1 by elimination; zeros where the arm's parameters are unknown."""
-    n, inverse = now.joints, law.inverse
+    n = now.joints
+    inverse = law.inverse
     for i in range(n):
         for j in range(n):
             inverse[i * n + j] = now.inertia[i][j]
@@ -66,7 +68,8 @@ def invert_inertia(law: Any, now: LawInput) -> None:
             inverse[p * n + j] /= pivot
         for i in range(n):
             if i != p:
-                factor, inverse[i * n + p] = inverse[i * n + p], 0.0
+                factor = inverse[i * n + p]
+                inverse[i * n + p] = 0.0
                 for j in range(n):
                     inverse[i * n + j] -= factor * inverse[p * n + j]
 
@@ -79,13 +82,20 @@ def lead(law: Any, now: LawInput, j: int, i: int) -> None:
     joint goes on as before, and farther by what torques of this tick add to those of the tick before, its own
     included. A deficit is repaid by damping.
     """
-    n, h, asked = now.joints, now.h_s, now.received[j].F[i]
-    at, spare = j * n + i, max(now.sent[j].W_led[i] - law.floor, 0.0)
-    sign, most = 1.0 if asked > 0.0 else -1.0, abs(asked)
-    step, own, half = now.qd[i] * h, 0.0, 0.5 * h * h
+    n = now.joints
+    h = now.h_s
+    asked = now.received[j].F[i]
+    at = j * n + i
+    spare = max(now.sent[j].W_led[i] - law.floor, 0.0)
+    sign = 1.0 if asked > 0.0 else -1.0
+    most = abs(asked)
+    step = now.qd[i] * h
+    own = 0.0
+    half = 0.5 * h * h
     if law.by_step:
         half *= AHEAD * AHEAD
-        own, step = half * law.inverse[i * n + i] / law.beta, AHEAD * step + AHEAD**2 * (law.ahead[i] - step)
+        own = half * law.inverse[i * n + i] / law.beta
+        step = AHEAD * step + AHEAD**2 * (law.ahead[i] - step)
         for one in range(n):
             step += half * law.inverse[i * n + one] * law.change[one]
     away = half * law.acceleration_rad_s2 - sign * step - own * sign * law.F_now[at]  # without a torque here
@@ -109,7 +119,9 @@ def control_follower(law: Any, now: LawInput, j: int, i: int, force: float, pric
 
     `price` is what the period is expected to cost beyond the work of that velocity.
     """
-    at, h, peer = j * now.joints + i, now.h_s, now.peers[j]
+    at = j * now.joints + i
+    h = now.h_s
+    peer = now.peers[j]
     known = now.received[j].E_led[i] + 0.5 * law.reserve_J - law.E_moved[at] + law.E_yielded[at]
     if law.by_step:  # half of the reserve is for what steps cost more than planned
         known = max(known - price, 0.0)
@@ -127,8 +139,11 @@ def correct_drift(law: Any, now: LawInput, i: int, error: float, room: float) ->
     `room` is what they have left together. The goal moves for all peers: the work of the torque counts, by
     steps that of the damper and the spring which answer, and what these do with the peers' velocities too.
     """
-    h, more = now.h_s, max(-law.drift_rad_s, min(law.drift_rad_s, error / now.h_s))
-    linear, square, most = law.force[i] * (1.0 if more > 0.0 else -1.0), 0.0, abs(more)
+    h = now.h_s
+    more = max(-law.drift_rad_s, min(law.drift_rad_s, error / now.h_s))
+    linear = law.force[i] * (1.0 if more > 0.0 else -1.0)
+    square = 0.0
+    most = abs(more)
     power = room / h
     if law.by_step:
         power = room / max(SPENT_S, h)
@@ -145,9 +160,11 @@ def correct_drift(law: Any, now: LawInput, i: int, error: float, room: float) ->
 @compiled
 def afford(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
     """Returns the velocity of the goal by peer j, less where that costs more than is known."""
-    at, work = j * now.joints + i, now.peers[j].alpha * force * now.h_s
+    at = j * now.joints + i
+    work = now.peers[j].alpha * force * now.h_s
     known = now.received[j].E_led[i] + 0.5 * law.reserve_J - law.E_moved[at] + law.E_yielded[at]
-    known, velocity = max(known, 0.0), float(law.v_led[at])
+    known = max(known, 0.0)
+    velocity = float(law.v_led[at])
     return known / work if law.controlled and work * velocity > known else velocity
 
 
@@ -159,7 +176,8 @@ def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: 
     those of the leader's velocity, and what the controller changes is booked apart. What drift compensation
     gives back stays here.
     """
-    at, h = j * now.joints + i, now.h_s
+    at = j * now.joints + i
+    h = now.h_s
     velocity = law.v_led[at] if law.by_step else now.peers[j].qd[i]
     energy = force * velocity * h
     if energy >= 0.0:
@@ -194,7 +212,10 @@ def settle_follower(law: Any, now: LawInput, i: int, stretch: float, more: float
 
     By steps, the torque is that of velocities which pay for it; several peers share one torque.
     """
-    n, h, force, velocity = now.joints, now.h_s, law.force[i], 0.0
+    n = now.joints
+    h = now.h_s
+    force = law.force[i]
+    velocity = 0.0
     for sweep in range(1 + SWEEPS * law.by_step):
         if sweep > 0:
             force = law.K[i] * stretch + law.B[i] * (velocity - now.qd[i])
@@ -209,13 +230,17 @@ def settle_follower(law: Any, now: LawInput, i: int, stretch: float, more: float
         part = law.left[j * n + i] / room if room > 0.0 else 0.0
         book_follower(law, now, j, i, now.peers[j].alpha * force, part * force * more * h)
     law.goal[i] += h * velocity
-    law.force[i], law.paid[i] = force, force * velocity * h + force * law.aligned[i]
+    law.force[i] = force
+    law.paid[i] = force * velocity * h + force * law.aligned[i]
 
 
 @compiled
 def follow(law: Any, now: LawInput, i: int) -> None:
     """Moves the goal of a joint by the velocities of the peers, and writes the torque that follows it."""
-    n, h, K, B = now.joints, now.h_s, law.K[i], law.B[i]
+    n = now.joints
+    h = now.h_s
+    K = law.K[i]
+    B = law.B[i]
     target = velocity = 0.0
     for j in range(len(now.peers)):
         target += now.peers[j].alpha * now.peers[j].q[i]
@@ -290,20 +315,28 @@ class Tdpa(EnergyLaw):
 
     def begin(self, facts: LawContext) -> None:
         """Makes the books of both ends of each coupling."""
-        n, peers = facts.joints, len(facts.peers)
-        self.by_step, self.controlled = self.energy == "step", bool(self.controlled)
+        n = facts.joints
+        peers = len(facts.peers)
+        self.by_step = self.energy == "step"
+        self.controlled = bool(self.controlled)
         self.floor = 0.5 * self.reserve_J if self.by_step else 0.0
         self.tau_limit = (np.zeros(n) + facts.tau_limit_nm).tolist()
-        self.goal, self.ahead, self.low, self.high = [0.0] * n, [0.0] * n, [0.0] * n, [0.0] * n
-        self.change, self.aligned = [0.0] * n, [0.0] * n
+        self.goal = [0.0] * n
+        self.ahead = [0.0] * n
+        self.low = [0.0] * n
+        self.high = [0.0] * n
+        self.change = [0.0] * n
+        self.aligned = [0.0] * n
         self.F_led, self.F_now, self.v_led, self.E_known = ([0.0] * (n * peers) for _ in range(4))
         self.E_moved, self.E_yielded, self.lent, self.E_settled = ([0.0] * (n * peers) for _ in range(4))
         self.carried, self.spring, self.force, self.paid = ([0.0] * n for _ in range(4))
-        self.inverse, self.left = [0.0] * (n * n), [0.0] * (n * peers)
+        self.inverse = [0.0] * (n * n)
+        self.left = [0.0] * (n * peers)
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque; sends torques and energies."""
-        n, peers = now.joints, len(now.peers)
+        n = now.joints
+        peers = len(now.peers)
         invert_inertia(self, now)
         for i in range(n):
             self.change[i] = self.carried[i] - now.tau_before[i]
@@ -324,7 +357,8 @@ class Tdpa(EnergyLaw):
                 for j in range(peers):
                     lead(self, now, j, i)
         for i in range(n):
-            felt, force = 0.0, self.force[i]
+            felt = 0.0
+            force = self.force[i]
             for j in range(peers):
                 felt += self.F_now[j * n + i]
             within = max(force - self.high[i], min(force - self.low[i], felt))
@@ -338,10 +372,13 @@ class Tdpa(EnergyLaw):
 
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Returns the energies of both ends of all couplings, those of following up to the period before."""
-        gave, took, observed = [], [], []
+        gave = []
+        took = []
+        observed = []
         n = seen.q.shape[1]
         for j, peer in enumerate(seen.peers):
-            came, sent = peer.received, peer.sent
+            came = peer.received
+            sent = peer.sent
             followed = np.vstack([np.zeros(n), sent["E_followed"][:-1]])
             gave.append(np.hstack([sent["E_led"], followed]))
             settled = seen.memory["E_settled"][:, j * n : (j + 1) * n]

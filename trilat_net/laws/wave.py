@@ -34,7 +34,9 @@ from .interface import DAMPING, STIFFNESS, EnergyLaw, TuningSite
 
 RECEPTIONS = ("replay", "zero", "scaled", "hold")
 """How waves are played, by number. `hold` repeats the last wave; it is not passive, and for comparison."""
-_REPLAY, _SCALED, _HOLD = 0, 2, 3
+_REPLAY = 0
+_SCALED = 2
+_HOLD = 3
 CONCEALED_S = 0.005
 """A wave that is held falls to what the known energy pays for this long, s."""
 STAMP_FILTER_TICKS = 20.0
@@ -82,7 +84,10 @@ def take_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
 
     `missed` counts the samples between the one in use and the one before it; -1: no new one came.
     """
-    received, sent, at, h = now.received[j], now.sent[j], j * now.joints + i, now.h_s
+    received = now.received[j]
+    sent = now.sent[j]
+    at = j * now.joints + i
+    h = now.h_s
     if now.k == 0 and law.playing == _REPLAY:
         sent.W[i] = law.reserve
     fresh = own = played = 0.0
@@ -97,7 +102,8 @@ def take_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
             law.owed_s[at] += max(missed * h - law.held_s[at], 0.0) if energy > 0.0 else 0.0
             sent.W[i] += energy
         law.held_s[at] = 0.0
-        law.U_seen[at], law.E_seen[at] = received.U[i], received.E[i]
+        law.U_seen[at] = received.U[i]
+        law.E_seen[at] = received.E[i]
         played = fresh
     if law.playing == _REPLAY and missed >= 0.0:
         played = replay_wave(law, at, fresh, sent.W[i], h)
@@ -114,8 +120,10 @@ def take_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
 @compiled
 def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
     """Moves what an end with a spring follows by a wave v, and answers it; returns the torque ON the arm."""
-    at, h = j * now.joints + i, now.h_s
-    b, stretch = law.impedance[at], law.q_sd[at] - now.q[i]
+    at = j * now.joints + i
+    h = now.h_s
+    b = law.impedance[at]
+    stretch = law.q_sd[at] - now.q[i]
     c = math.sqrt(2.0 * b)
     qd_sd = (c * v - law.K[i] * stretch + law.B[i] * now.qd[i]) / (b + law.B[i])
     force: float = law.K[i] * stretch + law.B[i] * (qd_sd - now.qd[i])
@@ -128,7 +136,8 @@ def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
 @compiled
 def close_wave_period(law: Any, now: LawInput, i: int) -> None:
     """Books in H what the arm got in the period before; what the springs of an end got is part of H."""
-    H, spring = now.to_all.H, 0.0
+    H = now.to_all.H
+    spring = 0.0
     for j in range(len(now.peers)):
         at = j * now.joints + i
         if now.k == 0:
@@ -139,7 +148,8 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
     if now.k == 0:
         H[i] = law.reserve + spring
     H[i] -= law.beta * (now.tau_before[i] - law.carried[i]) * (now.q[i] - now.q_before[i])
-    law.spring[i], most = spring, law.reserve + spring
+    law.spring[i] = spring
+    most = law.reserve + spring
     if law.K[i] > 0.0 and H[i] > most:  # what is left its damper has taken
         law.damped[i] += H[i] - most
         H[i] = most
@@ -148,7 +158,8 @@ def close_wave_period(law: Any, now: LawInput, i: int) -> None:
 @compiled
 def send_waves(law: Any, now: LawInput, i: int, ahead: float) -> None:
     """Shrinks the waves of a joint to what H pays for beside what lies ahead, and books them."""
-    h, asked = now.h_s, 0.0
+    h = now.h_s
+    asked = 0.0
     for j in range(len(now.peers)):
         asked += 0.5 * now.sent[j].u[i] * now.sent[j].u[i] * h
     most = now.to_all.H[i] - law.spring[i] - ahead - 0.5 * law.reserve
@@ -215,19 +226,27 @@ class Wave(EnergyLaw):
 
     def begin(self, facts: LawContext) -> None:
         """Makes the lines of this end."""
-        n, peers = facts.joints, len(facts.peers)
+        n = facts.joints
+        peers = len(facts.peers)
         self.impedance: list[float] = []
         for peer in facts.peers:
             line = find_line({} if self.lines == "shares" else self.lines, facts.site, peer)
             self.impedance += self.b if line is None else (np.zeros(n) + line).tolist()
         self.playing = RECEPTIONS.index(self.reception)
-        self.q_sd, self.wave = [0.0] * (n * peers), [0.0] * (n * peers)
-        self.U_seen, self.E_seen = [0.0] * (n * peers), [0.0] * (n * peers)
+        self.q_sd = [0.0] * (n * peers)
+        self.wave = [0.0] * (n * peers)
+        self.U_seen = [0.0] * (n * peers)
+        self.E_seen = [0.0] * (n * peers)
         self.owed_U, self.owed_s, self.held_s = ([0.0] * (n * peers) for _ in range(3))
-        self.stamp, self.rate = [-1.0] * peers, [1.0] * peers
-        self.reserve, self.tau_limit = float(self.reserve_J), (np.zeros(n) + facts.tau_limit_nm).tolist()
-        self.played, self.carried, self.ahead = [0.0] * (n * peers), [0.0] * n, [0.0] * n
-        self.spring, self.damped = [0.0] * n, [0.0] * n
+        self.stamp = [-1.0] * peers
+        self.rate = [1.0] * peers
+        self.reserve = float(self.reserve_J)
+        self.tau_limit = (np.zeros(n) + facts.tau_limit_nm).tolist()
+        self.played = [0.0] * (n * peers)
+        self.carried = [0.0] * n
+        self.ahead = [0.0] * n
+        self.spring = [0.0] * n
+        self.damped = [0.0] * n
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque, and sends the waves."""
@@ -236,11 +255,13 @@ class Wave(EnergyLaw):
             close_wave_period(self, now, i)
             if self.K[i] == 0.0:
                 for j in range(len(now.peers)):
-                    c, at = math.sqrt(2.0 * self.impedance[j * n + i]), j * n + i
+                    c = math.sqrt(2.0 * self.impedance[j * n + i])
+                    at = j * n + i
                     now.sent[j].u[i] = c * (now.q[i] - now.q_before[i]) / now.h_s - self.played[at]
                 send_waves(self, now, i, 0.0)
             self.carried[i] = self.gravity * now.gravity[i]
-            now.tau[i], self.ahead[i] = self.carried[i], 0.0
+            now.tau[i] = self.carried[i]
+            self.ahead[i] = 0.0
         for j in range(len(now.peers)):
             peer = now.peers[j]
             missed = -1.0
@@ -250,7 +271,8 @@ class Wave(EnergyLaw):
             if self.stamp[j] >= 0.0:
                 self.rate[j] += (missed + 1.0 - self.rate[j]) / STAMP_FILTER_TICKS
             for i in range(n):
-                b, at = self.impedance[j * n + i], j * n + i
+                b = self.impedance[j * n + i]
+                at = j * n + i
                 if b == 0.0:
                     continue
                 self.played[at] = take_wave(self, now, j, i, missed)
@@ -323,12 +345,16 @@ class Wave(EnergyLaw):
             return None
         here = at.names[at.site]
         form = LinearForm(len(at.inertia), [f"q_sd_{at.names[j]}" for j in at.peers] if any(self.K) else [])
-        K, B = np.array(self.K), np.array(self.B)
+        K = np.array(self.K)
+        B = np.array(self.B)
         for j in at.peers:
             b = np.array(self.find_impedances(here, at.names[j]))
             if not b.all():
                 continue
-            c, to, came, led = np.sqrt(2.0 * b), ("to", j), ("from", j), f"q_sd_{at.names[j]}"
+            c = np.sqrt(2.0 * b)
+            to = ("to", j)
+            came = ("from", j)
+            led = f"q_sd_{at.names[j]}"
             if not any(self.K):
                 form.add("tau", "qd", -b / self.beta)
                 form.add("tau", came, c / self.beta)

@@ -217,7 +217,9 @@ class StartGap:
     """
 
     def __init__(self, account: Account, under_way: int) -> None:
-        self._account, self._under_way, self._heard = account, under_way, 0
+        self._account = account
+        self._under_way = under_way
+        self._heard = 0
         # first that did not come, was not made, of the later start
         self._silent = self._begin = self._first = -1
 
@@ -292,7 +294,8 @@ def _percent(share: float) -> str:
     return f"{math.floor(1e5 * share) / 1e3:g} %"
 
 
-OVERRUN, LAST = "overrun", "last"
+OVERRUN = "overrun"
+LAST = "last"
 """Kinds of events: of ticks that a site did not make, and how many others know of a start that is gone."""
 MAX_STARTS = 64
 """Starts of a member whose events are counted apart."""
@@ -313,7 +316,8 @@ class SessionAccounts:
     def __init__(
         self, session: str, scenario: Scenario | None, *, continued: bool = False, events: bool = True
     ) -> None:
-        self._session, self._continued = session, continued
+        self._session = session
+        self._continued = continued
         self._rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()} if scenario else {}
         self._ticks = {name: scenario.ticks(name) for name in scenario.names} if scenario else {}
         self._ends: dict[str, int] = {}
@@ -368,7 +372,8 @@ class SessionAccounts:
             self._ends[event.member] = min(event.ticks, self._ticks[event.member])
             self.expect(event.member, self._ends[event.member])
         elif event.kind == "join" and event.ticks <= self._ticks[event.member]:
-            made, rate_hz = self._ends.pop(event.member, 0), self._rates_hz[event.member]
+            made = self._ends.pop(event.member, 0)
+            rate_hz = self._rates_hz[event.member]
             for channel, gap in self._find_start_gaps(event.member, event.boot):
                 base = self._bases.get(self._topic(event.member, channel), 0)
                 gap.begin_anew(*(count_messages(channel, n, rate_hz) - base for n in (event.ticks, made)))
@@ -483,7 +488,8 @@ def open_session_accounts(
     about = metadata.get(SESSION, {})
     try:
         scenario = parse_embedded(attachments[SCENARIO].decode(), SCENARIO)
-        session, version = about["session"], int(about["schema_version"])
+        session = about["session"]
+        version = int(about["schema_version"])
     except (KeyError, ValueError, ScenarioError):
         return None
     return SessionAccounts(

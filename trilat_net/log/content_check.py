@@ -192,7 +192,8 @@ class ContentCheck:
     def _decode(self, topic: str, payload: bytes) -> tuple[AnyMessage, MessageIdentity]:
         member, channel = topic.split("/")[-2:]
         kind: Any = CHANNEL_TYPES[channel]
-        layout, rate_hz = None, 1
+        layout = None
+        rate_hz = 1
         if member in self._scenario.sites:
             layout = self._scenario.layout(member)
             rate_hz = self._scenario.sites[member].rate_hz

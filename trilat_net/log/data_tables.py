@@ -220,7 +220,8 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
             text = f"{docs[field].text}, joint {n + 1}" + f", {joint}" * (arm.chain is not None)
             yield _make_number_column(site, field, n, f"{field}{n + 1}", unit, text)
     for n, (parameter, unit) in enumerate(arm.parameters):
-        stem, text = f"theta_hat{n + 1}", f"{docs['theta_hat'].text}, parameter {n + 1}"
+        stem = f"theta_hat{n + 1}"
+        text = f"{docs['theta_hat'].text}, parameter {n + 1}"
         if arm.chain is not None:
             link, _, symbol = parameter.rpartition(".")
             stem = f"theta_hat{1 + n // LINK_PARAMETERS}_{symbol}"
@@ -248,7 +249,8 @@ def _make_number_column(
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
     for n, entry in enumerate(site.channel.entries(site.peers)):
-        (name, unit, length, _), peer = entry.vector, entry.peer
+        (name, unit, length, _) = entry.vector
+        peer = entry.peer
         stem = f"ch_{name}" + f"_{peer}" * bool(peer) + f"_{entry.place + 1}" * (length > 1)
         suffix = UNIT_SUFFIXES.get(unit) or _to_word(unit).strip("_")
         text = f"{name} that the law sends to {peer or 'all'}" + f", number {entry.place + 1}" * (length > 1)
@@ -267,7 +269,8 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
         )
     names = arm.joint_names if mode == "joint" else TASK_AXES[:PLACE]
     units = {"tip": ("m", "m/s"), "joint": ("rad", "rad/s"), "force": ("N", "")}[mode]
-    size, what = (site.layout.hand - 3) // 2, "force" if mode == "force" else "target"
+    size = (site.layout.hand - 3) // 2
+    what = "force" if mode == "force" else "target"
     for n in range(2 * size if what == "target" else size):
         stem, unit = (what, units[0]) if n < size else (f"{what}_rate", units[1])
         meaning = f"{stem.replace('_', ' ')} of the hand, {names[n % size]}"
@@ -289,7 +292,8 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
 
 def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
     """Returns the records of a site, a row each, in order of their ticks."""
-    docs, arm = read_field_docs(State), scenario.arms[site.name]
+    docs = read_field_docs(State)
+    arm = scenario.arms[site.name]
     live = scenario.sites[site.name].find_live_hand()
     columns = list(_make_time_columns(site.tick, site.t_s, site.log_time_ns, site.publish_time_ns))
     columns.append(Column("mode", site.mode, "", docs["mode"].text, "mode"))
@@ -298,10 +302,12 @@ def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
     columns += [] if live is None else _make_hand_columns(site, arm, live.mode)
     columns += _make_bodies_columns(site, scenario.bodies_m(site.name))
     for peer in site.peers:
-        used, rate_hz = site.used[peer], scenario.sites[peer].rate_hz
+        used = site.used[peer]
+        rate_hz = scenario.sites[peer].rate_hz
         known: NDArray[np.bool_] = used >= 0
         age_ms = (site.t_ns - used * NS_PER_S // rate_hz) / 1e6
-        source, text = f"used.{peer}", f"tick of the sample of {peer} in use"
+        source = f"used.{peer}"
+        text = f"tick of the sample of {peer} in use"
         columns.append(Column(f"used_{peer}_tick", used, "tick", text, source, known))
         text = f"now minus the stamp of the sample of {peer} in use"
         columns.append(Column(f"age_{peer}_ms", age_ms, "ms", text, f"t_ns, {source}", known))

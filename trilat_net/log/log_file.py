@@ -89,7 +89,9 @@ class FileSync:
     """Syncing of one file: at once if `durable`, else once a second in a thread."""
 
     def __init__(self, descriptor: int, durable: bool, now_ns: Callable[[], int]) -> None:
-        self._descriptor, self._durable, self._now_ns = descriptor, durable, now_ns
+        self._descriptor = descriptor
+        self._durable = durable
+        self._now_ns = now_ns
         self._done_ns = now_ns()
         self._thread: threading.Thread | None = None
         self._trouble: OSError | None = None
@@ -172,7 +174,8 @@ class LogFile:
         opened: Callable[[Path, str], Any] | None = None,
         now_ns: Callable[[], int] | None = None,
     ) -> None:
-        self.path, self.working = path, working or active_path(path)
+        self.path = path
+        self.working = working or active_path(path)
         self.size = 0
         self.trouble: OSError | None = None
         self._force = force
@@ -186,7 +189,9 @@ class LogFile:
         sync_folder(path.parent)
         self._room = room or DiskReserve(path.parent)
         self._syncing = FileSync(self._raw.fileno(), durable, now_ns or SystemClock().monotonic_ns)
-        self._pending, self._done, self._owed = bytearray(), 0, 0
+        self._pending = bytearray()
+        self._done = 0
+        self._owed = 0
         self._tail = b""
         self._broken = self._closed = self._published = False
 
@@ -231,11 +236,13 @@ class LogFile:
             self._done += taken
         self._tail = bytes((self._tail + self._pending[-len(MAGIC) :])[-len(MAGIC) :])
         self.size += self._done
-        self._pending, self._done = bytearray(), 0
+        self._pending = bytearray()
+        self._done = 0
 
     def _cut(self) -> None:
         self._broken = True
-        self._pending, self._done = bytearray(), 0
+        self._pending = bytearray()
+        self._done = 0
         with suppress(OSError):
             self._raw.truncate(self.size)
 

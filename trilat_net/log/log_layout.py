@@ -148,7 +148,10 @@ VIZ_ROOT = "/viz/"
 """How topics of channels for viewers begin."""
 MAX_TIME_NS = (1 << 64) - 1
 """Largest time stamp of a message in a file; longer ones of others are cut to it."""
-SESSION, PART, ACCOUNTS, SCENARIO = "trilat.session", "trilat.part", "trilat.accounts", "scenario.toml"
+SESSION = "trilat.session"
+PART = "trilat.part"
+ACCOUNTS = "trilat.accounts"
+SCENARIO = "scenario.toml"
 CHANNEL_TYPES: dict[str, type[msgspec.Struct]] = {
     topics.STATE: State,
     topics.LINK: LinkStats,

@@ -95,8 +95,11 @@ class Log(Result, Mapping[str, SiteLog]):
     """
 
     def __init__(self, contents: LogContents) -> None:
-        self.source, self.sources = contents.source, contents.sources
-        self.session, self.damaged, self.chain = contents.session, contents.damaged, contents.chain
+        self.source = contents.source
+        self.sources = contents.sources
+        self.session = contents.session
+        self.damaged = contents.damaged
+        self.chain = contents.chain
         self.driver = self.session["driver"]
         self.scenario_sha256 = hashlib.sha256(contents.scenario).hexdigest()
         try:
@@ -180,7 +183,9 @@ class Log(Result, Mapping[str, SiteLog]):
 
     def _decode(self, topic: str, kind: type[M]) -> list[M]:
         """Returns the messages of a channel; those that cannot be read leave it, and are reported once."""
-        channel, readable, problem = self._channel(topic), ChannelMessages(), ""
+        channel = self._channel(topic)
+        readable = ChannelMessages()
+        problem = ""
         messages: list[M] = []
         for payload, *times in zip(channel.payloads, channel.log_ns, channel.publish_ns, strict=True):
             try:
@@ -316,7 +321,8 @@ class Log(Result, Mapping[str, SiteLog]):
         found: list[tuple[int, int]] = []
         for first, boot in starts:
             heard = [e.ticks for e in self.events if e.kind == LAST and e.boots.get(site) == boot]
-            begin, known = int(made[made < first].max(initial=-1)) + 1, min(first, max(heard, default=0))
+            begin = int(made[made < first].max(initial=-1)) + 1
+            known = min(first, max(heard, default=0))
             if known - begin > count_under_way(topics.STATE, self[site].rate_hz):
                 begin = known
             if found and begin == found[-1][0]:  # the start in between made no tick
@@ -336,7 +342,8 @@ class Log(Result, Mapping[str, SiteLog]):
         Those that it stated at its end; of a site that others lost for good, those up to its last known one;
         else those of the scenario; without those that it did not make between two of its starts.
         """
-        stated, there = self._stated_ticks.get(site), self[site].last_tick + 1
+        stated = self._stated_ticks.get(site)
+        there = self[site].last_tick + 1
         if stated is None:
             kinds = ("lost", "left", "back", "admit")
             told = [event for event in self.events if event.about == site and event.kind in kinds]
@@ -371,12 +378,17 @@ class Log(Result, Mapping[str, SiteLog]):
             raise UnknownName(f"no site {site!r} in {self.source}; it has {', '.join(self.sites)}")
         if site not in self._sites:
             channel = self._channel(self._topic(site, topics.STATE))
-            rate_hz, times = self.scenario.sites[site].rate_hz, channel.times()
-            peers, layout = self.scenario.peers(site), self.scenario.layout(site)
-            sent, axes = self.scenario.channel(site), self.scenario.arms[site].axes
-            payloads, source = channel.payloads, self.source
+            rate_hz = self.scenario.sites[site].rate_hz
+            times = channel.times()
+            peers = self.scenario.peers(site)
+            layout = self.scenario.layout(site)
+            sent = self.scenario.channel(site)
+            axes = self.scenario.arms[site].axes
+            payloads = channel.payloads
+            source = self.source
             part = SiteLog(site, peers, rate_hz, payloads, source, times, layout, sent, axes)
-            most, last = self.scenario.ticks(site), part.last_tick
+            most = self.scenario.ticks(site)
+            last = part.last_tick
             if last >= most:  # a tick of others is nothing to count up to
                 raise LogError(f"{self.source}: {site} has a record of tick {last}; the scenario has {most}")
             self._sites[site] = part

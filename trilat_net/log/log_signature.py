@@ -61,11 +61,13 @@ def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
     path = Path(path)
     if not path.name:
         raise UsageError(f"{path}: is no name; keys are named as in: trilat keys pair lab")
-    private, public = path.with_name(f"{path.name}.key"), path.with_name(f"{path.name}.pub")
+    private = path.with_name(f"{path.name}.key")
+    public = path.with_name(f"{path.name}.pub")
     for file in (private, public):
         refuse_existing(file, force=False)
     key = Ed25519PrivateKey.generate()
-    pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
+    pem = serialization.Encoding.PEM
+    plain = serialization.NoEncryption()
     secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain)
     write_whole(private, secret, force=False, mode=0o600)
     form = serialization.PublicFormat.SubjectPublicKeyInfo
@@ -86,7 +88,8 @@ def sign_log(
         LogError: the log cannot be read, has no digest chain, or does not agree with it.
         UsageError: the key is none, others can read it, or there is a signature already.
     """
-    path, key_file = Path(path), Path(key_file)
+    path = Path(path)
+    key_file = Path(key_file)
     key = _load_key(
         key_file, Ed25519PrivateKey, "private Ed25519 key; make a pair with: trilat keys pair NAME"
     )

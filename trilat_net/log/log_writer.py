@@ -107,7 +107,8 @@ class LogWriter:
         for member in (*scenario.names, topics.RECORDER):
             is_site = member != topics.RECORDER
             for name in log_layout.SITE_CHANNELS if is_site else log_layout.RECORDER_CHANNELS:
-                key, about = topics.key(session, member, name), {"member": member}
+                key = topics.key(session, member, name)
+                about = {"member": member}
                 if name == topics.STATE:
                     about["rate_hz"] = str(scenario.sites[member].rate_hz)
                 channels[key] = None
@@ -197,7 +198,8 @@ class LogWriter:
         """
         if self._ended == _FINISHED:
             return
-        whole, self._ended = not self._ended, _FINISHED
+        whole = not self._ended
+        self._ended = _FINISHED
         left_out = {f"/{key}" for key, channel in self._channels.items() if channel is None}
         taken = {name: text for name, text in accounts.items() if name not in left_out}
         with self._refusing():
@@ -313,7 +315,8 @@ class LogParts:
     ) -> None:
         self._opened = opened or (lambda path: LogFile(path, force=storage.force, durable=storage.durable))
         self.so_far: Callable[[], Mapping[str, str]] = dict
-        self._storage, self._begin_log = storage, begin
+        self._storage = storage
+        self._begin_log = begin
         self._number, self._previous = storage.first()
         self._previous_digest = ""
         if storage.force and storage.splits:  # what was left of a log would seem to belong to the new one
@@ -351,7 +354,8 @@ class LogParts:
             raise LogRefused(f"{error}; the log ends with {self._previous}") from None
 
     def _full(self, payload: bytes, log_time_ns: int) -> bool:
-        limit, writer = self._storage, self._writer
+        limit = self._storage
+        writer = self._writer
         if self._since_ns is None:
             self._since_ns = log_time_ns
         if limit.split_ns is not None and log_time_ns - self._since_ns >= limit.split_ns:

@@ -34,7 +34,9 @@ class FileCheck:
 
     def __init__(self, file: str, scanner: mcap_records.RecordScanner, findings: Findings) -> None:
         self.counts = Counter(bytes=scanner.size)
-        self._file, self._scanner, self._findings = file, scanner, findings
+        self._file = file
+        self._scanner = scanner
+        self._findings = findings
         self._end = 0
         self._defined: dict[tuple[int, int], Any] = {}  # by opcode and number
         self._found: dict[tuple[int, int], Any] = {}  # what an index should name: by its opcode and place
@@ -144,7 +146,8 @@ class FileCheck:
     def _take_message_index(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
         if self._indexes is None:
             return  # the chunk could not be read
-        channel, length = int.from_bytes(content[:2], "little"), int.from_bytes(content[2:6], "little")
+        channel = int.from_bytes(content[:2], "little")
+        length = int.from_bytes(content[2:6], "little")
         body = content[_INDEX_HEAD_BYTES:]
         if length != len(content) - _INDEX_HEAD_BYTES or length % 16:
             raise mcap_records.UnreadableRecord(

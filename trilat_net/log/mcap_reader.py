@@ -42,9 +42,11 @@ CHANNEL_SHARE = 1 / 3
 Arms at rest in virtual time pack best of all that is no bomb: 120 times.
 """
 _DECODED_BYTES = 3_000
-_LONG_BYTES, _LONG_RATIO = 300, 24
+_LONG_BYTES = 300
+_LONG_RATIO = 24
 """A message of a log, decoded, takes some memory, and more if it is longer than a record must be."""
-_NAME_BYTES, _NAME_RATIO = 600, 20
+_NAME_BYTES = 600
+_NAME_RATIO = 20
 """What a channel and its metadata take, likewise."""
 
 Progress = Callable[[int, int], None]
@@ -174,7 +176,8 @@ class McapReader:
         return self.watch is not None and len(self.damaged) >= mcap_records.MAX_DAMAGED_PARTS
 
     def _open(self, frame: mcap_records.RecordFrame) -> bytes:
-        content, data = self.scanner.content(frame), b""
+        content = self.scanner.content(frame)
+        data = b""
         try:
             if frame.opcode in _READ and not self._gave_up:
                 data = self._unpack(frame, content)
@@ -212,8 +215,11 @@ class McapReader:
         return b""
 
     def _read_records(self, data: bytes, frame: mcap_records.RecordFrame) -> Iterator[McapMessage]:
-        find_topic, ours, shares = self._topics.get, self._ours, self._shares
-        parse_head, head_bytes = mcap_records.MESSAGE_HEAD.unpack_from, mcap_records.MESSAGE_HEAD.size
+        find_topic = self._topics.get
+        ours = self._ours
+        shares = self._shares
+        parse_head = mcap_records.MESSAGE_HEAD.unpack_from
+        head_bytes = mcap_records.MESSAGE_HEAD.size
         new = tuple.__new__  # what the class does with its arguments, in half the time
         memory = chained = messages = 0
         view = memoryview(data)
@@ -378,7 +384,8 @@ def read_contents(
     session = reader.metadata[SESSION]
     damaged = [f"{name}: {damage}" for damage in reader.damaged]
     complete = reader.complete and not damaged and reader.metadata.get(PART, {}).get("index", "1") == "1"
-    text, chain = reader.attachments[SCENARIO], reader.judge_digest()
+    text = reader.attachments[SCENARIO]
+    chain = reader.judge_digest()
     ended = reader.complete
     return LogContents((name,), session, text, reader.metadata, channels, complete, ended, damaged, chain)
 

@@ -129,7 +129,8 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
 
 def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
     """Yields the records in an unpacked chunk: opcode, where the content begins, where it ends."""
-    unpack, size = RECORD_HEAD.unpack_from, len(data)
+    unpack = RECORD_HEAD.unpack_from
+    size = len(data)
     end = 0
     while end + RECORD_HEAD_BYTES <= size:
         opcode, length = unpack(data, end)
@@ -205,7 +206,9 @@ class RecordScanner:
 
     def frames(self) -> Iterator[RecordFrame]:
         """Yields the place of every record, anew on every call; skips what makes no sense (`damaged`)."""
-        self.damaged, self.torn, self.finished = [], None, False
+        self.damaged = []
+        self.torn = None
+        self.finished = False
         offset = sure = len(MAGIC)
         while len(self.damaged) < MAX_DAMAGED_PARTS:
             try:
@@ -297,7 +300,8 @@ class RecordScanner:
 
     def is_summary_intact(self, footer: records.Footer) -> bool:
         """True if the summary has the checksum that the footer states."""
-        begin, last = footer.summary_start, self.size - FOOTER_BYTES
+        begin = footer.summary_start
+        last = self.size - FOOTER_BYTES
         if not 0 <= begin <= last:
             return False
         return self.crc(begin or last, self.size - len(MAGIC) - 4) == footer.summary_crc

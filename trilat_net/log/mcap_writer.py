@@ -211,7 +211,8 @@ class McapWriter:
         head = _CHUNK.pack(start_ns, end_ns, raw, zlib.crc32(self._open)) + pack_text(_COMPRESSION)
         record = pack_record(Opcode.CHUNK, head + struct.pack("<Q", len(data)) + data)
         offset = self._put(record)
-        begin, places = self.position, b""
+        begin = self.position
+        places = b""
         for channel, entries in used.items():
             body = struct.pack(f"<HI{len(entries)}Q", channel, 8 * len(entries), *entries)
             place = self._put(pack_record(Opcode.MESSAGE_INDEX, body))
@@ -236,7 +237,9 @@ class McapWriter:
         head = _STATISTICS.pack(self.messages, self._records[Opcode.SCHEMA], *numbers)
         counts = b"".join(struct.pack("<HQ", n, count) for n, count in self._counts.items() if count)
         self._add_to_summary(Opcode.STATISTICS, head + struct.pack("<I", len(counts)) + counts)
-        begin, offsets, crc = self.position, b"", 0
+        begin = self.position
+        offsets = b""
+        crc = 0
         for opcode, group in self._summary.items():
             if group:
                 place = self._put(bytes(group))

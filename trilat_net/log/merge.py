@@ -40,7 +40,8 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
             session = f"the session in {parts[0].source}: {'; '.join(differ)}"
             raise LogError(f"{other.source}: is no part of {session}")
     ordered = sorted(parts, key=_first_time)
-    first, last = ordered[0], ordered[-1]
+    first = ordered[0]
+    last = ordered[-1]
     _check_digests(parts)
     names = dict.fromkeys(topic for part in ordered for topic in part.channels)
     whole = all(part.ended and not part.damaged for part in parts)

@@ -61,7 +61,9 @@ def find_six_numbers(turns: Array) -> Array:
     two = 2.0 * v
     wx, wy, wz = (w * two).T
     xx, yy, zz = (v * two).T
-    xy, xz, yz = 2.0 * v[:, 0] * v[:, 1], 2.0 * v[:, 0] * v[:, 2], 2.0 * v[:, 1] * v[:, 2]
+    xy = 2.0 * v[:, 0] * v[:, 1]
+    xz = 2.0 * v[:, 0] * v[:, 2]
+    yz = 2.0 * v[:, 1] * v[:, 2]
     columns = np.stack([1.0 - yy - zz, xy + wz, xz - wy, xy - wz, 1.0 - xx - zz, yz + wx], axis=1)
     return columns.reshape(*np.shape(turns)[:-1], len(MATRIX_ENTRIES))
 
@@ -102,7 +104,8 @@ def bring_nearer(turns: Array, references: Array) -> Array:
 def find_steady_vectors(turns: Array) -> Array:
     """Returns rotation vectors, shape (K, 3), rad, without jumps at half a turn; whole turns have them."""
     quaternions = find_quaternions(turns)
-    w, v = quaternions[:, :1], quaternions[:, 1:]
+    w = quaternions[:, :1]
+    v = quaternions[:, 1:]
     sine = np.linalg.norm(v, axis=1, keepdims=True)
     by_sine = np.divide(2.0 * np.arctan2(sine, w), sine, out=np.full_like(w, 2.0), where=sine > 0.0)
     return np.asarray(by_sine * v)

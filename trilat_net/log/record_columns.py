@@ -90,7 +90,8 @@ def decode_per_peer(
         rename=dict(zip(places, peers, strict=True)),
         gc=False,
     )
-    decoder, take = _make_decoder({field: entry}), attrgetter(*(f"{field}.{place}" for place in places))
+    decoder = _make_decoder({field: entry})
+    take = attrgetter(*(f"{field}.{place}" for place in places))
     found = map(take, map(decoder.decode, payloads))
     values = found if len(peers) == 1 else chain.from_iterable(found)
     rows = _to_array(payloads, values, np.int64, len(peers) * len(payloads)).reshape(-1, len(peers))

@@ -245,7 +245,10 @@ class _FileCopy:
 
     def __init__(self, reader: McapReader, file: LogFile, survey: RecoverySurvey, result: Recovery) -> None:
         reader.watch = self._copy
-        self._reader, self._scanner, self._survey, self._result = reader, reader.scanner, survey, result
+        self._reader = reader
+        self._scanner = reader.scanner
+        self._survey = survey
+        self._result = result
         by = f"recovered by trilat-net {collect_provenance()['version_trilat-net']}"
         self._out = McapWriter(file, f"{survey.library or 'unknown'}, {by}", survey.profile)
         self._accounts = open_session_accounts(survey.metadata, survey.attachments)
@@ -538,7 +541,8 @@ class _FileCopy:
         return ""
 
     def _report_unnamed(self) -> None:
-        result, stated = self._result, self._survey.count
+        result = self._result
+        stated = self._survey.count
         for number, count in self._unnamed.items():
             result.lose(f"{count_nouns(count, 'message')} of channel {number}, which no record names")
         for topic in self._bare:
@@ -563,9 +567,11 @@ class _FileCopy:
             )
 
     def _finish(self) -> None:
-        result, accounts = self._result, self._accounts
+        result = self._result
+        accounts = self._accounts
         result.finished = self._scanner.finished
-        result.messages, result.duration_s = self._out.messages, self._out.duration_s
+        result.messages = self._out.messages
+        result.duration_s = self._out.duration_s
         if SESSION in self._survey.metadata:
             result.chain = self._judge_source()
         if accounts is not None:

@@ -117,7 +117,8 @@ class RecoverySurvey:
         record = mcap_records.parse_record(frame.opcode, content)
         match frame.opcode:
             case Opcode.HEADER:
-                self.profile, self.library = record.profile, record.library
+                self.profile = record.profile
+                self.library = record.library
             case Opcode.METADATA:
                 self.metadata[record.name] = record.metadata
                 if record.name == SESSION:

@@ -80,7 +80,8 @@ class RunningDigest:
             finished: True if it was finished.
             damaged: True if a part of it cannot be read.
         """
-        stated, recovered = metadata.get(DIGESTS), metadata.get(RECOVERED, {})
+        stated = metadata.get(DIGESTS)
+        recovered = metadata.get(RECOVERED, {})
         if recovered.get("chain") == DigestState.CHANGED:
             return Integrity(DigestState.CHANGED, "recovered from a file that had been changed")
         if stated is None:

@@ -92,9 +92,11 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
     Raises:
         LogError: a file cannot be read, or is of another session than the files before it.
     """
-    check, paths = SessionCheck(), [Path(file) for file in files]
+    check = SessionCheck()
+    paths = [Path(file) for file in files]
     try:
-        total, before = sum(path.stat().st_size for path in paths), 0
+        total = sum(path.stat().st_size for path in paths)
+        before = 0
         for path in sorted(paths, key=lambda path: path.name):
             with open_regular(path) as stream:
                 check.read(str(path), stream, shift_progress(progress, before, total))
@@ -130,20 +132,25 @@ class ChannelCheck:
         findings: Findings,
         accounts: SessionAccounts,
     ) -> None:
-        self.member, self.kind = key.member, key.channel
+        self.member = key.member
+        self.kind = key.channel
         self._topic = "/" + topics.key(key.session, key.member, key.channel)
-        self.rate_hz, self._layout = 0, None
+        self.rate_hz = 0
+        self._layout = None
         if scenario is not None and key.member in scenario.sites:
             self.rate_hz = scenario.sites[key.member].rate_hz
             self._layout = scenario.layout(key.member)
-        self.received, self.boots = 0, set[int]()
+        self.received = 0
+        self.boots = set[int]()
         self.first: tuple[int, int] | None = None
         self.last: tuple[int, int] | None = None
-        self._findings, self._accounts = findings, accounts
+        self._findings = findings
+        self._accounts = accounts
         self._epoch_ns = _parse_number(about, "epoch_unix_ns")
         self._version = _parse_number(about, "schema_version")
         self._in_file: dict[int, Account] = {}  # by boot
-        self._file, self._log_ns = "", 0
+        self._file = ""
+        self._log_ns = 0
 
     @property
     def name(self) -> str:
@@ -153,7 +160,8 @@ class ChannelCheck:
     def begin(self, file: str, channel: ChannelInfo) -> None:
         """Begins with another file, and checks how it describes the channel."""
         self._in_file = defaultdict(Account)
-        self._file, self._log_ns = file, 0
+        self._file = file
+        self._log_ns = 0
         if fault := self._find_schema_fault(channel):
             self._add("schema", None, fault)
 
@@ -184,7 +192,8 @@ class ChannelCheck:
             self._add("schema", offset, str(error))
             return
         identity = identify_message(message, self.rate_hz)
-        number, sequence = identity.number, identity.sequence
+        number = identity.number
+        sequence = identity.sequence
         if self.kind == topics.STATS:  # these state no number: the file counts them
             number = sequence = self._in_file[message.boot].expected
         if message.v != self._version:
@@ -221,7 +230,8 @@ class ChannelCheck:
         self.last = place if self.last is None else max(self.last, place)
 
     def _check_times(self, stored: McapMessage, number: int, stated_ns: int | None, offset: int) -> None:
-        log_ns, publish_ns = stored.log_time_ns, stored.publish_time_ns
+        log_ns = stored.log_time_ns
+        publish_ns = stored.publish_time_ns
         if log_ns < self._log_ns:
             text = f"log_time goes back by {self._log_ns - log_ns} ns at number {number}"
             self._add("times", offset, text)
@@ -279,7 +289,8 @@ class SessionCheck:
 
     def _read_messages(self, file: str, reader: McapReader) -> None:
         checks: dict[str, ChannelCheck | None] = {}
-        self._file, begun = file, False
+        self._file = file
+        begun = False
         for message in reader.messages():
             if not begun:
                 begun = True
@@ -314,8 +325,10 @@ class SessionCheck:
         same = ("session", "epoch_unix_ns", "scenario_sha256")
         if self.ours and any(about.get(key) != self._about.get(key) for key in same):
             raise LogError(f"{self._file}: is of another session; look at it alone")
-        is_new, self.ours = not self.ours, True
-        self._about, self._version = about, _parse_number(about, "schema_version")
+        is_new = not self.ours
+        self.ours = True
+        self._about = about
+        self._version = _parse_number(about, "schema_version")
         self._files += 1
         self._parts += PART in reader.metadata
         self._first_part |= reader.metadata.get(PART, {}).get("index", "") in ("", "1")
@@ -328,8 +341,10 @@ class SessionCheck:
                     self._counted.open("/" + topics.key(about["session"], name, channel))
 
     def _check_scenario(self, text: bytes) -> None:
-        finding, about = self._findings["scenario"], self._about
-        digest, stated = hashlib.sha256(text).hexdigest(), about.get("scenario_sha256", "")
+        finding = self._findings["scenario"]
+        about = self._about
+        digest = hashlib.sha256(text).hexdigest()
+        stated = about.get("scenario_sha256", "")
         if digest != stated:
             finding.add(self._file, None, f"its SHA-256 is {digest[:16]}, the session names {stated[:16]}")
         try:
@@ -345,7 +360,8 @@ class SessionCheck:
 
     def _begin_channel(self, channel: ChannelInfo) -> ChannelCheck | None:
         """Returns the check of a channel in this file; None if it is none of the session's own."""
-        topic, finding = channel.topic, self._findings["schema"]
+        topic = channel.topic
+        finding = self._findings["schema"]
         key = topics.parse_key(topic.removeprefix("/"))
         if topic.startswith(VIZ_ROOT):
             is_cdr = (channel.encoding, channel.schema_encoding) == (cdr.ENCODING, cdr.SCHEMA_ENCODING)
@@ -369,8 +385,10 @@ class SessionCheck:
 
     def findings(self) -> Iterator[Finding]:
         """Yields the results, once all files were read; without a session only that it was taken out."""
-        counts, found = self._counts, self._findings
-        messages, chunks = counts["messages"], counts["chunks"]
+        counts = self._counts
+        found = self._findings
+        messages = counts["messages"]
+        chunks = counts["chunks"]
         yield found["whole"].tell(f"finished, {counts['bytes'] / 1e6:.1f} MB")
         yield found["checksums"].tell(f"{counts['crcs']} compared, all agree")
         yield found["records"].tell(
@@ -394,7 +412,9 @@ class SessionCheck:
         yield found["scenario"].tell(text)
 
     def _check_sequence(self) -> Finding:
-        finding, missing, reordered = self._findings["sequence"], 0, 0
+        finding = self._findings["sequence"]
+        missing = 0
+        reordered = 0
         gaps = []
         for topic, check in self.channels.items():
             if check.kind == topics.STATS:
@@ -423,7 +443,8 @@ class SessionCheck:
     @property
     def _takes_events(self) -> bool:
         """True if the files must tell how the sites ended: all of a log that leaves no events out."""
-        session, choice = self._about["session"], parse_filter_facts(self._about)
+        session = self._about["session"]
+        choice = parse_filter_facts(self._about)
         names = self._scenario.names if self._scenario else ()
         takes = all(choice.takes(topics.key(session, name, topics.EVENT)) for name in names)
         is_single_part = self._files == self._parts == 1
@@ -450,7 +471,8 @@ class SessionCheck:
         return finding.tell("agree with what is there")
 
     def _check_rates(self) -> Finding:
-        finding, texts = self._findings["rates"], []
+        finding = self._findings["rates"]
+        texts = []
         for check in self.channels.values():
             if check.kind != topics.STATE or check.first is None or check.last is None or not check.rate_hz:
                 continue

@@ -37,7 +37,8 @@ HEAVY_BYTES = 12 << 20
 HEAVY_RATIO = 10
 """Records whose decoded form takes more than this, and than so many times their payloads, are held few at a
 time: they were made to take much."""
-HEAVY_BLOCK, HEAVY_BLOCKS = 128, 8
+HEAVY_BLOCK = 128
+HEAVY_BLOCKS = 8
 """Heavy records that are decoded together, and how many times that many are held."""
 
 DecodeStates = Callable[[Sequence[bytes]], list[State]]
@@ -68,7 +69,8 @@ def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
 
 def _find_turns(turn: Array, reference: Array) -> Array:
     (a, u), (b, v) = map(split_quaternions, (turn, reference))
-    w, p = a * b + np.sum(u * v, axis=1, keepdims=True), b * u - a * v - np.cross(u, v)
+    w = a * b + np.sum(u * v, axis=1, keepdims=True)
+    p = b * u - a * v - np.cross(u, v)
     p *= np.where(w < 0.0, -1.0, 1.0)  # of two quaternions that turn alike that of the shorter turn
     sine = np.linalg.norm(p, axis=1, keepdims=True)
     by_sine = np.divide(2.0 * np.arctan2(sine, abs(w)), sine, out=np.full_like(w, 2.0), where=sine > 0.0)
@@ -80,7 +82,8 @@ class LazyRecords(Sequence[State]):
 
     def __init__(self, payloads: Sequence[bytes], decode_block: DecodeStates, *, heavy: bool = False) -> None:
         self._size, held = (HEAVY_BLOCK, HEAVY_BLOCKS) if heavy else (BLOCK_RECORDS, MAX_DECODED_RECORDS)
-        self._payloads, size = payloads, self._size
+        self._payloads = payloads
+        size = self._size
         self._block = lru_cache(maxsize=held if heavy else held // size)(
             lambda number: decode_block(payloads[number * size : (number + 1) * size])
         )
@@ -210,7 +213,11 @@ class SiteLog:
         axes: tuple[float, ...] = (),
     ) -> None:
         self.channel = channel
-        self.name, self.peers, self.rate_hz, self.layout, self.axes = name, peers, rate_hz, layout, axes
+        self.name = name
+        self.peers = peers
+        self.rate_hz = rate_hz
+        self.layout = layout
+        self.axes = axes
         self._source = source
         self.payloads = payloads
         self.tick = self._read(record_columns.decode_ticks)
@@ -220,7 +227,8 @@ class SiteLog:
             order = np.argsort(self.tick, kind="stable")
             self.tick = self.tick[order]
             self.payloads = [payloads[n] for n in order.tolist()]
-            self.log_time_ns, self.publish_time_ns = self.log_time_ns[order], self.publish_time_ns[order]
+            self.log_time_ns = self.log_time_ns[order]
+            self.publish_time_ns = self.publish_time_ns[order]
         freeze((self.tick, self.log_time_ns, self.publish_time_ns))
 
     def __len__(self) -> int:

@@ -170,7 +170,8 @@ def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
     while not is_last and place + _BLOCK_HEAD_BYTES <= len(packed):
         block_head = int.from_bytes(packed[place : place + _BLOCK_HEAD_BYTES], "little")
         is_last = bool(block_head & 1)
-        kind, size = block_head >> 1 & 3, block_head >> 3
+        kind = block_head >> 1 & 3
+        size = block_head >> 3
         end = place + _BLOCK_HEAD_BYTES + (1 if kind == _RUN_LENGTH_BLOCK else size)
         if size > _MAX_BLOCK_BYTES or end > len(packed):
             return

@@ -61,8 +61,10 @@ class SiteSender:
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, site: str, channel: str, boot: int) -> None:
-        self.boot, self.number = boot, -1
-        self._clock, self._site = clock, site
+        self.boot = boot
+        self.number = -1
+        self._clock = clock
+        self._site = site
         self._publish = bus.publisher(topics.key(session, site, channel))
 
     def send(self, kind: type[R], **fields: object) -> R:
@@ -83,7 +85,9 @@ class SiteClient:
     """The connection of a program to one site; a context, which closes it."""
 
     def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
-        self._bus, self._clock, self._site = bus, clock, site
+        self._bus = bus
+        self._clock = clock
+        self._site = site
         self._record: State | None = None
         self._came_ns = 0
         self._present = self._gone = False
@@ -132,7 +136,8 @@ class SiteClient:
             except WireError:
                 continue  # a stranger's
             if self._follows_last(record, message[1]):
-                self._record, self._came_ns = record, message[1]
+                self._record = record
+                self._came_ns = message[1]
         for event in read_messages(self._events, Event):
             if event.kind == "end" and self._record is not None and event.boot == self._record.boot:
                 self._gone = True
@@ -181,7 +186,8 @@ class SwitchClient(OutsideClient):
     ...         time.sleep(0.02)
     """
 
-    channel, member = topics.ENABLE, OPERATOR
+    channel = topics.ENABLE
+    member = OPERATOR
 
     def send(self, *, held: bool) -> None:
         """Says that somebody holds it, or has let it go."""
@@ -265,10 +271,13 @@ class Hand(SiteClient):
         repeats: bool = True,
     ) -> None:
         super().__init__(bus, clock, session, site)
-        self._operator, self._place, self._source = operator, place, source
+        self._operator = operator
+        self._place = place
+        self._source = source
         self._sender = make_hand_sender(bus, clock, session, site)
         self._message: HandMessage | None = None
-        self._lock, self._ended = threading.Lock(), threading.Event()
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
         if repeats:
             threading.Thread(target=self._beat, daemon=True).start()
 
@@ -303,7 +312,8 @@ class Hand(SiteClient):
     def release(self) -> None:
         """Lets go; the grip fades within 100 ms."""
         with self._lock:
-            held, self._message = self._message, None
+            held = self._message
+            self._message = None
             if held is not None:
                 self._sender.send(HandMessage, source=self._source, grip=False)
 
@@ -337,11 +347,13 @@ class Hand(SiteClient):
 
         What the operator feels is the negative.
         """
-        record, operator = self._need_record(), self._operator
+        record = self._need_record()
+        operator = self._operator
         hand = HandInForce.read(record.hand)
         pull = list(hand.target)
         if operator.acts is not TorqueKind.LIVE_FORCE:
-            at, speed = self._place(record.q), self._find_speed(record)
+            at = self._place(record.q)
+            speed = self._find_speed(record)
             pull = [
                 K * (x - here) + B * (v - moves)
                 for K, B, x, v, here, moves in zip(

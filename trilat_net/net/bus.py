@@ -128,7 +128,8 @@ class StampingRing(BoundedRing[tuple[T, int]]):
 
     def __init__(self, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int) -> None:
         super().__init__(capacity)
-        self._now_ns, self._read = now_ns, read
+        self._now_ns = now_ns
+        self._read = read
 
     def take(self, payload: bytes) -> None:
         """Stamps a message, reads it and appends it."""

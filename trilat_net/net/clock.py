@@ -60,7 +60,9 @@ class SkewedClock:
     """
 
     def __init__(self, clock: Clock, offset_ns: int, drift_ppb: int) -> None:
-        self._clock, self._offset_ns, self._drift_ppb = clock, offset_ns, drift_ppb
+        self._clock = clock
+        self._offset_ns = offset_ns
+        self._drift_ppb = drift_ppb
         self._start_ns = clock.monotonic_ns()
 
     def monotonic_ns(self) -> int:

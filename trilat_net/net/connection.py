@@ -29,7 +29,9 @@ from .zenoh_config import Endpoint, ZenohFile, ZenohMode, merge_settings
 if TYPE_CHECKING:
     from .member_keys import MemberKeys
 
-_FIRST_PORT, _BLOCKS, _BLOCK = 10_240, 340, 64
+_FIRST_PORT = 10_240
+_BLOCKS = 340
+_BLOCK = 64
 
 
 def default_endpoint(session: str, index: int) -> str:
@@ -175,7 +177,8 @@ def secure_connection(
         from .member_keys import read_member_keys  # loads what makes certificates
 
         keys = read_member_keys(keys)
-    own, named = connection.own, (*connection.listen, *(connection.connect or ()))
+    own = connection.own
+    named = (*connection.listen, *(connection.connect or ()))
     if udp := [place for place in find_endpoint_addresses(named) if place.startswith("udp/")]:
         raise UsageError(f"{udp[0]}: UDP loses, repeats and trusts everything: use tcp, tls or quic")
     if keys is not None:
@@ -318,7 +321,8 @@ def open_bus(
         UnknownHost: a host name does not resolve at the first attempt; later on it may be away for a while.
         SessionError: no router answered in time.
     """
-    begun_ns, printed = clock.monotonic_ns(), False
+    begun_ns = clock.monotonic_ns()
+    printed = False
     while not stopped():
         try:
             return connection.open()

@@ -40,7 +40,8 @@ def find_members(
     Raises:
         SessionError: the time is over, and all answers that arrived are unreadable.
     """
-    query, found = MemberQuery(bus, clock, session), False
+    query = MemberQuery(bus, clock, session)
+    found = False
     begun_ns = clock.monotonic_ns()
     while not stopped() and (timeout_s is None or clock.monotonic_ns() - begun_ns < timeout_s * 1e9):
         for info in query.poll():
@@ -142,7 +143,8 @@ def send_change(bus: Bus, clock: Clock, session: str, site: str, request: Change
 
 
 def _ask_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | None:
-    replies, give_up_ns = bus.ask(key, encode(request)), clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
+    replies = bus.ask(key, encode(request))
+    give_up_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
     while clock.monotonic_ns() < give_up_ns:
         clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         if (reply := replies.poll()) is not None:
@@ -152,7 +154,8 @@ def _ask_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | Non
 
 def list_past_events(bus: Bus, clock: Clock, session: str, site: str) -> Iterator[Event]:
     """Yields the events of a site that runs, from its first one on, as far as it keeps them and answers."""
-    first, made = 0, 1
+    first = 0
+    made = 1
     with suppress(WireError):  # a stranger's answer
         while first < made:
             wanted = BackfillRequest(channel="event", first=first, last=first + BACKFILL_MESSAGES - 1)
@@ -161,7 +164,8 @@ def list_past_events(bus: Bus, clock: Clock, session: str, site: str) -> Iterato
             if past is None or not past.payloads:
                 return
             yield from (decode(payload, Event) for payload in past.payloads)
-            first, made = past.first + len(past.payloads), past.made
+            first = past.first + len(past.payloads)
+            made = past.made
 
 
 def open_playback_bus(

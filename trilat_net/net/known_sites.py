@@ -25,7 +25,9 @@ from .zenoh_config import Endpoint, ZenohMode, merge_settings
 if TYPE_CHECKING:
     from .connection import Connection
 
-ASK_NS, POLL_NS, PATIENCE_NS = 50_000_000, 1_000_000, 1_500_000_000
+ASK_NS = 50_000_000
+POLL_NS = 1_000_000
+PATIENCE_NS = 1_500_000_000
 AT_ONCE = {"scouting": {"delay": 0}}
 """Settings of Zenoh: nothing is scouted, so that nothing is waited for."""
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL
@@ -63,7 +65,8 @@ def make_site_known(
 ) -> Iterator[None]:
     """Keeps a site's file inside the block, if others need no settings of Zenoh to reach it."""
     places = connection.reach([*connection.listen, *(connection.connect or ())])
-    how, here = (connection.mode, bool(connection.keys_of)), (os.getpid(), SystemClock().identity())
+    how = (connection.mode, bool(connection.keys_of))
+    here = (os.getpid(), SystemClock().identity())
     known = KnownSite(session, site, sites, *how, places, stop, *here)
     with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
         if connection.keys_of or not connection.own:
@@ -79,7 +82,8 @@ def make_site_known(
 
 def find_known_sites(session: str) -> list[KnownSite]:
     """Returns the sites of a session that run on this machine; removes the files of those that are gone."""
-    found, machine = [], SystemClock().identity()
+    found = []
+    machine = SystemClock().identity()
     with suppress(OSError, RuntimeError):
         for file in sorted(_find_folder().glob("*.json")):
             with suppress(OSError, msgspec.MsgspecError):  # half written, or none of ours
@@ -120,7 +124,9 @@ def stop_at_once(words: Sequence[str]) -> int | list[str]:
     Returns:
         The exit code; or the words with which the long way does it, or what is left.
     """
-    given, sites, simple = {"--session": "", "--keys": ""}, list[str](), True
+    given = {"--session": "", "--keys": ""}
+    sites = list[str]()
+    simple = True
     rest = iter(words)
     for word in rest:
         name, equals, value = word.partition("=")
@@ -165,9 +171,12 @@ def _order(known: Sequence[KnownSite], sites: Sequence[str], keys: str) -> bool:
         from .member_keys import read_member_keys
 
         own = merge_settings(read_member_keys(Path(keys), stops=True).settings, AT_ONCE)
-    left, twins = set(sites or known[0].sites), Counter(one.site for one in known)
+    left = set(sites or known[0].sites)
+    twins = Counter(one.site for one in known)
     asked: list[tuple[str, Inbox, list[dict[str, Any]]]] = []
-    clock, session, stops = SystemClock(), known[0].session, True
+    clock = SystemClock()
+    session = known[0].session
+    stops = True
     begun_ns = ask_ns = clock.monotonic_ns()
     with closing(ZenohBus([], list_places(known), known[0].mode, own)) as bus:
         while left and (now_ns := clock.monotonic_ns()) - begun_ns < PATIENCE_NS:

@@ -29,12 +29,10 @@ from ..errors import UsageError
 from ..files import find_rights_of_others, make_folder, open_regular, stage_output, write_whole
 from .zenoh_config import MOST_SESSIONS, PROTOCOLS, make_access_rules
 
-AUTHORITY, CERTIFICATE, PRIVATE_KEY, MEMBERS = (
-    "authority.pem",
-    "certificate.pem",
-    "private.key",
-    "members.json",
-)
+AUTHORITY = "authority.pem"
+CERTIFICATE = "certificate.pem"
+PRIVATE_KEY = "private.key"
+MEMBERS = "members.json"
 _AUTHORITY_FOLDER = "authority"
 HERE = ("localhost", "127.0.0.1", "::1")
 """Names of the own machine, which every certificate holds."""
@@ -46,7 +44,8 @@ MOST_KEY_BYTES = 65_536
 """Of a file of keys; the rest of a longer one is not read."""
 _RENEWAL = "renew it with trilat keys renew, or make new keys for all with trilat keys new"
 _DATE = "%Y-%m-%d %H:%M UTC"
-MOST_DAYS, MOST_LETTERS = 3_650, 64
+MOST_DAYS = 3_650
+MOST_LETTERS = 64
 """For which certificates may hold, and of a name in one."""
 
 
@@ -320,7 +319,8 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
         raise UsageError(f"{error.filename}: {error.strerror}: no keys of `trilat keys new`") from None
     try:
         named = json.loads(listed)
-        member, members = named["member"], tuple(named["members"])
+        member = named["member"]
+        members = tuple(named["members"])
         authority, certificate = map(x509.load_pem_x509_certificate, pems)
         key = serialization.load_pem_private_key(private, password=None)
         ends = certificate.not_valid_after_utc
@@ -347,7 +347,8 @@ def _find_fault(
 ) -> str:
     common = ", ".join(name.rfc4514_string().removeprefix("CN=") for name in certificate.subject.rdns)
     begins = certificate.not_valid_before_utc
-    private, now = folder / PRIVATE_KEY, datetime.datetime.now(datetime.UTC)
+    private = folder / PRIVATE_KEY
+    now = datetime.datetime.now(datetime.UTC)
     for fault, text in (
         (find_rights_of_others(private), f"{PRIVATE_KEY} can be read by others: chmod 600 {private}"),
         (common != member, f"the certificate is that of {common}, and {MEMBERS} names {member}"),

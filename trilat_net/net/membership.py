@@ -152,7 +152,9 @@ class Membership:
         self.met: dict[str, Info] = {}
         self.alive: set[str] = set()
         self.gone: set[str] = set()
-        self._session, self._publisher, self._sites = session, publisher, tuple(sites)
+        self._session = session
+        self._publisher = publisher
+        self._sites = tuple(sites)
         self._late = late
         self._presence = bus.presence(topics.presence_key(session, "*"))
         self._query = MemberQuery(bus, clock, session)

@@ -66,7 +66,8 @@ class OffsetEstimate(NamedTuple):
     def bound_at(self, at_ns: int, offset_ns: int) -> int:
         """Returns the largest distance of the offset from a value at another instant, ns."""
         passed_s = (at_ns - self.at_ns) / NS_PER_S
-        up, down = self.drift_high, self.drift_low
+        up = self.drift_high
+        down = self.drift_low
         if passed_s < 0.0:
             up, down = down, up
         above = self.high_ns - offset_ns + passed_s * up
@@ -122,7 +123,8 @@ class _Lines:
     """All lines under every ceiling and over every floor; times are s from now, values ns from a base."""
 
     def __init__(self, ceilings: deque[OffsetLimit], floors: deque[OffsetLimit], now_ns: int) -> None:
-        self._now_ns, self._base_ns = now_ns, ceilings[-1].offset_ns
+        self._now_ns = now_ns
+        self._base_ns = ceilings[-1].offset_ns
         self._above_s, self._above = self._columns(ceilings)
         self._below_s, self._below = self._columns(floors)
         self._widest = self._above - WANDER * self._above_s
@@ -165,9 +167,11 @@ class _Lines:
         A window of slow messages tells little: its weight falls with its distance from the best one, which
         depends on the slope, hence some rounds.
         """
-        slope, drift_weight = 0.0, _PRIOR**-2
+        slope = 0.0
+        drift_weight = _PRIOR**-2
         for n in range(_ROUNDS):
-            numerator, denominator = 0.0, drift_weight
+            numerator = 0.0
+            denominator = drift_weight
             for times, values, side in (
                 (self._above_s, self._above, 1.0),
                 (self._below_s, self._below, -1.0),
@@ -191,7 +195,8 @@ class _SlewSegment:
     """The slew from an instant and a value to one estimate, and on along it."""
 
     def __init__(self, from_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
-        self.from_ns, self.estimate = from_ns, estimate
+        self.from_ns = from_ns
+        self.estimate = estimate
         self._joined_ns = from_ns + SLEW_NS
         self._joined_offset_ns = estimate.offset_at(self._joined_ns)
         self._approach = (self._joined_offset_ns - offset_ns) / SLEW_NS
@@ -229,7 +234,9 @@ class SlewedOffset:
 
     def slew_to(self, at_ns: int, estimate: OffsetEstimate) -> None:
         """Slews to a new estimate from an instant of the own clock on."""
-        self._segment, self._before = _SlewSegment(at_ns, self.at(at_ns), estimate), self._segment
+        segment = _SlewSegment(at_ns, self.at(at_ns), estimate)
+        self._before = self._segment
+        self._segment = segment
 
     def at(self, at_ns: int) -> int:
         """Returns the offset at an instant, not before the last but one `slew_to`, ns."""

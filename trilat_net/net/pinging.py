@@ -28,7 +28,9 @@ class RepeatedQuery:
     """A query that is sent again and again; answers to the last QUERIES_KEPT of them count."""
 
     def __init__(self, bus: Bus, clock: Clock, key: str) -> None:
-        self._bus, self._clock, self._key = bus, clock, key
+        self._bus = bus
+        self._clock = clock
+        self._key = key
         self._open: deque[tuple[int, Inbox]] = deque(maxlen=QUERIES_KEPT)
 
     def repeat(self, every_ns: int = QUERY_EVERY_NS) -> bool:
@@ -142,7 +144,8 @@ class Pinger:
 
     def __init__(self, bus: Bus, clock: Clock, session: str, enough: int = PINGS) -> None:
         self.trips: dict[int, RoundTrips] = {}
-        self._clock, self._enough = clock, enough
+        self._clock = clock
+        self._enough = enough
         self._query = RepeatedQuery(bus, clock, topics.key(session, "*", topics.PING))
         self._glance_until_ns = 0
 
@@ -153,7 +156,8 @@ class Pinger:
             self._glance_until_ns = self._clock.monotonic_ns() + 2 * self.slowest_ns() + _STRAGGLE_NS
         while (reply := self._query.poll()) is not None:
             asked_ns, key, payload = reply
-            now_ns, parts = self._clock.monotonic_ns(), topics.parse_key(key)
+            now_ns = self._clock.monotonic_ns()
+            parts = topics.parse_key(key)
             try:
                 pong = decode(payload, Pong)
             except WireError:

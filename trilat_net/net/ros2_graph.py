@@ -177,7 +177,8 @@ class Refusals:
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self.counts: Counter[str] = Counter()
-        self._say, self._lock = say, threading.Lock()
+        self._say = say
+        self._lock = threading.Lock()
 
     def add(self, reason: str) -> None:
         """Counts one, in whatever thread."""
@@ -205,7 +206,10 @@ class TopicPublisher:
     """Publishes on a topic."""
 
     def __init__(self, declared: Any, gid: bytes, clock: Clock, *, latched: bool) -> None:
-        self._declared, self._gid, self._clock, self._latched = declared, gid, clock, latched
+        self._declared = declared
+        self._gid = gid
+        self._clock = clock
+        self._latched = latched
         self._number = 0
 
     @property
@@ -254,7 +258,9 @@ class Ros2Graph:
                 "ROS (ros2 run rmw_zenoh_cpp rmw_zenohd, at port 7447), or trilat router"
             )
         self._place = GraphPlace(domain, str(self._session.zid()), namespace, name)
-        self._distro, self._clock, self._endpoints = distro, clock, 0
+        self._distro = distro
+        self._clock = clock
+        self._endpoints = 0
         self.refusals = refusals
         # not Zenoh's own thread for it: one that waits there when the interpreter ends aborts the process
         self._answers = ThreadPoolExecutor(1, "services")

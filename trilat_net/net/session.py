@@ -46,8 +46,11 @@ class SessionJoin:
         sites: Sequence[str],
         late: LateSites = LateSites(),  # noqa: B008
     ) -> None:
-        self._clock, self._session, self._publisher = clock, session, publisher
-        self._sites, self._late = tuple(sites), late
+        self._clock = clock
+        self._session = session
+        self._publisher = publisher
+        self._sites = tuple(sites)
+        self._late = late
         self.refusal = ""
         self._coming: tuple[Event, Epoch] | None = None
         self._admitted: set[str] = set()
@@ -87,7 +90,8 @@ class SessionJoin:
         Raises:
             SessionError: this member cannot be part of the session.
         """
-        membership, now_ns = self.membership, self._clock.monotonic_ns()
+        membership = self.membership
+        now_ns = self._clock.monotonic_ns()
         self._publisher.answer_queries()
         membership.poll(invited=self._announced is not None and not membership.leads)
         self.pinger.poll(self._other_clocks(membership.boots(), membership.clocks()))
@@ -137,7 +141,9 @@ class SessionJoin:
 
     def _ask_to_join(self, epoch: Epoch, running: Sequence[Info], now_ns: int) -> Epoch | None:
         """Says `coming`, again and again; returns the epoch when every running site has admitted it."""
-        own, rate_hz, slowest_ns = self._own, self._late.rate_hz, self.pinger.slowest_ns()
+        own = self._own
+        rate_hz = self._late.rate_hz
+        slowest_ns = self.pinger.slowest_ns()
         if self._coming is not None:
             event, told = self._coming
             first_ns = told.mono_ns + tick_ns(event.ticks, rate_hz)
@@ -230,7 +236,8 @@ class SessionJoin:
         event = self._offered
         if event is None or not self.pinger.know(self._other_clocks(event.boots, event.clocks)):
             return
-        self._offered, self._announced = None, event
+        self._offered = None
+        self._announced = event
         estimate = self.pinger.estimate(event.boot)
         about_ns = event.epoch_mono_ns - estimate.offset_ns
         self._epoch_ns = event.epoch_mono_ns - estimate.offset_at(about_ns)
@@ -245,7 +252,9 @@ class SessionJoin:
 
     def _lead(self) -> Epoch | None:
         """Announces an epoch when all are present; returns it when all are ready in time."""
-        now_ns, membership, announced = self._clock.monotonic_ns(), self.membership, self._announced
+        now_ns = self._clock.monotonic_ns()
+        membership = self.membership
+        announced = self._announced
         if announced is None:
             other_clocks = self._other_clocks(membership.boots(), membership.clocks())
             if not membership.missing() and self.pinger.know(other_clocks):

@@ -45,7 +45,8 @@ class TickSchedule:
         self.slew = 0.0
         self.error_ns = 0
         self._rate_hz = rate_hz
-        self._from_ns, self._base_ns = 0, epoch_ns
+        self._from_ns = 0
+        self._base_ns = epoch_ns
         self._slew_per_ns = 0.0
 
     def due_ns(self, k: int) -> int:
@@ -82,7 +83,8 @@ class SentStamps:
     def put(self, tick: int, at_ns: int) -> None:
         """Notes the time of sending of a record, on the own clock."""
         slot = 2 * (tick % self._capacity)
-        self._entries[slot], self._entries[slot + 1] = tick, at_ns
+        self._entries[slot] = tick
+        self._entries[slot + 1] = at_ns
 
     def at(self, tick: int) -> int | None:
         """Returns the time of sending of a record, or None if it is no longer known."""
@@ -137,7 +139,8 @@ class LinkTimingMonitor:
         self.contradicted = self.unheard = False
         self._heard_ns = self._acknowledged_ns = -1
         self._acknowledged = -1
-        self._epoch_ns, self._place = peer.epoch_ns, peer.place
+        self._epoch_ns = peer.epoch_ns
+        self._place = peer.place
         self._shared_ns = peer.estimate.offset_ns if peer.is_own else None
         self._windows = 0
         self._opened_ns: int | None = None
@@ -166,7 +169,8 @@ class LinkTimingMonitor:
         for place, tick, at_ns in sample.echo:
             if place == self._place and (own_ns := self._sent.at(tick)) is not None:
                 if tick > self._acknowledged:
-                    self._acknowledged, self._acknowledged_ns = tick, arrived_ns
+                    self._acknowledged = tick
+                    self._acknowledged_ns = arrived_ns
                 reached_ns = at_ns + self._epoch_ns
                 there_ns = reached_ns - offset_ns - own_ns
                 if there_ns < self._there_ns:
@@ -216,8 +220,10 @@ class LinkTimingMonitor:
 
     def measured(self, now_ns: int) -> dict[str, int]:
         """Returns the link's timing fields of `LinkStats` since the last call."""
-        delays, rtt_ns = sorted(self._delays), self._rtt_ns
-        self._delays, self._rtt_ns = [], _FAR_NS
+        delays = sorted(self._delays)
+        rtt_ns = self._rtt_ns
+        self._delays = []
+        self._rtt_ns = _FAR_NS
         return {
             "offset_us": self.offset.at(now_ns) // 1000,
             "bound_us": -(-self.offset.bound_at(now_ns) // 1000),
@@ -265,7 +271,8 @@ class SiteTiming:
     ) -> None:
         self.schedule = TickSchedule(epoch_ns, rate_hz)
         self.turn_ns = turn_ns
-        self._epoch_ns, self._rate_hz = epoch_ns, rate_hz
+        self._epoch_ns = epoch_ns
+        self._rate_hz = rate_hz
         self._sent = SentStamps()
         self.meters = [LinkTimingMonitor(peer, self._sent) for peer in peers]
         for meter in self.meters:
@@ -299,7 +306,8 @@ class SiteTiming:
             return []
         k = t_ns * self._rate_hz // NS_PER_S
         at_ns = self.schedule.due_ns(k)
-        offset_ns, wide_ns = epoch_ns + k * NS_PER_S // self._rate_hz - at_ns, bound_ns + FIRST_BOUND_NS
+        offset_ns = epoch_ns + k * NS_PER_S // self._rate_hz - at_ns
+        wide_ns = bound_ns + FIRST_BOUND_NS
         sides = offset_ns - wide_ns, offset_ns + wide_ns, -DRIFT_LIMIT, DRIFT_LIMIT
         estimate = OffsetEstimate(at_ns, offset_ns, 0.0, *sides)
         meter.admit(known._replace(estimate=estimate, estimator=OffsetEstimator()))
@@ -335,7 +343,8 @@ class SiteTiming:
             if faulty and now_ns - self._faults_ns[n] >= FAULT_EVERY_NS:
                 self._faults_ns[n] = now_ns
                 notices.append(_fault_notice(meter))
-                meter.worst_ns, meter.contradicted = 0, False
+                meter.worst_ns = 0
+                meter.contradicted = False
             if meter.unheard is meter.hears(now_ns):  # None, of a silent peer, is neither
                 meter.unheard = not meter.unheard
                 notices.append(_hearing_notice(meter, k))
@@ -358,7 +367,9 @@ class SiteTiming:
 
 
 def _estimate_notice(meter: LinkTimingMonitor, k: int, at_ns: int) -> ClockNotice:
-    offset, estimate, name = meter.offset, meter.offset.estimate, meter.peer.name
+    offset = meter.offset
+    estimate = meter.offset.estimate
+    name = meter.peer.name
     offset_ns = offset.at(at_ns)
     drift_bound = max(estimate.drift_high - estimate.drift, estimate.drift - estimate.drift_low)
     told = f"{format_offset(offset_ns, offset.bound_ns)}, drift {estimate.drift / 1000:+.2f} ppm"
@@ -375,7 +386,9 @@ def _estimate_notice(meter: LinkTimingMonitor, k: int, at_ns: int) -> ClockNotic
 
 
 def _fault_notice(meter: LinkTimingMonitor) -> ClockNotice:
-    name, before_ns, bound_ns = meter.peer.name, meter.worst_ns, meter.offset.bound_ns
+    name = meter.peer.name
+    before_ns = meter.worst_ns
+    bound_ns = meter.offset.bound_ns
     what = f"its stamps contradict those before, beyond the bound of {bound_ns / 1000:.0f} us"
     if before_ns:
         what = f"a sample came {before_ns / 1e6:.3f} ms before it was sent"
@@ -402,7 +415,8 @@ class LoopStats:
     """
 
     def __init__(self, site: Site, boot: int) -> None:
-        self._site, self._boot = site, boot
+        self._site = site
+        self._boot = boot
         self._rates = [site.peer_rate_hz(peer) for peer in range(len(site.peers))]
         self._every = ticks_per_stats(site.rate_hz)
         self._period_us = 1_000_000 / site.rate_hz

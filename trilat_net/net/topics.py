@@ -10,12 +10,22 @@ from .bus import PresenceInbox
 
 ROOT = "trilat"
 RECORDER = "recorder"
-STATE, LINK, EVENT, INFO, ALIVE, PING, SET = "state", "link", "event", "info", "alive", "ping", "set"
+STATE = "state"
+LINK = "link"
+EVENT = "event"
+INFO = "info"
+ALIVE = "alive"
+PING = "ping"
+SET = "set"
 STOP = "stop"
 """What every member may ask of a site; all other changes are asked for under `SET`."""
 SAMPLE = "sample"
-PAST, STATS = "past", "stats"
-MEASURED, HAND, ENABLE, VIEW = "measured", "hand", "enable", "view"
+PAST = "past"
+STATS = "stats"
+MEASURED = "measured"
+HAND = "hand"
+ENABLE = "enable"
+VIEW = "view"
 STATS_PER_SECOND = 10
 
 

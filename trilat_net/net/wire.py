@@ -37,7 +37,8 @@ MAX_BYTES = 65_536
 MAX_INFO_BYTES = 64 * 1024 * 1024
 MAX_PAST_BYTES = 2 * MAX_BYTES
 """Largest message; largest `Info`, which holds a whole scenario with its traces; largest `Backfill`."""
-SAMPLE_BYTES, NUMBER_BYTES = 2_048, 9
+SAMPLE_BYTES = 2_048
+NUMBER_BYTES = 9
 """Of a sample, besides its vectors; of one of their numbers."""
 
 _Sent = LinkStats | Event | Info | RecorderStats | Request
@@ -126,7 +127,8 @@ def encode_sample(
     Raises:
         WireError: a number is not finite.
     """
-    (q, qd, tau_x), ch = output.shared(), output.ch
+    (q, qd, tau_x) = output.shared()
+    ch = output.ch
     total = sum(q) + sum(qd) + sum(tau_x) + sum(ch)
     if not _isfinite(total) and not all(map(_isfinite, [*q, *qd, *tau_x, *ch])):
         raise WireError("not finite", f"{site} at tick {output.tick}")
@@ -151,7 +153,8 @@ def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
     for payload in payloads:
         if block and size + len(payload) > BACKFILL_BYTES:
             yield b"".join(block)
-            block, size = [], 0
+            block = []
+            size = 0
         block.append(payload)
         size += len(payload)
     if block:
@@ -205,11 +208,13 @@ def make_decoder(
     kind: type[msgspec.Struct], versions: tuple[int, ...] = (VERSION,), layout: Layout | None = None
 ) -> Callable[[bytes], Any]:
     """Returns `decode` for one kind of message, with all that it needs at hand."""
-    limit, parse = _LIMITS.get(kind, MAX_BYTES), _DECODERS[kind].decode
+    limit = _LIMITS.get(kind, MAX_BYTES)
+    parse = _DECODERS[kind].decode
     if kind is PeerSample and layout is not None:  # thousands may wait
         limit = SAMPLE_BYTES + NUMBER_BYTES * (3 * layout.shared + layout.sent)
     names = _vectors(kind, layout or Layout())
-    vectors_of, lengths = attrgetter(*names) if names else None, list(names.values()) if layout else None
+    vectors_of = attrgetter(*names) if names else None
+    lengths = list(names.values()) if layout else None
 
     def read(payload: bytes) -> Any:
         if len(payload) > limit:

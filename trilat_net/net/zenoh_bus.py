@@ -49,7 +49,9 @@ class _ZenohRing(Generic[T]):
     """A ring of Zenoh's; `read` turns what it holds into an entry, or into None, which is passed over."""
 
     def __init__(self, source: Any, read: Callable[[Any], T | None]) -> None:
-        self._source, self._try_recv, self._read = source, source.try_recv, read
+        self._source = source
+        self._try_recv = source.try_recv
+        self._read = read
 
     def poll(self) -> T | None:
         try:

@@ -35,8 +35,10 @@ LEASE_MS = 5_000
 """A stall shorter than this loses no connection, hence no message. A killed peer is seen at once by its
 closed connection; a silent one by the age of its samples."""
 
-BATCHES, BATCH_BYTES = 16, 65_535
-MOST_PUT_BYTES, MOST_QUERY_BYTES = 262_144, 65_536
+BATCHES = 16
+BATCH_BYTES = 65_535
+MOST_PUT_BYTES = 262_144
+MOST_QUERY_BYTES = 65_536
 """The largest messages that a link takes: ten records of the longest arms; an order."""
 
 ZenohMode = Literal["peer", "client", "router"]
@@ -321,7 +323,10 @@ def _suggest_key(path: Sequence[str], reason: str) -> str:
     return f"no key of Zenoh's; {choice}"
 
 
-RECORDER, OPERATOR, ROUTER, BRIDGE = topics.RECORDER, "operator", "router", "bridge"
+RECORDER = topics.RECORDER
+OPERATOR = "operator"
+ROUTER = "router"
+BRIDGE = "bridge"
 PROTOCOLS = ("tls", "quic")
 
 MOST_REPLY_BYTES = 8_388_608

@@ -21,7 +21,8 @@ def list_site_colours(scenario: Scenario, colours: Sequence[str] = SITE_COLOURS)
     return [colours[place] for place in scenario.order_palette(len(SITE_COLOURS))]
 
 
-COLUMN_IN, PAGE_IN = 3.5, 7.0
+COLUMN_IN = 3.5
+PAGE_IN = 7.0
 """Widths of one column and of two, in."""
 
 

@@ -140,7 +140,8 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
     given = {name: x for name, x in balance.work.items() if name not in links}
     if len(links) > MAX_LISTED_LINKS:
         links = {f"{count_nouns(len(links), 'link')}": np.sum(list(links.values()), axis=0)}
-    gained, lost = sum(balance.work.values()), sum(balance.dissipation.values())
+    gained = sum(balance.work.values())
+    lost = sum(balance.dissipation.values())
     rest = balance.V - balance.V[0] - (gained - lost + balance.sampling - balance.transfer)
     entries = {
         **{f"taken: {name}": -values for name, values in balance.dissipation.items()},

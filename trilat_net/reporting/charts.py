@@ -159,7 +159,8 @@ class Charts:
             tables = self._tables_of(site_signals.external_torques, operated)
             yield from self._per_joint("torques", "operator torque on the arm", "N m", tables)
         yield from self._positions()
-        tables, unit = self._tables_of(site_signals.joint_errors), site_signals.shared_unit(log)
+        tables = self._tables_of(site_signals.joint_errors)
+        unit = site_signals.shared_unit(log)
         axes = style.name_shared(log) if site_signals.follows_in_task_space(log) else self._titles
         yield from self._per_joint("errors", "tracking error", unit, tables, axes)
         yield from self._estimates()
@@ -233,7 +234,8 @@ class Charts:
     def _ages(self) -> Iterator[TimeChart]:
         log = self._log
         for site in log.sites:
-            age_ms, peers = site_signals.sample_ages_ms(log, site), log[site].peers
+            age_ms = site_signals.sample_ages_ms(log, site)
+            peers = log[site].peers
             table = self._site_table(site, age_ms)
             series = [self._series(peer, table, n, f"{peer} → {site}") for n, peer in enumerate(peers)]
             lines = self._stated(site)
@@ -310,7 +312,8 @@ class Charts:
             )
 
     def _arm(self, index: int, site: str) -> PlanarArm | ChainArm:
-        part, arm = self._log[site], self._log.scenario.arms[site]
+        part = self._log[site]
+        arm = self._log.scenario.arms[site]
         if arm.chain is not None:
             return self._projected(index, site)
         values = np.hstack([site_signals.joint_angles(part), site_signals.reference_angles(part)])
@@ -320,14 +323,16 @@ class Charts:
 
     def _edges(self, site: str, rows: NDArray[np.int64]) -> list[NDArray[np.float64]]:
         """Returns the edges of the bodies of a site's plant in some records, shape (K, 2 P) each."""
-        sizes_m, arm = self._log.scenario.bodies_m(site).values(), self._log.scenario.arms[site]
+        sizes_m = self._log.scenario.bodies_m(site).values()
+        arm = self._log.scenario.arms[site]
         if not sizes_m:
             return []
         traced = arm_poses.trace_bodies_m(arm, sizes_m, self._log[site].bodies[rows])
         return [self.factor * path.reshape(len(rows), -1) for path in traced]
 
     def _projected(self, index: int, site: str) -> ChainArm:
-        part, arm = self._log[site], self._log.scenario.arms[site]
+        part = self._log[site]
+        arm = self._log.scenario.arms[site]
         rows = np.unique(np.linspace(0, max(len(part) - 1, 0), _FRAMES).astype(np.int64))[: len(part)]
         actual, desired = (
             joint_positions_m(arm, q[rows]) for q in (part.q, site_signals.reference_angles(part))

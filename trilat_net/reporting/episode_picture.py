@@ -35,7 +35,8 @@ class EpisodePicture:
     """
 
     def __init__(self, scenario: Scenario, goal_site: str) -> None:
-        self._scenario, self._goal_site = scenario, goal_site
+        self._scenario = scenario
+        self._goal_site = goal_site
         names = scenario.names
         width_in = PANEL_PX * len(names) / _DPI
         self._figure = Figure(figsize=(width_in, PANEL_PX / _DPI), dpi=_DPI)

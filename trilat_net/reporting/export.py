@@ -67,7 +67,8 @@ class Exporter:
         self._format: ExportFormat = import_module(f"{exports.__name__}.{form}").FORMAT
         self._settings = _read_settings(form, self._format.write, dict(settings))
         name = log.name.removesuffix(".active").removesuffix(".mcap")
-        self.path, self._force = path or log.parent / (name + self._format.ending), force
+        self.path = path or log.parent / (name + self._format.ending)
+        self._force = force
         self._manifest = EXPORT_MANIFEST if self._format.folder else None
         refuse_existing(self.path, force=force, manifest=self._manifest)
         if self._format.extra:

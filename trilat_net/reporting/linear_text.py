@@ -67,7 +67,8 @@ def _list_numbers(values: Array) -> str:
 
 def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
     """Yields the effective delays, in one line if they are equal; the means of those that vary."""
-    names, age_s = analysis.scenario.names, analysis.conditions.age_s
+    names = analysis.scenario.names
+    age_s = analysis.conditions.age_s
     what = "mean delay in use" if analysis.conditions.varying else "delay in use"
     links = list(zip(*np.nonzero(analysis.conditions.alpha), strict=True))
     values = {float(age_s[i, j]) for i, j in links}
@@ -115,7 +116,8 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
 
 def describe_linear_verdict(analysis: LinearAnalysis) -> str:
     """Returns the verdict with the growth rate and frequency of the rightmost root."""
-    rightmost, drifting = analysis.decisive.rightmost, analysis.decisive.drifting
+    rightmost = analysis.decisive.rightmost
+    drifting = analysis.decisive.drifting
     keeps = f"{drifting} {'motions keep their' if drifting > 1 else 'motion keeps its'} speed"
     if rightmost is None:
         return f"{analysis.verdict}: {keeps if drifting else 'nothing moves'}"
@@ -147,7 +149,8 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
     if ports.pole.order:
         kind = "as of free masses" if ports.pole.passive else "which no passive network has"
         lines.append(f"  at zero frequency Y has a pole of order {ports.pole.order}, {kind}")
-    unit, kind = ports.impedance_unit(), ports.kind
+    unit = ports.impedance_unit()
+    kind = ports.kind
     whole = _describe_passivity(ports.velocity, unit, kind)
     lines.append(f"  operators passive in {ports.speed}, coupled or not: {whole}")
     for joint, one in ports.joints.items():
@@ -221,10 +224,8 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     for group in groups.values():
         worst = min(group, key=lambda one: one.minima.least)
         sites, _, clamped, minima = worst
-        joints, bands = (
-            ", ".join(str(ports.axes.get(one.joint, one.joint)) for one in group),
-            [b for one in group for b in one.minima.below],
-        )
+        joints = ", ".join(str(ports.axes.get(one.joint, one.joint)) for one in group)
+        bands = [b for one in group for b in one.minima.below]
         within = f"within {min(b.from_hz for b in bands):.3g}-{max(b.to_hz for b in bands):.3g} Hz"
         which = f"{' and '.join(sites)}{f', {clamped} clamped' if clamped else ''}, {ports.kind} {joints}"
         least = f"least {minima.least:.3g} at {minima.least_hz:.3g} Hz"

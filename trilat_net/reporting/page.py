@@ -93,7 +93,8 @@ def write_report(
     section = f"<section><h2>Was it stable, and why</h2>{section}</section>"
     lines = list(verdicts)
     facts["checks"] = [line.line() for line in lines]
-    page, numbers = folder / "report.html", folder / "summary.json"
+    page = folder / "report.html"
+    numbers = folder / "summary.json"
     write_whole(page, render_report(log, twin, lines, facts, section, verdict))
     write_whole(numbers, _json(facts, indent=2) + "\n")
     return [page, numbers]
@@ -253,7 +254,8 @@ def _render_description(scenario: Scenario) -> str:
 
 
 def _render_run_facts(log: Log, facts: JsonObject) -> str:
-    scenario, torn = log.scenario, "" if log.complete else "; the file was not finished"
+    scenario = log.scenario
+    torn = "" if log.complete else "; the file was not finished"
     if log.unknown_ends:
         torn += f"; {describe_unknown_ends(log.unknown_ends)}"
     unit = shared_unit(log)
@@ -334,7 +336,8 @@ def _render_link_samples(log: Log, facts: JsonObject) -> str:
         counts: JsonObject = link["samples"] or {}
         cells = [*map(counts.get, keys), _percent(link["loss"]), link["burst"]]
         if measured:
-            way, clock = link["one_way_us"] or {}, link["clock"] or {}
+            way = link["one_way_us"] or {}
+            clock = link["clock"] or {}
             cells += [*map(way.get, ("min", "p50", "p99", "max")), clock.get("bound_p50_us")]
         rows.append([_label_link(log, name), *map(_format_cell, cells)])
     return _render_table(headers, rows)

@@ -66,7 +66,8 @@ def open_rerun(
     if show.save is None and not show.web and sys.platform == "linux" and not displays:
         raise UsageError("there is no display here; show it in a browser with --web, or keep it with --save")
     with tempfile.TemporaryDirectory(prefix="trilat-view-") as folder:
-        path, named = paths[0], Path(folder) / f"{make_application_id(paths[0])}.mcap"
+        path = paths[0]
+        named = Path(folder) / f"{make_application_id(paths[0])}.mcap"
         if show.full or len(paths) > 1 or not read_ros2_channels(path):
             say("making standard channels of every record ...")
             export_ros2(opened(), named)
@@ -270,6 +271,7 @@ def _view(rrb: Any, plot: CurvePlot) -> Any:
 def _lines(curves: PlotCurves, first: int) -> Any:
     """Returns the style of curves, from a color on; references are paler than the joints."""
     rr = import_extra("rerun", "view", "viewers")
-    pale, strong = cycle(_PALE), cycle(_COLORS[first:] + _COLORS[:first])
+    pale = cycle(_PALE)
+    strong = cycle(_COLORS[first:] + _COLORS[:first])
     colors = [next(pale) if name.endswith("_ref") else next(strong) for name in curves.names]
     return rr.SeriesLines(names=list(curves.names), colors=colors, visible_series=list(curves.shown))

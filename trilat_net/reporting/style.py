@@ -299,7 +299,8 @@ MOST_EXPLAINED_CHANGES = 12
 SiteSignal = Callable[[str], tuple[Ints, Array, Array]]
 """Ticks, shape (K,), times, shape (K,), s, and values, shape (K, J), of a site."""
 
-_AWAY, _BACK = 0.22, 0.09
+_AWAY = 0.22
+_BACK = 0.09
 _LETTERS_PER_IN = 120.0
 """Of 1 pt type, on the average."""
 _CHANGE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (1, 1.5)), "linewidth": 0.7}
@@ -328,7 +329,9 @@ class TimeFigure:
     """A figure of a log over time."""
 
     def __init__(self, log: Log, form: FigureSize, figure: Figure) -> None:
-        self.log, self.figure, self._small_pt = log, figure, form.small_pt
+        self.log = log
+        self.figure = figure
+        self._small_pt = form.small_pt
         self._changes = list(enumerate(list_changes(log), 1))
         self._modes = {site: find_mode_intervals(log[site]) for site in log.sites}
 
@@ -362,7 +365,8 @@ class TimeFigure:
         for n, changed in self._changes:
             if changed.site not in sites or (link and changed.change.link != link):
                 continue
-            at_s, place = changed.change.at_s, axes.get_xaxis_transform()
+            at_s = changed.change.at_s
+            place = axes.get_xaxis_transform()
             axes.axvline(at_s, zorder=0.6, **_CHANGE)
             if numbered:
                 axes.annotate(str(n), (at_s, 1.0), xycoords=place, fontsize=self._small_pt, **_NUMBER)

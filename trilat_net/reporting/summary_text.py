@@ -238,7 +238,9 @@ def _describe_effects(again: Rerun) -> list[str]:
     lines = []
     for effect in again.sites.values():
         if effect.q_max_rad:
-            most, at_s, rms = effect.q_max_rad, effect.q_max_at_s, effect.q_rms_rad
+            most = effect.q_max_rad
+            at_s = effect.q_max_at_s
+            rms = effect.q_rms_rad
             lines.append(
                 f"{effect.site}: q is up to {most:.3g} rad off the log, at {at_s:.3f} s; {rms:.3g} rad rms"
             )
@@ -275,7 +277,8 @@ def compose_doctor(found: Result) -> Iterator[Block]:
 def compose_ping(found: Result) -> Iterator[Block]:
     """Yields the members with round trips and clocks, and the links as the sites measure them."""
     facts = found.to_dict()
-    members, links = facts["members"], facts["links"]
+    members = facts["members"]
+    links = facts["links"]
     state = "runs" if any(member["running"] for member in members) else "waits for its members"
     yield f"session {facts['session']} {state}; times in us; a clock is the one there minus the one here"
     rows = []
@@ -305,9 +308,11 @@ def compose_topic_delays(found: Result) -> Iterator[Block]:
     """Yields a row per publisher, and how its delays are spread from the least to the largest."""
     facts = found.to_dict()
     yield f"/{facts['topic']}, {facts['lasted_s']:.3g} s; times in us, from sending to arrival here"
-    rows, least = [], 0.0
+    rows = []
+    least = 0.0
     for one in facts["publishers"]:
-        times, counts = one["delay_us"], one["histogram"]["counts"]
+        times = one["delay_us"]
+        counts = one["histogram"]["counts"]
         bars = "".join(_BARS[-(-8 * count // max(counts))] for count in counts)
         numbers = [str(one["messages"]), str(one["lost"]), f"{one['rate_hz']:.1f}"]
         rows.append([one["gid"][:8], one["type"], *numbers, *(f"{times[name]:.0f}" for name in times), bars])
@@ -330,7 +335,8 @@ def _clock(member: dict[str, Any]) -> str:
 def compose_benchmark(found: Result) -> Iterator[Block]:
     """Yields a row per size, rate and transport, and per transport whether that is good enough."""
     facts = found.to_dict()
-    needs, name = facts["needs"], facts["scenario"]
+    needs = facts["needs"]
+    name = facts["scenario"]
     yield "one way is half a round trip, the far end's handling with it; times in us"
     rows = []
     for row in facts["rows"]:
@@ -411,7 +417,8 @@ def _compose_statics(found: LogMetrics) -> Iterator[Block]:
         for pair in found.sharing_ratios:
             pushed = f"{pair.pushed}{' (wall)' if pair.by_wall else ''}"
             off = _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.3g} %"
-            when, which = f"{pair.from_s:.1f} - {pair.to_s:.1f} s", found.label(pair.joint)
+            when = f"{pair.from_s:.1f} - {pair.to_s:.1f} s"
+            which = found.label(pair.joint)
             row = [when, which, pushed, _write_value(pair.pushed_nm)]
             rows.append([*row, pair.holds, _write_value(pair.felt_nm), _write_metric(pair.expected_nm), off])
         yield from _tabulate(heads, rows, words=1)

@@ -37,7 +37,8 @@ from .urdf import UrdfChain, UrdfPayload, read_urdf
 TASK_AXES = ("x", "y", "z", "rx", "ry", "rz")
 STOP_REACH_RAD = 0.05
 """A stop answers with the joint's whole effort limit at this depth, rad or m."""
-START_MARGIN_RAD, START_MARGIN_M = 0.15, 0.02
+START_MARGIN_RAD = 0.15
+START_MARGIN_M = 0.02
 """So far beyond a stop or a limit of position an arm may start: 8.6 degrees, or 2 cm of a sliding joint.
 Encoders are set to zero by hand, and arms are parked on stops that lie beyond those of their files."""
 STOP_EFFORT_NM = 100.0
@@ -224,7 +225,8 @@ class ArmModel(NamedTuple):
     def end_effector(self, q: Vector) -> list[float]:
         """Returns the end effector's place in a pose, m, one number per axis of the arm's space."""
         if self.chain is None:
-            (l1, l2), turned = self.lengths_m, q[0] + q[1]
+            (l1, l2) = self.lengths_m
+            turned = q[0] + q[1]
             return [l1 * math.cos(q[0]) + l2 * math.cos(turned), l1 * math.sin(q[0]) + l2 * math.sin(turned)]
         return list(place_end_effector(self._place(q), np.array(self.chain.tip_m)))
 
@@ -331,14 +333,17 @@ def build_arm(arm: Arm, task: Task, urdf: Mapping[str, str], chains: bool) -> Ar
         raise ScenarioError(
             "its inertia matrix is singular in some pose: give the links mass away from their joints"
         )
-    names, bodies_moved, none = ("q1", "q2"), ("link1", "link2"), (math.inf, math.inf)
+    names = ("q1", "q2")
+    bodies_moved = ("link1", "link2")
+    none = (math.inf, math.inf)
     if not chains:
         return ArmModel(theta, fields.VectorCounts(), names, bodies_moved, none, none, (arm.l1_m, arm.l2_m))
     links = ((arm.m1_kg, arm.lc1_m, arm.I1_kg_m2), (arm.m2_kg, arm.lc2_m, arm.I2_kg_m2))
     bodies = [
         (m, m * c, 0.0, 0.0, 0.0, 0.0, m * c * c + own, 0.0, 0.0, m * c * c + own) for m, c, own in links
     ]
-    upright, axis = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 1.0)
+    upright = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    axis = (0.0, 0.0, 1.0)
     joints = tuple(ChainJoint(False, axis, upright, (x, 0.0, 0.0)) for x in (0.0, arm.l1_m))
     joints, gravity = _place_base(arm, joints, (0.0, -arm.g_m_s2, 0.0))
     chain = ChainSetup(joints, gravity, (arm.l2_m, 0.0, 0.0), task=task.setup)
@@ -402,7 +407,8 @@ def _place_base(
     roll, pitch, yaw = arm.base_rpy_rad
     tilted = multiply(rotation_matrix((0.0, pitch, 0.0)), rotation_matrix((roll, 0.0, 0.0)))
     base = multiply(rotation_matrix((0.0, 0.0, yaw)), tilted)
-    first, (x, y, z) = joints[0], arm.base_xyz_m
+    first = joints[0]
+    (x, y, z) = arm.base_xyz_m
     turned = apply(base, first.origin_m)
     origin = (turned[0] + x, turned[1] + y, turned[2] + z)
     first = first._replace(rotation=multiply(base, first.rotation), origin_m=origin)
@@ -504,19 +510,23 @@ def add_credible_box(gains: Gains, arm: ArmModel, limit_nm: Vector, g_m_s2: floa
     and l the reach of a link, a first moment is at most T / g and a second one l T / g; masses and second
     moments about an axis are not negative. The first estimate is always in the box.
     """
-    T, g = np.max(limit_nm), g_m_s2
+    T = np.max(limit_nm)
+    g = g_m_s2
     if gains.law is not Law.ADAPTIVE or np.isfinite(gains.low).any() or g == 0.0:
         return gains
     if arm.chain is None:
         T_1, T_2 = np.broadcast_to(limit_nm, 2)
-        outer, inner = min(T_1, T_2) / g, T_1 / g
+        outer = min(T_1, T_2) / g
+        inner = T_1 / g
         l1, l2 = arm.lengths_m
         high = np.array([l1 * inner + l2 * outer, l1 * outer, l2 * outer, inner, outer])
         low = np.zeros(5)
     else:
         reach = sum(float(np.linalg.norm(joint.origin_m)) for joint in arm.chain.joints)
         reach += float(np.linalg.norm(arm.chain.tip_m))
-        link, first, second = reach / arm.counts.joints, T / g, reach * T / g
+        link = reach / arm.counts.joints
+        first = T / g
+        second = reach * T / g
         high = np.tile([first / link, *[first] * 3, *[second] * 6], arm.counts.joints)
         low = np.tile([0.0, *[-first] * 3, 0.0, -second, 0.0, -second, -second, 0.0], arm.counts.joints)
     first_estimate = np.broadcast_to(gains.theta_hat0, high.shape)

@@ -212,11 +212,14 @@ def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
             )
     laws = []
     for key, owners in sites.items():
-        consent, now, file = find_consent(key), "", None
+        consent = find_consent(key)
+        now = ""
+        file = None
         with suppress(ScenarioError):
             source = read_code(key.code, "", consent and consent.file)
             check_class(source, key.code, "")
-            now, file = source.sha256, source.file
+            now = source.sha256
+            file = source.file
         allowed = consent is not None and consent.sha256 == now
         changed = "" if now in ("", key.sha256) else f"its sha256 is {now[:16]}, and was {key.sha256[:16]}"
         other = "" if allowed else describe_new_settings(key)

@@ -150,7 +150,8 @@ _COLUMN = re.compile(r"(?P<name>.+?)(?:[_ ](?P<suffix>s|ms|us|ns)|\((?P<unit>s|m
 _UNIT_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _NO_ANSWER = ("lost", "-1", "", "nan", "inf")
 """Delays of samples that were lost, in a table."""
-_TIMES, _DELAYS = ("t", "time", "timestamp", "pub_time"), ("delay", "rtt", "latency")
+_TIMES = ("t", "time", "timestamp", "pub_time")
+_DELAYS = ("delay", "rtt", "latency")
 
 
 @dataclass(frozen=True, repr=False)
@@ -180,7 +181,8 @@ class MeasuredTrace(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat trace import --json`."""
-        delay_ms, lost = self.delay_ms, np.array([math.isinf(ms) for _, ms in self.points])
+        delay_ms = self.delay_ms
+        lost = np.array([math.isinf(ms) for _, ms in self.points])
         bursts = int(np.sum(np.diff(lost.astype(np.int8), prepend=0) == 1))
         found: dict[str, Any] = {
             "samples": len(self.points),
@@ -289,7 +291,10 @@ def _arrange(measured: _Measured) -> MeasuredTrace:
     if not measured.sent:
         raise ValueError("it has no samples")
     sent = sorted(measured.sent, key=lambda one: one[0])
-    begin_s, points, too_long, doubled = sent[0][0], [], 0, 0
+    begin_s = sent[0][0]
+    points = []
+    too_long = 0
+    doubled = 0
     last_us = -1
     for at_s, ms in sent:
         t_us = round((at_s - begin_s) * 1e6)

@@ -49,7 +49,8 @@ def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]
     delay_s = np.zeros((len(names), len(names)))
     for name, link in links.items():
         peer, _, site = name.partition("->")
-        model, rate_hz = link.core(), rates_hz[site]
+        model = link.core()
+        rate_hz = rates_hz[site]
         constant = model.kind == DelayKind.CONSTANT and not link.loss and not link.measured
         delay_us = max(round(model.location), model.playout_us)
         ticks = max(1, -(-delay_us * rate_hz // 1_000_000))
@@ -136,7 +137,8 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
 def _describe_arms(scenario: Scenario) -> list[str]:
     lines: list[str] = []
     for arm, owners in _group_chains(scenario):
-        chain, model = read_arm(arm, scenario.urdf), scenario.arms[owners[0]]
+        chain = read_arm(arm, scenario.urdf)
+        model = scenario.arms[owners[0]]
         mass = sum(joint.inertia[0] for joint in chain.joints)
         lines.append(
             f"arm of {', '.join(owners)}: {arm.urdf}, {count_nouns(len(chain.joints), 'joint')} "
@@ -196,7 +198,8 @@ def _list_start_notes(scenario: Scenario) -> list[str]:
                         f"{name} starts {beyond:.3g} {units[n]} beyond a stop of joint {joint.name}: "
                         "the stop lies where the arm starts"
                     )
-        given, in_force = spec.limits.motion, scenario.motion_limits(name)
+        given = spec.limits.motion
+        in_force = scenario.motion_limits(name)
         for key, before, after in (
             ("q_min_rad", given.q_min, in_force.q_min),
             ("q_max_rad", given.q_max, in_force.q_max),
@@ -216,7 +219,8 @@ def _describe_tasks(scenario: Scenario) -> list[str]:
     lines = []
     for name, model in scenario.arms.items():
         if model.shares_pose:
-            spec, followed = scenario.sites[name], np.array(model.axes) > 0.0
+            spec = scenario.sites[name]
+            followed = np.array(model.axes) > 0.0
             least = np.linalg.svd(model.task_jacobian(spec.q0_rad)[followed], compute_uv=False)[-1]
             bound = spec.task.singular_value
             near = ", so that its inverse is damped there" if least < bound else ""

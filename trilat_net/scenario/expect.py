@@ -235,7 +235,8 @@ def find_expect_problem(expect: Expect, sites: Mapping[str, int]) -> KeyProblem 
         ("end_error_min_rad", "end_error_max_rad"),
         ("mean_age_min_ms", "mean_age_max_ms"),
     ):
-        floor, ceiling = getattr(expect, least), getattr(expect, most)
+        floor = getattr(expect, least)
+        ceiling = getattr(expect, most)
         if floor is not None and ceiling is not None and floor > ceiling:
             return KeyProblem(least, f"must be at most {most} = {ceiling:g}, is {floor:g}")
     return None

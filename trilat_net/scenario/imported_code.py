@@ -291,7 +291,8 @@ def check_class(source: CodeSource, code: str, path: str, method: str = "torque"
         ScenarioError: it is no Python, or has no such class, or that neither the method nor a base.
     """
     kind, page = PAGES[method]
-    name, classes = code.partition(":")[2], parse_classes(source.content, source.file, path)
+    name = code.partition(":")[2]
+    classes = parse_classes(source.content, source.file, path)
     if name not in classes:
         hint = suggest_nearest(name, list(classes)) or f"; see {find_page(page)}"
         raise ScenarioError(f"{source.file} defines no class {name}{hint}", path=path)
@@ -313,7 +314,8 @@ def _execute(module: str, source: CodeSource) -> Any:
     """Returns a module of the content that was checked, and of nothing that is cached beside the file."""
     if source in _executed:
         return _executed[source]
-    file, before = str(source.file), sys.modules.get(module)
+    file = str(source.file)
+    before = sys.modules.get(module)
     spec = spec_from_file_location(module, file, loader=SourceFileLoader(module, file))
     made = sys.modules[module] = module_from_spec(cast(ModuleSpec, spec))
     try:
@@ -332,7 +334,8 @@ def name_law_class(kind: type) -> str:
     Raises:
         ScenarioError: it stands in no file, or within something else there.
     """
-    module, name = kind.__module__, kind.__qualname__
+    module = kind.__module__
+    name = kind.__qualname__
     if module == "__main__":
         module = Path(getattr(sys.modules[module], "__file__", None) or "").stem
     if not module or not name.isidentifier():

@@ -95,7 +95,8 @@ def _expand_group(scenario: Scenario, group: str, name: str, given: Mapping[str,
         hint = suggest_nearest(vector, [*_KIND_KEYS[group], *valid]) or f"; valid are {', '.join(valid)}"
         raise ScenarioError(f"unknown key{hint}", path=f"{group}.{name}")
     if not members:
-        word, owners = _KIND_KEYS[group][0], [kind for kind, names in keys.items() if vector in names]
+        word = _KIND_KEYS[group][0]
+        owners = [kind for kind, names in keys.items() if vector in names]
         is_now = ", ".join(dict.fromkeys(kinds.values()))
         problem = f"belongs to {word} {', '.join(owners)}, and here is only {is_now}: set {group}.{word} too"
         raise ScenarioError(problem, path=f"{group}.{name}")
@@ -113,7 +114,8 @@ def split_entries(tables: TomlTable, pairs: Sequence[Override]) -> tuple[dict[st
 
     A vector may be one number, or be that of a group: its entries are there once the tables are resolved.
     """
-    own, of_entries = {}, []
+    own = {}
+    of_entries = []
     for key, value in pairs:
         vector, entry = _split_entry(key)
         reached: Any = tables if entry else []

@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 _BODY_NAME = re.compile(r"[a-z][a-z0-9_]{0,29}")
-_MAX_BODIES, _MAX_SIZE_M = 32, 100.0
+_MAX_BODIES = 32
+_MAX_SIZE_M = 100.0
 
 
 class PlantContext(NamedTuple):
@@ -134,8 +135,12 @@ class PlantPlayer:
     """
 
     def __init__(self, scenario: "Scenario", site: str, plant: OwnPlant, watch: Watch = call_plainly) -> None:
-        spec, path = scenario.sites[site], f"sites.{site}.plant"
-        self._site, self._code, self._watch, self.rate_hz = site, plant.code, watch, spec.rate_hz
+        spec = scenario.sites[site]
+        path = f"sites.{site}.plant"
+        self._site = site
+        self._code = plant.code
+        self._watch = watch
+        self.rate_hz = spec.rate_hz
         kind = import_class(CodeKey.of(plant), path, plant.method)
         if plant.bodies and not hasattr(kind, "poses"):
             raise ScenarioError(

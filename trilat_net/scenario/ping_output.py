@@ -174,7 +174,8 @@ def _arrange_probes(
         counts: packets sent and received by the summary; None: there is no summary.
         every_s: the interval between probes without times, s.
     """
-    lowest, highest = min(mentioned, default=first or 0), max(mentioned, default=(first or 0) - 1)
+    lowest = min(mentioned, default=first or 0)
+    highest = max(mentioned, default=(first or 0) - 1)
     begin = lowest if first is None else min(first, lowest)
     end = highest + 1
     if counts is not None:
@@ -230,7 +231,8 @@ def _read_windows(lines: Sequence[str], every_s: float) -> PingProbes:
         elif counts := _WINDOWS_COUNTS.match(line):
             if sent is not None:
                 raise ValueError(_SEVERAL_RUNS)
-            sent, is_over = int(counts[1]), True
+            sent = int(counts[1])
+            is_over = True
         elif is_over:
             continue
         elif line.endswith(":"):  # of the header, or of the counts

@@ -101,7 +101,8 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     if "windows" in expect:
         joints = {name: _name_joints(site["arm"], urdf) for name, site in sites.items()}
         expect["windows"] = number_window_joints(expect["windows"], joints)
-    written, rows = check_keys(tables["dominance"], list(sites), "dominance"), {}
+    written = check_keys(tables["dominance"], list(sites), "dominance")
+    rows = {}
     for name in sites:
         if name not in written:
             raise ScenarioError("is missing: whom does this site follow?", path=f"dominance.{name}")
@@ -235,7 +236,8 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> Tom
 def _join_group(shared: TomlTable, own: TomlTable) -> TomlTable:
     """Returns a site's table of a group upon the one of all sites; of `links` link by link, key by key."""
     joined = {**shared, **own}
-    shared_links, own_links = shared.get("links"), own.get("links")
+    shared_links = shared.get("links")
+    own_links = own.get("links")
     if isinstance(shared_links, dict) and isinstance(own_links, dict):
         joined["links"] = {**shared_links, **own_links}
         for name in shared_links.keys() & own_links.keys():
@@ -289,7 +291,8 @@ def _resolve_site(
 def _resolve_arm(
     site: TomlTable, draws: Draws, urdf: dict[str, str], chains: bool, path: str
 ) -> tuple[TomlTable, ArmModel | None]:
-    table, task = dict(site["arm"]), site["task"]
+    table = dict(site["arm"])
+    task = site["task"]
     armature = {key: table.pop(key) for key in ("armature_kg_m2",) if key in table}
     links = _resolve_link_inertias(table.pop("links", {}), draws, f"{path}.links")
     table = draws.draw_numbers(table, path) | ({"links": links} if links else {})
@@ -380,9 +383,11 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
         if found := find_count_problem(table, kind, counts):
             raise ScenarioError(found.problem, path=f"{place}.{found.key}")
     for key, value in site["limits"].items():
-        wanted, owner = counts.joints, f"the arm has {count_nouns(counts.joints, 'joint')}"
+        wanted = counts.joints
+        owner = f"the arm has {count_nouns(counts.joints, 'joint')}"
         if key == "qd_des_limit_rad_s":
-            wanted, owner = counts.shared, f"sites share {count_nouns(counts.shared, 'coordinate')}"
+            wanted = counts.shared
+            owner = f"sites share {count_nouns(counts.shared, 'coordinate')}"
         if isinstance(value, list) and len(value) != wanted:
             raise ScenarioError(
                 f"has {count_nouns(len(value), 'number')}, and {owner}", path=f"{path}.limits.{key}"

@@ -73,7 +73,8 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
         site: the site.
         qd: speed of each joint, rad/s, shape (n,); None: the limits of its speed.
     """
-    spec, setup = scenario.sites[site], scenario.setup(site)
+    spec = scenario.sites[site]
+    setup = scenario.setup(site)
     joints = len(spec.q0_rad)
     speed = np.abs(np.broadcast_to(setup.qd_limit_rad_s if qd is None else qd, joints)).astype(float)
     limit = np.broadcast_to(setup.tau_limit_nm, joints).astype(float)
@@ -135,7 +136,8 @@ def _sample_planar_arm(arm: Arm, speed: Array) -> _ArmSamples:
     elbow = np.linspace(-math.pi, math.pi, _POSES + 1)
     across = c + b * np.cos(elbow)
     M = np.array([[a + 2.0 * b * np.cos(elbow), across], [across, np.full_like(elbow, c)]])
-    upper, lower = abs(first) * arm.g_m_s2, abs(second) * arm.g_m_s2
+    upper = abs(first) * arm.g_m_s2
+    lower = abs(second) * arm.g_m_s2
     slope = np.abs(b * np.sin(elbow))
     pushes = np.array([2.0 * speed[0] * speed[1] + speed[1] ** 2, speed[0] ** 2])
     return _ArmSamples(
@@ -154,7 +156,9 @@ def _sample_chain(model: ArmModel, q0: Array, speed: Array) -> _ArmSamples:
     still = np.zeros(joints)
     torque = np.zeros(joints)
     patterns = speed * _list_patterns(joints)
-    inertias, gravities, pushes = [], [], []
+    inertias = []
+    gravities = []
+    pushes = []
     for q in _draw_poses(model, q0):
         inertias.append(model.inertia(q))
         place_joints(rows, q)

@@ -43,10 +43,15 @@ class LinkSchedule:
         self.models = np.array(sorted([*placed, *ordered], key=lambda one: one.from_ns), LINK_MODEL_DTYPE)
         self._points = np.array([*points, *setup.outages], dtype=np.int64).reshape(-1, 2)
         row: Row = np.zeros(1, link_dtype(0))[0]
-        row.rate_hz, row.key, row.models = setup.rate_hz, setup.key, len(self.models)
-        row.used, row.foreseen = -1, -1
-        row.outage_first, row.outage_count = len(points), len(setup.outages)
-        self.row, self._block = row, np.empty(_BLOCK, dtype=np.int64)
+        row.rate_hz = setup.rate_hz
+        row.key = setup.key
+        row.models = len(self.models)
+        row.used = -1
+        row.foreseen = -1
+        row.outage_first = len(points)
+        row.outage_count = len(setup.outages)
+        self.row = row
+        self._block = np.empty(_BLOCK, dtype=np.int64)
 
     def draw(self, end: int) -> IntArray:
         """Returns when the samples are due that follow those of the last call, up to one, ns; or LOST."""
@@ -103,11 +108,13 @@ class PictureDelay:
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        self._own_hz, view = scenario.sites[site].rate_hz, scenario.sites[site].view
+        self._own_hz = scenario.sites[site].rate_hz
+        view = scenario.sites[site].view
         self._links: dict[str, tuple[int, LinkSchedule]] = {}
         for peer in scenario.peers(site) if view is not None else ():
             assert view is not None
-            key, rate_hz = link_key(scenario.seed, f"view {peer}->{site}"), scenario.sites[peer].rate_hz
+            key = link_key(scenario.seed, f"view {peer}->{site}")
+            rate_hz = scenario.sites[peer].rate_hz
             outages = tuple((round(a * 1e9), round(b * 1e9)) for a, b in view.outages_s)
             setup = LinkSetup(peer, 1.0, rate_hz, (), key, (view.core(),), (view.points,), outages)
             self._links[peer] = rate_hz, LinkSchedule(setup)

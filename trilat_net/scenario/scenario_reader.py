@@ -233,7 +233,8 @@ def _refuse_long_keys(text: str) -> None:
     for number, line in enumerate(text.split("\n"), 1):
         if line.count(".") < MAX_KEY_PARTS:
             continue
-        dots, before = 0, ""
+        dots = 0
+        before = ""
         for found in _KEY_PART.finditer(line):
             kind = found.lastgroup or ""
             dots = dots + (kind == "dot") if {kind, before} == {"word", "dot"} else 0

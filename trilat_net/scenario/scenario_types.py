@@ -346,7 +346,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     def order_palette(self, colours: int) -> list[int]:
         """Returns the places of a palette in the order of the sites; sites beyond them begin anew."""
-        free, order, roles = list(range(colours)), [], [site.role for site in self.sites.values()]
+        free = list(range(colours))
+        order = []
+        roles = [site.role for site in self.sites.values()]
         for n, role in enumerate(roles[:colours]):
             kept = [place for place in free if place != _SLAVE or "slave" not in roles[n:]]
             order.append(_SLAVE if role == "slave" and _SLAVE in free else kept[0])
@@ -429,7 +431,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     def setup(self, site: str) -> site_setup.SiteSetup:
         """Returns all that the core needs to build a site."""
-        spec, arm, control = self.sites[site], self.arms[site], self.controls[self.names.index(site)]
+        spec = self.sites[site]
+        arm = self.arms[site]
+        control = self.controls[self.names.index(site)]
         return site_setup.SiteSetup(
             name=site,
             rate_hz=spec.rate_hz,
@@ -463,7 +467,8 @@ class Scenario(Frozen, frozen=True, dict=True):
         A joint that starts beyond `q_min_rad` or `q_max_rad` by no more than the margin may be there during
         the whole run: its limit on that side lies the margin further out.
         """
-        spec, arm = self.sites[site], self.arms[site]
+        spec = self.sites[site]
+        arm = self.arms[site]
         motion = spec.limits.motion
         start = np.array(spec.q0_rad)
         low, high = (np.broadcast_to(limit, start.shape) for limit in (motion.q_min, motion.q_max))
@@ -479,18 +484,21 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     def gains(self, site: str) -> site_setup.Gains:
         """Returns the gains of a site's law; under the rule `glide` its estimates are in a box."""
-        spec, arm = self.sites[site], self.arms[site]
+        spec = self.sites[site]
+        arm = self.arms[site]
         gains = spec.control.gains(arm.theta)
         if spec.on_stale.action != "glide":
             return gains
         return add_credible_box(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
     def _rest_gains(self, site: str) -> site_setup.RestGains:
-        spec, arm = self.sites[site], self.arms[site]
+        spec = self.sites[site]
+        arm = self.arms[site]
         control = spec.control
         gains = control.linear_gains(arm.theta) or control.gains(arm.theta)
         own: Array = np.zeros(arm.counts.joints) + gains.Kp + gains.d
-        limit, known = spec.limits.tau_limit_nm, spec.arm.known
+        limit = spec.limits.tau_limit_nm
+        known = spec.arm.known
         return find_rest_gains(arm, spec.q0_rad, own, limit, spec.rate_hz, known=known)
 
     def _link_setup(self, peer: str, site: str) -> site_setup.LinkSetup:
@@ -516,7 +524,8 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     def _speed_limit(self, site: str) -> tuple[float, ...]:
         """Returns the largest speed of a site's joints, rad/s; () if peers do not get their angles."""
-        spec, joints = self.sites[site], self.arms[site].counts.joints
+        spec = self.sites[site]
+        joints = self.arms[site].counts.joints
         if spec.task.space != "joints":
             return ()
         return tuple(np.broadcast_to(spec.limits.qd_limit_rad_s, joints).tolist())

@@ -40,8 +40,10 @@ class SimulatedArm:
         spec = scenario.sites[site]
         arm = build_arm(spec.arm, spec.task, scenario.urdf, chains=True).widen_stops(spec.q0_rad)
         assert arm.chain is not None
-        self.q, self.qd = np.array(spec.q0_rad), np.array(spec.qd0_rad_s)
-        self.chain, self.theta = arm.chain, heavier * arm.theta
+        self.q = np.array(spec.q0_rad)
+        self.qd = np.array(spec.qd0_rad_s)
+        self.chain = arm.chain
+        self.theta = heavier * arm.theta
         self._joints = build_chain(arm.chain.joints, MAX_JOINTS)
         self._gravity = np.array(arm.chain.gravity_m_s2)
 

@@ -315,7 +315,8 @@ def _read_tree(root: Element) -> _Robot:
     above: dict[str, _Edge] = {}
     below: dict[str, list[_Edge]] = {name: [] for name in links}
     for name, element in _name_elements(root, "joint").items():
-        place, kind = _joint(name), element.get("type", "")
+        place = _joint(name)
+        kind = element.get("type", "")
         if kind not in _KINDS:
             hint = suggest_nearest(kind, _KINDS)
             _refuse(place, f"is of type {_quote(kind)}, must be one of {', '.join(_KINDS)}{hint}")
@@ -553,10 +554,12 @@ def _read_limit(edge: _Edge, place: str, notes: list[str]) -> tuple[float, float
         _refuse(place, f"its limits of effort and velocity are {effort:g} and {velocity:g}, must be positive")
     unknown = [key for key, value in (("effort", effort), ("velocity", velocity)) if value == 0.0]
     if edge.kind == "continuous":
-        lower, upper = -math.inf, math.inf
+        lower = -math.inf
+        upper = math.inf
     elif lower == upper == 0.0:
         unknown.insert(0, "position")
-        lower, upper = -math.inf, math.inf
+        lower = -math.inf
+        upper = math.inf
     if lower > upper:
         _refuse(place, f"its lower limit is {lower:g}, must be below the upper one, {upper:g}")
     if lower == upper:
@@ -655,7 +658,9 @@ def _read_inertial(link: Element, name: str, given: LinkInertia | None) -> _Iner
             problem = f"is missing: the file states no mass of {_link(name)}"
             raise ScenarioError(problem, path=f"{_key(name)}.mass_kg")
         return None
-    mass, centre, tensor = given.mass_kg, _Pose(), None
+    mass = given.mass_kg
+    centre = _Pose()
+    tensor = None
     if inertial is not None:
         mass, centre, tensor = _read_stated_inertial(inertial, name, given)
     if given.inertia_kg_m2 is not None:  # in the axes of the link, and not in those of the <origin>
@@ -673,7 +678,8 @@ def _read_stated_inertial(
 ) -> tuple[float | None, _Pose, Matrix | None]:
     """Returns mass, frame and tensor of an <inertial>; what the scenario gives is not read."""
     place = _link(name)
-    mass, tensor = given.mass_kg, None
+    mass = given.mass_kg
+    tensor = None
     mass_element = _child(inertial, "mass", place)
     tensor_element = _child(inertial, "inertia", place)
     if mass is None and mass_element is not None:
@@ -732,7 +738,9 @@ def _move_body(mass: float, centre: _Pose, tensor: Matrix, pose: _Pose) -> BodyP
     """
     (r0, r1, r2), (x, y, z) = pose @ centre
     columns = apply(tensor, r0), apply(tensor, r1), apply(tensor, r2)
-    (xx, xy, xz), (_, yy, yz), (_, _, zz) = apply(columns, r0), apply(columns, r1), apply(columns, r2)
+    (xx, xy, xz) = apply(columns, r0)
+    (_, yy, yz) = apply(columns, r1)
+    (_, _, zz) = apply(columns, r2)
     return (
         mass,
         mass * x,

@@ -107,7 +107,8 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
     Raises:
         ScenarioError: with the path of the key.
     """
-    path, law = f"sites.{name}", site.control
+    path = f"sites.{name}"
+    law = site.control
     _check_plant(path, site)
     law.check(f"{path}.control", sites)
     if law.plugged and site.task.space != "joints":
@@ -321,7 +322,8 @@ def _check_start_poses(scenario: Scenario) -> None:
         joints = model.chain.joints if model.chain is not None else ()
         for n, (joint, start) in enumerate(zip(joints, scenario.sites[name].q0_rad, strict=False)):
             if not joint.lower <= start <= joint.upper:
-                unit, path = "m" if joint.prismatic else "rad", f"sites.{name}.q0_rad[{n}]"
+                unit = "m" if joint.prismatic else "rad"
+                path = f"sites.{name}.q0_rad[{n}]"
                 drawn = f", drawn with seed {scenario.seed}" if dotted_key(path) in scenario.drawn else ""
                 raise ScenarioError(
                     f"is {start:g} {unit}{drawn}, beyond a stop of joint {model.joint_names[n]}, which moves "
@@ -333,9 +335,11 @@ def _check_start_poses(scenario: Scenario) -> None:
 
 def _check_limits(scenario: Scenario, name: str) -> None:
     """Refuses limits that leave no room, that nothing keeps, or that a start pose breaks."""
-    site, path = scenario.sites[name], f"sites.{name}.limits"
+    site = scenario.sites[name]
+    path = f"sites.{name}.limits"
     limits = scenario.motion_limits(name)
-    low, high = limits.q_min, limits.q_max
+    low = limits.q_min
+    high = limits.q_max
     stated = next((key for key in ("q_min_rad", "q_max_rad") if getattr(site.limits, key) is not None), "")
     if stated and site.on_stale.action != "glide":
         raise ScenarioError(
@@ -361,7 +365,8 @@ def _check_task_poses(scenario: Scenario) -> None:
             continue
         followed = [axis for axis, on in zip(TASK_AXES, model.axes, strict=False) if on]
         J = model.task_jacobian(scenario.sites[name].q0_rad)[np.array(model.axes) > 0.0]
-        joints, path = model.counts.joints, f"sites.{name}.task.axes"
+        joints = model.counts.joints
+        path = f"sites.{name}.task.axes"
         for axis, row in zip(followed, J, strict=True):
             if np.abs(row).max() < RANK_TOLERANCE:
                 raise ScenarioError(
@@ -466,7 +471,8 @@ def _check_lost(scenario: Scenario) -> None:
                 path=f"sites.{name}.on_stale.on_lost",
             )
     masters = [n for n, site in enumerate(scenario.sites.values()) if site.role == "master"]
-    alpha, names = scenario.alpha, scenario.names
+    alpha = scenario.alpha
+    names = scenario.names
     able = [
         name
         for name in degrading

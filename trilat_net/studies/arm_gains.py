@@ -48,17 +48,28 @@ TUNED_LAWS = tuple(
 """Those with a stiffness and a damping that send nothing but their motion."""
 SHARES = (0.95, 1.1)
 """Of the edge, at which runs show that it is one."""
-_PUSH, _SMALL, _STILL = 1e-6, 1.0, 1e-7
+_PUSH = 1e-6
+_SMALL = 1.0
+_STILL = 1e-7
 """By how much the first arm starts aside, rad or m; from which speed on motions are not small, rad/s; and
 what share of the largest speed is rounding."""
 _SITES = {2: ("m", "s"), 3: ("m1", "m2", "s")}
-_SLACK, _HALF_TURN, _HALF_SLIDE_M = 0.05, math.pi, 0.5
+_SLACK = 0.05
+_HALF_TURN = math.pi
+_HALF_SLIDE_M = 0.5
 """Share of a joint's range that poses leave at its ends, and half of the range of one without limits."""
-_SETTLES, _SHORTEST_S, _LONGEST_S, _EXTENSIONS = 4.0, 2.0, 400.0, 3
+_SETTLES = 4.0
+_SHORTEST_S = 2.0
+_LONGEST_S = 400.0
+_EXTENSIONS = 3
 """By how many time constants of its slowest motion a run lasts at first, within which bounds, s; and how
 often it may go on for as long again."""
 _TELLS = {EnvelopeTrend.GROWS: False, EnvelopeTrend.DECAYS: True}
-_NO_GAIN, _CURVE_POINTS, _EDGE_TOLERANCE, _FITTING_STEP, _GONE_PER_S = 1e-6, 9, 1e-4, 0.9, -1e3
+_NO_GAIN = 1e-6
+_CURVE_POINTS = 9
+_EDGE_TOLERANCE = 1e-4
+_FITTING_STEP = 0.9
+_GONE_PER_S = -1e3
 _DELAY = re.compile(r"(\d+\.?\d*|\.\d+) ?(us|ms|s|)")
 _UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
 
@@ -100,7 +111,8 @@ class ArmGains(Result):
 
     def blocks(self) -> Iterator[Block]:
         """Yields the loop, a row per joint, the edge, the runs, and the line to paste."""
-        edge, about = self.edge, f"damping ratio {self.damping:g}, margin {self.margin:g}"
+        edge = self.edge
+        about = f"damping ratio {self.damping:g}, margin {self.margin:g}"
         yield f"{self.arm}: {self.sites} such arms, {self.law}, {self.rate_hz} Hz, {self.delay}, {about}"
         rows = [list(row.values()) for row in self.joints]
         cells = [[f"{one:.4g}" if isinstance(one, float) else one or "-" for one in row] for row in rows]
@@ -152,7 +164,8 @@ def _set_up_loop(arm: str | Path, link: Mapping[str, Any], law: str, more: Any, 
         raise UsageError(f"--law {law}: has no stiffness K beside a damping d of motion alone; {known} have")
     if (sites := at.pop("sites")) not in _SITES:
         raise UsageError(f"--sites is 2 or 3, not {sites}")
-    names, tip = _SITES[sites], at.pop("tip")
+    names = _SITES[sites]
+    tip = at.pop("tip")
     tables = {
         "name": "tune",
         "duration_s": _SHORTEST_S,
@@ -194,7 +207,9 @@ class _GainSearch:
     def __init__(
         self, scenario: Scenario, poses: Array, margin: float, damping: float, quantile: float
     ) -> None:
-        self._scenario, self._poses, self._margin = scenario, poses, margin
+        self._scenario = scenario
+        self._poses = poses
+        self._margin = margin
         self._damping = damping = damping / math.sqrt(margin)  # at the edge, where K is larger by the margin
         self.conditions = self.held = derive_operating_conditions(scenario)
         self.rate_hz = self.held.sites[0].rate_hz
@@ -205,7 +220,8 @@ class _GainSearch:
         self.age_s = float(self.held.age_s.max())
         # the heaviest mass is stable up to k = (2 zeta / T)^2, where the damping shall have its margin
         self._least = (2.0 * damping / self.age_s) ** 2
-        model, most = scenario.arms[scenario.names[0]], 1.0 if scenario.scheme == "second_order" else 2.0
+        model = scenario.arms[scenario.names[0]]
+        most = 1.0 if scenario.scheme == "second_order" else 2.0
         self._swings_per_s = most * self.rate_hz
         self._M = [model.inertia(q) for q in poses]
         self.inertia: Array = np.max([np.diag(M) for M in self._M], axis=0)
@@ -255,8 +271,10 @@ class _GainSearch:
 
         Under delays that vary they may grow, and not, and grow again: then the first steps are small.
         """
-        edge, worst = math.inf, self._poses[0]
-        small, steps = np.arange(15) * math.log(1.1), np.arange(24) * math.log(2.0)
+        edge = math.inf
+        worst = self._poses[0]
+        small = np.arange(15) * math.log(1.1)
+        steps = np.arange(24) * math.log(2.0)
         steps = np.append(small, math.log(4.0) + steps) if loop.varying else steps
         for pose in poses:
 
@@ -269,20 +287,24 @@ class _GainSearch:
                 low = next((one for one in high - steps[1:] if growth(one) <= 0.0), None)
                 if low is None:
                     raise UsageError(f"--arm: no gains are stable in the pose {pose.tolist()}")
-                edge, worst = math.exp(brentq(growth, low, high, xtol=_EDGE_TOLERANCE)), pose
+                edge = math.exp(brentq(growth, low, high, xtol=_EDGE_TOLERANCE))
+                worst = pose
         return edge, worst
 
     def find_edge(self) -> dict[str, Any]:
         constant, pose = self.find_least(self.held, self._poses, self._least)
-        k, continuous = constant, math.inf
-        link, varies = next(iter(self._scenario.links.values())), self.conditions.varying
+        k = constant
+        continuous = math.inf
+        link = next(iter(self._scenario.links.values()))
+        varies = self.conditions.varying
         delay_s = self.age_s if varies else 1e-3 * link.moments().mean_ms
         if delay_s > 0.0:  # without a delay such a loop is passive
             continuous, _ = self.find_least(self.delay_by(delay_s), [pose], self._least, sampled=False)
         if varies:
             k, _ = self.find_least(self.conditions, [pose], 0.5 * constant)
         limit = (self._swings_per_s / (2.0 * self._damping * self._find_lightest()[0])) ** 2
-        root, damped = self.find_root(self.at(k), pose, self.conditions), limit / self._margin**2
+        root = self.find_root(self.at(k), pose, self.conditions)
+        damped = limit / self._margin**2
         by_rate = damped < 1.001 * max(self._least, min(k, constant))
         return {
             "k_per_s2": k,
@@ -382,7 +404,8 @@ def tune_arm(
     scenario = _set_up_loop(arm, link, law, set, sites=sites, tip=tip, rate_hz=rate_hz)
     search = _GainSearch(scenario, _draw_poses(scenario, poses, seed), margin, damping, quantile)
     edge = search.find_edge()
-    pose, found = np.array(edge["pose"]), search.at(edge["used_per_s2"], margin)
+    pose = np.array(edge["pose"])
+    found = search.at(edge["used_per_s2"], margin)
     push = _PUSH * np.random.Generator(np.random.Philox(seed)).uniform(0.5, 1.0, len(pose))
     tried = [(None, found), *((share, search.at(share * edge["k_per_s2"])) for share in SHARES)]
     runs = list[dict[str, Any]]()
@@ -399,5 +422,6 @@ def tune_arm(
     joints = [dict(zip(heads, row, strict=True)) for row in zip(*columns, strict=True)]
     asked = Path(arm).name, law, sites, search.rate_hz, words, 1e3 * search.age_s, margin, damping
     agree = runs[0]["stable"] is True and all(run["agrees"] for run in runs)
-    line, over = f'control = {{ law = "{law}", {cells} }}', search.trace_edge(pose) if curve else []
+    line = f'control = {{ law = "{law}", {cells} }}'
+    over = search.trace_edge(pose) if curve else []
     return ArmGains(*asked, joints, edge, runs, agree, line, over)

@@ -95,14 +95,18 @@ class _Feed(Generic[T]):
 
     def __init__(self, items: Iterable[T], count: int | None, workers: int, batch_s: float = BATCH_S) -> None:
         self._new = enumerate(items)
-        self._left, self._workers, self._batch_s = count, workers, batch_s
+        self._left = count
+        self._workers = workers
+        self._batch_s = batch_s
         self._again: deque[tuple[int, T]] = deque()
         self._suspects: deque[tuple[int, T]] = deque()
         self._losses: Counter[int] = Counter()
-        self._runs, self._wall_s = 0, 0.0
+        self._runs = 0
+        self._wall_s = 0.0
 
     def measure(self, runs: int, wall_s: float) -> None:
-        self._runs, self._wall_s = self._runs + runs, self._wall_s + wall_s
+        self._runs = self._runs + runs
+        self._wall_s = self._wall_s + wall_s
 
     def take(self, *, idle: bool) -> list[tuple[int, T]]:
         """Returns the next batch, [] if there is none now; items under suspicion wait until all is idle."""
@@ -154,8 +158,11 @@ class WorkerPool:
         hint: str = "",
     ) -> None:
         self.workers = workers
-        self._executor, self._restart = executor, restart
-        self._cluster, self._required, self._hint = cluster, required, hint
+        self._executor = executor
+        self._restart = restart
+        self._cluster = cluster
+        self._required = required
+        self._hint = hint
         self.is_local = executor is None
 
     def each(

@@ -114,8 +114,12 @@ class ReachTask:
     def __init__(
         self, site: str = "s", radius_m: float = 0.3, within_m: float = 0.02, stay_s: float = 0.3
     ) -> None:
-        self.goal, self.bound = np.zeros(2), 100.0
-        self._site, self._radius_m, self._within_m, self._stay_s = site, radius_m, within_m, stay_s
+        self.goal = np.zeros(2)
+        self.bound = 100.0
+        self._site = site
+        self._radius_m = radius_m
+        self._within_m = within_m
+        self._stay_s = stay_s
         self._since_s = self._last_s = 0.0
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
@@ -144,7 +148,8 @@ class ReachTask:
     def judge(self, scene: Scene) -> Judgement:
         """Returns the reward."""
         apart_m = float(np.linalg.norm(scene.end_effector_m[self._site] - self.goal))
-        step_s, self._last_s = scene.t_s - self._last_s, scene.t_s
+        step_s = scene.t_s - self._last_s
+        self._last_s = scene.t_s
         if apart_m > self._within_m:
             self._since_s = scene.t_s
         done = scene.t_s - self._since_s >= self._stay_s
@@ -219,8 +224,12 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self.metadata = {**self.metadata, "render_fps": rate_hz}
         self._picture: EpisodePicture | None = None
         self._runs = False
-        self._user, self._mode, self._rate_hz, self._delay_s = user, mode, rate_hz, delay_ms * 1e-3
-        self._vary, self._leads = vary, leads
+        self._user = user
+        self._mode = mode
+        self._rate_hz = rate_hz
+        self._delay_s = delay_ms * 1e-3
+        self._vary = vary
+        self._leads = leads
         self.task: EpisodeTask = task or ReachTask(leads)
         self._base = self._prepare(load_scenario(scenario, set, duration_s=duration_s))
         if self._base.sites[user].rate_hz % rate_hz:
@@ -262,7 +271,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
     def _find_reach(self) -> float:
         """Returns how far from its base the user's end effector gets, m; or how far joints turn, rad."""
-        arm, spec = self._base.arms[self._user], self._base.sites[self._user]
+        arm = self._base.arms[self._user]
+        spec = self._base.sites[self._user]
         if self._place(self._base).spec.mode == "joint":
             return 2.0 * math.pi
         if arm.chain is None:
@@ -270,15 +280,20 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return 1.5 * float(np.linalg.norm(arm.end_effector(spec.q0_rad))) + 1.0
 
     def _begin(self, scenario: Scenario) -> None:
-        self.scenario, self._k, self._actions = scenario, 0, list[Array]()
+        self.scenario = scenario
+        self._k = 0
+        self._actions = list[Array]()
         self._player = ActedHand(self._place(scenario), self._actions)
         self._plants = make_plant_players(scenario)
         self._run = FusedRun(scenario, keep=1, hands={self._user: self._player}, plants=self._plants)
         self._run.plan([scenario.ticks(name) for name in scenario.names])
-        self._ticks, self._tick_rate_hz = scenario.ticks(self._user), scenario.sites[self._user].rate_hz
+        self._ticks = scenario.ticks(self._user)
+        self._tick_rate_hz = scenario.sites[self._user].rate_hz
 
     def _look(self) -> Scene:
-        names, arms, run = self.scenario.names, self.scenario.arms, self._run
+        names = self.scenario.names
+        arms = self.scenario.arms
+        run = self._run
         q = {name: row[: arms[name].counts.joints] for name, row in zip(names, run.q, strict=True)}
         places = {name: np.array(arms[name].end_effector(row.tolist())) for name, row in q.items()}
         view = self._player.view(self._k, run.arrays(names.index(self._user)))
@@ -361,7 +376,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             self._run.step_to(tick_ns(self._k, self._tick_rate_hz) - 1)
         except ValueError as error:
             raise UsageError(f"an action: {error}") from None
-        scene, diverged = self._look(), self._run.diverged_s is not None
+        scene = self._look()
+        diverged = self._run.diverged_s is not None
         said = self.task.judge(scene)
         said = Judgement(*said) if isinstance(said, tuple) else Judgement(said)
         ended = said.succeeded or said.failed or diverged

@@ -40,7 +40,8 @@ from ..scenario.operators.kernel_operators import Multisine
 from ..theory.characteristic_roots import Complex
 from ..theory.port_passivity import HandMatrices
 
-LEAST_SEGMENTS, LEAST_KNOWN = 5, 0.98
+LEAST_SEGMENTS = 5
+LEAST_KNOWN = 0.98
 """How many segments an interval needs; which share of a segment's records."""
 NEIGHBOURS = 1.0 / 6.0
 """Correlation of two segments under Hann's window that overlap by half, of what is white."""
@@ -198,7 +199,8 @@ def _find_phasors(
     multiples of the segment's own frequency away, and falls with the third power of what is slower than
     they are: what still settles, or drifts, is none of them. The first half segment is left out.
     """
-    count, half = round(segment_s * records.rate_hz), 0.5 * segment_s
+    count = round(segment_s * records.rate_hz)
+    half = 0.5 * segment_s
     first = round((start_s + half) * records.rate_hz) - records.first
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(count) / count)
     found = []

@@ -174,7 +174,8 @@ class WindowStats:
         self._records = 0
         self._peaks = {"error_peak_rad": 0.0, "speed_peak_rad_s": 0.0, "torque_peak_nm": 0.0}
         joints = len(spec.q0_rad)
-        self._q_least, self._q_most = np.full(joints, math.inf), np.full(joints, -math.inf)
+        self._q_least = np.full(joints, math.inf)
+        self._q_most = np.full(joints, -math.inf)
         self._push_sum = np.zeros(joints)
         self._force_sum = self._force_squares = self._force_peak = 0.0
         self._touched: bool | None = None
@@ -503,7 +504,8 @@ def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[Expectati
 
 
 def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    wanted, end = expect.stable is not False, metrics.end
+    wanted = expect.stable is not False
+    end = metrics.end
     if expect.stable is not None or end.diverged_at_s is not None:
         held = end.stability is (Stability.STABLE if wanted else Stability.NOT_STABLE)
         yield ExpectationResult("stable", held, f"{end.stability}: {end.text}", str(wanted).lower())
@@ -524,7 +526,8 @@ def _read_metric(key: str, metrics: RunMetrics) -> float | None:
 
 
 def _compare_with_limit(key: str, measured: float | None, limit: float) -> ExpectationResult:
-    least, unit = "_min_" in key, split_unit(key)[1]
+    least = "_min_" in key
+    unit = split_unit(key)[1]
     wanted = f"{'≥' if least else '≤'} {limit:g} {unit}".rstrip()
     if measured is None:
         return ExpectationResult(key, False, "never", wanted)
@@ -570,7 +573,8 @@ def _compare_with_range(
     if found is None:
         return ExpectationResult(name, False, why, wanted)
     text = " to ".join(f"{value:.4g}" for value in dict.fromkeys(found))
-    spare, half = min(found.least - least, most - found.most), 0.5 * (most - least)
+    spare = min(found.least - least, most - found.most)
+    half = 0.5 * (most - least)
     margin = spare / half if half else None
     value = found.most if found.least == found.most else None
     return ExpectationResult(name, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, margin, value)

@@ -69,7 +69,8 @@ def build_resume_hint(*words: str) -> str:
 
 def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
     """Returns rows as CSV with a line of heads: these columns, else all that rows have; None is empty."""
-    stream, heads = io.StringIO(), columns or list(dict.fromkeys(key for row in rows for key in row))
+    stream = io.StringIO()
+    heads = columns or list(dict.fromkeys(key for row in rows for key in row))
     writer = csv.DictWriter(stream, heads, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
@@ -107,7 +108,9 @@ class RunJournal(Generic[E]):
     """
 
     def __init__(self, path: Path, study: str, kind: type[E], remedy: str) -> None:
-        self._path, self._study, self._remedy = path, study, remedy
+        self._path = path
+        self._study = study
+        self._remedy = remedy
         self.done: dict[tuple[Any, int], E] = {}
         before = path.read_bytes() if path.exists() else b""
         for line in before.split(b"\n"):

@@ -175,7 +175,8 @@ def trials(
 
 
 def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
-    expect, end_s = scenario.expect, scenario.duration_s
+    expect = scenario.expect
+    end_s = scenario.duration_s
     if not expect.asks:
         raise ScenarioError(
             "nothing is expected of it: add a table [expect] with keys such as stable = true or "
@@ -220,7 +221,8 @@ def evaluate_live_log(trial: Trial, log_file: Path, problems: Sequence[str], wal
     ended = "; ".join(problems) or "ended in order"
     session = ExpectationResult("session", not problems, ended, "ends in order")
     judged = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
-    identical, records = f"{verdict.identical} identical{judged}", f"{count_nouns(verdict.records, 'record')}"
+    identical = f"{verdict.identical} identical{judged}"
+    records = f"{count_nouns(verdict.records, 'record')}"
     again = ExpectationResult("executed again", verdict.passed, identical, records)
     return result._replace(outcomes=[*result.outcomes, session, again], log=kept)
 
@@ -244,7 +246,8 @@ class ExpectationRow(NamedTuple):
     def cells(self) -> tuple[str, ...]:
         """Returns the row's texts, under `TRIAL_COLUMNS`."""
         mark = "ok" if self.held == self.runs else "FAIL"
-        worst, margin = self.worst, format_margin(self.worst.margin)
+        worst = self.worst
+        margin = format_margin(self.worst.margin)
         held = f"{self.held}/{self.runs}"
         return mark, self.scenario, self.key, worst.limit, worst.measured, margin, held
 
@@ -278,7 +281,8 @@ class TrialReport(Result):
                 by_key.setdefault(outcome.key, []).append(outcome)
             for key, outcomes in by_key.items():  # the worst is the first that failed, then by margin
                 worst = min(outcomes, key=lambda one: (one.held, one.margin or 0.0))
-                held, mean = sum(one.held for one in outcomes), mean_interval([one.value for one in outcomes])
+                held = sum(one.held for one in outcomes)
+                mean = mean_interval([one.value for one in outcomes])
                 rows.append(ExpectationRow(name, key, worst, held, len(outcomes), mean))
             if broken := [result.error for result in results if result.error]:
                 worst = ExpectationResult("a result", False, broken[0], "")

@@ -282,7 +282,8 @@ def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | No
     if not float(values[-1]) / size <= ROOT_RESIDUAL_TOLERANCE:
         return None
     count = int(np.sum(values <= _SAME_VALUE * size))
-    W, V = left[:, -count:], right[-count:].conj().T
+    W = left[:, -count:]
+    V = right[-count:].conj().T
     try:
         residue = V @ np.linalg.solve(W.conj().T @ derivative @ V, W.conj().T)
     except np.linalg.LinAlgError:
@@ -349,7 +350,8 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
         if not len(names):
             return Spectrum((), constant + zeros, drifting, 0, 0)
         has_delays = len(pencil.delays) > 0
-        order, before = _INITIAL_ORDER if has_delays else 0, None
+        order = _INITIAL_ORDER if has_delays else 0
+        before = None
         while True:
             matrix = discretise_generator(pencil, order) if has_delays else pencil.A
             if pencil.E is not None:
@@ -361,7 +363,8 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
             too_large = len(names) + 2 * order * len(pencil.delayed_states) > MAX_GENERATOR_SIZE
             if not has_delays or too_large or (before is not None and _agree(before, roots)):
                 return Spectrum(tuple(roots), constant + zeros, drifting, dropped, order)
-            before, order = roots, 2 * order
+            before = roots
+            order = 2 * order
 
 
 def _eliminate_states(matrix: Array, E: Array) -> Array:
@@ -382,7 +385,9 @@ def discretise_generator(pencil: Pencil, order: int) -> Array:
 
     Its states are the loop's, and the history of their delayed part at Chebyshev nodes.
     """
-    delayed, longest_s, n = pencil.delayed_states, float(pencil.delays.max()), len(pencil.A)
+    delayed = pencil.delayed_states
+    longest_s = float(pencil.delays.max())
+    n = len(pencil.A)
     c = len(delayed)
     whole = np.zeros((n + order * c, n + order * c))
     whole[:n, :n] = pencil.A

@@ -129,7 +129,8 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
             intervals.append(DelayInterval(low.delay_s if low else 0.0, crossing.delay_s, low, crossing))
             stable = False
         elif not stable and count == 0:
-            low, stable = crossing, True
+            low = crossing
+            stable = True
     if stable:
         intervals.append(DelayInterval(low.delay_s if low else 0.0, MAX_COMMON_DELAY_S, low, None))
     return DelayMargin(tuple(intervals), tuple(crossings))
@@ -156,7 +157,8 @@ def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
     with characteristic_roots.limit_blas_threads():
         sweep = _FrequencySweep(pencil)
         grid = sweep.grid()
-        crossings, moduli = [], np.abs(sweep.eigenvalues(grid))
+        crossings = []
+        moduli = np.abs(sweep.eigenvalues(grid))
         if ((moduli <= _OUTSIDE) & (moduli >= 2.0 - _OUTSIDE)).any(axis=1).all():
             return [], True
         for place in np.flatnonzero(np.diff((moduli > _OUTSIDE).sum(axis=1))):
@@ -183,7 +185,9 @@ class _FrequencySweep:
     """The eigenvalues of G(j w) over frequency."""
 
     def __init__(self, pencil: characteristic_roots.Pencil) -> None:
-        self._A, self._delayed, self._rates = pencil.A, pencil.delayed_states, pencil.rates
+        self._A = pencil.A
+        self._delayed = pencil.delayed_states
+        self._rates = pencil.rates
         self._Ad = pencil.Ad[0][:, self._delayed]
         self._highest = float(np.linalg.norm(pencil.A, 2) + np.linalg.norm(pencil.Ad[0], 2))
         self._modes: characteristic_roots.Complex = np.concatenate(
@@ -222,7 +226,8 @@ class _FrequencySweep:
             low, high = (middle, high) if count == ends[0] else (low, middle)
             if high - low <= 1e-13 * high:
                 break
-        omega, pairs = 0.5 * (low + high), int(ends[0] - ends[1])
+        omega = 0.5 * (low + high)
+        pairs = int(ends[0] - ends[1])
         values = self.eigenvalues(np.array([omega]))[0]
         nearest = np.argsort(np.abs(np.abs(values) - 1.0), kind="stable")[: abs(pairs)]
         crossings = []

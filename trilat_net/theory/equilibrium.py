@@ -119,7 +119,8 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
             share *= 0.5
         else:
             break
-        rest, residual = tried, after
+        rest = tried
+        residual = after
     return rest._replace(residual=float(np.abs(residual).max()))
 
 
@@ -127,9 +128,11 @@ def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step:
     """Returns an equilibrium shifted by a deviation of the loop's states; velocities do not count."""
     masks = linear_loop.find_loop_states(conditions)
     parts = np.split(step, np.cumsum([np.count_nonzero(mask) for mask in masks])[:-1])
-    q, theta_hat = np.array(rest.q), np.array(rest.theta_hat)
+    q = np.array(rest.q)
+    theta_hat = np.array(rest.theta_hat)
     for n, (site, mask, part) in enumerate(zip(conditions.sites, masks, parts, strict=True)):
-        at, states = lay_out_arguments(site), np.zeros(len(mask))
+        at = lay_out_arguments(site)
+        states = np.zeros(len(mask))
         states[mask] = part
         q[n, : at.joints] += states[at.q]
         theta_hat[n, : at.parameters] += states[at.estimate]
@@ -193,7 +196,8 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
     count = int(np.sum(values <= _FLAT * values[0]))
     if not count:
         return None
-    W, V = left[:, -count:], right[-count:].T
+    W = left[:, -count:]
+    V = right[-count:].T
     D = sum((term.delay_s * term.A for term in loop.delayed), np.eye(len(values)))
     inner = W.T @ D @ V
     if np.linalg.cond(inner) > 1.0 / _FLAT:
@@ -285,7 +289,8 @@ def _settle_memories(conditions: OperatingConditions, rest: Equilibrium, ticks: 
 
 
 def _take_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equilibrium:
-    at, task = lay_out_arguments(conditions.sites[0]), conditions.sites[0].layout.task
+    at = lay_out_arguments(conditions.sites[0])
+    task = conditions.sites[0].layout.task
     if len(pose) != at.coordinates or not np.isfinite(pose).all():
         count = "two" if at.coordinates == 2 else str(at.coordinates)
         numbers = f"{count_nouns(count, 'angle')} in rad" + (", one per joint" if at.coordinates != 2 else "")
@@ -317,10 +322,12 @@ def reach_pose(site: SiteSetup, pose: Array) -> Array:
     Raises:
         ScenarioError: it cannot be there along the axes that the site follows.
     """
-    at, q = lay_out_arguments(site), np.array(site.q0, dtype=np.float64)
+    at = lay_out_arguments(site)
+    q = np.array(site.q0, dtype=np.float64)
     for _ in range(_GAUSS_NEWTON_STEPS):
         x = np.zeros(at.arguments)
-        x[at.q], x[at.q_des] = q, pose
+        x[at.q] = q
+        x[at.q_des] = pose
         following = follow_peers(site, place_arm(site, q), x)
         if np.abs(following.e).max() <= _NEWTON_RESIDUAL:
             return q
@@ -346,7 +353,8 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
     """Runs a scenario until it is at rest, for at most `MAX_PROLONGATION` times its duration."""
     ticks = sum(map(scenario.ticks, scenario.names))
     most_s = scenario.duration_s * max(1.0, min(MAX_PROLONGATION, _MAX_RUN_TICKS / ticks))
-    run, until_s = FusedRun(prolong_scenario(scenario, most_s)), scenario.duration_s
+    run = FusedRun(prolong_scenario(scenario, most_s))
+    until_s = scenario.duration_s
     while True:
         states = run.advance_watching(until_s)
         speed_rad_s = max(float(values[-BUCKETS_PER_S:, 1].max()) for values in run.maxima)
@@ -358,7 +366,8 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
         how = f"the run diverges at {run.ran_s:.4g} s; {rest.how}"
         return _require_equilibrium(scenario, rest._replace(how=how))
     if speed_rad_s < EQUILIBRIUM_SPEED_RAD_S:
-        q, theta_hat = run.q, run.theta_hat
+        q = run.q
+        theta_hat = run.theta_hat
         how = f"the run is at rest at {run.ran_s:.4g} s (slower than {EQUILIBRIUM_SPEED_RAD_S:g} rad/s)"
     else:
         q, theta_hat = (values.mean(axis=0) for values in states)
@@ -399,7 +408,8 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
                 f"damped below {task.singular_value:g}): the damping is part of the loop, and J J+ is not 1"
             )
     for site, own, rates in zip(conditions.sites, x, conditions.rates(x), strict=True):
-        torques_nm, limits_nm = np.abs(rates.tau), np.broadcast_to(site.tau_limit_nm, rates.tau.shape)
+        torques_nm = np.abs(rates.tau)
+        limits_nm = np.broadcast_to(site.tau_limit_nm, rates.tau.shape)
         if (torques_nm >= limits_nm).any():
             worst = int(np.argmax(torques_nm - limits_nm))
             yield (

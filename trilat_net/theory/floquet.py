@@ -60,7 +60,8 @@ def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, A
     """
     n, m = B.shape
     whole = np.zeros((n + m, n + m))
-    whole[:n, :n], whole[:n, n:] = A * h_s, B * h_s
+    whole[:n, :n] = A * h_s
+    whole[:n, n:] = B * h_s
     exponential = expm(whole)
     return exponential[:n, :n], exponential[:n, n:]
 
@@ -83,9 +84,12 @@ class SiteTickMap(NamedTuple):
 
 def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     """Returns one site over a period, from the derivatives of its rates (`differentiate_rates`)."""
-    at, rates, h_s = jacobian.at, jacobian.rates, 1.0 / site.rate_hz
+    at = jacobian.at
+    rates = jacobian.rates
+    h_s = 1.0 / site.rate_hz
     second = site.scheme is Scheme.SECOND_ORDER
-    arm, memory = slice(0, at.qd.stop), at.estimate  # places in arguments and in X alike
+    arm = slice(0, at.qd.stop)
+    memory = at.estimate  # places in arguments and in X alike
     n = at.states + (at.joints if second else 0)
     peers = np.eye(at.arguments, at.inputs.stop - at.inputs.start, -at.inputs.start)
     own = np.eye(at.arguments, n)
@@ -106,7 +110,8 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
         u = (1.5 if second else 1.0) * tau + rates.held @ by
         return np.vstack([Gamma @ u, h_s * f, *([tau] if second else [])])
 
-    P, Q = control(own), control(peers)
+    P = control(own)
+    Q = control(peers)
     P[arm, arm] += Phi
     P[memory, memory] += np.eye(at.parameters)
     if second:
@@ -168,8 +173,10 @@ _SLIP = 0.05
 """Delays that repeat to this share of a tick repeat; else the nearest span does, to half a tick."""
 _PART_TICKS = 100
 """Columns are scaled after so many ticks of the fastest site: they may grow a thousandfold in each."""
-_COLUMNS, _MAX_COLUMNS = 8, 240
-_RESIDUAL, _LOOSE_RESIDUAL = 1e-9, 1e-4
+_COLUMNS = 8
+_MAX_COLUMNS = 240
+_RESIDUAL = 1e-9
+_LOOSE_RESIDUAL = 1e-4
 """The largest residual of a multiplier, relative to it; the other when the columns are at an end."""
 _SMALLEST = 1e-7
 """Multipliers below this share of the largest are not looked for."""
@@ -198,7 +205,9 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
     spans_s = np.arange(1, round(MAX_PERIOD_S * common_hz) + 1) / common_hz
     slips = np.zeros(len(spans_s))  # by which share of a tick the delays have not repeated
     for link in links:
-        model, points, cycle_s = link.core(), link.points, 0.0
+        model = link.core()
+        points = link.points
+        cycle_s = 0.0
         if points is not None and model.kind == DelayKind.TRACE and len(points) > 1:
             cycle_s = float(2 * points[-1, 0] - points[-2, 0]) * 1e-6
         elif model.kind == DelayKind.SINE:
@@ -219,7 +228,8 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
     start_s = math.ceil((4e-3 * reach_ms + 0.1) * common_hz) / common_hz  # past what the beginning is like
     used = {}
     for i, j in conditions.pairs:
-        ticks, first = np.arange(round(span_s * rates_hz[i])), round(start_s * rates_hz[i])
+        ticks = np.arange(round(span_s * rates_hz[i]))
+        first = round(start_s * rates_hz[i])
         used[i, j] = np.rint((ticks / rates_hz[i] - conditions.age_s[i, j]) * rates_hz[j]).astype(np.int64)
         if conditions.varying:
             whole = draw_uses(*conditions.links[i, j], rates_hz[i], rates_hz[j], start_s + span_s)
@@ -240,9 +250,11 @@ def _plan_parts(ticks: Sequence[int], used: Mapping[tuple[int, int], IntArray], 
         for (i, j), m in used.items()
     }
     peers = [[j for i, j in used if i == site] for site in range(len(ticks))]
-    done, parts = [0] * len(ticks), []
+    done = [0] * len(ticks)
+    parts = []
     for n in range(1, count + 1):
-        runs, stops = [], [-(-total * n // count) for total in ticks]
+        runs = []
+        stops = [-(-total * n // count) for total in ticks]
         while done != stops:
             for i, stop in enumerate(stops):
                 until = min([stop, *(known[i, j][done[j]] for j in peers[i])])
@@ -265,7 +277,8 @@ class _SpanMap:
         n = len(loop.names)
         self._own = [np.flatnonzero(loop.owners == i) for i in range(len(rates_hz))]
         self._P = [loop.S[np.ix_(own, own)] for own in self._own]
-        self._rows, used = [2] * len(rates_hz), {}
+        self._rows = [2] * len(rates_hz)
+        used = {}
         for i, j in loop.effects:
             now = -(-np.arange(len(uses.used[i, j])) * rates_hz[j] // rates_hz[i])
             used[i, j] = np.minimum(uses.used[i, j], now - 1)
@@ -314,8 +327,10 @@ class _SpanMap:
         return V, [track[rows - 1 :] for track, rows in zip(tracks, self._rows, strict=True)]
 
     def _run_ticks(self, tracks: Sequence[Array], i: int, first: int, count: int) -> None:
-        at, P = first + self._rows[i] - 1, self._P[i]
-        x, after = tracks[i][at], tracks[i][at + 1 : at + 1 + count]
+        at = first + self._rows[i] - 1
+        P = self._P[i]
+        x = tracks[i][at]
+        after = tracks[i][at + 1 : at + 1 + count]
         after[:] = 0.0
         for j, rows, effect in self._peers[i]:
             after += effect @ tracks[j][rows[first : first + count]]
@@ -332,16 +347,19 @@ def _find_multipliers(span: _SpanMap, n: int, wanted: int) -> tuple[Complex, Com
     first = np.random.default_rng(0).standard_normal((n, min(n, _COLUMNS)))
     block = span.hold(first)
     block = np.linalg.qr(block - span.neutral @ (span.neutral.T @ block))[0]
-    basis, H = block, np.zeros((block.shape[1], 0))
+    basis = block
+    H = np.zeros((block.shape[1], 0))
     while True:
-        W, H = span.advance(block)[0], np.hstack([H, np.zeros((basis.shape[1], block.shape[1]))])
+        W = span.advance(block)[0]
+        H = np.hstack([H, np.zeros((basis.shape[1], block.shape[1]))])
         for _ in range(2):
             onto = basis.T @ W
             W -= basis @ onto
             H[:, -block.shape[1] :] += onto
         left, lengths, right = np.linalg.svd(W, full_matrices=False)
         new = lengths > ZERO_SHARE * np.abs(H).max()
-        left, beyond = left[:, new], (lengths[:, np.newaxis] * right)[new]
+        left = left[:, new]
+        beyond = (lengths[:, np.newaxis] * right)[new]
         mu, y = np.linalg.eig(H)
         order = np.argsort(-np.abs(mu), kind="stable")
         sizes = np.abs(mu[order])
@@ -372,7 +390,8 @@ def compute_sampled_spectrum(
     span_s: float | None = uses.period_s or uses.span_s
     if uses.period_s is not None and uses.period_s * max(rates_hz) < 1.5:
         span_s = None
-    loop, deviation = couple_ticks(conditions, rest), None
+    loop = couple_ticks(conditions, rest)
+    deviation = None
     if not loop.names:
         return Spectrum((), loop.constant, 0, 0, 0, span_s)
     with limit_blas_threads():
@@ -381,7 +400,8 @@ def compute_sampled_spectrum(
         s = (np.log(mu) - np.log(span.scales).sum()) / uses.span_s
         still = exact & (np.abs(s) <= _STILL_PER_S)
         upper = exact & ~still & (s.imag >= -_SAME_ROOT)
-        s, both = s[upper], np.hstack([vectors[:, upper].real, vectors[:, upper].imag])
+        s = s[upper]
+        both = np.hstack([vectors[:, upper].real, vectors[:, upper].imag])
         if uses.period_s is None and len(s):
             sizes: list[Array] = []
             span.advance(both[:, :: len(s)], sizes=sizes)
@@ -408,7 +428,8 @@ def _describe_modes(
     for n, one in enumerate(s):
         order = sorted(speeds, key=lambda state: -sizes[state, n])
         i = int(loop.owners[order[0]])
-        state, hz = order[0] - int(np.argmax(loop.owners == i)), rates_hz[i]
+        state = order[0] - int(np.argmax(loop.owners == i))
+        hz = rates_hz[i]
         seen = min(len(tracks[i]) - 1, 2 + int(15.0 * hz / max(1e-9, abs(one.real))))  # then rounding shows
         speed = tracks[i][:seen, state, n] + 1j * tracks[i][:seen, state, n + len(s)]
         lines = np.abs(np.fft.fft(speed * np.exp(-one * np.arange(seen) / hz)))

@@ -18,7 +18,8 @@ from .port_response import PortResponse
 FrequencyCurve = Callable[[Array], Array]
 """Values, shape (F,), for frequencies of shape (F,), rad/s."""
 
-LOW_HZ, HIGH_HZ = 1e-3, 100.0
+LOW_HZ = 1e-3
+HIGH_HZ = 100.0
 """The default band."""
 
 _PER_DECADE = 40
@@ -67,7 +68,8 @@ def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array
 
     A round trip over the longest delay, T, turns the phase once in pi / T rad/s.
     """
-    low, high = 2.0 * np.pi * low_hz, 2.0 * np.pi * high_hz
+    low = 2.0 * np.pi * low_hz
+    high = 2.0 * np.pi * high_hz
     count = max(2, round(_PER_DECADE * np.log10(high / low)) + 1)
     points = np.geomspace(low, high, count)
     if delay_s > 0.0:
@@ -109,7 +111,8 @@ def _refine(
         wide = find_wide(values) & (w_rad_s[1:] > w_rad_s[:-1] * (1.0 + _CLOSEST))
         if not wide.any() or len(w_rad_s) > 2 * _MAX_POINTS:
             break
-        between, place = np.sqrt(w_rad_s[:-1] * w_rad_s[1:])[wide], np.flatnonzero(wide) + 1
+        between = np.sqrt(w_rad_s[:-1] * w_rad_s[1:])[wide]
+        place = np.flatnonzero(wide) + 1
         w_rad_s = np.insert(w_rad_s, place, between)
         values = np.insert(values, place, function(between), axis=0)
     return w_rad_s, values
@@ -143,7 +146,8 @@ def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
     1 % of their depth, or of that of the deepest if that is more; and more than rounding.
     """
     values, rounding = curve_and_rounding.T
-    middle, rise = values[1:-1], np.maximum(values[:-2], values[2:]) - values[1:-1]
+    middle = values[1:-1]
+    rise = np.maximum(values[:-2], values[2:]) - values[1:-1]
     low = (middle <= values[:-2]) & (middle <= values[2:])
     low &= rise > np.maximum(_SETTLED * np.maximum(np.abs(middle), abs(values.min())), rounding[1:-1])
     minimum = np.r_[False, low, False]
@@ -157,11 +161,14 @@ def _find_bands_below(
     """Returns the bands below a level; all edges are found by bisection together."""
     below = values < level
     turns = np.flatnonzero(below[1:] != below[:-1])
-    low, high, was = w_rad_s[turns], w_rad_s[turns + 1], below[turns]
+    low = w_rad_s[turns]
+    high = w_rad_s[turns + 1]
+    was = below[turns]
     for _ in range(30 if len(turns) else 0):
         middle = np.sqrt(low * high)
         same = (curve(middle) < level) == was
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
+        low = np.where(same, middle, low)
+        high = np.where(same, high, middle)
     edges = np.sqrt(low * high).tolist()
     if below[0]:
         edges.insert(0, float(w_rad_s[0]))

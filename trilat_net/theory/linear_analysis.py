@@ -117,7 +117,9 @@ class LinearAnalysis(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat linear --json`."""
-        names, conditions, rest = self.scenario.names, self.conditions, self.rest
+        names = self.scenario.names
+        conditions = self.conditions
+        rest = self.rest
         layouts = [site.layout for site in conditions.sites]
         learns = [not isinstance(site.own, NumericLaw) for site in conditions.sites]
         q = [own[: layout.joints].tolist() for own, layout in zip(rest.q, layouts, strict=True)]
@@ -270,7 +272,9 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
         return _no_roots(error.problem)
     sampled = compute_sampled_spectrum(conditions, rest, _ROOTS, uses)
     decisive = sampled or compute_delay_spectrum(linearise_loop(conditions, rest), _ROOTS)
-    root, verdict, about = decisive.rightmost, decisive.verdict, decisive.basis
+    root = decisive.rightmost
+    verdict = decisive.verdict
+    about = decisive.basis
     if sampled is None:  # a law in continuous time, whose ticks are left out
         about = ", in continuous time" + ", of the mean ages" * bool(conditions.varying or mean_s)
     exact = sampled is not None and sampled.deviation_per_s is None
@@ -292,15 +296,18 @@ def _fix_delays(log: Log) -> tuple[Scenario, SamplesInUse | None, dict[tuple[int
     unknown = [one.random or one.measured or one.points is not None for one in known.links.values()]
     if not any(unknown):
         return known, None, {}
-    sites, links = [log[name] for name in known.names], dict(known.links)
+    sites = [log[name] for name in known.names]
+    links = dict(known.links)
     common_hz = math.gcd(*(site.rate_hz for site in sites))
     end = max(1, min(int(site.tick[-1]) * common_hz // site.rate_hz for site in sites))
     start = max(3 * end // 4, end - round(DRAWN_SPAN_S * common_hz))
-    used, mean_s = {}, {}
+    used = {}
+    mean_s = {}
     for (i, own), (j, peer) in permutations(enumerate(sites), 2):
         ticks = np.arange(start * own.rate_hz // common_hz, end * own.rate_hz // common_hz)
         rows = np.maximum(np.searchsorted(own.tick, ticks, side="right") - 1, 0)
-        samples, name = own.used[peer.name][rows], f"{peer.name}->{own.name}"
+        samples = own.used[peer.name][rows]
+        name = f"{peer.name}->{own.name}"
         if samples.min() < 0:  # of a peer that never sent, or not yet
             return known, None, {}
         used[i, j] = samples - start * peer.rate_hz // common_hz

@@ -163,7 +163,9 @@ class _GrowthRate:
 
     def __init__(self, scenario: Scenario, key: str, rest: Equilibrium | None, sampled: bool | None) -> None:
         self.integer = key.rpartition(".")[2] in _INTEGER_KEYS
-        self._scenario, self._key, self._sampled = scenario, key, sampled
+        self._scenario = scenario
+        self._key = key
+        self._sampled = sampled
         self._rest = rest or choose_equilibrium(scenario)
         self._root: CharacteristicRoot | None = None
 
@@ -177,7 +179,8 @@ class _GrowthRate:
         return -np.inf if self._root is None else self._root.s.real
 
     def close_edge(self, left: tuple[float, float], right: tuple[float, float]) -> LinearEdge:
-        (low, at_low), (high, _) = left, right
+        (low, at_low) = left
+        (high, _) = right
         if self.integer:
             while high - low > 1.0:
                 middle = float((low + high) // 2.0)

@@ -106,13 +106,16 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
     arguments = [np.zeros(at.arguments) for at in layouts]
     poses = zip(rest.q, rest.theta_hat, find_references(conditions, rest), strict=True)
     for at, x, (q, theta_hat, q_des) in zip(layouts, arguments, poses, strict=True):
-        x[at.q], x[at.estimate], x[at.q_des] = q[: at.joints], theta_hat[: at.parameters], q_des
+        x[at.q] = q[: at.joints]
+        x[at.estimate] = theta_hat[: at.parameters]
+        x[at.q_des] = q_des
     reflected = [one.reflected for one in conditions.rates(arguments)]
     for i, (at, x, felt) in enumerate(zip(layouts, arguments, conditions.alpha @ reflected, strict=True)):
         x[at.peer_torque] = felt
         others = [j for j in range(len(arguments)) if j != i]
         for place in range(at.peers):
-            j, rest_qd = others[place], np.zeros(at.coordinates)
+            j = others[place]
+            rest_qd = np.zeros(at.coordinates)
             x[at.of_peer(place)] = np.r_[rest.q[j][: at.coordinates], rest_qd, -reflected[j]]
     return arguments
 
@@ -140,7 +143,8 @@ def differentiate_references(
 
     It is alpha_ij but for orientations that do not agree, which have one by the site's own pose as well.
     """
-    found, shared = {}, share_poses(conditions, rest)
+    found = {}
+    shared = share_poses(conditions, rest)
     for i, row in enumerate(conditions.alpha):
         for j in np.flatnonzero(row):
             found[i, int(j)] = row[j] * np.eye(len(shared[i]))
@@ -163,7 +167,8 @@ def couple_sites(
     references = differentiate_references(conditions, rest)
     coupling = {}
     for i, j in conditions.pairs:
-        at, zero = sites[i].at, np.zeros((sites[i].at.coordinates,) * 2)
+        at = sites[i].at
+        zero = np.zeros((sites[i].at.coordinates,) * 2)
         share = conditions.alpha[i, j] * np.eye(at.coordinates)
         whole = block_diag(references.get((i, j), zero), share, share)
         if at.peers:
@@ -193,10 +198,12 @@ def differentiate_rates(
 
     `every_estimate`: of chains too each estimate is a state, and not only what they say of gravity.
     """
-    x, references = gather_site_arguments(conditions, rest), differentiate_references(conditions, rest)
+    x = gather_site_arguments(conditions, rest)
+    references = differentiate_references(conditions, rest)
     jacobians = []
     for i, (site, own) in enumerate(zip(conditions.sites, x, strict=True)):
-        at, rates = site_dynamics.lay_out_arguments(site), site_dynamics.differentiate_site_rates(site, own)
+        at = site_dynamics.lay_out_arguments(site)
+        rates = site_dynamics.differentiate_site_rates(site, own)
         if conditions.has_forms:  # what such a law remembers holds the arm there
             left = site_dynamics.evaluate_site_rates(site, own).qdd
             own[at.external_torque] -= np.linalg.solve(rates.qdd[:, at.external_torque], left)
@@ -258,19 +265,25 @@ def linearise_loop(
         [slice(a, b) for a, b in pairwise(np.cumsum([0, *lengths]).tolist())]
         for lengths in ([one.at.states for one in sites], [one.at.joints for one in sites])
     )
-    size, count = own[-1].stop, ports[-1].stop
-    A, B, C = np.zeros((size, size)), np.zeros((size, count)), np.zeros((count, size))
+    size = own[-1].stop
+    count = ports[-1].stop
+    A = np.zeros((size, size))
+    B = np.zeros((size, count))
+    C = np.zeros((count, size))
     terms: dict[float, tuple[Array, Array]] = {}
     effects = []
     for i, (at, rates, _, _) in enumerate(sites):
         by = np.vstack([np.eye(at.joints, at.arguments, at.qd.start), rates.qdd, rates.estimate])
-        A[own[i], own[i]], B[own[i], ports[i]] = by[:, : at.states], by[:, at.external_torque]
+        A[own[i], own[i]] = by[:, : at.states]
+        B[own[i], ports[i]] = by[:, at.external_torque]
         C[ports[i], own[i]] = np.eye(at.joints, at.states, at.qd.start)
         effects.append(by[:, at.inputs])
     for (i, j), coupling in couple_sites(conditions, rest, sites).items():
-        delay_s, effect = float(conditions.age_s[i, j]), effects[i] @ coupling
+        delay_s = float(conditions.age_s[i, j])
+        effect = effects[i] @ coupling
         late_A, late_B = terms.setdefault(delay_s, (np.zeros_like(A), np.zeros_like(B)))
-        peer, m = sites[j], sites[j].at.coordinates
+        peer = sites[j]
+        m = sites[j].at.coordinates
         late_A[own[i], own[j]] += effect @ peer.sent
         late_B[own[i], ports[j]] += effect[:, 2 * m :] @ peer.rates.reflected[:, peer.at.external_torque]
     names = [
@@ -302,11 +315,13 @@ def add_law_forms(
     inertia = [np.linalg.inv(one.rates.qdd[:, one.at.external_torque]) for one in sites]
     forms = conditions.find_forms(inertia)
     at, names = _place_form_states(conditions, forms, loop)
-    size, count = len(names), len(loop.inputs)
+    size = len(names)
+    count = len(loop.inputs)
     terms = {0.0: (np.zeros((size, size)), np.zeros((size, count)))}
     for delay_s, A, B in (DelayedTerm(0.0, loop.A, loop.B), *loop.delayed):
         late_A, late_B = terms.setdefault(delay_s, (np.zeros((size, size)), np.zeros((size, count))))
-        late_A[: len(A), : len(A)], late_B[: len(B)] = A, B
+        late_A[: len(A), : len(A)] = A
+        late_B[: len(B)] = B
     E = np.ones(size)
     for i, form in enumerate(forms):
         if form is not None:
@@ -317,7 +332,8 @@ def add_law_forms(
             E[channel] = 0.0
             if form is not None and form.sends_acceleration:
                 for A, B in terms.values():
-                    A[channel], B[channel] = A[at[i, "qd"]], B[at[i, "qd"]]
+                    A[channel] = A[at[i, "qd"]]
+                    B[channel] = B[at[i, "qd"]]
             terms[0.0][0][channel, channel] -= np.eye(len(sites[i].rates.qdd))
     A, B = terms.pop(0.0)
     C = np.hstack([loop.C, np.zeros((len(loop.C), size - loop.C.shape[1]))])
@@ -356,7 +372,8 @@ def _add_form(
     form: LinearForm,
     terms: dict[float, tuple[Array, Array]],
 ) -> None:
-    site, ports = sites[i], np.cumsum([0, *(one.at.joints for one in sites)])
+    site = sites[i]
+    ports = np.cumsum([0, *(one.at.joints for one in sites)])
 
     def late(j: int) -> tuple[Array, Array]:
         zeros = np.zeros_like(terms[0.0][0]), np.zeros_like(terms[0.0][1])

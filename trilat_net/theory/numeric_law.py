@@ -53,14 +53,20 @@ class NumericLaw:
         if setup.layout.task:
             raise ScenarioError(f"{code} is linearised between joint angles alone", path=path)
         assert setup.own is not None
-        self._law, self._layout = setup.own(setup.law_context()), setup.layout
-        self._arrays, self._rate_hz = build_site_arrays(setup), setup.rate_hz
-        self._arrays.site["tau_limit"], self._arrays.links["alpha"] = np.inf, shares
+        self._law = setup.own(setup.law_context())
+        self._layout = setup.layout
+        self._arrays = build_site_arrays(setup)
+        self._rate_hz = setup.rate_hz
+        self._arrays.site["tau_limit"] = np.inf
+        self._arrays.links["alpha"] = shares
         self._asked = plug_law(self._law, setup, self._arrays, np.zeros(0))
         own = np.array(read_memory(self._law))
-        self._own, self._keeps_past = len(own), False
-        self.memory, self.names = own, _name_memory(self._law, self._own)
-        start, rest = np.array(setup.q0), np.zeros(self._layout.joints)
+        self._own = len(own)
+        self._keeps_past = False
+        self.memory = own
+        self.names = _name_memory(self._law, self._own)
+        start = np.array(setup.q0)
+        rest = np.zeros(self._layout.joints)
         peers = [np.r_[link.q0, rest, rest] for link in setup.links]
         arguments = np.concatenate([start, rest, self.memory, start, rest, rest, *peers, rest])
         past = np.r_[np.zeros(self._layout.joints), setup.q0]
@@ -88,7 +94,8 @@ class NumericLaw:
 
     def settle(self, x: Array, ticks: int) -> Array:
         """Returns its memory after so many ticks of the same arguments, or once it stays as it is."""
-        memory, x = self._memory_at, x.copy()
+        memory = self._memory_at
+        x = x.copy()
         for _ in range(ticks):
             step = self._evaluate(x)[1] / self._rate_hz
             x[memory] += step
@@ -105,27 +112,33 @@ class NumericLaw:
         columns = []
         for n, value in enumerate(at):
             half = _STEP * max(1.0, abs(float(value)))
-            up, down = at.copy(), at.copy()
-            up[n], down[n] = value + half, value - half
+            up = at.copy()
+            down = at.copy()
+            up[n] = value + half
+            down[n] = value - half
             ends = [np.concatenate(self._evaluate(one)) for one in (up, down)]
             columns.append((ends[0] - ends[1]) / (up[n] - down[n]))
         whole = np.concatenate([torque, rate])[:, np.newaxis] + 1j * (np.stack(columns, axis=1) @ x.imag)
         return whole[: len(torque)], whole[len(torque) :]
 
     def _evaluate(self, x: Array) -> tuple[Array, Array]:
-        n, memory = self._layout.joints, self._memory_at
+        n = self._layout.joints
+        memory = self._memory_at
         past = x[memory][self._own :] if self._keeps_past else np.r_[np.zeros(n), x[:n]]
         after = self._ask(x, past)
-        torque, kept = after[:n], after[n:]
+        torque = after[:n]
+        kept = after[n:]
         now = np.r_[kept, torque, x[:n]] if self._keeps_past else kept
         return torque, (now - x[memory]) * self._rate_hz
 
     def _ask(self, x: Array, past: Array) -> Array:
         """Returns the torque and the law's own memory after a tick; `past`: torque and angles before it."""
-        a, n = self._arrays, self._layout.joints
+        a = self._arrays
+        n = self._layout.joints
         s: Any = a.site[0]
         start = self._memory_at.stop
-        s.q[:], s.qd[:] = x[:n], x[n : 2 * n]
+        s.q[:] = x[:n]
+        s.qd[:] = x[n : 2 * n]
         s.q_des[:], s.qd_des[:], s.felt[:] = np.split(x[start : start + 3 * n], 3)
         s.tau_before[:], s.q_before[:] = np.split(past, 2)
         s.on_arm[:] = x[len(x) - n :]

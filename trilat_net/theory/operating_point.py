@@ -134,7 +134,8 @@ def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) ->
         _select_final_actors(scenario, name, notes)._replace(gains=gains[name]) for name in scenario.names
     )
     alpha = _final_dominance(scenario, sites, notes)
-    age_s, varying = np.zeros_like(alpha), []
+    age_s = np.zeros_like(alpha)
+    varying = []
     laws = scenario.controls
     sites = tuple(_make_own_law(scenario, site, alpha) for site in sites)
     codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
@@ -149,7 +150,8 @@ def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) ->
         notes.append("a law here has states or waves of its own: it is linearised in continuous time alone")
     links = {}
     for i, j in pairs:
-        peer, own = scenario.names[j], scenario.names[i]
+        peer = scenario.names[j]
+        own = scenario.names[i]
         link = _find_final_link(scenario, f"{peer}->{own}", notes)
         links[i, j] = link, link_key(scenario.seed, f"{peer}->{own}")
         age = compute_effective_delay(scenario, peer, own, link)
@@ -157,7 +159,8 @@ def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) ->
         if age.most_s > age.least_s + 1e-8:  # more than ticks in whole ns
             varying.append(age)
     if varying:
-        least, most = 1e3 * min(age.least_s for age in varying), 1e3 * max(age.most_s for age in varying)
+        least = 1e3 * min(age.least_s for age in varying)
+        most = 1e3 * max(age.most_s for age in varying)
         where = "one link" if len(varying) == 1 else f"{count_nouns(len(varying), 'link')}"
         notes.append(
             f"the age of the samples in use varies on {where}, {least:.4g} to {most:.4g} ms: the continuous "
@@ -175,7 +178,8 @@ def is_constant_link(link: LinkBase) -> bool:
 
 def _make_own_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetup:
     """Returns a site whose law, if it is imported, is made, to be asked."""
-    law, i = scenario.sites[site.name].control, scenario.names.index(site.name)
+    law = scenario.sites[site.name].control
+    i = scenario.names.index(site.name)
     if not isinstance(law, ImportedLaw):
         return site
     try:
@@ -187,7 +191,8 @@ def _make_own_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetu
 def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains]:
     found: dict[str, Gains] = {}
     for name, spec in scenario.sites.items():
-        law, theta = spec.control, scenario.arms[name].theta
+        law = spec.control
+        theta = scenario.arms[name].theta
         gains = law.linear_gains(theta)
         if own_laws and isinstance(law, ImportedLaw):
             gains = law.gains(theta)
@@ -230,7 +235,8 @@ def compute_effective_delay(scenario: Scenario, peer: str, site: str, link: Link
     Raises:
         ScenarioError: no sample ever arrives.
     """
-    own_hz, peer_hz = scenario.sites[site].rate_hz, scenario.sites[peer].rate_hz
+    own_hz = scenario.sites[site].rate_hz
+    peer_hz = scenario.sites[peer].rate_hz
     model = link.core()
     constant = is_constant_link(link)
     if constant and own_hz == peer_hz:
@@ -265,7 +271,8 @@ def _final_dominance(scenario: Scenario, sites: tuple[SiteSetup, ...], notes: li
 
 
 def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> SiteSetup:
-    setup, end_s = scenario.setup(name), scenario.duration_s
+    setup = scenario.setup(name)
+    end_s = scenario.duration_s
     present = [actor for actor in setup.actors if actor.start_s <= end_s < actor.end_s]
     if any(
         actor.acts in (TorqueKind.HAND, TorqueKind.TASK_HAND) and actor.move_end_s > end_s

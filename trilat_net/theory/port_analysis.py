@@ -208,7 +208,8 @@ def analyse_ports(
     conditions = derive_operating_conditions(scenario)
     loop = linearise_teleoperator(conditions, rest)
     of = of or scenario.slave
-    sites, delay_s = port_response.list_port_sites(loop), port_response.find_longest_delay_s(loop)
+    sites = port_response.list_port_sites(loop)
+    delay_s = port_response.find_longest_delay_s(loop)
     Y = port_response.build_admittance(loop)
     w_rad_s = frequency_search.refine_frequencies(Y, frequency_search.build_frequency_grid(*band_hz, delay_s))
     Y = frequency_search.cache_response(Y, w_rad_s)
@@ -256,7 +257,8 @@ def _place_hands(
     for site, own in zip(conditions.sites, rest.q, strict=True):
         if not hands or scenario.sites[site.name].role != "master":
             continue
-        q, ports = own[np.newaxis, : site.layout.joints], port_response.find_site_ports(loop, site.name)
+        q = own[np.newaxis, : site.layout.joints]
+        ports = port_response.find_site_ports(loop, site.name)
         J = build_arm_rows(scenario, site.name).place_end_effector(q, np.zeros_like(q)).J[0]
         if any(len(one.B) != len(J) for one in hands):
             raise UsageError(
@@ -398,14 +400,19 @@ def use_end_effector_ports(
     """Returns a loop with ports at the end effectors, if its sites follow with them; else the loop."""
     if not conditions.sites[0].layout.task:
         return loop
-    blocks, inverses, names, ports = [], [], [], []
+    blocks = []
+    inverses = []
+    names = []
+    ports = []
     for site, x in zip(conditions.sites, gather_site_arguments(conditions, rest), strict=True):
-        at, followed = lay_out_arguments(site), list_followed_axes(site)
+        at = lay_out_arguments(site)
+        followed = list_followed_axes(site)
         whole = follow_peers(site, place_arm(site, x[at.q]), x).J
         assert whole is not None
         J: Array = whole[[n - 1 for n in followed]]
         free = null_space(J)
-        T, inverse = np.vstack([J, free.T]), np.hstack([np.linalg.pinv(J), free])
+        T = np.vstack([J, free.T])
+        inverse = np.hstack([np.linalg.pinv(J), free])
         estimates = [name for name in loop.names if name.startswith(f"{site.name}.")][2 * at.joints :]
         rest_of_site = np.eye(len(estimates))
         blocks.append(block_diag(T, T, rest_of_site))
@@ -416,7 +423,9 @@ def use_end_effector_ports(
             names += [f"{site.name}.{name}{slow}" for name in free_names]
         names += estimates
         ports.append(J)
-    change, back, J = block_diag(*blocks), block_diag(*inverses), block_diag(*ports)
+    change = block_diag(*blocks)
+    back = block_diag(*inverses)
+    J = block_diag(*ports)
     numbers = [(site.name, n) for site in conditions.sites for n in list_followed_axes(site)]
     inputs, outputs = (tuple(f"{site}.{kind}{n}" for site, n in numbers) for kind in ("tau", "qd"))
     delayed = tuple(term._replace(A=change @ term.A @ back, B=change @ term.B @ J.T) for term in loop.delayed)

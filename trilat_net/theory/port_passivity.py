@@ -172,7 +172,9 @@ def llewellyn_parameter(Y: Complex) -> Array:
     2 Re y11 Re y22 - Re(y12 y21) over abs(y12 y21), but at most `MAX_LLEWELLYN`, which stands for a two-port
     without transmission, and at most -1 where Re y11 or Re y22 is negative.
     """
-    y11, y22, through = Y[:, 0, 0].real, Y[:, 1, 1].real, Y[:, 0, 1] * Y[:, 1, 0]
+    y11 = Y[:, 0, 0].real
+    y22 = Y[:, 1, 1].real
+    through = Y[:, 0, 1] * Y[:, 1, 0]
     norm = np.linalg.norm(Y, axis=(1, 2))
     size = np.maximum(np.abs(through), 1e-30 * norm**2)
     parameter: Array = np.minimum((2.0 * y11 * y22 - through.real) / size, MAX_LLEWELLYN)
@@ -182,7 +184,8 @@ def llewellyn_parameter(Y: Complex) -> Array:
 
 def llewellyn_rounding(Y: Complex) -> Array:
     """Returns the rounding error of the parameter, shape (F,): large if there is next to no transmission."""
-    through, norm = np.abs(Y[:, 0, 1] * Y[:, 1, 0]), np.linalg.norm(Y, axis=(1, 2))
+    through = np.abs(Y[:, 0, 1] * Y[:, 1, 0])
+    norm = np.linalg.norm(Y, axis=(1, 2))
     amount: Array = EIGENVALUE_ROUNDING + 1e-12 * norm**2 / np.maximum(through, 1e-30 * norm**2)
     return amount
 
@@ -217,8 +220,10 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
     Y has shape (F, p, p); `owner` is the site of each port, from 0 on, shape (p,).
     """
     scaled = _scale_sites(Y, owner)
-    count, free = len(Y), int(owner.max())
-    centre, best = np.zeros((count, free)), np.zeros((count, free))
+    count = len(Y)
+    free = int(owner.max())
+    centre = np.zeros((count, free))
+    best = np.zeros((count, free))
     shape = np.broadcast_to(_LOG_REACH**2 * free * np.eye(free), (count, free, free)).copy()
     margin = np.full(count, -np.inf)
     active = np.arange(count)
@@ -226,12 +231,14 @@ def find_best_weights(Y: Complex, owner: NDArray[np.int64]) -> BestWeights:
     for _ in range(_MAX_ROUNDS):
         value, slope = _value_and_slope(scaled[active], centre[active], owner)
         better = value > margin[active]
-        margin[active[better]], best[active[better]] = value[better], centre[active[better]]
+        margin[active[better]] = value[better]
+        best[active[better]] = centre[active[better]]
         along = np.einsum("fij,fj->fi", shape[active], slope)
         gain = np.sqrt(np.maximum(np.einsum("fi,fi->f", slope, along), 0.0))  # at most
         more = gain > _WEIGHT_TOLERANCE * np.maximum(np.abs(margin[active]), 1e-6)
         more &= most[active] - margin[active] > EIGENVALUE_ROUNDING
-        active, along = active[more], (along[more] / gain[more, np.newaxis])
+        active = active[more]
+        along = along[more] / gain[more, np.newaxis]
         if not len(active) or free == 0:
             break
         centre[active] += along / (free + 1.0)

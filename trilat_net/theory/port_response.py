@@ -269,7 +269,8 @@ class Transparency(NamedTuple):
 
     def size_at(self, frequency_hz: float) -> tuple[float, float]:
         """Returns the sizes of the free and the clamped impedance at a frequency, N m s/rad."""
-        x, at = np.log(self.w_rad_s), np.log(2.0 * np.pi * frequency_hz)
+        x = np.log(self.w_rad_s)
+        at = np.log(2.0 * np.pi * frequency_hz)
         free, clamped = (
             float(np.exp(np.interp(at, x, np.log(np.abs(Z))))) for Z in (self.free, self.clamped)
         )
@@ -278,7 +279,8 @@ class Transparency(NamedTuple):
     def _mean(self, Z: Complex) -> float:
         low, high = (2.0 * np.pi * edge for edge in self.band_hz)
         inside = (self.w_rad_s >= low * (1.0 - 1e-9)) & (self.w_rad_s <= high * (1.0 + 1e-9))
-        logs, x = np.log(np.abs(Z[inside])), np.log(self.w_rad_s[inside])
+        logs = np.log(np.abs(Z[inside]))
+        x = np.log(self.w_rad_s[inside])
         return float(np.exp(np.trapezoid(logs, x) / (x[-1] - x[0])))
 
 

@@ -48,13 +48,17 @@ class ArgumentLayout:
     """
 
     def __init__(self, joints: int, parameters: int, shared: int = 0, peers: int = 0) -> None:
-        self.joints, self.parameters, self.shared, self.peers = joints, parameters, shared, peers
+        self.joints = joints
+        self.parameters = parameters
+        self.shared = shared
+        self.peers = peers
         self.coordinates = m = shared or joints
         lengths = (joints, joints, parameters, m, m, m, 3 * m * peers, joints)
         parts = [slice(*ends) for ends in pairwise(accumulate(lengths, initial=0))]
         self.q, self.qd, self.estimate, self.q_des, self.qd_des, self.peer_torque, *_ = parts
         self.external_torque = parts[-1]
-        self.states, self.arguments = self.estimate.stop, self.external_torque.stop
+        self.states = self.estimate.stop
+        self.arguments = self.external_torque.stop
         self.inputs = slice(self.states, self.external_torque.start)
 
     def of_peer(self, place: int) -> slice:
@@ -102,7 +106,8 @@ class SiteRates(NamedTuple):
 
 def follow_peers(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers) -> Following:
     """Returns how a site follows what came from its peers, in its space."""
-    at, Lambda = lay_out_arguments(site), _as_columns(site.gains.Lambda, x)
+    at = lay_out_arguments(site)
+    Lambda = _as_columns(site.gains.Lambda, x)
     motion = (Lambda, x[at.q], x[at.qd], x[at.q_des], x[at.qd_des])
     if site.layout.task and isinstance(arm, PlacedChain):
         return follow_in_task(site, arm, *motion)
@@ -123,7 +128,8 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     x is laid out as `lay_out_arguments` says, shape (arguments, ...).
     """
     at = lay_out_arguments(site)
-    arm, qd = place_arm(site, x[at.q]), x[at.qd]
+    arm = place_arm(site, x[at.q])
+    qd = x[at.qd]
     following = follow_peers(site, arm, x)
     external = x[at.external_torque] + _sum_actors(site, arm, x, sampled=False)
     held = _sum_actors(site, arm, x, sampled=True)
@@ -157,8 +163,11 @@ def _as_columns(values: object, like: Numbers) -> Numbers:
 def _evaluate_law(
     site: SiteSetup, arm: PlacedArm | PlacedChain, following: Following, x: Numbers
 ) -> tuple[Numbers, Numbers]:
-    at, gains = lay_out_arguments(site), site.gains
-    q, qd, estimate = x[at.q], x[at.qd], x[at.estimate]
+    at = lay_out_arguments(site)
+    gains = site.gains
+    q = x[at.q]
+    qd = x[at.qd]
+    estimate = x[at.estimate]
     _, _, e, ed, v, a, *_ = following
     pull = _as_columns(gains.Kd, q) * ed
     if not has_estimate(site):
@@ -169,7 +178,9 @@ def _evaluate_law(
     r = qd - v
     if gains.absolute:
         Lambda = _as_columns(gains.Lambda, q)
-        v, a, r = -Lambda * q, -Lambda * qd, qd + Lambda * q
+        v = -Lambda * q
+        a = -Lambda * qd
+        r = qd + Lambda * q
         led = _as_columns(gains.Kp, q) * (x[at.qd_des] + Lambda * x[at.q_des])
         pull = pull - led
     tau = arm.required_torque(estimate, qd, v, a) - _as_columns(gains.Kp, q) * r - following.to_joints(pull)
@@ -181,7 +192,8 @@ def _evaluate_law(
 
 
 def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
-    low, high = _as_columns(site.gains.low, estimate), _as_columns(site.gains.high, estimate)
+    low = _as_columns(site.gains.low, estimate)
+    high = _as_columns(site.gains.high, estimate)
     down = (estimate.real <= low + SWITCHING_TOLERANCE) & (rate.real < -SWITCHING_TOLERANCE)
     up = (estimate.real >= high - SWITCHING_TOLERANCE) & (rate.real > SWITCHING_TOLERANCE)
     return down | up
@@ -190,7 +202,8 @@ def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
 def _sum_actors(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers, *, sampled: bool) -> Numbers:
     """Returns the torque of the actors in force on the arm, shape (n, ...), N m."""
     at = lay_out_arguments(site)
-    q, qd = x[at.q], x[at.qd]
+    q = x[at.q]
+    qd = x[at.qd]
     total: Numbers = 0.0 * q
     for actor in site.actors:
         if actor.sampled == sampled:
@@ -205,13 +218,15 @@ def _actor_torque(arm: PlacedArm | PlacedChain, actor: TorqueSource, q: Numbers,
     """
     if actor.acts in SCRIPTED_KINDS:
         return _as_columns(actor.a, q)
-    stiffness, damping = _as_columns(actor.K, q), _as_columns(actor.B, q)
+    stiffness = _as_columns(actor.K, q)
+    damping = _as_columns(actor.B, q)
     if actor.acts is TorqueKind.VISCOUS:
         return -damping * qd
     if actor.acts is TorqueKind.HAND:
         torque: Numbers = stiffness * (_as_columns(actor.b, q) - q) - damping * qd
         return torque
-    J, position = arm.position_jacobian(), arm.end_effector_position()
+    J = arm.position_jacobian()
+    position = arm.end_effector_position()
     velocity = multiply_columns(J, qd)
     if actor.acts in OWN_KINDS:
         at_tip = actor.acts is TorqueKind.OWN_TIP

@@ -34,7 +34,8 @@ from ..core.vectors import Array
 
 _EPSILON = np.zeros((3, 3, 3))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _EPSILON[_i, _j, _k], _EPSILON[_i, _k, _j] = 1.0, -1.0
+    _EPSILON[_i, _j, _k] = 1.0
+    _EPSILON[_i, _k, _j] = -1.0
 _INERTIA_PLACES = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2))
 """Rows and columns of Ixx, Ixy, Iyy, Ixz, Iyz, Izz."""
 
@@ -51,7 +52,8 @@ def _build_inertia_units() -> Numbers:
     units[0, :3, :3] = np.eye(3)
     for n in range(3):
         across = build_cross_matrix(np.eye(3)[n])
-        units[1 + n, :3, 3:], units[1 + n, 3:, :3] = -across, across
+        units[1 + n, :3, 3:] = -across
+        units[1 + n, 3:, :3] = across
     for n, (row, column) in enumerate(_INERTIA_PLACES):
         units[4 + n, 3 + row, 3 + column] = units[4 + n, 3 + column, 3 + row] = 1.0
     return units
@@ -96,11 +98,13 @@ class PlacedChain:
     """A chain in the poses q, shape (n, ...): the same methods as `PlacedArm`."""
 
     def __init__(self, chain: ChainSetup, q: Numbers) -> None:
-        self._chain, self._q = chain, q
+        self._chain = chain
+        self._q = q
         self._links: list[PlacedLink] = []
         columns = q.shape[1:]
         J = np.zeros((6, len(q), *columns))
-        R_base, place_m = np.multiply.outer(np.eye(3), np.ones(columns)), np.zeros((3, *columns))
+        R_base = np.multiply.outer(np.eye(3), np.ones(columns))
+        place_m = np.zeros((3, *columns))
         for i, joint in enumerate(chain.joints):
             R, p = _place_joint(joint, q[i])
             X = np.zeros((6, 6, *columns), np.result_type(R, p))
@@ -124,8 +128,10 @@ class PlacedChain:
         gravity = np.array([*self._chain.gravity_m_s2, 0.0, 0.0, 0.0])
         A = -np.multiply.outer(gravity, np.ones(self._q.shape[1:]))
         for i, (X, S, J, _, _) in enumerate(self._links):
-            V, W = multiply_columns(J, qd), multiply_columns(J, v)
-            V_x, W_x = _cross_motion(V), _cross_motion(W)
+            V = multiply_columns(J, qd)
+            W = multiply_columns(J, v)
+            V_x = _cross_motion(V)
+            W_x = _cross_motion(W)
             A = multiply_columns(X, A) + np.multiply.outer(S, a[i])
             A = A + multiply_columns(V_x, np.multiply.outer(S, v[i]))
             I_A, I_V, I_W, I_VW = (
@@ -171,7 +177,9 @@ class PlacedChain:
         return solve_columns(self.inertia_matrix(theta), force)
 
     def _stop_torque(self, qd: Numbers) -> Numbers:
-        q, stiffness, damping = self._q, self._per_joint("stop_stiffness"), self._per_joint("stop_damping")
+        q = self._q
+        stiffness = self._per_joint("stop_stiffness")
+        damping = self._per_joint("stop_damping")
         total: Numbers = np.zeros_like(q)
         for name, sign in (("lower", 1.0), ("upper", -1.0)):
             limit = self._per_joint(name)
@@ -218,15 +226,19 @@ class PlacedChain:
         return rate + turned
 
     def _carry_to_tip(self, columns: Numbers) -> Numbers:
-        R, tip = self._links[-1].R_base, build_cross_matrix(np.array(self._chain.tip_m))
+        R = self._links[-1].R_base
+        tip = build_cross_matrix(np.array(self._chain.tip_m))
         linear = columns[:3] - np.einsum("ab,bn...->an...", tip, columns[3:])
         return np.concatenate([_multiply(R, linear), _multiply(R, columns[3:])])
 
 
 def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
     """Returns a link's orientation, shape (3, 3, ...), and origin in the frame of the link before."""
-    at_rest, axis, ones = np.array(joint.rotation), np.array(joint.axis), np.ones(np.shape(q))
-    R, p = np.multiply.outer(at_rest, ones), np.multiply.outer(np.array(joint.origin_m), ones)
+    at_rest = np.array(joint.rotation)
+    axis = np.array(joint.axis)
+    ones = np.ones(np.shape(q))
+    R = np.multiply.outer(at_rest, ones)
+    p = np.multiply.outer(np.array(joint.origin_m), ones)
     if joint.prismatic:
         return R, p + np.multiply.outer(at_rest @ axis, q)
     across = build_cross_matrix(axis)
@@ -260,9 +272,15 @@ def vector_from_rotation(R: Numbers) -> Numbers:
 
     By the quaternion, from its largest part (Shepperd, 1978).
     """
-    xx, yy, zz = R[0, 0], R[1, 1], R[2, 2]
-    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
-    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    xx = R[0, 0]
+    yy = R[1, 1]
+    zz = R[2, 2]
+    x = R[2, 1] - R[1, 2]
+    y = R[0, 2] - R[2, 0]
+    z = R[1, 0] - R[0, 1]
+    xy = R[0, 1] + R[1, 0]
+    xz = R[0, 2] + R[2, 0]
+    yz = R[1, 2] + R[2, 1]
     forms = np.array(
         [
             [1.0 + xx + yy + zz, x, y, z],
@@ -275,7 +293,8 @@ def vector_from_rotation(R: Numbers) -> Numbers:
     quaternion = np.take_along_axis(forms, sizes.argmax(axis=0)[np.newaxis, np.newaxis], axis=0)[0]
     quaternion = quaternion / np.sqrt(np.sum(quaternion * quaternion, axis=0))
     quaternion = np.where(quaternion[0].real < 0.0, -quaternion, quaternion)
-    w, v = quaternion[0], quaternion[1:]
+    w = quaternion[0]
+    v = quaternion[1:]
     square = np.sum(v * v, axis=0)
     small = square.real < _SMALL
     sine = np.sqrt(np.where(small, 1.0, square))
@@ -351,7 +370,8 @@ class Following(NamedTuple):
 
 def follow_joints(Lambda: Numbers, q: Numbers, qd: Numbers, q_des: Numbers, qd_des: Numbers) -> Following:
     """Returns how a site follows joint by joint, Eq. (9), (10)."""
-    e, ed = q - q_des, qd - qd_des
+    e = q - q_des
+    ed = qd - qd_des
     return Following(q, qd, e, ed, -Lambda * e, -Lambda * ed)
 
 
@@ -375,27 +395,34 @@ def follow_in_task(
     """Returns how a site follows with its end effector; in a singular pose A and what needs it are NaN."""
     assert site.chain is not None
     assert site.chain.task is not None
-    task, m = site.chain.task, site.layout.shared
-    x, one = share_pose(task, arm), (1,) * (q.ndim - 1)
+    task = site.chain.task
+    m = site.layout.shared
+    x = share_pose(task, arm)
+    one = (1,) * (q.ndim - 1)
     axes = np.array(task.axes).reshape(m, *one)
     scales = np.array([task.scale] * PLACE + [1.0] * PLACE)[:m].reshape(m, 1, *one)
     whole, whole_rate = (scales * J[:m] for J in (arm.pose_jacobian(), arm.pose_jacobian_rate(qd)))
-    xd, e = multiply_columns(whole, qd), x - x_des
+    xd = multiply_columns(whole, qd)
+    e = x - x_des
     if m > PLACE:
         R, R_des = (rotation_from_vector(pose[PLACE:]) for pose in (x, x_des + 0.0 * x))
         e = np.concatenate([e[:PLACE], turn_from(R_des, R)])
-    e, ed = axes * e, axes * (xd - xd_des)
-    J, Jd = axes[:, np.newaxis] * whole, axes[:, np.newaxis] * whole_rate
+    e = axes * e
+    ed = axes * (xd - xd_des)
+    J = axes[:, np.newaxis] * whole
+    Jd = axes[:, np.newaxis] * whole_rate
     A, least = _damp(task, J)
     posture = np.array(task.posture or site.q0).reshape(-1, *one)
-    psi, psi_d = -task.posture_rate * (q - posture), -task.posture_rate * qd
+    psi = -task.posture_rate * (q - posture)
+    psi_d = -task.posture_rate * qd
     v, a = find_task_reference(J, Jd, partial(solve_columns, A), (psi, psi_d), (Lambda * e, Lambda * ed))
     return Following(x, xd, e, ed, v, a, J, A, least)
 
 
 def _damp(task: TaskSetup, J: Numbers) -> tuple[Numbers, float]:
     """Returns J J', damped if the pose is nearly singular, and what decides it, 1 / trace((J J')^-1)."""
-    m, one = len(task.axes), (1,) * (J.ndim - 2)
+    m = len(task.axes)
+    one = (1,) * (J.ndim - 2)
     followed = [n for n, on in enumerate(task.axes) if on]
     free = np.diag(1.0 - np.array(task.axes)).reshape(m, m, *one)
     A = np.einsum("an...,bn...->ab...", J, J) + free

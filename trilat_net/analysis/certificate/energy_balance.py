@@ -98,7 +98,8 @@ class SiteEnergy:
         if self.judged.sum() < MIN_PERIODS:
             return float(sum(np.abs(one.left).sum() + np.abs(one.right).sum() for _, one in signed))
         power = np.sum([sign * one.left for sign, one in signed], axis=0)
-        records, ends = self.motion.records, self.motion.ends
+        records = self.motion.records
+        ends = self.motion.ends
         coupled = 0.0
         for torque in (records.tau, records.tau_x):
             together = records.h_s * ((ends.r_right - ends.r_left) * np.diff(torque, axis=0)).sum(axis=1)
@@ -243,8 +244,11 @@ def compute_energy_balance(energies: Mapping[str, SiteEnergy], *, ones: bool = F
 
     With `ones` every site weighs the same, as in the paper; then it need not close.
     """
-    times, grids = find_common_times(energies), {}
-    columns, sites, unjudged = [], {}, np.zeros(len(times))
+    times = find_common_times(energies)
+    grids = {}
+    columns = []
+    sites = {}
+    unjudged = np.zeros(len(times))
     sums: dict[tuple[str, str], Array] = {}
     for n, (site, energy) in enumerate(energies.items()):
         records = energy.motion.records
@@ -337,7 +341,8 @@ def _interpolate_dominance(energies: Mapping[str, SiteEnergy], t_s: Array, ahead
     names = list(energies)
     alpha = np.zeros((len(t_s), len(names), len(names)))
     for i, energy in enumerate(energies.values()):
-        records, dominance = energy.motion.records, energy.motion.dominance
+        records = energy.motion.records
+        dominance = energy.motion.dominance
         place = (t_s - records.t_s[0]) * records.rate_hz
         row = np.clip(np.floor(place + 1e-5), 0, len(records.known) - 1).astype(np.int64)
         later_s = np.maximum(place - row, 0.0) / records.rate_hz + ahead_s
@@ -352,7 +357,8 @@ def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:
     """Returns every dominance matrix that was in force, of a ramp its ends, shape (M, N, N)."""
     times = [next(iter(energies.values())).motion.records.t_s[:1]]
     for energy in energies.values():
-        t_s, dominance = energy.motion.records.t_s, energy.motion.dominance
+        t_s = energy.motion.records.t_s
+        dominance = energy.motion.dominance
         turns = np.flatnonzero(np.diff(dominance.rate, axis=0, prepend=0.0).any(axis=1))
         steps = np.flatnonzero((dominance.alpha[1:] != dominance.before).any(axis=1)) + 1
         times += [t_s[turns], t_s[steps]]

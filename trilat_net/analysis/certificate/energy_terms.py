@@ -95,7 +95,8 @@ class SiteConstants(NamedTuple):
 
 def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
     """Returns the constants of a site whose law is the paper's, with a box or without."""
-    spec, arm = scenario.sites[site], build_arm_rows(scenario, site)
+    spec = scenario.sites[site]
+    arm = build_arm_rows(scenario, site)
     gains = scenario.gains(site)
     names = ("Lambda", "Kp", "Kd", "Gamma", "low", "high", "rho", "width", "friction")
     of_law = {name: np.array(getattr(gains, name)) for name in names}
@@ -159,7 +160,8 @@ class SiteMotion:
     @cached_property
     def follows(self) -> Following:
         """How an error of the reference becomes motion and torque of the joints."""
-        at, c = self.records, self.constants
+        at = self.records
+        c = self.constants
         return follow_rows(c.arm, at.q, at.qd, c.Lambda)
 
     @cached_property
@@ -185,7 +187,8 @@ class SiteMotion:
 
     def control_torque(self, rows: Ints, e: Array, ed: Array, r: Array) -> Array:
         """Returns tau of Eq. (13) with these errors in place of the recorded ones, without its limit."""
-        at, c = self.records, self.constants
+        at = self.records
+        c = self.constants
         v, a = self.follows.reference(rows, e, ed)
         model = c.arm.law_torque(at.theta_hat[rows], at.q[rows], at.qd[rows], v, a)
         found: Array = model - c.Kp * r - self.follows.push(rows, c.Kd * ed) - c.robust_torque(r)
@@ -200,21 +203,24 @@ class SiteMotion:
     @cached_property
     def nearest_torques(self) -> tuple[Array, Array]:
         """The least and the largest torque that a row may have, by its limit and its rate, (K, n), N m."""
-        at, c = self.records, self.constants
+        at = self.records
+        c = self.constants
         low = np.broadcast_to(-c.tau_limit, at.tau.shape).copy()
         high = -low
         if np.any(np.isfinite(c.tau_rate)):
             before = np.vstack([np.zeros(at.tau.shape[1]), at.tau[:-1]])  # the first tick has none before it
             most = np.broadcast_to(at.h_s * c.tau_rate, at.tau.shape).copy()
             most[0] = most[0] if at.first == 0 else np.inf
-            low, high = np.maximum(low, before - most), np.minimum(high, before + most)
+            low = np.maximum(low, before - most)
+            high = np.minimum(high, before + most)
         return low, high
 
     @cached_property
     def cut(self) -> Bools:
         """True for each torque at its limit, or as far from the one before as it may be, shape (K, n)."""
         low, high = self.nearest_torques
-        c, tau = self.constants, self.records.tau
+        c = self.constants
+        tau = self.records.tau
         near = RATE_TOLERANCE * c.tau_limit if np.any(np.isfinite(c.tau_rate)) else 0.0
         found: Bools = (tau <= low + near) | (tau >= high - near)
         return found & ~self.rests[:, np.newaxis]
@@ -226,13 +232,17 @@ class SiteMotion:
         While the site follows its peers, the smooth course of its reference is Eq. (6) with every stamp
         moving at rate one. Otherwise the rule decides: the trapezoid rule on the recorded derivative.
         """
-        at, views, alpha = self.records, list(self.peers.values()), self.dominance
+        at = self.records
+        views = list(self.peers.values())
+        alpha = self.dominance
         following = at.follows[:-1] & at.follows[1:]
-        here, left = following[:, np.newaxis], at.follows[:-1, np.newaxis]
+        here = following[:, np.newaxis]
+        left = at.follows[:-1, np.newaxis]
         before, after, rate = (x[:, :, np.newaxis] for x in (alpha.before, alpha.alpha[1:], alpha.rate[:-1]))
         kept_q = np.sum([before[:, j] * v.kept.q for j, v in enumerate(views)], axis=0)
         rates = [before[:, j] * v.kept.qd + rate[:, j] * v.kept.q for j, v in enumerate(views)]
-        qd_des_left, qd_des_right = at.qd_des[:-1], np.where(left, np.sum(rates, axis=0), at.qd_des[1:])
+        qd_des_left = at.qd_des[:-1]
+        qd_des_right = np.where(left, np.sum(rates, axis=0), at.qd_des[1:])
         ruled_q = at.q_des[:-1] + 0.5 * at.h_s * (qd_des_left + qd_des_right)
         jumps = [before[:, j] * (v.kept.q - v.seen.q[1:]) for j, v in enumerate(views)]
         link = np.where(here, jumps, 0.0)
@@ -271,7 +281,9 @@ class FunctionalParts(NamedTuple):
 
 def evaluate_functional(site: SiteMotion) -> FunctionalParts:
     """Returns the functional of a site along its records."""
-    at, c, r = site.records, site.constants, site.r
+    at = site.records
+    c = site.constants
+    r = site.r
     off = (at.theta_hat - c.theta)[:, c.adapts]
     in_transit = [_energy_in_transit(c, view) for view in site.peers.values()]
     return FunctionalParts(
@@ -319,7 +331,10 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     And r'(friction(qd) - friction(qd - r)) of joints with friction; r times a robust torque; and along axes
     that not all sites follow what they do not give back to each other.
     """
-    at, c, ends, alpha = site.records, site.constants, site.ends, site.dominance
+    at = site.records
+    c = site.constants
+    ends = site.ends
+    alpha = site.dominance
     rate = at.shared_rate
     left = right = np.zeros(len(at.known) - 1)
     for j, view in enumerate(site.peers.values()):
@@ -343,7 +358,8 @@ def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
     """
     c = site.constants._replace(Kd=axes * site.constants.Kd)
     own = 0.5 * _norm(c, site.records.shared_rate)
-    left, right = own[:-1], own[1:]
+    left = own[:-1]
+    right = own[1:]
     for j, view in enumerate(site.peers.values()):
         peer = 0.5 * _norm(c, view.now.qd)
         left = left - site.dominance.alpha[:-1, j] * peer[:-1]
@@ -358,7 +374,8 @@ def _norm(c: SiteConstants, x: Array) -> Array:
 
 def compute_work(site: SiteMotion) -> dict[str, Increment]:
     """Returns the work done on a site, by its source: all that may raise V_i besides transfer."""
-    torque, at = site.torque, site.records
+    torque = site.torque
+    at = site.records
     stops = site.constants.arm.stop_torque(at.q, at.qd)
     return {
         "hands": torque_work(site, torque.operator_now, torque.operator_held),
@@ -398,13 +415,17 @@ def dominance_change_work(site: SiteMotion) -> Increment:
     1/2 sum_j alpha_ij' int qd_j' Kd qd_j ds + qd_i' Kd sum_j alpha_ij' q_j(t - T_ij): the second because ed,
     and with it the damping, contains the ramp.
     """
-    at, c, alpha, ends = site.records, site.constants, site.dominance, site.ends
+    at = site.records
+    c = site.constants
+    alpha = site.dominance
+    ends = site.ends
     if alpha.constant:
         return _nothing(site)
     left = right = np.zeros(len(at.known) - 1)
     jump = _energy_of_jump(site, ends.dominance)
     for j, view in enumerate(site.peers.values()):
-        stored, rate = _energy_in_transit(c, view), alpha.rate[:-1, j]
+        stored = _energy_in_transit(c, view)
+        rate = alpha.rate[:-1, j]
         kept = 0.5 * (view.now.squares[1:] - view.kept.squares) @ c.Kd
         followed_rate = np.where(ends.following, rate, 0.0)
         left = left + rate * stored[:-1]
@@ -417,7 +438,9 @@ def dominance_change_work(site: SiteMotion) -> Increment:
 
 def stale_rule_work(site: SiteMotion) -> Increment:
     """Returns the work of the rule for stale peers: all that moves the reference while it is not Eq. (6)."""
-    at, alpha, ends = site.records, site.dominance, site.ends
+    at = site.records
+    alpha = site.dominance
+    ends = site.ends
     ruled = ~ends.following
     if not ruled.any():
         return _nothing(site)
@@ -444,7 +467,9 @@ def torque_limit_work(site: SiteMotion) -> Increment:
 
 def unknown_friction_work(site: SiteMotion) -> Increment:
     """Returns the work -int r' friction(v) of the share of friction that the law does not compensate."""
-    at, c, ends = site.records, site.constants, site.ends
+    at = site.records
+    c = site.constants
+    ends = site.ends
     left, right = (
         -(r * (1.0 - c.friction) * c.arm.friction(qd - r)).sum(axis=1)
         for r, qd in ((ends.r_left, at.qd[:-1]), (ends.r_right, at.qd[1:]))
@@ -457,7 +482,9 @@ def singular_pose_work(site: SiteMotion) -> Increment:
 
     Both are zero where J J+ = I.
     """
-    at, c, ends = site.records, site.constants, site.ends
+    at = site.records
+    c = site.constants
+    ends = site.ends
     powers = []
     for e, rows, qd_des, r in (
         (at.e[:-1], slice(0, -1), ends.qd_des_left, ends.r_left),
@@ -489,7 +516,8 @@ def estimate_work(site: SiteMotion) -> Increment:
     The box lessens 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta) where it holds the truth; a
     parameter that is not adapted leaves r' Y (theta_hat - theta) without its counterpart.
     """
-    at, c = site.records, site.constants
+    at = site.records
+    c = site.constants
     off = at.theta_hat - c.theta
     still = np.concatenate([[False], (np.diff(off, axis=0) == 0.0).all(axis=1)]) & site.rests
     at_edge = ((at.theta_hat <= c.low) | (at.theta_hat >= c.high))[1:] & c.adapts & ~still[1:, np.newaxis]
@@ -510,7 +538,9 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
     to its value before the jump; and the scheme's step of the estimate in place of the trapezoid rule up to
     there. It is no part of the balance: what that leaves without this is unexplained.
     """
-    at, c, ends = site.records, site.constants, site.ends
+    at = site.records
+    c = site.constants
+    ends = site.ends
     u = hold_torque(at.tau, c.tau_limit, digital=site.scheme is Scheme.DIGITAL)[:-1]
     tau_right, Yr_right = _evaluate_before_jump(site)
     off_law = u - 0.5 * (at.tau[:-1] + tau_right)
@@ -521,12 +551,17 @@ def compute_sampling_work(site: SiteMotion) -> Increment:
 
 
 def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
-    at, c, ends = site.records, site.constants, site.ends
-    tau, Yr = at.tau[1:].copy(), site.Yr[1:].copy()
+    at = site.records
+    c = site.constants
+    ends = site.ends
+    tau = at.tau[1:].copy()
+    Yr = site.Yr[1:].copy()
     e = 2.0 * ends.e_middle - at.e[1:]
     moved = np.abs(e - at.e[1:]) + np.abs(ends.qd_des_right - at.qd_des[1:]) > JUMP_TOLERANCE
     rows = np.flatnonzero(moved.any(axis=1))
-    e, ed, r = e[rows], (at.shared_rate[1:] - ends.qd_des_right)[rows], ends.r_right[rows]
+    e = e[rows]
+    ed = (at.shared_rate[1:] - ends.qd_des_right)[rows]
+    r = ends.r_right[rows]
     later = rows + 1
     v, a = site.follows.reference(later, e, ed)
     Yr[rows] = c.arm.gradient(at.q[later], at.qd[later], v, a, r)
@@ -541,7 +576,8 @@ def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
 
     Both are quadratic in e, so that the gradient half-way through the whole jump gives it, linear in `de`.
     """
-    c, ends = site.constants, site.ends
+    c = site.constants
+    ends = site.ends
     if not de.any():
         return np.zeros(len(de))
     momentum = c.arm.multiply_inertia(site.records.q[1:], ends.r_middle)

@@ -61,7 +61,8 @@ class EnergyCurve(NamedTuple):
     @property
     def name(self) -> str:
         """Its name: "line m->s", "known at s of m", "store of s", "taken by s" or "given by s"."""
-        site, peer = self.site, self.peer
+        site = self.site
+        peer = self.peer
         if self.kind == "line":
             return f"line {peer}->{site}"
         if self.kind == "known":
@@ -154,11 +155,13 @@ def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | No
 
 
 def _read_books(log: Log, name: str, law: Any) -> _SiteBooks:
-    part, setup = log[name], log.scenario.setup(name)
+    part = log[name]
+    setup = log.scenario.setup(name)
     count = len(part) - int(part.mode[-1] == "diverged")
     records = _read_law_records(log, name, law, count)
     booked: LawEnergies = law.energies(records)
-    limit_nm, digital = np.array(setup.tau_limit_nm), setup.scheme is Scheme.DIGITAL
+    limit_nm = np.array(setup.tau_limit_nm)
+    digital = setup.scheme is Scheme.DIGITAL
     given = -sum_work(hold_torque(records.tau, limit_nm, digital=digital), records.q)
     if setup.theta_known:  # holding the arm is no work of the law
         potential = build_arm_rows(log.scenario, name).potential_energy(records.q)
@@ -211,7 +214,8 @@ def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
 def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCurve]:
     """Yields the energies that must not be below zero."""
     for site, own in books.items():
-        booked, energies = own.booked, []
+        booked = own.booked
+        energies = []
         if booked.store is not None:
             energies.append(("store", "", booked.store))
         for j, peer in enumerate(log[site].peers):  # what the peer had given by each tick of this site
@@ -243,15 +247,14 @@ def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
     lowest = min(least, key=lambda one: one.amount_j)
     failed = [premise.name for premise in premises if not premise.holds]
     if not premises[0].holds:
-        finding, text = ObservedFinding.BROKEN, premises[0].text
+        finding = ObservedFinding.BROKEN
+        text = premises[0].text
     elif lowest.amount_j < LEAST_ENERGY_J - ROUNDING_SHARE * scale:
         finding = ObservedFinding.NEGATIVE
         text = f"{lowest.name} is {lowest.amount_j:.3g} J at {lowest.at_s:.4g} s"
     else:
-        finding, text = (
-            ObservedFinding.PASSIVE,
-            f"{count_nouns(len(least), 'energy')}, the largest {largest:.4g} J",
-        )
+        finding = ObservedFinding.PASSIVE
+        text = f"{count_nouns(len(least), 'energy')}, the largest {largest:.4g} J"
         text += f"; but a premise fails: {', '.join(failed)}" * bool(failed)
     numbers = (least, largest, residual, sampling, curves)
     return ObservedEnergy(finding, f"{finding}: {text}", premises, *numbers)

@@ -139,7 +139,8 @@ def gather_facts(log: Log) -> RunFacts:
     constants = {site: derive_site_constants(log.scenario, site) for site in log.sites}
     if not (energies := compute_site_energies(log)):
         return RunFacts(log, constants, unknown=NO_COMMON_TIME)
-    balance, absent = compute_energy_balance(energies), find_absent_spans(log)
+    balance = compute_energy_balance(energies)
+    absent = find_absent_spans(log)
     if not balance.judged.any():
         return RunFacts(log, constants, unknown=NO_PERIOD)
     closed = map(find_closed_groups, find_dominance_matrices(energies))
@@ -216,7 +217,8 @@ def _check_walls(log: Log) -> Premise | None:
 
 
 def _check_dominance(run: FunctionalFacts) -> Premise:
-    names, energies = run.log.scenario.names, run.energies
+    names = run.log.scenario.names
+    energies = run.energies
     changing = [site for site, energy in energies.items() if not energy.motion.dominance.constant]
     if changing:
         lost = list_losses(run.log)
@@ -245,14 +247,16 @@ def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
 
 
 def _check_delays(run: FunctionalFacts) -> Premise:
-    varying, constant = [], set()
+    varying = []
+    constant = set()
     for site, energy in run.energies.items():
         records = energy.motion.records
         for peer, view in energy.followed.items():
             used = np.isfinite(view.stamp_s) & records.known
             if not used.any():
                 continue
-            age_s, first_s = (records.t_s - view.stamp_s)[used], view.stamp_s[used][0]
+            age_s = (records.t_s - view.stamp_s)[used]
+            first_s = view.stamp_s[used][0]
             late = records.first == 0 and first_s > records.h_s + CONSTANT_DELAY_TOLERANCE_S
             if np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S or late:
                 varying.append(f"{peer}->{site} ({1e3 * age_s.min():.4g} to {1e3 * age_s.max():.4g} ms)")
@@ -348,7 +352,8 @@ def _check_singular_poses(run: FunctionalFacts) -> Premise | None:
 
 def _check_operators(run: FunctionalFacts) -> Premise:
     """Passive with respect to r: they give no more than they took before, up to a constant."""
-    energies, balance = run.energies, run.balance
+    energies = run.energies
+    balance = run.balance
     pushed_s = {
         site: energy.motion.records.t_s[energy.motion.records.tau_x.any(axis=1)]
         for site, energy in energies.items()
@@ -370,7 +375,8 @@ def _check_operators(run: FunctionalFacts) -> Premise:
     r = "qd - v" if any(energy.motion.constants.axes for energy in energies.values()) else "qd + Lambda e"
     text = f"the {who} gave up to {gave:.3g} J with respect to r = {r}"
     ages_s = [energy.largest_age_s for energy in energies.values()]
-    free_s, least_s = float(balance.t_s[-1] - let_go_s), max(MIN_FREE_S, MIN_FREE_AGES * max(ages_s))
+    free_s = float(balance.t_s[-1] - let_go_s)
+    least_s = max(MIN_FREE_S, MIN_FREE_AGES * max(ages_s))
     if free_s >= least_s:
         return Premise("hands", True, f"{text}; nobody pushes after {let_go_s:.3f} s")
     if free_s > 1e-9:
@@ -389,7 +395,8 @@ def _check_records(run: FunctionalFacts) -> Premise:
 
 def find_absent_spans(log: Log) -> list[AbsentSpan]:
     """Returns when sites were away from the session, in order."""
-    end_s, found = recorded_end_s(log), []
+    end_s = recorded_end_s(log)
+    found = []
     for site in log.sites:
         part = log[site]
         spans = [(a / part.rate_hz, (b + 1) / part.rate_hz) for a, b in log.absences.get(site, ())]
@@ -434,7 +441,8 @@ OF_RUN = (
 
 def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: float) -> str:
     """Returns from when on all sites follow in a stretch of time, and if the delays are constant then."""
-    follow_s, varying = from_s, []
+    follow_s = from_s
+    varying = []
     for energy in energies.values():
         records = energy.motion.records
         apart = records.known & ~records.follows & (records.t_s >= from_s) & (records.t_s < to_s)
@@ -519,9 +527,12 @@ class Evidence(NamedTuple):
 
 def collect_evidence(run: RunFacts, min_coverage: float) -> Evidence:
     """Returns what a certificate of a log rests on: of V the periods in which no site was away."""
-    log, known, share = run.log, run.functional, None
+    log = run.log
+    known = run.functional
+    share = None
     if known is not None and not known.groups:
-        t_s, judged = known.balance.t_s, known.balance.judged
+        t_s = known.balance.t_s
+        judged = known.balance.judged
         asked = np.ones(len(judged), dtype=np.bool_)
         for from_s, to_s in set(find_unjudged_spans(known.balance)) - set(known.unjudged):
             asked &= (t_s[:-1] < from_s) | (t_s[:-1] >= to_s)

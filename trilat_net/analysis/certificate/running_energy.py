@@ -50,8 +50,10 @@ class RecordWindow:
     """
 
     def __init__(self, scenario: Scenario, site: str, kept_s: float = KEPT_S) -> None:
-        self.site, self.rate_hz = site, scenario.sites[site].rate_hz
-        self.peers, self._axes = scenario.peers(site), scenario.arms[site].axes
+        self.site = site
+        self.rate_hz = scenario.sites[site].rate_hz
+        self.peers = scenario.peers(site)
+        self._axes = scenario.arms[site].axes
         layout = scenario.layout(site)
         names = (*RECORD_COLUMNS, *(TASK_VECTORS if layout.task else ()), *(("hand",) if layout.hand else ()))
         lengths = layout.lengths()
@@ -63,8 +65,10 @@ class RecordWindow:
         self._known = np.zeros(2 * self._kept, dtype=np.bool_)
         self._follows, self._rests = np.zeros((2, 2 * self._kept), dtype=np.bool_)
         self._limits = scenario.sites[site].limits
-        self.first, self.newest = 0, -1
-        self._glides, self._rested_at = scenario.sites[site].on_stale.action == "glide", -(2**40)
+        self.first = 0
+        self.newest = -1
+        self._glides = scenario.sites[site].on_stale.action == "glide"
+        self._rested_at = -(2**40)
 
     def take(self, record: State) -> bool:
         """Adds a record; false if it is older than the window, or says that the site diverged."""
@@ -81,7 +85,8 @@ class RecordWindow:
         if self._glides and record.mode in RESTING_MODES:
             self._rested_at = max(self._rested_at, record.tick)
         since = record.tick - self._rested_at
-        self._known[row], self._rests[row] = True, 0 <= since <= RESUMING_S * self.rate_hz
+        self._known[row] = True
+        self._rests[row] = 0 <= since <= RESUMING_S * self.rate_hz
         free = self._limits.qd_des_limit_rad_s is None or find_unlimited(
             self._limits, np.array(record.qd_des)
         )
@@ -103,14 +108,20 @@ class RecordWindow:
     def rows(self, first: int, last: int) -> AlignedRecords:
         """Returns the records of ticks in the window, both ends included; a missing one is interpolated."""
         part = slice(first - self.first, last + 1 - self.first)
-        known, floats, used = self._known[part].copy(), self._floats[part], self._used[part]
-        follows, rests = self._follows[part].copy(), self._rests[part].copy()
+        known = self._known[part].copy()
+        floats = self._floats[part]
+        used = self._used[part]
+        follows = self._follows[part].copy()
+        rests = self._rests[part].copy()
         if not known.all() and known.any():
-            floats, there = floats.copy(), np.flatnonzero(known)
+            floats = floats.copy()
+            there = np.flatnonzero(known)
             for column in floats.T:
                 column[:] = np.interp(np.arange(len(known)), there, column[there])
             before = there[np.maximum(np.searchsorted(there, np.arange(len(known)), side="right") - 1, 0)]
-            used, follows, rests = used[before], follows[before], rests[before]
+            used = used[before]
+            follows = follows[before]
+            rests = rests[before]
         columns: dict[str, Any] = {name: floats[:, where] for name, where in self._columns.items()}
         return AlignedRecords(
             *(self.site, self.rate_hz, first, known, follows),
@@ -147,7 +158,8 @@ class RunningEnergy:
         self.reason = explain_no_functional(scenario)
         if any(spec.on_stale.rule.degrades for spec in scenario.sites.values()):
             self.reason = self.reason or "shares change when a peer is lost: trilat certify tells V"
-        self._scenario, self._windows = scenario, windows
+        self._scenario = scenario
+        self._windows = windows
         self._dominance = {site: list_scripted_ramps(scenario, site) for site in windows}
         self._done_s: float | None = None
         self._supplied = 0.0

@@ -168,7 +168,8 @@ class Certificate(Result):
         found = [self.verdict.text] if broken else []
         if self.balance is not None and not broken:
             found += find_growth(self.balance, self.verdict.tolerance)
-        roots, twins = self.roots, self.twins
+        roots = self.roots
+        twins = self.twins
         if roots is not None and roots.verdict == "unstable":
             doubt = None if roots.exact else roots.rate_per_s
             if doubt is None or twins is None or doubt <= twins.excluded_rate_per_s:
@@ -207,7 +208,9 @@ class Certificate(Result):
 
     def to_dict(self) -> JsonObject:
         """Returns plain values, with the keys of `trilat certify --json`."""
-        verdict, end, balance = self.verdict, self.end, self.balance
+        verdict = self.verdict
+        end = self.end
+        balance = self.balance
         return {
             "passed": self.passed,
             "stability": self.stability.value,
@@ -269,7 +272,8 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = Fa
         verdict = verdict if known.groups else verdict._replace(tolerance=known.tolerance)
     if verdict.finding in (StabilityFinding.BROKEN, StabilityFinding.NOT_JUDGED):
         verdict = verdict._replace(text=f"{verdict.finding}: {verdict.text}")
-    end, observed = classify_log_end(log), observe_energies(log, own_laws=own_laws)
+    end = classify_log_end(log)
+    observed = observe_energies(log, own_laws=own_laws)
     found = Certificate(premises, verdict, end, collect_evidence(run, min_coverage), observed=observed)
     if known is None:
         return found
@@ -286,7 +290,8 @@ def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> Stabilit
     An arm outside of the program need not follow its theta, nor are its angles and velocities measured at
     once; the records of any other are not what they claim, unless the period may be the cause.
     """
-    energies, scale = run.energies, run.balance.scale
+    energies = run.energies
+    scale = run.balance.scale
 
     def allow(site: str, share: float = BROKEN_BALANCE_SHARE) -> float:
         return share * scale + 2.0 * energies[site].uncertainty + ZERO_ENERGY_J
@@ -314,7 +319,8 @@ def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> Stabilit
 def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """Recorded torques are not those of Eq. (13)."""
     for site, energy in run.energies.items():
-        error, records = energy_terms.measure_torque_error(energy.motion), energy.motion.records
+        error = energy_terms.measure_torque_error(energy.motion)
+        records = energy.motion.records
         wrong = error > TORQUE_TOLERANCE * (1.0 + np.abs(records.tau).max(axis=1))
         if wrong.any():
             off = f"{error.max():.3g} N m, from {records.t_s[int(np.argmax(wrong))]:.4g} s on"
@@ -332,7 +338,8 @@ def _judge_weights(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdi
 
 def _judge_precision(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """The energies are known too badly."""
-    scale, tolerance = run.balance.scale, run.tolerance
+    scale = run.balance.scale
+    tolerance = run.tolerance
     if tolerance <= COARSE_TOLERANCE_SHARE * scale + 2.0 * ZERO_ENERGY_J:
         return None
     known = f"its energies are known only to {tolerance:.3g} J of {scale:.4g} J"
@@ -341,7 +348,8 @@ def _judge_precision(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVer
 
 
 def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
-    balance, sources = run.balance, list(run.balance.external)
+    balance = run.balance
+    sources = list(run.balance.external)
     failed = [premise.name for premise in premises if premise.holds is False]
     outside = f"outside the theorem ({', '.join(failed)})"
     rise = _find_largest_rise(balance, run.tolerance)
@@ -393,14 +401,16 @@ def find_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
     It must not end above its beginning, nor rise at the end of the judged half: to above its least value
     there, by more than half of what it fell within that half.
     """
-    V, half = balance.unsupplied, len(balance.unsupplied) // 2
+    V = balance.unsupplied
+    half = len(balance.unsupplied) // 2
     found = []
     gained = float(V[-1] - V[0])
     if gained > tolerance:
         found.append(f"V ends {gained:.3g} J above its beginning, and nobody gave that")
     judged = V[half:]
     lowest = int(judged.argmin())
-    risen, fell = float(judged[-1] - judged[lowest]), float(judged[0] - judged[lowest])
+    risen = float(judged[-1] - judged[lowest])
+    fell = float(judged[0] - judged[lowest])
     if risen > tolerance and risen > 0.5 * fell:
         from_s = float(balance.t_s[half + lowest])
         found.append(f"V rises at the end: by {risen:.3g} J from {from_s:.4g} s on, and nobody gave that")
@@ -408,7 +418,9 @@ def find_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
 
 
 def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:
-    V, sites, ones = balance.V, certificate.energies, certificate.ones
+    V = balance.V
+    sites = certificate.energies
+    ones = certificate.ones
     with_ones: JsonObject | None = None
     if ones is not None:
         with_ones = {"v_first_j": float(ones.V[0]), "v_max_j": float(ones.V.max())}

@@ -158,7 +158,8 @@ def compute_log_metrics(log: Log) -> LogMetrics:
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
-    view, scenario = RunView(log), log.scenario
+    view = RunView(log)
+    scenario = log.scenario
     found = _measure_places(view, list_measures())
     names = {arm.joint_names if scenario.sites[site].arm.urdf else () for site, arm in scenario.arms.items()}
     return LogMetrics(

@@ -169,12 +169,14 @@ def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
 
 def _estimate_joints(runs: Mapping[str, SiteRun], site: str, wall: str) -> Iterator[ImpedanceEstimate]:
     records, by_source, _ = runs[site]
-    script, usable = by_source.script, _find_still_rows(runs, site, alone=not wall)
+    script = by_source.script
+    usable = _find_still_rows(runs, site, alone=not wall)
     rows, recorded = find_latest_rows(runs[wall or site].records, records.t_s)
     for joint in range(records.qd.shape[1]):
         found = [FrequencyResponse(why=NO_SCRIPT_TEXT)]
         if script is not None and usable is not None:
-            usable, operator = usable & records.known, by_source.operator[:, joint]
+            usable = usable & records.known
+            operator = by_source.operator[:, joint]
             if wall:
                 torque = runs[wall].torque.environment[rows, joint]
                 signals = torque, torque, -operator, usable & recorded

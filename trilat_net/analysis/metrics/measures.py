@@ -137,9 +137,17 @@ class Measure(NamedTuple):
 
 
 _MEASURES: list[Measure] = []
-TRACKING, SPREAD, FOLLOWING = "tracking", "apart", "slave and master"
-EFFORT, ENERGY, CONTACT, LEARNING = "effort", "energy", "walls", "learning"
-SHARING, USERS, NETWORK, LOOP = "force sharing", "users", "network", "loop"
+TRACKING = "tracking"
+SPREAD = "apart"
+FOLLOWING = "slave and master"
+EFFORT = "effort"
+ENERGY = "energy"
+CONTACT = "walls"
+LEARNING = "learning"
+SHARING = "force sharing"
+USERS = "users"
+NETWORK = "network"
+LOOP = "loop"
 _SHOWN = (TRACKING, SPREAD, FOLLOWING, EFFORT, ENERGY, CONTACT, SHARING, USERS, LEARNING, NETWORK, LOOP)
 """Headings in the order in which they are shown; others follow."""
 

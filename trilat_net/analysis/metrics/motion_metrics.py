@@ -70,7 +70,8 @@ def measure_tracking(view: RunView, site: str) -> MetricValues:
     part = log[site]
     if not len(part):
         return unavailable(TRACKING, f"no records of {site}")
-    e, space = site_signals.joint_errors(part), log.scenario.sites[site].task.space
+    e = site_signals.joint_errors(part)
+    space = log.scenario.sites[site].task.space
     unit = "rad" if space == "joints" else "m" if space == "position" else "m or rad"
     unsettled = f"|e| exceeds {site_signals.SETTLED_ERROR_RAD:g} {unit} in the last record"
     at_end = part.t_s > part.t_s[-1] - END_WINDOW_S
@@ -87,7 +88,8 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
     In task space between their places, along axes that all follow. Instants are the ticks of the first site
     at which every other site has its own latest tick recorded.
     """
-    log, runs = view.log, view.sites
+    log = view.log
+    runs = view.sites
     if view.absent:
         return unavailable(SPREAD, f"no records of {', '.join(view.absent)}")
     sites = [run.records for run in runs.values()]
@@ -116,14 +118,18 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     At every tick t_k of the slave from its first sample of that master on: the master's angles in the record
     whose sample the slave has in use, less the slave's own.
     """
-    log, runs, use = view.log, view.sites, view.links[link]
-    peer, site = use.peer, use.site
+    log = view.log
+    runs = view.sites
+    use = view.links[link]
+    peer = use.peer
+    site = use.site
     if [log.scenario.sites[name].role for name in (peer, site)] != ["master", "slave"]:
         return unavailable(FOLLOWING, "no link of a master to a slave", applies=False)
     absent = [name for name in (peer, site) if name not in runs]
     if absent:
         return unavailable(FOLLOWING, f"no records of {', '.join(absent)}")
-    master, slave = runs[peer].records, runs[site].records
+    master = runs[peer].records
+    slave = runs[site].records
     row = slave.used[peer] - master.first
     inside = (slave.used[peer] >= 0) & (row >= 0) & (row < len(master.known))
     row = np.clip(row, 0, len(master.known) - 1)
@@ -132,8 +138,10 @@ def measure_following(view: RunView, link: str) -> MetricValues:
         return unavailable(FOLLOWING, f"no record of {site} uses a recorded sample of {peer}")
     there = master.shared[row]
     apart = find_task_errors(there, slave.x, slave.axes) if slave.x.size else there - slave.q
-    off, last = apart[known], slave.known_at_end(END_WINDOW_S)[known]
-    space, none = log.scenario.sites[site].task.space, "no sample in the last second"
+    off = apart[known]
+    last = slave.known_at_end(END_WINDOW_S)[known]
+    space = log.scenario.sites[site].task.space
+    none = "no sample in the last second"
     return measure_shared(FOLLOWING, space, _LAGS, off, last, none)
 
 
@@ -187,7 +195,9 @@ def measure_wall_contact(view: RunView, name: str) -> MetricValues:
     run = view.sites.get(site)
     if run is None:
         return unavailable(CONTACT, "no records of the site")
-    t_s, known, end_effector = run.records.nominal_s, run.records.known, run.torque.end_effector
+    t_s = run.records.nominal_s
+    known = run.records.known
+    end_effector = run.torque.end_effector
     force = wall_force(wall, t_s, end_effector)
     touches = force > 0.0
     began = touches & np.concatenate([[False], ~touches[:-1] & known[:-1]])
@@ -249,11 +259,14 @@ class ParameterEstimates(NamedTuple):
 
 def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> ParameterEstimates:
     """Returns the estimates of a site, and their least-squares slopes at the end."""
-    spec, arm = scenario.sites[records.site], build_arm_rows(scenario, records.site)
-    gains, theta_hat = spec.control.gains(arm.theta), records.theta_hat
+    spec = scenario.sites[records.site]
+    arm = build_arm_rows(scenario, records.site)
+    gains = spec.control.gains(arm.theta)
+    theta_hat = records.theta_hat
     moved = (theta_hat != theta_hat[0]).any(axis=0)
     adapted = np.array(gains.Gamma) > 0.0 if gains.law is Law.ADAPTIVE else moved
-    rows, slope = records.known_at_end(LONG_END_S), None
+    rows = records.known_at_end(LONG_END_S)
+    slope = None
     if np.count_nonzero(rows) >= 2:
         x = records.t_s[rows] - records.t_s[rows].mean()
         slope = (x @ theta_hat[rows] / (x @ x)).tolist()
@@ -292,14 +305,17 @@ def measure_parameter_error(view: RunView, site: str) -> MetricValues:
     Distance and energy of a chain are those of the combinations that torques determine: what else its
     estimates are off by stays as it is, and acts on nothing.
     """
-    scenario, estimates = view.scenario, view.once(read_all_estimates).get(site)
+    scenario = view.scenario
+    estimates = view.once(read_all_estimates).get(site)
     if estimates is None:
         return unavailable(LEARNING, "no records of the site")
     arm = build_arm_rows(scenario, site)
-    gains, rows = scenario.sites[site].control.gains(arm.theta), np.array(estimates.learnt)
+    gains = scenario.sites[site].control.gains(arm.theta)
+    rows = np.array(estimates.learnt)
     if not rows.any():
         return unavailable(LEARNING, "nothing is learnt", applies=False)
-    slopes, base = estimates.slope_per_s, estimates.base
+    slopes = estimates.slope_per_s
+    base = estimates.base
     slope = None if slopes is None else float(np.linalg.norm(np.array(slopes)[rows]))
     metrics = unavailable(LEARNING, "theta of the arm is not known")
     metrics["theta_slope_per_s"] = metric(slope, "less than two records in the last 5 s")
@@ -345,7 +361,8 @@ def _find_parameter_energy(arm: ArmRows, learnt: Bools, Gamma: Array, off: Array
 def measure_network(view: RunView, link: str) -> MetricValues:
     """Returns effective delay, loss and bursts of a link."""
     use = view.links[link]
-    age, never = use.age_ms, "no sample ever came into use"
+    age = use.age_ms
+    never = "no sample ever came into use"
     unknown = "of no sample it is known whether it came"
     lossless = Metric(None, "nothing was lost", applies=False)
     return {

@@ -76,9 +76,12 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
     """
     if site not in view.sites:
         return unavailable(ENERGY, f"no records of {site}", of="site")
-    scenario, (records, torque, _) = view.scenario, view.sites[site]
+    scenario = view.scenario
+    (records, torque, _) = view.sites[site]
     arm = build_arm_rows(scenario, records.site)
-    spec, known, q = scenario.sites[records.site], records.known_periods, records.q
+    spec = scenario.sites[records.site]
+    known = records.known_periods
+    q = records.q
     if not known.any():
         return unavailable(ENERGY, "no two records in a row", of="site")
 
@@ -87,7 +90,8 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
 
     controller = total(held_work(held_control_torque(records, scenario), q))
     operator = total(trapezoid_work(torque.operator_now, q) + held_work(torque.operator_held, q))
-    stops, rubbed = arm.stop_torque(q, records.qd), arm.friction(records.qd)
+    stops = arm.stop_torque(q, records.qd)
+    rubbed = arm.friction(records.qd)
     walls = total(trapezoid_work(torque.environment_now + stops, q) + held_work(torque.environment_held, q))
     friction = total(trapezoid_work(rubbed, q))
     no_walls = Metric(None, "the scenario has no environment here", applies=False)
@@ -120,7 +124,9 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
     Over the periods that follow from records alone and in which the site follows its peers; of the torque
     that the law asks for, before its limit.
     """
-    runs, peer, site = view.sites, view.links[link].peer, view.links[link].site
+    runs = view.sites
+    peer = view.links[link].peer
+    site = view.links[link].site
     arm = build_arm_rows(view.scenario, site)
     law = view.scenario.sites[site].control
     gains = law.gains(arm.theta)
@@ -130,7 +136,9 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
     if gains.law is Law.OWN:
         unknown = f"the law {identify_law(law)} does not say which part of its torque is due to a peer"
         return unavailable(ENERGY, unknown, of="link")
-    records, other, factors = runs[site].records, runs[peer].records, runs[site].dominance
+    records = runs[site].records
+    other = runs[peer].records
+    factors = runs[site].dominance
     if min(len(records.known), len(other.known)) < 2:
         return unavailable(ENERGY, "no two records in a row", of="link")
     delayed = view_delayed_peer(records, PeerTrajectory(other))
@@ -160,7 +168,8 @@ def _delay_torque(
     late = view.seen.q - view.now.q
     off = alpha * late
     off_rate = alpha * (view.seen.qd - view.now.qd) + rate * late
-    every, axes = slice(None), np.array(records.axes or 1.0)
+    every = slice(None)
+    axes = np.array(records.axes or 1.0)
     follows = follow_rows(arm, records.q, records.qd, axes * np.array(gains.Lambda)).without_posture()
     Kd = axes * np.array(gains.Kd)
     if gains.law is Law.ADAPTIVE:

@@ -68,7 +68,8 @@ def find_static_windows(view: RunView) -> list[StaticWindow]:
         return []
     runs = view.shared
     first = next(iter(runs.values())).records
-    rows, still = {}, first.known.copy()
+    rows = {}
+    still = first.known.copy()
     for site, (records, torque, dominance) in runs.items():
         rows[site], recorded = find_latest_rows(records, first.t_s)
         slow = np.abs(records.qd).max(axis=1) < STATIC_SPEED_RAD_S
@@ -125,7 +126,8 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
     """Returns the stiffness between each two static windows between which one operator alone moved."""
     estimates = []
     for before, after in pairwise(view.once(find_static_windows)):
-        moved, known = [], True
+        moved = []
+        known = True
         for site, now in after.script.items():
             then = before.script[site]
             if now is None or then is None:
@@ -136,9 +138,11 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
             continue
         site = moved[0]
         operator = [window.torque[site] - window.environment[site] for window in (before, after)]
-        torques, angles = operator[1] - operator[0], after.q[site] - before.q[site]
+        torques = operator[1] - operator[0]
+        angles = after.q[site] - before.q[site]
         for joint in range(len(torques)):
-            torque, angle = float(torques[joint]), float(angles[joint])
+            torque = float(torques[joint])
+            angle = float(angles[joint])
             if abs(torque) >= MIN_TORQUE_CHANGE_NM:
                 K = torque / angle if abs(angle) >= MIN_ANGLE_CHANGE_RAD else None
                 found = StiffnessEstimate(before.to_s, after.to_s, site, joint + 1, torque, angle, K)
@@ -251,14 +255,16 @@ def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
 
     The operator that feels is a spring; if both are or none, the slave is the site of the torque.
     """
-    scenario, at = view.scenario, {window.from_s: window for window in view.once(find_static_windows)}
+    scenario = view.scenario
+    at = {window.from_s: window for window in view.once(find_static_windows)}
     pairs = []
     for load in view.once(find_joint_loads):
         if len(load.torque_nm) == 2:
             pushed, holds = sorted(load.torque_nm, key=lambda site: _holding_rank(scenario, site, load.to_s))
             torque = load.torque_nm[pushed]
             by_wall = abs(float(at[load.from_s].environment[pushed][load.joint - 1])) > 0.5 * abs(torque)
-            one, other = load.weight[pushed], load.weight[holds]
+            one = load.weight[pushed]
+            other = load.weight[holds]
             if one.value is None or other.value is None:
                 expected = Metric(None, one.why)
             elif other.value == 0.0:
@@ -293,8 +299,10 @@ def _torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
 
 def _holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
     """Returns the stiffness that holds e at rest, shape (n,), N m/rad, and the reason why more acts."""
-    spec, arm = scenario.sites[site], build_arm_rows(scenario, site)
-    gains, none = spec.control.gains(arm.theta), np.zeros(len(spec.q0_rad))
+    spec = scenario.sites[site]
+    arm = build_arm_rows(scenario, site)
+    gains = spec.control.gains(arm.theta)
+    none = np.zeros(len(spec.q0_rad))
     if gains.law is Law.OWN:
         return (
             none,
@@ -304,7 +312,8 @@ def _holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
         return none, "theta of the arm is not known"
     if np.any(gains.k_f):
         return none, "it reflects force: e is not all that its law goes by"
-    adaptive, gravity = gains.law is Law.ADAPTIVE, arm.gravity_parameters
+    adaptive = gains.law is Law.ADAPTIVE
+    gravity = arm.gravity_parameters
     if adaptive and arm.task is not None:
         return none, "in task space what holds the e of this law changes with the pose: J+'Kp J+ Lambda"
     estimate = np.array(gains.theta_hat0 if adaptive else gains.known)

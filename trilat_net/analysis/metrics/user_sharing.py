@@ -15,7 +15,8 @@ from ..dominance_history import RAMP_TIME_TOLERANCE_S, UserShares, find_user_sha
 from ..run_view import RunView, SiteRun
 from .measures import USERS, Metric, MetricValues, Quantity, measures, metric, peak, rms, unavailable
 
-PARTS, WIDEST = 8, 0.25
+PARTS = 8
+WIDEST = 0.25
 """Of a share in motion: parts that the jackknife leaves out in turn, and the widest half interval, 95 %."""
 STUDENT_T = 2.3646
 """The 0.975 quantile of Student's t with one degree of freedom less than parts, 7."""
@@ -43,7 +44,8 @@ def read_user_shares(view: RunView) -> UserShares | Metric:
 )
 def measure_authority(view: RunView, site: str) -> MetricValues:
     """Returns a user's share in the slave's motion, and h sum_k a_k |tau_h,k|^2 by its dominance a_k."""
-    shared, (slave, users) = view.once(read_user_shares), find_users(view.scenario)
+    shared = view.once(read_user_shares)
+    (slave, users) = find_users(view.scenario)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="site", applies=shared.applies)
     if site not in users:
@@ -64,7 +66,8 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     """
     slave, users = find_users(view.scenario)
     own = view.sites[slave].records
-    judged, rates = own.known & own.follows, []
+    judged = own.known & own.follows
+    rates = []
     for other in (view.sites[user].records for user in users):
         row = own.used[other.site] - other.first
         there = row.clip(0, len(other.known) - 1)
@@ -97,7 +100,8 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
 )
 def measure_sharing(view: RunView, _run: str) -> MetricValues:
     """Returns disagreement, interventions and takeovers of the users of a slave."""
-    shared, (slave, users) = view.once(read_user_shares), find_users(view.scenario)
+    shared = view.once(read_user_shares)
+    (slave, users) = find_users(view.scenario)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="run", applies=shared.applies)
     records = view.sites[slave].records
@@ -118,7 +122,8 @@ def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
     rows, known = find_common_rows([run.records for run in runs])
     torques = np.stack([run.torque.operator[row] for run, row in zip(runs, rows, strict=True)])[:, known]
     sizes = np.abs(torques).sum(axis=0)
-    cancels, whole = 0.5 * (sizes - np.abs(torques.sum(axis=0))), sizes.sum()
+    cancels = 0.5 * (sizes - np.abs(torques.sum(axis=0)))
+    whole = sizes.sum()
     places = PLACE if runs[0].records.x.size else 0
     found = {"internal_share": metric(2.0 * cancels.sum() / whole) if whole else _unasked("nobody pushes")}
     for unit, part in (("n", cancels[:, :places]), ("nm", cancels[:, places:])):
@@ -135,11 +140,14 @@ def _time_taken(at_s: float, h_s: float, spans: list[tuple[float, float]]) -> fl
 def _compare_steps(records: AlignedRecords, spans: list[tuple[float, float]]) -> Metric:
     """Returns the largest step of q_id from tick to tick while shares change, over that of the rest."""
     places = records.q_des[:, :PLACE] if records.x.size else records.q_des
-    follows, steps = records.known & records.follows, np.abs(np.diff(places, axis=0)).max(axis=1)
-    begins, ends = records.t_s[:-1] - RAMP_TIME_TOLERANCE_S, records.t_s[1:] + RAMP_TIME_TOLERANCE_S
+    follows = records.known & records.follows
+    steps = np.abs(np.diff(places, axis=0)).max(axis=1)
+    begins = records.t_s[:-1] - RAMP_TIME_TOLERANCE_S
+    ends = records.t_s[1:] + RAMP_TIME_TOLERANCE_S
     changing = np.any([(ends >= start) & (begins <= end) for start, end in [*spans, (np.inf, 0.0)]], axis=0)
     judged = follows[:-1] & follows[1:]
     if not (judged & changing).any():
         return _unasked("no share changes")
-    largest, rest = peak(steps[judged & changing]), peak(steps[judged & ~changing])
+    largest = peak(steps[judged & changing])
+    rest = peak(steps[judged & ~changing])
     return metric(largest / rest if rest else None, "the reference rests outside of it")

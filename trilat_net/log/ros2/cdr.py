@@ -14,13 +14,15 @@ from typing import Any, NamedTuple
 
 from ...core.ticks import NS_PER_S
 
-ENCODING, SCHEMA_ENCODING = "cdr", "ros2msg"
+ENCODING = "cdr"
+SCHEMA_ENCODING = "ros2msg"
 JOINT_STATE = "sensor_msgs/msg/JointState"
 FLOAT64_ARRAY = "std_msgs/msg/Float64MultiArray"
 STRING = "std_msgs/msg/String"
 LOG = "rcl_interfaces/msg/Log"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
-POSE, TWIST = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TwistStamped"
+POSE = "geometry_msgs/msg/PoseStamped"
+TWIST = "geometry_msgs/msg/TwistStamped"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
@@ -73,7 +75,8 @@ class JointStatePacker:
     def __init__(self, names: Sequence[str], *, velocity: bool = True, effort: bool = True) -> None:
         self._names = _pack_fields(8, "", len(names), *names)  # after the stamp; of no frame
         self._counts = [len(names) * present for present in (True, velocity, effort)]
-        form, offset = f"<4siI{len(self._names)}s", 8 + len(self._names)
+        form = f"<4siI{len(self._names)}s"
+        offset = 8 + len(self._names)
         for count in self._counts:
             part, offset = _format_floats(offset, count)
             form += part
@@ -95,7 +98,9 @@ class TransformPacker:
     """Packer of `tf2_msgs/msg/TFMessage` with these frames: pairs of parent and child."""
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
-        self._names, form, offset = [], "<4sI", 4
+        self._names = []
+        form = "<4sI"
+        offset = 4
         for parent, child in frames:
             names = _pack_fields(offset + 8, parent, child)
             gap = -(offset + 8 + len(names)) % 8
@@ -190,7 +195,8 @@ class CdrReader:
     def __init__(self, payload: bytes) -> None:
         if payload[:2] != _HEAD[:2] or len(payload) < len(_HEAD):
             raise ValueError("is not plain CDR, little-endian")
-        self._data, self._at = payload[len(_HEAD) :], 0
+        self._data = payload[len(_HEAD) :]
+        self._at = 0
 
     def numbers(self, code: str, count: int = 1) -> tuple[Any, ...]:
         """Returns numbers of a format of `struct`."""
@@ -220,7 +226,8 @@ class CdrReader:
 
     def header(self) -> tuple[int, str]:
         """Returns the stamp of a header, ns, on whatever clock, and its frame."""
-        (whole_s,), (rest_ns,) = self.numbers("i"), self.numbers("I")
+        (whole_s,) = self.numbers("i")
+        (rest_ns,) = self.numbers("I")
         return whole_s * NS_PER_S + rest_ns, self.text()
 
 

@@ -21,7 +21,9 @@ from .topic_names import DIAGNOSTICS, FRAMES, TopicTable
 Topics = dict[str, Ros2Channel]
 """Topics by name: of one site by our names, of a session by their full names."""
 
-_OK, _WARNING, _ERROR = 0, 1, 2
+_OK = 0
+_WARNING = 1
+_ERROR = 2
 _LEVELS = {"run": _OK, "fault": _ERROR, "diverged": _ERROR}
 """Of `/diagnostics`, by mode; others warn."""
 _STEADY = "unit quaternion, each nearest to the one before"
@@ -60,14 +62,16 @@ class SiteMessages:
     """
 
     def __init__(self, scenario: Scenario, site: str, epoch_unix_ns: int) -> None:
-        self._arm, self._epoch_unix_ns = scenario.arms[site], epoch_unix_ns
+        self._arm = scenario.arms[site]
+        self._epoch_unix_ns = epoch_unix_ns
         spec = scenario.sites[site]
         self._scale = spec.task.scale
         self._shapes = shapes = Ros2SiteChannels(scenario, site)
         self._robot = RobotModel(scenario, site)
         self._signs = {name: SteadyQuaternion() for name in ("tip_pose", "reference_pose")}
         self._link_signs = [SteadyQuaternion() for _ in self._robot.frames]
-        self._mode, self._shares = "", tuple[float, ...]()
+        self._mode = ""
+        self._shares = tuple[float, ...]()
         self.description = cdr.pack_string(self._robot.description)
         self.frame = self._robot.frames[0][1]
         self._pack_shared: Callable[..., bytes] | None = None

@@ -91,10 +91,13 @@ class RobotModel:
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        spec, names = scenario.sites[site].arm, scenario.arms[site].joint_names
-        base, text = "base", _PLANAR.format(l1_m=spec.l1_m, l2_m=spec.l2_m)
+        spec = scenario.sites[site].arm
+        names = scenario.arms[site].joint_names
+        base = "base"
+        text = _PLANAR.format(l1_m=spec.l1_m, l2_m=spec.l2_m)
         if spec.urdf:
-            base, text = read_arm(spec, scenario.urdf).base, scenario.urdf[spec.urdf]
+            base = read_arm(spec, scenario.urdf).base
+            text = scenario.urdf[spec.urdf]
         x, y, z = spec.down if spec.urdf else (0.0, -1.0, 0.0)
         root = ElementTree.fromstring(text)
         below: dict[str, list[Element]] = {}
@@ -167,7 +170,8 @@ def _vector(element: Element | None, key: str, absent: Vector) -> Vector:
 
 def _read_frame(joint: Element, names: Sequence[str]) -> _JointFrame:
     """Returns a joint as `read_urdf` has taken it."""
-    name, origin = joint.get("name", ""), joint.find("origin")
+    name = joint.get("name", "")
+    origin = joint.find("origin")
     turned = _turned(_vector(origin, "rpy", (0.0, 0.0, 0.0)))
     axis = _vector(joint.find("axis"), "xyz", (1.0, 0.0, 0.0))
     size = math.hypot(*axis) or 1.0
@@ -198,7 +202,8 @@ def _add_shape(link: Element, to: Vector, colour: str, site: str) -> None:
     visual = ElementTree.SubElement(link, "visual")
     length = math.hypot(*to)
     middle = " ".join(f"{x / 2.0:.9g}" for x in to)
-    tilt, turn = math.atan2(math.hypot(to[0], to[1]), to[2]), math.atan2(to[1], to[0])
+    tilt = math.atan2(math.hypot(to[0], to[1]), to[2])
+    turn = math.atan2(to[1], to[0])
     ElementTree.SubElement(visual, "origin", xyz=middle, rpy=f"0 {tilt:.9g} {turn:.9g}")
     geometry = ElementTree.SubElement(visual, "geometry")
     if length > 0.0:

@@ -27,13 +27,15 @@ from ..site_log import find_task_errors
 from . import cdr
 from .robot_model import RobotModel
 
-EVENTS, LINES = "events", "log"
+EVENTS = "events"
+LINES = "log"
 """Channels of a whole session: events as plain text, and as lines with a time and a level."""
 SENT_PREFIX = "sent_"
 """Of the names of arrays that hold what a law sends: "sent_E", "sent_u_to_m2"."""
 
 
-ROBOT, FRAMES = "robot_description", "tf"
+ROBOT = "robot_description"
+FRAMES = "tf"
 """Channels of an arm that a URDF describes: that file, and where its links are."""
 
 
@@ -49,7 +51,8 @@ class StandardChannels:
     """The channels of a file, of all that are known by topic; each is registered with its first message."""
 
     def __init__(self, file: McapWriter, known: Mapping[str, Ros2Channel]) -> None:
-        self._file, self._known = file, known
+        self._file = file
+        self._known = known
         self._numbers: dict[str, int] = {}  # of schemas by their kind, and of channels by their topic
 
     def __getitem__(self, topic: str) -> int:
@@ -113,10 +116,15 @@ class Ros2SiteChannels:
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        arm, self._peers = scenario.arms[site], scenario.peers(site)
-        self._arm, n, peers = arm, arm.counts.joints, self._peers
-        shared, axes = arm.counts.shared, TASK_AXES[: arm.counts.shared]
-        self.error_row, self.slow_row = slice(4 * n, 4 * n + shared), slice(4 * n + shared, None)
+        arm = scenario.arms[site]
+        self._peers = scenario.peers(site)
+        self._arm = arm
+        n = arm.counts.joints
+        peers = self._peers
+        shared = arm.counts.shared
+        axes = TASK_AXES[: arm.counts.shared]
+        self.error_row = slice(4 * n, 4 * n + shared)
+        self.slow_row = slice(4 * n + shared, None)
         self.robot = RobotModel(scenario, site) if arm.chain is not None else None
         self.joints = [*arm.joint_names] if self.robot else [f"{site}_{name}" for name in arm.joint_names]
         labels = ["_".join(name.split()) for name in self.joints]
@@ -170,7 +178,8 @@ class Ros2SiteChannels:
 
     def statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
         """Yields the arrays of one statistics; those of clocks and networks only in a live session."""
-        arrays, peers = self.arrays, self._peers
+        arrays = self.arrays
+        peers = self._peers
         if not peers:
             return
         yield "link_age", arrays["link_age"].pack(*(_ms(stats.age_us.get(peer, -1)) for peer in peers))

@@ -48,7 +48,8 @@ TOPICS = {
 """By our name of a topic the one that it has under `/<session>/<site>` in each of `NAMINGS`: as CRISP, and as
 the Collaborative Robotics Toolkit of the da Vinci Research Kit call it. What a law sends is "sent_" and the
 name of the vector, in every naming."""
-FRAMES, DIAGNOSTICS = "tf", "diagnostics"
+FRAMES = "tf"
+DIAGNOSTICS = "diagnostics"
 """Topics of all sessions together, where tools of ROS look for them."""
 
 

@@ -77,11 +77,13 @@ class _SiteBuckets:
         self, scenario: Scenario, site: str, views_hz: float, epoch_ns: int, put: PutMessage
     ) -> None:
         self._rate_hz = rate_hz = scenario.sites[site].rate_hz
-        self._put, self._epoch_unix_ns = put, epoch_ns
+        self._put = put
+        self._epoch_unix_ns = epoch_ns
         self._shapes = shapes = ros2_messages.Ros2SiteChannels(scenario, site)
         names = [*shapes.joints, *(f"{name}_ref" for name in shapes.joints)]
         self._states = JointStatePacker(names)
-        joints, sent = len(shapes.joints), scenario.channel(site).floats
+        joints = len(shapes.joints)
+        sent = scenario.channel(site).floats
         self.most_pending_bytes = MAX_PENDING_BYTES * -(-joints // 2) + SENT_PENDING_BYTES * sent
         self._none = [math.nan] * joints  # velocity, effort of a reference: size is dear
         own = {"joint_states": shapes.joint_states(names), **shapes.channels}
@@ -90,7 +92,8 @@ class _SiteBuckets:
         self._described = shapes.robot is None
         self._half = max(1, int(rate_hz // views_hz))  # ticks of half a bucket
         self._ratio = 1 if views_hz == FULL_RATE_HZ else max(1, round(rate_hz / self._half / SLOW_VIZ_HZ))
-        self._fast, self._slow = _BucketOutput(self._write_fast), _BucketOutput(self._write_slow)
+        self._fast = _BucketOutput(self._write_fast)
+        self._slow = _BucketOutput(self._write_slow)
         self._bucket = self._first = self._half_end = 0  # the open bucket, its first tick, the end of a half
         self._open: list[ros2_messages.Record] = []
         self._slow_open: list[StampedRow] = []
@@ -98,8 +101,10 @@ class _SiteBuckets:
 
     def _write_fast(self, stamp_ns: int, row: ros2_messages.SignalRow, log_ns: int) -> None:
         """Writes the joint states, the angles of the reference as joints of their own; and the error."""
-        none, n = self._none, len(self._none)
-        velocity, effort = [*row[2 * n : 3 * n], *none], [*row[3 * n : 4 * n], *none]
+        none = self._none
+        n = len(self._none)
+        velocity = [*row[2 * n : 3 * n], *none]
+        effort = [*row[3 * n : 4 * n], *none]
         data = self._states.pack(stamp_ns, row[: 2 * n], velocity, effort)
         self._put(self._topics["joint_states"], data, stamp_ns, log_ns)
         error = self._shapes.arrays["error"].pack(*row[self._shapes.error_row])
@@ -148,14 +153,16 @@ class _SiteBuckets:
             self._fast.add(rows, log_ns)
             self._slow_open += [(stamp_ns, row[self._shapes.slow_row]) for stamp_ns, row in rows]
             self._open = []
-        half, was = 2 * bucket // self._ratio, 2 * self._bucket // self._ratio
+        half = 2 * bucket // self._ratio
+        was = 2 * self._bucket // self._ratio
         if half != was:
             self._slow.flush(log_ns)
         if half // 2 != was // 2 and self._slow_open:
             stamps_ns, signals = zip(*self._slow_open, strict=True)
             self._slow.add(_stamp_extremes(stamps_ns, zip(*signals, strict=True)), log_ns)
             self._slow_open = []
-        self._bucket, self._first = bucket, 2 * self._half * bucket
+        self._bucket = bucket
+        self._first = 2 * self._half * bucket
 
     def _flush_late(self, log_ns: int) -> None:
         if self._late:
@@ -213,7 +220,8 @@ class VizChannels:
     def __init__(
         self, scenario: Scenario, session: str, epoch_unix_ns: int, views_hz: float, put: PutMessage
     ) -> None:
-        self._epoch_unix_ns, self._put = epoch_unix_ns, put
+        self._epoch_unix_ns = epoch_unix_ns
+        self._put = put
         self.channels = {
             f"{VIZ_ROOT}{name}": channel for name, channel in ros2_messages.SESSION_CHANNELS.items()
         }
@@ -250,10 +258,12 @@ def decimate_min_max(columns: Iterable[ros2_messages.SignalRow]) -> tuple[list[f
 
     Each column has one finite number at least, in the order in which they came.
     """
-    first, second = [], []
+    first = []
+    second = []
     for column in columns:
         ordered = sorted(column)  # smooth curves are nearly in order: a third of what min and max take
-        low, high = ordered[0], ordered[-1]
+        low = ordered[0]
+        high = ordered[-1]
         start = column[0]
         rises = start == low or (start != high and column.index(low) < column.index(high))
         first.append(low if rises else high)

@@ -68,7 +68,9 @@ def _write(
         raise UsageError(f"actions are {' or '.join(ACTIONS)}, not {actions!r}")
     tasks: dict[str, int] = {}
     names: Names = {}
-    parts, sessions, lost = list[Columns](), [], 0
+    parts = list[Columns]()
+    sessions = []
+    lost = 0
     for log in logs:
         rows, episode, left_out = _find_rows(log, fps)
         columns, found = _read_columns(log, rows, program, actions)
@@ -107,7 +109,8 @@ def _find_rows(log: Log, fps: int) -> tuple[dict[str, Ints], Ints, int]:
     if empty := [site for site, rows in kept.items() if not len(rows)]:
         raise LogError(f"{log.source}: no records of {', '.join(empty)}")
     stamps = {site: log[site].tick[rows] * NS_PER_S // log[site].rate_hz for site, rows in kept.items()}
-    begin_ns, end_ns = max(t[0] for t in stamps.values()), min(t[-1] for t in stamps.values())
+    begin_ns = max(t[0] for t in stamps.values())
+    end_ns = min(t[-1] for t in stamps.values())
     at_ns = begin_ns + np.arange((end_ns - begin_ns) * fps // NS_PER_S + 1) * NS_PER_S // fps
     fresh = np.ones(len(at_ns), dtype=np.bool_)
     for site, t_ns in stamps.items():
@@ -157,7 +160,8 @@ def _read_commands(
     if actions == "tip":
         tips = []
         for user in users:
-            q, qd = log[user].q[rows[user]], log[user].qd[rows[user]]
+            q = log[user].q[rows[user]]
+            qd = log[user].qd[rows[user]]
             tips.append(build_arm_rows(log.scenario, user).place_end_effector(q, qd).at)
         return tips, [f"{axis}.pos" for axis in TASK_AXES[: tips[0].shape[1]]]
     if not actions and log[users[0]].layout.task:
@@ -174,7 +178,8 @@ def _read_commands(
 
 def _store_tables(folder: Path, whole: Columns, edges: list[int], tasks: list[str]) -> dict[str, Any]:
     """Stores the tables of a dataset, and returns its statistics by their place."""
-    pa, parquet = import_extra("pyarrow", *_EXTRA[1:]), import_extra(*_EXTRA)
+    pa = import_extra("pyarrow", *_EXTRA[1:])
+    parquet = import_extra(*_EXTRA)
     vectors = {
         key: pa.FixedSizeListArray.from_arrays(one.ravel(), one[0].size) if one[0].size > 1 else one.ravel()
         for key, one in whole.items()

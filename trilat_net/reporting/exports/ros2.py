@@ -34,7 +34,8 @@ from ..export import ExportFormat, Written
 SOURCE_METADATA = "trilat.source"
 """Metadata of the file: its session."""
 _QOS = (cdr.DEFINITIONS / "qos.yaml").read_text(encoding="utf-8")
-_VOLATILE, _LATCHED = {"DEPTH": "10", "DURABILITY": "2"}, {"DEPTH": "1", "DURABILITY": "1"}
+_VOLATILE = {"DEPTH": "10", "DURABILITY": "2"}
+_LATCHED = {"DEPTH": "1", "DURABILITY": "1"}
 """Quality of service of the live topics: reliable; the last ten messages, or the last one also for who comes
 later (transient local)."""
 _EVERY = 1000
@@ -97,9 +98,12 @@ class _SiteRecords:
     def __init__(
         self, log: Log, name: str, session: str, table: TopicTable, progress: Callable[[int], None]
     ) -> None:
-        self._log, self._name, self._progress = log, name, progress
+        self._log = log
+        self._name = name
+        self._progress = progress
         self._messages = SiteMessages(log.scenario, name, _find_epoch_ns(log))
-        self._session, self._table = session, table
+        self._session = session
+        self._table = table
 
     def _find_topic(self, topic: str) -> str:
         return self._table.find(self._session, self._name, topic)
@@ -111,7 +115,8 @@ class _SiteRecords:
         """Yields its records in the order of arrival."""
         part = self._log[self._name]
         shares = trace_dominance(self._log, self._name, part.t_s).alpha.tolist()
-        log_ns, publish_ns = part.log_time_ns.tolist(), part.publish_time_ns.tolist()
+        log_ns = part.log_time_ns.tolist()
+        publish_ns = part.publish_time_ns.tolist()
         for count, at in enumerate(np.argsort(part.log_time_ns, kind="stable").tolist(), 1):
             record = part.states[at]
             messages = self._named(self._messages.pack_record(record, shares[at]))

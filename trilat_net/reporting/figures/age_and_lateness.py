@@ -237,7 +237,8 @@ def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 def _bars(log: Log, site: str, axes: Axes, times_us: Ints, edges: Array, form: FigureSize) -> None:
     axes.set(xscale="log", yscale="log")
-    counts, colour = bin_loop_times(times_us, edges), style.site_colour(log, site)
+    counts = bin_loop_times(times_us, edges)
+    colour = style.site_colour(log, site)
     axes.stairs(counts, edges, baseline=0.5, fill=True, color=colour)
     axes.axvline(1e6 / log.scenario.sites[site].rate_hz, **style.LIMIT_LINE)
     if not len(times_us):

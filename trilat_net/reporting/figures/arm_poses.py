@@ -63,7 +63,8 @@ def trace_bodies_m(arm: ArmModel, sizes_m: Iterable[Sequence[float]], poses: Arr
     """
     found = []
     for size, pose in zip(sizes_m, np.split(poses, poses.shape[1] // 7, axis=1), strict=True):
-        w, v = pose[:, np.newaxis, 3:4], pose[:, np.newaxis, 4:]
+        w = pose[:, np.newaxis, 3:4]
+        v = pose[:, np.newaxis, 4:]
         corners = np.broadcast_to(_BOX_PATH * np.asarray(size), (len(pose), *_BOX_PATH.shape))
         turned = corners + 2.0 * np.cross(v, np.cross(v, corners) + w * corners)
         edges = turned + pose[:, np.newaxis, :3]
@@ -107,7 +108,8 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 
 def pose_at(log: Log, site: str, t_s: float) -> ArmPose | None:
     """Returns the pose of a site at an instant: that of its last record until then; None without one."""
-    part, arm = log[site], log.scenario.arms[site]
+    part = log[site]
+    arm = log.scenario.arms[site]
     last = int(np.searchsorted(part.t_s, t_s + 1e-9, side="right")) - 1
     if last < 0:
         return None
@@ -127,11 +129,13 @@ def pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
     """Returns left, right, bottom and top of a box around poses with a margin, m; the base is inside."""
     points = [np.concatenate([*one[:4], *one.bodies]) for one in poses if one is not None]
     every = np.concatenate([*points, np.zeros((1, 2))])
-    low, high = every.min(axis=0), every.max(axis=0)
+    low = every.min(axis=0)
+    high = every.max(axis=0)
     centre = (low + high) / 2.0
     extent = max(float((high - low).max()), 0.1)
     half = np.maximum((high - low) / 2.0, 0.35 * extent) + 0.08 * extent
-    (left, bottom), (right, top) = centre - half, centre + half
+    (left, bottom) = centre - half
+    (right, top) = centre + half
     return float(left), float(right), float(bottom), float(top)
 
 

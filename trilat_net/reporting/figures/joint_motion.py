@@ -172,7 +172,8 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     with style.time_figure(log, form, _height_in(log, height_in)) as plot:
         grid, lowest = _add_joint_rows(plot, form, heads, labels, "col")
         for site, row in zip(log.sites, grid, strict=True):
-            actual, desired = site_signals.joint_angles(log[site]), site_signals.reference_angles(log[site])
+            actual = site_signals.joint_angles(log[site])
+            desired = site_signals.reference_angles(log[site])
             for joint, axes in enumerate(row[: actual.shape[1]]):
                 plot.trace(axes, site, actual[:, joint], 1.6)
                 plot.trace(axes, site, desired[:, joint], **style.LIMIT_LINE)
@@ -190,7 +191,8 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     In task space it is that of the place along each axis, m. The lowest panel shows, at every time, the
     largest error of any joint that is still to come: where it crosses the dashed line, the site has settled.
     """
-    titles, unit = style.name_shared(log), site_signals.shared_unit(log)
+    titles = style.name_shared(log)
+    unit = site_signals.shared_unit(log)
     count = len(titles)
     rows = len(style.arrange_joints(count, form.narrow))
     with style.time_figure(log, form, 3.6 + _ROW_IN * (rows - 1)) as plot:
@@ -206,7 +208,8 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             remaining = site_signals.largest_remaining_error(log[site])
             positive = style.positive(remaining)
             plot.trace(settling, site, positive)
-            low, high = np.nanmin(positive, initial=low), np.nanmax(positive, initial=high)
+            low = np.nanmin(positive, initial=low)
+            high = np.nanmax(positive, initial=high)
         settling.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
         settling.set(
             yscale="log", ylim=(0.5 * low, 2.0 * high), ylabel=f"largest error\nstill to come ({unit})"
@@ -223,7 +226,8 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     A triangle marks the time at which a site settles; the legend has its value.
     """
-    entries, unit = [], site_signals.shared_unit(log)
+    entries = []
+    unit = site_signals.shared_unit(log)
     with style.time_figure(log, form, 2.4) as plot:
         axes = style.add_panels(plot.figure, 1, 1)[0, 0]
         low = high = SETTLED_ERROR_RAD
@@ -234,7 +238,8 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             plot.trace(axes, site, positive)
             if size.any():
                 least, most = np.nanpercentile(positive, (2.0, 100.0)).tolist()
-                low, high = min(low, least), max(high, most)
+                low = min(low, least)
+                high = max(high, most)
             settled = site_signals.settling_time_s(log[site])
             if settled is not None:
                 mark = {"marker": "v", "markersize": 6.0, "color": line["color"], "clip_on": False}
@@ -328,15 +333,18 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
     A ring marks the start of a site, a disc its end.
     """
-    titles, unit = style.name_shared(log), site_signals.shared_unit(log)
+    titles = style.name_shared(log)
+    unit = site_signals.shared_unit(log)
     places = style.arrange_joints(len(titles), form.narrow)
     height_in = 0.72 * form.width_in / len(places[0])
     with style.styled_figure(form, 1.0 + len(places) * height_in) as figure:
         panels = figure.subplot_mosaic([[*row] for row in places])
         row = [axes for name, axes in panels.items() if name != "."]
         for site in log.sites:
-            part, line = log[site], style.site_line(log, site, _LOOP_PT)
-            e, ed = site_signals.joint_errors(part), site_signals.joint_error_rates(part)
+            part = log[site]
+            line = style.site_line(log, site, _LOOP_PT)
+            e = site_signals.joint_errors(part)
+            ed = site_signals.joint_error_rates(part)
             for joint, axes in enumerate(row[: e.shape[1]] if len(part) else ()):
                 _draw_path(axes, np.stack([e[:, joint], ed[:, joint]], axis=1), line)
         style.title_joints(log, row, titles)
@@ -366,7 +374,8 @@ def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     with style.styled_figure(form, 0.4 + len(places) * height_in) as figure:
         panels = figure.subplot_mosaic([[*row] for row in places])
         for site in log.sites:
-            part, line = log[site], style.site_line(log, site)
+            part = log[site]
+            line = style.site_line(log, site)
             path = build_arm_rows(log.scenario, site).place_end_effector(part.q, part.qd).at
             path = path * log.scenario.sites[site].task.scale
             for axes, plane in zip(panels.values() if len(part) else (), _PLANES, strict=False):
@@ -421,7 +430,8 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     with style.time_figure(log, form, 0.8 + (0.8 if low else 1.05) * rows) as plot:
         column = style.add_panels(plot.figure, rows, 1, sharex=True)[:, 0]
         for site, axes in zip(owners, column, strict=False):
-            part, peers = log[site], log.scenario.peers(site)
+            part = log[site]
+            peers = log.scenario.peers(site)
             alpha = trace_dominance(log, site, part.t_s).alpha
             for peer, share in zip(peers, alpha.T, strict=True):
                 plot.trace(axes, site, share, **style.site_line(log, peer))
@@ -454,7 +464,8 @@ def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     with style.time_figure(log, form, 2.9) as plot:
         column = style.add_panels(plot.figure, 2, 1, sharex=True)[:, 0]
         for site in sites:
-            part, spec = log[site], log.scenario.sites[site]
+            part = log[site]
+            spec = log.scenario.sites[site]
             end_effector = build_arm_rows(log.scenario, site).place_end_effector(part.q, part.qd)
             walls = list_walls(spec)
             for wall, dashes in zip(walls, [*style.DASHES] * len(walls), strict=False):

@@ -41,12 +41,14 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
     joints = sorted({one.joint for one in ports.transparency})
     sites = dict.fromkeys(one.at for one in ports.transparency)
     rows = style.arrange_joints(len(joints), size.narrow)
-    blocks, columns = len(rows), min(len(rows[0]), len(joints))
+    blocks = len(rows)
+    columns = min(len(rows[0]), len(joints))
     crowded = size.narrow or columns > 2
     with style.styled_figure(size, 3.8 * blocks) as figure:
         grid = style.add_panels(figure, 2 * blocks, columns, sharex=True, sharey="row")
         for place, joint in enumerate(joints):
-            top, column = 2 * (place // columns), place % columns
+            top = 2 * (place // columns)
+            column = place % columns
             of_joint = [one for one in ports.transparency if one.joint == joint]
             magnitude, phase = grid[top : top + 2, column]
             _plot_impedance(ports, of_joint, magnitude, phase)
@@ -195,7 +197,8 @@ _LOST: Any = {"marker": "x", "color": "#cc3311", "linestyle": "none", "markersiz
 
 def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
     """Returns the figure of a benchmark's values, see `NetworkBenchmark.to_dict`."""
-    rows, needs = facts["rows"], facts["needs"]
+    rows = facts["rows"]
+    needs = facts["needs"]
     cases = list(dict.fromkeys((row["bytes"], row["rate_hz"]) for row in rows))
     transports = list(dict.fromkeys(row["transport"] for row in rows))
     with style.styled_figure(REPORT_SIZE, _HEIGHT_IN) as figure:
@@ -254,7 +257,8 @@ def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
 
 def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:
     """Returns k at the edge over the delay, with the gains and the runs, see `ArmGains.to_dict`."""
-    edge, margin = facts["edge"], facts["margin"]
+    edge = facts["edge"]
+    margin = facts["margin"]
     delay_ms, k = np.array(facts["curve"]).T * [[1e3], [1.0]]
     runs = [run for run in facts["runs"] if run["share"]]
     marks = {True: ("o", "run decays"), False: ("x", "run grows"), None: ("s", "run tells nothing")}

@@ -74,7 +74,8 @@ def write_figures(
         UsageError: there is no such figure, width or format, the log has nothing to show in it, or a file
             exists.
     """
-    form, wanted = make_print_size(width_in), list(dict.fromkeys(names)) or list_drawable_figures(log)
+    form = make_print_size(width_in)
+    wanted = list(dict.fromkeys(names)) or list_drawable_figures(log)
     chosen = {name: partial(_find_figure(log, name).draw, log, form) for name in wanted}
     return _write(chosen, folder, form, formats, progress, force=force)
 

@@ -22,7 +22,8 @@ from .. import style
 from ..appearance import REPORT_SIZE, SITE_COLOURS, FigureSize
 from .figure_entry import draws
 
-_HEIGHT_IN, _NARROW_HEIGHT_IN = 3.9, 5.6
+_HEIGHT_IN = 3.9
+_NARROW_HEIGHT_IN = 5.6
 _DECADES = 6.0
 """Of an axis of errors, at most: what is smaller has settled long ago."""
 _LETTERS_PER_IN = 15.0

@@ -40,7 +40,10 @@ def draw_twins(found: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
 
     Twins of which there are none give a figure with the reason.
     """
-    log, growth, twins, worst = found.log, found.growth, found.growth.twins, found.growth.worst
+    log = found.log
+    growth = found.growth
+    twins = found.growth.twins
+    worst = found.growth.worst
     if twins is None or worst is None:
         return style.empty_figure(growth.text, form)
     with style.time_figure(log, form, 5.4 if form.narrow else 4.4) as plot:
@@ -55,7 +58,8 @@ def draw_twins(found: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
         own = [one for (_, path, _, _), one in zip(lines, drawn, strict=True) if path.push is shown.push]
         _draw_rate(above, found, shown, own[0][0], np.fmax.reduce([values for _, values in own]))
         _mark(above, found, form)
-        place, from_s = 0, max(0.0, found.at_s - 0.08 * (growth.to_s - found.at_s))
+        place = 0
+        from_s = max(0.0, found.at_s - 0.08 * (growth.to_s - found.at_s))
         t_s = twins.paths[0].t_s
         for site in log.sites:
             speed = twins.speed[:, place : (place := place + log.scenario.layout(site).joints)].max(axis=1)
@@ -77,7 +81,8 @@ draws("twins", "what became of small pushes of the run", explain_no_repetition, 
 def _list_lines(found: PushedTwins) -> Iterator[_Line]:
     twins = found.growth.twins
     assert twins is not None
-    paths, every = twins.paths, list(range(len(twins.joints)))
+    paths = twins.paths
+    every = list(range(len(twins.joints)))
     styles = {}  # of each joint: the colour of its site, and dashes
     for name in twins.joints:
         site, _, number = name.partition(" joint ")
@@ -98,8 +103,10 @@ def _list_lines(found: PushedTwins) -> Iterator[_Line]:
 
 
 def _trace(path: TwinPath, joints: list[int], to_s: float, step: int) -> tuple[Array, Array]:
-    amplitude, end = measure_amplitude(path, joints), int(np.searchsorted(path.t_s, to_s))
-    t_s, values = np.zeros(0), np.zeros(0)
+    amplitude = measure_amplitude(path, joints)
+    end = int(np.searchsorted(path.t_s, to_s))
+    t_s = np.zeros(0)
+    values = np.zeros(0)
     for first, last in pairwise([*path.pushed, max(end, path.pushed[-1] + 1)]):
         starts = np.arange(first, last, step)
         t_s = np.r_[t_s, path.t_s[np.minimum(starts + step // 2, last - 1)], np.nan]
@@ -113,11 +120,13 @@ def _draw_rate(axes: Axes, found: PushedTwins, one: PushGrowth, t_s: Array, valu
     rows = (t_s >= from_s) & (t_s <= end_s) & (values > 0.0)
     if not rows.any() or not np.isfinite(one.rate_per_s) or one.trend is EnvelopeTrend.UNDECIDED:
         return
-    t_s, falls = t_s[rows], one.rate_per_s < 0.0
+    t_s = t_s[rows]
+    falls = one.rate_per_s < 0.0
     level = float(np.max(np.log(1.15 * values[rows]) - one.rate_per_s * t_s))
     line = np.exp(np.minimum(level + one.rate_per_s * t_s, MOST_LOG))
     axes.plot(t_s, line, **{**style.LIMIT_LINE, "linewidth": 1.0, "zorder": 4.0})
-    words, at = f"{one.rate_per_s:+.3g} /s".replace("-", "\u2212"), len(t_s) // 2
+    words = f"{one.rate_per_s:+.3g} /s".replace("-", "\u2212")
+    at = len(t_s) // 2
     axes.annotate(words, (t_s[at], line[at]), (0.0, 3.0), ha="left" if falls else "right", **_WORDS)
 
 
@@ -126,7 +135,8 @@ def _mark(axes: Axes, found: PushedTwins, form: FigureSize) -> None:
     axes.set_ylabel("difference of velocities (rad/s)")
     low, high = axes.get_ylim()
     if low < 10.0 * SMALLEST:
-        low, top = SMALLEST / 10.0, (0.0, SMALLEST)
+        low = SMALLEST / 10.0
+        top = (0.0, SMALLEST)
         axes.axhspan(low, SMALLEST, **_ROUNDING)
         axes.annotate(
             "rounding", top, (3.0, -9.0), axes.get_yaxis_transform(), fontsize=form.small_pt, **_WORDS

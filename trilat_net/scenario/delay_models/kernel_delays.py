@@ -151,7 +151,9 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
     def _moments(self) -> tuple[float, float]:
         """A mixture's second moment is the mixture of theirs, 2 a^2 and 2 b^2."""
-        fast, slow, share = self.fast_ms, self.slow_ms, self.slow_share
+        fast = self.fast_ms
+        slow = self.slow_ms
+        share = self.slow_share
         above = (1.0 - share) * fast + share * slow
         square = 2.0 * ((1.0 - share) * fast * fast + share * slow * slow)
         return self.floor_ms + above, math.sqrt(square - above * above)
@@ -171,9 +173,12 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
 
     def _moments(self) -> tuple[float, float]:
         """Of max(0, x) for a normal x, in a form in which nothing large cancels."""
-        m, s = self.delay_ms, self.deviation_ms
+        m = self.delay_ms
+        s = self.deviation_ms
         a = m / s
-        above, below, density = _probability(a), _probability(-a), _density(a)
+        above = _probability(a)
+        below = _probability(-a)
+        density = _density(a)
         variance = above + a * above * a * below + a * density * (below - above) - density * density
         return m * above + s * density, s * math.sqrt(max(variance, 0.0))
 

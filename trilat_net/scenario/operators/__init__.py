@@ -58,7 +58,8 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
         """Returns a problem that no range of a single key shows, or None."""
         if math.hypot(*getattr(self, "normal", (1.0,))) < 1e-6:
             return fields.KeyProblem("normal", "must point somewhere, is zero")
-        start_s, end_s = getattr(self, "start_s", 0.0), getattr(self, "end_s", fields.MAX_QUANTITY)
+        start_s = getattr(self, "start_s", 0.0)
+        end_s = getattr(self, "end_s", fields.MAX_QUANTITY)
         if end_s <= start_s:
             return fields.KeyProblem("end_s", f"must be later than start_s = {start_s:g}, is {end_s:g}")
         return None

@@ -46,7 +46,8 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
             inward -= now.speed[i] * self.normal[i]
         if depth > 0.0:
             length = math.sqrt(square)
-            depth, inward = depth / length, inward / length
+            depth = depth / length
+            inward = inward / length
             push = self.stiffness_n_m15 * depth * math.sqrt(depth) * (1.0 + self.damping_s_m * inward)
             if push > 0.0:
                 for i in range(now.coordinates):

@@ -90,7 +90,8 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
 
     def find_problem(self) -> fields.KeyProblem | None:
         """Returns times in a wrong order."""
-        start_s, end_s = self.move_start_s, self.move_end_s
+        start_s = self.move_start_s
+        end_s = self.move_end_s
         if (problem := super().find_problem()) or end_s >= start_s:
             return problem
         return fields.KeyProblem("move_end_s", f"must not be before move_start_s = {start_s:g}, is {end_s:g}")
@@ -296,7 +297,8 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
                     path=f"{path}.{key}",
                 )
             del table[key]
-        device, axes = table.get("device"), holding.counts.axes
+        device = table.get("device")
+        axes = holding.counts.axes
         if isinstance(device, dict) and isinstance(frame := device.get("frame"), list):
             lines = {tuple(map(abs, DIRECTIONS.get(str(word), ()))) for word in frame}
             if not len(frame) == axes == len(lines - {()}):
@@ -331,9 +333,13 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         )
 
     def _source(self) -> TorqueSource:
-        stiffness, damping, limit = self.stiffness_n_m, self.damping_n_s_m, self.force_limit_n
+        stiffness = self.stiffness_n_m
+        damping = self.damping_n_s_m
+        limit = self.force_limit_n
         if self.mode == "joint":
-            stiffness, damping, limit = self.stiffness_nm_rad, self.damping_nm_s_rad, self.torque_limit_nm
+            stiffness = self.stiffness_nm_rad
+            damping = self.damping_nm_s_rad
+            limit = self.torque_limit_nm
         kind = TorqueKind[f"LIVE_{self.mode.upper()}"]
         return TorqueSource(kind, K=stiffness, B=damping, limit=limit, sampled=True)
 
@@ -402,6 +408,7 @@ class Wall(SampledActor, frozen=True, tag="wall"):
         # `math.hypot` of three numbers rounds otherwise on other machines
         length = math.hypot(x, y) if len(self.normal) == 2 else math.sqrt(x * x + y * y + z * z)
         unit = tuple(x / length for x in self.normal)
-        stiffness, damping = (self.stiffness_n_m, 0.0), (self.damping_n_s_m, 0.0)
+        stiffness = (self.stiffness_n_m, 0.0)
+        damping = (self.damping_n_s_m, 0.0)
         vectors: dict[str, Any] = {"a": self.point_m, "b": unit, "K": stiffness, "B": damping}
         return TorqueSource(TorqueKind.WALL, self.start_s, self.end_s, **vectors, sampled=self.sampled)

@@ -69,7 +69,8 @@ class ProgramHand(
     @classmethod
     def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:
         """Names the file of its class by a hash, and does as a live hand."""
-        code, place = table.get("class"), f"{path}.class"
+        code = table.get("class")
+        place = f"{path}.class"
         if isinstance(code, str) and "source_sha256" not in entry:
             table["source_sha256"] = read_code(code, place).sha256
         kept = {key: table.pop(key) for key in OWN_KEYS if key in table}
@@ -107,7 +108,9 @@ class HandSite(NamedTuple):
 
     def describe(self) -> HandContext:
         """Returns what its program knows before it begins."""
-        scenario, name, spec = self.scenario, self.name, self.spec
+        scenario = self.scenario
+        name = self.name
+        spec = self.spec
         rules = spec.rules(scenario.sites[name].rate_hz, scenario.arms[name])
         limit = spec.torque_limit_nm if spec.mode == "joint" else spec.force_limit_n
         own = (self.rate_hz, self.delay_s, rules.speed_limit, limit, scenario.draw_seed(name))
@@ -115,7 +118,8 @@ class HandSite(NamedTuple):
 
     def make_hand(self) -> OwnHand:
         """Returns the hand."""
-        tick_rate_hz, arm = self.scenario.sites[self.name].rate_hz, self.scenario.arms[self.name]
+        tick_rate_hz = self.scenario.sites[self.name].rate_hz
+        arm = self.scenario.arms[self.name]
         place: Any = list if self.spec.mode == "joint" else arm.end_effector
         delay = math.ceil(round(self.delay_s * tick_rate_hz, 6))
         return OwnHand(self.spec.rules(tick_rate_hz, arm), tick_rate_hz // self.rate_hz, delay, place)
@@ -131,9 +135,13 @@ class HandPlayer:
     """
 
     def __init__(self, at: HandSite, program: Any, watch: Watch = call_plainly) -> None:
-        self._program, self._watch = program, watch
-        self.failure, self.news = "", list[tuple[int, str]]()
-        self._site, self._code, self._layout = at.name, at.program, at.scenario.layout(at.name)
+        self._program = program
+        self._watch = watch
+        self.failure = ""
+        self.news = list[tuple[int, str]]()
+        self._site = at.name
+        self._code = at.program
+        self._layout = at.scenario.layout(at.name)
         self._rate_hz = at.scenario.sites[at.name].rate_hz
         self.hand = at.make_hand()
 
@@ -189,7 +197,8 @@ def make_program(at: HandSite) -> HandProgram:
         CodeWithheld: its class may not run.
         ScenarioError: it cannot be made.
     """
-    path, spec = f"sites.{at.name}.hands", at.spec
+    path = f"sites.{at.name}.hands"
+    spec = at.spec
     assert isinstance(spec, ProgramHand)
     kind = import_class(CodeKey.of(spec), f"{path}.class", spec.method)
     made: HandProgram = make_instance(kind, spec.code, at.describe(), spec.settings, path=path)

@@ -29,7 +29,8 @@ FIGURES_OF_BENCH = {
 }
 """Per figure its label, and the number that it shows; "" for the share of stable runs."""
 _WIDTH_IN = 7.0
-_ROW_IN, _HEAD_IN = 0.14, 0.65
+_ROW_IN = 0.14
+_HEAD_IN = 0.65
 _TEXT_PT = 5.5
 _PALETTE = "cividis"
 _NONE = "#a23b53"
@@ -82,7 +83,8 @@ def _rows(results: BenchResults, task: str) -> list[tuple[str, str]]:
 
 def _collect(results: BenchResults, task: str, quantity: str) -> Array:
     """Returns the numbers of a panel, shape (laws, links); NaN where there is none."""
-    rows, links = _rows(results, task), results.plan.links
+    rows = _rows(results, task)
+    links = results.plan.links
     field = np.full((len(rows), len(links)), np.nan)
     for place in results.of(task):
         value = place.mean(quantity) if quantity else place.stable / len(place.runs)
@@ -93,7 +95,8 @@ def _collect(results: BenchResults, task: str, quantity: str) -> Array:
 
 
 def _mark(axes: Axes, results: BenchResults, task: str) -> None:
-    rows, links = _rows(results, task), results.plan.links
+    rows = _rows(results, task)
+    links = results.plan.links
     axes.set_yticks(range(len(rows)), [name_law(*one) for one in rows], fontsize=_TEXT_PT)
     axes.grid(visible=False)
     axes.set_facecolor(_NONE)

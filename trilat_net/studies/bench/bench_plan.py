@@ -43,12 +43,14 @@ _OUT = (-0.4557864690179811, 1.3957985827210313)
 """The pose whose end effector is 0.30 m further out, at the same height."""
 _LESS_OUT = (-0.4901506797631161, 1.484043235051833)
 """The same 0.24 m further out: 0.09 m instead of 0.15 m behind the wall."""
-_LEFT, _RIGHT = (-0.4, 1.8), (-0.8, 1.8)
+_LEFT = (-0.4, 1.8)
+_RIGHT = (-0.8, 1.8)
 _HAND = {"kind": "spring", "stiffness_nm_rad": 50.0, "damping_nm_s_rad": 5.0}
 _WALL = {"kind": "wall", "point_m": [1.3376933693863516, 0.0], "normal": [-1.0, 0.0], "stiffness_n_m": 2000.0}
 _CUT_S = (2.0, 5.0)
 _BURST_SAMPLES = 100.0
-_FIRST, _SECOND = 0.75, 0.25
+_FIRST = 0.75
+_SECOND = 0.25
 """The share a of the first user, before a handover and after it."""
 
 
@@ -320,7 +322,8 @@ def tune_laws(
 
 
 def _keep(form: str, round_trip_ms: int, search: CandidateSearch) -> TunedGains:
-    law, scores = search.space.law, search.scores
+    law = search.space.law
+    scores = search.scores
     settled = [n for n, score in enumerate(scores) if score.outcome is CandidateClass.SETTLED]
     candidates = sorted(settled, key=lambda n: scores[n].error_rad or 0.0)
     kept = (n for n, at in enumerate(candidates) if _has_margin(form, round_trip_ms, search, at))

@@ -219,13 +219,15 @@ def _confirm(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) 
         return msgspec.structs.replace(run, confirmed=True)
     if run.stability is not Stability.NOT_STABLE or longer is None:
         return run
-    confirmed, words = longer.stability is Stability.NOT_STABLE, f"of {LONGEST_S:g} s: {longer.text}"
+    confirmed = longer.stability is Stability.NOT_STABLE
+    words = f"of {LONGEST_S:g} s: {longer.text}"
     return msgspec.structs.replace(run, stability=longer.stability, text=words, confirmed=confirmed)
 
 
 _SHOWN_LINKS = ("rtt8", "rtt136", "rtt544", "rtt1088", "rtt136-loss50", "4g", "5g", "geo", "trace")
 """Links of a table for people, if they are among those that ran; else all that ran."""
-OPEN_MARK, UNSTABLE_MARK = "?", "!"
+OPEN_MARK = "?"
+UNSTABLE_MARK = "!"
 
 
 def list_quantities(results: BenchResults) -> list[tuple[str, str]]:
@@ -299,7 +301,8 @@ def tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTa
 
 
 def _describe_place(place: BenchPlace, quantity: str) -> str:
-    value, found = place.mean(quantity), place.judgement
+    value = place.mean(quantity)
+    found = place.judgement
     mark = {Stability.NOT_STABLE: UNSTABLE_MARK, Stability.OPEN: OPEN_MARK}.get(found, "")
     if place.masked:
         return f"no contact{mark}"
@@ -326,7 +329,8 @@ def tabulate_round_trips(results: BenchResults) -> TextTable:
     rows = []
     for task in results.plan.tasks:
         for law, _ in results.plan.laws:
-            first, later = error(law, task, "rtt8"), error(law, task, "rtt272")
+            first = error(law, task, "rtt8")
+            later = error(law, task, "rtt272")
             times = ratio(error(law, task, "rtt1088"), first), ratio(error(law, task, "rtt272-loss50"), later)
             rows.append((task, law, format_number(first, 4), *times))
     heads = ("task", "law", "error at 8 ms, rad", "1088 ms: times that", "272 ms: half lost, times none lost")

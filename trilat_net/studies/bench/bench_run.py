@@ -34,7 +34,8 @@ from ..tuning.candidate import load_tuning_scenario
 from .bench_plan import SHORTER_REACH, TASKS, BenchCell, BenchPlan, name_settings
 from .bench_results import LONGEST_S, BenchResults, BenchRun, name_run
 
-SLAVE, USER = "s", "m1"
+SLAVE = "s"
+USER = "m1"
 BOUND_RAD_S = 5.0
 """No joint of a bounded run is faster, rad/s, and none further from its start than `THROWN_RAD`."""
 REST_S = 2.0
@@ -69,7 +70,8 @@ class _JudgedRun(NamedTuple):
 
 def run_bench_task(task: BenchRunItem) -> BenchRun:
     """Makes one run, in whatever process."""
-    cell, scenario = task.cell, task.cell.build(task.seed).scenario
+    cell = task.cell
+    scenario = task.cell.build(task.seed).scenario
     twins = TWINS if task.seed == cell.seeds[0] else 1
     judged = _run(scenario, task.to_s or scenario.duration_s, twins)
     if not task.to_s:
@@ -85,7 +87,8 @@ def run_bench_task(task: BenchRunItem) -> BenchRun:
 
 def _run(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
     scenario = msgspec.structs.replace(scenario, duration_s=length_s)
-    (records, end), growth = run_whole(scenario), TwinGrowth("none were asked for")
+    (records, end) = run_whole(scenario)
+    growth = TwinGrowth("none were asked for")
     if end.diverged_at_s is None and twins:
         growth = measure_virtual_twins(scenario, end, length_s, twins)
     found = judge_end_by_twins(end, growth, settles=None, rises=False)
@@ -109,15 +112,20 @@ def _lengthen(judged: _JudgedRun, twins: int) -> _JudgedRun:
 
 
 def _measure(made: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
-    scenario, whole = judged.scenario, judged.records
+    scenario = judged.scenario
+    whole = judged.records
     records = {name: one.between(0, round(duration_s * NS_PER_S)) for name, one in whole.items()}
-    efforts, hands, walls = [], [], []
+    efforts = []
+    hands = []
+    walls = []
     for name, record in records.items():
-        spec, arm = scenario.sites[name], build_arm_rows(scenario, name)
+        spec = scenario.sites[name]
+        arm = build_arm_rows(scenario, name)
         efforts.append(np.mean((record.tau - arm.gravity_torque(record.q)) ** 2))
         if spec.hands:
             hands.append(np.mean(_find_hand_torque(scenario, name, record) ** 2))
-        tip, t_s = arm.place_end_effector(record.q, record.qd), record.t_ns / NS_PER_S
+        tip = arm.place_end_effector(record.q, record.qd)
+        t_s = record.t_ns / NS_PER_S
         walls += [wall_force(wall, t_s, tip) for wall in list_walls(spec)]
     starts = [np.abs(one.q - scenario.sites[name].q0_rad).max() for name, one in whole.items()]
     fastest = max(np.abs(one.qd).max() for one in whole.values())
@@ -166,13 +174,15 @@ def _find_stiffness(task: BenchRunItem, far: _JudgedRun) -> float | None:
     near = _run(short.scenario, far.scenario.duration_s, twins=0)
     if None in (_find_settled_s(near.records), _find_settled_s(far.records)):
         return None
-    (near_m, near_n), (far_m, far_n) = _find_push(near), _find_push(far)
+    (near_m, near_n) = _find_push(near)
+    (far_m, far_n) = _find_push(far)
     return float((far_n - near_n) / (far_m - near_m))
 
 
 def _find_push(judged: _JudgedRun) -> tuple[float, float]:
     """Returns of the last second where the user's end effector is along x, m, and how it is pushed, N."""
-    scenario, record = judged.scenario, judged.records[USER].since(judged.records[USER].t_ns[-1] - NS_PER_S)
+    scenario = judged.scenario
+    record = judged.records[USER].since(judged.records[USER].t_ns[-1] - NS_PER_S)
     tip = build_arm_rows(scenario, USER).place_end_effector(record.q, record.qd)
     torque = _find_hand_torque(scenario, USER, record)
     force = np.linalg.solve(np.swapaxes(tip.J, 1, 2), torque[:, :, np.newaxis])[:, 0, 0]
@@ -180,8 +190,10 @@ def _find_push(judged: _JudgedRun) -> tuple[float, float]:
 
 
 def _follow_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> float:
-    peers, own = scenario.peers(SLAVE), records[SLAVE]
-    t_s, period_s = own.t_ns / NS_PER_S, 1.0 / scenario.sites[SLAVE].rate_hz
+    peers = scenario.peers(SLAVE)
+    own = records[SLAVE]
+    t_s = own.t_ns / NS_PER_S
+    period_s = 1.0 / scenario.sites[SLAVE].rate_hz
     alpha = evaluate_ramps(*list_scripted_ramps(scenario, SLAVE), t_s, period_s).alpha
     led: Array = sum(
         (alpha[:, n, None] * records[peer].q for n, peer in enumerate(peers)), np.zeros_like(own.q)
@@ -207,7 +219,8 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
         refuse_link(chosen)
     arithmetic, versions = describe_program()
     facts = {"arithmetic": arithmetic, **versions}
-    file, origin = chosen / ORIGIN_NAME, json.dumps(facts, indent=2) + "\n"
+    file = chosen / ORIGIN_NAME
+    origin = json.dumps(facts, indent=2) + "\n"
     if not file.exists():
         make_results_folder(chosen, "", force=None)
         write_whole(file, origin)

@@ -147,7 +147,8 @@ def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None]
     The r-th smallest and the r-th largest time enclose the median with probability 1 - 2 P(B < r), B binomial
     with p = 1/2; r is the largest for which that is 95 % or more. Censored times are infinite.
     """
-    ordered, tail = sorted(times_s), (1.0 - CONFIDENCE) / 2.0
+    ordered = sorted(times_s)
+    tail = (1.0 - CONFIDENCE) / 2.0
     binomial = import_scipy_stats().binom(len(ordered), 0.5)
     ranks = [r for r in range(1, len(ordered) // 2 + 1) if float(binomial.cdf(r - 1)) <= tail]
     if not ranks or math.isinf(ordered[ranks[-1] - 1]):

@@ -18,7 +18,8 @@ from ...reporting.appearance import COLUMN_IN, SITE_COLOURS, make_print_size
 from .completion_times import COMPLETION, find_median, find_unit_medians, summarise_times
 from .statistics import ConditionMean, Row, average_trials, summarise_conditions
 
-_FORM, _HEIGHT_IN = make_print_size(COLUMN_IN), 2.6
+_FORM = make_print_size(COLUMN_IN)
+_HEIGHT_IN = 2.6
 _USER: dict[str, Any] = {"color": style.FAINT, "linewidth": 0.5, "marker": "o", "markersize": 2.5}
 _COURSE: dict[str, Any] = {"linewidth": 1.2, "marker": "o", "markersize": 3.0}
 _MEAN: dict[str, Any] = {"color": SITE_COLOURS[0], "linewidth": 1.6, "marker": "D", "markersize": 5.0}
@@ -111,7 +112,8 @@ def draw_learning(
     if limit_s is not None:
         return _draw_learning_times(rows, limit_s, unit)
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
-        axes, shown = _add_panel(figure, measure), []
+        axes = _add_panel(figure, measure)
+        shown = []
         for n, condition in enumerate(dict.fromkeys(row["condition"] for row in rows)):
             look = {**_COURSE, "color": SITE_COLOURS[n % len(SITE_COLOURS)]}
             by_trial: dict[Any, list[Row]] = {}
@@ -136,7 +138,8 @@ def draw_learning(
 def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figure:
     """Returns the course of completion times of which some are longer than the limit."""
     with style.styled_figure(_FORM, _HEIGHT_IN) as figure:
-        axes, shown = _add_panel(figure, COMPLETION), []
+        axes = _add_panel(figure, COMPLETION)
+        shown = []
         axes.axhline(limit_s, **_LIMIT)
         for n, condition in enumerate(dict.fromkeys(row["condition"] for row in rows)):
             look = {**_COURSE, "color": SITE_COLOURS[n % len(SITE_COLOURS)]}

@@ -104,7 +104,9 @@ class ExperimentAnalysis(Result):
     """
 
     def __init__(self, experiment: Experiment, exclude: Mapping[str, str] = {}) -> None:
-        self._experiment, self._exclude, protocol = experiment, exclude, experiment.plan.protocol
+        self._experiment = experiment
+        self._exclude = exclude
+        protocol = experiment.plan.protocol
         self.unit = experiment.unit
         order = list(protocol.conditions).index
         who = {"-".join(group) for group in protocol.groups}
@@ -119,7 +121,8 @@ class ExperimentAnalysis(Result):
         self.rows = [row for row in self.learning_rows if row.get("phase") not in left_out]
         if not self.rows:
             raise UsageError(f"{experiment.folder}: no trial that counts is done yet")
-        self.throughput_rows, self.gain_rows = list(self._find_throughput()), list(self._find_gains())
+        self.throughput_rows = list(self._find_throughput())
+        self.gain_rows = list(self._find_gains())
         self.threshold_rows = sorted(self._find_thresholds(), key=lambda row: order(row["condition"]))
         scores = sorted(experiment.list_scores(), key=lambda row: order(row["condition"]))
         self._scores = [row for row in scores if row[self.unit] not in exclude]
@@ -142,7 +145,8 @@ class ExperimentAnalysis(Result):
                 self.comparisons[measure] = compare_conditions(rows, measure, unit=self.unit)
         self.missing_answers = list(self._count_missing_answers())
         self.models = list(self.fit_models())
-        self.methods, self.paths = self._write_methods(), list[Path]()
+        self.methods = self._write_methods()
+        self.paths = list[Path]()
 
     @property
     def _limit_s(self) -> float:
@@ -217,7 +221,8 @@ class ExperimentAnalysis(Result):
 
     def _find_gains(self) -> Iterator[dict[str, Any]]:
         """Yields by how much each pair has become better by a training: at once (transfer), and later."""
-        learnt, means = self._experiment.plan.protocol.task.learnt, dict[str, Any]()
+        learnt = self._experiment.plan.protocol.task.learnt
+        means = dict[str, Any]()
         for phase in ("before", "after", "retention"):
             if rows := [row for row in self.learning_rows if row.get("phase") == phase]:
                 means[phase] = self._average_learnt(rows, learnt)
@@ -247,7 +252,8 @@ class ExperimentAnalysis(Result):
 
     def _find_thresholds(self) -> Iterator[dict[str, Any]]:
         """Yields the threshold of each participant and condition, of a staircase that turned often enough."""
-        plan, choices = self._experiment.plan, self._experiment.list_choices()
+        plan = self._experiment.plan
+        choices = self._experiment.list_choices()
         if (stairs := plan.protocol.staircase) is None:
             return
         for trial in (one for one in plan.trials if one.trial == 1):
@@ -257,7 +263,8 @@ class ExperimentAnalysis(Result):
 
     def _write_methods(self) -> str:
         plan = self._experiment.plan
-        protocol, scenario = plan.protocol, next(iter(plan.scenarios.values()))
+        protocol = plan.protocol
+        scenario = next(iter(plan.scenarios.values()))
         who = dict.fromkeys(row[self.unit] for row in self.rows)
         rows_of = {
             name: [row for row in self.rows if row["condition"] == name] for name in protocol.conditions
@@ -588,11 +595,13 @@ class PowerOfExperiment(Result):
     """
 
     def __init__(self, d_z: float, participants: int | None, seed: int) -> None:
-        self.d_z, self.participants = d_z, participants
+        self.d_z = d_z
+        self.participants = participants
         self.least = {wanted: find_least_number(d_z, wanted=wanted) for wanted in (0.8, 0.9, 0.95)}
         self.power = self.simulated = None
         if participants is not None:
-            means, deviation = {"first": 0.0, "second": d_z}, 0.5**0.5
+            means = {"first": 0.0, "second": d_z}
+            deviation = 0.5**0.5
             self.power = power(d_z, participants)
             (self.simulated,) = simulate_power(means, participants, trial_deviation=deviation, seed=seed)
 

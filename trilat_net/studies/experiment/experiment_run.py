@@ -27,9 +27,11 @@ from .questionnaires import CHOICE, find_form
 from .staircase import COMPARISON, Staircase
 from .trial_run import TrialEntry, run_trial
 
-PROTOCOL_FILE, PLAN_FILE, JOURNAL_FILE, NOTES_FILE, TRIALS_FILE = (
-    "protocol.toml", "protocol.json", "trials.journal", "notes.journal", "trials.csv",
-)  # fmt: skip
+PROTOCOL_FILE = "protocol.toml"
+PLAN_FILE = "protocol.json"
+JOURNAL_FILE = "trials.journal"
+NOTES_FILE = "notes.journal"
+TRIALS_FILE = "trials.csv"  # fmt: skip
 LOGS = "logs"
 
 
@@ -80,7 +82,8 @@ class Experiment(Result):
     """
 
     def __init__(self, folder: Path, plan: ExperimentPlan) -> None:
-        self.folder, self.plan = folder, plan
+        self.folder = folder
+        self.plan = plan
         self.unit = "pair" if len(plan.protocol.users) > 1 else "participant"
         self._remedy = build_resume_hint("experiment", "run", str(folder))
 
@@ -124,8 +127,10 @@ class Experiment(Result):
             for step in self.plan.list_steps():
                 if step.form is None or step.form.name != CHOICE:
                     continue
-                last, who = step.planned, "-".join(step.planned.group)
-                right, more = self.plan.judge_choices(last, chosen), 1 + (last.phase == COMPARISON)
+                last = step.planned
+                who = "-".join(step.planned.group)
+                right = self.plan.judge_choices(last, chosen)
+                more = 1 + (last.phase == COMPARISON)
                 choice = stairs.draw_choice(stairs.list_differences(right)[-1], more, last.seed)
                 chosen[last.number] = choice
                 answers: dict[str, float | None] = {CHOICE: choice}
@@ -141,7 +146,8 @@ class Experiment(Result):
         self, jobs: int | None = None, show: Progress = ignore_progress, on: Workers = None
     ) -> "Experiment":
         """Makes the trials that are left, with synthetic participants, and writes the tables."""
-        logs, plan = make_subfolder(self.folder / LOGS), self.plan
+        logs = make_subfolder(self.folder / LOGS)
+        plan = self.plan
         with self.open_trials(people=False) as journal:
             if plan.protocol.staircase is not None:
                 self._choose(plan.protocol.staircase)
@@ -158,7 +164,9 @@ class Experiment(Result):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row for each trial that is done, in the order of the plan."""
-        done, choices, stairs = self.read_entries(), self.list_choices(), self.plan.protocol.staircase
+        done = self.read_entries()
+        choices = self.list_choices()
+        stairs = self.plan.protocol.staircase
         return [
             {
                 "trial_number": planned.number,
@@ -238,7 +246,8 @@ class Experiment(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns its plan and how far it is, as `trilat experiment status --json`."""
-        status, protocol = self.status(), self.plan.protocol
+        status = self.status()
+        protocol = self.plan.protocol
         return {
             "name": protocol.name,
             "digest": self.plan.digest,
@@ -255,7 +264,8 @@ class Experiment(Result):
         A trial that was not completed has no completion time: of those there is a median, in which it counts
         as longer than any.
         """
-        status, rows = self.status(), [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
+        status = self.status()
+        rows = [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
         yield (
             f"{self.plan.protocol.name}: {status.done} of "
             f"{count_nouns(status.total, 'trial')}, in {self.folder}"
@@ -388,7 +398,8 @@ def list_log_problems(experiment: Experiment) -> Iterator[str]:
     """Yields the trials that are done whose log is missing, or is not the one that they wrote."""
     done = experiment.read_entries()
     for planned in experiment.plan.trials:
-        entry, path = done.get(planned.number), experiment.folder / LOGS / planned.file
+        entry = done.get(planned.number)
+        path = experiment.folder / LOGS / planned.file
         if entry is None:
             continue
         if not path.exists():

@@ -212,7 +212,8 @@ def measure_pair(first: ArrayLike, second: ArrayLike, velocity: ArrayLike, rate_
     """
     one, other, moves = _read_alike(first=first, second=second, velocity=velocity)
     internal = find_internal_force(one, other)
-    sizes, efforts = np.abs(one).sum() + np.abs(other).sum(), [float((f * f).sum()) for f in (one, other)]
+    sizes = np.abs(one).sum() + np.abs(other).sum()
+    efforts = [float((f * f).sum()) for f in (one, other)]
     powers = [(force * moves).sum(axis=1) for force in (one, other)]
     work_j = [_integrate(power, rate_hz) for power in powers]
     taken_j = [_integrate(np.maximum(-power, 0.0), rate_hz) for power in powers]

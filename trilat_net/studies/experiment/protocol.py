@@ -263,14 +263,16 @@ class ExperimentPlan(Result):
 
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
         """Returns the difference in a trial's pair, and whether the choice was right; None: it is to come."""
-        stairs, number = self.protocol.staircase, (planned.trial - self.protocol.practice - 1) // 2
+        stairs = self.protocol.staircase
+        number = (planned.trial - self.protocol.practice - 1) // 2
         assert stairs is not None
         right = self.judge_choices(planned, choices)
         return stairs.list_differences(right)[number], right[number] if number < len(right) else None
 
     def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
         """Returns the scenario of a trial, after the choices of its block before it."""
-        scenario, stairs = self.scenarios[planned.condition], self.protocol.staircase
+        scenario = self.scenarios[planned.condition]
+        stairs = self.protocol.staircase
         if stairs is None or planned.practice:
             return scenario
         more = self.find_pair(planned, choices)[0] if planned.phase == COMPARISON else 0.0
@@ -278,7 +280,8 @@ class ExperimentPlan(Result):
 
     def rest_before_s(self, planned: PlannedTrial) -> float:
         """Returns how long people rest at least before a trial, s."""
-        training, before = self.protocol.training, self.trials[max(planned.number - 2, 0)]
+        training = self.protocol.training
+        before = self.trials[max(planned.number - 2, 0)]
         if training is not None and planned.phase == "retention" != before.phase:
             return training.rest_s
         return self.protocol.rest_s if planned.trial == 1 and planned.block > 1 else 0.0
@@ -294,7 +297,8 @@ class ExperimentPlan(Result):
 
     def blocks(self) -> Iterator[Block]:
         """Yields its text."""
-        protocol, facts = self.protocol, self.to_dict()
+        protocol = self.protocol
+        facts = self.to_dict()
         whose = "pairs" if len(protocol.users) > 1 else "participants"
         yield f"{protocol.name}: {protocol.title or protocol.task.words}"
         yield f"{facts['groups']} {whose} at {', '.join(protocol.users)}, {protocol.task.words}"
@@ -371,7 +375,8 @@ def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
 
 def _find_problems(protocol: Protocol) -> Iterator[str]:
     """Yields what no scenario is needed to see."""
-    size, names = len(protocol.users), [name for group in protocol.groups for name in group]
+    size = len(protocol.users)
+    names = [name for group in protocol.groups for name in group]
     if protocol.foreperiod_s[0] > protocol.foreperiod_s[1]:
         yield f"foreperiod_s is from the shorter to the longer time, not {list(protocol.foreperiod_s)}"
     if len(set(names)) < len(names):
@@ -452,7 +457,8 @@ def limit_forces(scenario: Scenario, protocol: Protocol, group: Sequence[str]) -
     """
     found = {}
     for user, name in zip(protocol.users, group, strict=False):  # an odd one out is refused by itself
-        spec, most = scenario.sites[user], protocol.force_limit_n.get(name)
+        spec = scenario.sites[user]
+        most = protocol.force_limit_n.get(name)
         hand = spec.find_live_hand(is_open=True)
         if most is None or hand is None:
             continue
@@ -499,7 +505,8 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
             number += 1
             caught = trial in _draw_catches(protocol, condition, (n, block))
             drawn = np.random.SeedSequence([protocol.seed, number]).generate_state(1)
-            seed, practice = int(drawn[0]) >> 1, trial < protocol.practice
+            seed = int(drawn[0]) >> 1
+            practice = trial < protocol.practice
             first = np.random.default_rng([protocol.seed, n, block]).integers(1000)
             target = int(first) + ((trial - protocol.practice) // 2 if protocol.staircase else trial)
             counts = block + 1, trial + 1, practice, block * len(phases) + trial, target
@@ -512,5 +519,6 @@ def _draw_catches(protocol: Protocol, condition: str, block: tuple[int, int]) ->
     catch = protocol.catch
     if catch is None or catch.condition == condition:
         return set()
-    random, count = np.random.default_rng([protocol.seed, *block, 1]), round(catch.share * protocol.trials)
+    random = np.random.default_rng([protocol.seed, *block, 1])
+    count = round(catch.share * protocol.trials)
     return set((protocol.practice + random.permutation(protocol.trials)[:count]).tolist())

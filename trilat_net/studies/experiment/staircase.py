@@ -18,7 +18,8 @@ from msgspec import Meta
 from ...fields import Frozen, Positive
 from .questionnaires import CHOICE, Questionnaire, Words
 
-STANDARD, COMPARISON = "standard", "comparison"
+STANDARD = "standard"
+COMPARISON = "comparison"
 SKIPPED = 2
 """So many reversals come before the difference is about where it settles."""
 
@@ -52,12 +53,14 @@ class Staircase(Frozen, frozen=True):
     @property
     def form(self) -> Questionnaire:
         """What is asked after each pair; the answer is 1 or 2."""
-        items, ends = {CHOICE: self.asks}, ("the first", "the second")
+        items = {CHOICE: self.asks}
+        ends = ("the first", "the second")
         return Questionnaire(CHOICE, title="Which one?", items=items, low=ends[0], high=ends[1], most=2)
 
     def _list_ways(self, right: Sequence[bool]) -> list[int]:
         """Returns whether the difference becomes less, -1, or more, 1, after each answer; 0: it stays."""
-        ways, in_row = list[int](), 0
+        ways = list[int]()
+        in_row = 0
         for is_right in right:
             in_row = in_row + 1 if is_right else 0
             ways.append(-int(in_row % self.down == 0) if is_right else 1)

@@ -130,7 +130,8 @@ def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
     if mean is None:
         return ConditionMean(condition, len(values), values[0], None, None, None)
     low_high = (mean.mean - mean.half, mean.mean + mean.half)
-    deviation, boot = float(np.std(values, ddof=1)), bootstrap_interval(values, seed)
+    deviation = float(np.std(values, ddof=1))
+    boot = bootstrap_interval(values, seed)
     return ConditionMean(condition, len(values), mean.mean, deviation, low_high, boot)
 
 
@@ -206,7 +207,8 @@ def _compare(measure: str, first: str, second: str, means: Mapping[str, Mapping[
     empty = Comparison(measure, first, second, len(both))
     if len(both) < 2:
         return empty._replace(difference=float(differences[0])) if both else empty
-    mean, spread = float(differences.mean()), float(differences.std(ddof=1))
+    mean = float(differences.mean())
+    spread = float(differences.std(ddof=1))
     if spread <= _ROUNDING * max(np.abs(one).max(), np.abs(other).max()):
         return empty._replace(difference=mean, interval=(mean, mean))
     stats = import_scipy_stats()
@@ -320,7 +322,8 @@ def _fit(formulas: Any, frame: Any, measure: str) -> Any:
 def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
     pairs: dict[str, str] = {}
     for row in rows:
-        user, pair = str(row["participant"]), "" if row.get("pair") is None else str(row["pair"])
+        user = str(row["participant"])
+        pair = "" if row.get("pair") is None else str(row["pair"])
         if pairs.setdefault(user, pair) != pair:
             raise UsageError(f"participant {user} is in pairs {pairs[user]} and {pair}: one pair each")
     if "" in pairs.values() or len(set(pairs.values())) == len(pairs):
@@ -329,8 +332,10 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
 
 
 def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
-    stats, name = import_scipy_stats(), f"condition[T.{condition}]"
-    estimate, error = float(fit.fe_params[name]), float(fit.bse_fe[name])
+    stats = import_scipy_stats()
+    name = f"condition[T.{condition}]"
+    estimate = float(fit.fe_params[name])
+    error = float(fit.bse_fe[name])
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, freedom)) * error
     p = 2.0 * float(stats.t.sf(abs(estimate / error), freedom))
     return MixedEffect(condition, estimate, error, (estimate - half, estimate + half), estimate / error, p)
@@ -346,7 +351,9 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
     """
     if number < 2 or not 0.0 < alpha < 1.0:
         raise UsageError(f"{number} units, alpha {alpha}: give two units or more, and alpha between 0 and 1")
-    stats, shift, freedom = import_scipy_stats(), abs(d_z) * math.sqrt(number), number - 1
+    stats = import_scipy_stats()
+    shift = abs(d_z) * math.sqrt(number)
+    freedom = number - 1
     critical = stats.t.ppf(1.0 - alpha / 2.0, freedom)
     # the lower tail by its mirror image: of small ones `nct.cdf` returns NaN
     return float(sum(stats.nct.sf(critical, freedom, sign * shift) for sign in (1.0, -1.0)))

@@ -81,21 +81,32 @@ class SyntheticParticipant:
         seed: int,
         user: int,
     ) -> None:
-        self._model, self._goal, self._before, self._size = model, goal, before, facts.size
+        self._model = model
+        self._goal = goal
+        self._before = before
+        self._size = facts.size
         name, self._arm, self._find_force_n = slave
-        self._user, self._peer = user, facts.peers.index(name)
+        self._user = user
+        self._peer = facts.peers.index(name)
         self._random = np.random.default_rng([seed, facts.seed])
         self._from = self._to = np.zeros(facts.size)
-        self._begins_s, self._takes_s, self._seen = -math.inf, 0.0, np.zeros(facts.size)
-        self._begun, self._still_s = False, 0.0
+        self._begins_s = -math.inf
+        self._takes_s = 0.0
+        self._seen = np.zeros(facts.size)
+        self._begun = False
+        self._still_s = 0.0
 
     def act(self, now: HandView) -> Array:
         """Returns where the hand goes, m."""
         slave = now.peers[self._peer]
         seen = place_slave(self._arm, slave.q)[: self._size]
         if not self._begun:
-            self._begun, self._from, self._to, self._seen = True, now.pose, now.pose, seen
-        moved, self._seen = float(np.linalg.norm(seen - self._seen)), seen
+            self._begun = True
+            self._from = now.pose
+            self._to = now.pose
+            self._seen = seen
+        moved = float(np.linalg.norm(seen - self._seen))
+        self._seen = seen
         if moved > 0.02 * self._goal.width_m:
             self._still_s = now.t_s
         if not self._goal.leads(now.t_s, self._user):  # goes along
@@ -130,7 +141,9 @@ class SyntheticParticipant:
         scatter = self._model.noise * length * self._random.standard_normal(self._size)
         difficulty = math.log2(length / self._goal.width_m + 1.0)
         slower = 1.0 + self._model.learning * 0.5 ** (self._before / self._model.practised)
-        self._from, self._to = self._reach(t_s), self._reach(t_s) + way + scatter
+        start = self._reach(t_s)
+        self._from = start
+        self._to = start + way + scatter
         self._begins_s = t_s
         self._takes_s = slower * (self._model.fitts_a_s + self._model.fitts_b_s * difficulty)
 

@@ -78,7 +78,9 @@ class TrialGoal:
     handover: tuple[float, float] | None = None
 
     def __init__(self, start_m: Array, width_m: float) -> None:
-        self.start_m, self.width_m, self.appears_s = start_m, width_m, 0.0
+        self.start_m = start_m
+        self.width_m = width_m
+        self.appears_s = 0.0
 
     def place(self, t_s: float, user: int | None = None) -> Array:
         """Returns where the end effector is to be, m, shape (2,) or (3,), as a user, from 0, is shown it."""
@@ -186,7 +188,9 @@ class _DwellGoal(TrialGoal):
 
     def __init__(self, task: "ReachTrial | ContactTrial", start_m: Array) -> None:
         super().__init__(start_m, task.width_m)
-        self._dwell_s, self._longest_s, self._met_s = task.dwell_s, task.longest_s, math.inf
+        self._dwell_s = task.dwell_s
+        self._longest_s = task.longest_s
+        self._met_s = math.inf
 
     def _is_met(self, after_s: float, at_m: Array, force_n: float) -> bool:
         raise NotImplementedError
@@ -202,9 +206,11 @@ class _DwellGoal(TrialGoal):
 class _ReachGoal(_DwellGoal):
     def __init__(self, task: ReachTrial, start_m: Array, targets_m: Sequence[Array]) -> None:
         super().__init__(task, start_m)
-        self._corridor_m, self._places = task.corridor_m, (start_m, *targets_m)
+        self._corridor_m = task.corridor_m
+        self._places = (start_m, *targets_m)
         if task.handover_s is not None:
-            self.lead, self.handover = 1.0, (task.handover_s, task.ramp_s)
+            self.lead = 1.0
+            self.handover = (task.handover_s, task.ramp_s)
         self._ramp_s, ramp_s = self.handover or (-1.0, 0.0)
         self._next_s = self._ramp_s + ramp_s
 
@@ -282,7 +288,8 @@ class ContactTrial(TrialTask, frozen=True, tag="contact"):
 class _ContactGoal(_DwellGoal):
     def __init__(self, task: ContactTrial, start_m: Array) -> None:
         super().__init__(task, start_m)
-        self.force_n, self._tolerance_n = task.force_n, task.tolerance_n
+        self.force_n = task.force_n
+        self._tolerance_n = task.tolerance_n
         self._target_m: Array = start_m + task.distance_m * (np.arange(len(start_m)) == task.axis)
 
     def _place(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - it does not move
@@ -347,7 +354,8 @@ class _TrackGoal(TrialGoal):
 
     def __init__(self, task: TrackTrial, start_m: Array, phases: Array) -> None:
         super().__init__(start_m, task.width_m)
-        self._task, self._phases = task, phases
+        self._task = task
+        self._phases = phases
 
     def measure(self, after_s: Array, at_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
         """Returns whose target the slave was at where two are shown: 1 the first user's, 0 the other's."""

@@ -38,7 +38,9 @@ from .tasks import Outcome, TrialGoal
 
 EVERY = 5
 """Of the slave's records one in so many is measured."""
-HAND_HZ, HAND_DELAY_S, REST_S = 50, 0.02, 0.1
+HAND_HZ = 50
+HAND_DELAY_S = 0.02
+REST_S = 0.1
 """How often a synthetic participant acts; time from what it decides to what its arm does; after the end."""
 
 
@@ -71,7 +73,8 @@ class TrialJudge:
     """
 
     def __init__(self, trial: "ExperimentTrial") -> None:
-        self.goal, self._trial = trial.make_goal(), trial
+        self.goal = trial.make_goal()
+        self._trial = trial
         self.outcome: Outcome | None = None
 
     def take(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
@@ -96,8 +99,10 @@ class ExperimentTrial:
     people = True
 
     def __init__(self, protocol: Protocol, scenario: Scenario, planned: PlannedTrial, digest: str) -> None:
-        self.protocol, self.planned = protocol, planned
-        self.slave, self.arm = scenario.slave, scenario.arms[scenario.slave]
+        self.protocol = protocol
+        self.planned = planned
+        self.slave = scenario.slave
+        self.arm = scenario.arms[scenario.slave]
         spec = scenario.sites[self.slave]
         self._start_m = np.array(self.arm.end_effector(spec.q0_rad), dtype=np.float64)
         whose = "" if self.people else "synthetic "
@@ -109,7 +114,8 @@ class ExperimentTrial:
         self.appears_s = round(float(drawn_s), 3)
         scenario = self._share_out(scenario)
         self.longest_s = self.appears_s + protocol.task.longest_s + 1.0 / HAND_HZ
-        lasts_s, sites = self.longest_s + REST_S, limit_forces(scenario, protocol, planned.group)
+        lasts_s = self.longest_s + REST_S
+        sites = limit_forces(scenario, protocol, planned.group)
         self.scenario = replace(
             scenario, duration_s=lasts_s, seed=planned.seed, about=about, sites={**scenario.sites, **sites}
         )
@@ -117,16 +123,20 @@ class ExperimentTrial:
 
     def _share_out(self, scenario: Scenario) -> Scenario:
         """Returns a scenario in which users have the authority over the slave that the trial gives them."""
-        row, (first, *rest), goal = scenario.dominance[self.slave], self.protocol.users, self.make_goal()
+        row = scenario.dominance[self.slave]
+        (first, *rest) = self.protocol.users
+        goal = self.make_goal()
         if goal.lead is None:
             return scenario
         both = row[first] + row[rest[0]]
         before, after = (
             {**row, first: both * lead, rest[0]: both - both * lead} for lead in (goal.lead, 1.0 - goal.lead)
         )
-        dominance, timeline = {**scenario.dominance, self.slave: before}, scenario.timeline
+        dominance = {**scenario.dominance, self.slave: before}
+        timeline = scenario.timeline
         if goal.handover is not None:
-            at_s, ramp_s = self.appears_s + goal.handover[0], goal.handover[1]
+            at_s = self.appears_s + goal.handover[0]
+            ramp_s = goal.handover[1]
             timeline = (*timeline, Change(at_s, dominance=self.slave, to=after, ramp_s=ramp_s))
         return replace(scenario, dominance=dominance, timeline=timeline)
 
@@ -165,7 +175,8 @@ class ExperimentTrial:
         return TrialEntry(self.planned.number, self.planned.seed, *of_log, self.people)
 
     def _judge(self, log: Log) -> Outcome | None:
-        judge, part = TrialJudge(self), log[self.slave]
+        judge = TrialJudge(self)
+        part = log[self.slave]
         for moment in zip(part.t_s.tolist(), part.q.tolist(), part.tau_x.tolist(), strict=True):
             if (outcome := judge.take(*moment)) is not None:
                 return outcome
@@ -173,11 +184,14 @@ class ExperimentTrial:
 
     def _measure(self, log: Log, outcome: Outcome) -> dict[str, float]:
         """Returns the measures of a trial, units in the names."""
-        found, aligned = self._measure_motion(log, outcome.ended_s), align_records(log)
+        found = self._measure_motion(log, outcome.ended_s)
+        aligned = align_records(log)
         forces = list[Array]()
         for place, user in enumerate(self.protocol.users, 1):
-            own, which = aligned[user], f"_user{place}" if len(self.protocol.users) > 1 else ""
-            split, until = split_torque(own, log.scenario), own.t_s <= outcome.ended_s
+            own = aligned[user]
+            which = f"_user{place}" if len(self.protocol.users) > 1 else ""
+            split = split_torque(own, log.scenario)
+            until = own.t_s <= outcome.ended_s
             forces.append(split.end_effector.find_force(split.operator)[until])  # of the hand ON its arm
             force_n = np.linalg.norm(forces[-1], axis=1)
             found |= {
@@ -195,7 +209,8 @@ class ExperimentTrial:
     ) -> tuple[Ints, Array, Array, float]:
         """Returns which records of the slave are measured, its places and velocities, and their rate, Hz."""
         rows = np.flatnonzero((part.t_s >= from_s) & (part.t_s <= until_s))[::EVERY]
-        places, rate_hz = self._place(part.q[rows]).at, part.rate_hz / EVERY
+        places = self._place(part.q[rows]).at
+        rate_hz = part.rate_hz / EVERY
         return rows, places, np.gradient(places, 1.0 / rate_hz, axis=0), rate_hz
 
     def _measure_pair(
@@ -214,9 +229,11 @@ class ExperimentTrial:
 
     def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
         """Returns what the slave did from when the target appears until the trial ends."""
-        goal, part = self.make_goal(), log[self.slave]
+        goal = self.make_goal()
+        part = log[self.slave]
         rows, places, moves, rate_hz = self._follow(part, goal.appears_s, ended_s)
-        t_s, speed = part.t_s[rows], np.linalg.norm(moves, axis=1)
+        t_s = part.t_s[rows]
+        speed = np.linalg.norm(moves, axis=1)
         wanted = np.array([goal.place(t) for t in t_s])
         apart_m = np.linalg.norm(places - wanted, axis=1)
         smooth = sparc(speed, rate_hz)
@@ -251,7 +268,8 @@ class SyntheticTrial(ExperimentTrial):
             assert hand is not None  # see `plan_experiment`
             at = HandSite(scenario, user, hand, HAND_HZ, HAND_DELAY_S)
             own = int.from_bytes(hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()[:4], "big")
-            model, slave = self.protocol.model.draw(own), (self.slave, self.arm, self.find_force_n)
+            model = self.protocol.model.draw(own)
+            slave = (self.slave, self.arm, self.find_force_n)
             mine = (self.make_goal(), slave, self.planned.before, self.planned.seed, len(found))
             act = SyntheticParticipant(at.describe(), model, *mine)
             found[user] = HandPlayer(at, act)
@@ -259,11 +277,14 @@ class SyntheticTrial(ExperimentTrial):
 
     def find_end_s(self) -> float:
         """Runs the trial, compiled, until it ends; returns when that is, s."""
-        scenario, judge, site = self.scenario, TrialJudge(self), self.slave
+        scenario = self.scenario
+        judge = TrialJudge(self)
+        site = self.slave
         kept = scenario.sites[site].rate_hz // HAND_HZ + 1
         run = FusedRun(scenario, keep=kept, hands=self._make_players(scenario))
         run.plan([scenario.ticks(name) for name in scenario.names])
-        place, columns = scenario.names.index(site), scenario.layout(site).columns()
+        place = scenario.names.index(site)
+        columns = scenario.layout(site).columns()
         for piece in range(math.ceil(self.longest_s * HAND_HZ)):
             run.step_to((piece + 1) * NS_PER_S // HAND_HZ)
             t_ns, rows = run.take_records()[place]

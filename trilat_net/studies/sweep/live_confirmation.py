@@ -120,7 +120,8 @@ def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) 
         live = "none" if one.live is None else one.live.value
         same = "same" if one.same else "DIFFERS"
         where = "none" if one.log is None else str(one.log)
-        cell, seed = str(one.row["cell"]), str(one.row["seed"])
+        cell = str(one.row["cell"])
+        seed = str(one.row["seed"])
         rows.append((cell, *place, seed, one.virtual.value, live, same, one.text, where))
     return TextTable(heads, rows)
 

@@ -155,7 +155,8 @@ def _columns(panels: int, form: FigureSize) -> int:
 
 
 def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> None:
-    x, y = _bounds(plane.x), _bounds(plane.y)
+    x = _bounds(plane.x)
+    y = _bounds(plane.y)
     axes.grid(visible=False)
     axes.set_facecolor("#f4f4f4")  # where nothing has run
     if plane.judged_by_twins:
@@ -225,7 +226,8 @@ def _bounds(side: PlaneAxis) -> Array:
 
 def _scale(axes: Axes, plane: MapPlane) -> None:
     """Gives a panel its ticks: round numbers on an even axis, else every value that there is room for."""
-    x, y = _bounds(plane.x), _bounds(plane.y)
+    x = _bounds(plane.x)
+    y = _bounds(plane.y)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[0], y[-1])
     for axis, side in ((axes.xaxis, plane.x), (axes.yaxis, plane.y)):
@@ -267,7 +269,8 @@ def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
     extent = axes.get_window_extent()
     width_pt = 72.0 * extent.width / axes.figure.dpi / len(plane.x.values)
     height_pt = 72.0 * extent.height / axes.figure.dpi / len(plane.y.values)
-    stable, decided = panel.stable, panel.decided
+    stable = panel.stable
+    decided = panel.decided
     letters = 2 * len(str(plane.seeds)) + 1
     if width_pt < letters * _LETTER * _COUNT_PT or height_pt < 1.2 * _COUNT_PT:
         return

@@ -97,7 +97,8 @@ def search_key_margin(
 
 
 def _narrowed(ask: StabilityTest, low: float, high: float, tolerance: float, whole: bool) -> StableInterval:
-    first, last = ask(low), ask(high)
+    first = ask(low)
+    last = ask(high)
     low, above = _halved(lambda value: ask(value) is first, low, high, tolerance, whole)
     sharp = ask(above) is not None
     if sharp:
@@ -258,7 +259,8 @@ class SweepMargins(Result):
 
     def table(self) -> TextTable:
         """Returns a row per edge, or per place that has none."""
-        plan, axes = self.plan, self.plan.axes[:-1]
+        plan = self.plan
+        axes = self.plan.axes[:-1]
         seeds = len({one.seed for one in self.found}) > 1
         closed = any(one.closed is not None for one in self.found)
         heads = [*(label_axis(axis.key, plan.base) for axis in axes), *(["law"] if plan.laws else [])]
@@ -284,7 +286,8 @@ class SweepMargins(Result):
     def headline(self) -> str:
         """Returns how many edges were found where."""
         edges = sum(len(one.margin.spans) for one in self.found)
-        low, high = self.within.low, self.within.high
+        low = self.within.low
+        high = self.within.high
         return (
             f"{self.plan.base.name}: {count_nouns(edges, 'edge')} of {self.within.key} "
             f"from {low:g} to {high:g}"

@@ -103,7 +103,8 @@ class MapPanel(NamedTuple):
     @property
     def share(self) -> Array:
         """Share of stable runs among the decided ones, shape (y, x); NaN where none was decided."""
-        stable, decided = self.stable, self.decided
+        stable = self.stable
+        decided = self.decided
         share: Array = np.full(decided.shape, np.nan)
         np.divide(stable, decided, out=share, where=decided > 0)
         return share
@@ -255,9 +256,11 @@ def _damped(scenario: Scenario) -> StabilityCriterion | None:
     Of N sites the shares must be reversible. It is the condition for no root on the unit circle whatever the
     masses, down to d h: lighter arms no damping steadies at this tick rate (docs/errata.md, 13).
     """
-    delays_s, rates_hz = _delays_s(scenario), {spec.rate_hz for spec in scenario.sites.values()}
+    delays_s = _delays_s(scenario)
+    rates_hz = {spec.rate_hz for spec in scenario.sites.values()}
     gains = [_scalar_gains(spec) for spec in scenario.sites.values()]
-    K, d = [gain[0] for gain in gains if gain], [gain[1] for gain in gains if gain]
+    K = [gain[0] for gain in gains if gain]
+    d = [gain[1] for gain in gains if gain]
     if delays_s is None or len(K) < len(gains) or len(rates_hz) > 1 or scenario.scheme != "second_order":
         return None
     rate_hz = rates_hz.pop()
@@ -393,7 +396,8 @@ class MapLine(NamedTuple):
 
     def crossings(self, column: int, y: PlaneAxis) -> list[float]:
         """Returns where it crosses a column, from below."""
-        at, spare = y.values, self.spare[:, column].tolist()
+        at = y.values
+        spare = self.spare[:, column].tolist()
         return [at[n] + (at[n + 1] - at[n]) * spare[n] / (spare[n] - spare[n + 1]) for n in _changes(spare)]
 
 

@@ -122,7 +122,8 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
     ends_s = scenario.duration_s
     growth_per_s = _advance_in_contact(scenario, run)
-    totals, extended = run.totals, 0
+    totals = run.totals
+    extended = 0
     if growth_per_s > 0.0:
         outcome = _cell_result(run, scenario, totals, extended)
         left = outcome.verdict is CellClass.DIVERGED
@@ -165,7 +166,8 @@ def _moves_on(run: FusedRun) -> bool:
         joints = site.shape[1] // 3
         half = site[len(site) // 2 :, joints : 2 * joints]
         quarter = len(half) // 4
-        first, last = half[:quarter].max(axis=0), half[-quarter:].max(axis=0)
+        first = half[:quarter].max(axis=0)
+        last = half[-quarter:].max(axis=0)
         if (last > np.maximum(0.5 * first, FLOOR_RAD)).any():
             return True
     return False

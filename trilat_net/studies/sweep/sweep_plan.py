@@ -42,7 +42,9 @@ class _Steps:
     """The values a, a + step, ... as texts, made as they are asked for."""
 
     def __init__(self, first: Decimal, step: Decimal, count: int) -> None:
-        self._first, self._step, self._count = first, step, count
+        self._first = first
+        self._step = step
+        self._count = count
 
     def __len__(self) -> int:
         return self._count
@@ -154,7 +156,9 @@ def _listed(key: str, text: str) -> tuple[str, ...]:
 
 
 def _split(text: str, mark: str) -> list[str]:
-    parts, depth, quote = [""], 0, ""
+    parts = [""]
+    depth = 0
+    quote = ""
     for letter in text:
         if quote:
             quote = "" if letter == quote else quote
@@ -250,7 +254,8 @@ class SweepPlan(NamedTuple):
         """
         if not 0 <= number < self.cells:
             raise UsageError(f"there is no cell {number}: they are numbered from 0 to {self.cells - 1}")
-        rest, places = number, list[int]()
+        rest = number
+        places = list[int]()
         for count in reversed(self.shape):
             rest, place = divmod(rest, count)
             places.insert(0, place)
@@ -307,7 +312,8 @@ def plan_sweep(
         ScenarioError: the scenario, an axis or one of its values cannot be right, or cannot run.
         UsageError: another argument cannot be right.
     """
-    written, texts = read_experiment(source), tuple(overrides)
+    written = read_experiment(source)
+    texts = tuple(overrides)
     axes = tuple(map(parse_axis, list_axes(over)))
     named = [laws] if isinstance(laws, str | type) else laws
     chosen = list(map(name_law_classes, named))
@@ -347,7 +353,8 @@ def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
         ScenarioError: it cannot run here.
     """
     folder = None if facts["folder"] is None else Path(facts["folder"])
-    written, texts = ExperimentText(facts["source"], facts["text"], folder), tuple(facts["overrides"])
+    written = ExperimentText(facts["source"], facts["text"], folder)
+    texts = tuple(facts["overrides"])
     axes = tuple(map(parse_axis, facts["over"]))
     before = _load_base(written, texts, axes, facts["laws"])
     base = allow_own_code(before.scenario)
@@ -546,7 +553,8 @@ def build_sweep_command(plan: SweepPlan, *more: str) -> str:
     """Returns the command that makes a sweep."""
     words = set_options(plan.overrides)
     words += [word for one in plan.axes for word in ("--over", one.asked)]
-    own, count = plan.base.seed, len(plan.seeds)
+    own = plan.base.seed
+    count = len(plan.seeds)
     if plan.seeds == tuple(range(own, own + count)):
         words += ["--seeds", str(count)] if count > 1 else []
     else:

@@ -260,7 +260,8 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
     rows_of: dict[tuple[int, str], list[ResultRow]] = {}
     for row in results.rows:
         rows_of.setdefault((row["cell"], row["law"]), []).append(row)
-    points, totals = [], list_totals(results.plan)
+    points = []
+    totals = list_totals(results.plan)
     for (cell, law), rows in rows_of.items():
         counts = Counter(row["verdict"] for row in rows)
         kept = [row for row in rows if row["diverged_s"] is None]
@@ -316,7 +317,8 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
         count = len(texts)
         shown = [texts[0], texts[1], "...", texts[-1]] if count > 4 else [texts[n] for n in range(count)]
         lines.append(f"  over {one.asked}: {', '.join(shown)}")
-    first_s, longest_s = plan.base.duration_s, plan.longest_s
+    first_s = plan.base.duration_s
+    longest_s = plan.longest_s
     extended = f", an undecided one up to {longest_s:g} s" if longest_s > first_s else ""
     twins = ", judged by twins" if plan.judge == "twins" else ""
     return [*lines, f"  {first_s:g} s each{extended}{twins}"]

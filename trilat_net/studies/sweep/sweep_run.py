@@ -194,7 +194,8 @@ def run_cell(task: CellItem) -> CellRun:
     Raises:
         ScenarioError: there is no such experiment; says of which cell.
     """
-    plan, cell = task.plan, task.cell
+    plan = task.plan
+    cell = task.cell
     try:
         scenario = plan.scenario(*cell.overrides, f"seed={task.seed}")
         sweep_cell.check_sweepable(scenario)
@@ -288,7 +289,8 @@ def run_sweep(
     with folder.journal() as journal:
         for entry in known:
             journal.add(entry)
-        before, began_ns = set(journal.done), clock.monotonic_ns()
+        before = set(journal.done)
+        began_ns = clock.monotonic_ns()
         left = plan.cells * len(plan.seeds) - len(before)
         laws = list_imported_code([plan.base])
         workers = on if left else None

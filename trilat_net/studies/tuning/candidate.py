@@ -260,7 +260,8 @@ def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
     worst = min(scores, key=lambda score: rank.index(score.outcome))
     named = ("error_rad", "spread_rad", "pose_rad", "effort_nm", "settled_s", "saturated")
     means = {name: mean_interval([getattr(score, name) for score in scores]) for name in named}
-    error, effort = means["error_rad"], means["effort_nm"]
+    error = means["error_rad"]
+    effort = means["effort_nm"]
     return msgspec.structs.replace(
         worst,
         **{name: mean and mean.mean for name, mean in means.items()},
@@ -302,13 +303,16 @@ def _run(scenario: Scenario) -> _Run:
     records = list(of_site.values())
     t_s, q, e = _aligned(records)
     mean = q.mean(axis=0)
-    apart, off = q - mean, mean - compute_consensus_pose(scenario, t_s)
-    last, half_s = t_s > t_s[-1] - END_WINDOW_S, 0.5 * t_s[-1]
+    apart = q - mean
+    off = mean - compute_consensus_pose(scenario, t_s)
+    last = t_s > t_s[-1] - END_WINDOW_S
+    half_s = 0.5 * t_s[-1]
     middle = (t_s > half_s - END_WINDOW_S) & (t_s <= half_s + 1e-9)
     end_rad, before_rad = (np.abs(off[part].mean(axis=0)) for part in (last, middle))
     largest = np.abs(e).max(axis=(0, 2))
     apart_at_s = t_s[largest >= SETTLED_ERROR_RAD].max(initial=0.0)
-    efforts, saturated = [], []
+    efforts = []
+    saturated = []
     for record, site in zip(records, scenario.names, strict=True):
         beyond_nm = record.tau - build_arm_rows(scenario, site).gravity_torque(record.q)
         efforts.append(np.mean(beyond_nm**2))

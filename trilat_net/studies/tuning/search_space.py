@@ -122,9 +122,12 @@ class SearchSpace(NamedTuple):
         if self.kind is None:
             told = {"gravity": knowledge.gravity} if self.told == "gravity" else {}
             return {"law": self.law, **gains, **told}
-        estimate, law = knowledge.prior(scenario, site), self.law
+        estimate = knowledge.prior(scenario, site)
+        law = self.law
         if law == _KNOWN:
-            arm, gains, law = build_arm_rows(scenario, site), {**gains, "Gamma": 0.0}, "adaptive"
+            arm = build_arm_rows(scenario, site)
+            gains = {**gains, "Gamma": 0.0}
+            law = "adaptive"
             estimate = np.where(arm.gravity_parameters, estimate, arm.theta).tolist()
         at = TuningSite(
             scenario.sites[site].role,

@@ -116,7 +116,8 @@ class CandidateSearch:
         self._objective = objective
         self._rng = np.random.default_rng(seed)  # the same for every law
         self._logs = np.log([[knob.low, knob.high] for knob in space.knobs])
-        first, count = (budget + 1) // 2, len(REFINEMENT_STEPS)
+        first = (budget + 1) // 2
+        count = len(REFINEMENT_STEPS)
         share, more = divmod(budget - first, count)
         self.rounds = [first, *(share + (n < more) for n in range(count))]
 
@@ -158,7 +159,8 @@ class CandidateSearch:
 
         Where nothing settled yet, those that erred least without diverging; where all diverged, anything.
         """
-        points, places = self.points, self.front
+        points = self.points
+        places = self.front
         if places:
             lonely = compute_crowding([points[n] or (0.0, 0.0) for n in places])
             by_space = [n for _, n in sorted(zip(lonely, places, strict=True), key=lambda pair: -pair[0])]
@@ -166,7 +168,8 @@ class CandidateSearch:
         else:
             errors = [(s.outcome is CandidateClass.DIVERGED, s.error_rad or 0.0) for s in self.scores]
             by_space = sorted(range(len(errors)), key=errors.__getitem__)
-            by_space, best = by_space[: max(1, count // 4)], by_space[0]
+            best = by_space[0]
+            by_space = by_space[: max(1, count // 4)]
         chosen = [best if k % 2 == 0 else by_space[k // 2 % len(by_space)] for k in range(count)]
         tried = [[self.tried[n][knob.name] for knob in self.space.knobs] for n in chosen]
         logs = np.log(np.reshape(tried, (count, len(self.space.knobs))))
@@ -255,7 +258,8 @@ class TuningPlan(NamedTuple):
         bases = (self.base, *self.others)
         printed = list(map(self.printed, bases))
         measured: list[CandidateScore] = []
-        total, done = len(searches) * self.budget + len(printed[0]), 0
+        total = len(searches) * self.budget + len(printed[0])
+        done = 0
 
         def show(more: int, _: int) -> None:
             progress(done + more, total)
@@ -312,8 +316,10 @@ class TuningResult(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat compare --tune --json`."""
-        asked, base = self.plan, self.plan.base
-        scenario, weights = base.scenario, search_space.weigh_joints(base.scenario)
+        asked = self.plan
+        base = self.plan.base
+        scenario = base.scenario
+        weights = search_space.weigh_joints(base.scenario)
         return {
             "scenario": {
                 "source": base.source,

@@ -63,7 +63,9 @@ def tabulate_laws(tuned: TuningResult) -> TextTable:
     heads = ("law", "tried", *(one.word for one in reversed(CandidateClass)), "front", "of all")
     rows = []
     for found in tuned.found:
-        counts, points, front = found.outcomes, found.points, found.front
+        counts = found.outcomes
+        points = found.points
+        front = found.front
         ends = [points[place] or (None, None) for place in front[-1:] + front[:1]]
         best, cheapest = ends or [(None, None)] * 2
         classes = (str(counts[outcome]) for outcome in reversed(CandidateClass))
@@ -223,7 +225,8 @@ def _draw_law(axes: Axes, found: CandidateSearch) -> Line2D:
     """Draws a law's stable runs faintly and its front on top; returns its entry of the legend."""
     names = list(dict.fromkeys([*SEARCH_SPACES, found.space.law]))
     place = names.index(found.space.law)
-    colour, mark = SITE_COLOURS[place % len(SITE_COLOURS)], _MARKS[place % len(_MARKS)]
+    colour = SITE_COLOURS[place % len(SITE_COLOURS)]
+    mark = _MARKS[place % len(_MARKS)]
     points = found.points
     settled = [point for point in points if point is not None]
     front = [point for place in found.front if (point := points[place]) is not None]
@@ -253,7 +256,8 @@ def _draw_printed(axes: Axes, tuned: TuningResult) -> list[Line2D]:
 
 def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
     """Writes a comparison into a folder that exists, and returns the paths."""
-    data, text = folder / "front.json", folder / "front.md"
+    data = folder / "front.json"
+    text = folder / "front.md"
     write_whole(data, json.dumps(tuned.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
     write_whole(text, build_tuning_page(tuned))
     figure = draw_front(tuned)
