@@ -76,7 +76,9 @@ def measured(name: str, path: Path, folder: Path) -> list[str]:
     """
     command = [sys.executable, "-c", _ALONE, path, folder]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ)
-    cost = {what: float(value) for what, value in (line.split("=") for line in done.stdout.split())}
+    cost = {
+        what: float(value) for what, value in (line.split("=") for line in done.stdout.split())
+    }
     apart = {what: cost.pop(what) for what in ("twin", "verify")}
     shares = ", ".join(f"{what} {value:.1f}" for what, value in cost.items())
     executed = ", ".join(f"{what} {value:.1f}" for what, value in apart.items())

@@ -36,10 +36,16 @@ def started_cluster(folder: Path) -> Iterator[str]:
     """Yields the address of a scheduler with workers of one thread each."""
     file = folder / "scheduler.json"
     dask = [sys.executable, "-m", "dask"]
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "env": {**os.environ, **SETTINGS}}
+    quiet = {
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.DEVNULL,
+        "env": {**os.environ, **SETTINGS},
+    }
     local = ["--host", "127.0.0.1", "--no-dashboard"]
     processes = [
-        subprocess.Popen([*dask, "scheduler", *local, "--port", "0", "--scheduler-file", str(file)], **quiet)  # type: ignore[call-overload]
+        subprocess.Popen(
+            [*dask, "scheduler", *local, "--port", "0", "--scheduler-file", str(file)], **quiet
+        )  # type: ignore[call-overload]
     ]
     try:
         while not (file.exists() and file.read_text()):
@@ -76,7 +82,9 @@ def plain_cells_per_s(tasks: list[CellItem]) -> float:
     with worker_pool(WORKERS) as executor:
         for share in (tasks[:WARMED], tasks):
             began = time.perf_counter()
-            parts = [executor.submit(run_batch, run_cell, share[n::WORKERS]) for n in range(WORKERS)]
+            parts = [
+                executor.submit(run_batch, run_cell, share[n::WORKERS]) for n in range(WORKERS)
+            ]
             for part in parts:
                 part.result()
         return len(tasks) / (time.perf_counter() - began)

@@ -85,11 +85,15 @@ def _measure_paper(root: str) -> tuple[float, float]:
     """
     with mock.patch.dict(PLAIN, PYTHONPATH=root), _demo() as demo:
         time.sleep(AHEAD_S)
-        printed = "".join((demo.folder / PROCESSES / f"{name}.txt").read_text() for name in SITES)
+        printed = "".join(
+            (demo.folder / PROCESSES / f"{name}.txt").read_text() for name in SITES
+        )
         priority = FIFO_PRIORITY * (printed.count("SCHED_FIFO") == len(SITES))
         measure = cyclictest_us if shutil.which("cyclictest") else thread_us
         beside_us: list[float] = []
-        usage = _watch(_find_members(demo.pid), lambda: beside_us.append(measure(priority, WINDOW_S)))
+        usage = _watch(
+            _find_members(demo.pid), lambda: beside_us.append(measure(priority, WINDOW_S))
+        )
         demo.signal(signal.SIGINT)
         assert demo.code() == 128 + signal.SIGINT
         log = open_log(demo.folder / "run" / "run.mcap")
@@ -97,7 +101,10 @@ def _measure_paper(root: str) -> tuple[float, float]:
         assert all(len(log[name]) == log[name].last_tick + 1 for name in SITES)
         late_us = max(float(np.percentile(log[name].late_us, 99)) for name in SITES)
     cost_ms = sum(map(_total, usage.values())) / len(SITES)
-    print(f"  {root}: {cost_ms:.0f} ms; late p99 {late_us:.0f} us, beside {beside_us[0]:.0f} us", flush=True)
+    print(
+        f"  {root}: {cost_ms:.0f} ms; late p99 {late_us:.0f} us, beside {beside_us[0]:.0f} us",
+        flush=True,
+    )
     return cost_ms, late_us / beside_us[0]
 
 
@@ -110,7 +117,12 @@ def _demo() -> Iterator[Process]:
         )
         printed = [demo.folder / PROCESSES / f"{name}.txt" for name in SITES]
         try:
-            until(lambda: all(file.exists() and "the session begins" in file.read_text() for file in printed))
+            until(
+                lambda: all(
+                    file.exists() and "the session begins" in file.read_text()
+                    for file in printed
+                )
+            )
             yield demo
         finally:
             demo.end()
@@ -164,7 +176,9 @@ def _watch(pids: Mapping[str, int], meanwhile: Callable[[], object]) -> dict[str
     for name, pid in pids.items():
         for task, (thread, *spent) in _read_threads(pid).items():
             earlier = before[name].get(task, (thread, 0.0, 0.0))[1:]
-            for key, now, then in zip((thread, f"{thread} switches"), spent, earlier, strict=True):
+            for key, now, then in zip(
+                (thread, f"{thread} switches"), spent, earlier, strict=True
+            ):
                 usage[name][key] += (now - then) / passed_s  # type: ignore[assignment]
     return usage
 
@@ -179,5 +193,9 @@ def _read_threads(pid: int) -> dict[int, tuple[str, float, float]]:
             status = (folder / "status").read_text("utf-8")
             switches = float(status.partition("\nvoluntary_ctxt_switches:")[2].split()[0])
             name = "main" if int(folder.name) == pid else comm
-            threads[int(folder.name)] = name, (int(fields[11]) + int(fields[12])) * MS_PER_TICK, switches
+            threads[int(folder.name)] = (
+                name,
+                (int(fields[11]) + int(fields[12])) * MS_PER_TICK,
+                switches,
+            )
     return threads

@@ -50,10 +50,14 @@ def _full_disks() -> list[str]:
                 found.append(_on_disk(mib))
     except NoSmallDisk as reason:
         return [f"no small disk here: {reason}"]
-    lines = [f"{PAIRS} pairs of runs of {DURATION_S} s, disk of 3 MiB and of 300 MiB; all sites together:"]
+    lines = [
+        f"{PAIRS} pairs of runs of {DURATION_S} s, disk of 3 MiB and of 300 MiB; all sites together:"
+    ]
     for n, what in enumerate(("samples missing", "ticks begun late", "samples late")):
         full, ample = ([one[n] for one in runs[mib]] for mib in (3, 300))
-        lines.append(f"  {what}: {full} and {ample}, medians {median(full)} and {median(ample)}")
+        lines.append(
+            f"  {what}: {full} and {ample}, medians {median(full)} and {median(ample)}"
+        )
     return lines
 
 
@@ -69,8 +73,20 @@ def _on_disk(mib: int) -> tuple[int, int, int]:
                 path = place / "run.mcap"
                 recorder = stage.start(
                     "recorder",
-                    *("record", "--session", "t", "-o", str(path), "--listen", session.recorder_endpoint),
-                    *(word for endpoint in session.endpoints for word in ("--connect", endpoint)),
+                    *(
+                        "record",
+                        "--session",
+                        "t",
+                        "-o",
+                        str(path),
+                        "--listen",
+                        session.recorder_endpoint,
+                    ),
+                    *(
+                        word
+                        for endpoint in session.endpoints
+                        for word in ("--connect", endpoint)
+                    ),
                     before=disk.before,
                 )
                 for name in SITES:

@@ -20,7 +20,9 @@ def run() -> list[str]:
     with paper(DURATION_S) as session:
         session.all()
         session.begun()
-        samples = np.array(list(_samples({name: p.pid for name, p in session.processes.items()})))
+        samples = np.array(
+            list(_samples({name: p.pid for name, p in session.processes.items()}))
+        )
         for process in session.processes.values():
             process.code()
         log = open_log(session.log)
@@ -31,7 +33,10 @@ def run() -> list[str]:
     return [
         f"{DURATION_S} s of three sites at 1 kHz: {have}/{want} records, {size_mb:.0f} MB",
         *told,
-        *(_line(name, samples[:, 0], samples[:, 1 + 2 * n :]) for n, name in enumerate(session.processes)),
+        *(
+            _line(name, samples[:, 0], samples[:, 1 + 2 * n :])
+            for n, name in enumerate(session.processes)
+        ),
     ]
 
 
@@ -39,7 +44,10 @@ def _samples(pids: dict[str, int]) -> Iterator[list[float]]:
     """Yields, once a second: the time, s; of every process what it holds, MiB, and has taken, s."""
     begun = time.monotonic()
     while (t_s := time.monotonic() - begun) < DURATION_S - 2.0:
-        yield [t_s, *(figure for pid in pids.values() for figure in (_held_mib(pid), cpu_s(pid)))]
+        yield [
+            t_s,
+            *(figure for pid in pids.values() for figure in (_held_mib(pid), cpu_s(pid))),
+        ]
         time.sleep(1.0)
 
 

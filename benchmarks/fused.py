@@ -31,7 +31,9 @@ def run() -> list[str]:
     real_s = scenario.duration_s
     lines, whole, fused_s = _both_drivers(scenario, 40)
     for tolerance in (1e-5, 1e-11):
-        problem = dataclasses.replace(equations(scenario), tolerance=tolerance, starts=[], pieces=[])
+        problem = dataclasses.replace(
+            equations(scenario), tolerance=tolerance, starts=[], pieces=[]
+        )
         begun = time.perf_counter()
         states = problem.solve(real_s).at(np.array([real_s - 1e-3]))
         scipy_s = time.perf_counter() - begun
@@ -42,7 +44,12 @@ def run() -> list[str]:
         )
     for name in ("six_joints", "seven_joints"):
         lines += _both_drivers(load_scenario(name, {"duration_s": 2.0}), 5)[0]
-    return [*lines, *_in_environment(), *_with_plugged_laws(real_s, fused_s), *_on_all_cores(real_s)]
+    return [
+        *lines,
+        *_in_environment(),
+        *_with_plugged_laws(real_s, fused_s),
+        *_on_all_cores(real_s),
+    ]
 
 
 def _in_environment() -> list[str]:
@@ -70,7 +77,9 @@ def _with_plugged_laws(real_s: float, adaptive_s: float) -> list[str]:
     built_in = [name for name, kind in LAWS.items() if hasattr(kind.kind, "torque")]
     lines = ["laws that are plugged in, by their names, in one run:"]
     for law in ("tests.plugged_laws:CompiledLine", "examples.reaction_law:Reaction", *built_in):
-        scenario = load_scenario("free", {"duration_s": real_s, "scheme": "digital", "control.law": law})
+        scenario = load_scenario(
+            "free", {"duration_s": real_s, "scheme": "digital", "control.law": law}
+        )
 
         def run_it(scenario: Scenario = scenario) -> None:
             FusedRun(scenario).advance(real_s)
@@ -80,7 +89,9 @@ def _with_plugged_laws(real_s: float, adaptive_s: float) -> list[str]:
         except ScenarioError as error:  # it is not for three sites, or not for joints
             lines.append(f"  {law}: {error.problem}")
             continue
-        lines.append(f"  {law}: {adaptive_s / best_s(run_it, 10):.2f} of the speed of adaptive (bar: >= 0.4)")
+        lines.append(
+            f"  {law}: {adaptive_s / best_s(run_it, 10):.2f} of the speed of adaptive (bar: >= 0.4)"
+        )
     return lines
 
 

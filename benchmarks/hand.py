@@ -55,7 +55,9 @@ def _epoch_ns(log: Log, site: str) -> int:
 def _move(session: Session) -> list[tuple[int, int]]:
     """Moves a hand at random times; returns the number of each message and when it was asked for, ns."""
     moved = []
-    with trilat_net.hand("t", "m1", connect=session.endpoints, source="benchmark", timeout_s=60.0) as hand:
+    with trilat_net.hand(
+        "t", "m1", connect=session.endpoints, source="benchmark", timeout_s=60.0
+    ) as hand:
         x, y = hand.pose
         for n in range(MOVES):
             time.sleep(random.uniform(0.008, 0.024))
@@ -77,7 +79,14 @@ def _ask_alone() -> float:
 def _lead(session: Session) -> str:
     """Leads m1 by a service that speaks as Haply's; returns its rate, and what the program told."""
     with HaplyService() as service:
-        words = ("hand", "m1", "--session", "t", "--device", f"haply_inverse3={service.address}")
+        words = (
+            "hand",
+            "m1",
+            "--session",
+            "t",
+            "--device",
+            f"haply_inverse3={service.address}",
+        )
         program = session.stage.start("device", *words, *connections(session.endpoints))
         program.prints("takes hold")
         service.pressed, begun, begun_s = {"a"}, len(service.asked), time.monotonic()
@@ -120,8 +129,12 @@ def _describe_kill(log: Log, killed_ns: int) -> list[str]:
     part = log["m2"]
     last = int(np.flatnonzero(part.hand[:, 0] > 0.0)[-1])
     gone_ms = (_epoch_ns(log, "m2") + int(part.t_ns[last + 1]) - killed_ns) / 1e6
-    logged = [event.text for event in log.events if event.kind == "hand" and "silent" in event.text]
-    return [f"killed (SIGKILL) in grip: no force after {gone_ms:.0f} ms (bar: 320), logged: {logged}"]
+    logged = [
+        event.text for event in log.events if event.kind == "hand" and "silent" in event.text
+    ]
+    return [
+        f"killed (SIGKILL) in grip: no force after {gone_ms:.0f} ms (bar: 320), logged: {logged}"
+    ]
 
 
 def _flood(session: Session) -> tuple[int, int, int]:
@@ -129,7 +142,11 @@ def _flood(session: Session) -> tuple[int, int, int]:
     connection = resolve_member_connection(None, session.endpoints, None, None, [], None)
     bus = ZenohBus([], connection.connect or ())
     time.sleep(2.0)
-    publish, sent, begun_ns = bus.publisher(topics.key("t", "s", topics.HAND)), 0, time.monotonic_ns()
+    publish, sent, begun_ns = (
+        bus.publisher(topics.key("t", "s", topics.HAND)),
+        0,
+        time.monotonic_ns(),
+    )
     while time.monotonic_ns() - begun_ns < FLOOD_S * 1e9:
         for _ in range(100):
             publish(b"\xc1 no message of a hand at all, and many of them")

@@ -65,7 +65,9 @@ def _step(link: dict[str, Any], peers: int) -> Callable[[], None]:
     def step() -> None:
         nonlocal k
         k += 1
-        site.step(TickInput(k, [Arrival(n, k - 1, (0.1, 0.2), (0.0, 0.0)) for n in range(peers)]))
+        site.step(
+            TickInput(k, [Arrival(n, k - 1, (0.1, 0.2), (0.0, 0.0)) for n in range(peers)])
+        )
 
     return step
 
@@ -84,7 +86,9 @@ def per_sample_us(link: dict[str, Any]) -> np.ndarray:
 
 def run() -> list[str]:
     """Returns a line per model."""
-    lines = ["one more link with one sample per tick, in Site.step from Python (bar: p50 <= 5 us):"]
+    lines = [
+        "one more link with one sample per tick, in Site.step from Python (bar: p50 <= 5 us):"
+    ]
     for name, link in MODELS.items():
         costs = per_sample_us(link)
         lines.append(

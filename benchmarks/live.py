@@ -39,7 +39,9 @@ def run() -> list[str]:
         sent_us = [np.median(_sent_after_us(log, name)) for name in SITES]
         p50, (late_p50, late) = np.percentile(busy_us, 50), np.percentile(late_us, (50, 99))
         rows.append((p50, late_p50, late, beside_us, late / beside_us, np.ptp(sent_us)))
-        by_site = ", ".join(f"{name} {at_us:.0f}" for name, at_us in zip(SITES, sent_us, strict=True))
+        by_site = ", ".join(
+            f"{name} {at_us:.0f}" for name, at_us in zip(SITES, sent_us, strict=True)
+        )
         print(
             f"  busy p50 {p50:.0f} us; late p50 {late_p50:.0f}, p99 {late:.0f}, beside {beside_us:.0f} us: "
             f"ratio {late / beside_us:.1f}; sent after their turns, p50: {by_site} us",
@@ -58,7 +60,9 @@ def _run(waker: str) -> tuple[Log, float]:
     with paper(DURATION_S) as session:
         session.all()
         session.begun()
-        priority = FIFO_PRIORITY * all("SCHED_FIFO" in session.processes[name].text() for name in SITES)
+        priority = FIFO_PRIORITY * all(
+            "SCHED_FIFO" in session.processes[name].text() for name in SITES
+        )
         measure = cyclictest_us if waker == "cyclictest" else thread_us
         beside_us = measure(priority, DURATION_S - 2)
         session.codes()
@@ -70,15 +74,21 @@ def _run(waker: str) -> tuple[Log, float]:
 def _sent_after_us(log: Log, site: str) -> np.ndarray:
     """Returns how long after its turns in its ticks a site sent its samples, by its clock, us."""
     turn_ns = find_turn_ns(SITES.index(site), len(SITES), log[site].rate_hz)
-    return np.array([(state.sent_ns - state.t_ns - turn_ns) / 1000 for state in log[site].states])
+    return np.array(
+        [(state.sent_ns - state.t_ns - turn_ns) / 1000 for state in log[site].states]
+    )
 
 
 def cyclictest_us(priority: int, duration_s: int) -> float:
     """Returns the 99th percentile of cyclictest's latencies, us."""
     every_ms = ["cyclictest", "-q", "-m", "-i", "1000", "-h", "10000", "-D", str(duration_s)]
     policy = ["-p", str(priority)] if priority else ["--policy=other"]
-    text = subprocess.run([*every_ms, *policy], capture_output=True, text=True, check=True).stdout
-    rows = np.array([line.split()[:2] for line in text.splitlines() if re.match(r"\d{6} \d{6}", line)], int)
+    text = subprocess.run(
+        [*every_ms, *policy], capture_output=True, text=True, check=True
+    ).stdout
+    rows = np.array(
+        [line.split()[:2] for line in text.splitlines() if re.match(r"\d{6} \d{6}", line)], int
+    )
     counts = np.cumsum(rows[:, 1])
     return float(rows[np.searchsorted(counts, 0.99 * counts[-1]), 0])
 

@@ -41,7 +41,9 @@ def run() -> list[str]:
             first = texts[names.index(law)]
             list(pool.map(_judge, [law] * 2 * cores, [first] * 2 * cores))
         found = list(pool.map(_judge, names, texts, chunksize=6))
-    took = {law: sum(s for one, s, _ in found if one == law) / count for law, count in laws.items()}
+    took = {
+        law: sum(s for one, s, _ in found if one == law) / count for law, count in laws.items()
+    }
     built_in, compiled, plain = took.values()
     same = [v for law, _, v in found if law == "p_d"] == [
         v for law, _, v in found if law.endswith("CompiledPD")

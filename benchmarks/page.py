@@ -35,7 +35,9 @@ const tip = card.project(trilat.frame.sites[card.name].points.at(-1)), ratio = c
 return [box.left + tip[0] / ratio, box.top + tip[1] / ratio]; })()"""
 _STAMP = """trilat.parts.arms.cards[0].canvas.addEventListener("pointerrawupdate",
 (event) => { trilat.moved = performance.timeOrigin + event.timeStamp; })"""
-_READY = "Boolean(trilat.frame?.t > 2 && trilat.takesPart && trilat.parts.arms.cards[0].project)"
+_READY = (
+    "Boolean(trilat.frame?.t > 2 && trilat.takesPart && trilat.parts.arms.cards[0].project)"
+)
 
 
 def run() -> list[str]:
@@ -59,10 +61,14 @@ def live_session(folder: Path, *options: str) -> Iterator[tuple[str, int]]:
     """A session of `play` with a page: its address and its process; its log is whole at the end."""
     options = ("--no-browser", "--force", "--out", str(folder), *options)
     command = [sys.executable, "-m", "trilat_net", "live", "play", *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
     assert process.stdout is not None
     lines = iter(process.stdout)
-    address = next(found[1] for line in lines if (found := re.search(r"experimenter: (\S+)", line)))
+    address = next(
+        found[1] for line in lines if (found := re.search(r"experimenter: (\S+)", line))
+    )
     try:
         yield address, process.pid
     finally:
@@ -107,14 +113,20 @@ def measure_once(pages: int) -> tuple[float, float]:
             share = 100.0 * (cpu_s(pid) - before_s) / (time.monotonic() - began_s)
         log = trilat_net.open_log(str(folder / "run.mcap"))
         assert not any(log.missing(site) for site in log.sites)
-        late_us = [log[site].late_us[(log[site].t_s > 2.5) & (log[site].t_s < RUN_S)] for site in log.sites]
+        late_us = [
+            log[site].late_us[(log[site].t_s > 2.5) & (log[site].t_s < RUN_S)]
+            for site in log.sites
+        ]
         return float(np.percentile(np.concatenate(late_us), 99)), share
 
 
 def measure_load() -> tuple[float, float, float]:
     """Lateness with two pages and with none, us, and the server's share with two, percent: medians."""
     pairs = [(measure_once(2), measure_once(0)) for _ in range(PAIRS)]
-    print("p99 with two pages and with none, us:", [(f"{a[0]:.0f}", f"{b[0]:.0f}") for a, b in pairs])
+    print(
+        "p99 with two pages and with none, us:",
+        [(f"{a[0]:.0f}", f"{b[0]:.0f}") for a, b in pairs],
+    )
     ratio = float(np.median([two[0] / none[0] for two, none in pairs]))
     none_us = float(np.median([none[0] for _, none in pairs]))
     return ratio * none_us, none_us, float(np.median([two[1] for two, _ in pairs]))
@@ -160,7 +172,9 @@ def measure_pointer() -> "np.ndarray[tuple[int, int], np.dtype[np.float64]]":
             watch.start()
             page.mouse.move(x, y)
             page.mouse.down()
-            took_ms = [move_once(page, watch, x + 4 * (n % 2), y - 4 * (n % 2)) for n in range(MOVES)]
+            took_ms = [
+                move_once(page, watch, x + 4 * (n % 2), y - 4 * (n % 2)) for n in range(MOVES)
+            ]
             page.mouse.up()
             watch.ended.set()
             watch.join()

@@ -88,5 +88,7 @@ def iterated(path: Path) -> None:
 
 def alone(path: Path) -> int:
     """Returns by how many KiB a process has grown at most that opened a log and looked at one joint."""
-    done = subprocess.run([sys.executable, "-c", _ALONE, path], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", _ALONE, path], capture_output=True, text=True, check=True
+    )
     return int(done.stdout)

@@ -60,10 +60,17 @@ def subscribe(endpoint: str) -> None:
     def stored(_: str, payload: bytes) -> None:
         said = msgspec.msgpack.decode(payload, type=Event)
         ended[0] |= said.kind == "end"
-        publish(encode(Event(member=topics.RECORDER, boot=boot, kind="stored", text="", about=said.member)))
+        publish(
+            encode(
+                Event(
+                    member=topics.RECORDER, boot=boot, kind="stored", text="", about=said.member
+                )
+            )
+        )
 
     bus.tap(
-        topics.key(SESSION, "*", topics.STATE), lambda key, p: came.setdefault(key, []).append(tick(p).tick)
+        topics.key(SESSION, "*", topics.STATE),
+        lambda key, p: came.setdefault(key, []).append(tick(p).tick),
     )
     bus.tap(topics.key(SESSION, "*", topics.EVENT), stored)
     info = _info(boot)
@@ -98,7 +105,16 @@ def _play(path: Path, *options: str) -> tuple[dict[str, Any], dict[str, Any]]:
     )
     replay = subprocess.run(
         [
-            *(sys.executable, "-m", "trilat_net", "replay", str(path), "--session", SESSION, "--json"),
+            *(
+                sys.executable,
+                "-m",
+                "trilat_net",
+                "replay",
+                str(path),
+                "--session",
+                SESSION,
+                "--json",
+            ),
             *("--listen", endpoint, "--needs-recorder", "--exclude", "**/link", *options),
         ],
         capture_output=True,
@@ -132,7 +148,9 @@ def _line(what: str, said: dict[str, Any], got: dict[str, Any]) -> str:
     )
     held = f", {said['held_s']:.2f} s in publishers that waited" if said["held_s"] else ""
     order = "in order" if got["in_order"] else "OUT OF ORDER"
-    return f"  {what}: {how}{held}; {records - got['received']} of {records} records lost, {order}"
+    return (
+        f"  {what}: {how}{held}; {records - got['received']} of {records} records lost, {order}"
+    )
 
 
 if __name__ == "__main__":

@@ -37,12 +37,18 @@ def measure(*, bridged: bool) -> tuple[float, float, float]:
         if bridged:
             session.stage.start("router", "router", "--listen", router)
             words = ("--session", "t", "--ros", router, "--rate", str(RATE_HZ))
-            bridge = session.stage.start("ros2", "ros2", *words, *connections(session.endpoints))
+            bridge = session.stage.start(
+                "ros2", "ros2", *words, *connections(session.endpoints)
+            )
             bridge.prints("is in the graph of ROS 2")
             heard_hz, busy_percent = listen(router, bridge.pid)
         session.ends_well()
         log = open_log(session.log)
-    return max(float(np.percentile(log[site].late_us, 99)) for site in SITES), heard_hz, busy_percent
+    return (
+        max(float(np.percentile(log[site].late_us, 99)) for site in SITES),
+        heard_hz,
+        busy_percent,
+    )
 
 
 def listen(router: str, pid: int, lasts_s: float = 6.0) -> tuple[float, float]:

@@ -26,7 +26,9 @@ def run() -> list[str]:
         orders = (True, False) if pair % 2 else (False, True)
         busy = {stalled: _busy_p99_us(_run(stalled)) for stalled in orders}
         ratios.append(busy[True] / busy[False])
-        shown = ", ".join(f"{a:.0f}/{b:.0f}" for a, b in zip(busy[True], busy[False], strict=True))
+        shown = ", ".join(
+            f"{a:.0f}/{b:.0f}" for a, b in zip(busy[True], busy[False], strict=True)
+        )
         print(f"  p99 of the sites' computing times with/without, us: {shown}", flush=True)
     return [f"  median ratio {np.median(ratios):.3f} (bar: <= 1.2)"]
 

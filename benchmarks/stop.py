@@ -35,9 +35,15 @@ RATE = ("--set", "rate_hz=250")
 """Drawing takes what a machine of two cores has."""
 PHONE = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
 WAYS: dict[str, tuple[dict[str, Any], Callable[[Page], None]]] = {
-    "button on a user's page": ({"viewport": {"width": 1440, "height": 900}}, lambda page: _press(page)),
+    "button on a user's page": (
+        {"viewport": {"width": 1440, "height": 900}},
+        lambda page: _press(page),
+    ),
     "touch on a phone": (PHONE, lambda page: page.touchscreen.tap(*_middle(page))),
-    "Esc": ({"viewport": {"width": 1440, "height": 900}}, lambda page: page.keyboard.press("Escape")),
+    "Esc": (
+        {"viewport": {"width": 1440, "height": 900}},
+        lambda page: page.keyboard.press("Escape"),
+    ),
 }
 _STAMP = """for (const kind of ["pointerdown", "keydown"]) addEventListener(kind, (event) => {
 trilat.pressed = performance.timeOrigin + event.timeStamp; }, true)"""
@@ -99,7 +105,10 @@ def _describe_presses() -> list[str]:
                 presses[way] = _press_often(browser, address, way, apart_ms)
             browser.close()
         log = trilat_net.open_log(str(folder / "run.mcap"))
-        took = {way: [_find_stop_ms(log, at_ms) for at_ms in pressed] for way, pressed in presses.items()}
+        took = {
+            way: [_find_stop_ms(log, at_ms) for at_ms in pressed]
+            for way, pressed in presses.items()
+        }
     lines = []
     for way, rows in took.items():
         last = np.max(rows, axis=1)
@@ -109,10 +118,15 @@ def _describe_presses() -> list[str]:
             f"p50 {p50:.1f} ms (at most {P50_MS:g}), p95 {p95:.1f} ms (at most {P95_MS:g}), "
             f"most {last.max():.1f} ms"
         )
-    return [*lines, f"  the page's clock and this program's were at most {max(apart_ms):.2f} ms apart"]
+    return [
+        *lines,
+        f"  the page's clock and this program's were at most {max(apart_ms):.2f} ms apart",
+    ]
 
 
-def _press_often(browser: Browser, address: str, way: str, apart_ms: list[float]) -> list[float]:
+def _press_often(
+    browser: Browser, address: str, way: str, apart_ms: list[float]
+) -> list[float]:
     """Presses, lets the arms follow again, and so on; returns when, Unix time, ms."""
     options, press = WAYS[way]
     page = browser.new_page(**options)

@@ -26,8 +26,12 @@ class TickParts:
         self.site = site = Site(load_scenario("paper").setup("m1"))
         record = site.step(TickInput(0))
         self.echo = [(0, 0, AT_NS - DELAY_NS), (1, 0, AT_NS - DELAY_NS)]
-        self.payloads = [encode_sample(p, 7, record, AT_NS - DELAY_NS, self.echo) for p in site.peers]
-        peers = [PeerClock(peer, 0, 0, exact_offset(0), OffsetEstimator()) for peer in site.peers]
+        self.payloads = [
+            encode_sample(p, 7, record, AT_NS - DELAY_NS, self.echo) for p in site.peers
+        ]
+        peers = [
+            PeerClock(peer, 0, 0, exact_offset(0), OffsetEstimator()) for peer in site.peers
+        ]
         self.timing = SiteTiming(0, site.rate_hz, peers, "m2")
         self.timing.sent(0, AT_NS - 2 * DELAY_NS)
         self.counter = iter(range(1, 10_000_000))
@@ -37,7 +41,9 @@ class TickParts:
 
     def decode(self) -> list[PeerSample]:
         """Returns what the peers sent."""
-        return [decode(payload, PeerSample, layout=self.site.layout) for payload in self.payloads]
+        return [
+            decode(payload, PeerSample, layout=self.site.layout) for payload in self.payloads
+        ]
 
     def take(self, samples: list[PeerSample]) -> list[Arrival]:
         """Returns samples as the site takes them in."""
@@ -93,7 +99,9 @@ def run() -> list[str]:
     }
     gc.enable()
     p50, p99 = np.percentile(total, (50, 99))
-    lines = [f"one site tick, two peers: p50 {p50:.1f} us, p99 {p99:.1f} us (bar: p50 <= 20 us)"]
+    lines = [
+        f"one site tick, two peers: p50 {p50:.1f} us, p99 {p99:.1f} us (bar: p50 <= 20 us)"
+    ]
     for name, times in parts.items():
         median = np.percentile(times, 50)
         lines.append(f"  {name}: {median:.1f} us, {100 * median / p50:.0f} %")

@@ -37,7 +37,8 @@ def send(folder: str, *places: str) -> None:
             for place, own in zip(places, settings, strict=True)
         ]
         publish = [bus.publisher(_KEY) for bus in buses]
-        clock.sleep_until(clock.monotonic_ns() + 2 * 10**9)  # links and subscriptions are there by then
+        # links and subscriptions are there by then
+        clock.sleep_until(clock.monotonic_ns() + 2 * 10**9)
         due_ns = clock.monotonic_ns()
         for n in range(2 * ROUNDS * SAMPLES):
             due_ns += 10**9 // RATE_HZ
@@ -64,7 +65,9 @@ def measure_us() -> "list[np.ndarray[tuple[int, int], np.dtype[np.float64]]]":
             with taking:
                 arrivals.append((number, now_ns - sent_ns))
 
-        for place, own in zip(places, (None, read_member_keys(folder / "s").settings), strict=True):
+        for place, own in zip(
+            places, (None, read_member_keys(folder / "s").settings), strict=True
+        ):
             stack.enter_context(closing(ZenohBus([place], own=own))).tap(_KEY, take)
         program = "import sys; from benchmarks.tls import send; send(*sys.argv[1:])"
         subprocess.run([sys.executable, "-c", program, str(folder), *places], check=True)

@@ -18,7 +18,9 @@ def run() -> list[str]:
     scenario = load_scenario("paper")
     real = scenario.duration_s
     with_log = best_s(lambda: virtual.write_virtual_log(scenario, io.BytesIO()))
-    with_views = best_s(lambda: virtual.write_virtual_log(scenario, io.BytesIO(), views_hz=VIZ_HZ))
+    with_views = best_s(
+        lambda: virtual.write_virtual_log(scenario, io.BytesIO(), views_hz=VIZ_HZ)
+    )
     alone = best_s(lambda: [None for _ in virtual.execute_virtual(scenario)])
     encoding, writing = time_writing(scenario)
     reading, checking = time_checking(scenario)

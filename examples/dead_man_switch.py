@@ -22,7 +22,10 @@ PERIOD_S = 0.02
 
 
 def hold(
-    switch: tn.SwitchClient, read: Callable[[], bytes | None], now_s: Callable[[], float], gap_s: float
+    switch: tn.SwitchClient,
+    read: Callable[[], bytes | None],
+    now_s: Callable[[], float],
+    gap_s: float,
 ) -> None:
     """Holds a switch while something comes in, until its session or its input ends.
 
@@ -70,9 +73,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("session", help="its name, as the site prints it")
     parser.add_argument("site", help="whose arm moves while the switch is held")
-    parser.add_argument("--connect", action="append", required=True, help="endpoint of the site; repeatable")
+    parser.add_argument(
+        "--connect", action="append", required=True, help="endpoint of the site; repeatable"
+    )
     parser.add_argument("--keys", help="folder of the operator's keys, in a session with keys")
-    parser.add_argument("--gap-s", type=float, default=0.6, help="let go once nothing came for so long")
+    parser.add_argument(
+        "--gap-s", type=float, default=0.6, help="let go once nothing came for so long"
+    )
     options = parser.parse_args()
     connect = (options.session, options.site, options.connect, options.keys)
     with tn.SwitchClient.connected(*connect) as switch, single_keys():

@@ -48,7 +48,8 @@ class Robot(tn.SimulatedArm):
             self.qd[:] = 0.0
             return
         self._moved_s += PERIOD_S
-        self.tau_x[0] = -LEAN_NM * math.sin(self._moved_s)  # the torque ON the arm is its negative
+        # the torque ON the arm is its negative
+        self.tau_x[0] = -LEAN_NM * math.sin(self._moved_s)
         friction = self._size * (VISCOUS * self.qd + COULOMB * np.tanh(self.qd / 0.01))
         self.move(np.array(tau) - self.tau_x - friction, PERIOD_S)
 
@@ -57,10 +58,14 @@ def main() -> None:
     """Drives the robot until the site's run is over."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("site", help="whose arm this is")
-    parser.add_argument("--scenario", default=SCENARIO, help="of the session, for the arm's joints")
+    parser.add_argument(
+        "--scenario", default=SCENARIO, help="of the session, for the arm's joints"
+    )
     parser.add_argument("--session", help="its name, if it is not the scenario's")
     parser.add_argument("--connect", required=True, help="where that site listens")
-    parser.add_argument("--sensor", action="store_true", help="send the torque that the joints measure")
+    parser.add_argument(
+        "--sensor", action="store_true", help="send the torque that the joints measure"
+    )
     options = parser.parse_args()
 
     scenario = tn.load_scenario(options.scenario)
@@ -71,7 +76,8 @@ def main() -> None:
         while not client.over:
             client.send(robot.q, robot.qd, robot.tau_x if options.sensor else ())
             robot.apply(client.torque())
-            next_s = max(next_s + PERIOD_S, time.monotonic())  # late periods are not made up for, see `apply`
+            # late periods are not made up for, see `apply`
+            next_s = max(next_s + PERIOD_S, time.monotonic())
             time.sleep(max(0.0, next_s - time.monotonic()))
     print(f"over: the arm is at {', '.join(f'{q:.3f}' for q in robot.q)} rad")
 

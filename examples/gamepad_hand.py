@@ -36,7 +36,8 @@ class Stick:
         self._device, self._codes = device, evdev.ecodes
         axes = dict(device.capabilities()[evdev.ecodes.EV_ABS])
         self._ranges = {
-            code: (axes[code].min, axes[code].max) for code in (self._codes.ABS_X, self._codes.ABS_Y)
+            code: (axes[code].min, axes[code].max)
+            for code in (self._codes.ABS_X, self._codes.ABS_Y)
         }
         self._values = dict.fromkeys(self._ranges, 0.0)
         self.released = False
@@ -58,7 +59,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("session", help="its name, as in play")
     parser.add_argument("site", help="whose arm the gamepad holds")
-    parser.add_argument("--connect", action="append", help="endpoint of the session; repeatable")
+    parser.add_argument(
+        "--connect", action="append", help="endpoint of the session; repeatable"
+    )
     options = parser.parse_args()
     try:
         import evdev
@@ -66,7 +69,9 @@ def main() -> None:
         sys.exit("a gamepad needs python-evdev, which is not installed: pip install evdev")
 
     stick = Stick(evdev, find_gamepad(evdev))
-    with trilat_net.hand(options.session, options.site, connect=options.connect, source="gamepad") as hand:
+    with trilat_net.hand(
+        options.session, options.site, connect=options.connect, source="gamepad"
+    ) as hand:
         target: list[float] | None = None
         while not hand.over:
             right, up = stick.poll()

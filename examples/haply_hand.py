@@ -22,7 +22,9 @@ class Smoothed(tn.HaplyInverse3):
     def render(self, force_n: tuple[float, float, float]) -> None:
         """Renders a force that follows the wanted one within some milliseconds."""
         share = 1.0 / (1.0 + SMOOTH_S * self.rate_hz)
-        x, y, z = (old + share * (new - old) for old, new in zip(self.felt_n, force_n, strict=True))
+        x, y, z = (
+            old + share * (new - old) for old, new in zip(self.felt_n, force_n, strict=True)
+        )
         self.felt_n = (x, y, z)
         super().render(self.felt_n)
 
@@ -33,7 +35,9 @@ def main() -> None:
     parser.add_argument("session", help="its name, as in play")
     parser.add_argument("site", help="whose arm the device holds")
     parser.add_argument("--address", default="ws://127.0.0.1:10001", help="of Haply's service")
-    parser.add_argument("--connect", action="append", help="endpoint of the session; repeatable")
+    parser.add_argument(
+        "--connect", action="append", help="endpoint of the session; repeatable"
+    )
     options = parser.parse_args()
     device = Smoothed(options.address)
     tn.session(options.session, connect=options.connect).lead(options.site, device)

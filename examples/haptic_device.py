@@ -41,7 +41,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("session", help="its name, as in play")
     parser.add_argument("site", help="whose arm the device holds")
-    parser.add_argument("--connect", action="append", help="endpoint of the session; repeatable")
+    parser.add_argument(
+        "--connect", action="append", help="endpoint of the session; repeatable"
+    )
     parser.add_argument("--seconds", type=float, default=10.0)
     options = parser.parse_args()
 

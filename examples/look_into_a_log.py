@@ -20,8 +20,12 @@ log = trilat_net.open_log(*files) if files else trilat_net.simulate("jitter", {"
 print(log)
 
 # %% What ran: the scenario stands in the log, every value of every site and link
-slave = next((name for name in log.sites if log.scenario.sites[name].role == "slave"), log.sites[-1])
-print(f"{log.session['driver']} session of {log.session['scenario']}, seed {log.session['seed']}")
+slave = next(
+    (name for name in log.sites if log.scenario.sites[name].role == "slave"), log.sites[-1]
+)
+print(
+    f"{log.session['driver']} session of {log.session['scenario']}, seed {log.session['seed']}"
+)
 for name, link in log.scenario.links.items():
     print(f"  {name}: {link.describe()}")
 
@@ -34,16 +38,28 @@ print(
 )
 
 # %% How old is the sample in use? Ages are NaN before the first
-ages_ms = {peer: 1e3 * site.age_s(peer, log.scenario.sites[peer].rate_hz) for peer in site.peers}
+ages_ms = {
+    peer: 1e3 * site.age_s(peer, log.scenario.sites[peer].rate_hz) for peer in site.peers
+}
 for peer, age_ms in ages_ms.items():
     median, worst = np.nanpercentile(age_ms, [50, 100])
-    print(f"sample of {peer} in use at {slave}: median {median:.1f} ms old, at most {worst:.1f} ms")
+    print(
+        f"sample of {peer} in use at {slave}: median {median:.1f} ms old, at most {worst:.1f} ms"
+    )
 
 # %% One figure
-figure, (top, middle, bottom) = plt.subplots(3, sharex=True, figsize=(8, 7), layout="constrained")
+figure, (top, middle, bottom) = plt.subplots(
+    3, sharex=True, figsize=(8, 7), layout="constrained"
+)
 for joint in range(2):
     (line,) = top.plot(site.t_s, site.q[:, joint], label=f"q{joint + 1}")
-    top.plot(site.t_s, site.q_des[:, joint], ":", color=line.get_color(), label=f"q{joint + 1} reference")
+    top.plot(
+        site.t_s,
+        site.q_des[:, joint],
+        ":",
+        color=line.get_color(),
+        label=f"q{joint + 1} reference",
+    )
     middle.plot(site.t_s, site.e[:, joint], label=f"joint {joint + 1}")
 for peer, age_ms in ages_ms.items():
     bottom.plot(site.t_s, age_ms, label=f"from {peer}")

@@ -53,7 +53,9 @@ class References:
 
     def largest(self, site: str, spans: Sequence[tuple[float, float]]) -> float:
         """Returns the largest step of a site's reference within some times, rad."""
-        within = (step for t_s, step in self.steps[site] if any(a <= t_s <= b for a, b in spans))
+        within = (
+            step for t_s, step in self.steps[site] if any(a <= t_s <= b for a, b in spans)
+        )
         return max(within, default=0.0)
 
 
@@ -61,13 +63,19 @@ def main() -> None:
     """Leads the slave, hands over, and takes back."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("session", help="its name, as in play")
-    parser.add_argument("--connect", action="append", help="endpoint of the session; repeatable")
+    parser.add_argument(
+        "--connect", action="append", help="endpoint of the session; repeatable"
+    )
     parser.add_argument("--alone", action="store_true", help="leave m1 to a real person")
-    parser.add_argument("--seconds", type=float, default=15.0, help="in all; the lead changes at each third")
+    parser.add_argument(
+        "--seconds", type=float, default=15.0, help="in all; the lead changes at each third"
+    )
     options = parser.parse_args()
     name, reached = options.session, {"connect": options.connect}
     session = tn.session(name, **reached)
-    person = nullcontext(None) if options.alone else tn.hand(name, "m1", source="person", **reached)
+    person = (
+        nullcontext(None) if options.alone else tn.hand(name, "m1", source="person", **reached)
+    )
     with tn.hand(name, "m2", source="policy", **reached) as program, person as other:
         report(*lead(session, program, other, options.seconds, time.monotonic, time.sleep))
 

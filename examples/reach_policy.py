@@ -26,12 +26,19 @@ def place(q: np.ndarray, qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     a, b = q[0], q[0] + q[1]
     links = [(LENGTHS_M[0], a, qd[0]), (LENGTHS_M[1], b, qd[0] + qd[1])]
     at = sum(length * np.array([np.cos(angle), np.sin(angle)]) for length, angle, _ in links)
-    speed = sum(length * rate * np.array([-np.sin(angle), np.cos(angle)]) for length, angle, rate in links)
+    speed = sum(
+        length * rate * np.array([-np.sin(angle), np.cos(angle)])
+        for length, angle, rate in links
+    )
     return np.asarray(at), np.asarray(speed)
 
 
 def decide(
-    weights: Sequence[float], goal_m: np.ndarray, pose: np.ndarray, slave_q: np.ndarray, slave_qd: np.ndarray
+    weights: Sequence[float],
+    goal_m: np.ndarray,
+    pose: np.ndarray,
+    slave_q: np.ndarray,
+    slave_qd: np.ndarray,
 ) -> np.ndarray:
     """Returns where the hand is to go, m."""
     at, speed = place(slave_q, slave_qd)
@@ -43,7 +50,9 @@ def decide(
 class ReachPolicy:
     """The policy as a hand of a scenario."""
 
-    def __init__(self, facts: tn.HandContext, goal_m: Sequence[float], weights: Sequence[float]) -> None:
+    def __init__(
+        self, facts: tn.HandContext, goal_m: Sequence[float], weights: Sequence[float]
+    ) -> None:
         self.goal_m, self.weights = np.array(goal_m), weights
         self.slave = facts.peers.index("s")
 

@@ -32,8 +32,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("session", help="its name, as in play")
     parser.add_argument("site", help="whose arm the device holds")
-    parser.add_argument("--device", default="", help="as /dev/hidraw3; by default the first one")
-    parser.add_argument("--connect", action="append", help="endpoint of the session; repeatable")
+    parser.add_argument(
+        "--device", default="", help="as /dev/hidraw3; by default the first one"
+    )
+    parser.add_argument(
+        "--connect", action="append", help="endpoint of the session; repeatable"
+    )
     options = parser.parse_args()
     device = OneAxis(options.device)
     tn.session(options.session, connect=options.connect).lead(options.site, device)

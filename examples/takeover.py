@@ -32,7 +32,13 @@ def run(weights: np.ndarray, seed: int, ramp_s: float | None) -> dict[str, float
     angle, way_m = random.uniform(0.0, 2.0 * math.pi), random.uniform(0.15, 0.3)
     goal_m = [start_m[0] + way_m * math.cos(angle), start_m[1] + way_m * math.sin(angle)]
     policy = {"goal_m": goal_m, "weights": weights.tolist()}
-    hand = {"kind": "own", "class": "reach_policy:ReachPolicy", "rate_hz": 25, **FIRM, "settings": policy}
+    hand = {
+        "kind": "own",
+        "class": "reach_policy:ReachPolicy",
+        "rate_hz": 25,
+        **FIRM,
+        "settings": policy,
+    }
     person = {"kind": "tip_spring", "to_m": goal_m, **FIRM}
     overrides: dict[str, Any] = {
         **base,
@@ -43,7 +49,12 @@ def run(weights: np.ndarray, seed: int, ramp_s: float | None) -> dict[str, float
         "seed": seed,
     }
     if ramp_s is not None:
-        change = {"at_s": TAKEN_S, "dominance": "s", "to": {"m1": 0.9, "m2": 0.1}, "ramp_s": ramp_s}
+        change = {
+            "at_s": TAKEN_S,
+            "dominance": "s",
+            "to": {"m1": 0.9, "m2": 0.1},
+            "ramp_s": ramp_s,
+        }
         overrides["timeline"] = [change]
     log = tn.simulate("paper", overrides, duration_s=LASTS_S)
     slave = log["s"]

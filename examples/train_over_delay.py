@@ -37,7 +37,12 @@ USERS: dict[str, Any] = {
     "sites.m2.hands": [{"kind": "live", "force_limit_n": 200.0, **FIRM}],
 }
 """A person rests at m1 and has two fifths of the slave, so that the program has to see where the slave is."""
-SCENE = {"class": "scene:Scene", "bodies": {"box": [0.2, 0.2, 0.2]}, "ahead_m": 0.15, "friction": 0.2}
+SCENE = {
+    "class": "scene:Scene",
+    "bodies": {"box": [0.2, 0.2, 0.2]},
+    "ahead_m": 0.15,
+    "friction": 0.2,
+}
 
 
 class PushTask:
@@ -114,7 +119,9 @@ FIRST = np.array([0.2, 0.0, 0.0, 0.0])
 def make_env(study: Study, network: str) -> Any:
     """Returns the environment of a network."""
     how = {"user": "m2", "rate_hz": STEP_HZ, "duration_s": EPISODE_S, "mode": "tip"}
-    return tn.make_env("paper", {**study.scenario, **NETWORKS[network]}, task=study.make_task(), **how)
+    return tn.make_env(
+        "paper", {**study.scenario, **NETWORKS[network]}, task=study.make_task(), **how
+    )
 
 
 def play(env: Any, weights: np.ndarray, seed: int) -> float:
@@ -122,7 +129,9 @@ def play(env: Any, weights: np.ndarray, seed: int) -> float:
     seen, _ = env.reset(seed=seed)
     total = 0.0
     for _ in range(int(EPISODE_S * STEP_HZ)):
-        action = decide(weights, seen["goal"], seen["pose"], seen["peer_q"][1], seen["peer_qd"][1])
+        action = decide(
+            weights, seen["goal"], seen["pose"], seen["peer_q"][1], seen["peer_qd"][1]
+        )
         seen, reward, ended, _, info = env.step(action)
         total -= reward - float(info["success"])
         if ended and not info["success"]:
@@ -146,7 +155,10 @@ def train(study: Study, network: str, seed: int) -> np.ndarray:
         ]
         gain = np.array(costs)[:, 1] - np.array(costs)[:, 0]
         scale = max(float(np.abs(gain).max()), 1e-9)
-        weights = weights + study.rate * (1.0 - n / study.rounds) * (gain / scale) @ steps / study.pairs
+        weights = (
+            weights
+            + study.rate * (1.0 - n / study.rounds) * (gain / scale) @ steps / study.pairs
+        )
     return weights
 
 
@@ -159,9 +171,15 @@ def run_seed(name: str, seed: int) -> dict[str, Any]:
     for there in NETWORKS:
         env = make_env(study, there)
         for here in NETWORKS:
-            tests = [play(env, weights[here], 10_000_019 * (seed + 1) + n) for n in range(TESTS)]
+            tests = [
+                play(env, weights[here], 10_000_019 * (seed + 1) + n) for n in range(TESTS)
+            ]
             costs[f"{here} -> {there}"] = float(np.mean(tests))
-    return {"seed": seed, "weights": {name: one.tolist() for name, one in weights.items()}, "costs": costs}
+    return {
+        "seed": seed,
+        "weights": {name: one.tolist() for name, one in weights.items()},
+        "costs": costs,
+    }
 
 
 def interval(values: np.ndarray) -> tuple[float, float, float]:
@@ -173,7 +191,9 @@ def interval(values: np.ndarray) -> tuple[float, float, float]:
 
 def report(found: list[dict[str, Any]], measure: str) -> dict[str, tuple[float, float, float]]:
     """Prints the table, and the paired difference that the question is about; returns the intervals."""
-    columns = {name: np.array([one["costs"][name] for one in found]) for name in found[0]["costs"]}
+    columns = {
+        name: np.array([one["costs"][name] for one in found]) for name in found[0]["costs"]
+    }
     calm, hard = NETWORKS
     columns["difference"] = columns[f"{calm} -> {hard}"] - columns[f"{hard} -> {hard}"]
     print(f"{measure}, mm, {len(found)} seeds, 95 % interval of the mean")
@@ -197,7 +217,9 @@ def draw(found: list[dict[str, Any]], measure: str, path: Path) -> None:
         colour = f"C{list(NETWORKS).index(here)}"
         axes.plot(values, np.full(len(values), place), "o", alpha=0.4, color=colour)
         axes.plot(values.mean(), place, "|", markersize=20, markeredgewidth=2, color="black")
-    axes.set_yticks(range(len(rows)), [f"trained: {here}\ntested: {there}" for here, there in rows])
+    axes.set_yticks(
+        range(len(rows)), [f"trained: {here}\ntested: {there}" for here, there in rows]
+    )
     axes.set_xlabel(f"{measure}, mm;\na dot a seed, a bar their mean")
     axes.set_xlim(left=0.0)
     axes.invert_yaxis()

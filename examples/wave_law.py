@@ -21,7 +21,9 @@ class Wave:
     sends: ClassVar = {"u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True}}
     remembers = ("q_sd", "played")
 
-    def __init__(self, facts: tn.LawContext, b: float = 10.0, K: float = 0.0, B: float = 0.0) -> None:
+    def __init__(
+        self, facts: tn.LawContext, b: float = 10.0, K: float = 0.0, B: float = 0.0
+    ) -> None:
         self.b, self.K, self.B = b, K, B
         self.c = math.sqrt(2.0 * b)
         self.q_sd = [[0.0] * facts.joints for _ in facts.peers]
@@ -34,10 +36,14 @@ class Wave:
         tau = list(now.gravity)
         for j, peer in enumerate(now.peers):
             for i in range(now.joints):
-                v = now.received[j].u[i] if peer.new else 0.0  # a wave that does not come is none
+                # a wave that does not come is none
+                v = now.received[j].u[i] if peer.new else 0.0
                 if self.K == 0.0:  # the line pushes the arm
                     step = now.q[i] - now.q_before[i]
-                    force, wave = self.c * v - self.b * now.qd[i], self.c * step / now.h_s - self.played[j][i]
+                    force, wave = (
+                        self.c * v - self.b * now.qd[i],
+                        self.c * step / now.h_s - self.played[j][i],
+                    )
                     self.played[j][i] = v
                 else:
                     force, wave = self.follow(now, j, i, v)

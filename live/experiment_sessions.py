@@ -1,8 +1,10 @@
-"""An experiment with people: a session for each trial, one page for all of them, and what is written down.
+"""An experiment with people: a session for each trial, one page for all of them, and what is
+written down.
 
-Invariant: what counts is a function of the log, which is in its place before the journal has the trial: a
-process that dies at any moment loses no trial whose session it had ended, and counts no other. Every try has
-a folder of its own, which stays if the trial does not count, with a note that says why.
+Invariant: what counts is a function of the log, which is in its place before the journal has
+the trial: a process that dies at any moment loses no trial whose session it had ended, and
+counts no other. Every try has a folder of its own, which stays if the trial does not count,
+with a note that says why.
 """
 
 import shutil
@@ -39,8 +41,9 @@ SOON_NS = 60 * NS_PER_S
 """A session that fails sooner than this, before it has begun, would fail again."""
 
 SessionRunner = Callable[[TrialWatch, Path, Callable[[], bool]], SessionResult]
-"""Runs the session of a trial in a folder: from when the function given returns true until its watch is over,
-or people end the experiment."""
+"""Runs the session of a trial in a folder: from when the function given returns true until its
+watch is over, or people end the experiment.
+"""
 
 
 @dataclass
@@ -88,22 +91,30 @@ class ExperimentSessions:
         users = dict(zip(self.stage.users, step.planned.group, strict=True))
         cells = {site: f"{step.key} {who}" for site, who in users.items()}
         asked = self.stage.ask(
-            step, rest_s, [site for site, cell in cells.items() if (cell, 0) in self._notes.done]
+            step,
+            rest_s,
+            [site for site, cell in cells.items() if (cell, 0) in self._notes.done],
         )
         noted = len(self._notes.done)
         while not asked.replies.keys() >= users.keys():
             if self.ends():
                 return False
             self.clock.sleep_until(self.clock.monotonic_ns() + POLL_NS)
-            for site, (answers, _) in list(asked.replies.items()) if step.kind != "trial" else ():
+            for site, (answers, _) in (
+                list(asked.replies.items()) if step.kind != "trial" else ()
+            ):
                 told = step.form.name if step.form else ""
-                self._note(cells[site], step.kind, users[site], step.planned.number, told, answers)
+                self._note(
+                    cells[site], step.kind, users[site], step.planned.number, told, answers
+                )
         if len(self._notes.done) > noted:
             self.experiment.write_tables()
         return True
 
     def _note(self, cell: str, kind: str, who: str, number: int, *told: Any) -> None:
-        self._notes.add(Note(cell, kind, who, number, round(self.clock.unix_ns() / NS_PER_S, 3), *told))
+        self._notes.add(
+            Note(cell, kind, who, number, round(self.clock.unix_ns() / NS_PER_S, 3), *told)
+        )
 
     def _make_trial(self, step: Step) -> bool:
         """Makes a trial until one counts; false if the experiment was ended before."""
@@ -112,7 +123,8 @@ class ExperimentSessions:
         scenario = plan.find_scenario(planned, self.experiment.list_choices())
         trial = ExperimentTrial(plan.protocol, scenario, planned, plan.digest)
         path = make_subfolder(self.experiment.folder / LOGS) / planned.file
-        if path.exists() and not self._count(trial, path):  # a program was killed before it was counted
+        # a program was killed before it was counted
+        if path.exists() and not self._count(trial, path):
             return True
         for left in self._list_tries(planned)[-1:]:
             if any(left.glob("*.mcap*")):
@@ -158,7 +170,8 @@ class ExperimentSessions:
         self.stage.check()
         if result.problems and result.exit_code == LogRefused.exit_code:
             raise LogRefused("; ".join(result.problems))
-        if not ready:  # nobody has begun anything: people have ended it, or the sites have waited for long
+        # nobody has begun anything: people have ended it, or the sites have waited for long
+        if not ready:
             shutil.rmtree(folder, ignore_errors=True)
             if result.problems and self.clock.monotonic_ns() - begun_ns < SOON_NS:
                 raise RunFailed("; ".join(result.problems))
@@ -174,7 +187,9 @@ class ExperimentSessions:
         return not why
 
     def _count(self, trial: ExperimentTrial, path: Path) -> str:
-        """Counts a trial by its log, which is in its place; returns why it does not count, "" if it does."""
+        """Counts a trial by its log, which is in its place; returns why it does not count, ""
+        if it does.
+        """
         tries = self._list_tries(trial.planned)[-1:]
         try:
             entry = trial.settle(path)
@@ -195,7 +210,9 @@ class ExperimentSessions:
 
 
 def _find_reason(watch: TrialWatch, result: SessionResult) -> str:
-    """Returns why the session of a trial is none that counts; an arm that diverged is a trial that failed."""
+    """Returns why the session of a trial is none that counts; an arm that diverged is a trial
+    that failed.
+    """
     if result.interrupted:
         return "the experiment was interrupted"
     if watch.aborted or not result.log.exists():
@@ -203,7 +220,9 @@ def _find_reason(watch: TrialWatch, result: SessionResult) -> str:
     return "" if watch.diverged else "; ".join(result.problems)
 
 
-def run_with_people(experiment: Experiment, options: PageOptions, say: Callable[[str], None]) -> int:
+def run_with_people(
+    experiment: Experiment, options: PageOptions, say: Callable[[str], None]
+) -> int:
     """Goes on with an experiment, with people on its page; returns the exit code.
 
     Raises:
@@ -219,16 +238,31 @@ def run_with_people(experiment: Experiment, options: PageOptions, say: Callable[
             compile_core(scenario, say, interrupt)
         with PageServer(idle, clock, name, options, ends=True, say=say, stage=stage) as page:
 
-            def run_session(watch: TrialWatch, folder: Path, begins: Callable[[], bool]) -> SessionResult:
+            def run_session(
+                watch: TrialWatch, folder: Path, begins: Callable[[], bool]
+            ) -> SessionResult:
                 attend = partial(_attend, page, idle, watch)
-                result = run_demo(watch.trial.scenario, folder, Console(quiet=True), attend, begins)
+                result = run_demo(
+                    scenario=watch.trial.scenario,
+                    folder=folder,
+                    console=Console(quiet=True),
+                    attend=attend,
+                    begins=begins,
+                )
                 interrupt.number = interrupt.number or result.interrupted
                 return result
 
             def ends() -> bool:
                 return interrupt.requested() or page.end_requested.is_set()
 
-            if ExperimentSessions(experiment, stage, clock, run_session, ends, say).run():
+            if ExperimentSessions(
+                experiment=experiment,
+                stage=stage,
+                clock=clock,
+                run_session=run_session,
+                ends=ends,
+                say=say,
+            ).run():
                 clock.sleep_until(clock.monotonic_ns() + GOODBYE_NS)
     return interrupt.exit_code if interrupt.requested() else 0
 

@@ -1,8 +1,9 @@
-"""What an experiment asks of people on their pages: consent, whether they are ready, a trial, questionnaires.
+"""What an experiment asks of people on their pages: consent, whether they are ready, a trial,
+questionnaires.
 
-Invariant: a reply counts for the step that its page was shown, from the first page of a user's site alone. A
-trial is judged by every record of its slave, as its log is afterwards. How long people rest or are away is
-told by the monotonic clock. Users are not told the condition.
+Invariant: a reply counts for the step that its page was shown, from the first page of a user's
+site alone. A trial is judged by every record of its slave, as its log is afterwards. How long
+people rest or are away is told by the monotonic clock. Users are not told the condition.
 """
 
 from collections.abc import Collection, Sequence
@@ -22,7 +23,9 @@ from .page_orders import AbortTrial, StageMessage
 from .session_view import SessionView
 
 AWAY_NS = 8 * NS_PER_S
-"""A page that is reloaded within a trial is back by then; one that is away for longer ends the trial."""
+"""A page that is reloaded within a trial is back by then; one that is away for longer ends the
+trial.
+"""
 END_NS = NS_PER_S // 2
 """From the end of a trial to that of its session, in which its last mark reaches the log."""
 
@@ -52,10 +55,14 @@ class TrialWatch:
     def over(self) -> bool:
         """True once its session can end."""
         ended = self.judge.outcome is not None
-        return bool(self.aborted) or (ended and self._clock.monotonic_ns() - self._ended_ns > END_NS)
+        return bool(self.aborted) or (
+            ended and self._clock.monotonic_ns() - self._ended_ns > END_NS
+        )
 
     def poll(self, view: SessionView, away: Collection[str]) -> list[str]:
-        """Takes in the records that have come, and whose page is `away`; returns moments for the log."""
+        """Takes in the records that have come, and whose page is `away`; returns moments for
+        the log.
+        """
         if self.over or self.judge.outcome is not None or not view.running:
             return []
         modes = {name: site.record.mode for name, site in view.sites.items() if site.record}
@@ -63,7 +70,9 @@ class TrialWatch:
         halted = [name for name, mode in modes.items() if mode in HALTED_MODES]
         if away or halted:
             self.aborted = (
-                f"the page of {', '.join(away)} is gone" if away else f"{', '.join(halted)} stopped"
+                f"the page of {', '.join(away)} is gone"
+                if away
+                else f"{', '.join(halted)} stopped"
             )
             return [f"trial {self.trial.planned.number} aborted: {self.aborted}"]
         return self._judge(view)
@@ -88,11 +97,16 @@ class TrialWatch:
                 moments.append("target appears")
             if known and (outcome := self.judge.take(t_s, q, tau_x)) is not None:
                 self._ended_ns = self._clock.monotonic_ns()
-                return [*moments, f"trial {number} {'succeeded' if outcome.succeeded else 'failed'}"]
+                return [
+                    *moments,
+                    f"trial {number} {'succeeded' if outcome.succeeded else 'failed'}",
+                ]
         return moments
 
     def describe(self, t_s: float, site: str) -> Json:
-        """Returns what a page draws at a time of its arms, s; a user's page as that user is shown it."""
+        """Returns what a page draws at a time of its arms, s; a user's page as that user is
+        shown it.
+        """
         goal = self.judge.goal
         trial = self.trial
         users = self.trial.protocol.users
@@ -113,7 +127,8 @@ class Asked:
     Attributes:
         step: which.
         from_ns: until then people rest.
-        replies: of the users who have done it, by site: the answers, and the page that gave them.
+        replies: of the users who have done it, by site: the answers, and the page that gave
+            them.
     """
 
     step: Step
@@ -122,11 +137,13 @@ class Asked:
 
 
 class Stage:
-    """What pages are shown around a session; the one who runs the experiment sets it, the server asks it.
+    """What pages are shown around a session; the one who runs the experiment sets it, the
+    server asks it.
 
     Attributes:
         users: the sites of those who take part.
-        shows_ages: whether pages begin with the ages of samples shown; they could tell the answer of a pair.
+        shows_ages: whether pages begin with the ages of samples shown; they could tell the
+            answer of a pair.
     """
 
     def __init__(self, plan: ExperimentPlan, clock: Clock) -> None:
@@ -143,7 +160,9 @@ class Stage:
         self._seen_ns: dict[str, int] = {}
 
     def ask(self, step: Step, rest_s: float = 0.0, done: Collection[str] = ()) -> Asked:
-        """Asks users for a step, but those who have `done` it; returns what they reply, as it comes."""
+        """Asks users for a step, but those who have `done` it; returns what they reply, as it
+        comes.
+        """
         asked = Asked(step, self._clock.monotonic_ns() + int(rest_s * NS_PER_S))
         asked.replies |= {site: ({}, 0) for site in done}
         self._step = step
@@ -164,11 +183,15 @@ class Stage:
         self._phase = "checking"
 
     def tell(self, entry: TrialEntry | None, why: str = "") -> None:
-        """Shows the feedback on a trial, as far as the protocol has any; or why it is made again."""
+        """Shows the feedback on a trial, as far as the protocol has any; or why it is made
+        again.
+        """
         names = self._plan.protocol.feedback if entry is not None else ()
         self._told = {
             "why": why,
-            "measures": {name: entry.measures[name] for name in names if entry and name in entry.measures},
+            "measures": {
+                name: entry.measures[name] for name in names if entry and name in entry.measures
+            },
         }
         if entry is not None and names:
             self._told["succeeded"] = entry.succeeded
@@ -180,7 +203,9 @@ class Stage:
         self._phase = "over"
 
     def poll(self, view: SessionView, pages: Sequence[tuple[str, int]]) -> list[str]:
-        """Takes in what has come, and site and number of each user's page; returns moments for the log."""
+        """Takes in what has come, and site and number of each user's page; returns moments for
+        the log.
+        """
         now_ns = self._clock.monotonic_ns()
         asked = self._asked
         self._holders = {site: min(n for at, n in pages if at == site) for site, _ in pages}
@@ -193,11 +218,15 @@ class Stage:
             return []
         if view.running and self._phase == "starting":
             self._phase = "trial"
-        away = [site for site in self.users if now_ns - self._seen_ns.get(site, now_ns) > AWAY_NS]
+        away = [
+            site for site in self.users if now_ns - self._seen_ns.get(site, now_ns) > AWAY_NS
+        ]
         return self._watch.poll(view, away)
 
     def take(self, site: str, page: int, message: StageMessage) -> bool:
-        """Takes a message of a user's page, or of an experimenter's, ""; false: nobody asked for it."""
+        """Takes a message of a user's page, or of an experimenter's, ""; false: nobody asked
+        for it.
+        """
         if isinstance(message, AbortTrial):
             watch = self._watch
             who = site or "the experimenter"
@@ -207,30 +236,49 @@ class Stage:
             return True
         asked = self._asked
         early = self._asked and self._clock.monotonic_ns() < self._asked.from_ns
-        if asked is None or early or self._holders.get(site) != page or message.key != asked.step.key:
+        if (
+            asked is None
+            or early
+            or self._holders.get(site) != page
+            or message.key != asked.step.key
+        ):
             return False
         try:
-            asked.replies[site] = asked.step.form.read(message.answers) if asked.step.form else {}, page
+            asked.replies[site] = (
+                asked.step.form.read(message.answers) if asked.step.form else {},
+                page,
+            )
         except UsageError:
             return False
         return True
 
     def describe(self, role: str, site: str, page: int, t_s: float | None) -> Json:
-        """Returns what a page shows, by role, site and number, at a time of its arms, s, if there are any."""
+        """Returns what a page shows, by role, site and number, at a time of its arms, s, if
+        there are any.
+        """
         step = self._step
         asked = self._asked
         watch = self._watch
         protocol = self._plan.protocol
-        found: Json = {"phase": self._phase, "title": protocol.title or protocol.name, "told": self._told}
+        found: Json = {
+            "phase": self._phase,
+            "title": protocol.title or protocol.name,
+            "told": self._told,
+        }
         if step is None:
             return found
         planned = step.planned
         replies = {} if asked is None else asked.replies
         names = dict(zip(self.users, planned.group, strict=True))
-        states = {at: "done" if at in replies else "here" if at in self._holders else "" for at in self.users}
+        states = {
+            at: "done" if at in replies else "here" if at in self._holders else ""
+            for at in self.users
+        }
         found |= {
             "key": step.key,
-            "users": [{"site": at, "who": names[at], "state": state} for at, state in states.items()],
+            "users": [
+                {"site": at, "who": names[at], "state": state} for at, state in states.items()
+            ],
             "task": protocol.task.ask(self._plan.scenarios[planned.condition].slave),
             "trial": planned.trial,
             "trials": self._plan.trials[-1].trial,
@@ -244,12 +292,25 @@ class Stage:
             found |= watch.describe(t_s, site)
         if role == "experimenter":
             found |= {"number": planned.number, "of": len(self._plan.trials)}
-            also = f", {planned.phase}" if planned.phase else ", a catch trial" if planned.catch else ""
+            also = (
+                f", {planned.phase}"
+                if planned.phase
+                else ", a catch trial"
+                if planned.catch
+                else ""
+            )
             found |= {"condition": planned.condition + also}
         if site in names and role == "user":
-            found |= {"who": names[site], "done": site in replies, "second": self._holders.get(site) != page}
+            found |= {
+                "who": names[site],
+                "done": site in replies,
+                "second": self._holders.get(site) != page,
+            }
             if step.kind == "consent":
                 found["text"] = protocol.consent
             if step.form is not None:
-                found["form"] = {**msgspec.to_builtins(step.form), "forced": step.form.is_forced}
+                found["form"] = {
+                    **msgspec.to_builtins(step.form),
+                    "forced": step.form.is_forced,
+                }
         return found

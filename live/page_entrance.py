@@ -1,11 +1,13 @@
-"""Who gets a connection to the page's server: strangers without a role, and pages by their role.
+"""Who gets a connection to the page's server: strangers without a role, and pages by their
+role.
 
 Invariant:
-- Connections whose role is not known yet (silent ones, slow ones, downloads) are bounded in number. The
-  oldest one gives way to a new one, so that nobody who holds many of them keeps others out.
-- Pages have places by role. Watchers take places of their own and no others. A page of an experimenter or a
-  user always gets in: if all places of its role are taken, the oldest page of that role gives way. Among
-  experimenters those that do not take part go first.
+- Connections whose role is not known yet (silent ones, slow ones, downloads) are bounded in
+  number. The oldest one gives way to a new one, so that nobody who holds many of them keeps
+  others out.
+- Pages have places by role. Watchers take places of their own and no others. A page of an
+  experimenter or a user always gets in: if all places of its role are taken, the oldest page of
+  that role gives way. Among experimenters those that do not take part go first.
 """
 
 from collections import Counter
@@ -60,11 +62,15 @@ def is_full(pages: Iterable[Placed], role: Role) -> bool:
 
 
 def choose_to_leave(pages: Iterable[P], role: Role) -> P | None:
-    """Returns the page that gives its place to a new page of a role; None if there is a free place."""
+    """Returns the page that gives its place to a new page of a role; None if there is a free
+    place.
+    """
     alike = _list_alike(pages, role)
     if len(alike) < MOST_PAGES[role.kind]:
         return None
-    return min(alike, key=lambda page: (role.kind == "experimenter" and page.takes_part, page.number))
+    return min(
+        alike, key=lambda page: (role.kind == "experimenter" and page.takes_part, page.number)
+    )
 
 
 def _list_alike(pages: Iterable[P], role: Role) -> list[P]:

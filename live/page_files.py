@@ -1,7 +1,8 @@
-"""What the page's server sends for a request: the page's own files, and report and log of an ended session.
+"""What the page's server sends for a request: the page's own files, and report and log of an
+ended session.
 
-Invariant: a page runs scripts of its own server alone; a report runs its own, cut off from the page. Nobody
-can guess the address of a report or a log.
+Invariant: a page runs scripts of its own server alone; a report runs its own, cut off from the
+page. Nobody can guess the address of a report or a log.
 """
 
 import secrets
@@ -56,7 +57,9 @@ class PageFiles:
             return _send_file(kind, result.read_bytes(), _REPORT_POLICY, "no-store")
         if (file := self._own.get(path)) is None:
             return None
-        return _send_file(*file, _POLICY, "no-store" if path in ("/", "/index.html") else "no-cache")
+        return _send_file(
+            *file, _POLICY, "no-store" if path in ("/", "/index.html") else "no-cache"
+        )
 
 
 def _list_assets() -> dict[str, tuple[str, bytes]]:
@@ -64,7 +67,11 @@ def _list_assets() -> dict[str, tuple[str, bytes]]:
     files = {}
     for file in [*(resources.files("live") / "assets").iterdir(), *plots]:
         kind = _KINDS.get(file.name.rpartition(".")[2].rpartition("-")[2])
-        if kind is not None and not file.name.startswith("report.") and "/" + file.name not in files:
+        if (
+            kind is not None
+            and not file.name.startswith("report.")
+            and "/" + file.name not in files
+        ):
             files["/" + file.name] = kind, file.read_bytes()
     files["/"] = files["/index.html"]
     return files

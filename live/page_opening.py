@@ -1,7 +1,8 @@
 """Opens a browser at a link whose token no other user of the machine may see.
 
-Invariant: the token stands in no command line, since every user of the machine can list those. The browser
-gets a file that only its user can read, and which leads on to the link; it is removed once the page is there.
+Invariant: the token stands in no command line, since every user of the machine can list those.
+The browser gets a file that only its user can read, and which leads on to the link; it is
+removed once the page is there.
 """
 
 import html
@@ -28,13 +29,14 @@ class BrowserOpening:
     def write(self) -> Path:
         """Returns the file, which leads on to the link.
 
-        The file is in a folder of the home directory: browsers that run confined (snap) can read neither /tmp
-        nor hidden folders.
+        The file is in a folder of the home directory: browsers that run confined (snap) can
+        read neither /tmp nor hidden folders.
 
         Raises:
             OSError: the file cannot be written.
         """
-        self._folder = Path(tempfile.mkdtemp(prefix="trilat-live-", dir=Path.home()))  # of mode 0700
+        # of mode 0700
+        self._folder = Path(tempfile.mkdtemp(prefix="trilat-live-", dir=Path.home()))
         link = html.escape(self._link)
         text = (
             '<!DOCTYPE html><meta charset="utf-8"><title>trilat live</title>'

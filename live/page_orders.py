@@ -1,11 +1,13 @@
-"""What a page may ask for, by who looks at it: roles and their links, messages, and how they reach the sites.
+"""What a page may ask for, by who looks at it: roles and their links, messages, and how they
+reach the sites.
 
-Invariant: a message is one of the types below with finite numbers in range and names of the session, and
-comes no oftener than its kind may, or it is counted and dropped. What a site takes in is for the site to
-decide. Of a link or a row only the newest order waits, however often it is changed, and one question to a
-site is open at a time, besides that to stop. A token gives a role and, to a user, a site; the rest of a link
-may lower the role and never raises it. Every link has a token, on loopback as well: other users of the
-machine reach that too. Every role stops the arms.
+Invariant: a message is one of the types below with finite numbers in range and names of the
+session, and comes no oftener than its kind may, or it is counted and dropped. What a site takes
+in is for the site to decide. Of a link or a row only the newest order waits, however often it
+is changed, and one question to a site is open at a time, besides that to stop. A token gives a
+role and, to a user, a site; the rest of a link may lower the role and never raises it. Every
+link has a token, on loopback as well: other users of the machine reach that too. Every role
+stops the arms.
 """
 
 import hmac
@@ -42,7 +44,9 @@ Name = Annotated[str, Meta(max_length=64)]
 Numbers = Annotated[list[float], Meta(max_length=12)]
 
 
-class PageMessage(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="do"):
+class PageMessage(
+    msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="do"
+):
     """A message of a page; the tag says what it is."""
 
 
@@ -111,7 +115,8 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
     """The page takes hold of an arm, moves what it holds, or lets go.
 
     Attributes:
-        to: the target of the end effector, m, or of the joints, rad; for an arm that is pushed the force, N.
+        to: the target of the end effector, m, or of the joints, rad; for an arm that is pushed
+            the force, N.
     """
 
     site: Name
@@ -128,7 +133,8 @@ class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
 
     Attributes:
         key: of the step, as the page was shown it.
-        answers: of a questionnaire, in the order of its items; None for an item that was left out.
+        answers: of a questionnaire, in the order of its items; None for an item that was left
+            out.
     """
 
     key: Name
@@ -159,7 +165,9 @@ _RATES: dict[type[PageMessage], tuple[float, int]] = {
 
 
 class MessageLimits:
-    """What a page may still send: of each kind with a rate, and of all, a bucket that fills at that rate."""
+    """What a page may still send: of each kind with a rate, and of all, a bucket that fills at
+    that rate.
+    """
 
     def __init__(self) -> None:
         self._buckets = {kind: (float(burst), 0) for kind, (_, burst) in _RATES.items()}
@@ -182,7 +190,8 @@ def read_page_message(text: str | bytes) -> PageMessage:
         WireError: it is none, or a number in it is out of range.
     """
     try:
-        message: PageMessage = _DECODER.decode(text)  # JSON has no infinity, and 1e999 is refused
+        # JSON has no infinity, and 1e999 is refused
+        message: PageMessage = _DECODER.decode(text)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise WireError("malformed", str(error)) from None
     return message
@@ -193,7 +202,8 @@ class Role:
     """What somebody may do, and which view of the arms is shown.
 
     Attributes:
-        kind: an experimenter may do everything, a user holds the arm of one site, a watcher does nothing.
+        kind: an experimenter may do everything, a user holds the arm of one site, a watcher
+            does nothing.
         site: as which site the arms are shown; "": as they are, without delay.
     """
 
@@ -228,12 +238,16 @@ class RoleLinks:
         self._secret = secrets.token_bytes(TOKEN_BYTES)
 
     def link(self, address: str, role: Role) -> str:
-        """Returns the link of a role; its token stands where a browser sends it to no server by itself."""
+        """Returns the link of a role; its token stands where a browser sends it to no server by
+        itself.
+        """
         query = f"?{role.query}" if role.query else ""
         return f"{address}{query}#token={self._make_token(role)}"
 
     def find(self, query: str) -> Role | None:
-        """Returns the role of whoever comes by a link with this query; None if no role has its token."""
+        """Returns the role of whoever comes by a link with this query; None if no role has its
+        token.
+        """
         asked = parse_qs(query, keep_blank_values=True)
         token, site = (asked.get(key, [""])[0] for key in ("token", "as"))
         able = Role(), Role("user", site), Role("watcher")
@@ -245,7 +259,9 @@ class RoleLinks:
         return Role("user", site) if site else given
 
     def _make_token(self, role: Role) -> str:
-        return hmac.digest(self._secret, f"{role.kind} {role.site}".encode(), "sha256")[:TOKEN_BYTES].hex()
+        return hmac.digest(self._secret, f"{role.kind} {role.site}".encode(), "sha256")[
+            :TOKEN_BYTES
+        ].hex()
 
     def _is_token(self, token: str, role: Role) -> bool:
         return hmac.compare_digest(token.encode(), self._make_token(role).encode())
@@ -291,11 +307,14 @@ class OrderDesk:
     """The orders of all pages to the sites.
 
     Attributes:
-        replies: the answers that nobody has read yet: site, channel of the order, if it is accepted, text.
+        replies: the answers that nobody has read yet: site, channel of the order, if it is
+            accepted, text.
         refused: counts what is refused, and why.
     """
 
-    def __init__(self, bus: Bus, clock: Clock, session: str, refused: Counter[str] | None = None) -> None:
+    def __init__(
+        self, bus: Bus, clock: Clock, session: str, refused: Counter[str] | None = None
+    ) -> None:
         self._bus = bus
         self._clock = clock
         self._session = session
@@ -304,8 +323,11 @@ class OrderDesk:
         self.replies: list[tuple[str, str, bool, str]] = []
         self.refused: Counter[str] = Counter() if refused is None else refused
 
-    def order(self, order: Order, sites: Collection[str], links: Collection[str], source: str = "") -> None:
-        """Takes an order, if the session has the site or the link; it replaces one that waits for that.
+    def order(
+        self, order: Order, sites: Collection[str], links: Collection[str], source: str = ""
+    ) -> None:
+        """Takes an order, if the session has the site or the link; it replaces one that waits
+        for that.
 
         Args:
             order: the new values of a link, or a new row of shares.
@@ -352,7 +374,9 @@ class OrderDesk:
             if site not in sites:
                 self.refused["no such site"] += 1
             else:
-                self._wait(site, RELEASE, _name_source(ChangeRequest(order=order.order), source))
+                self._wait(
+                    site, RELEASE, _name_source(ChangeRequest(order=order.order), source)
+                )
 
     def _wait(self, site: str, subject: str, request: ChangeRequest) -> None:
         """Keeps a request until the site is asked; a newer one of the same subject replaces it."""
@@ -385,12 +409,20 @@ class OrderDesk:
                 del self._waiting[site, what]
                 self._ask(site, topics.SET, request)
 
-    def _take_reply(self, site: str, channel: str, request: ChangeRequest, reply: ChangeReply) -> None:
-        """Keeps an answer for the pages; a stop that was refused is ordered again without its source.
+    def _take_reply(
+        self, site: str, channel: str, request: ChangeRequest, reply: ChangeReply
+    ) -> None:
+        """Keeps an answer for the pages; a stop that was refused is ordered again without its
+        source.
 
-        A site of an older program knows no source and refuses the whole request; its arm has to stop too.
+        A site of an older program knows no source and refuses the whole request; its arm has to
+        stop too.
         """
-        if channel == topics.STOP and not reply.accepted and request.source is not msgspec.UNSET:
+        if (
+            channel == topics.STOP
+            and not reply.accepted
+            and request.source is not msgspec.UNSET
+        ):
             self._ask(site, channel, msgspec.structs.replace(request, source=msgspec.UNSET))
         else:
             self.replies.append((site, channel, reply.accepted, reply.text))
@@ -405,7 +437,9 @@ def _link_request(order: SetLink) -> ChangeRequest:
     """Returns the request of a link: constant delay, or one that jitters; or a preset."""
     to: dict[str, Any] = dict(order.to)
     if "preset" not in to and "delay_ms" in to:
-        jitters = all(str(to.get(key, 0.0)) not in ("0.0", "-0.0") for key in ("deviation_ms", "delay_ms"))
+        jitters = all(
+            str(to.get(key, 0.0)) not in ("0.0", "-0.0") for key in ("deviation_ms", "delay_ms")
+        )
         to["model"] = "gamma" if jitters else "constant"
         if not jitters:
             to.pop("deviation_ms", None)

@@ -1,13 +1,15 @@
-"""The page's server: its socket, and its files by HTTP, from one `websockets` server in a thread of its own.
+"""The page's server: its socket, and its files by HTTP, from one `websockets` server in a
+thread of its own.
 
-It is an onlooker of a session that is started for it, or of one that runs already: the session neither waits
-for it nor needs it, and runs on if it fails. In an experiment it shows one session after the other, with a
-stage around them. A browser is opened only where there is one.
+It is an onlooker of a session that is started for it, or of one that runs already: the session
+neither waits for it nor needs it, and runs on if it fails. In an experiment it shows one
+session after the other, with a stage around them. A browser is opened only where there is one.
 
-Invariant: newest state wins. A page gets its next frame when it has drawn one of those before, so that a slow
-page sees fewer frames and nobody waits for it. A page of another origin, without a token, with messages that
-are too many, too large or not of its role is refused and counted; nothing of it reaches a site. Places are
-kept by role (`page_entrance`). One thread serves all pages and takes in the session's messages.
+Invariant: newest state wins. A page gets its next frame when it has drawn one of those before,
+so that a slow page sees fewer frames and nobody waits for it. A page of another origin, without
+a token, with messages that are too many, too large or not of its role is refused and counted;
+nothing of it reaches a site. Places are kept by role (`page_entrance`). One thread serves all
+pages and takes in the session's messages.
 """
 
 import asyncio
@@ -71,14 +73,19 @@ if TYPE_CHECKING:  # an experiment's libraries are for experiments alone
     from .experiment_stage import Stage
 
 NICE = -5
-"""Priority of the page's threads and of those that bring its messages: above normal, below the sites' own."""
+"""Priority of the page's threads and of those that bring its messages: above normal, below the
+sites' own.
+"""
 FRAMES_PER_S = 30
 FRAMES_AHEAD = 2
-"""Frames that a page may have got and not drawn yet: one is on its way while it draws the other."""
+"""Frames that a page may have got and not drawn yet: one is on its way while it draws the
+other.
+"""
 MOST_EXCESS = 1_000
 """A page that sends so many more messages than it may is closed."""
 OPENING_S = 3.0
-"""Time for a connection to say what it wants: for the encryption, and again for its request, s."""
+"""Time for a connection to say what it wants: for the encryption, and again for its request, s.
+"""
 ANSWER_NS = 10_000_000_000
 """A page that holds an arm may say for so long whether another one takes part."""
 RESTART_S = 1.0
@@ -104,7 +111,9 @@ _NO_HTTP = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\nConnection: close\
 
 
 class Visitor(ServerConnection):
-    """One connection: what is no request of a page is counted, and answered with 400 if it is not HTTP."""
+    """One connection: what is no request of a page is counted, and answered with 400 if it is
+    not HTTP.
+    """
 
     refused: Counter[str]
     strangers: Strangers
@@ -147,7 +156,13 @@ class Page:
     """
 
     def __init__(
-        self, connection: ServerConnection, number: int, role: Role, hands: PageHands, *, takes_part: bool
+        self,
+        connection: ServerConnection,
+        number: int,
+        role: Role,
+        hands: PageHands,
+        *,
+        takes_part: bool,
     ) -> None:
         self.connection = connection
         self.number = number
@@ -170,9 +185,11 @@ class PageOptions:
 
     Attributes:
         port: 0: any.
-        insecure: true: another address than this machine's is allowed, though nothing is encrypted.
+        insecure: true: another address than this machine's is allowed, though nothing is
+            encrypted.
         opens: true: a browser is opened where there is one.
-        tls: the folder of a member's keys, by which page and socket are encrypted; None: they are not.
+        tls: the folder of a member's keys, by which page and socket are encrypted; None: they
+            are not.
     """
 
     host: str = "127.0.0.1"
@@ -195,7 +212,8 @@ class PageOptions:
         return context
 
     def check(self) -> None:
-        """Refuses an address that is taken, and to serve others without being told that it is not safe.
+        """Refuses an address that is taken, and to serve others without being told that it is
+        not safe.
 
         Raises:
             UsageError: with the reason.
@@ -210,7 +228,9 @@ class PageOptions:
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
             socket.create_server((self.host, self.port), family=family).close()
         except OSError as error:
-            raise UsageError(f"{self.host}:{self.port}: cannot listen: {error.strerror}") from None
+            raise UsageError(
+                f"{self.host}:{self.port}: cannot listen: {error.strerror}"
+            ) from None
 
 
 class PageServer:
@@ -273,10 +293,16 @@ class PageServer:
         self._thread.start()
         self._ready.wait()
         if self._problem is not None:
-            raise UsageError(f"{self._host}:{self._port}: cannot listen: {self._problem.strerror}")
+            raise UsageError(
+                f"{self._host}:{self._port}: cannot listen: {self._problem.strerror}"
+            )
         self._say(f"experimenter: {self.address}")
         screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        if self._opens and sys.stdout.isatty() and (screen or not sys.platform.startswith("linux")):
+        if (
+            self._opens
+            and sys.stdout.isatty()
+            and (screen or not sys.platform.startswith("linux"))
+        ):
             self._opening = BrowserOpening(self.address)
             self._opening.open()
         return self
@@ -290,7 +316,9 @@ class PageServer:
         self._opening.forget()
 
     def show(self, bus: Bus, session: str) -> None:
-        """Shows another session from now on; the bus of the one before is no longer used on return."""
+        """Shows another session from now on; the bus of the one before is no longer used on
+        return.
+        """
         self._next = bus, session
         while self._next is not None and self._thread.is_alive():
             self._clock.sleep_until(self._clock.monotonic_ns() + TURN_NS)
@@ -323,7 +351,9 @@ class PageServer:
                 asyncio.run(self._serve())
             except Exception as error:
                 if not self._ready.is_set():
-                    self._problem = error if isinstance(error, OSError) else OSError(0, str(error))
+                    self._problem = (
+                        error if isinstance(error, OSError) else OSError(0, str(error))
+                    )
                 else:
                     self._count_failure("server", error)
                     self._ending.wait(RESTART_S)
@@ -335,7 +365,9 @@ class PageServer:
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
     def _count_failure(self, of: str, error: Exception) -> None:
-        """Counts a failure, and says it the first time: no failure of the page is one of the session."""
+        """Counts a failure, and says it the first time: no failure of the page is one of the
+        session.
+        """
         reason = f"{of} failed: {type(error).__name__}"
         self.refused[reason] += 1
         with suppress(OSError, ValueError):  # no terminal any more
@@ -387,10 +419,14 @@ class PageServer:
         users = [name for name, spec in sites.items() if spec.role == "master"]
         users = users if self._stage is None else [*self._stage.users]
         for role in (*(Role("user", site) for site in users), Role("watcher")):
-            self._say(f"{role.kind} {role.site}".rstrip() + f": {self._links.link(self._base, role)}")
+            self._say(
+                f"{role.kind} {role.site}".rstrip() + f": {self._links.link(self._base, role)}"
+            )
 
     async def _tick(self) -> None:
-        """Takes in the session's messages and makes a frame, thirty times a second; failures end a turn."""
+        """Takes in the session's messages and makes a frame, thirty times a second; failures
+        end a turn.
+        """
         while True:
             begun_ns = self._clock.monotonic_ns()
             polls = self._desk.poll, self.view.poll, self._turn_over, self._poll_stage
@@ -406,7 +442,11 @@ class PageServer:
 
     def _poll_stage(self) -> None:
         if self._stage is not None:
-            users = [(page.role.site, page.number) for page in self._pages if page.role.kind == "user"]
+            users = [
+                (page.role.site, page.number)
+                for page in self._pages
+                if page.role.kind == "user"
+            ]
             for moment in self._stage.poll(self.view, users):
                 self._desk.mark(next(iter(self.view.sites)), moment)
 
@@ -459,7 +499,9 @@ class PageServer:
         assert role is not None  # or it would have been refused
         self._met += 1
         hands = PageHands(self._bus, self._clock, self.view.session, f"page {self._met}")
-        alone = role.kind == "experimenter" and not any(one.takes_part for one in self.experimenters)
+        alone = role.kind == "experimenter" and not any(
+            one.takes_part for one in self.experimenters
+        )
         page = Page(connection, self._met, role, hands, takes_part=alone or role.kind == "user")
         self._make_room(role)
         self._pages.add(page)
@@ -483,7 +525,9 @@ class PageServer:
             self._pages.discard(page)
 
     def _make_room(self, role: Role) -> None:
-        """Closes the page that gives way to a new page of a role, if all places of that role are taken."""
+        """Closes the page that gives way to a new page of a role, if all places of that role
+        are taken.
+        """
         page = choose_to_leave(self._pages, role)
         if page is None:
             return
@@ -548,7 +592,9 @@ class PageServer:
             else:
                 page.hands.move(message, pushes=site.hand.mode == "force")
         elif isinstance(message, StageMessage):
-            asked = self._stage is not None and self._stage.take(page.role.site, page.number, message)
+            asked = self._stage is not None and self._stage.take(
+                page.role.site, page.number, message
+            )
             self.refused["was not asked"] += not asked
         elif isinstance(message, EndSession) and self._ends:
             self.end_requested.set()
@@ -578,7 +624,9 @@ class PageServer:
         self.refused["was not asked"] += 1
 
     def _settle_asked(self) -> None:
-        """Lets pages take part that nobody has answered, if whom they asked has gone or holds no arm."""
+        """Lets pages take part that nobody has answered, if whom they asked has gone or holds
+        no arm.
+        """
         now_ns = self._clock.monotonic_ns()
         for page in self._pages:
             here = page.asks[0] & self._pages if page.asks is not None else set()
@@ -588,7 +636,11 @@ class PageServer:
 
     def _list_held(self, page: Page) -> list[str]:
         sites = (self._frame or {}).get("sites", {})
-        return [name for name, site in sites.items() if page.hands.holds(name, site.get("source", 0))]
+        return [
+            name
+            for name, site in sites.items()
+            if page.hands.holds(name, site.get("source", 0))
+        ]
 
     async def _send(self, page: Page) -> None:
         """Sends a page what is newest, again and again, each time it has drawn what it got."""
@@ -604,12 +656,16 @@ class PageServer:
                     continue
                 scenario = self.view.scenario
                 if scenario is not None and page.role.site not in ("", *scenario.names):
-                    return await page.connection.close(_POLICY_VIOLATION, "the session has no such site")
+                    return await page.connection.close(
+                        _POLICY_VIOLATION, "the session has no such site"
+                    )
                 page.notified = page.sent
                 page.sent = self._n
                 page.unseen.append(page.sent)
                 try:
-                    payload = encode(self._frame_for(page) if page.greeted and begins else self._greet(page))
+                    payload = encode(
+                        self._frame_for(page) if page.greeted and begins else self._greet(page)
+                    )
                 except Exception as error:
                     self._count_failure("frame", error)
                     continue
@@ -620,7 +676,13 @@ class PageServer:
         role = page.role
         about = self._frames.describe_narrowed() if role.site else self._frames.describe()
         ends = self._ends and role.kind == "experimenter"
-        shown = {"role": role.kind, "as": role.site, "n": self._n, "ends": ends, **self._describe_stage(page)}
+        shown = {
+            "role": role.kind,
+            "as": role.site,
+            "n": self._n,
+            "ends": ends,
+            **self._describe_stage(page),
+        }
         return {"hello": {**about, **shown}}
 
     def _describe_stage(self, page: Page, t_s: float | None = None) -> dict[str, Any]:
@@ -632,8 +694,12 @@ class PageServer:
         notices = [one for one in self._notices if one["n"] > page.notified]
         if page.role.kind != "experimenter":
             # The answers of sites name keys and commands, which only an experimenter can use.
-            stops = [notice for notice in notices if notice["of"] == topics.STOP and not notice["ok"]]
-            notices = [{**notice, "text": f"{notice['site']} was not stopped"} for notice in stops]
+            stops = [
+                notice for notice in notices if notice["of"] == topics.STOP and not notice["ok"]
+            ]
+            notices = [
+                {**notice, "text": f"{notice['site']} was not stopped"} for notice in stops
+            ]
         shown = self._show_as(page.role.site) if page.role.site else self._show_all(page)
         return {
             "n": self._n,
@@ -644,7 +710,11 @@ class PageServer:
             "pages": len(self._pages),
             "takes_part": page.takes_part,
             "asks": page.asks is not None,
-            "asked": [one.number for one in self._pages if one.asks is not None and page in one.asks[0]],
+            "asked": [
+                one.number
+                for one in self._pages
+                if one.asks is not None and page in one.asks[0]
+            ],
             "holds": self._list_held(page),
             "refused": sum(self.refused.values()),
             **self._describe_stage(page, shown["t"]),
@@ -658,7 +728,9 @@ class PageServer:
         return {**self._known[site], "points": [], "energies": [], "events": []}
 
     def _show_all(self, page: Page) -> dict[str, Any]:
-        """Returns what is, and what has been added to plots and events since the page's last frame."""
+        """Returns what is, and what has been added to plots and events since the page's last
+        frame.
+        """
         frames = self._frames
         view = self.view
         first = page.points == 0 and page.energies == 0
@@ -673,7 +745,9 @@ class PageServer:
 
 
 class PageAttendant(ExitStack):
-    """The page of a session that is run here; a context, as the page outlives the session for its report."""
+    """The page of a session that is run here; a context, as the page outlives the session for
+    its report.
+    """
 
     def __init__(self, options: PageOptions, clock: Clock) -> None:
         super().__init__()
@@ -685,7 +759,9 @@ class PageAttendant(ExitStack):
     def attend(
         self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
     ) -> Iterator[Callable[[], bool]]:
-        """The `SessionAttendant` that serves the page, until that asks for the end of the session."""
+        """The `SessionAttendant` that serves the page, until that asks for the end of the
+        session.
+        """
         bus = self.enter_context(closing(ZenohBus([], endpoints)))
         page = PageServer(bus, self._clock, session, self._options, ends=True, say=say)
         self._page = self.enter_context(page)
@@ -693,7 +769,8 @@ class PageAttendant(ExitStack):
         self._page.tell_refused()
 
     def offer(self, paths: Iterable[Path]) -> None:
-        """Offers files of the ended session to experimenters while their page is open, or until Ctrl-C.
+        """Offers files of the ended session to experimenters while their page is open, or until
+        Ctrl-C.
 
         The address of a file cannot be guessed, and only these pages are told.
         """

@@ -1,10 +1,12 @@
-"""Frames of a session for pages: what never changes, what is now, and the newest points of the plots.
+"""Frames of a session for pages: what never changes, what is now, and the newest points of the
+plots.
 
-Invariant: a frame is a function of the records since the frame before; whatever a page misses, the next is
-whole. Extremes between two frames are kept. Forces are those ON the arm, N; of people and of the law by the
-transpose of the Jacobian, which near a singular pose gives the least force that explains the torque. A frame
-as one site knows the session shows of a peer nothing but its pose at one tick: that of the sample that the
-site has in use, or to which the picture of the site's user has come (`SessionView.find_shown`).
+Invariant: a frame is a function of the records since the frame before; whatever a page misses,
+the next is whole. Extremes between two frames are kept. Forces are those ON the arm, N; of
+people and of the law by the transpose of the Jacobian, which near a singular pose gives the
+least force that explains the torque. A frame as one site knows the session shows of a peer
+nothing but its pose at one tick: that of the sample that the site has in use, or to which the
+picture of the site's user has come (`SessionView.find_shown`).
 """
 
 import math
@@ -14,7 +16,12 @@ from typing import Any
 import numpy as np
 
 from trilat_net.analysis.aligned import AlignedRecords
-from trilat_net.analysis.arm_rows import EndEffectorRows, build_arm_rows, joint_positions_m, upright_axes
+from trilat_net.analysis.arm_rows import (
+    EndEffectorRows,
+    build_arm_rows,
+    joint_positions_m,
+    upright_axes,
+)
 from trilat_net.analysis.body_turns import BodyTurns
 from trilat_net.analysis.torque_sources import TorqueSplit, list_walls, split_torque, wall_force
 from trilat_net.core.live_hand import HandInForce
@@ -35,7 +42,9 @@ COLOURS = 6
 LONGEST_FRAME_S = 0.5
 """A frame looks at no more records than this, s."""
 _LEAST_SINGULAR_VALUE = 0.05
-"""Forces along directions in which the end effector moves less are not told apart from none, m/rad."""
+"""Forces along directions in which the end effector moves less are not told apart from none,
+m/rad.
+"""
 
 Json = dict[str, Any]
 
@@ -56,7 +65,9 @@ class ArmFrames:
         self._walls = list_walls(self._spec)
         self._hand = self._spec.find_live_hand()
         counts = self._model.counts.joints
-        limits = np.broadcast_to(np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64), (counts,))
+        limits = np.broadcast_to(
+            np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64), (counts,)
+        )
         self._tau_limit = limits
         self._rows = build_arm_rows(scenario, site)
 
@@ -64,7 +75,9 @@ class ArmFrames:
         """Returns what never changes."""
         chain = self._model.chain
         places = self._scenario.order_palette(COLOURS)
-        start = joint_positions_m(self._model, np.array([self._spec.q0_rad], dtype=np.float64))[0]
+        start = joint_positions_m(self._model, np.array([self._spec.q0_rad], dtype=np.float64))[
+            0
+        ]
         reach = float(np.linalg.norm(np.diff(start, axis=0), axis=1).sum())
         return {
             "role": self._spec.role,
@@ -97,14 +110,23 @@ class ArmFrames:
 
     def pose(self, q: Array) -> Json:
         """Returns the arm at its joints' coordinates q, shape (n,), rad."""
-        return {"points": _rounded(joint_positions_m(self._model, q[np.newaxis])[0]), "q": _rounded(q)}
+        return {
+            "points": _rounded(joint_positions_m(self._model, q[np.newaxis])[0]),
+            "q": _rounded(q),
+        }
 
     def at_start(self) -> Json:
         """Returns the arm as a scenario places it: before tick 0."""
-        return {**self.pose(np.array(self._spec.q0_rad, dtype=np.float64)), "tick": -1, "bodies": []}
+        return {
+            **self.pose(np.array(self._spec.q0_rad, dtype=np.float64)),
+            "tick": -1,
+            "bodies": [],
+        }
 
     def now(self, own: AlignedRecords) -> tuple[Json, list[float]]:
-        """Returns the arm in the last of some records, and extremes over all: |e|, torque, hand, wall."""
+        """Returns the arm in the last of some records, and extremes over all: |e|, torque,
+        hand, wall.
+        """
         split = split_torque(own, self._scenario)
         last = slice(len(own.known) - 1, None)
         hand = self._hand_force(own, split)
@@ -136,19 +158,31 @@ class ArmFrames:
         hand = self._hand
         limited = False
         if hand is not None and hand.mode != "joint" and held.source:
-            limited = float(np.linalg.norm(force)) >= held.grip * hand.force_limit_n * (1.0 - 1e-6)
-        shown = held.target if hand is not None and hand.mode == "tip" and held.grip > 0.0 else None
-        return {"grip": held.grip, "source": held.source, "target": shown, "hand_limited": limited}
+            limited = float(np.linalg.norm(force)) >= held.grip * hand.force_limit_n * (
+                1.0 - 1e-6
+            )
+        shown = (
+            held.target if hand is not None and hand.mode == "tip" and held.grip > 0.0 else None
+        )
+        return {
+            "grip": held.grip,
+            "source": held.source,
+            "target": shown,
+            "hand_limited": limited,
+        }
 
     def _hand_force(self, own: AlignedRecords, split: TorqueSplit) -> Array:
         """Returns the force of people at the end effector, shape (K, 2) or (K, 3), N."""
         torque = split.operator
-        if not self._spec.hands and np.abs(torque).max() < 1e-9 * (1.0 + np.abs(own.tau_x).max()):
+        if not self._spec.hands and np.abs(torque).max() < 1e-9 * (
+            1.0 + np.abs(own.tau_x).max()
+        ):
             return np.zeros_like(split.end_effector.at)
         return split.end_effector.find_force(torque, _LEAST_SINGULAR_VALUE)
 
     def _find_pull(self, own: AlignedRecords, split: TorqueSplit) -> list[float]:
-        """Returns the force with which the law pulls the end effector, which a user feels, at the end.
+        """Returns the force with which the law pulls the end effector, which a user feels, at
+        the end.
 
         It is that of the torque beyond what carries the arm; [] if nobody knows the masses.
         """
@@ -189,12 +223,17 @@ class SessionFrames:
         """Returns the session as a page needs it once: sites, links, columns of the plots."""
         view = self._view
         scenario = self._view.scenario
-        if scenario is not None and not self._arms:  # before it runs: the compiled arms take seconds to load
+        # before it runs: the compiled arms take seconds to load
+        if scenario is not None and not self._arms:
             self._arms = {site: ArmFrames(scenario, site) for site in scenario.names}
             self._shapes = {site: arm.describe() for site, arm in self._arms.items()}
         if scenario is None or not view.running:
             here = sorted(view.met)
-            sites = [] if scenario is None else [name for name in scenario.names if name not in view.met]
+            sites = (
+                []
+                if scenario is None
+                else [name for name in scenario.names if name not in view.met]
+            )
             waiting = {"running": False, "title": "", "here": here, "missing": sites}
             return {"session": view.session, **waiting}
         links = {name: list(name.split("->")) for name in scenario.links}
@@ -208,7 +247,11 @@ class SessionFrames:
             "sites": self._shapes,
             "links": links,
             "shares": {site: scenario.dominance[site] for site in scenario.names},
-            "columns": [f"{site}.{kind}" for site in scenario.names for kind in ("e", "tau", "hand", "wall")]
+            "columns": [
+                f"{site}.{kind}"
+                for site in scenario.names
+                for kind in ("e", "tau", "hand", "wall")
+            ]
             + [f"{link}.age" for link in scenario.links],
         }
 
@@ -229,9 +272,13 @@ class SessionFrames:
         links = {name: self._link_now(name) for name in view.links}
         row += [link["age_ms"] for link in links.values()]
         if any(site["new"] for site in sites.values()):
-            self.points.add([round(t_s, 4), *(None if x is None else float(f"{x:.5g}") for x in row)])
+            self.points.add(
+                [round(t_s, 4), *(None if x is None else float(f"{x:.5g}") for x in row)]
+            )
         course = view.advance_energy()
-        for t_energy_s, V, supplied in zip(*(column.tolist() for column in course or ()), strict=True):
+        for t_energy_s, V, supplied in zip(
+            *(column.tolist() for column in course or ()), strict=True
+        ):
             if t_energy_s >= self._energy_s + ENERGY_EVERY_S - 1e-9:
                 self._energy_s = t_energy_s
                 self.energies.add([t_energy_s, V, supplied])
@@ -254,7 +301,8 @@ class SessionFrames:
         return {**about, **hidden} if about["running"] else about
 
     def narrow(self, frame: Json, site: str, *, ages: bool) -> Json:
-        """Returns a frame as one site knows the session: its own arm now, its peers as shown to its user.
+        """Returns a frame as one site knows the session: its own arm now, its peers as shown to
+        its user.
 
         Args:
             frame: the newest that `make` has returned.
@@ -336,18 +384,28 @@ class SessionFrames:
             age_ms = record.t_ns / 1e6 - used * 1e3 / rate_hz
         newest = other.record.tick if other.record else used
         shown = ("delay_us", -1), ("accepted", 0), ("late", 0), ("lost", 0)
-        counts = {} if stats is None else {key: getattr(stats, key).get(peer, none) for key, none in shown}
+        counts = (
+            {}
+            if stats is None
+            else {key: getattr(stats, key).get(peer, none) for key, none in shown}
+        )
         return {
             "age_ms": age_ms,
             "under_way": max(0, min(newest - used, 100_000)) if used >= 0 else 0,
-            "stated": {key: value for key, value in table.items() if isinstance(value, str | int | float)},
+            "stated": {
+                key: value
+                for key, value in table.items()
+                if isinstance(value, str | int | float)
+            },
             "share": view.dominance.get(receiver, {}).get(peer, 0.0),
             **counts,
         }
 
 
 def _show_alarm(alarm: LifeAlarm) -> Json:
-    """Returns an alarm for a page, whose button gives the order: no page shows a command of a shell."""
+    """Returns an alarm for a page, whose button gives the order: no page shows a command of a
+    shell.
+    """
     advice = alarm.before if alarm.order else alarm.advice
     return {"word": alarm.word, "reason": alarm.reason, "advice": advice, "order": alarm.order}
 

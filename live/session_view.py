@@ -1,11 +1,13 @@
 """What a session does now: the records, statistics and events of its sites as they come in.
 
 Invariant:
-- Every record counts. What is missing is asked for as a recorder asks, from the same buffers, so that
-  energies are those of the log; a page is shown fewer, and always the newest.
-- A view that begins late asks for no records from before it, and for all events, which say what was changed.
-- A site has ended if its `end` message says so, and never because it is silent: on a busy machine a running
-  site may be silent for long, and its records are taken in when they come again.
+- Every record counts. What is missing is asked for as a recorder asks, from the same buffers,
+  so that energies are those of the log; a page is shown fewer, and always the newest.
+- A view that begins late asks for no records from before it, and for all events, which say what
+  was changed.
+- A site has ended if its `end` message says so, and never because it is silent: on a busy
+  machine a running site may be silent for long, and its records are taken in when they come
+  again.
 """
 
 from collections import Counter, deque
@@ -16,7 +18,12 @@ import msgspec
 
 from recorder.backfill import GapRepair
 from recorder.site_reception import InboundMessage, InboundQueue, SiteReception
-from trilat_net.analysis.certificate.running_energy import KEPT_S, EnergyCourse, RecordWindow, RunningEnergy
+from trilat_net.analysis.certificate.running_energy import (
+    KEPT_S,
+    EnergyCourse,
+    RecordWindow,
+    RunningEnergy,
+)
 from trilat_net.core.live_hand import TAKEN
 from trilat_net.core.ticks import NS_PER_S, LifeAlarm, find_alarm
 from trilat_net.errors import ScenarioError, WireError
@@ -52,7 +59,9 @@ class Tail(Generic[T]):
         self.count += 1
 
     def since(self, count: int, most: int) -> list[T]:
-        """Returns the entries after the first `count`, of those that are kept; the newest `most` of them."""
+        """Returns the entries after the first `count`, of those that are kept; the newest
+        `most` of them.
+        """
         new = min(self.count - count, most, len(self._entries))
         return [self._entries[n] for n in range(len(self._entries) - new, len(self._entries))]
 
@@ -65,12 +74,19 @@ class SiteView:
         holds_from: its first tick that was seen.
         holder: who took hold of its arm last.
         stopped_by: who ordered its last stop, as far as its events say.
-        bodies: poses of its plant's bodies by tick, as far back as the window reaches; {} without bodies.
+        bodies: poses of its plant's bodies by tick, as far back as the window reaches; {}
+            without bodies.
         layout: of its records, if it may go on without a lost one of its peers; else None.
     """
 
     def __init__(
-        self, bus: Bus, session: str, scenario: Scenario, name: str, boot: int, window: RecordWindow
+        self,
+        bus: Bus,
+        session: str,
+        scenario: Scenario,
+        name: str,
+        boot: int,
+        window: RecordWindow,
     ) -> None:
         rule = scenario.sites[name].on_stale
         self.glides = rule.action == "glide"
@@ -94,7 +110,14 @@ class SiteView:
         if record is None or not self.glides or self.ended:
             return None
         lost = self.layout.find_lost(record.mem, self.peers) if self.layout is not None else ()
-        alarm = find_alarm(session, name, record.mode, record.mem, len(record.q_des), lost)
+        alarm = find_alarm(
+            session=session,
+            site=name,
+            mode=record.mode,
+            mem=record.mem,
+            shared=len(record.q_des),
+            lost=lost,
+        )
         if alarm is not None and alarm.order == "enable" and self.stopped_by:
             return alarm._replace(reason=f"ordered by {self.stopped_by}")
         return alarm
@@ -106,7 +129,9 @@ class SiteView:
 
     @property
     def complete(self) -> int:
-        """The last tick up to which all records are there or cannot be had; -1 before the first."""
+        """The last tick up to which all records are there or cannot be had; -1 before the
+        first.
+        """
         account = self.reception.accounts[topics.STATE]
         gap = account.wanted()
         return account.last if gap is None else gap[0] - 1
@@ -151,10 +176,14 @@ class SessionView:
     @property
     def ended(self) -> bool:
         """True once every site has said that it ends, or `finish` was called."""
-        return self.running and (self._finished or all(site.ended for site in self.sites.values()))
+        return self.running and (
+            self._finished or all(site.ended for site in self.sites.values())
+        )
 
     def finish(self) -> None:
-        """Shows the session as ended: whoever has started its sites knows that their processes are gone."""
+        """Shows the session as ended: whoever has started its sites knows that their processes
+        are gone.
+        """
         self._finished = True
 
     def silence_s(self, site: SiteView) -> float:
@@ -190,11 +219,15 @@ class SessionView:
             # A silent site is asked too: its answer may be the `end` message that was lost.
             for channel, message, _ in site.repair.poll(now_ns, alive=not site.ended):
                 self._keep(name, site, channel, message.content)
-        newest_ns = max((site.record.t_ns for site in self.sites.values() if site.record), default=0)
+        newest_ns = max(
+            (site.record.t_ns for site in self.sites.values() if site.record), default=0
+        )
         self.links.advance(newest_ns)
 
     def advance_energy(self) -> EnergyCourse | None:
-        """Returns V at the ticks of which all records have come since the last call; None without any."""
+        """Returns V at the ticks of which all records have come since the last call; None
+        without any.
+        """
         complete = {name: site.complete for name, site in self.sites.items()}
         return None if self.energy is None else self.energy.advance(complete)
 
@@ -217,7 +250,9 @@ class SessionView:
         if self.scenario is None:
             return
         boots = {name: self.met[name].boot for name in self.scenario.names if name in self.met}
-        if len(boots) == len(self.scenario.names) and all(self.met[name].running for name in boots):
+        if len(boots) == len(self.scenario.names) and all(
+            self.met[name].running for name in boots
+        ):
             self._begin(self.scenario, boots)
 
     def _begin(self, scenario: Scenario, boots: dict[str, int]) -> None:
@@ -226,7 +261,14 @@ class SessionView:
         self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
         self.energy = RunningEnergy(scenario, windows)
         self.sites = {
-            name: SiteView(self.bus, self.session, scenario, name, boots[name], windows[name])
+            name: SiteView(
+                bus=self.bus,
+                session=self.session,
+                scenario=scenario,
+                name=name,
+                boot=boots[name],
+                window=windows[name],
+            )
             for name in scenario.names
         }
 
@@ -239,7 +281,9 @@ class SessionView:
             try:
                 message = site.reception.read(parts.channel, payload)
             except WireError:
-                if parts.channel != topics.EVENT or not self._begin_start(parts.member, payload):
+                if parts.channel != topics.EVENT or not self._begin_start(
+                    parts.member, payload
+                ):
                     raise
                 message = site.reception.read(parts.channel, payload)
             if site.record is None and site.stats is None and parts.channel != topics.EVENT:
@@ -251,7 +295,11 @@ class SessionView:
         """Goes over to another start of a site, if that says that it joins."""
         event = decode(payload, Event)
         site = self.sites[name]
-        joins = event.kind == "join" and event.member == name and event.boots.get(name) == event.boot
+        joins = (
+            event.kind == "join"
+            and event.member == name
+            and event.boots.get(name) == event.boot
+        )
         if not joins or self.scenario is None or not self.scenario.sites_may_return:
             return False
         site.reception = SiteReception(self.scenario, name, event.boot, site.reception)
@@ -268,7 +316,9 @@ class SessionView:
             site.reception.accounts[channel].give_up(tick)
         site.repair.probe()
 
-    def _keep(self, name: str, site: SiteView, channel: str, content: State | LinkStats | Event) -> None:
+    def _keep(
+        self, name: str, site: SiteView, channel: str, content: State | LinkStats | Event
+    ) -> None:
         if isinstance(content, State):
             if site.record is None or content.tick > site.record.tick:
                 site.record = content

@@ -1,4 +1,5 @@
-"""A session that runs already, watched until it ends: by `trilat watch` in a terminal, by a page elsewhere.
+"""A session that runs already, watched until it ends: by `trilat watch` in a terminal, by a
+page elsewhere.
 
 Where standard input is a terminal, a key stops every arm.
 """
@@ -27,8 +28,12 @@ from .session_view import SessionView
 POLL_NS = 20_000_000
 STOP_KEYS = frozenset(" sS")
 
-SessionOnlooker = Callable[[Bus], AbstractContextManager[tuple[SessionView, Callable[[], None]]]]
-"""Given a bus that reaches a session, a context that shows it: its view, and what is to be called often."""
+SessionOnlooker = Callable[
+    [Bus], AbstractContextManager[tuple[SessionView, Callable[[], None]]]
+]
+"""Given a bus that reaches a session, a context that shows it: its view, and what is to be
+called often.
+"""
 
 
 def watch_session(
@@ -39,7 +44,8 @@ def watch_session(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> int:
-    """Shows a session that runs already, until it ends or a signal comes; returns the exit code.
+    """Shows a session that runs already, until it ends or a signal comes; returns the exit
+    code.
 
     Raises:
         SessionError: the session is not there, or no site answers in time.
@@ -60,7 +66,9 @@ def watch_session(
                     look()
                     now_ns = clock.monotonic_ns()
                     if now_ns > give_up_ns and not view.met:
-                        raise SessionError(f"no site of session {session!r} answered within {timeout_s:g} s")
+                        raise SessionError(
+                            f"no site of session {session!r} answered within {timeout_s:g} s"
+                        )
                     clock.sleep_until(now_ns + POLL_NS)
         if stopped():
             return interrupt.exit_code
@@ -69,7 +77,9 @@ def watch_session(
 
 
 class SessionWatch:
-    """What is shown of a session, or of it to the user of one site; `update` takes in what has come."""
+    """What is shown of a session, or of it to the user of one site; `update` takes in what has
+    come.
+    """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, as_site: str = "") -> None:
         self.view = SessionView(bus, clock, session)
@@ -83,7 +93,9 @@ class SessionWatch:
         if self._as_site and view.scenario is not None:
             find_site(view.scenario, self._as_site)
         if (course := view.advance_energy()) is not None:
-            self._V = f"V = {course.V[-1]:.4g} J at {course.t_s[-1]:.1f} s, people and walls gave "
+            self._V = (
+                f"V = {course.V[-1]:.4g} J at {course.t_s[-1]:.1f} s, people and walls gave "
+            )
             self._V += f"{course.supplied[-1]:.4g} J"
         elif view.energy is not None and view.energy.reason:
             self._V = f"no V: {view.energy.reason}"
@@ -111,7 +123,9 @@ class SessionWatch:
         return [(name, alarm) for name, alarm in found if alarm is not None]
 
     def rows(self) -> list[SiteRow]:
-        """Returns the row of each site; of a peer of the site that is watched, what its user is shown."""
+        """Returns the row of each site; of a peer of the site that is watched, what its user is
+        shown.
+        """
         view = self.view
         scenario = self.view.scenario
         own = self._as_site
@@ -128,7 +142,9 @@ class SessionWatch:
             if scenario is not None and own in ("", name)
         }
         record = view.sites[own].record if own in every else None
-        for peer, tick in view.find_shown(own, record.tick, record.used).items() if record else ():
+        for peer, tick in (
+            view.find_shown(own, record.tick, record.used).items() if record else ()
+        ):
             window = view.sites[peer].window
             seen = {"site": peer}
             if window.knows(tick):
@@ -152,7 +168,9 @@ def show_in_terminal(
         def look() -> None:
             watch.update()
             if read_keys is not None and STOP_KEYS.intersection(read_keys()):
-                display.say("stopping every arm" if watch.view.running else "the session has not begun")
+                display.say(
+                    "stopping every arm" if watch.view.running else "the session has not begun"
+                )
                 desk.stop(watch.view.sites, "a watcher at a terminal")
             desk.poll()
             while desk.replies:
@@ -165,7 +183,9 @@ def show_in_terminal(
 
 @contextmanager
 def _read_keys() -> Iterator[Callable[[], str] | None]:
-    """Yields what returns the keys pressed since it was asked last; None without a terminal of ours."""
+    """Yields what returns the keys pressed since it was asked last; None without a terminal of
+    ours.
+    """
     try:
         import termios
         import tty
@@ -174,7 +194,13 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
         if os.tcgetpgrp(keyboard) != os.getpgrp():  # its keys go to another program
             raise OSError
         before = termios.tcgetattr(keyboard)
-    except (ImportError, OSError, ValueError, AttributeError):  # no terminal, or a system without them
+    # no terminal, or a system without them
+    except (
+        ImportError,
+        OSError,
+        ValueError,
+        AttributeError,
+    ):
         yield None
         return
 

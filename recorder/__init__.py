@@ -1,1 +1,3 @@
-"""Records every channel of a session into one MCAP file (`record_process`), and plays logs (`play`)."""
+"""Records every channel of a session into one MCAP file (`record_process`), and plays logs
+(`play`).
+"""

@@ -1,10 +1,11 @@
 """Gap repair: requests missing messages from one site's retransmission buffer.
 
-Invariant: at most one request is outstanding, none is sent while nothing is missing, and a message that the
-site does not have is not requested twice. Backfilled messages pass the same checks as live ones.
+Invariant: at most one request is outstanding, none is sent while nothing is missing, and a
+message that the site does not have is not requested twice. Backfilled messages pass the same
+checks as live ones.
 
-A site that is silent for too long is asked for its newest messages, so a lost tail, a lost end and lost
-statistics are noticed. Time is an argument; nothing waits.
+A site that is silent for too long is asked for its newest messages, so a lost tail, a lost end
+and lost statistics are noticed. Time is an argument; nothing waits.
 """
 
 from collections import Counter
@@ -22,7 +23,9 @@ from .site_reception import SiteMessage, SiteReception
 GRACE_NS = 50_000_000
 """Time for a message that may only be late, before it is requested."""
 SILENT_NS = 1_000_000_000
-"""Silence, and three periods of the site, after which the site is asked for its newest messages."""
+"""Silence, and three periods of the site, after which the site is asked for its newest
+messages.
+"""
 ANSWER_NS = (300_000_000, 3_000_000_000)
 """First and longest timeout of a request; it doubles after each request without an answer."""
 REST_NS = 250_000_000
@@ -41,7 +44,12 @@ class GapRepair:
     """The requests to one site; `dropped` counts its invalid answers by reason."""
 
     def __init__(
-        self, bus: Bus, session: str, reception: SiteReception, dropped: Counter[str], now_ns: int = 0
+        self,
+        bus: Bus,
+        session: str,
+        reception: SiteReception,
+        dropped: Counter[str],
+        now_ns: int = 0,
     ) -> None:
         self._progress_ns = self._polled_ns = now_ns
         self._bus = bus
@@ -53,7 +61,9 @@ class GapRepair:
         self._probed_ns = now_ns
         self._next = dict.fromkeys(SITE_CHANNELS, 0)
         self._vain = dict.fromkeys(SITE_CHANNELS, 0)
-        self._open: tuple[BackfillRequest, Inbox, int] | None = None  # its answers, when it was sent
+        self._open: tuple[BackfillRequest, Inbox, int] | None = (
+            None  # its answers, when it was sent
+        )
         self._due_ns: int | None = None
         # fewer messages per request while answers do not arrive
         self._timeout_ns = ANSWER_NS[0]
@@ -73,7 +83,9 @@ class GapRepair:
             yield from self._read_answers(*self._open, now_ns)
         if alive:
             silent_ns = now_ns - max(self._reception.heard_ns or 0, self._probed_ns)
-            if self._reception.made is None and silent_ns > max(SILENT_NS, 3 * self._reception.period_ns):
+            if self._reception.made is None and silent_ns > max(
+                SILENT_NS, 3 * self._reception.period_ns
+            ):
                 self._probed_ns = now_ns
                 self.probe()
             if self._open is None:
@@ -131,10 +143,14 @@ class GapRepair:
         past = decode(payload, Backfill)
         self._reception.check_sender(past)
         if past.channel != wanted.channel or past.first > max(past.made, wanted.first):
-            raise WireError("out of range", f"{past.channel} from {past.first} on, of {past.made}")
+            raise WireError(
+                "out of range", f"{past.channel} from {past.first} on, of {past.made}"
+            )
         return past
 
-    def _take(self, past: Backfill, wanted: BackfillRequest, now_ns: int) -> Iterator[RepairedMessage]:
+    def _take(
+        self, past: Backfill, wanted: BackfillRequest, now_ns: int
+    ) -> Iterator[RepairedMessage]:
         channel = past.channel
         account = self._reception.accounts[channel]
         self._probes.discard(channel)
@@ -148,7 +164,9 @@ class GapRepair:
             try:
                 message = self._reception.read(channel, payload)
                 if message.number != number:
-                    raise WireError("out of range", f"{channel} {message.number} in the place of {number}")
+                    raise WireError(
+                        "out of range", f"{channel} {message.number} in the place of {number}"
+                    )
             except WireError as error:
                 self._dropped[error.reason] += 1
                 continue

@@ -1,8 +1,9 @@
 """The recorder as one process: find and join a session, write its messages, end with it.
 
-Invariant: no message is lost that arrived, or that a site still buffers. Messages are stamped on arrival and
-wait in one bounded queue; one thread writes. The file is flushed every 100 ms and completed on every orderly
-end of the process. A signal ends it when it has what the sites hold, a second one at once.
+Invariant: no message is lost that arrived, or that a site still buffers. Messages are stamped
+on arrival and wait in one bounded queue; one thread writes. The file is flushed every 100 ms
+and completed on every orderly end of the process. A signal ends it when it has what the sites
+hold, a second one at once.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,9 +33,13 @@ from .site_reception import InboundQueue
 POLL_NS = 10_000_000
 END_S = 10
 END_NS = END_S * 1_000_000_000
-"""Longest time after a signal for what the sites still hold; they hold it as long as that, see `sites`."""
+"""Longest time after a signal for what the sites still hold; they hold it as long as that, see
+`sites`.
+"""
 FLUSH_NS = 65_000_000
-"""Between two turns of writing, each of which ends in a flush: a crash loses this. Fewer turns cost less."""
+"""Between two turns of writing, each of which ends in a flush: a crash loses this. Fewer turns
+cost less.
+"""
 
 
 class Recorder:
@@ -48,8 +53,8 @@ class Recorder:
         storage: where the log goes.
         stopped: returns True once it is to end at once.
         say: prints a line for the user.
-        is_ending: returns True once it is to end as soon as it has what the sites hold, after `END_NS`
-            at most.
+        is_ending: returns True once it is to end as soon as it has what the sites hold, after
+            `END_NS` at most.
     """
 
     def __init__(
@@ -77,10 +82,13 @@ class Recorder:
         info = describe_member(topics.RECORDER, boot, clock)
         keep = partial(self._queue.take, topics.key(session, topics.RECORDER, topics.EVENT))
         self._publisher = EventPublisher(bus, session, info, keep)
-        self._joining = SessionJoin(bus, clock, session, self._publisher, ())
+        self._joining = SessionJoin(
+            bus=bus, clock=clock, session=session, publisher=self._publisher, sites=()
+        )
 
     def join(self, timeout_s: float | None) -> Epoch | None:
-        """Waits for a session to begin, without a timeout for ever; returns its epoch, or None if `stopped`.
+        """Waits for a session to begin, without a timeout for ever; returns its epoch, or None
+        if `stopped`.
 
         Raises:
             SessionError: none began in time.
@@ -122,9 +130,22 @@ class Recorder:
             )
 
         with LogParts(self._storage, begin) as log:
-            recording = Recording(log, scenario, self._session, epoch, self._bus, self._publisher)
+            recording = Recording(
+                writer=log,
+                scenario=scenario,
+                session=self._session,
+                epoch=epoch,
+                bus=self._bus,
+                publisher=self._publisher,
+            )
             log.so_far = partial(recording.account_texts, self._queue)
-            report = RecorderReport(self._bus, self._clock, recording, self._queue, lambda: log.written_bytes)
+            report = RecorderReport(
+                bus=self._bus,
+                clock=self._clock,
+                recording=recording,
+                queue=self._queue,
+                size=lambda: log.written_bytes,
+            )
             self._begin(recording, epoch, log.path)
             has_room = True  # on a full disk there is none for the queue
             try:
@@ -202,15 +223,16 @@ def record_session(
         join_timeout_s: how long to wait for the session to begin, s, or None.
         clock: the time.
         say: prints a line for the user.
-        afterwards: works on the finished log of a session that was not interrupted. The recorder remains a
-            member until that is done: sites with `--stay` wait for it.
+        afterwards: works on the finished log of a session that was not interrupted. The
+            recorder remains a member until that is done: sites with `--stay` wait for it.
         warn: warns the user of what may harm the recording, once the connection is open.
 
     Returns:
         The exit code: 0, or 128 and the number of the signal that ended it.
 
     Raises:
-        TrilatError: the session did not begin, the file cannot be written, or records are missing.
+        TrilatError: the session did not begin, the file cannot be written, or records are
+            missing.
     """
     share_threads()
     boot = new_boot()
@@ -233,7 +255,14 @@ def record_session(
             return interrupt.exit_code
         warn()
         recorder = Recorder(
-            bus, clock, session, boot, storage, interrupt.insists, say, is_ending=interrupt.requested
+            bus=bus,
+            clock=clock,
+            session=session,
+            boot=boot,
+            storage=storage,
+            stopped=interrupt.insists,
+            say=say,
+            is_ending=interrupt.requested,
         )
         process.freeze_gc()  # in a session its pauses would be time that a crash can lose
         epoch = recorder.join(join_timeout_s)

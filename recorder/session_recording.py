@@ -1,8 +1,10 @@
-"""One log while it is recorded: messages written, accounts of missing ones, and the recorder's statistics.
+"""One log while it is recorded: messages written, accounts of missing ones, and the recorder's
+statistics.
 
-Invariant: a message of this session is written once, byte for byte; any other is counted by reason. The
-recorder sends `stored` to a site when it has every message that it can get. Statistics, once a second, go to
-the bus and the log; they are bounded, and a stepping wall clock shows in them and nowhere else.
+Invariant: a message of this session is written once, byte for byte; any other is counted by
+reason. The recorder sends `stored` to a site when it has every message that it can get.
+Statistics, once a second, go to the bus and the log; they are bounded, and a stepping wall
+clock shows in them and nowhere else.
 """
 
 from collections import Counter
@@ -26,7 +28,8 @@ from .site_reception import InboundQueue, SiteMessage, SiteReception
 SETTLE_NS = 1_000_000_000
 """Time for messages still under way of a site that has ended and is gone."""
 RECONNECT_NS = 10_000_000_000
-"""Time for a site that has ended and keeps records that are missing, if its connection broke."""
+"""Time for a site that has ended and keeps records that are missing, if its connection broke.
+"""
 HEARD_NS = 500_000_000
 """A site that was heard within this time is there."""
 UNDER_WAY_NS = 100_000_000
@@ -68,9 +71,18 @@ class Recording:
         self._confirmed: set[int] = set()
         self._vanished: set[tuple[str, str]] = set()
         self._end_ns = epoch.mono_ns + round(scenario.duration_s * 1e9) + LAST_NS
-        self._sites = {name: SiteReception(scenario, name, epoch.boots.get(name)) for name in scenario.names}
+        self._sites = {
+            name: SiteReception(scenario, name, epoch.boots.get(name))
+            for name in scenario.names
+        }
         self._repairs = {
-            name: GapRepair(bus, session, site, self.dropped, epoch.mono_ns)
+            name: GapRepair(
+                bus=bus,
+                session=session,
+                reception=site,
+                dropped=self.dropped,
+                now_ns=epoch.mono_ns,
+            )
             for name, site in self._sites.items()
         }
         self._channels = {
@@ -78,7 +90,9 @@ class Recording:
             for name, site in self._sites.items()
             for channel in site.accounts
         }
-        self._blocks = {key for key, (_, channel) in self._channels.items() if channel == topics.STATE}
+        self._blocks = {
+            key for key, (_, channel) in self._channels.items() if channel == topics.STATE
+        }
         self._own = {
             topics.key(session, topics.RECORDER, channel): Account()
             for channel in (topics.EVENT, topics.STATS)
@@ -92,7 +106,9 @@ class Recording:
         self._overflowed = 0
 
     def join_late(self, now_ns: int) -> None:
-        """Reports that the recorder joins a running session, and requests everything from every site."""
+        """Reports that the recorder joins a running session, and requests everything from every
+        site.
+        """
         at_ns = now_ns - self.epoch.mono_ns
         sites = ", ".join(name for name in self._sites if name not in self._gone)
         self.publisher.publish(
@@ -110,7 +126,9 @@ class Recording:
         self._gone = set(self._sites)
 
     def write(self, queue: InboundQueue, now_ns: int) -> None:
-        """Writes the queue, requests missing messages, and sends `stored` to sites that are complete."""
+        """Writes the queue, requests missing messages, and sends `stored` to sites that are
+        complete.
+        """
         self._drain(queue, now_ns)
         self._admit_starts()
         log_time_ns = self.epoch.unix_ns + now_ns - self.epoch.mono_ns
@@ -121,7 +139,9 @@ class Recording:
             for channel, message, payload in repair.poll(now_ns, alive=alive):
                 key = topics.key(self.session, name, channel)
                 sent_ns = max(message.t_ns, 0)  # an event before the epoch has no time
-                self._writer.add(key, payload, sent_ns, log_time_ns, message.sequence, message.content)
+                self._writer.add(
+                    key, payload, sent_ns, log_time_ns, message.sequence, message.content
+                )
                 self._note_admission(message.content)
         for name, site in self._sites.items():
             if name in self._stored or not site.full:
@@ -145,7 +165,9 @@ class Recording:
                 self.dropped[error.reason] += 1
 
     def _admit_starts(self) -> None:
-        """Goes over to starts of sites that others admit, or where the one before is gone or has ended."""
+        """Goes over to starts of sites that others admit, or where the one before is gone or
+        has ended.
+        """
         for name, boot in list(self._candidates.items()):
             before = self._sites[name]
             left = name in self._gone or name not in self._boots
@@ -154,7 +176,9 @@ class Recording:
             del self._candidates[name]
             self._boots[name] = boot
             site = self._sites[name] = SiteReception(self._scenario, name, boot, before)
-            repair = self._repairs[name] = GapRepair(self._bus, self.session, site, self.dropped)
+            repair = self._repairs[name] = GapRepair(
+                self._bus, self.session, site, self.dropped
+            )
             repair.probe()
             for channel in site.accounts:
                 key = topics.key(self.session, name, channel)
@@ -162,7 +186,9 @@ class Recording:
                 self.accounts[key] = site.accounts[channel]
             self._stored.discard(name)
             self._gone_ns.pop(name, None)
-            (self._gone.add if (name, str(boot)) in self._vanished else self._gone.discard)(name)
+            (self._gone.add if (name, str(boot)) in self._vanished else self._gone.discard)(
+                name
+            )
 
     def _note_start(self, name: str, payload: bytes) -> None:
         event = decode(payload, Event)
@@ -238,7 +264,9 @@ class Recording:
         if boot != self.publisher.info.boot:
             raise WireError("another recorder", key)
         if number >= 0 and account.take(number, mono_ns):
-            self._writer.add(key, payload, since_ns, self.epoch.unix_ns + since_ns, number, content)
+            self._writer.add(
+                key, payload, since_ns, self.epoch.unix_ns + since_ns, number, content
+            )
 
     def presence(self, key: str, alive: bool) -> None:
         """Notes a member's token that appeared or disappeared."""
@@ -253,8 +281,8 @@ class Recording:
     def _silent_since_ns(self, site: str, now_ns: int) -> int | None:
         """Returns since when a site is gone; None while its token is present.
 
-        A reconnection may report a token's end after its return: a message of the site that arrives later
-        than those under way proves that it is still present.
+        A reconnection may report a token's end after its return: a message of the site that
+        arrives later than those under way proves that it is still present.
         """
         if site not in self._gone:
             self._gone_ns.pop(site, None)
@@ -284,7 +312,8 @@ class Recording:
     def is_up_to_date(self, ending_ns: int, now_ns: int) -> bool:
         """True once nothing more can be had of any site, since the recorder was asked to end.
 
-        A site that goes on is one that is heard `SETTLE_NS` after that, without an end, and lacks nothing.
+        A site that goes on is one that is heard `SETTLE_NS` after that, without an end, and
+        lacks nothing.
 
         Args:
             ending_ns: when the recorder was asked to end, on its monotonic clock.
@@ -311,7 +340,9 @@ class Recording:
         self._writer.finish(self.account_texts(queue))
 
     def account_texts(self, queue: InboundQueue) -> dict[str, str]:
-        """Returns the accounts as they stand in the file: per topic, and dropped messages by reason."""
+        """Returns the accounts as they stand in the file: per topic, and dropped messages by
+        reason.
+        """
         before = {
             topics.key(self.session, name, topics.EVENT): site.event_accounts
             for name, site in self._sites.items()
@@ -320,7 +351,10 @@ class Recording:
             f"/{key}": f"{account.as_text(*before.get(key, ()))}, overflowed {queue.overflowed[key]}"
             for key, account in self.accounts.items()
         }
-        return {**texts, **{f"dropped: {reason}": str(count) for reason, count in self.dropped.items()}}
+        return {
+            **texts,
+            **{f"dropped: {reason}": str(count) for reason, count in self.dropped.items()},
+        }
 
     def summary(self) -> list[str]:
         """Returns a line for every site, and for messages turned away or dropped."""
@@ -351,9 +385,7 @@ class Recording:
         """Describes what is missing; None if nothing is."""
         for name, site in self._sites.items():
             if site.made is None:
-                return (
-                    f"{name} disappeared after {count_nouns(site.accounts[topics.STATE].received, 'record')}"
-                )
+                return f"{name} disappeared after {count_nouns(site.accounts[topics.STATE].received, 'record')}"
             if shortage := site.shortage():
                 return f"missing of {name}: {shortage}"
         return None
@@ -369,7 +401,12 @@ class RecorderReport:
     """The statistics of one recording; `size` returns the bytes of its log."""
 
     def __init__(
-        self, bus: Bus, clock: Clock, recording: Recording, queue: InboundQueue, size: Callable[[], int]
+        self,
+        bus: Bus,
+        clock: Clock,
+        recording: Recording,
+        queue: InboundQueue,
+        size: Callable[[], int],
     ) -> None:
         self._clock = clock
         self._recording = recording
@@ -401,19 +438,31 @@ class RecorderReport:
 
     def _stats(self) -> RecorderStats:
         accounts = {  # by member and channel, as in "m1/state"
-            "/".join(key.split("/")[2:]): account for key, account in self._recording.accounts.items()
+            "/".join(key.split("/")[2:]): account
+            for key, account in self._recording.accounts.items()
         }
         most = max(1, min(MAX_GAPS_REPORTED, _ALL_GAPS // len(accounts)))
         now_ns = self._clock.monotonic_ns()
         counts: dict[str, Any] = {
             field: {name: getattr(account, field) for name, account in accounts.items()}
-            for field in ("expected", "received", "missing", "duplicate", "reordered", "refilled")
+            for field in (
+                "expected",
+                "received",
+                "missing",
+                "duplicate",
+                "reordered",
+                "refilled",
+            )
         }
         return RecorderStats(
             boot=self._recording.publisher.info.boot,
             t_ns=now_ns - self._recording.epoch.mono_ns,
             **counts,
-            gaps={name: account.gap_texts(most) for name, account in accounts.items() if account.missing},
+            gaps={
+                name: account.gap_texts(most)
+                for name, account in accounts.items()
+                if account.missing
+            },
             overflowed={
                 name: self._queue.overflowed[key]
                 for name, key in zip(accounts, self._recording.accounts, strict=True)

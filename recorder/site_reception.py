@@ -1,11 +1,12 @@
-"""What comes to a recorder: the bounded queue of messages, and per site those received and those missing.
+"""What comes to a recorder: the bounded queue of messages, and per site those received and
+those missing.
 
-Invariant (L6): the queue is bounded, in messages and in bytes, and each key in its share of the bytes, so
-that one member's flood does not displace what the others send; overflow is counted and reported. A message
-counts only when it is decoded, of this site, of this boot, and has a number that the scenario and the clock
-allow; each such message may imply that others exist. Records and statistics are as many as the scenario has
-ticks, and none is of a tick still to come; of events a log takes so many bytes, and the first word of an end
-all the same.
+Invariant (L6): the queue is bounded, in messages and in bytes, and each key in its share of the
+bytes, so that one member's flood does not displace what the others send; overflow is counted
+and reported. A message counts only when it is decoded, of this site, of this boot, and has a
+number that the scenario and the clock allow; each such message may imply that others exist.
+Records and statistics are as many as the scenario has ticks, and none is of a tick still to
+come; of events a log takes so many bytes, and the first word of an end all the same.
 """
 
 import math
@@ -21,7 +22,12 @@ from trilat_net.net import topics
 from trilat_net.net.clock import Clock
 from trilat_net.net.messages import Event, LinkStats, State
 from trilat_net.net.requests import Backfill
-from trilat_net.net.topics import count_messages, count_under_way, number_message, skipped_numbers
+from trilat_net.net.topics import (
+    count_messages,
+    count_under_way,
+    number_message,
+    skipped_numbers,
+)
 from trilat_net.net.wire import make_decoder
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.run_changes import count_skipped_ticks
@@ -30,7 +36,9 @@ CAPACITY = 60_000
 """Capacity in messages: minutes of three sites at 1 kHz, whose records come in blocks."""
 CAPACITY_BYTES = 96 << 20
 KEY_BYTES = 32 << 20
-"""Capacity in bytes, and of messages of one key: a planar arm at 1 kHz makes half a megabyte a second."""
+"""Capacity in bytes, and of messages of one key: a planar arm at 1 kHz makes half a megabyte a
+second.
+"""
 OVERHEAD_BYTES = 200
 """What a message takes besides its payload."""
 KEYS = 1_000
@@ -65,8 +73,15 @@ class InboundQueue:
         size = len(payload) + OVERHEAD_BYTES
         with self._taking:
             of = key if key in self._taken or len(self._taken) < KEYS else "others"
-            waiting = self._taken_bytes - self._drained_bytes, self._taken[of] - self._drained[of]
-            if len(self._queue) >= CAPACITY or waiting[0] >= CAPACITY_BYTES or waiting[1] >= KEY_BYTES:
+            waiting = (
+                self._taken_bytes - self._drained_bytes,
+                self._taken[of] - self._drained[of],
+            )
+            if (
+                len(self._queue) >= CAPACITY
+                or waiting[0] >= CAPACITY_BYTES
+                or waiting[1] >= KEY_BYTES
+            ):
                 self.overflowed[of] += 1
                 return
             self._taken[of] += size
@@ -74,7 +89,9 @@ class InboundQueue:
             self._queue.append(InboundMessage(key, payload, self._clock.monotonic_ns()))
 
     def drain(self, until_ns: int | None = None) -> Iterator[InboundMessage]:
-        """Yields the waiting messages that arrived until an instant, oldest first; all without one."""
+        """Yields the waiting messages that arrived until an instant, oldest first; all without
+        one.
+        """
         queue = self._queue
         while queue and (until_ns is None or queue[0].mono_ns <= until_ns):
             message = queue.popleft()
@@ -87,10 +104,14 @@ class InboundQueue:
 CHANNEL_NOUNS = {topics.STATE: "records", topics.LINK: "statistics", topics.EVENT: "events"}
 _LEAD_NS = 2_000_000_000
 _DRIFT = 1e-3
-"""By so much, and this share of the session's time, clocks of sites may be ahead of the recorder's."""
+"""By so much, and this share of the session's time, clocks of sites may be ahead of the
+recorder's.
+"""
 EVENT_BYTES = 512 << 10
 EVENT_BYTES_PER_S = 4 << 10
-"""Bytes of a site's events that a log takes, and more for each of its seconds: ten events a second."""
+"""Bytes of a site's events that a log takes, and more for each of its seconds: ten events a
+second.
+"""
 _LEAST_EVENT_BYTES = 128
 """No event is shorter."""
 
@@ -125,7 +146,11 @@ class SiteReception:
     """
 
     def __init__(
-        self, scenario: Scenario, name: str, boot: int | None, before: "SiteReception | None" = None
+        self,
+        scenario: Scenario,
+        name: str,
+        boot: int | None,
+        before: "SiteReception | None" = None,
     ) -> None:
         self.name = name
         self._before = before
@@ -140,7 +165,9 @@ class SiteReception:
         self._boot = boot
         self._rate_hz = scenario.sites[name].rate_hz
         layout = scenario.layout(name)
-        self._decoders = {name: make_decoder(CHANNEL_TYPES[name], layout=layout) for name in SITE_CHANNELS}
+        self._decoders = {
+            name: make_decoder(CHANNEL_TYPES[name], layout=layout) for name in SITE_CHANNELS
+        }
         self.period_ns = 1_000_000_000 // self._rate_hz
         self._gaps = {
             channel: StartGap(self.accounts[channel], count_under_way(channel, self._rate_hz))
@@ -149,7 +176,8 @@ class SiteReception:
         self._ticks = scenario.ticks(name)
         self._event_room = EVENT_BYTES + round(EVENT_BYTES_PER_S * scenario.duration_s)
         self._most = {
-            channel: count_messages(channel, self._ticks, self._rate_hz) for channel in SITE_CHANNELS
+            channel: count_messages(channel, self._ticks, self._rate_hz)
+            for channel in SITE_CHANNELS
         } | {topics.EVENT: self._event_room // _LEAST_EVENT_BYTES}
 
     def read(self, channel: str, payload: bytes) -> SiteMessage:
@@ -165,7 +193,8 @@ class SiteReception:
             ticks = event.ticks if event.kind in ("join", "end") else 0
             if event.kind == "end" and not 0 <= event.ticks <= self._ticks:
                 raise WireError(
-                    "out of range", f"{self.name} says it made {count_nouns(event.ticks, 'tick')}"
+                    "out of range",
+                    f"{self.name} says it made {count_nouns(event.ticks, 'tick')}",
                 )
         else:
             tick = self._decoders[channel](payload)
@@ -174,7 +203,13 @@ class SiteReception:
             message = SiteMessage(number, tick.tick, t_ns, tick)
             sender = tick.site
             ticks = tick.tick + 1
-        self._check(channel, sender, message.content.boot, message.number, ticks)
+        self._check(
+            channel=channel,
+            sender=sender,
+            boot=message.content.boot,
+            number=message.number,
+            ticks=ticks,
+        )
         if isinstance(message.content, Event):
             self._take_room(message.content, len(payload))
         return message
@@ -187,7 +222,9 @@ class SiteReception:
         if ticks > self._possible_ticks:
             raise WireError(f"{self.name} is ahead of the clock", f"{channel} number {number}")
 
-    def take_records(self, payloads: Iterable[bytes], came_ns: int) -> Iterator[tuple[bytes, State]]:
+    def take_records(
+        self, payloads: Iterable[bytes], came_ns: int
+    ) -> Iterator[tuple[bytes, State]]:
         """Counts the published records of one block, and yields those that are no duplicates.
 
         Raises:
@@ -202,7 +239,13 @@ class SiteReception:
             record: State = decode(payload)
             tick = record.tick
             if tick >= possible or record.site != name or record.boot != boot:
-                self._check(topics.STATE, record.site, record.boot, tick, tick + 1)
+                self._check(
+                    channel=topics.STATE,
+                    sender=record.site,
+                    boot=record.boot,
+                    number=tick,
+                    ticks=tick + 1,
+                )
             self.heard_ns = came_ns
             new = account.take(tick, came_ns)
             if record.cmd:
@@ -219,7 +262,9 @@ class SiteReception:
         """Refuses the events of a flood, which would make a log of nothing else."""
         ends = event.kind == "end" and self.made is None and size <= EVENT_BYTES_PER_S
         if size > self._event_room and not ends:
-            raise WireError("flood of events", f"{self.name} sent more than a log takes of one site")
+            raise WireError(
+                "flood of events", f"{self.name} sent more than a log takes of one site"
+            )
         self._event_room -= size
 
     def take(self, channel: str, message: SiteMessage, came_ns: int) -> bool:
@@ -242,23 +287,33 @@ class SiteReception:
             WireError: its sender is another one.
         """
         if past.member != self.name or past.boot != self._boot:
-            raise WireError("stranger", f"{past.member}, start {past.boot}, answers for {self.name}")
+            raise WireError(
+                "stranger", f"{past.member}, start {past.boot}, answers for {self.name}"
+            )
 
     def expect(self, channel: str, made: int) -> None:
-        """Counts the messages of a channel that exist at least; no more than scenario and clock allow."""
+        """Counts the messages of a channel that exist at least; no more than scenario and clock
+        allow.
+        """
         most = self._most[channel]
         if channel != topics.EVENT:
             most = min(most, count_messages(channel, self._possible_ticks, self._rate_hz))
         self.accounts[channel].expect(min(made, most))
 
     def hear_of_start_before(self, ticks: int) -> None:
-        """Counts what the start before published at least, of which another site heard so many ticks."""
+        """Counts what the start before published at least, of which another site heard so many
+        ticks.
+        """
         for channel, gap in self._gaps.items():
             gap.hear_of(number_message(channel, ticks, self._rate_hz))
 
     def _imply(self, content: State | LinkStats | Event) -> None:
         """Counts the messages that must exist because this one does, and those that never did."""
-        if isinstance(content, State) and content.cmd and (skipped := count_skipped_ticks(content.cmd)):
+        if (
+            isinstance(content, State)
+            and content.cmd
+            and (skipped := count_skipped_ticks(content.cmd))
+        ):
             for channel in (topics.STATE, topics.LINK):
                 left_out = skipped_numbers(channel, content.tick, skipped, self._rate_hz)
                 self.accounts[channel].begin_anew(*left_out)
@@ -267,7 +322,10 @@ class SiteReception:
         elif isinstance(content, Event) and content.kind == "join":
             made = 0 if self._before is None or self._before.made is None else self._before.made
             for channel, gap in self._gaps.items():
-                numbers = (count_messages(channel, ticks, self._rate_hz) for ticks in (content.ticks, made))
+                numbers = (
+                    count_messages(channel, ticks, self._rate_hz)
+                    for ticks in (content.ticks, made)
+                )
                 gap.begin_anew(*numbers)
         elif isinstance(content, Event) and content.kind == "end":
             self.made = content.ticks

@@ -1,10 +1,11 @@
 """Answers change requests to a running site.
 
-Invariant: every request gets a reply: refused with a reason, or accepted by the very next tick, whose record
-names it. An accepted change holds for samples and ticks from AHEAD_MS later on, so it alters no decision
-already made. In one tick a stop outweighs all other orders, so `enable` and `reset` wait for a tick in which
-nothing was ordered before them, and what came after them waits too. Dominance is ramped over `MIN_RAMP_S` at
-least, whatever is asked for, so that no reference jumps; the record has the ramp that holds.
+Invariant: every request gets a reply: refused with a reason, or accepted by the very next tick,
+whose record names it. An accepted change holds for samples and ticks from AHEAD_MS later on, so
+it alters no decision already made. In one tick a stop outweighs all other orders, so `enable`
+and `reset` wait for a tick in which nothing was ordered before them, and what came after them
+waits too. Dominance is ramped over `MIN_RAMP_S` at least, whatever is asked for, so that no
+reference jumps; the record has the ramp that holds.
 """
 
 from collections import Counter, deque
@@ -22,7 +23,12 @@ from trilat_net.net.messages import MODE_WORDS
 from trilat_net.net.requests import ChangeReply, ChangeRequest
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import Scenario, find_owner
-from trilat_net.scenario.run_changes import LinkTables, make_site_order, resolve_change, to_core_change
+from trilat_net.scenario.run_changes import (
+    LinkTables,
+    make_site_order,
+    resolve_change,
+    to_core_change,
+)
 from trilat_net.scenario.scenario_types import SiteOrder
 
 AHEAD_MS = 100
@@ -39,13 +45,14 @@ _NEEDED_MODES = {"reset": Mode.FAULT, "enable": Mode.STOPPED}
 class ChangeServer:
     """The change requests to one site, whose mode after the last tick `mode` returns.
 
-    Who may ask for nothing else asks it to stop by `stops`. While its dead-man switch is not `held` it takes
-    up no work again and ends no fault.
+    Who may ask for nothing else asks it to stop by `stops`. While its dead-man switch is not
+    `held` it takes up no work again and ends no fault.
 
     Attributes:
         stopped: True once the site has made the last tick that it was asked for.
         marks: moments that somebody marked and that no event names yet: ticks, and texts.
-        sources: who asked for an accepted change, by its text in the record, until an event says it.
+        sources: who asked for an accepted change, by its text in the record, until an event
+            says it.
     """
 
     def __init__(
@@ -83,7 +90,9 @@ class ChangeServer:
         while (query := self._poll()) is not None:
             try:
                 request = decode(query.payload, ChangeRequest)
-                first = first_tick_at(tick_ns(k, self._rate_hz) + AHEAD_MS * 1_000_000, self._rate_hz)
+                first = first_tick_at(
+                    tick_ns(k, self._rate_hz) + AHEAD_MS * 1_000_000, self._rate_hz
+                )
                 if ordered and request.order in _NEEDED_MODES:
                     self._held_up = query
                     break
@@ -99,7 +108,9 @@ class ChangeServer:
                     tick = k
                 else:
                     changes.append(self._resolve(request, first))
-                    text = f"{self._site} takes it in at tick {k}; it holds from tick {first} on"
+                    text = (
+                        f"{self._site} takes it in at tick {k}; it holds from tick {first} on"
+                    )
                     tick = first
                 if isinstance(request.source, str) and changes:
                     self.sources[changes[-1].text] = request.source
@@ -120,7 +131,9 @@ class ChangeServer:
         while self._stops is not None and (query := self._stops.poll()) is not None:
             with suppress(WireError):
                 request = decode(query.payload, ChangeRequest)
-                if msgspec.structs.replace(request, source=UNSET) == ChangeRequest(order="stop"):
+                if msgspec.structs.replace(request, source=UNSET) == ChangeRequest(
+                    order="stop"
+                ):
                     return query
             text = f"{self._site} can be asked to stop under this key, and nothing else"
             query.answer(encode(ChangeReply(member=self._site, accepted=False, text=text)))
@@ -128,7 +141,9 @@ class ChangeServer:
 
     def _mark(self, k: int, text: str) -> str:
         if len(self.marks) >= MARKS_WAITING:
-            raise ScenarioError(f"at most {MARKS_WAITING} marks wait to be published; mark again in 100 ms")
+            raise ScenarioError(
+                f"at most {MARKS_WAITING} marks wait to be published; mark again in 100 ms"
+            )
         self.marks.append((k, text))
         return f"{self._site} marks tick {k}"
 
@@ -140,7 +155,9 @@ class ChangeServer:
             only = MODE_WORDS[needed]
             raise ScenarioError(f"{self._site} is in {doing}; {order} is for a site in {only}")
         if needed is not None and not self._held():
-            raise ScenarioError(f"the dead-man switch of {self._site} is not held; {order} it while it is")
+            raise ScenarioError(
+                f"the dead-man switch of {self._site} is not held; {order} it while it is"
+            )
         change = make_site_order(self._scenario, self._site, order, tick_ns(k, self._rate_hz))
         return to_core_change(self._scenario, change)
 
@@ -148,7 +165,10 @@ class ChangeServer:
         asked = first_tick_at(round(stop_s * 1e9), self._rate_hz)
         self._stop_tick = min(max(asked, k + 1), self._stop_tick or self._ticks)
         self.stopped = k + 1 >= self._stop_tick
-        return f"{self._site} ends at t = {self._stop_tick / self._rate_hz:.3f} s", self._stop_tick
+        return (
+            f"{self._site} ends at t = {self._stop_tick / self._rate_hz:.3f} s",
+            self._stop_tick,
+        )
 
     def _resolve(self, request: ChangeRequest, first: int) -> CoreChange:
         from_ns = tick_ns(first, self._rate_hz)
@@ -163,10 +183,16 @@ class ChangeServer:
             raise ScenarioError(
                 f"at most {MAX_RAMPS} changes of shares wait to begin; ask again in {AHEAD_MS} ms"
             )
-        written = {key: value for key in ("link", "dominance", "ramp_s") if (value := getattr(request, key))}
+        written = {
+            key: value
+            for key in ("link", "dominance", "ramp_s")
+            if (value := getattr(request, key))
+        }
         if request.dominance and request.ramp_s >= 0.0:
             written["ramp_s"] = max(request.ramp_s, MIN_RAMP_S)
-        change = resolve_change(self._scenario, self._links, {**written, "to": request.to}, from_ns)
+        change = resolve_change(
+            self._scenario, self._links, {**written, "to": request.to}, from_ns
+        )
         if find_owner(change) != self._site:
             raise ScenarioError(f"{self._site} cannot do that; ask {find_owner(change)}")
         if change.link:

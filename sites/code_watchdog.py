@@ -1,12 +1,13 @@
 """Deadline budget and watchdog of code of a user's own: a law, a hand, a plant.
 
-Invariant: the watchdog judges the code's own computing time, never the machine's lateness, and enters no
-number of the run. A single hiccup is only counted; code that is too slow, or does not return, fails in order.
+Invariant: the watchdog judges the code's own computing time, never the machine's lateness, and
+enters no number of the run. A single hiccup is only counted; code that is too slow, or does not
+return, fails in order.
 
-It may use `SHARE` of the period at which it is called. Time beyond that adds to its overtime, which faster
-calls pay back; code that owes `MOST_NS` is too slow. One call counts for at most `HICCUP_NS`, so that no
-single call fails. If the machine preempted the thread, the thread's computing time counts instead of the
-elapsed time.
+It may use `SHARE` of the period at which it is called. Time beyond that adds to its overtime,
+which faster calls pay back; code that owes `MOST_NS` is too slow. One call counts for at most
+`HICCUP_NS`, so that no single call fails. If the machine preempted the thread, the thread's
+computing time counts instead of the elapsed time.
 """
 
 import signal
@@ -33,12 +34,15 @@ HICCUP_NS = 50_000_000
 CHECK_S = 1.0
 CHECKS = 3
 FIRST_CHECKS = 61
-"""Code in the same call at so many checks in a row, one every `CHECK_S`, hangs; the second is of its first
-tick, in which it may compile."""
+"""Code in the same call at so many checks in a row, one every `CHECK_S`, hangs; the second is
+of its first tick, in which it may compile.
+"""
 
 
 def read_thread_usage() -> tuple[int, int]:
-    """Returns this thread's computing time, ns, and its involuntary switches; (0, -1) if unknown."""
+    """Returns this thread's computing time, ns, and its involuntary switches; (0, -1) if
+    unknown.
+    """
     if _THREAD is None:
         return 0, -1
     usage = resource.getrusage(_THREAD)
@@ -126,7 +130,8 @@ class WatchedCode:
         )
 
     def check(self) -> None:
-        """Stops code that is in the same call as at the checks before; a process that slept had none.
+        """Stops code that is in the same call as at the checks before; a process that slept had
+        none.
 
         Raises:
             Exception: of `fail`, out of the code.

@@ -1,11 +1,13 @@
-"""A whole session on one machine: starts every site and the recorder as processes, monitors and ends them.
+"""A whole session on one machine: starts every site and the recorder as processes, monitors and
+ends them.
 
-They are copies of one process, the starter, which has loaded everything: a copy begins in a tenth of the time
-that an interpreter takes. What is copied has no connection, no thread of its own and no code of the user's.
+They are copies of one process, the starter, which has loaded everything: a copy begins in a
+tenth of the time that an interpreter takes. What is copied has no connection, no thread of its
+own and no code of the user's.
 
-Invariant: in every case the recorder ends last and no child is left on return, nor if this process is killed;
-if the starter is, all are asked to end. The children have process sessions of their own, so that Ctrl-C
-reaches them through this process, in that order.
+Invariant: in every case the recorder ends last and no child is left on return, nor if this
+process is killed; if the starter is, all are asked to end. The children have process sessions
+of their own, so that Ctrl-C reaches them through this process, in that order.
 """
 
 import os
@@ -27,7 +29,13 @@ from setproctitle import setproctitle
 from trilat_net.core.jit import compiling_notice, is_core_cached
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogRefused, RunFailed
-from trilat_net.files import create_file, find_page, make_results_folder, make_subfolder, write_whole
+from trilat_net.files import (
+    create_file,
+    find_page,
+    make_results_folder,
+    make_subfolder,
+    write_whole,
+)
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net import topics
 from trilat_net.net.clock import Clock, SystemClock
@@ -48,17 +56,21 @@ START_S = 10
 """Time for a site to start, s, where many share a few processors."""
 JOIN_S = 60
 WAIT_S = 600
-"""For so long sites wait for each other and for the recorder, s; the second where people begin a session."""
+"""For so long sites wait for each other and for the recorder, s; the second where people begin
+a session.
+"""
 END_TIMEOUT_NS = 45 * NS_PER_S
-"""Time for a child to end after its signal; then it is killed. A site waits 10 s for the recorder, and as
-long again after every question of one that was behind."""
+"""Time for a child to end after its signal; then it is killed. A site waits 10 s for the
+recorder, and as long again after every question of one that was behind.
+"""
 RECORDER_NS = 2 * NS_PER_S
 """Time for the recorder to write what is under way, once all sites have ended."""
 
 
 @dataclass(slots=True)
 class SessionResult:
-    """How a session ended: what failed, in order, the number of the signal that ended it, or 0; and a code.
+    """How a session ended: what failed, in order, the number of the signal that ended it, or 0;
+    and a code.
 
     The exit code is that of a run that failed, or of a disk that took no more.
     """
@@ -91,7 +103,9 @@ class SessionProcess:
         code = self.code
         if self._signalled and self.pid is None:
             return None  # the signal met the starter: an interpreter that still starts ends with any code
-        if code in (0, None) or (self._signalled and code in (128 + signal.SIGINT, -signal.SIGINT)):
+        if code in (0, None) or (
+            self._signalled and code in (128 + signal.SIGINT, -signal.SIGINT)
+        ):
             return None  # a process that ends anyway has no handler any more
         if code is not None and code < 0:
             return f"{self.name} was killed by {signal.Signals(-code).name}"
@@ -101,7 +115,9 @@ class SessionProcess:
 
 
 class ProcessStarter:
-    """Starts the processes of a scenario's session on this machine; what each prints is kept in a folder."""
+    """Starts the processes of a scenario's session on this machine; what each prints is kept in
+    a folder.
+    """
 
     def __init__(self, scenario_file: Path, folder: Path) -> None:
         self._folder = folder
@@ -109,7 +125,12 @@ class ProcessStarter:
         self._processes: dict[str, SessionProcess] = {}
         self._orders, theirs = Pipe()
         with theirs, create_file(self._output) as sink:
-            words = ["start-processes", str(theirs.fileno()), str(scenario_file)]  # see `run_starter`
+            # see `run_starter`
+            words = [
+                "start-processes",
+                str(theirs.fileno()),
+                str(scenario_file),
+            ]
             self._starter = subprocess.Popen(
                 [sys.executable, "-m", "trilat_net", *words],
                 stdin=subprocess.DEVNULL,
@@ -163,8 +184,9 @@ class ProcessStarter:
 SessionAttendant = Callable[
     [str, Sequence[str], Callable[[str], None]], AbstractContextManager[Callable[[], bool]]
 ]
-"""Given a session's name, the endpoints of its sites and what tells people, a context that lasts as long as
-the session; what it yields returns true once the session is to end."""
+"""Given a session's name, the endpoints of its sites and what tells people, a context that
+lasts as long as the session; what it yields returns true once the session is to end.
+"""
 
 
 def run_demo(
@@ -176,8 +198,8 @@ def run_demo(
 ) -> SessionResult:
     """Runs a session of all sites and a recorder, by the scenario's name, as single sites do.
 
-    Its log is valid whenever the session began. Given `begins`, the sites wait for the recorder until it
-    returns true, at most `WAIT_S`; so the session begins a second or two after that.
+    Its log is valid whenever the session began. Given `begins`, the sites wait for the recorder
+    until it returns true, at most `WAIT_S`; so the session begins a second or two after that.
 
     Raises:
         ScenarioError: an arm outside of the program lacks limits.
@@ -186,30 +208,57 @@ def run_demo(
     result = SessionResult(folder / "run.mcap")
     session = scenario.name
     clock = SystemClock()
-    with SessionDisplay(console, clock) as display, Interrupt() as interrupt, ExitStack() as reserved:
+    with (
+        SessionDisplay(console, clock) as display,
+        Interrupt() as interrupt,
+        ExitStack() as reserved,
+    ):
         compile_core(scenario, display.say, interrupt)
         if warning := describe_load(measure_busy_share(clock)):
             display.say(f"warning: {warning}")
         endpoints = reserved.enter_context(reserve_session_endpoints(session, scenario.names))
         patience_s = JOIN_S if begins is None else WAIT_S
-        starter, sites, start_recorder = _start(scenario, folder, reserved, endpoints, patience_s)
+        starter, sites, start_recorder = _start(
+            scenario=scenario,
+            folder=folder,
+            reserved=reserved,
+            endpoints=endpoints,
+            wait_s=patience_s,
+        )
         recorder: list[SessionProcess] = []
         display.say(f"others connect to {', '.join(endpoints)}")
         for name in scenario.outside:
             place = f"{topics.key(session, name, topics.MEASURED)} at {endpoints[scenario.names.index(name)]}"
-            display.say(f"{name} waits for its arm on {place}; see {find_page('external-arm.md')}")
-        attending = nullcontext(lambda: False) if attend is None else attend(session, endpoints, display.say)
+            display.say(
+                f"{name} waits for its arm on {place}; see {find_page('external-arm.md')}"
+            )
+        attending = (
+            nullcontext(lambda: False)
+            if attend is None
+            else attend(session, endpoints, display.say)
+        )
         try:
             with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:
                 monitor = SessionMonitor(bus, session, scenario, display)
-                while not (interrupt.requested() or is_enough() or _is_over([*sites, *recorder], result)):
+                while not (
+                    interrupt.requested()
+                    or is_enough()
+                    or _is_over([*sites, *recorder], result)
+                ):
                     if not recorder and (begins is None or begins()):
                         recorder.append(start_recorder())
                     monitor.poll()
                     clock.sleep_until(clock.monotonic_ns() + POLL_NS)
                     starter.poll()
         finally:
-            _end_all(starter, sites, recorder, clock, interrupt, display.say)
+            _end_all(
+                starter=starter,
+                sites=sites,
+                recorder=recorder,
+                clock=clock,
+                interrupt=interrupt,
+                say=display.say,
+            )
         result.interrupted = interrupt.number
     for child in [*sites, *recorder]:
         problem = child.problem()
@@ -224,7 +273,8 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
     """Compiles what a scenario's arms need, if it may not be cached; a signal interrupts it."""
     layouts = {arm.counts: name for name, arm in scenario.arms.items()}
     chains = any(arm.chain is not None for arm in scenario.arms.values())
-    if chains or not is_core_cached():  # what is cached may be of arms with other numbers of joints
+    # what is cached may be of arms with other numbers of joints
+    if chains or not is_core_cached():
         compiling_notice.say = say
         with interrupt.raising():
             for name in layouts.values():
@@ -248,7 +298,16 @@ def _start(
         starter.start(
             name,
             [
-                *("site", name, "--scenario", str(file), "--session", session, "--listen", endpoints[n]),
+                *(
+                    "site",
+                    name,
+                    "--scenario",
+                    str(file),
+                    "--session",
+                    session,
+                    "--listen",
+                    endpoints[n],
+                ),
                 *chain(*connect[:n]),
                 *("--needs-recorder", *patience),
             ],
@@ -261,7 +320,11 @@ def _start(
             words = ["hand", name, "--scenario", str(file), "--session", session]
             sites.append(starter.start(f"hand-{name}", [*words, *connect[n], *patience]))
     arguments = ["record", "--session", session, *chain(*connect), "-o", str(log)]
-    return starter, sites, lambda: starter.start(topics.RECORDER, [*arguments, *patience, "--force"])
+    return (
+        starter,
+        sites,
+        lambda: starter.start(topics.RECORDER, [*arguments, *patience, "--force"]),
+    )
 
 
 def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
@@ -286,14 +349,18 @@ def _end_all(
         "the sites keep their last records until the recorder has them, 10 s at most; "
         "Ctrl-C a second time ends it at once",
     )
-    _end_group(starter, sites, clock, interrupt.insists, tell)
+    _end_group(starter=starter, group=sites, clock=clock, insists=interrupt.insists, tell=tell)
     sites_left_ns = clock.monotonic_ns()
 
     def may_insist() -> bool:
-        """True once the recorder has had its time: without sites there is nothing that it could ask for."""
+        """True once the recorder has had its time: without sites there is nothing that it could
+        ask for.
+        """
         return interrupt.insists() or clock.monotonic_ns() - sites_left_ns > RECORDER_NS
 
-    _end_group(starter, recorder, clock, may_insist, lambda: None)
+    _end_group(
+        starter=starter, group=recorder, clock=clock, insists=may_insist, tell=lambda: None
+    )
 
 
 def _end_group(
@@ -303,7 +370,9 @@ def _end_group(
     insists: Callable[[], bool],
     tell: Callable[[], None],
 ) -> None:
-    """Ends processes in order, at once when `insists` returns True; `tell` says why it takes long."""
+    """Ends processes in order, at once when `insists` returns True; `tell` says why it takes
+    long.
+    """
     for process in group:
         process.end(signal.SIGINT)
     begun_ns = clock.monotonic_ns()
@@ -325,10 +394,13 @@ def _end_group(
 
 
 def run_starter(number: int, scenario_file: str) -> list[str] | None:
-    """Starts and signals processes as ordered until nobody is there; in each process it returns its words."""
+    """Starts and signals processes as ordered until nobody is there; in each process it returns
+    its words.
+    """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     scenario = load_scenario(scenario_file)
-    if not list_imported_code([scenario]):  # code of the user's is loaded where it runs, and nowhere else
+    # code of the user's is loaded where it runs, and nowhere else
+    if not list_imported_code([scenario]):
         for name in {arm.counts: name for name, arm in scenario.arms.items()}.values():
             warm_up(scenario, name)
     freeze_gc()
@@ -379,7 +451,9 @@ class _Starter:
             self._orders.send(news)
 
     def _end_all(self) -> None:
-        recorder = [self._running.pop(topics.RECORDER)] if topics.RECORDER in self._running else []
+        recorder = (
+            [self._running.pop(topics.RECORDER)] if topics.RECORDER in self._running else []
+        )
         for pids in (list(self._running.values()), recorder):
             for pid in pids:
                 os.kill(pid, signal.SIGINT)
@@ -417,7 +491,8 @@ def run(
     True
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
+            scenario.
         set: overrides, as in `{"control.Kd": 5}`.
         duration_s: the duration of the run, s; by default the scenario's.
         seed: the seed; by default the scenario's.

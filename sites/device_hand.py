@@ -1,13 +1,16 @@
-"""A device at the arm of a site: its motion leads the arm, and it renders what the arm gives back.
+"""A device at the arm of a site: its motion leads the arm, and it renders what the arm gives
+back.
 
 Invariant:
-    - Only changes of the device's place move the target, and only while its clutch is pressed: a state
-      that is not finite, or a jump, moves nothing, and neither does a device that comes back.
-    - The target stays within the arm's reach, however often the clutch is pressed: a motion of the
-      device that leads out of it is lost, and one that leads back in acts at once.
-    - Whoever has let go, by the device's silence too, takes hold again by pressing the clutch anew.
-    - The force is that of the newest record, turned, scaled and limited as the scenario says; it is
-      zero while the clutch is open, or the record is old.
+    - Only changes of the device's place move the target, and only while its clutch is pressed:
+      a state that is not finite, or a jump, moves nothing, and neither does a device that comes
+      back.
+    - The target stays within the arm's reach, however often the clutch is pressed: a motion of
+      the device that leads out of it is lost, and one that leads back in acts at once.
+    - Whoever has let go, by the device's silence too, takes hold again by pressing the clutch
+      anew.
+    - The force is that of the newest record, turned, scaled and limited as the scenario says;
+      it is zero while the clutch is open, or the record is old.
     - The hand has no heartbeat but the device's: a loop that hangs is a silent hand.
 """
 
@@ -44,7 +47,8 @@ class DeviceHand:
         reach: where the target may be.
 
     Attributes:
-        states, jumps, unreadable: how many states came, and how many of them moved nothing for that reason.
+        states, jumps, unreadable: how many states came, and how many of them moved nothing for
+        that reason.
         trips_ns: from the place of the device to the force that it has caused.
     """
 
@@ -75,7 +79,9 @@ class DeviceHand:
         self._asked.clear()
 
     def serve(self) -> None:
-        """Reads a state, moves the target by it, and renders a force; takes a period of the device."""
+        """Reads a state, moves the target by it, and renders a force; takes a period of the
+        device.
+        """
         state = self._device.read()
         now_ns = self._clock.monotonic_ns()
         if now_ns - self._came_ns > SILENCE_NS:
@@ -124,7 +130,10 @@ class DeviceHand:
         closed = min(1.0, (self._clock.monotonic_ns() - self._since_ns) / GRIP_NS)
         force = [-self._how.force_scale * closed * one for one in self._hand.force]
         share = min(1.0, self._how.force_limit_n / max(math.hypot(*force), 1e-9))
-        x, y, z = (share * sum(map(operator.mul, force, column)) for column in zip(*self._rows, strict=True))
+        x, y, z = (
+            share * sum(map(operator.mul, force, column))
+            for column in zip(*self._rows, strict=True)
+        )
         return x, y, z
 
     def _measure_trips(self) -> None:
@@ -145,7 +154,9 @@ class DeviceHand:
         return f"{told}; from its place to the force of it p50 {p50:.1f} ms, p99 {p99:.1f} ms"
 
     def run(self, stopped: Callable[[], bool], say: Callable[[str], None]) -> None:
-        """Leads the arm until the end; says once each time that the device is lost, and is there."""
+        """Leads the arm until the end; says once each time that the device is lost, and is
+        there.
+        """
         there: bool | None = None
         while not (stopped() or self._hand.over):
             try:
@@ -153,7 +164,9 @@ class DeviceHand:
                     while not (stopped() or self._hand.over):
                         self.serve()
                         if not there:
-                            say(f"the device is there: its button {self._how.clutch!r} takes hold")
+                            say(
+                                f"the device is there: its button {self._how.clutch!r} takes hold"
+                            )
                         there = True
             except OSError as problem:
                 self.let_go()

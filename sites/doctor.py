@@ -1,7 +1,9 @@
-"""What stands in the way of a session on this machine: keys, links, clock, rights, rate and room.
+"""What stands in the way of a session on this machine: keys, links, clock, rights, rate and
+room.
 
-Invariant: nothing is changed and nothing is sent but what a member sends that connects; a finding says what
-was found, and, unless it is well, what to do. Rights and rate are those that a process of its own got.
+Invariant: nothing is changed and nothing is sent but what a member sends that connects; a
+finding says what was found, and, unless it is well, what to do. Rights and rate are those that
+a process of its own got.
 """
 
 import json
@@ -36,7 +38,13 @@ from trilat_net.net.connection import (
     resolve_member_connection,
     secure_connection,
 )
-from trilat_net.net.member_keys import AUTHORITY, CERTIFICATE, PRIVATE_KEY, MemberKeys, read_member_keys
+from trilat_net.net.member_keys import (
+    AUTHORITY,
+    CERTIFICATE,
+    PRIVATE_KEY,
+    MemberKeys,
+    read_member_keys,
+)
 from trilat_net.net.timing import LoopStats, SiteTiming
 from trilat_net.net.zenoh_bus import RouterSilent, ZenohBus
 from trilat_net.results import Result
@@ -51,17 +59,23 @@ FindingState = Literal["ok", "warn", "fail"]
 CONNECT_S = 2.0
 LEAST_BYTES = 100 << 20
 FEW_BYTES = 2 << 30
-"""Free room with which a recording is likely to end early, and room for an hour and a half of three sites."""
+"""Free room with which a recording is likely to end early, and room for an hour and a half of
+three sites.
+"""
 STEADY_NS = 100_000_000
 STEP_NS = 1_000_000
 BOUND_US = 1_000
-"""How long the clocks are compared, by how much they may part meanwhile, and an offset's largest bound."""
+"""How long the clocks are compared, by how much they may part meanwhile, and an offset's
+largest bound.
+"""
 PINGS = 20
 RATES_HZ = (1000, 500, 200, 100)
 REHEARSAL_S = 1.0
 HELD_PERIODS = 0.5
 HELD_SHARE = 0.99
-"""A rate is held if this share of its ticks begins in this part of a period, from when each is due."""
+"""A rate is held if this share of its ticks begins in this part of a period, from when each is
+due.
+"""
 
 
 class DoctorFinding(NamedTuple):
@@ -95,9 +109,13 @@ def examine_machine(
 
 
 def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKeys | None]:
-    """Yields whose keys they are, until when they hold, and if others can get at them; returns good ones."""
+    """Yields whose keys they are, until when they hold, and if others can get at them; returns
+    good ones.
+    """
     if folder is None:
-        yield DoctorFinding("keys", "ok", "none given: without --keys a member listens on this machine alone")
+        yield DoctorFinding(
+            "keys", "ok", "none given: without --keys a member listens on this machine alone"
+        )
         return None
     try:
         owned = read_member_keys(folder)
@@ -105,13 +123,17 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
         yield DoctorFinding("keys", "fail", str(error))
         return None
     left = owned.ends - datetime.now(UTC)
-    text = f"{owned.member} of {', '.join(owned.members)}, until {owned.ends:%Y-%m-%d %H:%M} UTC"
+    text = (
+        f"{owned.member} of {', '.join(owned.members)}, until {owned.ends:%Y-%m-%d %H:%M} UTC"
+    )
     if left < ENDS_SOON:
         yield DoctorFinding("keys", "warn", f"{text}: soon; renew them with trilat keys renew")
     else:
         yield DoctorFinding("keys", "ok", text)
     if find_rights_of_others(folder):
-        yield DoctorFinding("keys", "warn", f"others can look into {folder}: chmod 700 {folder}")
+        yield DoctorFinding(
+            "keys", "warn", f"others can look into {folder}: chmod 700 {folder}"
+        )
     authority = folder.resolve().parent / "authority" / PRIVATE_KEY
     if authority.exists():
         text = f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
@@ -129,18 +151,24 @@ def examine_links(
         yield DoctorFinding("links", "fail", str(error))
         return
     sides = [(place, True) for place in find_endpoint_addresses(safe.reach(safe.listen))]
-    sides += [(place, False) for place in find_endpoint_addresses(safe.reach(safe.connect or ()))]
+    sides += [
+        (place, False) for place in find_endpoint_addresses(safe.reach(safe.connect or ()))
+    ]
     for place, listens in sides:
         if not listens and place.startswith("quic/"):
             yield _examine_quic(place, owned)
         elif (address := _split_address(place)) is None:
-            yield DoctorFinding("links", "warn", f"{place} was not tried: not an address of TCP or QUIC")
+            yield DoctorFinding(
+                "links", "warn", f"{place} was not tried: not an address of TCP or QUIC"
+            )
         elif listens:
             yield _examine_listening(place, address)
         else:
             yield _examine_reaching(place, address, folder if owned else None)
     if not safe.listen and not safe.connect:
-        yield DoctorFinding("links", "ok", "no endpoints given: --listen and --connect are tried if given")
+        yield DoctorFinding(
+            "links", "ok", "no endpoints given: --listen and --connect are tried if given"
+        )
 
 
 def _examine_listening(place: str, address: tuple[str, int]) -> DoctorFinding:
@@ -154,13 +182,19 @@ def _examine_listening(place: str, address: tuple[str, int]) -> DoctorFinding:
             if not quic:
                 probe.listen(1)
     except OSError as error:
-        return DoctorFinding("links", "fail", f"cannot listen at {place}: {error.strerror or error}")
+        return DoctorFinding(
+            "links", "fail", f"cannot listen at {place}: {error.strerror or error}"
+        )
     if place.startswith(ENCRYPTED) or is_loopback(place):
         return DoctorFinding("links", "ok", f"can listen at {place}")
-    return DoctorFinding("links", "warn", f"{place} would listen unencrypted, to anybody who reaches it")
+    return DoctorFinding(
+        "links", "warn", f"{place} would listen unencrypted, to anybody who reaches it"
+    )
 
 
-def _examine_reaching(place: str, address: tuple[str, int], folder: Path | None) -> DoctorFinding:
+def _examine_reaching(
+    place: str, address: tuple[str, int], folder: Path | None
+) -> DoctorFinding:
     try:
         with socket.create_connection(address, CONNECT_S) as link:
             if not place.startswith("tls/"):
@@ -168,26 +202,40 @@ def _examine_reaching(place: str, address: tuple[str, int], folder: Path | None)
                 return DoctorFinding("links", state, f"{place} answers, unencrypted")
             with _tls_context(folder).wrap_socket(link, server_hostname=address[0]) as safe:
                 proved = (
-                    "with a certificate of the same authority" if folder else "whose authority is unknown"
+                    "with a certificate of the same authority"
+                    if folder
+                    else "whose authority is unknown"
                 )
-                return DoctorFinding("links", "ok", f"{place} answers over {safe.version()}, {proved}")
+                return DoctorFinding(
+                    "links", "ok", f"{place} answers over {safe.version()}, {proved}"
+                )
     except ssl.SSLError as error:
         why = getattr(error, "verify_message", "") or error.reason or str(error)
-        return DoctorFinding("links", "fail", f"{place} answers, but not as a member with these keys: {why}")
+        return DoctorFinding(
+            "links", "fail", f"{place} answers, but not as a member with these keys: {why}"
+        )
     except OSError as error:
-        return DoctorFinding("links", "fail", f"{place} cannot be reached: {error.strerror or error}")
+        return DoctorFinding(
+            "links", "fail", f"{place} cannot be reached: {error.strerror or error}"
+        )
 
 
 def _examine_quic(place: str, owned: MemberKeys | None) -> DoctorFinding:
-    """Returns whether a member answers over QUIC: there is no way to try that but to connect as a member."""
+    """Returns whether a member answers over QUIC: there is no way to try that but to connect as
+    a member.
+    """
     if owned is None:
-        return DoctorFinding("links", "warn", f"{place} was not tried: QUIC asks for the keys of a member")
+        return DoctorFinding(
+            "links", "warn", f"{place} was not tried: QUIC asks for the keys of a member"
+        )
     try:
         with closing(ZenohBus([], [place], "client", owned.settings)):
             text = f"{place} answers over QUIC, with a certificate of the same authority"
             return DoctorFinding("links", "ok", text)
     except (RouterSilent, UsageError) as error:
-        return DoctorFinding("links", "fail", f"{place} does not answer a member with these keys: {error}")
+        return DoctorFinding(
+            "links", "fail", f"{place} does not answer a member with these keys: {error}"
+        )
 
 
 def _tls_context(folder: Path | None) -> ssl.SSLContext:
@@ -221,7 +269,9 @@ def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
     apart_ns = abs(clock.unix_ns() - wall - (clock.monotonic_ns() - begun))
     if backwards:
         yield DoctorFinding(
-            "clock", "fail", f"the monotonic clock went back {count_nouns(backwards, 'time')} in 0.1 s"
+            "clock",
+            "fail",
+            f"the monotonic clock went back {count_nouns(backwards, 'time')} in 0.1 s",
         )
     elif apart_ns > STEP_NS:
         text = f"the wall clock stepped by {apart_ns / 1e6:.1f} ms in 0.1 s; that distorts no record"
@@ -231,10 +281,19 @@ def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
         yield DoctorFinding("clock", "ok", f"steady; {longest}")
 
 
-def examine_offsets(connection: Connection, clock: Clock, session: str) -> Iterator[DoctorFinding]:
+def examine_offsets(
+    connection: Connection, clock: Clock, session: str
+) -> Iterator[DoctorFinding]:
     """Yields how far the clocks of a session's members are ahead, and how well that is known."""
     try:
-        ping = ping_session(connection, clock, session, PINGS, CONNECT_S, lambda: False)
+        ping = ping_session(
+            connection=connection,
+            clock=clock,
+            session=session,
+            count=PINGS,
+            timeout_s=CONNECT_S,
+            stopped=lambda: False,
+        )
     except (RunFailed, SessionError, UsageError) as error:
         yield DoctorFinding("clock", "fail", str(error))
         return
@@ -252,7 +311,9 @@ def examine_offsets(connection: Connection, clock: Clock, session: str) -> Itera
 
 def _ask_process(code: str) -> Any:
     """Returns what a process of its own prints last, as JSON; None if it fails."""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False
+    )
     return None if done.returncode else json.loads(done.stdout.splitlines()[-1])
 
 
@@ -268,7 +329,11 @@ def examine_rights() -> Iterator[DoctorFinding]:
     good = {"scheduling": "SCHED_FIFO", "memory": "locked", "timer_slack": "1 ns"}
     for name, start in good.items():
         got = obtained[name].startswith(start)
-        help_ = "" if got else "; ticks will be late by milliseconds under load: see compose.realtime.yaml"
+        help_ = (
+            ""
+            if got
+            else "; ticks will be late by milliseconds under load: see compose.realtime.yaml"
+        )
         text = f"{name.replace('_', ' ')}: {obtained[name]}{help_}"
         yield DoctorFinding("rights", "ok" if got else "warn", text)
 
@@ -277,8 +342,12 @@ def examine_system() -> DoctorFinding:
     """Returns which half of the program is promised on this system."""
     name = {"Darwin": "macOS"}.get(platform.system(), platform.system())
     if name == "Linux":
-        return DoctorFinding("system", "ok", "Linux: live sessions and studies are both promised")
-    text = f"live sessions are promised on Linux alone; on {name} simulation, logs and studies are"
+        return DoctorFinding(
+            "system", "ok", "Linux: live sessions and studies are both promised"
+        )
+    text = (
+        f"live sessions are promised on Linux alone; on {name} simulation, logs and studies are"
+    )
     return DoctorFinding("system", "warn", text)
 
 
@@ -293,9 +362,18 @@ class Rehearsal(LoopStats):
 
     def run(self, clock: Clock) -> list[int]:
         """Makes its ticks in real time; returns how late each began, us."""
-        inbox = PeerInbox((), (), (), (), self.dropped)
-        timing = SiteTiming(clock.monotonic_ns() + NS_PER_S // 10, self._stepped.rate_hz, (), "")
-        timed: Any = (clock, inbox, timing, self, StateBlock(self._stepped, 1, lambda _: None), self)
+        inbox = PeerInbox(links=(), rings=(), boots=(), monitors=(), dropped=self.dropped)
+        timing = SiteTiming(
+            clock.monotonic_ns() + NS_PER_S // 10, self._stepped.rate_hz, (), ""
+        )
+        timed: Any = (
+            clock,
+            inbox,
+            timing,
+            self,
+            StateBlock(self._stepped, 1, lambda _: None),
+            self,
+        )
         run_loop(self._stepped, 1, self._ticks, *timed)
         return self._late_us
 
@@ -318,7 +396,8 @@ class Rehearsal(LoopStats):
 def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
     """Runs a site at one rate after the other until one is held, or none.
 
-    Returns for each its rate, Hz, the lateness within which `HELD_SHARE` of its ticks began, and the largest.
+    Returns for each its rate, Hz, the lateness within which `HELD_SHARE` of its ticks began,
+    and the largest.
     """
     found: list[tuple[int, int, int]] = []
     for rate_hz in RATES_HZ:
@@ -342,9 +421,13 @@ _RATES = (
 
 
 def examine_rate() -> DoctorFinding:
-    """Returns the highest tick rate that a site alone holds here and now, measured for a second each."""
+    """Returns the highest tick rate that a site alone holds here and now, measured for a second
+    each.
+    """
     if not is_core_cached():
-        return DoctorFinding("rate", "warn", "not measured: the core is not yet compiled, see below")
+        return DoctorFinding(
+            "rate", "warn", "not measured: the core is not yet compiled, see below"
+        )
     found: list[tuple[int, int, int]] | None = _ask_process(_RATES)
     if found is None:
         return DoctorFinding("rate", "warn", "could not be measured")
@@ -354,7 +437,9 @@ def examine_rate() -> DoctorFinding:
     if not is_held(rate_hz, late_us):
         text = f"a site alone holds not even {rate_hz} Hz: {text}; end other programs"
         return DoctorFinding("rate", "fail", text)
-    text = f"a site alone holds {rate_hz} Hz: {text} ({HELD_SHARE:.0%} must within half a period)"
+    text = (
+        f"a site alone holds {rate_hz} Hz: {text} ({HELD_SHARE:.0%} must within half a period)"
+    )
     if missed:
         text += f"; at {missed[-1][0]} Hz within {missed[-1][1] / 1e3:.2f} ms: lower rate_hz"
     return DoctorFinding("rate", "warn" if missed else "ok", text)
@@ -362,7 +447,9 @@ def examine_rate() -> DoctorFinding:
 
 def examine_room(folder: Path) -> Iterator[DoctorFinding]:
     """Yields free disk, processors and their load, and whether the core is compiled."""
-    place = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir())
+    place = next(
+        path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir()
+    )
     free = shutil.disk_usage(place).free
     state: FindingState = "fail" if free < LEAST_BYTES else "warn" if free < FEW_BYTES else "ok"
     if not os.access(place, os.W_OK):
@@ -373,7 +460,9 @@ def examine_room(folder: Path) -> Iterator[DoctorFinding]:
     text = f"{count_nouns(cores, 'processor')}, of which {load:.1f} are busy"
     warning = describe_load(measure_busy_share(SystemClock()))
     is_short = cores < 2 or load >= cores or bool(warning)
-    yield DoctorFinding("processors", "warn" if is_short else "ok", f"{text}; {warning}" if warning else text)
+    yield DoctorFinding(
+        "processors", "warn" if is_short else "ok", f"{text}; {warning}" if warning else text
+    )
     cached = is_core_cached()
     late = "not yet compiled: the first session here begins half a minute later"
     yield DoctorFinding("core", "ok" if cached else "warn", "compiled" if cached else late)
@@ -388,7 +477,9 @@ class DoctorReport(Result):
     def headline(self) -> str:
         """Returns how many findings warn or fail."""
         states = [finding.state for finding in self.findings]
-        return f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
+        return (
+            f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the findings as of `trilat doctor --json`."""
@@ -409,7 +500,8 @@ def doctor(
     folder: str | Path = "runs",
     insecure: bool = False,
 ) -> DoctorReport:
-    """Examines keys, links, clocks, rights, disk and processors; the command is `trilat doctor`.
+    """Examines keys, links, clocks, rights, disk and processors; the command is `trilat
+    doctor`.
 
     >>> "clock" in {finding.check for finding in tn.doctor().findings}
     True
@@ -428,5 +520,12 @@ def doctor(
     """
     connection = resolve_member_connection(listen, connect, router)
     place = None if keys is None else Path(keys)
-    found = examine_machine(connection, place, Path(folder), session, SystemClock(), insecure=insecure)
+    found = examine_machine(
+        connection=connection,
+        keys=place,
+        folder=Path(folder),
+        session=session,
+        clock=SystemClock(),
+        insecure=insecure,
+    )
     return DoctorReport(list(found))

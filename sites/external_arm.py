@@ -1,9 +1,10 @@
-"""Measurements of an external arm (`plant = "external"`) and its dead-man switch, as its site receives them.
+"""Measurements of an external arm (`plant = "external"`) and its dead-man switch, as its site
+receives them.
 
-Invariant: no arriving measurement can raise out of the loop, and the inbox is bounded. The newest
-measurement counts; a site does not begin without one, holds when none arrive for a moment, and is in fault
-when none arrive any more. One that the arm cannot have made since the last is dropped, and is none. A switch
-of which nothing is heard is not held.
+Invariant: no arriving measurement can raise out of the loop, and the inbox is bounded. The
+newest measurement counts; a site does not begin without one, holds when none arrive for a
+moment, and is in fault when none arrive any more. One that the arm cannot have made since the
+last is dropped, and is none. A switch of which nothing is heard is not held.
 """
 
 from collections import Counter
@@ -31,8 +32,9 @@ SILENCE_LIMIT_NS = 200_000_000
 SWITCH_SILENCE_NS = 100_000_000
 """A dead-man switch of which nothing is heard for longer is not held."""
 STARTS_KEPT = 64
-"""So many programs at a switch are told apart by their messages; of more one is forgotten, rather one that
-does not hold it."""
+"""So many programs at a switch are told apart by their messages; of more one is forgotten,
+rather one that does not hold it.
+"""
 START_POSE_TOLERANCE_RAD = 0.01
 """A larger distance of the arm from its `q0_rad` at the start is reported."""
 POLL_NS = 5_000_000
@@ -48,7 +50,12 @@ class ExternalArm:
     """
 
     def __init__(
-        self, site: Site, ring: StampedInbox[bytes], clock: Clock, dropped: Counter[str], place: str
+        self,
+        site: Site,
+        ring: StampedInbox[bytes],
+        clock: Clock,
+        dropped: Counter[str],
+        place: str,
     ) -> None:
         self.newest: PlantState | None = None
         self.taken = 0
@@ -80,12 +87,16 @@ class ExternalArm:
             self.poll()
             if self.newest is not None:
                 return True
-            for reason in [one for one in self._dropped if one.startswith("of ") and one not in told]:
+            for reason in [
+                one for one in self._dropped if one.startswith("of ") and one not in told
+            ]:
                 told.add(reason)  # as in: of 6 joints; the scenario has 7
                 say(f"its arm sends measurements {reason}")
             now_ns = self._clock.monotonic_ns()
             if now_ns > give_up_ns:
-                dropped = ", ".join(f"{count} {reason}" for reason, count in self._dropped.items())
+                dropped = ", ".join(
+                    f"{count} {reason}" for reason, count in self._dropped.items()
+                )
                 raise SessionError(
                     f"{self._site} waited in vain for its arm: no measurement came on {self._place}"
                     + (f"; dropped: {dropped}" if dropped else "")
@@ -104,8 +115,12 @@ class ExternalArm:
         self._silent_ns = 0
         pairs = zip(self.newest.q if self.newest else q0_rad, q0_rad, strict=True)
         off_rad = max(abs(a - b) for a, b in pairs)
-        told = f"its arm stands {off_rad:.3g} rad off q0_rad, which its peers take for its start"
-        return f"{told}: their references will jump" if off_rad > START_POSE_TOLERANCE_RAD else ""
+        told = (
+            f"its arm stands {off_rad:.3g} rad off q0_rad, which its peers take for its start"
+        )
+        return (
+            f"{told}: their references will jump" if off_rad > START_POSE_TOLERANCE_RAD else ""
+        )
 
     def poll(self) -> None:
         """Takes the measurements that have arrived."""
@@ -113,12 +128,16 @@ class ExternalArm:
         before = self.taken
         while (message := self._ring.poll()) is not None:
             self._take(message[0])
-        passed_ns = 0 if self._polled_ns is None else min(now_ns - self._polled_ns, _MAX_POLL_GAP_NS)
+        passed_ns = (
+            0 if self._polled_ns is None else min(now_ns - self._polled_ns, _MAX_POLL_GAP_NS)
+        )
         self._silent_ns = 0 if self.taken > before else self._silent_ns + passed_ns
         self._polled_ns = now_ns
 
     def take_order(self, mode: Mode) -> SiteOrder:
-        """Returns what its arm's silence asks of the site, which is in some mode; "": nothing new."""
+        """Returns what its arm's silence asks of the site, which is in some mode; "": nothing
+        new.
+        """
         told = self._told
         self._told = ""
         if self._silent_ns > SILENCE_LIMIT_NS:
@@ -136,7 +155,9 @@ class ExternalArm:
             self._dropped[error.reason] += 1
             return
         lost = self._silent_ns > SILENCE_LIMIT_NS  # its program may have been started anew
-        if message.site != self._site or (self._bound and not lost and message.boot != self._boot):
+        if message.site != self._site or (
+            self._bound and not lost and message.boot != self._boot
+        ):
             self._dropped["stranger"] += 1
             return
         if message.boot != self._boot:
@@ -180,13 +201,16 @@ class _Holder:
 
 
 class DeadManSwitch:
-    """The dead-man switch of one arm: whoever holds it and lets go, or is silent, stops the arm.
+    """The dead-man switch of one arm: whoever holds it and lets go, or is silent, stops the
+    arm.
 
-    Who held it besides has then to let go and press anew. Its age is taken on the own clock from where a
-    message came in, so that a site that slept is not held.
+    Who held it besides has then to let go and press anew. Its age is taken on the own clock
+    from where a message came in, so that a site that slept is not held.
     """
 
-    def __init__(self, site: str, ring: StampedInbox[bytes], clock: Clock, dropped: Counter[str]) -> None:
+    def __init__(
+        self, site: str, ring: StampedInbox[bytes], clock: Clock, dropped: Counter[str]
+    ) -> None:
         self._site = site
         self._ring = ring
         self._clock = clock
@@ -195,10 +219,15 @@ class DeadManSwitch:
         self._was_let_go = False
 
     def _holders(self) -> list[_Holder]:
-        return [one for one in self._programs.values() if one.counts and one.pressed_ns is not None]
+        return [
+            one for one in self._programs.values() if one.counts and one.pressed_ns is not None
+        ]
 
     def _is_silent(self, one: _Holder) -> bool:
-        return one.pressed_ns is None or self._clock.monotonic_ns() - one.pressed_ns > SWITCH_SILENCE_NS
+        return (
+            one.pressed_ns is None
+            or self._clock.monotonic_ns() - one.pressed_ns > SWITCH_SILENCE_NS
+        )
 
     @property
     def held(self) -> bool:
@@ -213,7 +242,9 @@ class DeadManSwitch:
         self._let_go([one for one in self._holders() if self._is_silent(one)])
 
     def take_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
-        """Returns what the switch asks of its site, which is in some mode for a reason; "": nothing."""
+        """Returns what the switch asks of its site, which is in some mode for a reason; "":
+        nothing.
+        """
         was_let_go = self._was_let_go
         self._was_let_go = False
         if was_let_go or not self.held:
@@ -221,7 +252,9 @@ class DeadManSwitch:
         return "held" if (mode, reason) == (Mode.STOPPED, LifeReason.RELEASED) else ""
 
     def _let_go(self, released: Sequence[_Holder]) -> None:
-        """Takes note of holders that let go or are silent: the others count no more until they press anew."""
+        """Takes note of holders that let go or are silent: the others count no more until they
+        press anew.
+        """
         if not released:
             return
         for one in released:

@@ -1,8 +1,9 @@
 """A hand of one's own in a process of its own: what `trilat hand` runs.
 
-Invariant: it sees what the site sends it, and nothing else of the session; each decision names the tick by
-whose view it was made, so that the site lets it act a fixed time after that. Views that are too old to act in
-time are skipped. If its class fails, it lets go and ends; if it is killed, the site notices the silence.
+Invariant: it sees what the site sends it, and nothing else of the session; each decision names
+the tick by whose view it was made, so that the site lets it act a fixed time after that. Views
+that are too old to act in time are skipped. If its class fails, it lets go and ends; if it is
+killed, the site notices the silence.
 """
 
 from collections import deque
@@ -39,7 +40,9 @@ class HandProcess(SiteClient):
         skipped: number of views that it had no time for.
     """
 
-    def __init__(self, at: HandSite, program: HandProgram, bus: Bus, clock: Clock, session: str) -> None:
+    def __init__(
+        self, at: HandSite, program: HandProgram, bus: Bus, clock: Clock, session: str
+    ) -> None:
         super().__init__(bus, clock, session, at.name)
         self.asked = self.skipped = 0
         self._program = program
@@ -76,8 +79,12 @@ class HandProcess(SiteClient):
             numbers = None if goal is None else [float(one) for one in goal]
         except (Exception, SystemExit) as error:  # the user's code
             self._send(message.k, None)
-            problem = f"failed at tick {message.k}: {type(error).__name__}: {error}; it has let go"
-            raise RunFailed(f"the hand {self._code.split()[0]} of {message.site} {problem}") from error
+            problem = (
+                f"failed at tick {message.k}: {type(error).__name__}: {error}; it has let go"
+            )
+            raise RunFailed(
+                f"the hand {self._code.split()[0]} of {message.site} {problem}"
+            ) from error
         self._send(message.k, numbers)
 
     def _send(self, k: int, goal: list[float] | None) -> None:
@@ -90,7 +97,10 @@ def read_view(message: HandViewMessage) -> HandView:
 
     def read(one: Any, names: tuple[str, ...]) -> Any:
         values = ((name, getattr(one, name)) for name in names if name != "peers")
-        return {name: np.array(value) if isinstance(value, list) else value for name, value in values}
+        return {
+            name: np.array(value) if isinstance(value, list) else value
+            for name, value in values
+        }
 
     peers = tuple(PeerView(**read(peer, PeerView._fields)) for peer in message.peers)
     return HandView(**read(message, HandView._fields), peers=peers)
@@ -115,20 +125,26 @@ def run_hand(
     at = place_own_hand(scenario, name)
     if at is None or not at.runs_alone:
         problem = "has no hand of kind 'own' with process = true"
-        raise UsageError(f"{name} {problem}: its site runs such a hand itself, or there is none")
+        raise UsageError(
+            f"{name} {problem}: its site runs such a hand itself, or there is none"
+        )
     program = make_program(at)
     clock = SystemClock()
     stopped = interrupt.requested
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
-    bus = open_bus(connection, clock, stopped, timeout_s, say)
+    bus = open_bus(
+        connection=connection, clock=clock, stopped=stopped, timeout_s=timeout_s, say=say
+    )
     if bus is None:
         return
-    with HandProcess(at, program, bus, clock, session) as hand:
+    with HandProcess(at=at, program=program, bus=bus, clock=clock, session=session) as hand:
         say(f"{name}: its hand {at.program} is there")
         while not (stopped() or hand.over):
             hand.serve()
             if not hand.asked and clock.monotonic_ns() > give_up_ns:
-                raise SessionError(f"{name} did not ask its hand {at.program} within {timeout_s:g} s")
+                raise SessionError(
+                    f"{name} did not ask its hand {at.program} within {timeout_s:g} s"
+                )
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         say(
             f"{name}: its hand was asked {count_nouns(hand.asked, 'time')}, "

@@ -1,8 +1,8 @@
 """The messages of whoever holds a site's arm, as the site receives them.
 
-Invariant: no message can raise out of the loop, and few are read in one tick. What somebody wants is limited
-here, whatever the sender says: `HandRules` and the operator's limits hold, and one of them holds the arm at a
-time. What is refused is counted by reason.
+Invariant: no message can raise out of the loop, and few are read in one tick. What somebody
+wants is limited here, whatever the sender says: `HandRules` and the operator's limits hold, and
+one of them holds the arm at a time. What is refused is counted by reason.
 """
 
 import math
@@ -27,7 +27,8 @@ from trilat_net.scenario.operators.kernel_operators import LiveHand
 from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
 
 MESSAGES_KEPT = 32
-"""Capacity of the inbox, and most messages that a tick reads: newer ones push older ones out."""
+"""Capacity of the inbox, and most messages that a tick reads: newer ones push older ones out.
+"""
 POLL_NS = 5_000_000
 
 
@@ -52,8 +53,8 @@ def _read_messages(
 class HandServer:
     """The live hand of one site.
 
-    `news` are ticks, and sentences on who has taken hold and let go that no event names yet. `limits` are
-    those of the site's motion.
+    `news` are ticks, and sentences on who has taken hold and let go that no event names yet.
+    `limits` are those of the site's motion.
     """
 
     def __init__(
@@ -77,13 +78,21 @@ class HandServer:
         self.news: list[tuple[int, str]] = []
 
     def track(self, _site: Site, k: int) -> list[float]:
-        """Returns what the hand does in tick k, by the messages that have come; see `HandInForce`."""
+        """Returns what the hand does in tick k, by the messages that have come; see
+        `HandInForce`.
+        """
         came = _read_messages(self._inbox, self._site, self._dropped)
         commands = [command for message in came if (command := self._read(message)) is not None]
         if not commands and not self._memory.target:
             return self._free
         t_ns = tick_ns(k, self._rules.rate_hz)
-        step = advance_hand(self._rules, self._memory, t_ns, commands, self._place)
+        step = advance_hand(
+            rules=self._rules,
+            memory=self._memory,
+            t_ns=t_ns,
+            commands=commands,
+            place=self._place,
+        )
         self._memory = step.memory
         for reason in step.refused:
             self._dropped[reason] += 1
@@ -106,14 +115,22 @@ class HandServer:
                 kept = self._memory.source
                 self._names = {kept: self._names[kept]} if kept else {}
             self._names[message.boot] = message.source or f"hand {message.boot:08x}"
-            return HandCommand(message.boot, message.n, message.grip, tuple(target), message.sent_ns)
+            return HandCommand(
+                source=message.boot,
+                number=message.n,
+                grip=message.grip,
+                target=tuple(target),
+                sent_ns=message.sent_ns,
+            )
         return None
 
 
 class RemoteHand(HandPlayer):
-    """A hand of one's own in a process of its own, which is sent what it sees and sends what it decides.
+    """A hand of one's own in a process of its own, which is sent what it sees and sends what it
+    decides.
 
-    Of what comes only the program of its class is taken; what is decided too late acts at once, and counts.
+    Of what comes only the program of its class is taken; what is decided too late acts at once,
+    and counts.
     """
 
     def __init__(
@@ -143,7 +160,9 @@ class RemoteHand(HandPlayer):
     def ask(self, k: int, arrays: SiteArrays) -> None:
         """Sends it what it sees."""
         view = self.view(k, arrays)
-        seen = _list_numbers(view) | {"peers": [PeerSeen(**_list_numbers(one)) for one in view.peers]}
+        seen = _list_numbers(view) | {
+            "peers": [PeerSeen(**_list_numbers(one)) for one in view.peers]
+        }
         self._publish(encode(HandViewMessage(site=self._site, boot=self._boot, **seen)))
         self._asked = k
 
@@ -181,4 +200,6 @@ class RemoteHand(HandPlayer):
 
 
 def _list_numbers(view: Any) -> dict[str, Any]:
-    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in view._asdict().items()}
+    return {
+        k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in view._asdict().items()
+    }

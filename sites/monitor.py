@@ -1,6 +1,7 @@
 """A session in a terminal, a row for each site: what `trilat demo` and `trilat watch` show.
 
-A terminal shows a table that is refreshed; other outputs get the same rows as lines every two seconds.
+A terminal shows a table that is refreshed; other outputs get the same rows as lines every two
+seconds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -65,14 +66,19 @@ def describe_site(
             "time": f"{stats.t_ns / NS_PER_S:.1f} s",
             "mode": stats.mode,
             AGES: ", ".join(
-                f"{peer} {age / 1000:.0f} ms" if age >= 0 else f"{peer} none" for peer, age in aged
+                f"{peer} {age / 1000:.0f} ms" if age >= 0 else f"{peer} none"
+                for peer, age in aged
             ),
             "late": f"{stats.late_max_us} us",
             "overruns": f"{stats.overruns}",
         }
     if record is not None:
         own, desired = (np.array([v]) for v in (record.x or record.q, record.q_des))
-        e = find_task_errors(own, desired, scenario.arms[name].axes) if record.x else own - desired
+        e = (
+            find_task_errors(own, desired, scenario.arms[name].axes)
+            if record.x
+            else own - desired
+        )
         hand = HandInForce.read(record.hand) if record.hand else None
         row |= {
             "time": f"{record.t_ns / NS_PER_S:.1f} s",
@@ -80,7 +86,13 @@ def describe_site(
             "angles": describe_angles(record.q),
             "|e|": f"{np.linalg.norm(e):.4f} {'m' if record.x else 'rad'}",
             "torque": f"{max(map(abs, record.tau)):.2f} N m",
-            "held": "" if hand is None else "yes" if hand.source else "fades" if hand.grip else "free",
+            "held": ""
+            if hand is None
+            else "yes"
+            if hand.source
+            else "fades"
+            if hand.grip
+            else "free",
         }
     if ended:
         return row | {"mode": "ended"}
@@ -96,16 +108,22 @@ def describe_row(row: SiteRow) -> str:
     """Returns a site in a line of text."""
     words = {"|e|": "|e|", "torque": "torque", "age": AGES, "hand": "held", "late": "late"}
     parts = [f"{row['site']} {row['time']} {row['mode']}".strip(), row["angles"]]
-    return "; ".join([*parts, *(f"{word} {row[key]}" for word, key in words.items() if row[key])])
+    return "; ".join(
+        [*parts, *(f"{word} {row[key]}" for word, key in words.items() if row[key])]
+    )
 
 
 def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
-    """Returns a block for each alarm: red, or yellow of a site that holds and goes on by itself."""
+    """Returns a block for each alarm: red, or yellow of a site that holds and goes on by
+    itself.
+    """
     blocks = []
     for name, alarm in alarms:
         colour = "red" if alarm.word in ("FAULT", "STOPPED") else "yellow"
         head = f" {name} {alarm.word} "
-        text = Text.assemble((head, f"bold reverse {colour}"), f"  {alarm.reason}\n", (alarm.advice, "bold"))
+        text = Text.assemble(
+            (head, f"bold reverse {colour}"), f"  {alarm.reason}\n", (alarm.advice, "bold")
+        )
         blocks.append(Panel(text, box=HEAVY, border_style=f"bold {colour}"))
     return blocks
 
@@ -130,20 +148,28 @@ class SessionDisplay:
     @property
     def due(self) -> bool:
         """True if what it shows is old."""
-        return self._clock.monotonic_ns() - self._shown_ns >= (TABLE_NS if self._live else LINES_NS)
+        return self._clock.monotonic_ns() - self._shown_ns >= (
+            TABLE_NS if self._live else LINES_NS
+        )
 
     def say(self, text: str) -> None:
         """Prints a line above the table."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
-    def show(self, title: str, rows: Sequence[SiteRow], alarms: Sequence[tuple[str, LifeAlarm]] = ()) -> None:
+    def show(
+        self, title: str, rows: Sequence[SiteRow], alarms: Sequence[tuple[str, LifeAlarm]] = ()
+    ) -> None:
         """Shows all sites, under what nobody may overlook."""
         self._shown_ns = self._clock.monotonic_ns()
         if self._live is None:
             shouted = [f"*** {name} {alarm}" for name, alarm in alarms]
             titled = [title] if title != self._title else []
             self._title = title
-            for line in [*titled, *shouted, *(describe_row(row) for row in rows if row["time"])]:
+            for line in [
+                *titled,
+                *shouted,
+                *(describe_row(row) for row in rows if row["time"]),
+            ]:
                 self.say(line)
             return
         table = Table(title=escape(title), title_justify="left")
@@ -158,7 +184,9 @@ class SessionDisplay:
 class SessionMonitor:
     """What the sites of a session that is started here say of themselves, on a display."""
 
-    def __init__(self, bus: Bus, session: str, scenario: Scenario, display: SessionDisplay) -> None:
+    def __init__(
+        self, bus: Bus, session: str, scenario: Scenario, display: SessionDisplay
+    ) -> None:
         self.latest: dict[str, LinkStats] = {}
         self.records: dict[str, State] = {}
         self._scenario = scenario
@@ -166,7 +194,8 @@ class SessionMonitor:
         self._links = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
         self._states = {
-            name: bus.inbox(topics.key(session, name, topics.STATE), 1) for name in scenario.names
+            name: bus.inbox(topics.key(session, name, topics.STATE), 1)
+            for name in scenario.names
         }
 
     def poll(self) -> None:
@@ -182,6 +211,8 @@ class SessionMonitor:
             for record in read_records(states, scenario.layout(name)):
                 self.records[name] = record
         if self._display.due:
-            known = [(name, self.records.get(name), self.latest.get(name)) for name in scenario.names]
+            known = [
+                (name, self.records.get(name), self.latest.get(name)) for name in scenario.names
+            ]
             rows = [describe_site(scenario, *one) for one in known]
             self._display.show(f"{scenario.name}, {scenario.duration_s:g} s", rows)

@@ -1,7 +1,9 @@
-"""The benchmark of a network: round trips by size, rate and transport, against what a scenario bears.
+"""The benchmark of a network: round trips by size, rate and transport, against what a scenario
+bears.
 
-Invariant: it is no part of any session. Its payloads go as samples go, by the same keys' roles, priority and
-settings, in a session of its own name; the far end sends each back at once. It lasts as long as it was told.
+Invariant: it is no part of any session. Its payloads go as samples go, by the same keys' roles,
+priority and settings, in a session of its own name; the far end sends each back at once. It
+lasts as long as it was told.
 """
 
 import math
@@ -26,7 +28,12 @@ from trilat_net.files import require_libraries
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, StampedInbox
 from trilat_net.net.clock import Clock, SystemClock
-from trilat_net.net.connection import ENCRYPTED, Connection, find_free_endpoints, secure_connection
+from trilat_net.net.connection import (
+    ENCRYPTED,
+    Connection,
+    find_free_endpoints,
+    secure_connection,
+)
 from trilat_net.net.member_keys import MemberKeys, create_keys, read_member_keys
 from trilat_net.net.messages import VERSION, PeerSample
 from trilat_net.net.zenoh_bus import ZenohBus
@@ -80,7 +87,9 @@ class NearEnd:
         self._number = 0
         self._put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
         key = topics.key(SESSION, "*", topics.SAMPLE)
-        self._inbox: StampedInbox[tuple[int, ...] | None] = bus.stamped(key, clock.monotonic_ns, _read)
+        self._inbox: StampedInbox[tuple[int, ...] | None] = bus.stamped(
+            key, clock.monotonic_ns, _read
+        )
 
     def _send(self, size_bytes: int) -> None:
         sample = _HEADER.pack(self._owner, self._number, self._clock.monotonic_ns(), 0)
@@ -107,7 +116,9 @@ class NearEnd:
         return False
 
     def measure(self, size_bytes: int, rate_hz: float, duration_s: float) -> Array:
-        """Returns the round trips of samples sent at a rate, s; NaN for those that did not come back."""
+        """Returns the round trips of samples sent at a rate, s; NaN for those that did not come
+        back.
+        """
         count = max(10, round(rate_hz * duration_s))
         clock = self._clock
         trips_s = np.full(count, np.nan)
@@ -131,12 +142,18 @@ class NearEnd:
         return trips_s
 
 
-def _open(endpoint: str, keys: MemberKeys | None, *, listens: bool, insecure: bool) -> tuple[ZenohBus, str]:
+def _open(
+    endpoint: str, keys: MemberKeys | None, *, listens: bool, insecure: bool
+) -> tuple[ZenohBus, str]:
     encrypted = endpoint.startswith(ENCRYPTED)
     if encrypted and keys is None:
-        raise UsageError(f"{endpoint}: an encrypted endpoint takes keys: give --keys DIR of a site")
+        raise UsageError(
+            f"{endpoint}: an encrypted endpoint takes keys: give --keys DIR of a site"
+        )
     if encrypted and keys is not None and keys.member in (*ROLES, ROUTER):
-        raise UsageError(f"--keys: a benchmark goes as samples go, so it takes a site's, not {keys.member}'s")
+        raise UsageError(
+            f"--keys: a benchmark goes as samples go, so it takes a site's, not {keys.member}'s"
+        )
     used = keys if encrypted else None
     at_end = Connection(listen=[endpoint]) if listens else Connection(connect=[endpoint])
     bus = secure_connection(at_end, used, insecure=insecure).open()
@@ -171,12 +188,22 @@ def run_far_end(
 
 @contextmanager
 def _own_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
-    """Yields endpoints of a far end on this machine, of all transports, and the keys of the near one."""
+    """Yields endpoints of a far end on this machine, of all transports, and the keys of the
+    near one.
+    """
     with tempfile.TemporaryDirectory() as folder:
         near, far = create_keys(Path(folder) / "keys", [NEAR, FAR], days=1)
         free = find_free_endpoints(len(PROTOCOLS))
-        endpoints = [place.replace("tcp", kind) for kind, place in zip(PROTOCOLS, free, strict=True)]
-        words = ["ping", "--keys", str(far), "--seconds", str(math.ceil(duration_s + 2 * CONNECT_NS / 1e9))]
+        endpoints = [
+            place.replace("tcp", kind) for kind, place in zip(PROTOCOLS, free, strict=True)
+        ]
+        words = [
+            "ping",
+            "--keys",
+            str(far),
+            "--seconds",
+            str(math.ceil(duration_s + 2 * CONNECT_NS / 1e9)),
+        ]
         words += [word for place in endpoints for word in ("--answer", place)]
         child = subprocess.Popen(
             [sys.executable, "-m", "trilat_net", *words],
@@ -196,8 +223,10 @@ class ScenarioNeeds(NamedTuple):
     Attributes:
         sample_bytes: of a sample of its largest arm.
         playout_ms: the least play-out of its links.
-        held_ms: for how long every link holds its samples at least, by play-out or a constant delay.
-        in_use_ms: the age of samples in use that its own links make; None if theory does not know.
+        held_ms: for how long every link holds its samples at least, by play-out or a constant
+            delay.
+        in_use_ms: the age of samples in use that its own links make; None if theory does not
+            know.
         stable_ms: the common delays for which its loop is stable; None if theory does not know.
         words: that in words, or why theory does not know.
     """
@@ -225,33 +254,51 @@ def find_needs(scenario: Scenario) -> ScenarioNeeds:
         echo=[[n, 100_000, 2**60] for n in range(len(scenario.names) - 1)],
         **vectors,
     )
-    held = [max(one.playout_ms, one.delay_ms if isinstance(one, ConstantDelay) else 0.0) for one in links]
+    held = [
+        max(one.playout_ms, one.delay_ms if isinstance(one, ConstantDelay) else 0.0)
+        for one in links
+    ]
     rates = [site.rate_hz for site in scenario.sites.values()]
     instead = ["link.model=constant", "link.delay_ms=1"] if scenario.measured else []
     try:
         require_libraries("scipy")
-        from trilat_net.theory.linear_analysis import analyse_linear_loop  # SciPy: no need of a far end
+        # SciPy: no need of a far end
+        from trilat_net.theory.linear_analysis import (
+            analyse_linear_loop,
+        )
 
         found = analyse_linear_loop(load_scenario(scenario, instead))
     except (ScenarioError, RunFailed, UsageError) as error:
-        theory: tuple[Any, ...] = (None, None, f"theory does not know its delay margin: {error}")
+        theory: tuple[Any, ...] = (
+            None,
+            None,
+            f"theory does not know its delay margin: {error}",
+        )
     else:
         stable = [[1e3 * one.low_s, 1e3 * one.high_s] for one in found.margin.intervals]
         own = None if instead else 1e3 * float(found.conditions.age_s.max())
         theory = (own, stable, found.margin.words)
     playout_ms = min((one.playout_ms for one in links), default=0.0)
     return ScenarioNeeds(
-        len(msgspec.msgpack.encode(sample)), max(rates), playout_ms, min(held, default=0.0), *theory
+        len(msgspec.msgpack.encode(sample)),
+        max(rates),
+        playout_ms,
+        min(held, default=0.0),
+        *theory,
     )
 
 
 def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any]:
     """Judges if a network is good enough, by its row at the scenario's own size and rate.
 
-    A sample is in use from its receiver's first tick after it came and was due (L2): the network counts with
-    its p99, a play-out and the scenario's own delay hide what is shorter.
+    A sample is in use from its receiver's first tick after it came and was due (L2): the
+    network counts with its p99, a play-out and the scenario's own delay hide what is shorter.
     """
-    facts = {"transport": row["transport"], "good": False, "lost_share": row["lost"] / row["sent"]}
+    facts = {
+        "transport": row["transport"],
+        "good": False,
+        "lost_share": row["lost"] / row["sent"],
+    }
     times = row["one_way_us"]
     if times is None:
         nothing = dict.fromkeys(("p99_ms", "age_ms", "spare_ms", "playout_ms"))
@@ -276,7 +323,9 @@ def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any
 
 @dataclass(frozen=True, repr=False)
 class NetworkBenchmark(Result):
-    """A network as it was measured, and whether it is good enough for a scenario, per transport."""
+    """A network as it was measured, and whether it is good enough for a scenario, per
+    transport.
+    """
 
     scenario: str
     duration_s: float
@@ -292,7 +341,12 @@ class NetworkBenchmark(Result):
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat ping --benchmark --json`."""
         facts = {"scenario": self.scenario, "duration_s": self.duration_s, "good": self.good}
-        return {**facts, "needs": self.needs._asdict(), "transports": self.judged, "rows": self.rows}
+        return {
+            **facts,
+            "needs": self.needs._asdict(),
+            "transports": self.judged,
+            "rows": self.rows,
+        }
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per size, rate and transport; times in us."""
@@ -312,18 +366,20 @@ def ping_benchmark(
     connect: Sequence[str] | None = None,
     keys: str | Path | None = None,
 ) -> NetworkBenchmark:
-    """Measures a network by size, rate and transport against a scenario; as `trilat ping --benchmark`.
+    """Measures a network by size, rate and transport against a scenario; as `trilat ping
+    --benchmark`.
 
     >>> found = tn.ping_benchmark("p_d_margin", duration_s=2)
     >>> [row["transport"] for row in found.to_dict()["transports"]]
     ['tcp', 'tls', 'quic']
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
+            scenario.
         set: overrides, as in `{"link.model": "measured"}`.
         duration_s: how long all cases take together, s.
-        connect: endpoints at which `trilat ping --answer` runs; by default one on this machine, over TCP,
-            TLS and QUIC.
+        connect: endpoints at which `trilat ping --answer` runs; by default one on this machine,
+            over TCP, TLS and QUIC.
         keys: folder of a site's keys, for encrypted endpoints.
 
     Raises:
@@ -338,8 +394,14 @@ def ping_benchmark(
             connect, keys = stack.enter_context(_own_far_end(duration_s))
         known = None if keys is None else read_member_keys(keys)
         share_s = duration_s / (len(connect) * len(SIZES) * len(RATES))
-        rows = [row for place in connect for row in _measure_endpoint(place, known, needs, share_s)]
-    own = [row for row in rows if (row["bytes"], row["rate_hz"]) == (needs.sample_bytes, needs.rate_hz)]
+        rows = [
+            row for place in connect for row in _measure_endpoint(place, known, needs, share_s)
+        ]
+    own = [
+        row
+        for row in rows
+        if (row["bytes"], row["rate_hz"]) == (needs.sample_bytes, needs.rate_hz)
+    ]
     judged = [judge_network(needs, row) for row in own]
     return NetworkBenchmark(chosen.name, duration_s, needs, rows, judged)
 
@@ -362,7 +424,11 @@ def _measure_endpoint(
             trips_s = near.measure(size_bytes, rate_hz, share_s)
             came_us = trips_s[np.isfinite(trips_s)] / 2 * 1e6  # half a round trip
             p50, p99 = np.percentile(came_us, (50, 99)) if len(came_us) else (0.0, 0.0)
-            most = {"p50": float(p50), "p99": float(p99), "max": float(came_us.max(initial=0.0))}
+            most = {
+                "p50": float(p50),
+                "p99": float(p99),
+                "max": float(came_us.max(initial=0.0)),
+            }
             yield {
                 "transport": endpoint.partition("/")[0],
                 "bytes": size_bytes,

@@ -1,7 +1,8 @@
-"""Real-time settings of a process: affinity, timer slack, locked memory, scheduling, garbage collector.
+"""Real-time settings of a process: affinity, timer slack, locked memory, scheduling, garbage
+collector.
 
-Invariant: a step that fails warns and the site goes on. A loop without privileges runs as well as it can, and
-its log records the settings obtained.
+Invariant: a step that fails warns and the site goes on. A loop without privileges runs as well
+as it can, and its log records the settings obtained.
 """
 
 import ctypes
@@ -17,7 +18,9 @@ from trilat_net.errors import count_nouns
 FIFO_PRIORITY = 50
 NICE = -10
 SITES_PER_PROCESSOR = 2
-"""More loops with priority would keep Zenoh and recorders from running, and connections would be lost."""
+"""More loops with priority would keep Zenoh and recorders from running, and connections would
+be lost.
+"""
 
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT = 1
@@ -37,8 +40,12 @@ def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
     steps: dict[str, Callable[[], str]] = {
         "affinity": lambda: _set_affinity(cpu),
         "timer_slack": lambda: _call_libc("1 ns", "prctl", _PR_SET_TIMERSLACK, 1),
-        "memory": lambda: _call_libc("locked", "mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT),
-        "scheduling": _set_scheduling if sites <= SITES_PER_PROCESSOR * cpus else lambda: shared,
+        "memory": lambda: _call_libc(
+            "locked", "mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT
+        ),
+        "scheduling": _set_scheduling
+        if sites <= SITES_PER_PROCESSOR * cpus
+        else lambda: shared,
         "collector": _stop_collector,
     }
     obtained = {}
@@ -70,7 +77,9 @@ def _call_libc(obtained: str, function: str, *arguments: int) -> str:
 def _set_scheduling() -> str:
     try:
         _set_threads(
-            lambda thread: os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY - 1))
+            lambda thread: os.sched_setscheduler(
+                thread, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY - 1)
+            )
         )
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(FIFO_PRIORITY))
     except (OSError, AttributeError):
@@ -83,7 +92,9 @@ def _set_scheduling() -> str:
 
 
 def _set_threads(change: Callable[[int], None]) -> None:
-    """Changes this thread and all others: one that waits for a processor may hold the interpreter."""
+    """Changes this thread and all others: one that waits for a processor may hold the
+    interpreter.
+    """
     change(0)
     tasks = Path("/proc/self/task")
     for thread in tasks.iterdir() if tasks.is_dir() else ():

@@ -1,7 +1,7 @@
 """Retransmission buffer of a site: recently published messages, for recorders that missed them.
 
-Invariant (L6): bounded in memory, a minute of every channel, and in time, one chunk per request. The loop
-answers in the slack of its ticks.
+Invariant (L6): bounded in memory, a minute of every channel, and in time, one chunk per
+request. The loop answers in the slack of its ticks.
 """
 
 from array import array
@@ -26,7 +26,8 @@ EVENTS_BYTES = 4_000_000
 
 
 class ChannelBuffer:
-    """The last messages of one channel; their numbers count from 0. `size_bytes` holds any one message.
+    """The last messages of one channel; their numbers count from 0. `size_bytes` holds any one
+    message.
 
     The memory is allocated at the start: nothing is allocated while the loop runs.
     """
@@ -38,7 +39,9 @@ class ChannelBuffer:
         self._bytes = bytearray().ljust(size_bytes, b"\xff")  # touched, so that the pages exist
         self._starts = array("q", bytes(8 * capacity))
         self._lengths = array("q", bytes(8 * capacity))
-        self._head = 0  # bytes written since the start, with those skipped at the end of the memory
+        self._head = (
+            0  # bytes written since the start, with those skipped at the end of the memory
+        )
 
     def begin_at(self, number: int) -> None:
         """Lets the first message have a number, before there is any."""
@@ -67,7 +70,9 @@ class ChannelBuffer:
             self.keep(b"")
 
     def chunk(self, first: int, last: int) -> tuple[int, list[bytes]]:
-        """Returns the number of the first message and the messages of one answer, of those that are kept."""
+        """Returns the number of the first message and the messages of one answer, of those that
+        are kept.
+        """
         first = max(first, self.oldest)
         payloads: list[bytes] = []
         size = 0
@@ -101,10 +106,14 @@ class RetransmitBuffer:
     def begin_at(self, tick: int) -> None:
         """Lets tick be the first one of the site."""
         self.channels[topics.STATE].begin_at(tick)
-        self.channels[topics.LINK].begin_at(count_messages(topics.LINK, tick, self._site.rate_hz))
+        self.channels[topics.LINK].begin_at(
+            count_messages(topics.LINK, tick, self._site.rate_hz)
+        )
 
     def skip(self, first: int, next_tick: int) -> None:
-        """Adds the numbers of what a site never publishes that makes no ticks from one on, up to another."""
+        """Adds the numbers of what a site never publishes that makes no ticks from one on, up
+        to another.
+        """
         self.channels[topics.STATE].skip(next_tick - first)
         ticks = next_tick, next_tick - first
         number, first_skipped = skipped_numbers(topics.LINK, *ticks, self._site.rate_hz)

@@ -1,10 +1,12 @@
-"""The bridge of a session to the graph of ROS 2: orders as services, and topics that are hands and robots.
+"""The bridge of a session to the graph of ROS 2: orders as services, and topics that are hands
+and robots.
 
-Invariant: ROS never sits in a loop. What comes from it enters only as a hand's message, which the site
-limits, fades and records, or as a measurement of an external arm, so that a log is verified without ROS. A
-topic that two publishers share moves nothing; a target that falls silent for 200 ms lets go. A robot without
-a valid torque gets what is safe for it, never mere silence. Nothing that comes from ROS ends the bridge: it
-is refused, counted by its reason, and the first of each reason is said.
+Invariant: ROS never sits in a loop. What comes from it enters only as a hand's message, which
+the site limits, fades and records, or as a measurement of an external arm, so that a log is
+verified without ROS. A topic that two publishers share moves nothing; a target that falls
+silent for 200 ms lets go. A robot without a valid torque gets what is safe for it, never mere
+silence. Nothing that comes from ROS ends the bridge: it is refused, counted by its reason, and
+the first of each reason is said.
 """
 
 import math
@@ -59,7 +61,9 @@ class OneSender:
         self._heard_ns = self._mixed_ns = clock.monotonic_ns() - RIVAL_NS
 
     def admit(self, gid: bytes) -> int:
-        """Returns how long nothing had come before a message, ns; ValueError: two publishers send."""
+        """Returns how long nothing had come before a message, ns; ValueError: two publishers
+        send.
+        """
         now_ns = self._clock.monotonic_ns()
         silent_ns = now_ns - self._heard_ns
         if self._gid not in (b"", gid) and silent_ns < RIVAL_NS:
@@ -67,18 +71,25 @@ class OneSender:
         self._gid = gid
         self._heard_ns = now_ns
         if now_ns - self._mixed_ns < RIVAL_NS:
-            raise ValueError("has two publishers: neither moves the arm until the other is gone")
+            raise ValueError(
+                "has two publishers: neither moves the arm until the other is gone"
+            )
         return silent_ns
 
 
 class TargetTopic:
-    """A topic of ROS that holds an arm as a hand: `target_pose`, `target_joint` or `target_wrench`.
+    """A topic of ROS that holds an arm as a hand: `target_pose`, `target_joint` or
+    `target_wrench`.
 
     `read` returns the goal of a message, or raises ValueError, and `act` gives it to the hand.
     """
 
     def __init__(
-        self, hand: Hand, read: Callable[[bytes], Sequence[float]], act: Callable[..., int], clock: Clock
+        self,
+        hand: Hand,
+        read: Callable[[bytes], Sequence[float]],
+        act: Callable[..., int],
+        clock: Clock,
     ) -> None:
         self.hand = hand
         self._read = read
@@ -89,7 +100,9 @@ class TargetTopic:
         self._held_ns: int | None = None
 
     def take(self, data: bytes, attachment: Attachment) -> None:
-        """Takes a message, in a thread of Zenoh's; raises ValueError or TrilatError if that cannot be."""
+        """Takes a message, in a thread of Zenoh's; raises ValueError or TrilatError if that
+        cannot be.
+        """
         with self._lock:
             try:
                 self._sender.admit(attachment.gid)
@@ -102,7 +115,10 @@ class TargetTopic:
     def watch(self) -> None:
         """Lets go where nobody has repeated the target."""
         with self._lock:
-            if self._held_ns is not None and self._clock.monotonic_ns() - self._held_ns > SILENCE_NS:
+            if (
+                self._held_ns is not None
+                and self._clock.monotonic_ns() - self._held_ns > SILENCE_NS
+            ):
                 self._let_go()
 
     def _let_go(self) -> None:
@@ -112,10 +128,11 @@ class TargetTopic:
 
 
 class DominanceTopic:
-    """A topic of ROS that sets the shares of a site in its peers, `set_dominance`; the newest message wins.
+    """A topic of ROS that sets the shares of a site in its peers, `set_dominance`; the newest
+    message wins.
 
-    One that only repeats what was asked for, without a pause of a second, asks for nothing. Its numbers are
-    in the order of `peers`; `change` asks the site, and waits until it agrees.
+    One that only repeats what was asked for, without a pause of a second, asks for nothing. Its
+    numbers are in the order of `peers`; `change` asks the site, and waits until it agrees.
     """
 
     def __init__(
@@ -147,12 +164,13 @@ class DominanceTopic:
 
 
 class RobotArm:
-    """A robot of ROS that is the arm of a site: the site gets its joint states, it gets the site's torque.
+    """A robot of ROS that is the arm of a site: the site gets its joint states, it gets the
+    site's torque.
 
-    It is the program of an external arm, see `ArmClient`. Where that has to brake, the robot's controller
-    gets again and again what is safe for it. Of each joint, in the scenario's order, `joints` has the names
-    by which the robot may call it; `make` returns a client of whatever start of the site. Until it is `armed`
-    the robot gets nothing but what is safe.
+    It is the program of an external arm, see `ArmClient`. Where that has to brake, the robot's
+    controller gets again and again what is safe for it. Of each joint, in the scenario's order,
+    `joints` has the names by which the robot may call it; `make` returns a client of whatever
+    start of the site. Until it is `armed` the robot gets nothing but what is safe.
 
     Raises:
         UsageError: the controller has not one number for each joint.
@@ -174,21 +192,33 @@ class RobotArm:
         self._order = [n for name in order for n, called in enumerate(joints) if name in called]
         self._safe = robot.safe or [0.0] * len(joints)
         whole = sorted(self._order) == list(range(len(joints))) and len(order) == len(joints)
-        if not whole or len(self._safe) != len(joints) or not all(map(math.isfinite, self._safe)):
+        if (
+            not whole
+            or len(self._safe) != len(joints)
+            or not all(map(math.isfinite, self._safe))
+        ):
             named = ", ".join(called[0] for called in joints)
-            raise UsageError(f"--names: `controller` and `safe` have one of each joint: {named}")
+            raise UsageError(
+                f"--names: `controller` and `safe` have one of each joint: {named}"
+            )
         self._pack = cdr.make_float_array_packer((" ".join(order), len(order)))
         self._commands = commands
         self._clock = clock
         self._sender = OneSender(clock)
         self._lock = threading.Lock()
-        self._sent: tuple[int, int] | None = None  # boot and tick of the record whose torque went out last
+        self._sent: tuple[int, int] | None = (
+            None  # boot and tick of the record whose torque went out last
+        )
         self._safe_ns = clock.monotonic_ns() - SAFE_NS
 
     def take(self, data: bytes, attachment: Attachment) -> None:
-        """Takes a message, in a thread of Zenoh's, unless it is of another robot; ValueError: it is none."""
+        """Takes a message, in a thread of Zenoh's, unless it is of another robot; ValueError:
+        it is none.
+        """
         found = cdr.read_joint_state(data)
-        if found.names and not any(name in found.names for called in self._joints for name in called):
+        if found.names and not any(
+            name in found.names for called in self._joints for name in called
+        ):
             return
         at = find_joint_places(self._joints, found)
         if len(found.velocity) != len(found.position):
@@ -196,7 +226,9 @@ class RobotArm:
                 f"has {count_nouns(len(found.position), 'position')} and "
                 f"{count_nouns(len(found.velocity), 'velocity')}"
             )
-        q, qd = (_check_finite([row[n] for n in at]) for row in (found.position, found.velocity))
+        q, qd = (
+            _check_finite([row[n] for n in at]) for row in (found.position, found.velocity)
+        )
         with self._lock:
             self._sender.admit(attachment.gid)
             self._client.send(q, qd, stamp_ns=found.stamp_ns)
@@ -208,7 +240,12 @@ class RobotArm:
                 self._client = self._make()
         record = self._client.record
         torque = self._client.torque()  # of that record, or a newer one
-        if not self.armed or torque is None or record is None or len(torque) != len(self._order):
+        if (
+            not self.armed
+            or torque is None
+            or record is None
+            or len(torque) != len(self._order)
+        ):
             if self._clock.monotonic_ns() - self._safe_ns >= SAFE_NS:
                 self.brake()
         elif self._sent != (record.boot, record.tick):
@@ -222,7 +259,9 @@ class RobotArm:
 
 
 def find_joint_places(names: Sequence[Sequence[str]], found: cdr.RosJoints) -> list[int]:
-    """Returns where joints, of some names each, stand in a message; ValueError: one is not there once."""
+    """Returns where joints, of some names each, stand in a message; ValueError: one is not
+    there once.
+    """
     if len(found.names) != len(found.position):
         raise ValueError(
             f"has {count_nouns(len(found.names), 'name')} and {count_nouns(len(found.position), 'position')}"
@@ -230,14 +269,18 @@ def find_joint_places(names: Sequence[Sequence[str]], found: cdr.RosJoints) -> l
     at = {name: n for n, name in enumerate(found.names)}
     lacking = [called[0] for called in names if not at.keys() & set(called)]
     if lacking:
-        raise ValueError(f"lacks {', '.join(lacking)}; it has {', '.join(found.names[:9]) or 'no names'}")
+        raise ValueError(
+            f"lacks {', '.join(lacking)}; it has {', '.join(found.names[:9]) or 'no names'}"
+        )
     if twice := [name for called in names for name in called if found.names.count(name) > 1]:
         raise ValueError(f"has {twice[0]} twice")
     return [next(at[name] for name in called if name in at) for called in names]
 
 
 def read_joint_target(names: Sequence[Sequence[str]], data: bytes) -> list[float]:
-    """Returns the angles of a `JointState` in an arm's order; ValueError: it lacks one, or is none."""
+    """Returns the angles of a `JointState` in an arm's order; ValueError: it lacks one, or is
+    none.
+    """
     found = cdr.read_joint_state(data)
     return _check_finite([found.position[n] for n in find_joint_places(names, found)])
 
@@ -249,10 +292,12 @@ def _check_finite(numbers: Sequence[float]) -> list[float]:
 
 
 def read_place_target(frame: str, axes: int, count: int, data: bytes) -> list[float]:
-    """Returns the place of a `PoseStamped` (7 numbers) or the force of a `WrenchStamped` (6), by the axes.
+    """Returns the place of a `PoseStamped` (7 numbers) or the force of a `WrenchStamped` (6),
+    by the axes.
 
     Raises:
-        ValueError: it cannot be read, is in another frame than this or none, or a number is not finite.
+        ValueError: it cannot be read, is in another frame than this or none, or a number is not
+            finite.
     """
     found, numbers = cdr.read_frame_vectors(data, count)
     if found not in ("", frame):
@@ -277,14 +322,22 @@ class Bridge:
         self._met = False
         self._epoch_unix_ns = epoch_unix_ns
         frames, self._diagnostics = (
-            graph.publisher(topic, COMMON_TOPICS[topic].kind, RELIABLE) for topic in (FRAMES, DIAGNOSTICS)
+            graph.publisher(topic, COMMON_TOPICS[topic].kind, RELIABLE)
+            for topic in (FRAMES, DIAGNOSTICS)
         )
         self._lines = {
             name: graph.publisher(f"{session}/{name}", channel.kind, RELIABLE)
             for name, channel in SESSION_CHANNELS.items()
         }
         self._sites = {
-            name: SiteTopics(ends, scenario, name, epoch_unix_ns, frames) for name in scenario.names
+            name: SiteTopics(
+                ends=ends,
+                scenario=scenario,
+                site=name,
+                epoch_unix_ns=epoch_unix_ns,
+                frames=frames,
+            )
+            for name in scenario.names
         }
         running = RunningSession(session, Connection(), bus)
         self.targets = dict[str, TargetTopic]()
@@ -297,14 +350,25 @@ class Bridge:
             self.dominance[topic] = DominanceTopic(scenario.peers(name), change, clock)
             graph.subscribe(topic, cdr.FLOAT64_ARRAY, self.dominance[topic].take)
         for name in scenario.open_hands:
-            hand = open_hand(bus, clock, session, name, scenario, "ros2")
-            last, kind, read, act = describe_target(scenario, name, hand, self._sites[name].frame)
+            hand = open_hand(
+                bus=bus,
+                clock=clock,
+                session=session,
+                site=name,
+                scenario=scenario,
+                source="ros2",
+            )
+            last, kind, read, act = describe_target(
+                scenario, name, hand, self._sites[name].frame
+            )
             topic = ends.topic(name, last)
             self.targets[topic] = TargetTopic(hand, read, act, clock)
             graph.subscribe(topic, kind, self.targets[topic].take)
         serve_orders(graph, running, scenario.names)
 
-    def run(self, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]) -> bool:
+    def run(
+        self, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
+    ) -> bool:
         """Shows the session at a rate, the newest record each time, until it ends or `stopped`.
 
         Returns True if another session has begun under its name.
@@ -324,7 +388,9 @@ class Bridge:
                 before = connected
                 connected = self._ends.graph.connected
                 if connected != before:
-                    say(f"the router of ROS {'is back' if connected else 'is gone: waiting for it'}")
+                    say(
+                        f"the router of ROS {'is back' if connected else 'is gone: waiting for it'}"
+                    )
             if now_ns - diagnosed_ns > NS_PER_S:
                 diagnosed_ns = now_ns
                 self._diagnose()
@@ -333,13 +399,17 @@ class Bridge:
         return False
 
     def _show(self, rate_hz: float) -> bool:
-        """Shows what has come; returns whether another session has begun under the name of this one."""
+        """Shows what has come; returns whether another session has begun under the name of this
+        one.
+        """
         for record in read_records(self._records):
             if record.site in self._sites:
                 self._sites[record.site].show(record, rate_hz)
         anew = False
         for event in read_messages(self._events, Event):
-            anew = anew or (event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns)
+            anew = anew or (
+                event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns
+            )
             if event.member in self._sites:
                 self._sites[event.member].shares.take(event.command)
             for name, data in pack_event(event, self._ends.clock.unix_ns()):
@@ -356,13 +426,17 @@ class Bridge:
     def _diagnose(self) -> None:
         records = [shown.newest for shown in self._sites.values() if shown.newest is not None]
         if self._diagnostics.heard:
-            self._diagnostics.put(pack_session_diagnostics(self._ends.session, self._epoch_unix_ns, records))
+            self._diagnostics.put(
+                pack_session_diagnostics(self._ends.session, self._epoch_unix_ns, records)
+            )
 
 
 def describe_target(
     scenario: Scenario, site: str, hand: Hand, frame: str
 ) -> tuple[str, str, Callable[[bytes], Sequence[float]], Callable[..., int]]:
-    """Returns how the live hand of a site is moved, in a frame: topic, type, what reads it, what it does."""
+    """Returns how the live hand of a site is moved, in a frame: topic, type, what reads it,
+    what it does.
+    """
     live = scenario.sites[site].find_live_hand(is_open=True)
     assert live is not None
     axes = len(scenario.arms[site].end_effector(scenario.sites[site].q0_rad))
@@ -370,13 +444,22 @@ def describe_target(
         read = partial(read_joint_target, list_joint_names(scenario, site))
         return "target_joint", cdr.JOINT_STATE, read, hand.turn
     if live.mode == "force":
-        return "target_wrench", cdr.WRENCH, partial(read_place_target, frame, axes, 6), hand.push
+        return (
+            "target_wrench",
+            cdr.WRENCH,
+            partial(read_place_target, frame, axes, 6),
+            hand.push,
+        )
     return "target_pose", cdr.POSE, partial(read_place_target, frame, axes, 7), hand.move
 
 
 def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
-    """Returns the names of each joint of a site: the one that its topics show, and that of the scenario."""
-    pairs = zip(Ros2SiteChannels(scenario, site).joints, scenario.arms[site].joint_names, strict=True)
+    """Returns the names of each joint of a site: the one that its topics show, and that of the
+    scenario.
+    """
+    pairs = zip(
+        Ros2SiteChannels(scenario, site).joints, scenario.arms[site].joint_names, strict=True
+    )
     return [tuple(dict.fromkeys(pair)) for pair in pairs]
 
 
@@ -430,7 +513,8 @@ def serve_ros2(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> None:
-    """Joins a session to the graph of ROS 2 until it ends, or `stopped`; waits for a router and for it.
+    """Joins a session to the graph of ROS 2 until it ends, or `stopped`; waits for a router and
+    for it.
 
     `timeout_s` is the longest wait for the first site or its router.
 
@@ -451,12 +535,17 @@ def serve_ros2(
                 clock.sleep_until(clock.monotonic_ns() + LOOK_NS)
                 continue
             with graph:
-                ends = Ends(graph, bus, clock, running.name, table)
+                ends = Ends(
+                    graph=graph, bus=bus, clock=clock, session=running.name, table=table
+                )
                 began_anew = show_session(ends, rate_hz, stopped, say)
 
 
-def show_session(ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]) -> bool:
-    """Shows a session until it ends or `stopped`; waits for it to begin, which the arms of robots let it.
+def show_session(
+    ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
+) -> bool:
+    """Shows a session until it ends or `stopped`; waits for it to begin, which the arms of
+    robots let it.
 
     Returns True if another one has begun under its name.
     """
@@ -484,8 +573,13 @@ def show_session(ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: C
         for topic, shares in bridge.dominance.items():
             stack.enter_context(_repeated(ASK_S, ends.graph.refusals.guard(topic, shares.ask)))
         held = [f"; /{topic} holds an arm" for topic in bridge.targets]
-        held += [f"; /{ends.topic(site, 'robot_states')} measures the arm of {site}" for site in robots]
-        say(f"session {ends.session} is in the graph of ROS 2: /{ends.session}/...{''.join(held)}")
+        held += [
+            f"; /{ends.topic(site, 'robot_states')} measures the arm of {site}"
+            for site in robots
+        ]
+        say(
+            f"session {ends.session} is in the graph of ROS 2: /{ends.session}/...{''.join(held)}"
+        )
         return bridge.run(rate_hz, stopped, say)
 
 
@@ -494,10 +588,12 @@ def open_robot(
     ends: Ends, site: str, robot: RobotTable, joints: Sequence[Sequence[str]] = ()
 ) -> Iterator[RobotArm]:
     """Yields the robot of a site, which is heard and driven meanwhile, and brakes at the end."""
-    commands = ends.graph.publisher(ends.topic(site, "robot_commands"), cdr.FLOAT64_ARRAY, RELIABLE)
+    commands = ends.graph.publisher(
+        ends.topic(site, "robot_commands"), cdr.FLOAT64_ARRAY, RELIABLE
+    )
     make = partial(ArmClient, ends.bus, ends.clock, ends.session, site)
     names = joints or [(name,) for name in robot.joints]
-    arm = RobotArm(make, names, robot, commands, ends.clock)
+    arm = RobotArm(make=make, joints=names, robot=robot, commands=commands, clock=ends.clock)
     ends.graph.subscribe(ends.topic(site, "robot_states"), cdr.JOINT_STATE, arm.take)
     with _repeated(DRIVE_S, arm.drive, arm.brake):
         yield arm
@@ -506,12 +602,20 @@ def open_robot(
 def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
     """Raises UsageError if the table has the robot of a site without an external arm."""
     for site, robot in table.robots.items():
-        if site not in scenario.outside and (robot != RobotTable() or site not in scenario.names):
+        if site not in scenario.outside and (
+            robot != RobotTable() or site not in scenario.names
+        ):
             able = ", ".join(scenario.outside) or "none"
-            raise UsageError(f"--names: sites.{site}: there is no external arm; sites with one: {able}")
+            raise UsageError(
+                f"--names: sites.{site}: there is no external arm; sites with one: {able}"
+            )
 
 
 def await_site(ends: Ends, stopped: Callable[[], bool], *, running: bool) -> Info | None:
-    """Returns what a site answers, of a session that is to be running or not; None if `stopped`."""
+    """Returns what a site answers, of a session that is to be running or not; None if
+    `stopped`.
+    """
     answers = find_members(ends.bus, ends.clock, ends.session, stopped=stopped, timeout_s=None)
-    return next((info for info in answers if info.scenario and (info.running or not running)), None)
+    return next(
+        (info for info in answers if info.scenario and (info.running or not running)), None
+    )

@@ -1,7 +1,7 @@
 """What a session shows in the graph of ROS 2: the topics of its sites.
 
-Invariant: a message is made only while somebody listens. Names are those of `topic_names`, messages those of
-`published`, which a bag has as well.
+Invariant: a message is made only while somebody listens. Names are those of `topic_names`,
+messages those of `published`, which a bag has as well.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,9 @@ LATCHED = QualityOfService(latched=True, depth=1)
 
 
 class Ends(NamedTuple):
-    """Both ends of the bridge: the graph of ROS, and a session by its bus, its name and its topics."""
+    """Both ends of the bridge: the graph of ROS, and a session by its bus, its name and its
+    topics.
+    """
 
     graph: Ros2Graph
     bus: Bus
@@ -36,13 +38,19 @@ class Ends(NamedTuple):
 
 
 class SiteTopics:
-    """What one site shows, under `/<session>/<site>`, and by `frames` of `/tf`; stamps count from the epoch.
+    """What one site shows, under `/<session>/<site>`, and by `frames` of `/tf`; stamps count
+    from the epoch.
 
     Its end effector is in `frame`; `newest` is the record that was shown last.
     """
 
     def __init__(
-        self, ends: Ends, scenario: Scenario, site: str, epoch_unix_ns: int, frames: TopicPublisher
+        self,
+        ends: Ends,
+        scenario: Scenario,
+        site: str,
+        epoch_unix_ns: int,
+        frames: TopicPublisher,
     ) -> None:
         self._messages = SiteMessages(scenario, site, epoch_unix_ns)
         self._frames = frames
@@ -61,7 +69,8 @@ class SiteTopics:
         return self._publishers[topic].heard
 
     def show(self, record: State, rate_hz: float) -> None:
-        """Publishes a record, as far as somebody listens, if it is the first of its time at a rate.
+        """Publishes a record, as far as somebody listens, if it is the first of its time at a
+        rate.
 
         None is shown after a later one.
         """
@@ -70,7 +79,9 @@ class SiteTopics:
         if last is not None and record.boot == last.boot and times[0] <= times[1]:
             return
         self.newest = record
-        for topic, data in self._messages.pack_record(record, self.shares.at(record.t_ns), self._is_heard):
+        for topic, data in self._messages.pack_record(
+            record, self.shares.at(record.t_ns), self._is_heard
+        ):
             self._publishers[topic].put(data)
         if self._frames.heard:
             for data in self._messages.pack_frames(record):

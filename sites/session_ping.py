@@ -1,6 +1,8 @@
-"""Ping client: round trips to every member of a session, the links of its sites; delays of a topic of ROS 2.
+"""Ping client: round trips to every member of a session, the links of its sites; delays of a
+topic of ROS 2.
 
-Invariant: read-only. It announces no token in a session, which neither waits for it nor sees it.
+Invariant: read-only. It announces no token in a session, which neither waits for it nor sees
+it.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,7 +36,9 @@ PATIENCE_NS = 3_000_000_000
 
 @dataclass(frozen=True, repr=False)
 class PingReport(Result):
-    """Round trips and clock offsets to every member of a session, and its links as its sites measure them."""
+    """Round trips and clock offsets to every member of a session, and its links as its sites
+    measure them.
+    """
 
     session: str
     members: list[dict[str, Any]]
@@ -46,7 +50,9 @@ class PingReport(Result):
 
 
 class SessionPing:
-    """One measurement of a session, of `count` round trips to each member; call `poll` until `over`."""
+    """One measurement of a session, of `count` round trips to each member; call `poll` until
+    `over`.
+    """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, count: int) -> None:
         self.infos: dict[str, Info] = {}
@@ -79,7 +85,9 @@ class SessionPing:
             return now_ns - begun_ns > timeout_ns
         passed_ns = now_ns - self._first_ns
         enough_ns = GATHER_NS + self._count * PING_PACE_NS + PATIENCE_NS
-        return passed_ns > GATHER_NS and (self.pinger.know(self._boots) or passed_ns > enough_ns)
+        return passed_ns > GATHER_NS and (
+            self.pinger.know(self._boots) or passed_ns > enough_ns
+        )
 
     def report(self) -> PingReport:
         """Returns what it found."""
@@ -135,7 +143,8 @@ def ping_session(
     timeout_s: float,
     stopped: Callable[[], bool],
 ) -> PingReport | None:
-    """Measures a session once; None if `stopped`. It waits for the first answer for `timeout_s`.
+    """Measures a session once; None if `stopped`. It waits for the first answer for
+    `timeout_s`.
 
     Raises:
         RunFailed: no member answered.
@@ -144,7 +153,8 @@ def ping_session(
     def site_names(text: str) -> tuple[str, ...]:
         try:
             return parse_embedded(text, session).names
-        except ScenarioError:  # of another version: the first site's endpoint is all that is known
+        # of another version: the first site's endpoint is all that is known
+        except ScenarioError:
             return ()
 
     there = connection, clock, session, site_names
@@ -174,8 +184,8 @@ def ping_session(
 class TopicDelays(Result):
     """How long messages of a topic of ROS 2 were on their way, for each publisher of it.
 
-    From the time of sending in the attachment of each to its arrival here: it contains the offset between the
-    clocks of the two machines.
+    From the time of sending in the attachment of each to its arrival here: it contains the
+    offset between the clocks of the two machines.
     """
 
     topic: str
@@ -213,7 +223,10 @@ def ping_topic(
             f"nobody published on /{topic} in {lasted_s:.3g} s: see ros2 topic list, and --domain"
         )
     publishers = [
-        {"gid": gid.hex(), "type": types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_")}
+        {
+            "gid": gid.hex(),
+            "type": types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_"),
+        }
         | _describe_delays(list(came), lasted_s)
         for gid, came in list(heard.items())
     ]

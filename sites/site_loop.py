@@ -1,11 +1,11 @@
 """The real-time loop of a site on an absolute tick grid, and the inbox of its peers' samples.
 
-Invariant (L1): tick k lies at epoch + k periods of the leader's grid; the site wakes up for it in its turn.
-Lateness is telemetry and enters no formula; a late loop runs its missed ticks back to back and counts them,
-or at an arm outside makes none of them, since no plant can be caught up with: the numbers of its ticks jump.
-No arriving payload can raise out of the loop: it is a peer's sample, or it is counted by reason and dropped.
-Samples are decoded as they arrive, before their tick, and carry the instants of their arrival, not of their
-draining.
+Invariant (L1): tick k lies at epoch + k periods of the leader's grid; the site wakes up for it
+in its turn. Lateness is telemetry and enters no formula; a late loop runs its missed ticks back
+to back and counts them, or at an arm outside makes none of them, since no plant can be caught
+up with: the numbers of its ticks jump. No arriving payload can raise out of the loop: it is a
+peer's sample, or it is counted by reason and dropped. Samples are decoded as they arrive,
+before their tick, and carry the instants of their arrival, not of their draining.
 """
 
 from bisect import bisect_right
@@ -19,7 +19,14 @@ from trilat_net.core.link import AHEAD_LIMIT_NS
 from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.site_setup import LinkSetup, SiteSetup
 from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import MAX_ARRIVALS, NS_PER_S, Arrival, Mode, TickRecord, first_tick_at
+from trilat_net.core.ticks import (
+    MAX_ARRIVALS,
+    NS_PER_S,
+    Arrival,
+    Mode,
+    TickRecord,
+    first_tick_at,
+)
 from trilat_net.errors import WireError
 from trilat_net.net.bus import StampedInbox
 from trilat_net.net.clock import Clock
@@ -33,7 +40,9 @@ if TYPE_CHECKING:
 
 
 def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample | WireError]]:
-    """Returns for each peer of a site what reads its samples, in threads that nothing may raise in."""
+    """Returns for each peer of a site what reads its samples, in threads that nothing may raise
+    in.
+    """
     layouts = [setup.layout._replace(sent=link.channel.floats) for link in setup.links]
     return [make_reader(PeerSample, layout) for layout in layouts]
 
@@ -41,15 +50,17 @@ def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample |
 GUARDED_AHEAD_NS = NS_PER_S
 """Of a site that glides: a stamp further ahead is dropped."""
 STEP_MARGIN_RAD = 0.02
-"""A peer's angle may be so much farther from the last one than its limit of speed lets it go."""
+"""A peer's angle may be so much farther from the last one than its limit of speed lets it go.
+"""
 
 
 class PeerInbox:
     """The samples of a site's peers; every sequence has one entry for each, in scenario order.
 
-    Messages of other boots are dropped; `dropped` counts what is dropped, by reason. A site that joins late
-    passes over samples stamped before its own first tick, at `from_ns`: it takes nothing for the past. Under
-    `glide` a sample that the peer's arm cannot have made since the last is dropped too, and one far ahead.
+    Messages of other boots are dropped; `dropped` counts what is dropped, by reason. A site
+    that joins late passes over samples stamped before its own first tick, at `from_ns`: it
+    takes nothing for the past. Under `glide` a sample that the peer's arm cannot have made
+    since the last is dropped too, and one far ahead.
     """
 
     def __init__(
@@ -74,16 +85,22 @@ class PeerInbox:
             self.drain(from_ns)  # what came while it waited must not burden the first tick
 
     def admit(self, index: int, boot: int, first: int) -> None:
-        """Takes from now on the samples of another start of a peer, which begins at a tick of its own."""
+        """Takes from now on the samples of another start of a peer, which begins at a tick of
+        its own.
+        """
         self._boots[index] = boot
         self._newest[index] = None
         self._last[index] = max(self._last[index], first - 1)
         self._passed_over[index] = self._last[index]
 
     def newest_before(self, index: int, boot: int) -> int | None:
-        """Returns the newest tick of which a sample came of a peer's start, if this is another one."""
+        """Returns the newest tick of which a sample came of a peer's start, if this is another
+        one.
+        """
         newest = self._last[index]
-        return newest if boot != self._boots[index] and newest > self._passed_over[index] else None
+        return (
+            newest if boot != self._boots[index] and newest > self._passed_over[index] else None
+        )
 
     def drain(self, since_epoch_ns: int) -> list[Arrival]:
         """Returns the samples that arrived, peer by peer, each in order; at most MAX_ARRIVALS."""
@@ -120,7 +137,15 @@ class PeerInbox:
         self._last[index] = max(self._last[index], sample.tick)
         delay_ns = self._monitors[index].take(sample, arrived_ns)
         ch = link.channel.part(sample.ch, link.place) if sample.ch else ()
-        return Arrival(index, sample.tick, sample.q, sample.qd, delay_ns // 1000, sample.tau_x, ch)
+        return Arrival(
+            peer=index,
+            tick=sample.tick,
+            q=sample.q,
+            qd=sample.qd,
+            latency_us=delay_ns // 1000,
+            tau_x=sample.tau_x,
+            ch=ch,
+        )
 
     def _is_plausible(self, index: int, sample: PeerSample) -> bool:
         link = self._links[index]
@@ -142,13 +167,18 @@ BLOCKS_PER_S = 100
 """Recorders get the records of 10 ms together."""
 HELD_PER_S = 200
 HELD_DELAY_US = 100_000
-"""Peers on the same machine get the samples of 5 ms together where none is due sooner after its stamp."""
+"""Peers on the same machine get the samples of 5 ms together where none is due sooner after its
+stamp.
+"""
 
 
 def may_hold_samples(scenario: Scenario, name: str) -> bool:
-    """True if all links from a site delay its samples so much, and it hears of changes of these links."""
+    """True if all links from a site delay its samples so much, and it hears of changes of these
+    links.
+    """
     return all(
-        max(model.playout_us, model.location * (model.kind == DelayKind.CONSTANT)) >= HELD_DELAY_US
+        max(model.playout_us, model.location * (model.kind == DelayKind.CONSTANT))
+        >= HELD_DELAY_US
         for site in scenario.names
         for link in scenario.setup(site).links
         for model in link.models
@@ -157,14 +187,17 @@ def may_hold_samples(scenario: Scenario, name: str) -> bool:
 
 
 class StateBlock:
-    """The records of a site's latest ticks, which recorders get together, and after peers have their samples.
+    """The records of a site's latest ticks, which recorders get together, and after peers have
+    their samples.
 
     Args:
-        turn: the site's place among those of the scenario, so that sites of one processor take turns.
+        turn: the site's place among those of the scenario, so that sites of one processor take
+            turns.
         single: True if every record is sent with its tick, for the program of an external arm.
 
     Attributes:
-        holds_samples: True if samples wait for others too, so that peers are woken up once for some.
+        holds_samples: True if samples wait for others too, so that peers are woken up once for
+            some.
     """
 
     def __init__(
@@ -187,7 +220,8 @@ class StateBlock:
         self._records: list[tuple[Any, ...]] = []
 
     def add(self, output: TickRecord, *facts: Any) -> bool:
-        """Adds a record, with the arguments of `encode_state` up to the stamps; true if its block is due.
+        """Adds a record, with the arguments of `encode_state` up to the stamps; true if its
+        block is due.
 
         Whoever holds the arm gets every record at once.
         """
@@ -196,7 +230,9 @@ class StateBlock:
         return held or (output.tick + 1) % self._ticks == self._turn
 
     def send_samples(self, k: int, send: Callable[[TickRecord], tuple[Any, ...]]) -> None:
-        """Sends the samples so far if peers get them after tick k; `send` returns the stamps of one."""
+        """Sends the samples so far if peers get them after tick k; `send` returns the stamps of
+        one.
+        """
         if not self.holds_samples or (k + 1 - self._turn) % self._held == 0:
             self._add_stamps(send)
 
@@ -211,11 +247,18 @@ class StateBlock:
         records = self._records
         self._records = []
         if records:
-            self._send([encode_state(site.name, self._boot, site.peers, *record) for record in records])
+            self._send(
+                [encode_state(site.name, self._boot, site.peers, *record) for record in records]
+            )
 
 
 def _send_sample(
-    name: str, boot: int, clock: Clock, timing: SiteTiming, io: "RunningSite", output: TickRecord
+    name: str,
+    boot: int,
+    clock: Clock,
+    timing: SiteTiming,
+    io: "RunningSite",
+    output: TickRecord,
 ) -> tuple[Any, ...]:
     stamps = timing.sent(output.tick, clock.monotonic_ns()), timing.echo()
     io.publish_sample(encode_sample(name, boot, output, *stamps))
@@ -236,7 +279,9 @@ def run_loop(
     *,
     catches_up: bool = True,
 ) -> TickRecord | None:
-    """Runs a site in real time, from its first tick, and returns its last record; None without a tick."""
+    """Runs a site in real time, from its first tick, and returns its last record; None without
+    a tick.
+    """
     send = partial(_send_sample, site.name, boot, clock, timing, io)
     quarter_ns = NS_PER_S // (4 * site.rate_hz)
     deadline_ns = timing.deadline(first)

@@ -1,7 +1,7 @@
 """The parts of a site that live from its start to its end, and its options.
 
-Invariant: once made, every subscription of the site is declared and its step is compiled, so a site that
-declares itself alive is ready for its session.
+Invariant: once made, every subscription of the site is declared and its step is compiled, so a
+site that declares itself alive is ready for its session.
 """
 
 from collections.abc import Callable
@@ -53,7 +53,8 @@ class SiteOptions:
     Attributes:
         stay_s: how long to stay afterwards until the recorder has left, at most, s.
         without: sites without which the session begins; they may join it while it runs.
-        leave_timeout_s: how long to go on after a site has left that does not come back, s; None: to the end.
+        leave_timeout_s: how long to go on after a site has left that does not come back, s;
+            None: to the end.
     """
 
     session: str
@@ -97,7 +98,9 @@ class SiteParts:
         self.watchdog, self.step = watch_law(scenario, self.site, clock)
         self.rings = [
             bus.stamped(topics.key(session, link.peer, topics.SAMPLE), clock.monotonic_ns, read)
-            for link, read in zip(self.setup.links, make_sample_readers(self.setup), strict=True)
+            for link, read in zip(
+                self.setup.links, make_sample_readers(self.setup), strict=True
+            )
         ]
         self.arm: ExternalArm | None = None
         self.switch: DeadManSwitch | None = None
@@ -111,14 +114,19 @@ class SiteParts:
         queries = bus.questions(topics.key(session, name, topics.PAST))
         self.buffer = RetransmitBuffer(self.site, self.boot, queries)
         self.publish_sample = bus.publisher(topics.key(session, name, topics.SAMPLE))
-        single = self.arm is not None or scenario.sites_may_return  # a site that is killed loses no record
+        # a site that is killed loses no record
+        single = self.arm is not None or scenario.sites_may_return
         send_states, send_links = map(self._keeping_publisher, (topics.STATE, topics.LINK))
-        self.states = StateBlock(self.site, self.boot, send_states, scenario.names.index(name), single=single)
+        self.states = StateBlock(
+            self.site, self.boot, send_states, scenario.names.index(name), single=single
+        )
         self.states.holds_samples = not single and may_hold_samples(scenario, name)
         self.publish_link: Callable[[bytes], None] = lambda payload: send_links([payload])
         self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
         self._next_tick = -1
-        asked, stops = (bus.questions(topics.key(session, name, one)) for one in (topics.SET, topics.STOP))
+        asked, stops = (
+            bus.questions(topics.key(session, name, one)) for one in (topics.SET, topics.STOP)
+        )
         inputs = (lambda: self.site.mode), (lambda: self.switch is None or self.switch.held)
         self.changes = ChangeServer(scenario, name, asked, *inputs, stops)
         warm_up(scenario, name, clock)
@@ -145,28 +153,40 @@ class SiteParts:
         dropped = self.stats.dropped
         if at is not None:
             publish = bus.publisher(topics.key(session, name, topics.VIEW))
-            self.hand = RemoteHand(at, self.boot, inbox, publish, dropped, self.clock)
+            self.hand = RemoteHand(
+                at=at,
+                boot=self.boot,
+                inbox=inbox,
+                publish=publish,
+                dropped=dropped,
+                clock=self.clock,
+            )
             return
         self.hand = HandServer(
-            self.site,
-            live,
-            self.scenario.arms[name],
-            inbox,
-            dropped,
-            self.scenario.motion_limits(name),
+            site=self.site,
+            hand=live,
+            arm=self.scenario.arms[name],
+            inbox=inbox,
+            dropped=dropped,
+            limits=self.scenario.motion_limits(name),
         )
 
     def _meet_outside_arm(self) -> None:
         name = self.name
         session = self.options.session
         dropped = self.stats.dropped
-        measured, enable = (topics.key(session, name, one) for one in (topics.MEASURED, topics.ENABLE))
+        measured, enable = (
+            topics.key(session, name, one) for one in (topics.MEASURED, topics.ENABLE)
+        )
         if name in self.scenario.outside:
             ring = self.bus.stamped(measured, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
             connection = self.options.connection
-            reached = connection.reach(connection.listen or connection.connect or ())  # its own, or a router
+            # its own, or a router
+            reached = connection.reach(connection.listen or connection.connect or ())
             place = " at ".join([measured, *map(str, reached[:1])])
-            self.arm = ExternalArm(self.site, ring, self.clock, dropped, place)
+            self.arm = ExternalArm(
+                site=self.site, ring=ring, clock=self.clock, dropped=dropped, place=place
+            )
         if self.scenario.sites[name].arm.dead_man:
             ring = self.bus.stamped(enable, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
             self.switch = DeadManSwitch(name, ring, self.clock, dropped)
@@ -184,22 +204,34 @@ class SiteParts:
         return keep_and_publish
 
     def take_changes(self, k: int) -> list[CoreChange]:
-        """Returns what the site takes in at tick k: requests, and what it finds out about its own arm."""
+        """Returns what the site takes in at tick k: requests, and what it finds out about its
+        own arm.
+        """
         changes = list(self.changes.take(k))
         if self.arm is None:
             return changes
-        skipped = k - self._next_tick if self._next_tick >= 0 else 0  # it may join a running session
+        # it may join a running session
+        skipped = k - self._next_tick if self._next_tick >= 0 else 0
         self._next_tick = k + 1
         if skipped:
             self.buffer.skip(k - skipped, k)
         mode = self.site.mode
-        orders: list[tuple[SiteOrder, int]] = [("overrun", skipped), (self.arm.take_order(mode), 0)]
+        orders: list[tuple[SiteOrder, int]] = [
+            ("overrun", skipped),
+            (self.arm.take_order(mode), 0),
+        ]
         if self.switch is not None:
             orders.append((self.switch.take_order(mode, self.site.life_reason), 0))
         for order, ticks in orders:
             if ticks or (order and order != "overrun"):
                 t_ns = tick_ns(k, self.site.rate_hz)
-                change = make_site_order(self.scenario, self.name, order, t_ns, ticks)
+                change = make_site_order(
+                    scenario=self.scenario,
+                    site=self.name,
+                    order=order,
+                    from_ns=t_ns,
+                    ticks=ticks,
+                )
                 changes.append(to_core_change(self.scenario, change))
         return changes
 
@@ -208,7 +240,8 @@ WARM_UP_TICKS = 200
 
 
 def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
-    """Steps a throw-away site, so that all code of a tick is compiled and in memory; it leaves no trace.
+    """Steps a throw-away site, so that all code of a tick is compiled and in memory; it leaves
+    no trace.
 
     Raises:
         LawFailed: a user law fails already with every arm at rest where it starts.
@@ -220,7 +253,9 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
         with watchdog:
             _warm(setup, site, step)
     except LawFailed as failed:
-        problem = f"{failed.problem}; this was the rehearsal, with every arm at rest where it starts"
+        problem = (
+            f"{failed.problem}; this was the rehearsal, with every arm at rest where it starts"
+        )
         raise LawFailed(problem, site=name, code=failed.code, tick=failed.tick) from None
 
 
@@ -252,7 +287,21 @@ def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord])
         ]
         output = step(TickInput(k, arrivals, (), measured))
         echo = [(arrival.peer, arrival.tick, k) for arrival in arrivals]
-        decode(encode_sample(setup.name, 0, output, k, echo), PeerSample, layout=site.layout)
-        encode_state(setup.name, 0, site.peers, output, arrivals, 0, 0, k, echo)
+        decode(
+            encode_sample(site=setup.name, boot=0, output=output, sent_ns=k, echo=echo),
+            PeerSample,
+            layout=site.layout,
+        )
+        encode_state(
+            site=setup.name,
+            boot=0,
+            peers=site.peers,
+            output=output,
+            arrivals=arrivals,
+            late_us=0,
+            busy_us=0,
+            sent_ns=k,
+            echo=echo,
+        )
         estimator.add(OffsetLimit(k, 1), OffsetLimit(k, -1))
     estimator.estimate(WARM_UP_TICKS)

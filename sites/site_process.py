@@ -1,8 +1,8 @@
 """One site as one process: it joins a session, runs, and leaves.
 
-Invariant: a site declares itself alive only when its subscriptions are declared and its step is compiled.
-Until the epoch its arm is braked; at the end it stays until every recorder present has all messages that it
-can have, or for some seconds.
+Invariant: a site declares itself alive only when its subscriptions are declared and its step is
+compiled. Until the epoch its arm is braked; at the end it stays until every recorder present
+has all messages that it can have, or for some seconds.
 """
 
 import signal
@@ -59,8 +59,10 @@ NOBODY = -1
 STATUS_TICKS_S = 5
 """Between two lines that say how a site does, s."""
 LINGER_NS = 10 * NS_PER_S
-"""Longest wait after the last query of a recorder. One whose process was frozen, or whose connection broke,
-needs seconds to connect again: that takes the lease of Zenoh, 5 s, and one attempt after that."""
+"""Longest wait after the last query of a recorder. One whose process was frozen, or whose
+connection broke, needs seconds to connect again: that takes the lease of Zenoh, 5 s, and one
+attempt after that.
+"""
 TELL_NS = NS_PER_S
 """A wait of this length is announced to the user."""
 LEAVE_TIMEOUT_NS = 2 * NS_PER_S
@@ -69,7 +71,9 @@ QUERIED_NS = NS_PER_S
 """A recorder that has sent a query within this time is present, whatever its token says."""
 
 
-def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[[str], None]) -> int:
+def run_site(
+    scenario: Scenario, name: str, options: SiteOptions, say: Callable[[str], None]
+) -> int:
     """Runs one site of a scenario from its start to its end.
 
     Returns:
@@ -78,12 +82,13 @@ def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[
     Raises:
         SessionError: the session could not begin.
         UsageError: an endpoint cannot be used.
-        ScenarioError: its user law cannot be made, or is not the one that the scenario names; or an arm
-            outside of the program lacks limits.
+        ScenarioError: its user law cannot be made, or is not the one that the scenario names;
+            or an arm outside of the program lacks limits.
         RunFailed: the run diverged, its user law failed, or its arm fell silent.
     """
     check_outside_arms(scenario)
-    if not scenario.sites_may_return:  # one that returns to a session has less time to go: see `join_session`
+    # one that returns to a session has less time to go: see `join_session`
+    if not scenario.sites_may_return:
         options.connection.require_keys_until(scenario.duration_s)
     share_threads()
     with Interrupt() as interrupt:
@@ -93,12 +98,26 @@ def run_site(scenario: Scenario, name: str, options: SiteOptions, say: Callable[
             say(f"{name}: {text}")
 
         timeout_s = options.join_timeout_s
-        bus = open_bus(options.connection, clock, interrupt.requested, timeout_s, named)
+        bus = open_bus(
+            connection=options.connection,
+            clock=clock,
+            stopped=interrupt.requested,
+            timeout_s=timeout_s,
+            say=named,
+        )
         if bus is None:
             return interrupt.exit_code
         with closing(bus), LinePrinter(say) as printer:
             with interrupt.raising():  # it may compile for minutes
-                parts = SiteParts(scenario, name, options, bus, clock, interrupt, printer.put)
+                parts = SiteParts(
+                    scenario=scenario,
+                    name=name,
+                    options=options,
+                    bus=bus,
+                    clock=clock,
+                    interrupt=interrupt,
+                    say=printer.put,
+                )
             if options.connection.listen:
                 parts.say(f"others connect to {', '.join(map(str, options.connection.listen))}")
             return take_part(parts)
@@ -124,7 +143,8 @@ def take_part(parts: SiteParts) -> int:
 
 
 def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
-    """Declares a site alive, and waits for the others and the epoch; None if a signal comes first.
+    """Declares a site alive, and waits for the others and the epoch; None if a signal comes
+    first.
 
     Raises:
         SessionError: the session did not begin in time, or this site cannot be part of it.
@@ -136,7 +156,14 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
     late = LateSites(scenario.sites_may_return, options.without, parts.site.rate_hz)
     keep = parts.buffer.channels[topics.EVENT].keep
     publisher = EventPublisher(parts.bus, options.session, info, keep)
-    joining = SessionJoin(parts.bus, parts.clock, options.session, publisher, scenario.names, late)
+    joining = SessionJoin(
+        bus=parts.bus,
+        clock=parts.clock,
+        session=options.session,
+        publisher=publisher,
+        sites=scenario.names,
+        late=late,
+    )
     membership = joining.membership
     pinger = joining.pinger
     parts.say(f"waiting for {', '.join(membership.missing()) or 'the epoch'}")
@@ -153,7 +180,11 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
         now_ns = parts.clock.monotonic_ns()
         if now_ns > give_up_ns:
             missing = membership.missing()
-            reason = f"{', '.join(missing)} never came" if missing else "the others came, but no epoch"
+            reason = (
+                f"{', '.join(missing)} never came"
+                if missing
+                else "the others came, but no epoch"
+            )
             reason = joining.reason or reason
             for member, problem in membership.unreadable.items():
                 reason += f"; the answer of {member} cannot be read: {problem}"
@@ -166,11 +197,13 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
 class RunningSite:
     """A site between the epoch and its last tick.
 
-    The loop calls `use_slack` after a block of records, and again after the next tick if it returns true, in
-    a quarter of a period.
+    The loop calls `use_slack` after a block of records, and again after the next tick if it
+    returns true, in a quarter of a period.
     """
 
-    def __init__(self, parts: SiteParts, publisher: EventPublisher, pinger: Pinger, epoch: Epoch) -> None:
+    def __init__(
+        self, parts: SiteParts, publisher: EventPublisher, pinger: Pinger, epoch: Epoch
+    ) -> None:
         scenario = parts.scenario
         site = parts.site
         self._parts = parts
@@ -191,11 +224,11 @@ class RunningSite:
         boots = [epoch.boots.get(peer, NOBODY) for peer in site.peers]
         peers = [
             PeerClock(
-                peer,
-                epoch.epochs.get(peer, epoch.mono_ns),
-                scenario.peers(peer).index(parts.name),
-                pinger.estimate(boot),
-                pinger.estimator(boot),
+                name=peer,
+                epoch_ns=epoch.epochs.get(peer, epoch.mono_ns),
+                place=scenario.peers(peer).index(parts.name),
+                estimate=pinger.estimate(boot),
+                estimator=pinger.estimator(boot),
             )
             for peer, boot in zip(site.peers, boots, strict=True)
         ]
@@ -205,12 +238,21 @@ class RunningSite:
         self._here = [name for name in scenario.names if name == parts.name or name in own]
         rate_hz = max(scenario.sites[name].rate_hz for name in self._here)
         turn_ns = find_turn_ns(self._here.index(parts.name), len(self._here), rate_hz)
-        self._timing = SiteTiming(epoch.mono_ns, site.rate_hz, peers, scenario.names[0], turn_ns)
+        self._timing = SiteTiming(
+            epoch_ns=epoch.mono_ns,
+            rate_hz=site.rate_hz,
+            peers=peers,
+            leader=scenario.names[0],
+            turn_ns=turn_ns,
+        )
         self._clock_texts = describe_clocks(pinger, epoch.boots, epoch.mono_ns)
         heard = (parts.rings, boots, self._timing.meters, parts.stats.dropped)
         self._inbox = PeerInbox(parts.setup.links, *heard, tick_ns(epoch.first, site.rate_hz))
         publisher.update(
-            running=True, epoch_mono_ns=epoch.mono_ns, epoch_unix_ns=epoch.unix_ns, boots=epoch.boots
+            running=True,
+            epoch_mono_ns=epoch.mono_ns,
+            epoch_unix_ns=epoch.unix_ns,
+            boots=epoch.boots,
         )
 
     def run(self) -> None:
@@ -220,12 +262,20 @@ class RunningSite:
         self._publish_setup()
         order = encode(ChangeRequest(order="stop", source="the operator"))
         name = parts.name
-        here = (parts.options.session, name, parts.scenario.names, parts.boot, parts.options.connection)
+        here = (
+            parts.options.session,
+            name,
+            parts.scenario.names,
+            parts.boot,
+            parts.options.connection,
+        )
         with make_site_known(*here, order), parts.watchdog:
             ticks = parts.scenario.ticks(name)
             timed = (ticks, parts.clock, self._inbox, self._timing, parts.stats)
             last = (parts.states, self, self._epoch.first)
-            self._output = run_loop(parts.site, parts.boot, *timed, *last, catches_up=parts.arm is None)
+            self._output = run_loop(
+                parts.site, parts.boot, *timed, *last, catches_up=parts.arm is None
+            )
         output = self._output
         self._ticks = 0 if output is None else output.tick + 1
         self._t_ns = -1 if output is None else output.t_ns
@@ -248,10 +298,14 @@ class RunningSite:
             begins = f"joins the running session at t = {tick_ns(first, parts.site.rate_hz) * 1e-9:.3f} s"
             text = f"{parts.name} {begins}"
             about = {"boots": self._epoch.boots, "ticks": first}
-            self._publisher.publish("join", text, t_ns=tick_ns(first, parts.site.rate_hz), **about)
+            self._publisher.publish(
+                "join", text, t_ns=tick_ns(first, parts.site.rate_hz), **about
+            )
         parts.say(f"{begins}; {obtained['scheduling']}, memory {obtained['memory']}")
         self._publish_clocks(self._timing.opening(), 0)
-        if parts.arm is not None and (text := parts.arm.bind(parts.scenario.sites[parts.name].q0_rad)):
+        if parts.arm is not None and (
+            text := parts.arm.bind(parts.scenario.sites[parts.name].q0_rad)
+        ):
             self._publisher.publish("arm", f"{parts.name}: {text}")
             texts = [*texts, text]
         for text in texts:
@@ -278,7 +332,15 @@ class RunningSite:
         try:
             if parts.plant is not None:
                 measured = parts.plant.state
-            self._output = parts.step(TickInput(k, arrivals, parts.take_changes(k), measured, hand))
+            self._output = parts.step(
+                TickInput(
+                    k=k,
+                    arrivals=arrivals,
+                    commands=parts.take_changes(k),
+                    measured=measured,
+                    hand=hand,
+                )
+            )
             if parts.plant is not None:
                 parts.plant.move(k, self._output.tau)
         except CodeFailed as failed:
@@ -287,7 +349,8 @@ class RunningSite:
         return self._output
 
     def attend(self, k: int, t_ns: int) -> None:
-        """Answers queries, follows the leader's grid, publishes news: ten times a second, after statistics.
+        """Answers queries, follows the leader's grid, publishes news: ten times a second, after
+        statistics.
 
         These are of tick k, whose nominal time is given.
         """
@@ -310,7 +373,9 @@ class RunningSite:
 
     def _tell(self, kind: str, news: list[tuple[int, str]]) -> None:
         for tick, text in news:
-            self._publisher.publish(kind, text, t_ns=tick_ns(tick, self._parts.site.rate_hz), ticks=tick)
+            self._publisher.publish(
+                kind, text, t_ns=tick_ns(tick, self._parts.site.rate_hz), ticks=tick
+            )
         news.clear()
 
     def _tell_skipped(self, k: int, t_ns: int) -> None:
@@ -321,12 +386,21 @@ class RunningSite:
             self._publisher.publish("overrun", text, t_ns=t_ns, ticks=k + 1, command=ticks)
 
     def _tell_waiting(self, k: int, t_ns: int) -> None:
-        """Publishes once a second that the site does not go to its peers because they are too far away."""
+        """Publishes once a second that the site does not go to its peers because they are too
+        far away.
+        """
         output = self._output
         holds = output is not None and output.mode in (Mode.WAITING, Mode.HOLD)
-        if output is None or not holds or self._parts.setup.on_stale.action is not StaleAction.GLIDE:
+        if (
+            output is None
+            or not holds
+            or self._parts.setup.on_stale.action is not StaleAction.GLIDE
+        ):
             return
-        if find_life_reason(output) is LifeReason.ALIGN_LIMIT and t_ns // NS_PER_S > self._told_s:
+        if (
+            find_life_reason(output) is LifeReason.ALIGN_LIMIT
+            and t_ns // NS_PER_S > self._told_s
+        ):
             self._told_s = t_ns // NS_PER_S
             text = describe_mode(self._parts.name, output, glides=True)
             self._publisher.publish("waiting", text, t_ns=t_ns, ticks=k)
@@ -356,28 +430,43 @@ class RunningSite:
         self._given_up = patience_s is not None and t_ns - since_ns > patience_s * NS_PER_S
 
     def _come_again(self, t_ns: int) -> None:
-        """Says once a second that this site has come, while a peer that was cut off then ignores it."""
+        """Says once a second that this site has come, while a peer that was cut off then
+        ignores it.
+        """
         coming = self._epoch.coming
         now_ns = self._parts.clock.monotonic_ns()
         if coming is None or t_ns < self._came_ns + NS_PER_S:
             return
-        if any(meter.is_heard(now_ns) and meter.hears(now_ns) is None for meter in self._timing.meters):
+        if any(
+            meter.is_heard(now_ns) and meter.hears(now_ns) is None
+            for meter in self._timing.meters
+        ):
             self._came_ns = t_ns
-            self._publisher.publish(**{**asdict(coming), "t_ns": t_ns, "n": self._publisher.published})
+            self._publisher.publish(
+                **{**asdict(coming), "t_ns": t_ns, "n": self._publisher.published}
+            )
 
     def _tell_last(self, index: int, coming: Event, t_ns: int) -> None:
-        """Publishes how far the start of a peer was heard that ends now: it may not have been able to."""
+        """Publishes how far the start of a peer was heard that ends now: it may not have been
+        able to.
+        """
         newest = self._inbox.newest_before(index, coming.boot)
         if newest is not None:
             text = f"of the start of {coming.member} before came samples up to tick {newest}"
-            about = {"about": coming.member, "boots": {coming.member: coming.boot}, "ticks": newest + 1}
+            about = {
+                "about": coming.member,
+                "boots": {coming.member: coming.boot},
+                "ticks": newest + 1,
+            }
             self._publisher.publish("last", text, t_ns=t_ns, **about)
 
     def _describe_status(self, output: TickRecord) -> str:
         shared = output.shared()[0]
         own, desired = (np.array([vector]) for vector in (shared, output.q_des))
         axes = self._parts.scenario.arms[self._parts.name].axes
-        apart = np.abs(find_task_errors(own, desired, axes) if output.x else own - desired).max()
+        apart = np.abs(
+            find_task_errors(own, desired, axes) if output.x else own - desired
+        ).max()
         unit = "m or rad" if output.x else "rad"
         torque_nm = max(map(abs, output.tau))
         stats = self._parts.stats
@@ -409,7 +498,9 @@ class RunningSite:
             self._raise_alarm(output)
 
     def _raise_alarm(self, output: TickRecord) -> None:
-        """Says that the arm is stopped, or at most once a second that it holds; why, and what to do."""
+        """Says that the arm is stopped, or at most once a second that it holds; why, and what
+        to do.
+        """
         parts = self._parts
         mode = output.mode
         rule = self._parts.setup.on_stale
@@ -421,7 +512,14 @@ class RunningSite:
             return
         says_lost = rule.degrades and mode is Mode.RETURN
         lost = parts.site.layout.find_lost(output.mem, parts.site.peers) if says_lost else ()
-        shown = (parts.options.session, parts.name, MODE_WORDS[mode], output.mem, len(output.q_des), lost)
+        shown = (
+            parts.options.session,
+            parts.name,
+            MODE_WORDS[mode],
+            output.mem,
+            len(output.q_des),
+            lost,
+        )
         if (alarm := find_alarm(*shown)) is not None:
             parts.say(f"*** {alarm}")
 
@@ -446,12 +544,16 @@ class RunningSite:
         about, why = self._find_cause()
         if unheard := [meter.peer.name for meter in self._timing.meters if meter.unheard]:
             why += f"; {', '.join(unheard)} did not hear it at the end"
-        self._publish("end", f"{parts.name} made {count_nouns(self._ticks, 'tick')}{why}", about=about)
+        self._publish(
+            "end", f"{parts.name} made {count_nouns(self._ticks, 'tick')}{why}", about=about
+        )
         code = interrupt.exit_code if interrupt.requested() else 0  # later signals end the wait
         parts.monitor.watch(self._publisher, self._t_ns)
         if topics.RECORDER in parts.monitor.boots or parts.monitor.recorders:
             self._await_recorders()
-        dropped = ", ".join(f"{count} {reason}" for reason, count in parts.stats.dropped.items())
+        dropped = ", ".join(
+            f"{count} {reason}" for reason, count in parts.stats.dropped.items()
+        )
         parts.say(
             f"{count_nouns(self._ticks, 'tick')}, {parts.stats.overruns} of them late by a period or more"
             + (f"; dropped: {dropped}" if dropped else "")
@@ -472,7 +574,9 @@ class RunningSite:
         return "; ".join(text for _, text in self._parts.monitor.away.values())
 
     def _find_cause(self) -> tuple[str, str]:
-        """Returns whose end it was if the run ends before its time, and why, to be put behind a sentence."""
+        """Returns whose end it was if the run ends before its time, and why, to be put behind a
+        sentence.
+        """
         parts = self._parts
         monitor = self._parts.monitor
         if self._failure is not None:
@@ -491,10 +595,11 @@ class RunningSite:
         self._publisher.publish(kind, text, t_ns=self._t_ns, ticks=self._ticks, about=about)
 
     def _await_recorders(self) -> None:
-        """Waits until every recorder present has stored all, then for `stay_s` until they are gone.
+        """Waits until every recorder present has stored all, then for `stay_s` until they are
+        gone.
 
-        A signal does not shorten the first wait, since records that are not stored are lost with this
-        process; a second signal ends it.
+        A signal does not shorten the first wait, since records that are not stored are lost
+        with this process; a second signal ends it.
         """
         parts = self._parts
         clock = self._parts.clock
@@ -514,7 +619,10 @@ class RunningSite:
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + LEAVE_TIMEOUT_NS)
             if monitor.read_stored(self._ticks) and monitor.all_stored:
                 give_up_ns = clock.monotonic_ns() + int(parts.options.stay_s * 1e9)
-            if not (is_announced or monitor.all_stored) and clock.monotonic_ns() - begun_ns > TELL_NS:
+            if (
+                not (is_announced or monitor.all_stored)
+                and clock.monotonic_ns() - begun_ns > TELL_NS
+            ):
                 is_announced = True
                 parts.say(
                     f"keeps its last records until the recorder has them, {LINGER_NS // NS_PER_S} s at most; "

@@ -72,15 +72,23 @@ def two_arms(
     armature: float | list[float] = 0.2,
 ) -> str:
     """The text of two arms of one file in one pose."""
-    return TWO.format(urdf=urdf, q0=list(q0), duration_s=duration_s, delay_ms=delay_ms, armature=armature)
+    return TWO.format(
+        urdf=urdf, q0=list(q0), duration_s=duration_s, delay_ms=delay_ms, armature=armature
+    )
 
 
 @functools.cache
 def robot_files() -> dict[str, Path]:
     """The files of `example-robot-data`, which long tests have, by their path in its folder of robots."""
-    files = [str(file) for file in metadata.files("example-robot-data") or () if file.suffix == ".urdf"]
+    files = [
+        str(file)
+        for file in metadata.files("example-robot-data") or ()
+        if file.suffix == ".urdf"
+    ]
     places = {
-        name.partition("/robots/")[2]: metadata.distribution("example-robot-data").locate_file(name)
+        name.partition("/robots/")[2]: metadata.distribution("example-robot-data").locate_file(
+            name
+        )
         for name in files
     }
     return {name: Path(str(place)) for name, place in places.items()}

@@ -29,7 +29,11 @@ class Talking:
             peer, heard = now.peers[j], now.received[j]
             self.told[j] += now.h_s * heard.energy[0]
             for i in range(now.joints):
-                pull = peer.alpha * self.K * (heard.target[i] - now.q[i]) if peer.tick >= 0 else 0.0
+                pull = (
+                    peer.alpha * self.K * (heard.target[i] - now.q[i])
+                    if peer.tick >= 0
+                    else 0.0
+                )
                 now.tau[i] += pull
                 energy += 0.5 * peer.alpha * self.K * (heard.target[i] - now.q[i]) ** 2
                 now.sent[j].target[i] = now.q[i] + 0.01 * (j + 1) + 1e-3 * self.told[j]

@@ -55,7 +55,10 @@ def compile_parts(parts: Sequence[str], cores: int) -> None:
     """Compiles parts beside each other, and says how far it is."""
     parts_text = count_nouns(len(parts), "part")
     cores_text = count_nouns(cores, "processor")
-    print(f"compiling {parts_text} of the core on {cores_text}, half a minute each ...", flush=True)
+    print(
+        f"compiling {parts_text} of the core on {cores_text}, half a minute each ...",
+        flush=True,
+    )
     with Interrupt() as interrupt, interrupt.raising(), worker_pool(cores) as pool:
         running = [pool.submit(compile_part, part) for part in parts]
         for done, one in enumerate(as_completed(running), 1):

@@ -28,12 +28,17 @@ def _on_a_push(config: pytest.Config) -> bool:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Marks tests that are dear; on a push, a property has ten examples at most."""
-    dear = frozenset() if config.pluginmanager.hasplugin("tests.push_set") else read_long_tests()
+    dear = (
+        frozenset() if config.pluginmanager.hasplugin("tests.push_set") else read_long_tests()
+    )
     for item in items:
         if item.nodeid in dear and not item.get_closest_marker("push"):
             item.add_marker(pytest.mark.long)
-        own = getattr(getattr(item, "function", None), "_hypothesis_internal_use_settings", None)
-        if own is not None and own.max_examples > 10 and _on_a_push(config):  # a test's own number precedes
+        own = getattr(
+            getattr(item, "function", None), "_hypothesis_internal_use_settings", None
+        )
+        # a test's own number precedes
+        if own is not None and own.max_examples > 10 and _on_a_push(config):
             item.function._hypothesis_internal_use_settings = settings(own, max_examples=10)
 
 

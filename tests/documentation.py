@@ -12,7 +12,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
-PAGES = ["README.md", *sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md"))]
+PAGES = [
+    "README.md",
+    *sorted(str(page.relative_to(ROOT)) for page in (ROOT / "docs").rglob("*.md")),
+]
 _BLOCK = re.compile(
     r"^```(?P<language>\w*)\n(?P<fenced>.*?)^```$|(?P<indented>(?:^ {4}[^\n]*\n(?:\n(?= {4}))?)+)",
     re.DOTALL | re.MULTILINE,
@@ -42,7 +45,9 @@ def find_blocks(page: str) -> tuple[Block, ...]:
         text = found["fenced"] if found["fenced"] is not None else _unindent(found["indented"])
         stated = found["language"] or ""
         guessed = "sh" if _PROGRAM.match(text) else "python" if _CODE.match(text) else ""
-        blocks.append(Block(page, guessed if stated == "" else stated.replace("text", ""), text))
+        blocks.append(
+            Block(page, guessed if stated == "" else stated.replace("text", ""), text)
+        )
     return tuple(blocks)
 
 
@@ -64,7 +69,9 @@ def read_commands(text: str) -> Iterator[tuple[list[str], list[str]]]:
                 made[-1][1].append(" ".join(line.split("   #")[0].split()))
             continue
         parts = re.split(r"  {2,}(?=[a-z])", line.removeprefix("$ "))[0].split(" && ")
-        made.extend((words, []) for part in parts if (words := shlex.split(part, comments=True)))
+        made.extend(
+            (words, []) for part in parts if (words := shlex.split(part, comments=True))
+        )
     yield from made
 
 

@@ -23,7 +23,9 @@ LAWS: dict[str, dict[str, Any]] = {
 
 def pair(control: dict[str, Any], *, clamped: bool, duration_s: float, **more: Any) -> Scenario:
     """A master with the hand H50 that leads only, and a slave with K and B, of laws that have them."""
-    follows, leads = ({}, {}) if control["law"].lower().endswith("tanks") else (FOLLOWER, LEADER)
+    follows, leads = (
+        ({}, {}) if control["law"].lower().endswith("tanks") else (FOLLOWER, LEADER)
+    )
     slave = {"hands": [CLAMP] if clamped else [], "control": {**control, **follows}}
     sites = {"m": {"hands": [H50], "control": {**control, **leads}}, "s": slave}
     return unit_scenario(sites, control, **{"duration_s": duration_s, "link": CONSTANT, **more})
@@ -38,14 +40,17 @@ def ticked(scenario: Scenario, every: int = 1) -> dict[str, Any]:
     ticks = np.arange(every, round(scenario.duration_s * rate_hz) + 1, every)
     rows = sampled(scenario, ticks / rate_hz)
     return {
-        name: _name_columns(scenario, name, site) for name, site in zip(scenario.names, rows, strict=True)
+        name: _name_columns(scenario, name, site)
+        for name, site in zip(scenario.names, rows, strict=True)
     }
 
 
 def _name_columns(scenario: Scenario, name: str, rows: Any) -> Any:
     columns = scenario.layout(name).columns()
     ch = rows[:, columns.pop("ch")]
-    run = SimpleNamespace(**{key: rows[:, one] for key, one in columns.items()}, to_all=SimpleNamespace())
+    run = SimpleNamespace(
+        **{key: rows[:, one] for key, one in columns.items()}, to_all=SimpleNamespace()
+    )
     run.sent = [SimpleNamespace() for _ in scenario.peers(name)]
     vectors = scenario.channel(name).vectors
     places = [(run.to_all, one) for one in vectors if not one.per_peer]
@@ -79,7 +84,10 @@ def drawn(law: str, seed: int) -> Scenario:
     rng = np.random.default_rng(seed)
     names = ["m1", "m2", "s"] if rng.random() < 0.65 else ["m1", "s"]
     K = round(float(np.exp(rng.uniform(np.log(20.0), np.log(300.0)))), 1)
-    B, T = round(K * float(rng.uniform(0.03, 0.15)), 2), round(float(rng.uniform(20.0, 250.0)), 1)
+    B, T = (
+        round(K * float(rng.uniform(0.03, 0.15)), 2),
+        round(float(rng.uniform(20.0, 250.0)), 1),
+    )
     b = round(float(rng.uniform(2.0, 20.0)), 2)
     keys: dict[str, dict[str, Any]] = {
         "tdpa": {"K": K, "B": B},
@@ -92,18 +100,32 @@ def drawn(law: str, seed: int) -> Scenario:
         {"model": "constant", "delay_ms": T, "loss": 0.5},
         {"model": "uniform", "delay_ms": T, "half_width_ms": round(0.5 * T, 1), "loss": 0.5},
     ]
-    clamp = {**CLAMP, "stiffness_nm_rad": float(rng.uniform(200.0, 1500.0)), "damping_nm_s_rad": 3.0}
+    clamp = {
+        **CLAMP,
+        "stiffness_nm_rad": float(rng.uniform(200.0, 1500.0)),
+        "damping_nm_s_rad": 3.0,
+    }
     push = {"kind": "pulse", "start_s": 3.0, "end_s": 3.3, "peak_nm": [8.0, 4.0]}
     sites: dict[str, Any] = {"s": {"hands": [[clamp], [clamp], [push], []][rng.integers(4)]}}
     for name, to in zip(names[:-1], (0.3, -0.3), strict=False):
         k = round(float(rng.uniform(20.0, 100.0)), 1)
-        sites = {name: {"hands": [hand(to * float(rng.uniform(0.5, 1.5)), k, 0.15 * k)]}, **sites}
+        sites = {
+            name: {"hands": [hand(to * float(rng.uniform(0.5, 1.5)), k, 0.15 * k)]},
+            **sites,
+        }
     sites = {name: sites[name] for name in names}
-    more: dict[str, Any] = {} if rng.random() < 0.5 else {"arm": {}, "limits": {"tau_limit_nm": 200.0}}
+    more: dict[str, Any] = (
+        {} if rng.random() < 0.5 else {"arm": {}, "limits": {"tau_limit_nm": 200.0}}
+    )
     if len(names) == 3:
         times = [(at_s, name) for at_s in (2.5, 4.5, 6.5) for name in names]
-        changes = [{"at_s": at_s, "dominance": name, "to": _draw_shares(rng, name)} for at_s, name in times]
-        more["timeline"] = [{**one, "ramp_s": float(rng.choice([0.0, 0.05, 1.0]))} for one in changes]
+        changes = [
+            {"at_s": at_s, "dominance": name, "to": _draw_shares(rng, name)}
+            for at_s, name in times
+        ]
+        more["timeline"] = [
+            {**one, "ramp_s": float(rng.choice([0.0, 0.05, 1.0]))} for one in changes
+        ]
         more["dominance"] = {name: _draw_shares(rng, name) for name in names}
     control, link = {"law": law, **keys[law]}, links[rng.integers(4)]
     return unit_scenario(sites, control, duration_s=8.0, link=link, seed=seed, **more)

@@ -20,12 +20,17 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 # what Numba compiles cannot be instrumented
 import trilat_net.core.site  # noqa: F401
 
-with atheris.instrument_imports(include=["trilat_net.log", "trilat_net.execution", "recorder.play", "mcap"]):
+with atheris.instrument_imports(
+    include=["trilat_net.log", "trilat_net.execution", "recorder.play", "mcap"]
+):
     from tests.log.hostility import mangled, read_by_all
     from tests.log_editing import edited, recorded
 
 SHORT = {"duration_s": 0.04, "link.delay_ms": 5.0}
-LOGS = (edited(recorded("paper", SHORT), chunk_bytes=4096), recorded("jitter", {"duration_s": 0.04}))
+LOGS = (
+    edited(recorded("paper", SHORT), chunk_bytes=4096),
+    recorded("jitter", {"duration_s": 0.04}),
+)
 MEMORY_MB = 512
 
 
@@ -65,7 +70,9 @@ def main() -> None:
         (FOLDER / "seeds").mkdir()
         for n, log in enumerate(LOGS):
             (FOLDER / "seeds" / str(n)).write_bytes(log)
-        (FOLDER / "seeds" / "magic").write_bytes(b"\x89MCAP0\r\n" + struct.pack("<BQ", 1, 8) + bytes(8))
+        (FOLDER / "seeds" / "magic").write_bytes(
+            b"\x89MCAP0\r\n" + struct.pack("<BQ", 1, 8) + bytes(8)
+        )
         arguments.append(str(FOLDER / "seeds"))
     limits = [f"-rss_limit_mb={MEMORY_MB}", "-timeout=120"]
     long = [] if as_bytes else ["-len_control=0", "-max_len=300"]

@@ -58,7 +58,11 @@ def _module(at: Path) -> Path | None:
 def room_imports() -> set[tuple[str, str]]:
     """Returns which room imports which; those that lie below all others are left out."""
     pairs = {(room(path), room(other)) for path in files() for other in _imported(path)}
-    return {(a, b) for a, b in pairs if a != b and not {a, b} & (BELOW_ALL | {"__init__", "__main__"})}
+    return {
+        (a, b)
+        for a, b in pairs
+        if a != b and not {a, b} & (BELOW_ALL | {"__init__", "__main__"})
+    }
 
 
 def definitions(path: Path) -> set[str]:
@@ -69,6 +73,8 @@ def definitions(path: Path) -> set[str]:
             found.add(node.name)
         if isinstance(node, ast.ClassDef):
             found |= {
-                f"{node.name}.{below.name}" for below in node.body if isinstance(below, ast.FunctionDef)
+                f"{node.name}.{below.name}"
+                for below in node.body
+                if isinstance(below, ast.FunctionDef)
             }
     return found

@@ -48,13 +48,36 @@ def install_extras(names: list[str]) -> None:
     uv = VENV / "bin" / "uv"
     if not uv.exists():
         wanted = [need for name in names for need in list_extras()[name]]
-        command = [python, "-m", "pip", "--disable-pip-version-check", "install", "--quiet", *wanted]
+        command = [
+            python,
+            "-m",
+            "pip",
+            "--disable-pip-version-check",
+            "install",
+            "--quiet",
+            *wanted,
+        ]
         raise SystemExit(subprocess.run(command, check=False).returncode)
     with tempfile.TemporaryDirectory() as scratch:
         lock = Path(scratch) / "extras.lock"
         of_extras = [word for name in names for word in ("--extra", name)]
-        resolve = [uv, "pip", "compile", "--quiet", "pyproject.toml", *of_extras, "--generate-hashes"]
-        resolve += ["--python", python, "--constraints", "requirements/dev.lock", "--output-file", lock]
+        resolve = [
+            uv,
+            "pip",
+            "compile",
+            "--quiet",
+            "pyproject.toml",
+            *of_extras,
+            "--generate-hashes",
+        ]
+        resolve += [
+            "--python",
+            python,
+            "--constraints",
+            "requirements/dev.lock",
+            "--output-file",
+            lock,
+        ]
         install = [uv, "pip", "install", "--quiet", "--python", python, "--require-hashes"]
         install += ["--only-binary", ":all:", "-r", lock]
         for command in (resolve, install):

@@ -35,14 +35,19 @@ OTHERS: dict[str, Callable[[Path], list[Result]]] = {
         tn.linear("jitter", {"rate_hz": 200}, pose=(0.1, 0.2), over=["control.d=0.1:0.4"]),
     ],
     "tune": lambda _: [
-        tn.tune_arm("arm6.urdf", delay, law, poses=1, curve=True) for delay, law in ((20, "pd_d"), (0, "p_d"))
+        tn.tune_arm("arm6.urdf", delay, law, poses=1, curve=True)
+        for delay, law in ((20, "pd_d"), (0, "p_d"))
     ],
     "twin": lambda _: [tn.twin(LOGS[1]), tn.twin(LOGS[1], delta="1e-9:1e-3")],
     "test": lambda _: [tn.check("free", jobs=1)],
     "sweep": lambda folder: [
-        tn.sweep("contact", ["link.delay_ms=20,200"], laws=["p_f"], out=folder / "contact", jobs=1),
+        tn.sweep(
+            "contact", ["link.delay_ms=20,200"], laws=["p_f"], out=folder / "contact", jobs=1
+        ),
         tn.sweep("p_d_margin", ["control.d=1,2"], judge="twins", out=folder / "twins", jobs=1),
-        tn.sweep("jitter", ["control.d=0,3"], seeds=2, duration_s=20, out=folder / "jitter", jobs=1),
+        tn.sweep(
+            "jitter", ["control.d=0,3"], seeds=2, duration_s=20, out=folder / "jitter", jobs=1
+        ),
     ],
     "sweep --margin": lambda _: [
         tn.margin("p_d_margin", f"control.d={span}", tolerance=0.2, duration_s=4, jobs=1)
@@ -70,13 +75,18 @@ OTHERS: dict[str, Callable[[Path], list[Result]]] = {
 }
 SINES = [
     {"kind": "multisine", "amplitude_nm": amplitude_nm, "frequencies_hz": frequencies_hz}
-    for amplitude_nm, frequencies_hz in (([2.0, 0.0], [0.5, 1.5, 3.0]), ([0.0, 2.0], [0.75, 1.75, 3.25]))
+    for amplitude_nm, frequencies_hz in (
+        ([2.0, 0.0], [0.5, 1.5, 3.0]),
+        ([0.0, 2.0], [0.75, 1.75, 3.25]),
+    )
 ]
 HAND = {"kind": "tip_spring", "stiffness_n_m": [220.0, 150.0], "damping_n_s_m": [12.0, 9.0]}
 OF_PEOPLE: dict[str, Callable[[Path], list[Result]]] = {
     "identify hand": lambda _: [
         tn.identify_hand(
-            tn.simulate("free", {"rate_hz": 250, "duration_s": 28.0, "sites.m1.hands": [HAND, *SINES]})
+            tn.simulate(
+                "free", {"rate_hz": 250, "duration_s": 28.0, "sites.m1.hands": [HAND, *SINES]}
+            )
         )
     ],
     "experiment check": lambda folder: [tn.check_experiment(write_protocol(folder))],
@@ -84,9 +94,12 @@ OF_PEOPLE: dict[str, Callable[[Path], list[Result]]] = {
         tn.run_experiment(write_protocol(folder), folder / "experiment", jobs=1)
     ],
     "experiment analyse": lambda folder: [
-        tn.analyse_experiment(folder / "experiment", exclude=left) for left in ({}, {"P2": "left"})
+        tn.analyse_experiment(folder / "experiment", exclude=left)
+        for left in ({}, {"P2": "left"})
     ],
-    "experiment power": lambda _: [tn.compute_experiment_power(0.5, people) for people in (None, 20)],
+    "experiment power": lambda _: [
+        tn.compute_experiment_power(0.5, people) for people in (None, 20)
+    ],
 }
 NOTES = {
     "experiment run": "Also of `trilat experiment status`.",
@@ -113,10 +126,15 @@ _NAMED = re.compile(
 
 def is_documented(command: str, value: Any) -> bool:
     """True if the page has every key of a result, as it is, or with more below it."""
-    section = PAGE.read_text(encoding="utf-8").partition(f"## trilat {command}\n")[2].partition("\n## ")[0]
+    section = (
+        PAGE.read_text(encoding="utf-8")
+        .partition(f"## trilat {command}\n")[2]
+        .partition("\n## ")[0]
+    )
     known = re.findall(r"^([^\s:]+): ", section, re.MULTILINE)
     return all(
-        any(f"{one}.".startswith((f"{path}.", f"{path}[")) for one in known) for path in gather([value])
+        any(f"{one}.".startswith((f"{path}.", f"{path}[")) for one in known)
+        for path in gather([value])
     )
 
 
@@ -152,7 +170,9 @@ def build_page() -> str:
         samples["certify"].append(tn.certify(log).to_dict())
     with tempfile.TemporaryDirectory() as folder:
         others = {**OTHERS, **OF_PEOPLE}
-        samples |= {name: [one.to_dict() for one in find(Path(folder))] for name, find in others.items()}
+        samples |= {
+            name: [one.to_dict() for one in find(Path(folder))] for name, find in others.items()
+        }
     parts = [HEAD]
     for name, found in samples.items():
         lines = [f"{path}: {kind}" for path, kind in gather(found).items()]

@@ -13,7 +13,9 @@ from trilat_net.core.user_law import LawContext, LawInput
 class Adaptive:
     """Eq. (13) and (15) with the trapezoid rule, by the same leaves as the built-in law."""
 
-    def __init__(self, facts: LawContext, Lambda: float = 1.0, Kp: float = 1.0, Kd: float = 3.0) -> None:
+    def __init__(
+        self, facts: LawContext, Lambda: float = 1.0, Kp: float = 1.0, Kd: float = 3.0
+    ) -> None:
         self._facts = facts
         self._Lambda, self._Kp, self._Kd = (np.full(2, gain) for gain in (Lambda, Kp, Kd))
         self._Yr = np.zeros(5)
@@ -28,7 +30,9 @@ class Adaptive:
         if now.k:
             self.theta_hat = self.theta_hat - 0.5 / self._facts.rate_hz * (self._Yr + Yr)
         self._Yr = Yr
-        return control.adaptive_torque(Y, self.theta_hat, self._Kp, self._Kd, r, ed, self._facts.tau_limit_nm)
+        return control.adaptive_torque(
+            Y, self.theta_hat, self._Kp, self._Kd, r, ed, self._facts.tau_limit_nm
+        )
 
     def memory(self) -> Sequence[float]:
         return [*self._Yr, *self.theta_hat]

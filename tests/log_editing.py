@@ -77,13 +77,19 @@ def edited(
         if channel.topic.endswith("/event"):
             payload = event(payload)
         if schema.name not in schemas:
-            schemas[schema.name] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            schemas[schema.name] = writer.register_schema(
+                schema.name, schema.encoding, schema.data
+            )
         if channel.topic not in channels:
             channels[channel.topic] = writer.register_channel(
                 channel.topic, channel.message_encoding, schemas[schema.name], channel.metadata
             )
         writer.add_message(
-            channels[channel.topic], message.log_time, payload, message.publish_time, message.sequence
+            channels[channel.topic],
+            message.log_time,
+            payload,
+            message.publish_time,
+            message.sequence,
         )
     for name, entries in metadata.items():
         writer.add_metadata(name, entries)

@@ -40,7 +40,8 @@ class Pieces:
         return next(
             entry.metadata
             for entry in self.about
-            if getattr(entry, "metadata", None) is not None and getattr(entry, "name", "") == name
+            if getattr(entry, "metadata", None) is not None
+            and getattr(entry, "name", "") == name
         )
 
     def topics(self) -> dict[int, str]:
@@ -48,7 +49,9 @@ class Pieces:
 
     def without_chain(self) -> "Pieces":
         """The same as an older program wrote it."""
-        self.about = [entry for entry in self.about if getattr(entry, "name", "") != "trilat.chain"]
+        self.about = [
+            entry for entry in self.about if getattr(entry, "name", "") != "trilat.chain"
+        ]
         self.metadata("trilat.session").pop("digest_chain", None)
         return self
 
@@ -56,7 +59,9 @@ class Pieces:
         stream = io.BytesIO()
         writer = McapWriter(stream, self.library)
         late = [
-            entry for entry in self.about if getattr(entry, "name", "") in ("trilat.accounts", "trilat.chain")
+            entry
+            for entry in self.about
+            if getattr(entry, "name", "") in ("trilat.accounts", "trilat.chain")
         ]
         for entry in self.about:
             if entry not in late:
@@ -76,11 +81,15 @@ def _write(writer: McapWriter, entry: Any) -> None:
         case "Metadata":
             writer.add_metadata(entry.name, entry.metadata)
         case "Attachment":
-            writer.add_attachment(entry.create_time, entry.log_time, entry.name, entry.media_type, entry.data)
+            writer.add_attachment(
+                entry.create_time, entry.log_time, entry.name, entry.media_type, entry.data
+            )
         case "Schema":
             writer.register_schema(entry.name, entry.encoding, entry.data)
         case "Channel":
-            writer.register_channel(entry.topic, entry.message_encoding, entry.schema_id, entry.metadata)
+            writer.register_channel(
+                entry.topic, entry.message_encoding, entry.schema_id, entry.metadata
+            )
 
 
 def taken_apart(data: bytes) -> Pieces:

@@ -35,8 +35,12 @@ from .golden.digests import channel_digests
 
 LINKS = ("arrivals", "channel", "delay", "link", "lost_peers", "philox")
 ROOMS = {
-    "core": [path for path in house.files() if house.room(path) == "core" and path.stem not in LINKS],
-    "links": [path for path in house.files() if house.room(path) == "core" and path.stem in LINKS],
+    "core": [
+        path for path in house.files() if house.room(path) == "core" and path.stem not in LINKS
+    ],
+    "links": [
+        path for path in house.files() if house.room(path) == "core" and path.stem in LINKS
+    ],
     "log": [path for path in house.files() if house.room(path) == "log"],
     "certificate": sorted((house.ROOT / "trilat_net/analysis/certificate").glob("*.py")),
 }
@@ -135,7 +139,10 @@ class _Places(ast.NodeVisitor):
         """The operator between two operands."""
         assert before.end_lineno is not None
         assert before.end_col_offset is not None
-        first, last = (before.end_lineno, before.end_col_offset), (after.lineno, after.col_offset)
+        first, last = (
+            (before.end_lineno, before.end_col_offset),
+            (after.lineno, after.col_offset),
+        )
         low, high = (bisect_left(self._tokens, (place, "")) for place in (first, last))
         words = [one for one in self._tokens[low:high] if one[1] not in ("(", ")")]
         if len(words) == 1 and words[0][1] in OTHERS:  # `is not` and `not in` are two
@@ -150,7 +157,9 @@ class _Places(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_Compare(self, node: ast.Compare) -> None:
-        for before, after in zip([node.left, *node.comparators], node.comparators, strict=False):
+        for before, after in zip(
+            [node.left, *node.comparators], node.comparators, strict=False
+        ):
             self._between(before, after)
         self.generic_visit(node)
 
@@ -175,8 +184,14 @@ class _Places(ast.NodeVisitor):
 
     def visit_Name(self, node: ast.Name) -> None:
         """An argument becomes the next one of its function."""
-        if node.id in self._parameters and len(self._parameters) > 1 and isinstance(node.ctx, ast.Load):
-            after = self._parameters[(self._parameters.index(node.id) + 1) % len(self._parameters)]
+        if (
+            node.id in self._parameters
+            and len(self._parameters) > 1
+            and isinstance(node.ctx, ast.Load)
+        ):
+            after = self._parameters[
+                (self._parameters.index(node.id) + 1) % len(self._parameters)
+            ]
             self._add((node.lineno, node.col_offset), node.id, after)
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
@@ -224,16 +239,27 @@ def order_tests(path: Path) -> Iterator[list[str]]:
     """Yields files of tests: those that import a file of the program, golden runs, its room, all others."""
     module = path.relative_to(house.ROOT).with_suffix("").parts
     tests = sorted((house.ROOT / "tests").rglob("test_*.py"))
-    near = [one for one in tests if any(name[: len(module)] == module for name in house.imported_names(one))]
+    near = [
+        one
+        for one in tests
+        if any(name[: len(module)] == module for name in house.imported_names(one))
+    ]
     near.sort(key=lambda one: one.stem != f"test_{path.stem}")
     room = [one for one in tests if house.room(path) in one.parts and one not in near]
     golden = [one for one in tests if "golden" in one.parts and one not in near]
-    for some in (near, golden, room, [one for one in tests if one not in (*near, *golden, *room)]):
+    for some in (
+        near,
+        golden,
+        room,
+        [one for one in tests if one not in (*near, *golden, *room)],
+    ):
         if some:
             yield [str(one.relative_to(house.ROOT)) for one in some]
 
 
-def ask_pytest(tree: Path, options: list[str], workers: int, **environment: str) -> CompletedProcess[str]:
+def ask_pytest(
+    tree: Path, options: list[str], workers: int, **environment: str
+) -> CompletedProcess[str]:
     """Runs tests of a push in a tree; what runs in another folder is of this tree too."""
     command = [sys.executable, "-m", "pytest", "-q", "--tb=no", "-p", "no:cacheprovider"]
     command += ["-m", "not live and not long"]
@@ -282,17 +308,24 @@ def run_interpreted(tree: Path, path: Path, workers: int) -> str:
         return "tests/golden/test_payloads.py[paper]"
     listed = tree.parent / "quick.txt"
     near = next(order_tests(path))
-    names = sorted(find_quick_tests(workers), key=lambda name: name.partition("::")[0] not in near)
+    names = sorted(
+        find_quick_tests(workers), key=lambda name: name.partition("::")[0] not in near
+    )
     listed.write_text("\n".join(names), encoding="utf-8")
-    ended = ask_pytest(tree, ["-x", "-rfE", "--timeout=60", f"@{listed}"], workers, **INTERPRETED)
+    ended = ask_pytest(
+        tree, ["-x", "-rfE", "--timeout=60", f"@{listed}"], workers, **INTERPRETED
+    )
     return name_failure(ended)
 
 
 def run_tests(tree: Path, files: list[str], workers: int) -> str:
     """Runs tests of a push in a tree until one fails; returns its name, or "" if none does."""
     options = ["-x", "-rfE", f"--timeout={SLOWEST_S}", "--timeout-method=thread", *files]
-    changed = any((tree / path.relative_to(house.ROOT)).read_bytes() != path.read_bytes() for path in CORE)
-    cache = {"XDG_CACHE_HOME": str(tree.parent / "cache")} if changed else {}  # nothing compiled is kept
+    changed = any(
+        (tree / path.relative_to(house.ROOT)).read_bytes() != path.read_bytes() for path in CORE
+    )
+    # nothing compiled is kept
+    cache = {"XDG_CACHE_HOME": str(tree.parent / "cache")} if changed else {}
     return name_failure(ask_pytest(tree, options, workers, **cache))
 
 
@@ -303,13 +336,17 @@ def name_failure(ended: CompletedProcess[str]) -> str:
     named = re.search(r"^(?:FAILED|ERROR) (\S+)", ended.stdout, re.MULTILINE)
     hangs = re.search(r"Timeout", ended.stdout + ended.stderr)
     return (
-        named[1] if named else f"{'a test hangs' if hangs else 'the tests do not run'} ({ended.returncode})"
+        named[1]
+        if named
+        else f"{'a test hangs' if hangs else 'the tests do not run'} ({ended.returncode})"
     )
 
 
 def copy_tree(to: Path) -> None:
     """Copies what is under version control; times stay, as compiled code goes by them."""
-    listed = subprocess.run(["git", "ls-files", "-z"], cwd=house.ROOT, capture_output=True, check=True)
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=house.ROOT, capture_output=True, check=True
+    )
     for name in filter(None, listed.stdout.decode().split("\0")):
         (to / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(house.ROOT / name, to / name)
@@ -320,28 +357,42 @@ def judge_mutant(mutant: Mutant, workers: int) -> str:
     with tempfile.TemporaryDirectory() as made:
         tree = Path(made) / "tree"
         copy_tree(tree)
-        (tree / mutant.path.relative_to(house.ROOT)).write_text(mutant.apply(), encoding="utf-8")
+        (tree / mutant.path.relative_to(house.ROOT)).write_text(
+            mutant.apply(), encoding="utf-8"
+        )
         if mutant.path in CORE and (found := run_interpreted(tree, mutant.path, workers)):
             return found
-        return next(filter(None, (run_tests(tree, some, workers) for some in order_tests(mutant.path))), "")
+        return next(
+            filter(None, (run_tests(tree, some, workers) for some in order_tests(mutant.path))),
+            "",
+        )
 
 
 def main() -> int:
     """Prints a table, a row as it is found; the exit code is 1 if more than a twentieth survives."""
-    parser = argparse.ArgumentParser(description="Judges the tests of a push by single-token changes.")
+    parser = argparse.ArgumentParser(
+        description="Judges the tests of a push by single-token changes."
+    )
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--count", type=int, default=40, help="of changes, over four rooms")
     parser.add_argument("--only", default="", help="a pattern of the files that are changed")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="processes that test")
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, help="processes that test"
+    )
     given = parser.parse_args()
     print("| change | found by | s |\n|---|---|---|", flush=True)
-    drawn = [one for one in draw_mutants(given.seed, given.count) if re.search(given.only, str(one))]
+    drawn = [
+        one for one in draw_mutants(given.seed, given.count) if re.search(given.only, str(one))
+    ]
     survivors = 0
     for mutant in drawn:
         begun_s = time.monotonic()
         found = judge_mutant(mutant, given.workers)
         survivors += not found
-        print(f"| {mutant} | {found or 'SURVIVES'} | {time.monotonic() - begun_s:.0f} |", flush=True)
+        print(
+            f"| {mutant} | {found or 'SURVIVES'} | {time.monotonic() - begun_s:.0f} |",
+            flush=True,
+        )
     print(f"\n{len(drawn) - survivors} of {len(drawn)} are found")
     return int(survivors > len(drawn) / 20)
 

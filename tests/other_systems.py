@@ -86,9 +86,13 @@ def read_typeshed() -> tuple[dict[str, list[str]], list[str]]:
         body = ast.parse(file.read_text(encoding="utf-8")).body
         here, *there = (set(_list_names(body, platform)) for platform in ("linux", *OTHERS))
         if missing := {name for name, _ in here.difference(set.intersection(*there))}:
-            module = ".".join(file.relative_to(stubs).with_suffix("").parts).removesuffix(".__init__")
+            module = ".".join(file.relative_to(stubs).with_suffix("").parts).removesuffix(
+                ".__init__"
+            )
             lacks[module] = sorted(missing)
-            if not all(any(own and not name.startswith("_") for name, own in names) for names in there):
+            if not all(
+                any(own and not name.startswith("_") for name, own in names) for names in there
+            ):
                 refused.append(module)
     return lacks, refused
 

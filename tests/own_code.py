@@ -21,8 +21,13 @@ class Circle:
     def act(self, now: HandView) -> Sequence[float] | None:
         if self.start is None:
             self.start = now.pose
-        angle, size = 2.0 * math.pi * now.t_s / self.turn_s, self.radius_m * min(1.0, now.t_s / self.turn_s)
-        moved: Sequence[float] = self.start + size * np.array([math.cos(angle) - 1.0, math.sin(angle)])
+        angle, size = (
+            2.0 * math.pi * now.t_s / self.turn_s,
+            self.radius_m * min(1.0, now.t_s / self.turn_s),
+        )
+        moved: Sequence[float] = self.start + size * np.array(
+            [math.cos(angle) - 1.0, math.sin(angle)]
+        )
         return moved
 
 
@@ -35,7 +40,10 @@ class Follower:
 
     def act(self, now: HandView) -> Sequence[float] | None:
         self.seen.append(now)
-        way = sum((one.alpha * (one.q - now.q) * math.exp(-one.age_s) for one in now.peers), np.zeros(2))
+        way = sum(
+            (one.alpha * (one.q - now.q) * math.exp(-one.age_s) for one in now.peers),
+            np.zeros(2),
+        )
         goal: Sequence[float] = now.pose + 0.3 * way + 0.01 * now.grip * (now.target - now.pose)
         return goal
 
@@ -85,7 +93,11 @@ class Carousel(Arm):
 
     def poses(self) -> Any:
         if self.how and self.t_s > 0.1:
-            return {"few": [[0.0] * 7], "nan": [[float("nan")] * 7] * self.count, "short": [[0.0]]}[self.how]
+            return {
+                "few": [[0.0] * 7],
+                "nan": [[float("nan")] * 7] * self.count,
+                "short": [[0.0]],
+            }[self.how]
         half = [0.5 * (self.t_s + n) for n in range(self.count)]
         return [[n, 0.1 * n, 0.0, np.cos(a), 0.0, 0.0, np.sin(a)] for n, a in enumerate(half)]
 
@@ -121,7 +133,12 @@ class HeldArm:
     """The planar arm without gravity, held by a hand that also does things by itself."""
 
     def __init__(
-        self, facts: PlantContext, M: list[float], B: list[float], K: list[float], unrest_n: float = 0.3
+        self,
+        facts: PlantContext,
+        M: list[float],
+        B: list[float],
+        K: list[float],
+        unrest_n: float = 0.3,
     ) -> None:
         arm = facts.scenario.arms[facts.site]
         self.theta, self.lengths = arm.theta.tolist(), arm.lengths_m
@@ -147,7 +164,12 @@ class HeldArm:
         inertia = np.array([[self.theta[0] + 2.0 * bend, inner], [inner, self.theta[2]]])
         w1, w2 = self.qd
         turning = swing * np.array([w2 * (2.0 * w1 + w2), -w1 * w1])
-        force = self.own - self.K @ (at - self.at) - self.B @ (J @ self.qd) - self.M @ (Jd @ self.qd)
+        force = (
+            self.own
+            - self.K @ (at - self.at)
+            - self.B @ (J @ self.qd)
+            - self.M @ (Jd @ self.qd)
+        )
         qdd = np.linalg.solve(inertia + J.T @ self.M @ J, self.tau - turning + J.T @ force)
         return qdd, J.T @ (force - self.M @ (J @ qdd))
 

@@ -10,7 +10,9 @@ class PD:
     remembers: tuple[str, ...] = ()
     tune = {"K": (5.0, 50.0, "N m/rad"), "d": (1.0, 20.0, "N m s/rad")}  # noqa: RUF012
 
-    def __init__(self, _facts: LawContext, K: float = 10.0, d: float = 3.0, gravity: float = 1.0) -> None:
+    def __init__(
+        self, _facts: LawContext, K: float = 10.0, d: float = 3.0, gravity: float = 1.0
+    ) -> None:
         self.K, self.d, self.gravity = K, d, gravity
 
     def torque(self, now: LawInput) -> None:
@@ -66,7 +68,12 @@ class Forces:
     remembers = ()
 
     def __init__(
-        self, _facts: LawContext, K: float = 100.0, B: float = 20.0, own: float = 0.5, alone: bool = False
+        self,
+        _facts: LawContext,
+        K: float = 100.0,
+        B: float = 20.0,
+        own: float = 0.5,
+        alone: bool = False,
     ) -> None:
         self.K, self.B, self.own, self.alone = K, B, own, alone
 
@@ -75,5 +82,10 @@ class Forces:
             felt = now.felt[i]
             if self.alone:
                 felt = -sum(peer.alpha * peer.tau_x[i] for peer in now.peers)
-            now.tau[i] = now.gravity[i] + self.K * (now.q_des[i] - now.q[i]) + felt - self.own * now.tau_x[i]
+            now.tau[i] = (
+                now.gravity[i]
+                + self.K * (now.q_des[i] - now.q[i])
+                + felt
+                - self.own * now.tau_x[i]
+            )
             now.tau[i] += self.B * (now.qd_des[i] - now.qd[i])

@@ -25,7 +25,12 @@ class Line:
 
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):
-            total = now.gravity[i] + 0.01 * now.bias[i] + 0.05 * now.tau_x[i] - 0.1 * now.tau_before[i]
+            total = (
+                now.gravity[i]
+                + 0.01 * now.bias[i]
+                + 0.05 * now.tau_x[i]
+                - 0.1 * now.tau_before[i]
+            )
             for j in range(len(now.peers)):
                 peer = now.peers[j]
                 apart = now.q[i] - peer.q[i]
@@ -34,7 +39,11 @@ class Line:
                 if peer.new:
                     pull += 1e-3 * peer.tick + 0.1 * peer.age_s + 0.01 * peer.tau_x[i]
                 now.sent[j].u[i] = pull
-                total -= pull + 0.1 * now.received[j].u[i] - self.signs[i] * 0.01 * now.received[j].E[0]
+                total -= (
+                    pull
+                    + 0.1 * now.received[j].u[i]
+                    - self.signs[i] * 0.01 * now.received[j].E[0]
+                )
             now.to_all.E[0] += total * (now.q[i] - now.q_before[i])
             now.tau[i] = total - 5.0 * now.inertia[i][i] * now.qd[i]
             now.theta_hat[i] = self.integral[0][i]

@@ -34,14 +34,18 @@ class Progress:
         self._config, self._name = config, name
         self._total, self._done, self._failed = 0, 0, 0
         self._began_s = self._printed_s = time.monotonic()
-        self._expected_s: float | None = config.cache.get(_KEY + name, None) if config.cache else None
+        self._expected_s: float | None = (
+            config.cache.get(_KEY + name, None) if config.cache else None
+        )
 
     def begin(self, total: int) -> None:
         """Says how many tests there are, and how long they took before."""
         if self._total:
             return  # of another worker: all have the same tests
         self._total, self._began_s = total, time.monotonic()
-        known = "" if self._expected_s is None else f", about {format_duration(self._expected_s)}"
+        known = (
+            "" if self._expected_s is None else f", about {format_duration(self._expected_s)}"
+        )
         self._print(f"{total} tests{known}")
 
     def count(self, report: pytest.TestReport) -> None:
@@ -57,8 +61,12 @@ class Progress:
         spent_s = now_s - self._began_s
         left_s = spent_s / self._done * (self._total - self._done)
         failed = f", {self._failed} failed" if self._failed else ""
-        share = f"{100 * self._done // self._total} %, {self._done} of {self._total} tests{failed}"
-        self._print(f"{share}, {format_duration(spent_s)}, about {format_duration(left_s)} left")
+        share = (
+            f"{100 * self._done // self._total} %, {self._done} of {self._total} tests{failed}"
+        )
+        self._print(
+            f"{share}, {format_duration(spent_s)}, about {format_duration(left_s)} left"
+        )
 
     def end(self) -> None:
         """Says how long the run took, and keeps that."""
@@ -81,7 +89,9 @@ def pytest_configure(config: pytest.Config) -> None:
     if not hasattr(config, "workerinput"):
         config.stash[_PROGRESS] = Progress(config, os.environ.get("TRILAT_TEST_RUN", "tests"))
         config.pluginmanager.register(_Hooks(config.stash[_PROGRESS]))
-        if config.pluginmanager.hasplugin("dsession") or config.pluginmanager.hasplugin("xdist"):
+        if config.pluginmanager.hasplugin("dsession") or config.pluginmanager.hasplugin(
+            "xdist"
+        ):
             config.pluginmanager.register(_HooksOfWorkers(config.stash[_PROGRESS]))
 
 
@@ -107,7 +117,11 @@ class _Hooks:
     @pytest.hookimpl(tryfirst=True)
     def pytest_report_teststatus(self, report: Any) -> tuple[str, str, str] | None:
         """Lets what passed print no letter."""
-        if report.passed and getattr(report, "when", "") == "call" and not hasattr(report, "wasxfail"):
+        if (
+            report.passed
+            and getattr(report, "when", "") == "call"
+            and not hasattr(report, "wasxfail")
+        ):
             return "passed", "", ""
         return None
 

@@ -62,7 +62,9 @@ def _dear_s(name: str) -> float:
 
 
 def main() -> int:
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter).parse_args()
+    argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    ).parse_args()
     pytest_options = ["-q", "-n", "auto", "--dist", "worksteal", "-m", "not live and not long"]
     with tempfile.TemporaryDirectory() as folder:
         times = Path(folder, "times.tsv")
@@ -74,7 +76,9 @@ def main() -> int:
     if code == 0:
         left = choose_long_tests({name: float(seconds) for seconds, _tab, name in rows})
         LONG_TESTS.write_text("".join(f"{name}\n" for name in left), encoding="utf-8")
-        print(f"{len(left)} of {len(rows)} tests are left to make test-long: {LONG_TESTS.relative_to(ROOT)}")
+        print(
+            f"{len(left)} of {len(rows)} tests are left to make test-long: {LONG_TESTS.relative_to(ROOT)}"
+        )
     return code
 
 

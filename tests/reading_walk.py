@@ -88,7 +88,9 @@ def _definition(place: Place) -> ast.FunctionDef | ast.ClassDef | None:
     body = house.tree(place.module).body
     for node in body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef) and node.name == head:
-            inside = [n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == method]
+            inside = [
+                n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == method
+            ]
             return node if not method else next(iter(inside), None)
     return None
 
@@ -105,10 +107,19 @@ def _resolve(path: Path, name: str) -> list[Place]:
     """What a name of a module stands for, through aliases and tables."""
     found = _module_names(path).get(name)
     if isinstance(found, ast.expr):
-        return [place for inner in _names_in(found) if inner != name for place in _resolve(path, inner)]
+        return [
+            place
+            for inner in _names_in(found)
+            if inner != name
+            for place in _resolve(path, inner)
+        ]
     if not isinstance(found, Place):
         return []
-    return [found] if _definition(found) or found.module == path else _resolve(found.module, found.name)
+    return (
+        [found]
+        if _definition(found) or found.module == path
+        else _resolve(found.module, found.name)
+    )
 
 
 def _fields(node: ast.ClassDef) -> list[ast.AnnAssign]:
@@ -126,7 +137,9 @@ def _is_numbers(path: Path, name: str) -> bool:
         if not isinstance(node, ast.ClassDef) or not _fields(node):
             return False
         for field in _fields(node):
-            if not all(_is_numbers(place.module, inner) for inner in _names_in(field.annotation)):
+            if not all(
+                _is_numbers(place.module, inner) for inner in _names_in(field.annotation)
+            ):
                 return False
     return name in NUMBERS or bool(places)
 
@@ -183,8 +196,14 @@ class _Body:
                 self._give(node)
 
     def _give(self, node: ast.AST) -> None:
-        pairs = [(node.target, node.iter)] if isinstance(node, ast.For | ast.comprehension) else []
-        pairs += [(target, node.value) for target in node.targets] if isinstance(node, ast.Assign) else []
+        pairs = (
+            [(node.target, node.iter)] if isinstance(node, ast.For | ast.comprehension) else []
+        )
+        pairs += (
+            [(target, node.value) for target in node.targets]
+            if isinstance(node, ast.Assign)
+            else []
+        )
         pairs += [(node.target, node.value)] if isinstance(node, ast.NamedExpr) else []
         for target, value in pairs:
             for name in ast.walk(target):
@@ -197,30 +216,54 @@ class _Body:
         if isinstance(node, ast.Name) and node.id in self.names:
             return self.names[node.id]
         if isinstance(node, ast.Name):
-            return {one for one in _resolve(module, node.id) if isinstance(_definition(one), ast.ClassDef)}
+            return {
+                one
+                for one in _resolve(module, node.id)
+                if isinstance(_definition(one), ast.ClassDef)
+            }
         if isinstance(node, ast.Attribute):
             owners = self.classes(node.value)
             found = [_member(owner, node.attr) for owner in owners]
             known = [(one.module, part) for one, part in found if part is not None]
-            return {c for path, part in known for c in _classes_in(path, part)} if known else owners
+            return (
+                {c for path, part in known for c in _classes_in(path, part)}
+                if known
+                else owners
+            )
         if isinstance(node, ast.Call):
             results = [(one.module, _definition(one).returns) for one in self.called(node.func)]  # type: ignore[union-attr]
             classes = {c for path, part in results if part for c in _classes_in(path, part)}
-            return classes or self.classes(node.func) or {c for one in node.args for c in self.classes(one)}
+            return (
+                classes
+                or self.classes(node.func)
+                or {c for one in node.args for c in self.classes(one)}
+            )
         below = ast.iter_child_nodes(node)
-        return {c for one in below for c in self.classes(one)} if isinstance(node, ast.expr) else set()
+        return (
+            {c for one in below for c in self.classes(one)}
+            if isinstance(node, ast.expr)
+            else set()
+        )
 
     def called(self, node: ast.AST) -> list[Place]:
         """The functions, methods and properties of the rooms that an expression leads to."""
         found: list[Place] = []
-        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load) and node.id not in self.names:
+        if (
+            isinstance(node, ast.Name)
+            and isinstance(node.ctx, ast.Load)
+            and node.id not in self.names
+        ):
             found = _resolve(self.place.module, node.id)
         elif isinstance(node, ast.Attribute):
             above = _module_names(self.place.module).get(getattr(node.value, "id", ""))
             owners = sorted(self.classes(node.value))
             found = [_member(owner, node.attr)[0] for owner in owners]
             found = [Place(above, node.attr)] if isinstance(above, Path) else found
-        return [one for one in found if isinstance(_definition(one), ast.FunctionDef) and _in_rooms(one)]
+        return [
+            one
+            for one in found
+            if isinstance(_definition(one), ast.FunctionDef) and _in_rooms(one)
+        ]
 
 
 def _in_rooms(place: Place) -> bool:
@@ -264,7 +307,9 @@ def walk(*starts: Place) -> Walk:
     def read(place: Place) -> None:
         body = _Body(place)
         decided = _decided(body.function)
-        for node in (inner for statement in body.function.body for inner in _in_order(statement)):
+        for node in (
+            inner for statement in body.function.body for inner in _in_order(statement)
+        ):
             new = [one for one in body.called(node) if one not in seen]
             seen.update(new)
             judging = [one for one in new if not _measures(one)]

@@ -139,10 +139,15 @@ def read_table_commands() -> set[str]:
     for row in table.splitlines()[2:]:
         for code in re.findall(r"`trilat ([^`]*)`", row.split(" | ")[0]):
             parts = [
-                re.sub(r"\[.*?\]|--\S.*|\b[A-Z]{1,}\b.*", "", part).split() for part in code.split(" / ")
+                re.sub(r"\[.*?\]|--\S.*|\b[A-Z]{1,}\b.*", "", part).split()
+                for part in code.split(" / ")
             ]
             group = parts[0][:-1] if len(parts) > 1 else []
-            named |= {" ".join([*group, *words] if n else words) for n, words in enumerate(parts) if words}
+            named |= {
+                " ".join([*group, *words] if n else words)
+                for n, words in enumerate(parts)
+                if words
+            }
     return {name.split(" '")[0] for name in named}
 
 
@@ -155,8 +160,17 @@ def list_missing_commands(commands: set[str]) -> set[str]:
     run = [shlex.split(command)[1:] for command in list_all() if command.startswith("trilat ")]
     for block in find_blocks("README.md"):
         run += [words[1:] for words, _ in read_commands(block.text) if words[0] == "trilat"]
-    done = {f"{words[0]} {word}" for words in run for word in words[1:]} | {words[0] for words in run}
+    done = {f"{words[0]} {word}" for words in run for word in words[1:]} | {
+        words[0] for words in run
+    }
     named = read_table_commands()
-    assert all(name in commands or any(one.startswith(f"{name} ") for one in commands) for name in named)
-    wanted = {one for one in commands if one in named or any(one.startswith(f"{name} ") for name in named)}
+    assert all(
+        name in commands or any(one.startswith(f"{name} ") for one in commands)
+        for name in named
+    )
+    wanted = {
+        one
+        for one in commands
+        if one in named or any(one.startswith(f"{name} ") for name in named)
+    }
     return {one for one in wanted if one not in done}

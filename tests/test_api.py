@@ -99,7 +99,16 @@ COUNTERPARTS = {
     "read_member_keys": ["keys info"],
     **{
         name: [name]
-        for name in ("doctor", "verify", "certify", "metrics", "figure", "report", "rerun", "twin")
+        for name in (
+            "doctor",
+            "verify",
+            "certify",
+            "metrics",
+            "figure",
+            "report",
+            "rerun",
+            "twin",
+        )
     },
     **{name: [name] for name in ("sweep", "bench", "linear")},
 }
@@ -108,7 +117,9 @@ COUNTERPARTS = {
 
 def test_every_command_has_a_counterpart() -> None:
     names = [name.removeprefix("trilat ") for name in all_options() if name != "trilat"]
-    commands = {name for name in names if not any(other.startswith(f"{name} ") for other in names)}
+    commands = {
+        name for name in names if not any(other.startswith(f"{name} ") for other in names)
+    }
     assert {command for done in COUNTERPARTS.values() for command in done} == commands
     assert not COUNTERPARTS.keys() - set(dir(tn))
 
@@ -131,7 +142,9 @@ def test_its_example_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @pytest.fixture(scope="module")
 def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tn.simulate("two_sites", duration_s=0.2).save(tmp_path_factory.mktemp("api") / "run.mcap")
+    return tn.simulate("two_sites", duration_s=0.2).save(
+        tmp_path_factory.mktemp("api") / "run.mcap"
+    )
 
 
 class _Texts(HTMLParser):
@@ -165,12 +178,17 @@ def test_a_result_says_what_its_command_prints(
     """By a short name: the command lays out tables for the width of its terminal."""
     monkeypatch.chdir(file.parent)
     file = Path(file.name)
-    more = {"compare": [file], "rerun": ["--replace", "s", "--set", "control.Kd=5"]}.get(command, [])
+    more = {"compare": [file], "rerun": ["--replace", "s", "--set", "control.Kd=5"]}.get(
+        command, []
+    )
     found = RESULTS[command](file)
     printed = trilat(*command.split(), file, *more, cwd=Path.cwd())
     assert found.summary().split() == (printed.out + printed.err).split()
     as_json = json.loads(trilat(*command.split(), file, *more, "--json", cwd=Path.cwd()).out)
-    assert {**as_json, "file": None} == {**json.loads(json.dumps(found.to_dict())), "file": None}
+    assert {**as_json, "file": None} == {
+        **json.loads(json.dumps(found.to_dict())),
+        "file": None,
+    }
     assert "\n" not in repr(found)
     assert repr(found).startswith(f"<{type(found).__name__} ")
     assert _Texts(found._repr_html_()).words == found.summary().split()
@@ -226,10 +244,14 @@ def test_a_log_is_a_mapping_of_its_sites(file: Path) -> None:
 
 def test_a_run_that_diverged_says_so() -> None:
     keys = {"limits.qd_limit_rad_s": 0.5}
-    with pytest.warns(RuntimeWarning, match=r"the run diverged at .* s, and ends there") as caught:
+    with pytest.warns(
+        RuntimeWarning, match=r"the run diverged at .* s, and ends there"
+    ) as caught:
         log = tn.simulate("two_sites", keys, duration_s=5)
     assert caught[0].filename == __file__
-    assert log.diverged_s == min(part.t_s[-1] for part in log.values() if part.mode[-1] == "diverged")
+    assert log.diverged_s == min(
+        part.t_s[-1] for part in log.values() if part.mode[-1] == "diverged"
+    )
     assert f"DIVERGED at {log.diverged_s:.3f} s" in repr(log)
     still = tn.simulate("two_sites", duration_s=0.1)
     assert still.diverged_s is None
@@ -238,25 +260,52 @@ def test_a_run_that_diverged_says_so() -> None:
 
 WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
     "scenario": (lambda _: tn.simulate(42), "42: no scenario of that name"),
-    "set": (lambda _: tn.simulate("two_sites", 5), "an override reads KEY=VALUE, as in control.Kd=5, not 5"),
+    "set": (
+        lambda _: tn.simulate("two_sites", 5),
+        "an override reads KEY=VALUE, as in control.Kd=5, not 5",
+    ),
     "set[]": (lambda _: tn.simulate("two_sites", [5]), "an override reads KEY=VALUE"),
     "set key": (lambda _: tn.simulate("two_sites", {5: 5}), "5: unknown key"),
-    "set value": (lambda _: tn.simulate("two_sites", {"control.Kd": None}), "control.Kd: expected"),
+    "set value": (
+        lambda _: tn.simulate("two_sites", {"control.Kd": None}),
+        "control.Kd: expected",
+    ),
     "log": (lambda _: tn.open_log("nothing.mcap"), "^nothing.mcap: cannot be read"),
-    "log is none": (lambda _: tn.verify(None), "a log is a path, or a file opened for reading, not None"),
+    "log is none": (
+        lambda _: tn.verify(None),
+        "a log is a path, or a file opened for reading, not None",
+    ),
     "site": (lambda file: tn.open_log(file)["x"], "^no site 'x' in .*; it has m, s$"),
     "table": (lambda file: tn.open_log(file).table("m", "x"), "^no table 'x' of m"),
-    "save": (lambda file: tn.simulate("two_sites", duration_s=0.1).save(file), "replace it with force=True$"),
-    "report": (lambda file: tn.report(file, file.parent), "choose another folder, or use force=True$"),
-    "run": (lambda file: tn.run("two_sites", out=file.parent), "choose another folder, or use force=True$"),
-    "sweep out": (lambda file: tn.sweep("free", "control.Kd=1,2", out=file.parent), "another folder$"),
+    "save": (
+        lambda file: tn.simulate("two_sites", duration_s=0.1).save(file),
+        "replace it with force=True$",
+    ),
+    "report": (
+        lambda file: tn.report(file, file.parent),
+        "choose another folder, or use force=True$",
+    ),
+    "run": (
+        lambda file: tn.run("two_sites", out=file.parent),
+        "choose another folder, or use force=True$",
+    ),
+    "sweep out": (
+        lambda file: tn.sweep("free", "control.Kd=1,2", out=file.parent),
+        "another folder$",
+    ),
     "export": (lambda file: tn.export(file, "npz", file), "replace it with force=True$"),
-    "sweep seeds": (lambda _: tn.sweep("free", "control.Kd=1,2", seeds="1..3"), "^seeds is how many"),
+    "sweep seeds": (
+        lambda _: tn.sweep("free", "control.Kd=1,2", seeds="1..3"),
+        "^seeds is how many",
+    ),
     "sweep over": (lambda _: tn.sweep("free", 5), "^over reads KEY=VALUES"),
     "sweep law": (lambda _: tn.sweep("free", laws="pd"), "^laws: there is no law 'pd'"),
     "margin": (lambda _: tn.margin("free", "x"), "^along reads KEY=FROM:TO"),
     "tune": (lambda _: tn.tune("free", gravity_percent=5), "^gravity_percent is from 50"),
-    "rerun": (lambda file: tn.rerun(file), r"replace=NAME \(of m, s\), or closed_loop=True for all"),
+    "rerun": (
+        lambda file: tn.rerun(file),
+        r"replace=NAME \(of m, s\), or closed_loop=True for all",
+    ),
     "figure": (lambda file: tn.figure(file, "positions", "x"), "3.5 or 7 in wide, not x"),
     "linear": (lambda _: tn.linear("two_sites", pose=["x"]), "a pose is of angles in rad"),
     "bench": (lambda _: tn.bench(seeds=0), "^seeds is how many, 1 to 1000, not 0"),
@@ -272,13 +321,22 @@ def test_errors_in_python_are_of_one_type_and_name_arguments(what: str, file: Pa
 
 
 def test_an_error_names_arguments_and_whole_commands() -> None:
-    error = UsageError("x: trilat log recover x --force; or take -o, --seeds 5, --keys DIR or --force")
-    assert str(error) == "x: trilat log recover x --force; or take out, seeds=5, keys=DIR or force=True"
+    error = UsageError(
+        "x: trilat log recover x --force; or take -o, --seeds 5, --keys DIR or --force"
+    )
+    assert (
+        str(error)
+        == "x: trilat log recover x --force; or take out, seeds=5, keys=DIR or force=True"
+    )
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 
 
 def test_numbers_of_numpy_are_numbers() -> None:
-    keys = {"control.Kd": np.array([5.0, 5.0]), "control.Kp": np.float64(2.0), "seed": np.int64(3)}
+    keys = {
+        "control.Kd": np.array([5.0, 5.0]),
+        "control.Kp": np.float64(2.0),
+        "seed": np.int64(3),
+    }
     same = {"control.Kd": 5.0, "control.Kp": 2.0, "seed": 3, "duration_s": 0.5}
     given = tn.load_scenario("two_sites", keys, duration_s=np.float32(0.5))
     assert given == tn.load_scenario("two_sites", same)
@@ -286,7 +344,9 @@ def test_numbers_of_numpy_are_numbers() -> None:
 
 def test_a_law_is_given_as_its_class() -> None:
     log = tn.simulate("two_sites", {"control.law": Adaptive, "control.Kp": 2.0}, duration_s=0.1)
-    assert {site.control.code for site in log.scenario.sites.values()} == {"tests.laws:Adaptive"}
+    assert {site.control.code for site in log.scenario.sites.values()} == {
+        "tests.laws:Adaptive"
+    }
     (trial,) = tn.trials("free", set={"control.law": Adaptive})
     assert trial.overrides == ('control.law="tests.laws:Adaptive"',)
 

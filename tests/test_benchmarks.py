@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-NAMES = sorted(path.stem for path in (Path(__file__).parents[1] / "benchmarks").glob("[!_]*.py"))
+NAMES = sorted(
+    path.stem for path in (Path(__file__).parents[1] / "benchmarks").glob("[!_]*.py")
+)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -24,7 +24,9 @@ def test_they_name_the_same_program() -> None:
     assert said("version") == PROJECT["version"]
     assert said("abstract") == PROJECT["description"]
     listed = re.findall(
-        r"^  - \"?(.*?)\"?$", CITATION.split("keywords:")[1].split("references:")[0], re.MULTILINE
+        r"^  - \"?(.*?)\"?$",
+        CITATION.split("keywords:")[1].split("references:")[0],
+        re.MULTILINE,
     )
     assert listed == PROJECT["keywords"]
 
@@ -41,4 +43,7 @@ def test_they_name_the_same_licence_and_holder() -> None:
 def test_the_paper_is_a_reference() -> None:
     reference = CITATION.split("references:")[1]
     assert "type: article" in reference
-    assert "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty" in reference
+    assert (
+        "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty"
+        in reference
+    )

@@ -31,7 +31,13 @@ from trilat_net.net import arm_client, offset, requests, session, timing, zenoh_
 from trilat_net.scenario import laws, operators, resolve
 from trilat_net.studies import dask_cluster, executor
 from trilat_net.studies.bench import bench_plan, bench_results, bench_run
-from trilat_net.studies.sweep import live_confirmation, margin_search, sweep_cell, sweep_plan, sweep_run
+from trilat_net.studies.sweep import (
+    live_confirmation,
+    margin_search,
+    sweep_cell,
+    sweep_plan,
+    sweep_run,
+)
 from trilat_net.studies.tuning import candidate, search_space, tuning_plan
 from trilat_net.theory import (
     characteristic_roots,
@@ -65,7 +71,12 @@ STATED: list[tuple[str, str, float, float]] = [
     ("bench.md", "40 round trips", 40, bench_plan.ROUND_TRIPS),
     ("bench.md", "less than 1 N", 1, bench_results.LEAST_CONTACT_N),
     ("bench.md", "none of fewer than 20 seeds", 20, bench_results.LEAST_SEEDS),
-    ("bench.md", "round trips of 68, 272 and 1088 ms", 1088, bench_plan.TUNED_ROUND_TRIPS_MS[-1]),
+    (
+        "bench.md",
+        "round trips of 68, 272 and 1088 ms",
+        1088,
+        bench_plan.TUNED_ROUND_TRIPS_MS[-1],
+    ),
     ("certificate.md", "end of each of 16 windows", 16, twins.WINDOWS),
     ("certificate.md", "a difference above 1e-4 is made small again", 1e-4, twins.LARGEST),
     ("certificate.md", "a run within 1e-7 of its records has twins", 1e-7, twins.SAME_RUN),
@@ -103,10 +114,20 @@ STATED: list[tuple[str, str, float, float]] = [
     ("linear.md", "within 1e-6/s", 1e-6, characteristic_roots.STABILITY_EDGE_PER_S),
     ("linear.md", "a scan of 24 values", 24, linear_edge.EDGE_SCAN_POINTS),
     ("links.md", "No delay is longer than 10 s", 10, delay.MAX_DELAY_US / 1e6),
-    ("links.md", "round trips (8, 68, 136, 272, 544, 1088 ms)", 1088, resolve.GRID_ROUND_TRIPS_MS[-1]),
+    (
+        "links.md",
+        "round trips (8, 68, 136, 272, 544, 1088 ms)",
+        1088,
+        resolve.GRID_ROUND_TRIPS_MS[-1],
+    ),
     ("links.md", "losses (0, 10, 25, 50 %)", 50, resolve.GRID_LOSSES_PERCENT[-1]),
     ("metrics.md", "faster than 2e-3 rad/s", 2e-3, run_end.STATIC_SPEED_RAD_S),
-    ("metrics.md", "by more than 1 % of the largest", 1, 100 * static_windows.MAX_TORQUE_VARIATION),
+    (
+        "metrics.md",
+        "by more than 1 % of the largest",
+        1,
+        100 * static_windows.MAX_TORQUE_VARIATION,
+    ),
     ("metrics.md", "from 0.05 N m", 0.05, static_windows.MIN_LOAD_NM),
     ("metrics.md", "and 2 % of the largest", 2, 100 * static_windows.MIN_LOAD_SHARE),
     ("metrics.md", "Hann windows of 4 s", 4, measured_impedance.SEGMENT_S),
@@ -129,7 +150,12 @@ STATED: list[tuple[str, str, float, float]] = [
     ("definitions.md", "differ by more than 0.02 rad", 0.02, run_end.AGREEMENT_RAD),
     ("definitions.md", "within 0.3 rad of straight down", 0.3, arm_rows.HANGING_RAD),
     ("definitions.md", "left alone for 2 s or more", 2, run_end.LEAST_JUDGED_S),
-    ("definitions.md", "an error \\|e\\| of 2 % of the difference", 2, 100 * run_end.HELD_SHARE),
+    (
+        "definitions.md",
+        "an error \\|e\\| of 2 % of the difference",
+        2,
+        100 * run_end.HELD_SHARE,
+    ),
     ("certificate.md", "they let go 1 s and five times", 1, premises.MIN_FREE_S),
     ("sweep.md", "eight times the duration", 8, sweep_plan.MAX_EXTENSION),
     ("sweep.md", "by more than 2 %", 2, 100 * sweep_cell.FLAT_LOG_CHANGE),
@@ -143,13 +169,23 @@ STATED: list[tuple[str, str, float, float]] = [
     ),
     ("certificate.md", "less than 1e-3 is unexplained", 1e-3, certificates.CLEAR_BREAK_SHARE),
     ("certificate.md", "up to 1e-4 of the largest energy", 1e-4, premises.SAMPLING_RISE_SHARE),
-    ("certificate.md", "more than 1e-2 of the largest energy", 1e-2, certificates.COARSE_TOLERANCE_SHARE),
+    (
+        "certificate.md",
+        "more than 1e-2 of the largest energy",
+        1e-2,
+        certificates.COARSE_TOLERANCE_SHARE,
+    ),
     ("certificate.md", "to 1e-6 (1 + |tau|)", 1e-6, certificates.TORQUE_TOLERANCE),
     ("certificate.md", "`--min-coverage` (0.999)", 0.999, accounting.MIN_COVERAGE),
     ("definitions.md", "<= 0.01 rad/s in", 0.01, run_end.SETTLED_SPEED_RAD_S),
     ("definitions.md", "and a tenth of the run", 0.1, run_end.LEAST_JUDGED_SHARE),
     ("definitions.md", "largest values of 50 ms", 50, 1e3 / ticks.BUCKETS_PER_S),
-    ("definitions.md", "less than 99.9 % of a site's ticks", 99.9, 100 * accounting.MIN_COVERAGE),
+    (
+        "definitions.md",
+        "less than 99.9 % of a site's ticks",
+        99.9,
+        100 * accounting.MIN_COVERAGE,
+    ),
     ("design.md", "queue of 16 batches", 16, zenoh_config.BATCHES),
     ("design.md", "waits 15 s for them", 15, session_recording.AWAY_NS / 1e9),
     ("recording.md", "for 10 s after its last question", 10, site_process.LINGER_NS / 1e9),
@@ -159,11 +195,26 @@ STATED: list[tuple[str, str, float, float]] = [
     ("linear.md", "30 s of the draws", 30, floquet.DRAWN_SPAN_S),
     ("linear.md", "at most eight times its duration", 8, equilibrium.MAX_PROLONGATION),
     ("linear.md", "to a residual of 1e-10", 1e-10, equilibrium.MAX_EQUILIBRIUM_RESIDUAL),
-    ("linear.md", "1e-12 of the terms' size", 1e-12, characteristic_roots.ROOT_RESIDUAL_TOLERANCE),
+    (
+        "linear.md",
+        "1e-12 of the terms' size",
+        1e-12,
+        characteristic_roots.ROOT_RESIDUAL_TOLERANCE,
+    ),
     ("linear.md", "regula falsi to 1e-6", 1e-6, linear_edge.EDGE_TOLERANCE),
-    ("linear.md", "if it differs by more than 1 %", 1, 100 * linear_analysis.SAMPLED_ROOT_DIFFERENCE),
+    (
+        "linear.md",
+        "if it differs by more than 1 %",
+        1,
+        100 * linear_analysis.SAMPLED_ROOT_DIFFERENCE,
+    ),
     ("log-tools.md", "After 100 such places", 100, mcap_records.MAX_DAMAGED_PARTS),
-    ("log-tools.md", "max(32 MiB, 32 x its own size)", 32, mcap_records.MAX_UNPACKED_BYTES / 2**20),
+    (
+        "log-tools.md",
+        "max(32 MiB, 32 x its own size)",
+        32,
+        mcap_records.MAX_UNPACKED_BYTES / 2**20,
+    ),
     ("log-tools.md", "32 x its own size", 32, mcap_records.MAX_UNPACKED_RATIO),
     ("log-tools.md", "max(64 MiB, 300 x the file's size)", 64, mcap_reader.KEPT_BYTES / 2**20),
     ("log-tools.md", "300 x the file's size", 300, mcap_reader.KEPT_RATIO),
@@ -202,8 +253,12 @@ def flat(text: str) -> str:
     return " ".join(text.split())
 
 
-@pytest.mark.parametrize(("page", "words", "number", "own"), STATED, ids=[f"{p}: {w}" for p, w, *_ in STATED])
-def test_a_limit_on_a_page_is_the_program_s(page: str, words: str, number: float, own: float) -> None:
+@pytest.mark.parametrize(
+    ("page", "words", "number", "own"), STATED, ids=[f"{p}: {w}" for p, w, *_ in STATED]
+)
+def test_a_limit_on_a_page_is_the_program_s(
+    page: str, words: str, number: float, own: float
+) -> None:
     assert words in flat((ROOT / "docs" / page).read_text(encoding="utf-8"))
     assert number == pytest.approx(own, rel=1e-12)
 
@@ -238,14 +293,21 @@ def test_a_test_that_a_page_names_exists(page: Path) -> None:
     names = re.findall(r"`(?:tests/[\w/]*/)?(test_\w+?)(_?\.\.\.|\.py)?`", text)
     assert len(names) > 25 or page.name != "errata.md"
     for name, rest in names:
-        known = name in files or any(one.startswith(name) if rest else one == name for one in functions)
+        known = name in files or any(
+            one.startswith(name) if rest else one == name for one in functions
+        )
         assert known, name
 
 
 def test_every_operator_environment_and_law_stands_in_table_of_laws() -> None:
     text = (ROOT / "docs/laws.md").read_text(encoding="utf-8")
-    kinds = [str(one.__struct_config__.tag) for one in get_args(operators.Operator | operators.Environment)]
-    assert [kind for kind in (*kinds, *laws.LAWS) if kind != "own" and f"| `{kind}` |" not in text] == []
+    kinds = [
+        str(one.__struct_config__.tag)
+        for one in get_args(operators.Operator | operators.Environment)
+    ]
+    assert [
+        kind for kind in (*kinds, *laws.LAWS) if kind != "own" and f"| `{kind}` |" not in text
+    ] == []
 
 
 def test_every_test_that_the_security_page_names_is_there() -> None:

@@ -48,7 +48,9 @@ def test_every_block_is_run_or_there_is_a_reason() -> None:
     runs = {"sh": COMMAND_PAGES, "python": PYTHON_PAGES, "toml": set(SCENARIO_OF)}
     known = [block for block in BLOCKS if block.language]
     assert len(known) > 60
-    assert not [b.name for b in known if b.page not in runs[b.language] and not find_exception(b)]
+    assert not [
+        b.name for b in known if b.page not in runs[b.language] and not find_exception(b)
+    ]
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -65,7 +67,11 @@ def test_command_in_sentence_is_one_and_has_these_options(page: str) -> None:
         words = re.findall(r"[^\s\[\]|,()]+", text)
         (name, *_) = [w for w in (" ".join(words[:n]) for n in (3, 2, 1)) if w in OPTIONS]
         below = [one for known, one in OPTIONS.items() if known.startswith(name)]
-        known = {option for one in below for option in one} | {"--help", "--version", "--install-completion"}
+        known = {option for one in below for option in one} | {
+            "--help",
+            "--version",
+            "--install-completion",
+        }
         given = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
         assert not given - known, text
 
@@ -96,18 +102,26 @@ def merge(base: dict[str, Any], more: dict[str, Any]) -> dict[str, Any]:
     return both
 
 
-@pytest.mark.parametrize("block", [b for b in BLOCKS if b.language == "toml"], ids=lambda block: block.name)
-def test_settings_make_a_scenario(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "block", [b for b in BLOCKS if b.language == "toml"], ids=lambda block: block.name
+)
+def test_settings_make_a_scenario(
+    block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     text = block.text
     if block.page == "docs/metrics.md":  # each line is one way to push
         for line in text.splitlines():
             hands = tomllib.loads(line)
-            assert tn.load_scenario("free", {"sites.m1.hands": hands["hands"]}).sites["m1"].hands
+            assert (
+                tn.load_scenario("free", {"sites.m1.hands": hands["hands"]}).sites["m1"].hands
+            )
         return
     if block.page == "docs/experiments.md":
         written = tn.new_experiment("p.toml").read_text(encoding="utf-8")
-        (tmp_path / "p.toml").write_text(written.replace("[set]", text + "[set]", 1), encoding="utf-8")
+        (tmp_path / "p.toml").write_text(
+            written.replace("[set]", text + "[set]", 1), encoding="utf-8"
+        )
         protocol = tn.check_experiment("p.toml").protocol
         assert len(protocol.questionnaires) == 3 or protocol.staircase
         return
@@ -120,7 +134,9 @@ def test_settings_make_a_scenario(block: Block, tmp_path: Path, monkeypatch: pyt
     for code in find_blocks("docs/policies.md"):
         if named := re.match(r"# (my_\w+\.py)\n", code.text):
             (tmp_path / named[1]).write_text(code.text)
-    base = tomllib.loads((SCENARIOS / f"{SCENARIO_OF[block.page]}.toml").read_text(encoding="utf-8"))
+    base = tomllib.loads(
+        (SCENARIOS / f"{SCENARIO_OF[block.page]}.toml").read_text(encoding="utf-8")
+    )
     stated = tomllib.loads(text)
     (tmp_path / "arm6.urdf").write_text((SCENARIOS / "arm6.urdf").read_text(encoding="utf-8"))
     (tmp_path / "whole.toml").write_text(tomli_w.dumps(merge(base, stated)))
@@ -138,7 +154,10 @@ def write_own_arm(folder: Path, text: str) -> str:
 
 # --- commands ---------------------------------------------------------------------------------------------
 
-PUSHED_COMMAND_PAGES, PUSHED_PYTHON_PAGES = {"docs/links.md"}, {"docs/certificate.md", "docs/policies.md"}
+PUSHED_COMMAND_PAGES, PUSHED_PYTHON_PAGES = (
+    {"docs/links.md"},
+    {"docs/certificate.md", "docs/policies.md"},
+)
 """Pages whose blocks run on every push; those of the others run in `make test-long`."""
 
 
@@ -146,7 +165,10 @@ def list_pages(pages: set[str], pushed: set[str]) -> list[Any]:
     """Returns pages as parameters of a test; all but those that run on every push are long."""
     assert pushed <= pages
     slow = pytest.mark.long
-    return [pytest.param(page, marks=() if page in pushed else slow, id=page) for page in sorted(pages)]
+    return [
+        pytest.param(page, marks=() if page in pushed else slow, id=page)
+        for page in sorted(pages)
+    ]
 
 
 COMMAND_PAGES = {
@@ -160,7 +182,9 @@ COMMAND_PAGES = {
     "docs/rerun.md",
     "docs/sweep.md",
 }
-SHORTER = {"compare": ["--law", "p_d,adaptive", "--budget", "4", "--duration", "2", "--jobs", "1"]}
+SHORTER = {
+    "compare": ["--law", "p_d,adaptive", "--budget", "4", "--duration", "2", "--jobs", "1"]
+}
 """What is added to a command that else would take minutes."""
 OF_RUNS = {"docs/rerun.md": "paper"}
 """Pages whose blocks are about run.mcap, and its scenario."""
@@ -177,7 +201,9 @@ def prepare(page: str, folder: Path) -> None:
         (folder / "mine.toml").write_text(write_own_arm(folder, own.text))
 
 
-@pytest.mark.parametrize("page", list_pages(COMMAND_PAGES - {"docs/lab.md"}, PUSHED_COMMAND_PAGES))
+@pytest.mark.parametrize(
+    "page", list_pages(COMMAND_PAGES - {"docs/lab.md"}, PUSHED_COMMAND_PAGES)
+)
 def test_commands_of_page_run_and_print_what_stands_there(page: str, tmp_path: Path) -> None:
     prepare(page, tmp_path)
     for block in find_blocks(page):
@@ -195,7 +221,10 @@ def test_commands_of_page_run_and_print_what_stands_there(page: str, tmp_path: P
 @pytest.mark.live
 def test_code_of_hand_takes_hold_of_arm_and_lets_go(tmp_path: Path) -> None:
     words = ("--scenario", "play", "--set", "duration_s=600")
-    sites = [Process(name, ["site", name, *words], tmp_path) for name in tn.load_scenario("play").names]
+    sites = [
+        Process(name, ["site", name, *words], tmp_path)
+        for name in tn.load_scenario("play").names
+    ]
     try:
         sites[0].prints(BEGUN)
         names: dict[str, Any] = {"__name__": "page"}
@@ -235,7 +264,10 @@ def run_python(page: str, folder: Path, names: dict[str, Any] | None = None) -> 
     printed = StringIO()
     with redirect_stdout(printed), pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        for code in (AT_HAND.get(page, ""), *(b.text for b in find_blocks(page) if b.language == "python")):
+        for code in (
+            AT_HAND.get(page, ""),
+            *(b.text for b in find_blocks(page) if b.language == "python"),
+        ):
             exec(compile(code, page, "exec"), space)
     return printed.getvalue()
 
@@ -253,7 +285,11 @@ def check_linear(printed: str, names: dict[str, Any]) -> None:
 def check_ports(_: str, names: dict[str, Any]) -> None:
     page = (ROOT / "docs/ports.md").read_text(encoding="utf-8")
     call = re.search(r"`print\(\*(describe_ports\(.+\)), sep=.*`", page)
-    (shown,) = (block.text for block in find_blocks("docs/ports.md") if block.text.startswith("Ports of"))
+    (shown,) = (
+        block.text
+        for block in find_blocks("docs/ports.md")
+        if block.text.startswith("Ports of")
+    )
     assert "\n".join(eval(call[1], names)).startswith(shown.rstrip())
 
 
@@ -299,14 +335,27 @@ def list_shown(page: str) -> list[str]:
     shown: list[str] = []
     for code, after in pairwise(blocks):
         between = text.partition(code.text)[2].partition(after.text)[0]
-        if code.language == "python" and after.language == "" and between.split() == ["```", "```text"]:
+        if (
+            code.language == "python"
+            and after.language == ""
+            and between.split() == ["```", "```text"]
+        ):
             shown += after.text.splitlines()
     return shown
 
 
 @pytest.mark.long
 def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
-    over = ["--over", "link.delay_ms=0,100", "--over", "control.d=0.2,3", "--duration", "2", "--jobs", "1"]
+    over = [
+        "--over",
+        "link.delay_ms=0,100",
+        "--over",
+        "control.d=0.2,3",
+        "--duration",
+        "2",
+        "--jobs",
+        "1",
+    ]
     trilat("sweep", "p_d_margin", *over, cwd=tmp_path).succeeds()
     names: dict[str, Any] = {"__name__": "page"}
     run_python("docs/sweep.md", tmp_path, names)
@@ -317,5 +366,7 @@ def test_the_code_about_sweeps_reads_what_a_sweep_left(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_what_certificate_says_first_is_what_stands_on_its_page(tmp_path: Path) -> None:
     trilat("sim", "paper", "-o", "run.mcap", cwd=tmp_path).succeeds()
-    (shown,) = (b.text for b in find_blocks("docs/certificate.md") if b.text.startswith("ok   stable"))
+    (shown,) = (
+        b.text for b in find_blocks("docs/certificate.md") if b.text.startswith("ok   stable")
+    )
     assert trilat("certify", "run.mcap", cwd=tmp_path).out.startswith(shown.rstrip())

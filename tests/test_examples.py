@@ -37,7 +37,10 @@ def quiet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("polars", [True, False])
 def test_a_look_into_a_log(
-    polars: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    polars: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     if not polars:
         monkeypatch.setitem(sys.modules, "polars", None)
@@ -46,13 +49,17 @@ def test_a_look_into_a_log(
     runpy.run_path(str(LOOK), run_name="__main__")
     plt.close("all")
     printed = capsys.readouterr().out
-    assert "virtual session paper of m1, m2, s" in printed or "virtual session jitter" in printed
+    assert (
+        "virtual session paper of m1, m2, s" in printed or "virtual session jitter" in printed
+    )
     assert ("no polars" in printed) is not polars
     assert (tmp_path / "look_into_a_log.png").read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.long
-def test_springs_with_reactions_rest_where_their_sum_is_zero(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_springs_with_reactions_rest_where_their_sum_is_zero(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Forces of springs that act at both ends move no centre: by d qd_i summed, the mean pose stays."""
     monkeypatch.syspath_prepend(LOOK.parent)
     law = {"control.law": "reaction_law:Reaction", "link.delay_ms": 5.0, "duration_s": 6.0}
@@ -89,7 +96,9 @@ class PinnedArm:
         self.released += 1
 
 
-def run_with_hand(name: str, arm: PinnedArm, monkeypatch: pytest.MonkeyPatch, *options: str) -> None:
+def run_with_hand(
+    name: str, arm: PinnedArm, monkeypatch: pytest.MonkeyPatch, *options: str
+) -> None:
     """Runs an example whose hand holds such an arm, and which does not wait."""
     monkeypatch.setattr(trilat_net, "hand", lambda *_, **__: nullcontext(arm), raising=False)
     monkeypatch.setattr(sys, "argv", [name, "play", "m1", *options])
@@ -112,7 +121,9 @@ def device_of(name: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> Any:
     """The device by which an example leads m1 of `play`."""
     led: dict[str, Any] = {}
     session = SimpleNamespace(lead=lambda site, device: led.update({site: device}))
-    monkeypatch.setattr(trilat_net, "session", lambda name, connect: {("play", None): session}[name, connect])
+    monkeypatch.setattr(
+        trilat_net, "session", lambda name, connect: {("play", None): session}[name, connect]
+    )
     monkeypatch.setattr(sys, "argv", [name, "play", "m1", *options])
     runpy.run_path(str(LOOK.with_name(name)), run_name="__main__")
     return led["m1"]
@@ -163,9 +174,13 @@ def test_a_stick_moves_the_target_and_a_button_lets_go(monkeypatch: pytest.Monke
 
     def read_one() -> SimpleNamespace | None:
         event = script.pop(next(rounds), None)
-        return event and SimpleNamespace(**dict(zip(("type", "code", "value"), event, strict=True)))
+        return event and SimpleNamespace(
+            **dict(zip(("type", "code", "value"), event, strict=True))
+        )
 
-    pad = SimpleNamespace(capabilities=lambda: {3: [(0, at_rest), (1, at_rest)]}, read_one=read_one)
+    pad = SimpleNamespace(
+        capabilities=lambda: {3: [(0, at_rest), (1, at_rest)]}, read_one=read_one
+    )
     found = SimpleNamespace(ecodes=codes, list_devices=lambda: ["a"], InputDevice=lambda _: pad)
     monkeypatch.setitem(sys.modules, "evdev", found)
     arm = PinnedArm(rounds=120)
@@ -204,7 +219,9 @@ def test_a_switch_is_let_go_when_its_program_ends(monkeypatch: pytest.MonkeyPatc
     os.close(ends[1])
     switch = PressedSwitch(1000)
     monkeypatch.setattr(SwitchClient, "connected", lambda *_: nullcontext(switch))
-    monkeypatch.setattr(sys, "argv", ["dead_man_switch.py", "play", "s", "--connect", "tcp/127.0.0.1:1"])
+    monkeypatch.setattr(
+        sys, "argv", ["dead_man_switch.py", "play", "s", "--connect", "tcp/127.0.0.1:1"]
+    )
     with os.fdopen(ends[0]) as there:
         monkeypatch.setattr(sys, "stdin", there)
         runpy.run_path(str(LOOK.with_name("dead_man_switch.py")), run_name="__main__")
@@ -245,14 +262,21 @@ def test_a_program_hands_over_and_back_without_a_step(
 def test_a_person_takes_over_from_a_policy_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     """By a ramp the slave comes to its goal, with smaller steps of the reference than at once."""
     monkeypatch.syspath_prepend(LOOK.parent)
-    takeover, weights = runpy.run_path(str(LOOK.with_name("takeover.py"))), np.array([0.95, -0.3, 0.3, 0.5])
-    left, abrupt, blended = (takeover["run"](weights, 3, ramp_s) for ramp_s in takeover["WAYS"].values())
+    takeover, weights = (
+        runpy.run_path(str(LOOK.with_name("takeover.py"))),
+        np.array([0.95, -0.3, 0.3, 0.5]),
+    )
+    left, abrupt, blended = (
+        takeover["run"](weights, 3, ramp_s) for ramp_s in takeover["WAYS"].values()
+    )
     assert blended["success"] == 1.0 > left["success"]
     assert blended["jump"] < abrupt["jump"]
     assert blended["without_control_s"] == 0.0
 
 
-def test_a_trained_policy_acts_alike_as_a_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_trained_policy_acts_alike_as_a_hand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What an episode's actions did, the class does as a hand of the scenario, bit for bit."""
     monkeypatch.syspath_prepend(LOOK.parent)
     study = runpy.run_path(str(LOOK.with_name("train_over_delay.py")))
@@ -261,8 +285,13 @@ def test_a_trained_policy_acts_alike_as_a_hand(tmp_path: Path, monkeypatch: pyte
     assert 0.0 < study["play"](env, np.array(weights), 3) < 0.2
     trained = trilat_net.open_log(env.save(tmp_path / "episode.mcap"))
     hand = {"kind": "own", "class": "reach_policy:ReachPolicy", "rate_hz": 25, **study["FIRM"]}
-    hand |= {"force_limit_n": 200.0, "settings": {"goal_m": env.task.goal.tolist(), "weights": weights}}
-    acted = trilat_net.simulate(env.scenario, {"sites.m2.hands": [hand]}, duration_s=trained["m2"].t_s[-1])
+    hand |= {
+        "force_limit_n": 200.0,
+        "settings": {"goal_m": env.task.goal.tolist(), "weights": weights},
+    }
+    acted = trilat_net.simulate(
+        env.scenario, {"sites.m2.hands": [hand]}, duration_s=trained["m2"].t_s[-1]
+    )
     for name in trained.sites:
         count = len(acted[name])
         assert np.array_equal(acted[name].q, trained[name].q[:count]), name
@@ -270,7 +299,10 @@ def test_a_trained_policy_acts_alike_as_a_hand(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.parametrize("task", ["reach", "box"])
 def test_a_study_of_training_reports_intervals(
-    task: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    task: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
 ) -> None:
     monkeypatch.syspath_prepend(LOOK.parent)
     study = runpy.run_path(str(LOOK.with_name("train_over_delay.py")))

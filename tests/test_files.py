@@ -49,7 +49,9 @@ def test_what_is_made_is_there_and_nothing_else(folder: bool, tmp_path: Path) ->
     make(tmp_path / "out", "1", folder=folder)
     there = {"out": "", f"out/{EXPORT_MANIFEST}": "1"} if folder else {"out": "1"}
     assert everything(tmp_path) == there
-    with pytest.raises(UsageError, match="exists; choose another name, or replace it with force=True"):
+    with pytest.raises(
+        UsageError, match="exists; choose another name, or replace it with force=True"
+    ):
         make(tmp_path / "out", "2", folder=folder)
     assert everything(tmp_path) == there
     make(tmp_path / "out", "3", folder=folder, force=True)
@@ -78,7 +80,9 @@ def test_whatever_goes_wrong_leaves_what_was_there(
 
 def test_a_full_disk_has_its_exit_code_and_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(LogRefused, match="No space left") as raised:
-        break_off(tmp_path / "out", OSError(errno.ENOSPC, "No space left on device"), folder=False)
+        break_off(
+            tmp_path / "out", OSError(errno.ENOSPC, "No space left on device"), folder=False
+        )
     assert raised.value.exit_code == 5
     assert everything(tmp_path) == {}
 
@@ -125,7 +129,9 @@ def test_a_file_is_written_whole_or_what_was_there_stays(
     assert everything(tmp_path) == {"report.json": "1"}
 
 
-def test_a_file_open_elsewhere_stays_as_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_open_elsewhere_stays_as_on_windows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Windows replaces no file that a program has open."""
     write_whole(tmp_path / "report.json", "1")
 
@@ -140,7 +146,9 @@ def test_a_file_open_elsewhere_stays_as_on_windows(tmp_path: Path, monkeypatch: 
     assert everything(tmp_path) == {"report.json": "1"}
 
 
-def test_a_folder_without_sync_is_left_as_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_without_sync_is_left_as_on_windows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Windows opens no folder."""
 
     def refuse(*_: object) -> int:
@@ -158,7 +166,9 @@ def test_every_text_that_is_written_states_its_line_ends() -> None:
         for call in (node for node in ast.walk(house.tree(path)) if isinstance(node, ast.Call)):
             name = getattr(call.func, "attr", getattr(call.func, "id", ""))
             modes = [one.value for one in call.args if isinstance(one, ast.Constant)]
-            writes = name == "write_text" or (name == "open" and {"w", "a", "x", "r+", "w+"} & {*modes})
+            writes = name == "write_text" or (
+                name == "open" and {"w", "a", "x", "r+", "w+"} & {*modes}
+            )
             if writes and "newline" not in {keyword.arg for keyword in call.keywords}:
                 found.append((path.name, call.lineno))
     assert not found
@@ -184,10 +194,16 @@ def test_no_output_is_written_through_a_link(
     if exists:
         (tmp_path / "real").write_text("years")
     (tmp_path / "linked").symlink_to(tmp_path / "real")
-    with pytest.raises(UsageError, match="linked: is a symbolic link, and no output is written through one"):
+    with pytest.raises(
+        UsageError, match="linked: is a symbolic link, and no output is written through one"
+    ):
         write(tmp_path / "linked")
     assert (tmp_path / "linked").is_symlink()
-    assert everything(tmp_path) == {"linked": "years", "real": "years"} if exists else {"linked": ""}
+    assert (
+        everything(tmp_path) == {"linked": "years", "real": "years"}
+        if exists
+        else {"linked": ""}
+    )
 
 
 @pytest.mark.parametrize("name", ["out.unfinished", "out.mcap.active"])
@@ -234,7 +250,9 @@ def test_what_has_no_end_is_no_file(tmp_path: Path) -> None:
         assert stream.read() == "text"
 
 
-def test_two_at_once_get_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_at_once_get_folders_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     with ThreadPoolExecutor(8) as pool:
         made = list(pool.map(lambda _: make_results_folder(None, "x", force=False), range(24)))
@@ -267,7 +285,9 @@ def test_a_clone_names_its_makefile(program: Path, monkeypatch: pytest.MonkeyPat
     assert format_extra_install("view") == "make extras EXTRAS=view"
 
 
-def test_a_clone_in_another_environment_names_pip(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clone_in_another_environment_names_pip(
+    program: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     make_clone(program)
     monkeypatch.setattr(sys, "prefix", "/opt/lab")
     monkeypatch.setattr(sys, "executable", "/opt/lab/bin/python")
@@ -279,7 +299,9 @@ def test_every_named_extra_can_be_installed() -> None:
     named = {
         keyword
         for file in house.files()
-        for keyword in re.findall(r'import_extra\("[\w.]+", "(\w+)"', file.read_text(encoding="utf-8"))
+        for keyword in re.findall(
+            r'import_extra\("[\w.]+", "(\w+)"', file.read_text(encoding="utf-8")
+        )
     }
     assert {"view", "frames", "cluster", "stats"} <= named <= list_extras().keys()
 
@@ -289,7 +311,9 @@ def test_extras_stand_between_commas_or_spaces(text: str) -> None:
     assert parse_extras(text) == ["view", "frames"][: 1 + ("frames" in text)]
 
 
-@pytest.mark.parametrize(("text", "word"), [("", "which extras"), ("views", "there is no extra views")])
+@pytest.mark.parametrize(
+    ("text", "word"), [("", "which extras"), ("views", "there is no extra views")]
+)
 def test_a_wrong_extra_lists_what_there_is(text: str, word: str) -> None:
     with pytest.raises(SystemExit, match=word) as error:
         parse_extras(text)
@@ -298,7 +322,9 @@ def test_a_wrong_extra_lists_what_there_is(text: str, word: str) -> None:
 
 
 def test_the_locks_hold_every_extra() -> None:
-    locked = (Path(__file__).parents[1] / "requirements" / "dev.lock").read_text(encoding="utf-8")
+    locked = (Path(__file__).parents[1] / "requirements" / "dev.lock").read_text(
+        encoding="utf-8"
+    )
     for needs in list_extras().values():
         for need in needs:
             assert f"\n{re.split('[><=]', need)[0]}==" in f"\n{locked}"

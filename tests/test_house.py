@@ -9,7 +9,10 @@ import pytest
 from . import house, reading_walk
 
 ARM_STAGES = ("trilat_net/core/chain_stages.py", "trilat_net/core/two_link_stages.py")
-PLUG_INS = {"main", *set.intersection(*(house.definitions(house.ROOT / path) for path in ARM_STAGES))}
+PLUG_INS = {
+    "main",
+    *set.intersection(*(house.definitions(house.ROOT / path) for path in ARM_STAGES)),
+}
 """Names that an interface asks of several modules: the entry point of a program, the stages of an arm."""
 DESIGN = (house.ROOT / "docs" / "design.md").read_text(encoding="utf-8")
 TOUR = (house.ROOT / "docs" / "tour.md").read_text(encoding="utf-8")
@@ -18,7 +21,8 @@ TOUR = (house.ROOT / "docs" / "tour.md").read_text(encoding="utf-8")
 def test_a_class_or_public_function_has_one_module() -> None:
     homes = defaultdict(set)
     for path in house.files():
-        for name in house.definitions(path) if house.room(path) != "api" else ():  # it has commands' names
+        # it has commands' names
+        for name in house.definitions(path) if house.room(path) != "api" else ():
             if "." not in name and not name.startswith("_") and name not in PLUG_INS:
                 homes[name].add(str(path.relative_to(house.ROOT)))
     assert not {name: places for name, places in homes.items() if len(places) > 1}
@@ -27,7 +31,8 @@ def test_a_class_or_public_function_has_one_module() -> None:
 def test_a_module_name_is_used_once() -> None:
     homes = defaultdict(set)
     for path in house.files():
-        if path.stem != "__init__" and house.room(path) != "cli":  # a command's module bears its name
+        # a command's module bears its name
+        if path.stem != "__init__" and house.room(path) != "cli":
             homes[path.stem].add(str(path.relative_to(house.ROOT)))
     assert not {name: places for name, places in homes.items() if len(places) > 1}
 
@@ -42,9 +47,19 @@ def test_a_reader_walks_straight_from_certify_to_its_judgement() -> None:
 
 @pytest.mark.push
 def test_no_test_imports_another() -> None:
-    files = [path for top in ("tests", "benchmarks") for path in (house.ROOT / top).rglob("*.py")]
-    told = {path: re.findall(r"\btest_(?!.*\) -> None:)", path.read_text(encoding="utf-8")) for path in files}
-    found = [(path.name, *name) for path in files if told[path] for name in house.imported_names(path)]
+    files = [
+        path for top in ("tests", "benchmarks") for path in (house.ROOT / top).rglob("*.py")
+    ]
+    told = {
+        path: re.findall(r"\btest_(?!.*\) -> None:)", path.read_text(encoding="utf-8"))
+        for path in files
+    }
+    found = [
+        (path.name, *name)
+        for path in files
+        if told[path]
+        for name in house.imported_names(path)
+    ]
     assert not [name for name in found if any(part.startswith("test_") for part in name[1:])]
 
 
@@ -74,7 +89,9 @@ def test_the_tour_is_short() -> None:
 
 def test_examples_import_the_interface_alone() -> None:
     """Whoever reads one learns what a program of his own may use."""
-    inside = re.compile(r"^\s*(?:from|import) (?:trilat_net\.|sites|recorder|live)", re.MULTILINE)
+    inside = re.compile(
+        r"^\s*(?:from|import) (?:trilat_net\.|sites|recorder|live)", re.MULTILINE
+    )
     assert not [
         path.name
         for path in (house.ROOT / "examples").rglob("*.py")

@@ -12,7 +12,10 @@ from tests.cli.running import trilat
 SHEET = (Path(__file__).parents[1] / "docs" / "lab.md").read_text()
 BLOCKS = re.findall(r"^```sh\n(.*?)^```", SHEET, re.S | re.M)
 COMMANDS = [
-    shlex.split(line) for block in BLOCKS for line in block.replace("\\\n", " ").splitlines() if line.strip()
+    shlex.split(line)
+    for block in BLOCKS
+    for line in block.replace("\\\n", " ").splitlines()
+    if line.strip()
 ]
 SHORT_S = "0.2"
 

@@ -21,7 +21,9 @@ def apart_rad(name: str, rate_hz: int, **more: Any) -> float:
     """How far the slave gets from where our own dynamics take it, in free motion."""
     overrides = {"rate_hz": rate_hz, "link.delay_ms": 50, **more}
     plant = {"sites.s.plant": {"class": "scene:Scene", "thing": "nothing"}}
-    ours, theirs = (tn.simulate(name, {**overrides, **one}, duration_s=1.5) for one in ({}, plant))
+    ours, theirs = (
+        tn.simulate(name, {**overrides, **one}, duration_s=1.5) for one in ({}, plant)
+    )
     return float(np.abs(ours["s"].q - theirs["s"].q).max())
 
 
@@ -56,5 +58,7 @@ def test_runs_on_one_machine_have_the_same_bits() -> None:
 
 
 def test_a_thing_that_it_has_not_is_named() -> None:
-    with pytest.raises(ScenarioError, match="thing is one of nothing, box, door, slot, not 'cup'"):
+    with pytest.raises(
+        ScenarioError, match="thing is one of nothing, box, door, slot, not 'cup'"
+    ):
         tn.simulate("push.toml", {"sites.s.plant.thing": "cup"})

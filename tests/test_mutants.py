@@ -17,7 +17,11 @@ def test_a_mutant_is_one_token_of_code(seed: int) -> None:
     assert len(set(drawn)) == 40
     for mutant in drawn:
         before, after = (
-            [one.string for one in tokenize.generate_tokens(io.StringIO(text).readline) if one.string.strip()]
+            [
+                one.string
+                for one in tokenize.generate_tokens(io.StringIO(text).readline)
+                if one.string.strip()
+            ]
             for text in (mutant.path.read_text(encoding="utf-8"), mutant.apply())
         )
         at = next(n for n, one in enumerate(before) if after[n] != one)

@@ -51,7 +51,9 @@ def test_a_notebook_runs_and_says_what_is_true(name: str, tmp_path: Path) -> Non
     notebook = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
     notebook.cells.append(nbformat.v4.new_code_cell("\n".join(FACTS[name])))
     where = {"metadata": {"path": str(tmp_path)}}
-    nbclient.NotebookClient(notebook, timeout=1200, kernel_name="python3", resources=where).execute()
+    nbclient.NotebookClient(
+        notebook, timeout=1200, kernel_name="python3", resources=where
+    ).execute()
 
 
 SHOWN = {
@@ -75,7 +77,9 @@ def test_values_show_themselves_in_a_notebook(tmp_path: Path) -> None:
     cells = [nbformat.v4.new_code_cell(text) for text in (begin, *SHOWN)]
     notebook = nbformat.v4.new_notebook(cells=cells)
     where = {"metadata": {"path": str(tmp_path)}}
-    nbclient.NotebookClient(notebook, timeout=600, kernel_name="python3", resources=where).execute()
+    nbclient.NotebookClient(
+        notebook, timeout=600, kernel_name="python3", resources=where
+    ).execute()
     for cell, kind in zip(notebook.cells[1:], SHOWN.values(), strict=True):
         (output,) = (one for one in cell.outputs if one.output_type == "execute_result")
         assert kind in output.data, cell.source

@@ -72,26 +72,38 @@ def keys(changes: Changes) -> Changes:
 
 
 def continuous(name: str, changes: Changes, pose: Pose | None = None) -> tuple[float, float]:
-    found = analyse_linear_loop(load_scenario(name, changes), pose=pose, roots=1).continuous.rightmost
+    found = analyse_linear_loop(
+        load_scenario(name, changes), pose=pose, roots=1
+    ).continuous.rightmost
     assert found is not None
     return found.s.real, abs(found.s.imag)
 
 
-def root(name: str, changes: Changes | None = None, pose: Pose | None = None) -> tuple[float, float]:
+def root(
+    name: str, changes: Changes | None = None, pose: Pose | None = None
+) -> tuple[float, float]:
     """The rightmost root that decides, the upper one of a pair."""
-    found = analyse_linear_loop(load_scenario(name, changes or {}), pose=pose, roots=1).decisive.rightmost
+    found = analyse_linear_loop(
+        load_scenario(name, changes or {}), pose=pose, roots=1
+    ).decisive.rightmost
     assert found is not None
     return found.s.real, abs(found.s.imag)
 
 
 def margin(name: str, changes: Changes | None = None) -> tuple[float, float]:
     """The largest common delay, ms, and the frequency there, rad/s."""
-    high = analyse_linear_loop(load_scenario(name, changes or {}), roots=1).margin.intervals[0].high
+    high = (
+        analyse_linear_loop(load_scenario(name, changes or {}), roots=1)
+        .margin.intervals[0]
+        .high
+    )
     assert high is not None
     return 1e3 * high.delay_s, high.omega_rad_s
 
 
-def edge(name: str, key: str, low: float, high: float, changes: Changes, pose: Pose | None = None) -> float:
+def edge(
+    name: str, key: str, low: float, high: float, changes: Changes, pose: Pose | None = None
+) -> float:
     scenario = load_scenario(name, changes)
     rest = None if pose is None else find_equilibrium(scenario, pose)
     found = next(iterate_linear_edges(scenario, key, low, high, rest), None)
@@ -127,7 +139,13 @@ def learning(delay_ms: float) -> Numbers:
     assert made.proof is not None
     assert made.proof.passive
     (band,), least = made.velocity.minima.below, made.velocity.minima
-    return (*band[:2], least.least, least.least_hz, *felt(made).size_at(1.0), felt(made).ratio_db)
+    return (
+        *band[:2],
+        least.least,
+        least.least_hz,
+        *felt(made).size_at(1.0),
+        felt(made).ratio_db,
+    )
 
 
 def known(delay_ms: float) -> float:
@@ -165,11 +183,15 @@ def fused(name: str, duration_s: float | None = None, **changes: Any) -> FusedRu
 
 def rms_of_free(delay_ms: float) -> float:
     """Of e over 20 s, of all joints and sites together, rad."""
-    made = sampled(load_scenario("free", {"link.delay_ms": delay_ms}), np.arange(0.02, 20.01, 0.02))
+    made = sampled(
+        load_scenario("free", {"link.delay_ms": delay_ms}), np.arange(0.02, 20.01, 0.02)
+    )
     return float(np.sqrt(((made[..., :2] - made[..., 4:6]) ** 2).mean()))
 
 
-def seen(name: str, asked: str, *windows: tuple[float, float, str], **changes: Any) -> list[float]:
+def seen(
+    name: str, asked: str, *windows: tuple[float, float, str], **changes: Any
+) -> list[float]:
     """Quantities of windows of a run, window by window."""
     made = measured(name, keys(changes), *windows)
     return [value(made, key, n) for n in range(len(windows)) for key in asked.split()]
@@ -177,7 +199,9 @@ def seen(name: str, asked: str, *windows: tuple[float, float, str], **changes: A
 
 def age(**changes: Any) -> float:
     """Mean age of the samples in use in `jitter`, ms."""
-    return float(np.mean([one.mean_ms for one in measured("jitter", keys(changes)).ages.values()]))
+    return float(
+        np.mean([one.mean_ms for one in measured("jitter", keys(changes)).ages.values()])
+    )
 
 
 def anchored(delay_s: float, duration_s: float) -> Numbers:
@@ -262,12 +286,16 @@ LINEAR: dict[str, Make] = {
     "is stable from {} Hz on": lambda: [edge("paper", "rate_hz", 20, 400, DIGITAL, PAPER_END)],
     "unstable, {} ± {} j": lambda: root("contact"),
     "the margin is {} ms ({} rad/s)": lambda: margin("contact"),
-    "force gain for 200 ms is {}": lambda: [edge("contact", "sites.m.control.k_f", 0.01, 1.0, {})],
+    "force gain for 200 ms is {}": lambda: [
+        edge("contact", "sites.m.control.k_f", 0.01, 1.0, {})
+    ],
     "and a margin of {} ms at them": lambda: margin("paper", {"link.delay_ms": 0})[:1],
 }
 PORTS: dict[str, Make] = {
     **{
-        f"| {T} | {{}}-{{}} Hz | {{}} at {{}} Hz | yes | {{}} / {{}} | {{}} |": lambda T=T: learning(T)
+        f"| {T} | {{}}-{{}} Hz | {{}} at {{}} Hz | yes | {{}} / {{}} | {{}} |": lambda T=T: (
+            learning(T)
+        )
         for T in (0, 50, 200, 800)
     },
     "not passive at {}-{} Hz; least eigenvalue {} at {} Hz; {} N m s/rad more": lacking,
@@ -298,11 +326,17 @@ ERRATA: dict[str, Make] = {
     "K T, grow by {}/s": lambda: root("p_d_margin", SHEET, (-0.1, 0.4))[:1],
     "200 ms and d = 4 grows by {}/s": lambda: root("p_d_margin", ONE_WAY, (-0.1, 0.4))[:1],
     "1/6 of K T is {}, 0.2172 of it {}.": lambda: [2.0 / 6.0, 2.0 * common_motion()[0]],
-    "it is {}, {} and {} N m s/rad at 20, 200": lambda: [(200 * T + 40) ** 2 / 160 for T in (0.02, 0.2, 1)],
+    "it is {}, {} and {} N m s/rad at 20, 200": lambda: [
+        (200 * T + 40) ** 2 / 160 for T in (0.02, 0.2, 1)
+    ],
 }
 LAB: dict[str, Make] = {
-    "only the first decays: {} rad at 38 s": lambda: seen("jitter", "error_peak_rad", (38, 40, "")),
-    "against {} rad at a constant 200 ms": lambda: seen("jitter", "error_peak_rad", (38, 40, ""), **CONSTANT),
+    "only the first decays: {} rad at 38 s": lambda: seen(
+        "jitter", "error_peak_rad", (38, 40, "")
+    ),
+    "against {} rad at a constant 200 ms": lambda: seen(
+        "jitter", "error_peak_rad", (38, 40, ""), **CONSTANT
+    ),
     "the age in use is {} ms on average": lambda: [age()],
     "the order makes it {} ms": lambda: [age(link__order="in_order")],
     "to choose from: {} ms": lambda: [age(rate_hz=100)],
@@ -337,7 +371,9 @@ LAB: dict[str, Make] = {
         *seen("outage", "speed_peak_rad_s torque_peak_nm", (6, 15, "s")),
         *seen("outage", "torque_peak_nm", (6, 15, "s"), link__outages_s=[]),
     ],
-    "smoothly takes {} N m": lambda: seen("outage", "torque_peak_nm", (6, 15, "s"), on_stale__action="hold"),
+    "smoothly takes {} N m": lambda: seen(
+        "outage", "torque_peak_nm", (6, 15, "s"), on_stale__action="hold"
+    ),
     "from the link, {} and {} J at 6.2 s": energy_of_healing,
 }
 PAGES: dict[str, dict[str, Make]] = {
@@ -348,7 +384,9 @@ PAGES: dict[str, dict[str, Make]] = {
     "docs/laws.md": {"towards one pose: {} N m/rad": lambda: [G**2 * 1.2]},
     "docs/definitions.md": {
         "± 50 ms gives {} ms and {} ms, uniform 0 to 400 ms gives {} ms and {} ms": lambda: [
-            uniform_age(order, *ends) for ends in ((150, 250), (0, 400)) for order in (newest_wins, in_order)
+            uniform_age(order, *ends)
+            for ends in ((150, 250), (0, 400))
+            for order in (newest_wins, in_order)
         ]
     },
     "docs/certificate.md": {
@@ -361,7 +399,9 @@ PAGES: dict[str, dict[str, Make]] = {
     },
     "docs/maps/p_d.md": {
         **{
-            f"| {T} | … | {{}} | … | {0.005 * T:g} |": lambda T=T: [edge_of_p_d("p_d_margin", 0.5, T)]
+            f"| {T} | … | {{}} | … | {0.005 * T:g} |": lambda T=T: [
+                edge_of_p_d("p_d_margin", 0.5, T)
+            ]
             for T in (50, 100, 150, 200, 300, 400, 600, 800, 1000, 1200, 1400)
         },
         **{
@@ -372,8 +412,12 @@ PAGES: dict[str, dict[str, Make]] = {
         },
     },
     "docs/benchmarks.md": {
-        "at 500 / 1000 / 2000 Hz | {} / {} / {} rad: orders {} and {}": lambda: distances("second_order"),
-        "`digital` at the same rates | {} / {} / {} rad: orders {} and {}": lambda: distances("digital"),
+        "at 500 / 1000 / 2000 Hz | {} / {} / {} rad: orders {} and {}": lambda: distances(
+            "second_order"
+        ),
+        "`digital` at the same rates | {} / {} / {} rad: orders {} and {}": lambda: distances(
+            "digital"
+        ),
         "part of max V | `paper` {}, `asymmetric` {}; orders {} and {}": lambda: [
             *[energy.booked(name).residual for name in ("paper", "asymmetric")],
             *[energy.order("paper", "second_order", rate_hz) for rate_hz in (1000, 2000)],
@@ -383,7 +427,9 @@ PAGES: dict[str, dict[str, Make]] = {
             *[energy.order("paper", "digital", rate_hz) for rate_hz in (1000, 2000)],
         ],
         "{} runs of the twenty-two": lambda: [len(shipped_trials())],
-        "run once): {} s simulated": lambda: [sum(one.scenario.duration_s for one in shipped_trials())],
+        "run once): {} s simulated": lambda: [
+            sum(one.scenario.duration_s for one in shipped_trials())
+        ],
     },
     "README.md": {
         "{} scenarios show one": lambda: [len(SHIPPED)],
@@ -413,10 +459,14 @@ LONG = (
 PUSHED, PUSHED_PAGES = 12, ("docs/linear.md", "docs/ports.md", "docs/errata.md")
 """Of so many numbers of these pages one is made on a push; the long tests make all numbers of all pages."""
 ROWS = [
-    pytest.param(page, words, make, id=f"{page}: {words}", marks=pytest.mark.long if slow else ())
+    pytest.param(
+        page, words, make, id=f"{page}: {words}", marks=pytest.mark.long if slow else ()
+    )
     for page, entries in PAGES.items()
     for n, (words, make) in enumerate(entries.items())
-    for slow in [n % PUSHED > 0 or page not in PUSHED_PAGES or any(word in words for word in LONG)]
+    for slow in [
+        n % PUSHED > 0 or page not in PUSHED_PAGES or any(word in words for word in LONG)
+    ]
 ]
 
 
@@ -435,7 +485,8 @@ def check(page: str, words: str, made: Numbers | str) -> None:
     wanted = list(map(float, numbers(words, made))) if isinstance(made, str) else list(made)
     printed = numbers(words, text)
     digits = [
-        10.0 ** (int(e or 0) - len(m.partition(".")[2])) for m, _, e in (p.partition("e") for p in printed)
+        10.0 ** (int(e or 0) - len(m.partition(".")[2]))
+        for m, _, e in (p.partition("e") for p in printed)
     ]
     off = [
         one is None or abs(one - float(word)) > 0.6 * digit
@@ -468,7 +519,9 @@ ENDS = [
 
 
 def tuned(duration_s: float, changes: Changes) -> CandidateScore:
-    scenario = load_scenario("free", {"limits.tau_limit_nm": 60, "duration_s": duration_s, **changes})
+    scenario = load_scenario(
+        "free", {"limits.tau_limit_nm": 60, "duration_s": duration_s, **changes}
+    )
     return measure_candidate(scenario.text, None)
 
 
@@ -478,13 +531,18 @@ def test_the_end_of_a_front_is_what_its_gains_make(row: int) -> None:
     assert len(TUNED) == 8
     law, reached, effort_nm, gains = TUNED[row]
     (space,) = select_search_spaces([law], load_scenario("free"))
-    values = {name: float(number) for name, number in (gain.split() for gain in gains.split(", "))}
+    values = {
+        name: float(number) for name, number in (gain.split() for gain in gains.split(", "))
+    }
     controls = space.controls(load_scenario("free"), build_model_information(100.0), values)
     made = tuned(
-        30.0 if row < 4 else 6.0, {f"sites.{name}.control": table for name, table in controls.items()}
+        30.0 if row < 4 else 6.0,
+        {f"sites.{name}.control": table for name, table in controls.items()},
     )
     digit = 10.0 ** -len(reached.partition(".")[2])
-    assert (made.error_rad if row < 4 else made.settled_s) == pytest.approx(float(reached), abs=0.6 * digit)
+    assert (made.error_rad if row < 4 else made.settled_s) == pytest.approx(
+        float(reached), abs=0.6 * digit
+    )
     assert made.effort_nm == pytest.approx(float(effort_nm), abs=0.006)
     assert made.outcome == "settled"
 
@@ -493,7 +551,11 @@ def test_the_end_of_a_front_is_what_its_gains_make(row: int) -> None:
 @pytest.mark.parametrize("told", AS_PRINTED)
 def test_the_gains_as_printed_make_what_the_page_says(told: str) -> None:
     made = tuned(30.0, {"control.theta_hat0": AS_PRINTED[told]})
-    check("docs/fair-comparison.md", f"| as printed{told} | {{}} | {{}} |", [made.error_rad, made.effort_nm])
+    check(
+        "docs/fair-comparison.md",
+        f"| as printed{told} | {{}} | {{}} |",
+        [made.error_rad, made.effort_nm],
+    )
 
 
 P_D_PAGE = (ROOT / "docs/maps/p_d.md").read_text(encoding="utf-8")
@@ -523,8 +585,11 @@ def test_an_edge_of_p_d_lies_between_two_runs(row: int) -> None:
 def test_a_cell_that_was_run_live_has_its_class(row: int) -> None:
     number, delay_ms, d, virtual, live = LIVE_CELLS[row]
     assert virtual == live
-    assert int(number) == 40 * (int(delay_ms) // 40) + round(10.0 * float(d)) - 1  # 40 values of d each
-    found = class_of(160.0, link__delay_ms=float(delay_ms), control__d=float(d), duration_s=20.0)
+    # 40 values of d each
+    assert int(number) == 40 * (int(delay_ms) // 40) + round(10.0 * float(d)) - 1
+    found = class_of(
+        160.0, link__delay_ms=float(delay_ms), control__d=float(d), duration_s=20.0
+    )
     assert found.value == virtual
 
 

@@ -50,7 +50,9 @@ def test_handlers_are_put_back() -> None:
     assert [signal.getsignal(name) for name in ENDING_SIGNALS] == before
 
 
-@pytest.mark.parametrize("handler", [signal.SIG_DFL, signal.SIG_IGN], ids=["as usual", "under nohup"])
+@pytest.mark.parametrize(
+    "handler", [signal.SIG_DFL, signal.SIG_IGN], ids=["as usual", "under nohup"]
+)
 def test_a_terminals_end_is_a_signal_unless_ignored(handler: signal.Handlers) -> None:
     before = signal.signal(signal.SIGHUP, handler)
     try:
@@ -138,7 +140,9 @@ def test_workers_end_when_their_parent_is_killed() -> None:
         "    pool.submit(threading.Event().wait)\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    done = subprocess.run([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, timeout=60
+    )
     until(lambda: not is_running(int(done.stdout)), 30)
 
 
@@ -167,7 +171,16 @@ def unmasked(act: Callable[[], None]) -> None:
     act()
 
 
-WINDOWS_WORDS = ["trilat", "sweep", r"my runs\\one", "m1->s", 'say "no"', r"C:\\runs", "--set", "a=-1.5"]
+WINDOWS_WORDS = [
+    "trilat",
+    "sweep",
+    r"my runs\\one",
+    "m1->s",
+    'say "no"',
+    r"C:\\runs",
+    "--set",
+    "a=-1.5",
+]
 
 
 def test_a_command_is_quoted_as_the_shell_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,7 +206,9 @@ def test_a_worker_ends_with_its_parent_as_on_windows(
         raise ProcessEndedError
 
     monkeypatch.setattr(process, "os", replace_os(_exit=end, getppid=lambda: 4))
-    monkeypatch.setattr(multiprocessing, "parent_process", lambda: SimpleNamespace(sentinel=ended.fileno()))
+    monkeypatch.setattr(
+        multiprocessing, "parent_process", lambda: SimpleNamespace(sentinel=ended.fileno())
+    )
     alive.close()
     with pytest.raises(ProcessEndedError):
         process._exit_after(4)
@@ -211,7 +226,9 @@ def test_a_closed_window_is_a_signal_as_on_windows() -> None:
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="threads have nice values on Linux alone")
+@pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="threads have nice values on Linux alone"
+)
 def test_priority_rises_but_for_the_main_thread() -> None:
     """Where it is not permitted nothing changes and nothing is said."""
     before = os.getpriority(os.PRIO_PROCESS, os.getpid())

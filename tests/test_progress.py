@@ -23,12 +23,16 @@ def test_number(n):
 def run_tests(folder: Path, *options: str) -> str:
     """Runs six tests, of which one fails; returns what is printed."""
     (folder / "test_numbers.py").write_text(TESTS)
-    (folder / "sitecustomize.py").write_text("import tests.progress\ntests.progress.EVERY_S = 0.0\n")
+    (folder / "sitecustomize.py").write_text(
+        "import tests.progress\ntests.progress.EVERY_S = 0.0\n"
+    )
     paths = os.pathsep.join([str(folder), str(ROOT)])
     given = {**os.environ, "PYTHONPATH": paths, "TRILAT_TEST_RUN": "numbers"}
     command = [sys.executable, "-m", "pytest", "-q", "-c", os.devnull, "--rootdir", str(folder)]
     command += ["-p", "tests.progress", *options, "test_numbers.py"]
-    done = subprocess.run(command, cwd=folder, env=given, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        command, cwd=folder, env=given, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 1, done
     return done.stdout
 
@@ -44,6 +48,8 @@ def test_a_run_prints_lines_with_an_estimate(options: list[str], tmp_path: Path)
     assert re.search(r"numbers: 6 tests, about \d+ s\n", run_tests(tmp_path, *options))
 
 
-@pytest.mark.parametrize(("seconds", "text"), [(0.4, "0 s"), (59.0, "59 s"), (200.0, "3 min 20 s")])
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0 s"), (59.0, "59 s"), (200.0, "3 min 20 s")]
+)
 def test_durations_are_for_people(seconds: float, text: str) -> None:
     assert format_duration(seconds) == text

@@ -22,4 +22,6 @@ def test_all_that_is_left_exists() -> None:
     for name in read_long_tests():
         path, _, case = name.partition("::")
         text = Path(ROOT, path).read_text(encoding="utf-8")
-        assert re.search(rf"^def {re.escape(case.partition('[')[0])}\(", text, re.MULTILINE), name
+        assert re.search(rf"^def {re.escape(case.partition('[')[0])}\(", text, re.MULTILINE), (
+            name
+        )

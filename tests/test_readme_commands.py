@@ -36,5 +36,7 @@ def test_options_of_these_commands_exist() -> None:
         name = max((one for one in options if " ".join(words).startswith(one)), key=len)
         if name == "trilat set":
             continue  # the options of its commands follow their words
-        unknown = {word.partition("=")[0] for word in words if word.startswith("-")} - {*options[name]}
+        unknown = {word.partition("=")[0] for word in words if word.startswith("-")} - {
+            *options[name]
+        }
         assert not {word for word in unknown if not word.startswith("--no-")}, command

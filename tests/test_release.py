@@ -49,7 +49,9 @@ def test_workflows_install_by_hash_or_what_they_built() -> None:
     """A package of somebody else could put its own files among those that are published."""
     installed = 0
     for path in WORKFLOWS:
-        for line in re.findall(r"pip install (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE):
+        for line in re.findall(
+            r"pip install (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE
+        ):
             words = [word for word in line.split() if word != "--disable-pip-version-check"]
             if words[0] == "--no-index":
                 assert any(word.startswith("dist") for word in words), line
@@ -58,8 +60,11 @@ def test_workflows_install_by_hash_or_what_they_built() -> None:
                 assert len(words) == 3, line
                 assert "--hash=sha256:" in (ROOT / words[2]).read_text(encoding="utf-8"), line
             installed += 1
-        for line in re.findall(r"python -m build (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE):
-            assert "--no-isolation" in line.split(), line  # else pip gets what builds it, without hashes
+        for line in re.findall(
+            r"python -m build (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE
+        ):
+            # else pip gets what builds it, without hashes
+            assert "--no-isolation" in line.split(), line
     assert installed >= 8
 
 
@@ -73,7 +78,12 @@ def test_what_the_workflows_run_is_there() -> None:
                 elif words[0] in PROJECT["project"]["scripts"] and words[1:] != ["--version"]:
                     parses(["trilat", *words[1:]])
                 else:
-                    assert words[0] in ("python", "check-wheel-contents", "twine", "trilat-net"), line
+                    assert words[0] in (
+                        "python",
+                        "check-wheel-contents",
+                        "twine",
+                        "trilat-net",
+                    ), line
 
 
 def test_a_release_is_built_once_and_published_without_a_secret() -> None:
@@ -88,7 +98,9 @@ def test_a_release_is_built_once_and_published_without_a_secret() -> None:
     assert jobs["publish"]["permissions"] == {"id-token": "write"}
     assert [name for name in jobs if "permissions" in jobs[name]] == ["publish"]
     assert not any("checkout" in step.get("uses", "") for step in jobs["publish"]["steps"])
-    stated = [one.rpartition(" ")[2] for one in PROJECT["project"]["classifiers"] if ":: 3." in one]
+    stated = [
+        one.rpartition(" ")[2] for one in PROJECT["project"]["classifiers"] if ":: 3." in one
+    ]
     for name in ("compile", "install"):
         assert jobs[name]["strategy"]["matrix"]["python"] == stated
     assert PROJECT["project"]["requires-python"] == f">={stated[0]}"
@@ -106,7 +118,10 @@ def locked(name: str) -> set[str]:
 def test_every_lock_has_what_is_stated_for_it() -> None:
     """A lock that is made once and not again with a new dependency lacks it: `make lock`."""
     groups = {key: names_of(stated) for key, stated in PROJECT["dependency-groups"].items()}
-    needed, extras = PROJECT["project"]["dependencies"], PROJECT["project"]["optional-dependencies"]
+    needed, extras = (
+        PROJECT["project"]["dependencies"],
+        PROJECT["project"]["optional-dependencies"],
+    )
     every_extra = {name for stated in extras.values() for name in names_of(stated)}
     assert names_of(needed) | groups["build"] <= locked("runtime")
     assert not every_extra & locked("runtime")
@@ -118,7 +133,9 @@ def test_every_lock_has_what_is_stated_for_it() -> None:
 
 def check_release(tag: str, folder: Path) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
-        [sys.executable, ROOT / ".ci" / "check-release", tag, folder], capture_output=True, text=True
+        [sys.executable, ROOT / ".ci" / "check-release", tag, folder],
+        capture_output=True,
+        text=True,
     )
 
 
@@ -126,27 +143,42 @@ def test_a_tag_that_is_not_the_version_is_refused(tmp_path: Path) -> None:
     for name in ("pyproject.toml", "CITATION.cff"):
         shutil.copy(ROOT / name, tmp_path)
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    (tmp_path / "CHANGELOG.md").write_text(changes.replace("## Unreleased", f"## {VERSION} (2026-12-01)", 1))
+    (tmp_path / "CHANGELOG.md").write_text(
+        changes.replace("## Unreleased", f"## {VERSION} (2026-12-01)", 1)
+    )
     assert check_release(f"v{VERSION}", tmp_path).returncode == 0
     assert len(check_release("v99.0.0", tmp_path).stderr.splitlines()) == 3
     (tmp_path / "CHANGELOG.md").write_text(changes)
     refused = check_release(f"v{VERSION}", tmp_path)
-    assert (refused.returncode, "CHANGELOG.md" in refused.stderr) == (1, "Unreleased" in changes)
+    assert (refused.returncode, "CHANGELOG.md" in refused.stderr) == (
+        1,
+        "Unreleased" in changes,
+    )
 
 
 def test_both_names_of_the_program_are_one() -> None:
     """`uvx trilat-net` runs the script that bears the name of the package."""
     scripts = PROJECT["project"]["scripts"]
     assert scripts["trilat-net"] == scripts["trilat"]
-    (made,) = {one.value for one in entry_points(group="console_scripts") if one.name == "trilat"}
+    (made,) = {
+        one.value for one in entry_points(group="console_scripts") if one.name == "trilat"
+    }
     assert made == scripts["trilat"]
 
 
 def run(*words: object, cwd: Path, **more: str) -> str:
     """Runs a program outside of the checkout; returns what it printed."""
-    bare = {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "VIRTUAL"))}
+    bare = {
+        key: value
+        for key, value in os.environ.items()
+        if not key.startswith(("PYTHON", "VIRTUAL"))
+    }
     done = subprocess.run(
-        [str(word) for word in words], cwd=cwd, env={**bare, **more}, capture_output=True, text=True
+        [str(word) for word in words],
+        cwd=cwd,
+        env={**bare, **more},
+        capture_output=True,
+        text=True,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout + done.stderr
@@ -183,10 +215,17 @@ def built(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
 def test_both_distributions_are_one_program_of_one_version(sources: Path) -> None:
     """One has every file, the other the remaining libraries; nothing is installed twice."""
     core, whole = (
-        tomllib.loads((sources / name / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        tomllib.loads((sources / name / "pyproject.toml").read_text(encoding="utf-8"))[
+            "project"
+        ]
         for name in (CORE, WHOLE)
     )
-    assert (core["name"], core["version"], whole["name"], whole["version"]) == (CORE, VERSION, WHOLE, VERSION)
+    assert (core["name"], core["version"], whole["name"], whole["version"]) == (
+        CORE,
+        VERSION,
+        WHOLE,
+        VERSION,
+    )
     first, *added = whole["dependencies"]
     assert first == f"{CORE}=={VERSION}"
     assert names_of(added) == set(STUDY_LIBRARIES)
@@ -194,7 +233,11 @@ def test_both_distributions_are_one_program_of_one_version(sources: Path) -> Non
     assert {**core["scripts"], **whole["scripts"]} == PROJECT["project"]["scripts"]
     assert not core["scripts"].keys() & whole["scripts"].keys()
     assert whole["optional-dependencies"] == PROJECT["project"]["optional-dependencies"]
-    assert {path.name for path in (sources / WHOLE).iterdir()} == {"pyproject.toml", "README.md", "LICENSE"}
+    assert {path.name for path in (sources / WHOLE).iterdir()} == {
+        "pyproject.toml",
+        "README.md",
+        "LICENSE",
+    }
 
 
 def needed(names: set[str]) -> dict[str, Distribution]:
@@ -204,31 +247,52 @@ def needed(names: set[str]) -> dict[str, Distribution]:
     while left:
         one = found[name] = distribution(name := left.pop())
         stated = map(Requirement, one.requires or [])
-        left |= {r.name for r in stated if not r.marker or r.marker.evaluate({"extra": ""})} - found.keys()
+        left |= {
+            r.name for r in stated if not r.marker or r.marker.evaluate({"extra": ""})
+        } - found.keys()
     return found
 
 
 def install(clean: Path, wheel: Path, libraries: set[str]) -> Path:
     """Installs a wheel into an environment, and libraries from this one; returns its `site-packages`."""
-    onto = ["-m", "pip", "--python", clean / "bin" / "python", "install", "--no-deps", "--no-index", wheel]
+    onto = [
+        "-m",
+        "pip",
+        "--python",
+        clean / "bin" / "python",
+        "install",
+        "--no-deps",
+        "--no-index",
+        wheel,
+    ]
     run(sys.executable, *onto, cwd=clean)
     (packages,) = (clean / "lib").glob("python3*/site-packages")
     for one in needed(libraries).values():
-        for top in {file.parts[0] for file in one.files or [] if file.parts[0] not in ("..", "__pycache__")}:
+        for top in {
+            file.parts[0]
+            for file in one.files or []
+            if file.parts[0] not in ("..", "__pycache__")
+        }:
             (packages / top).exists() or (packages / top).symlink_to(one.locate_file(top))
     return packages
 
 
 @pytest.mark.live
 @pytest.mark.long
-def test_a_robot_runs_trilat_net_core_alone(built: dict[str, list[Path]], tmp_path: Path) -> None:
+def test_a_robot_runs_trilat_net_core_alone(
+    built: dict[str, list[Path]], tmp_path: Path
+) -> None:
     """Without a network: libraries are of this environment, the program is the wheel's; then both wheels'."""
     with zipfile.ZipFile(built[CORE][1]) as archive:
         names = set(archive.namelist())
     packages = ("trilat_net", "sites", "recorder", "live")
-    code = {str(one.relative_to(ROOT)) for name in packages for one in (ROOT / name).rglob("*.py")}
+    code = {
+        str(one.relative_to(ROOT)) for name in packages for one in (ROOT / name).rglob("*.py")
+    }
     assert code <= names
-    assert {name.split("/")[0] for name in names if "." not in name.split("/")[0]} == set(packages)
+    assert {name.split("/")[0] for name in names if "." not in name.split("/")[0]} == set(
+        packages
+    )
     clean = tmp_path / "clean"
     run(sys.executable, "-m", "venv", "--without-pip", clean, cwd=tmp_path)
     stated = names_of(PROJECT["project"]["dependencies"])
@@ -240,11 +304,19 @@ def test_a_robot_runs_trilat_net_core_alone(built: dict[str, list[Path]], tmp_pa
     run(trilat, "sim", "two_sites", "--duration", "1", "-o", "first.mcap", cwd=tmp_path)
     run(trilat, "verify", "first.mcap", cwd=tmp_path)  # compiled before three at once would
     ends = [one.replace("tcp", "tls", 1) for one in find_free_endpoints(3)]
-    ways = [["--listen", own, *(f"--connect={one}" for one in ends[:n])] for n, own in enumerate(ends)]
-    members = [["site", name, "--scenario", "two_sites", "--set", "duration_s=2"] for name in ("m", "s")]
+    ways = [
+        ["--listen", own, *(f"--connect={one}" for one in ends[:n])]
+        for n, own in enumerate(ends)
+    ]
+    members = [
+        ["site", name, "--scenario", "two_sites", "--set", "duration_s=2"]
+        for name in ("m", "s")
+    ]
     members.append(["record", "-o", "run.mcap"])
     started = [
-        subprocess.Popen([trilat, *words, "--session", "t", "--keys", f"keys/{name}", *way], cwd=tmp_path)
+        subprocess.Popen(
+            [trilat, *words, "--session", "t", "--keys", f"keys/{name}", *way], cwd=tmp_path
+        )
         for words, way, name in zip(members, ways, ("m", "s", "recorder"), strict=True)
     ]
     try:
@@ -272,7 +344,9 @@ def test_the_packagers_find_nothing(built: dict[str, list[Path]]) -> None:
 def test_to_import_the_package_imports_none_of_what_takes_time() -> None:
     """The bar is 30 ms: what it imports beyond an interpreter's start are a few modules of the library."""
     code = "import sys; before = set(sys.modules); import trilat_net; print(*(set(sys.modules) - before))"
-    made = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True)
+    made = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
+    )
     extra = {name.partition(".")[0] for name in made.stdout.split()} - {"trilat_net"}
     assert extra <= sys.stdlib_module_names
     assert len(made.stdout.split()) < 60

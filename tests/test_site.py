@@ -55,8 +55,16 @@ def test_the_gallery_begins_with_the_paper() -> None:
 @needs_browser
 def test_the_site_is_whole() -> None:
     """Zensical refuses a Markdown link or an anchor that leads nowhere; pictures in HTML it does not see."""
-    subprocess.run([sys.executable, "docs/site/make_pages.py", "--no-gallery"], cwd=ROOT, check=True)
-    build = [Path(sys.executable).with_name("zensical"), "build", "--strict", "-f", "zensical.toml"]
+    subprocess.run(
+        [sys.executable, "docs/site/make_pages.py", "--no-gallery"], cwd=ROOT, check=True
+    )
+    build = [
+        Path(sys.executable).with_name("zensical"),
+        "build",
+        "--strict",
+        "-f",
+        "zensical.toml",
+    ]
     subprocess.run(build, cwd=ROOT / "build" / "site", check=True)
     names = {name.rpartition(".")[2] for name in Page(HTML / "reference" / "python.html").ids}
     assert not {name for name in tn.__all__ if name != "__version__"} - names

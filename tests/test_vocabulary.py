@@ -10,13 +10,20 @@ from . import house
 PAGE = (house.ROOT / "docs" / "vocabulary.md").read_text(encoding="utf-8")
 HEADS = ("word", "not")
 USED, UNUSED = (
-    [row for row in re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", part, re.MULTILINE) if row[0] not in HEADS]
+    [
+        row
+        for row in re.findall(r"^\| ([^|]+) \| ([^|]+) \|$", part, re.MULTILINE)
+        if row[0] not in HEADS
+    ]
     for part in PAGE.split("## Words that are not used")
 )
 
 
 def _words(name: str) -> set[str]:
-    return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name.rpartition(".")[2])}
+    return {
+        word.lower()
+        for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])", name.rpartition(".")[2])
+    }
 
 
 def _names() -> list[str]:

@@ -47,7 +47,10 @@ def test_a_noun_agrees_with_its_number(count: object, noun: str, text: str) -> N
 
 
 def test_a_verb_agrees_as_well() -> None:
-    assert [count_nouns(n, "mark waits", "marks wait") for n in (1, 2)] == ["1 mark waits", "2 marks wait"]
+    assert [count_nouns(n, "mark waits", "marks wait") for n in (1, 2)] == [
+        "1 mark waits",
+        "2 marks wait",
+    ]
 
 
 def test_every_counted_noun_is_a_plural_of_itself() -> None:

@@ -76,7 +76,9 @@ def balance(
     return slow * s**2 + (K + B * s) * (one - late) + b @ impedance, b
 
 
-def transmitted(frequency_hz: float, alpha: NDArray[np.float64], at: int, **law: object) -> float:
+def transmitted(
+    frequency_hz: float, alpha: NDArray[np.float64], at: int, **law: object
+) -> float:
     """|torque / velocity| that a torque on arm `at` meets, over |Z_e| of the wall at the last arm."""
     s = 2j * np.pi * frequency_hz
     free = [(0.0, 0.0)] * (len(alpha) - 1)
@@ -85,7 +87,9 @@ def transmitted(frequency_hz: float, alpha: NDArray[np.float64], at: int, **law:
     return float(abs(1.0 / (s * x[at])) / abs(WALL[0] / s + WALL[1]))
 
 
-def rightmost_root(alpha: NDArray[np.float64], loads: Sequence[tuple[float, float]], **law: object) -> float:
+def rightmost_root(
+    alpha: NDArray[np.float64], loads: Sequence[tuple[float, float]], **law: object
+) -> float:
     """The largest real part of the roots without delay, from det A(s), a polynomial of degree 2 n."""
     degree = 2 * len(alpha)
     points = 10.0 * np.exp(2j * np.pi * np.arange(degree + 1) / (degree + 1))

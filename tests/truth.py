@@ -48,12 +48,16 @@ class Member:
 def members(log: Log) -> dict[str, Member]:
     """The clocks of a log's members."""
     started = next(event for event in log.events if event.kind == "start")
-    announced = next(e for e in log.events if e.kind == "epoch" and e.attempt == started.attempt)
+    announced = next(
+        e for e in log.events if e.kind == "epoch" and e.attempt == started.attempt
+    )
     clocks = {}
     for name, identity in announced.clocks.items():
         skew = SKEWED.search(identity)
         offset_ns, drift_ppb, start_ns = map(int, skew.groups()) if skew else (0, 0, 0)
-        clocks[name] = Member(started.epochs[name], start_ns, offset_ns, 1 + Fraction(drift_ppb, NS_PER_S))
+        clocks[name] = Member(
+            started.epochs[name], start_ns, offset_ns, 1 + Fraction(drift_ppb, NS_PER_S)
+        )
     return clocks
 
 
@@ -120,7 +124,9 @@ def judged(log: Log, site: str, peer: str) -> Judged:
             limit_us = 0.0 if shared else bound.at(state.tick, state.t_ns)
             if index == place and limit_us is not None:
                 true_ns = clocks[site].true_ns(arrived_ns) - clocks[peer].true_ns(sent[tick])
-                rows.append((state.tick, true_ns / 1000, logged[tick] - true_ns / 1000, limit_us))
+                rows.append(
+                    (state.tick, true_ns / 1000, logged[tick] - true_ns / 1000, limit_us)
+                )
     ticks, delay, error, limit = np.array(rows).T
     return Judged(ticks.astype(np.int64), delay, error, limit)
 
@@ -134,6 +140,10 @@ def offset_errors(log: Log, site: str, peer: str) -> NDArray[np.float64]:
     for event in Bound(log, site, peer).events:
         offset_ns = own.offset_to_ns(other, event.t_ns)
         rows.append(
-            (event.t_ns / NS_PER_S, (event.offset_ns - offset_ns) / 1000, event.drift_ppb / 1000 - drift_ppm)
+            (
+                event.t_ns / NS_PER_S,
+                (event.offset_ns - offset_ns) / 1000,
+                event.drift_ppb / 1000 - drift_ppm,
+            )
         )
     return np.array(rows).reshape(-1, 3)

@@ -17,7 +17,16 @@ from trilat_net.scenario import Scenario, load_scenario
 CASE = Path(__file__).parent / "reporting" / "cases" / "tool_down.toml"
 MOTIONS = range(30)
 RECORDS = 150
-AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 0), (1, 0, -1), (0, 1, 1), (1, 1, 1), (-1, 2, 0.5))
+AXES = (
+    (1, 0, 0),
+    (0, 1, 0),
+    (0, 0, 1),
+    (1, 1, 0),
+    (1, 0, -1),
+    (0, 1, 1),
+    (1, 1, 1),
+    (-1, 2, 0.5),
+)
 ALLOWED = 1.5
 """Largest step of a series by that of the true motion."""
 
@@ -53,7 +62,9 @@ def move(number: int, site: str, start: Array, records: int = RECORDS) -> Motion
     reach = random.uniform(-2.5, 2.5, len(start)) * np.pi
     whole = turn(number, records + 2)
     first = 1 if site == "m" else 0
-    return Motion(whole[first : first + records], whole[2:], start + reach * s**2 * (3.0 - 2.0 * s))
+    return Motion(
+        whole[first : first + records], whole[2:], start + reach * s**2 * (3.0 - 2.0 * s)
+    )
 
 
 def count_wraps(turned: Rotation) -> int:
@@ -74,7 +85,9 @@ def place_links(scenario: Scenario, site: str, q: Array) -> list[Rotation]:
     links, whole = list[Rotation](), Rotation.identity()
     for joint, angle in zip(chain.joints, q.T, strict=True):
         whole = (
-            whole * Rotation.from_matrix(joint.rotation) * Rotation.from_rotvec(np.outer(angle, joint.axis))
+            whole
+            * Rotation.from_matrix(joint.rotation)
+            * Rotation.from_rotvec(np.outer(angle, joint.axis))
         )
         links.append(whole)
     return links
@@ -95,8 +108,13 @@ def _simulate() -> bytes:
 def make_log(number: int) -> tuple[Log, dict[str, Motion]]:
     """A log of two arms whose records have one of the motions, and the motions by site."""
     scenario = load_case()
-    motions = {site: move(number, site, np.array(scenario.sites[site].q0_rad)) for site in scenario.names}
-    vectors = {site: [one.as_rotvec() for one in motion[:2]] for site, motion in motions.items()}
+    motions = {
+        site: move(number, site, np.array(scenario.sites[site].q0_rad))
+        for site in scenario.names
+    }
+    vectors = {
+        site: [one.as_rotvec() for one in motion[:2]] for site, motion in motions.items()
+    }
 
     def record(found: Record) -> Record:
         site, k = found["site"], min(found["tick"], RECORDS - 1)

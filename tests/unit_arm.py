@@ -23,11 +23,18 @@ ARM = {
     "I2_kg_m2": 0.3333333333333333,
     "g_m_s2": 0.0,
 }
-CLAMP = {"kind": "spring", "stiffness_nm_rad": 1000.0, "damping_nm_s_rad": 0.0, "to_rad": [0.0, 0.0]}
+CLAMP = {
+    "kind": "spring",
+    "stiffness_nm_rad": 1000.0,
+    "damping_nm_s_rad": 0.0,
+    "to_rad": [0.0, 0.0],
+}
 """What holds a clamped slave; without it the slave is free."""
 
 
-def hand(to: float, stiffness: float = 50.0, damping: float = 10.0, start_s: float = 1.0) -> dict[str, Any]:
+def hand(
+    to: float, stiffness: float = 50.0, damping: float = 10.0, start_s: float = 1.0
+) -> dict[str, Any]:
     """A spring hand that goes to x = `to` in two seconds."""
     gains = {"stiffness_nm_rad": stiffness, "damping_nm_s_rad": damping}
     return {
@@ -42,7 +49,12 @@ def hand(to: float, stiffness: float = 50.0, damping: float = 10.0, start_s: flo
 H50 = hand(0.3)
 """The hand of most tests."""
 WALL = hand(0.0, 500.0, 5.0)
-DRIVE = {"kind": "multisine", "amplitude_nm": [2.0, 1.0], "frequencies_hz": [1.0], "end_s": 1000.0}
+DRIVE = {
+    "kind": "multisine",
+    "amplitude_nm": [2.0, 1.0],
+    "frequencies_hz": [1.0],
+    "end_s": 1000.0,
+}
 
 
 def _toml(value: Any) -> str:
@@ -53,7 +65,9 @@ def _toml(value: Any) -> str:
     return str(value).lower() if isinstance(value, bool) else repr(value)
 
 
-def unit_text(sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any) -> str:
+def unit_text(
+    sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any], **more: Any
+) -> str:
     """Sites with unit arms, the last one a slave; two follow each other, more share as `dominance` says.
 
     `more` are keys of the scenario; links have 200 ms unless `link` says otherwise.
@@ -68,7 +82,10 @@ def unit_text(sites: Mapping[str, Mapping[str, Any]], control: Mapping[str, Any]
         "arm": ARM,
         "limits": {"tau_limit_nm": 1e6, "qd_limit_rad_s": 1e3},
         "link": {"model": "constant", "delay_ms": 200.0},
-        "sites": {name: {"role": roles[name], "q0_rad": [0.0, 0.0], **site} for name, site in sites.items()},
+        "sites": {
+            name: {"role": roles[name], "q0_rad": [0.0, 0.0], **site}
+            for name, site in sites.items()
+        },
         "control": control,
         "dominance": pair,
         **more,
@@ -96,7 +113,9 @@ def two_sites(variant: str, delay_s: float, duration_s: float = 9.0, **more: Any
 
     def one(at: int) -> dict[str, Any]:
         law = {"law": "four_channel", "K": 100.0, "B": 20.0, **VARIANTS[variant], **more}
-        return {key: value[at] if isinstance(value, tuple) else value for key, value in law.items()}
+        return {
+            key: value[at] if isinstance(value, tuple) else value for key, value in law.items()
+        }
 
     sites = {
         "m": {"hands": [DRIVE, hand(0.0)], "control": one(0)},

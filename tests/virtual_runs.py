@@ -52,7 +52,17 @@ def trajectories(scenario: Scenario) -> Run:
                 t_s=np.array([o.tick for o in outputs]) / scenario.sites[name].rate_hz,
                 **{
                     field: np.array([getattr(o, field) for o in outputs])
-                    for field in ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat", "used", "ch")
+                    for field in (
+                        "q",
+                        "qd",
+                        "q_des",
+                        "qd_des",
+                        "tau",
+                        "tau_x",
+                        "theta_hat",
+                        "used",
+                        "ch",
+                    )
                 },
             )
             for name, outputs in records.items()

@@ -6,9 +6,9 @@
     log["m1"].t_s, log["m1"].q
     tn.certify(log)
 
-One `Site.step` and three drivers: live over a network, in virtual time, and again from a log. The same code
-gives the same numbers, bit for bit. What a function finds is an object with `summary()`, `to_frame()` and
-`to_dict()`; docs/python.md lists them all.
+One `Site.step` and three drivers: live over a network, in virtual time, and again from a log.
+The same code gives the same numbers, bit for bit. What a function finds is an object with
+`summary()`, `to_frame()` and `to_dict()`; docs/python.md lists them all.
 """
 
 from importlib import import_module as _import_module
@@ -72,7 +72,9 @@ if _TYPE_CHECKING:
     from .scenario.skeletons import new_plant as new_plant
     from .studies.arm_gains import tune_arm as tune_arm
     from .studies.experiment.experiment_analysis import analyse_experiment as analyse_experiment
-    from .studies.experiment.experiment_analysis import compute_experiment_power as compute_experiment_power
+    from .studies.experiment.experiment_analysis import (
+        compute_experiment_power as compute_experiment_power,
+    )
     from .studies.experiment.experiment_run import check_experiment as check_experiment
     from .studies.experiment.experiment_run import new_experiment as new_experiment
     from .studies.experiment.experiment_run import open_experiment as open_experiment
@@ -129,7 +131,9 @@ __all__ = sorted(["__version__", *_MODULES])
 
 
 def __getattr__(name: str) -> _Any:
-    """Imports the parts on first use: `trilat --help` needs none of them, and Numba takes a second."""
+    """Imports the parts on first use: `trilat --help` needs none of them, and Numba takes a
+    second.
+    """
     if name == "__version__":
         from .files import find_version
 
@@ -140,7 +144,8 @@ def __getattr__(name: str) -> _Any:
 
 
 def _import_part(name: str) -> _Any:
-    """Returns what is offered by this name; if a package is missing, a stand-in that says so when called.
+    """Returns what is offered by this name; if a package is missing, a stand-in that says so
+    when called.
 
     Programs look for names (`hasattr`, `dir`, completion) without the wish to use them.
     """

@@ -1,7 +1,8 @@
-"""Entry point of `trilat` and `python -m trilat_net`; who stops arms does not wait for other commands.
+"""Entry point of `trilat` and `python -m trilat_net`; who stops arms does not wait for other
+commands.
 
-Invariant: what is printed into a file or pipe is UTF-8 with the line ends of POSIX on every system, like any
-text that is written; a terminal that lacks a letter shows its number.
+Invariant: what is printed into a file or pipe is UTF-8 with the line ends of POSIX on every
+system, like any text that is written; a terminal that lacks a letter shows its number.
 """
 
 import atexit
@@ -14,7 +15,8 @@ from contextlib import suppress
 
 def main() -> None:
     """Runs `trilat`."""
-    gc.set_threshold(100_000, 20, 20)  # with Python's own thresholds a ninth of the start is spent there
+    # with Python's own thresholds a ninth of the start is spent there
+    gc.set_threshold(100_000, 20, 20)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             if not stream.isatty():
@@ -55,7 +57,8 @@ def _run() -> None:
 
 
 def _leave(code: int | None) -> None:
-    if code is not None and "zenoh" in sys.modules:  # whose threads abort a process without Python
+    # whose threads abort a process without Python
+    if code is not None and "zenoh" in sys.modules:
         with suppress(OSError):  # which Python says itself
             sys.stdout.flush()
             os._exit(code & 0xFF)

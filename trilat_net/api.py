@@ -1,7 +1,7 @@
 """The Python interface: a function per command, for logs, virtual time and studies.
 
-Invariant: no logic here but joining rooms. A scenario is a name, a path, a TOML text, its tables or a
-`Scenario`; a log is a path or a `Log`. What takes a network is in `session_api`.
+Invariant: no logic here but joining rooms. A scenario is a name, a path, a TOML text, its
+tables or a `Scenario`; a log is a path or a `Log`. What takes a network is in `session_api`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -62,7 +62,8 @@ def simulate(
     (100, 2)
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
+            scenario.
         set: overrides, as in `{"control.Kd": 5}` or `["control.Kd=5"]`.
         duration_s: the duration of the run, s; by default the scenario's.
         seed: the seed; by default the scenario's.
@@ -76,9 +77,15 @@ def simulate(
 
 
 def export(
-    log: AnyLog | Sequence[AnyLog], to: str, out: str | Path, *, force: bool = False, **settings: Any
+    log: AnyLog | Sequence[AnyLog],
+    to: str,
+    out: str | Path,
+    *,
+    force: bool = False,
+    **settings: Any,
 ) -> Path:
-    """Exports a log to files for other tools and returns the path; the command is `trilat log export`.
+    """Exports a log to files for other tools and returns the path; the command is `trilat log
+    export`.
 
     >>> tn.export(tn.simulate("two_sites", duration_s=0.1), "npz", "run.npz").name
     'run.npz'
@@ -88,10 +95,12 @@ def export(
         to: ros2, parquet, csv, npz, mat or lerobot.
         out: a file, or of parquet, csv and lerobot a folder.
         force: whether it may replace one.
-        settings: what the format lets one choose, as `fps=30`, `program="m2"` and `actions="tip"` of lerobot.
+        settings: what the format lets one choose, as `fps=30`, `program="m2"` and
+            `actions="tip"` of lerobot.
 
     Raises:
-        UsageError: there is no such format or setting, a package is missing, or the place is taken.
+        UsageError: there is no such format or setting, a package is missing, or the place is
+            taken.
     """
     from .reporting.export import Exporter
 
@@ -103,7 +112,11 @@ def export(
 
 
 def verify(
-    log: AnyLog, *, virtual: bool = False, min_coverage: float = MIN_COVERAGE, resume_every: int = 0
+    log: AnyLog,
+    *,
+    virtual: bool = False,
+    min_coverage: float = MIN_COVERAGE,
+    resume_every: int = 0,
 ) -> LogCheckReport:
     """Executes a log again and compares every computed field; the command is `trilat verify`.
 
@@ -114,17 +127,23 @@ def verify(
         log: the log, or its path.
         virtual: whether to compare with virtual time too.
         min_coverage: the least share of every site's ticks that must be judged to pass.
-        resume_every: at every tick that it divides a site starts afresh from the records, so that what a law
-            of one's own knows besides shows; 0: at none.
+        resume_every: at every tick that it divides a site starts afresh from the records, so
+            that what a law of one's own knows besides shows; 0: at none.
 
     Raises:
         LogError: the log cannot be read.
     """
-    return run_log_checks(_open(log), virtual=virtual, min_coverage=min_coverage, resume_every=resume_every)
+    return run_log_checks(
+        _open(log), virtual=virtual, min_coverage=min_coverage, resume_every=resume_every
+    )
 
 
 def certify(
-    log: AnyLog, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False, twins: int = TWINS
+    log: AnyLog,
+    *,
+    min_coverage: float = MIN_COVERAGE,
+    own_laws: bool = False,
+    twins: int = TWINS,
 ) -> Certificate:
     """Judges a run: stable, not stable or open, and why; the command is `trilat certify`.
 
@@ -133,8 +152,10 @@ def certify(
 
     Args:
         log: the log, or its path.
-        min_coverage: the least share of every site's ticks that must be judged for a stable run.
-        own_laws: whether code of laws from outside may run, for the energies that they declare, and twins.
+        min_coverage: the least share of every site's ticks that must be judged for a stable
+            run.
+        own_laws: whether code of laws from outside may run, for the energies that they declare,
+            and twins.
         twins: how many twins of the run get a small push; 0: none.
 
     Raises:
@@ -146,7 +167,8 @@ def certify(
 
 
 def metrics(log: AnyLog) -> LogMetrics:
-    """Measures a run: tracking, effort, energies, force sharing, network; the command is `trilat metrics`.
+    """Measures a run: tracking, effort, energies, force sharing, network; the command is
+    `trilat metrics`.
 
     >>> found = tn.metrics(tn.simulate("two_sites", duration_s=0.1))
     >>> found.sites["m"]["rms_error_rad"].value > 0.0
@@ -181,7 +203,9 @@ def report(
     opened = _open(log)
     first = Path(opened.sources[0])
     if not first.is_file():
-        raise UsageError("a report is of a log in a file: save it first, as in log.save('run.mcap')")
+        raise UsageError(
+            "a report is of a log in a file: save it first, as in log.save('run.mcap')"
+        )
     folder = first.with_suffix("") if out is None else Path(out)
     return conclude(opened, make_results_folder(folder, "", force=force), png=png)
 
@@ -196,13 +220,15 @@ def linear(
     ports: bool = True,
     operators: Sequence[str | Path] = (),
 ) -> "LinearAnalysis":
-    """Linearises the loop about its equilibrium: roots, margins, ports; the command is `trilat linear`.
+    """Linearises the loop about its equilibrium: roots, margins, ports; the command is `trilat
+    linear`.
 
     >>> tn.linear("p_d_margin", {"control.d": 0.9}, ports=False).verdict
     'unstable'
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
+            scenario.
         set: overrides, as in `{"control.d": 0.9}`.
         pose: the angles of all sites, rad; by default those at which a run ends.
         roots: how many roots.
@@ -220,7 +246,9 @@ def linear(
     try:
         fixed = None if pose is None else tuple(map(float, pose))
     except (TypeError, ValueError):
-        raise UsageError(f"a pose is of angles in rad, as in (0.1, 0.3), not {pose!r}") from None
+        raise UsageError(
+            f"a pose is of angles in rad, as in (0.1, 0.3), not {pose!r}"
+        ) from None
     return analyse_linear_loop(
         load_scenario(scenario, set),
         pose=fixed,
@@ -246,24 +274,30 @@ def sweep(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "SweepResults":
-    """Runs a scenario over a grid of its keys and classifies stability; the command is `trilat sweep`.
+    """Runs a scenario over a grid of its keys and classifies stability; the command is `trilat
+    sweep`.
 
-    >>> found = tn.sweep("p_d_margin", {"control.d": [0.3, 3.0]}, duration_s=2, out="grid", jobs=1)
+    >>> found = tn.sweep("p_d_margin", {"control.d": [0.3, 3.0]}, duration_s=2, out="grid",
+    jobs=1)
     >>> len(found.rows)
     2
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        over: the axes, as in `{"link.delay_ms": range(0, 1601, 50)}`: lists or arrays of values by key; or
-            as texts, `["link.delay_ms=0:1600:50"]`.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
+            scenario.
+        over: the axes, as in `{"link.delay_ms": range(0, 1601, 50)}`: lists or arrays of values
+            by key; or as texts, `["link.delay_ms=0:1600:50"]`.
         set: what is to be changed everywhere, as in `{"control.Kd": 5}`.
         seeds: how many, or which.
         laws: names of laws, or classes, to sweep besides.
         duration_s: how long a cell runs at first, s.
-        longest_s: how long at most, s; by default eight times that, or just that if twins judge.
+        longest_s: how long at most, s; by default eight times that, or just that if twins
+            judge.
         judge: "twins" measures the growth exponent of every cell besides its verdict.
-        metrics: keys of docs/metrics.md that are measured of every run besides; columns of the rows.
-        out: folder of the results; a sweep in it is continued. By default the next free runs/sweep-NAME-N.
+        metrics: keys of docs/metrics.md that are measured of every run besides; columns of the
+            rows.
+        out: folder of the results; a sweep in it is continued. By default the next free
+            runs/sweep-NAME-N.
         jobs: how many processes; None for one per core.
         on: what runs the cells instead: a Dask scheduler's address or an executor.
 
@@ -274,7 +308,12 @@ def sweep(
     from .studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
 
     texts = _texts(set, duration_s)
-    more: dict[str, Any] = {"laws": laws, "longest_s": longest_s, "judge": judge, "metrics": metrics}
+    more: dict[str, Any] = {
+        "laws": laws,
+        "longest_s": longest_s,
+        "judge": judge,
+        "metrics": metrics,
+    }
     plan = plan_sweep(scenario, texts, over=over, seeds=seeds, **more)
     folder = prepare_sweep_folder(plan, None if out is None else Path(out))
     return run_sweep(folder, jobs, on=on).results
@@ -300,9 +339,11 @@ def margin(
     [False]
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
+            scenario.
         along: the key and its range, as in "control.d=0.2:3".
-        over: axes at every point of which it is searched, as in `{"link.delay_ms": [100, 200]}`, as `sweep`.
+        over: axes at every point of which it is searched, as in `{"link.delay_ms": [100,
+            200]}`, as `sweep`.
         set: what is to be changed everywhere.
         tolerance: how wide an edge may be, relative to its value.
         seeds: how many, or which.
@@ -351,7 +392,8 @@ def tune(
     ['p_d']
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
+            scenario.
         laws: which laws, by names or as classes; none means all that take any number of sites.
         set: overrides, as in `{"link.delay_ms": 100}`.
         budget: candidates per law.
@@ -394,9 +436,11 @@ def bench(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "BenchResults":
-    """Runs the suite of control laws; the command is `trilat bench`, which writes tables and figures as well.
+    """Runs the suite of control laws; the command is `trilat bench`, which writes tables and
+    figures as well.
 
-    >>> found = tn.bench(tasks=["free"], laws=["p_d"], links=["rtt68"], seeds=1, out="suite", jobs=1)
+    >>> found = tn.bench(tasks=["free"], laws=["p_d"], links=["rtt68"], seeds=1, out="suite",
+    jobs=1)
     >>> len(found.runs)
     1
 
@@ -412,7 +456,8 @@ def bench(
         on: what runs them instead: a Dask scheduler's address or an executor.
 
     Raises:
-        UsageError: there is no such study, task, law or link, or the folder holds something else.
+        UsageError: there is no such study, task, law or link, or the folder holds something
+            else.
     """
     from .studies.bench import plan_bench, prepare_bench_folder, run_bench
 
@@ -439,4 +484,6 @@ def view(*files: str | Path, full: bool = False, save: str | Path | None = None)
 
     paths = [Path(file) for file in files]
     kept = None if save is None else Path(save)
-    open_rerun(paths, lambda: open_log(*paths), ViewerOptions(full=full, web=False, save=kept), print)
+    open_rerun(
+        paths, lambda: open_log(*paths), ViewerOptions(full=full, web=False, save=kept), print
+    )

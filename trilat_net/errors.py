@@ -1,16 +1,19 @@
 """Errors, by who has to act: the author of a scenario, the caller, a peer, a file, the program.
 
-Invariant: an error carries its data and one sentence that names the problem, its place and the remedy. The
-command line prints that sentence and nothing else; `exit_code` is the code that a command ends with. Options
-that it names are those of a command in a command, and arguments in Python. Every text of the program that
-counts things goes through `count_nouns`, as in "1 record" and "2 records" (`tests/test_wording.py`).
+Invariant: an error carries its data and one sentence that names the problem, its place and the
+remedy. The command line prints that sentence and nothing else; `exit_code` is the code that a
+command ends with. Options that it names are those of a command in a command, and arguments in
+Python. Every text of the program that counts things goes through `count_nouns`, as in "1
+record" and "2 records" (`tests/test_wording.py`).
 """
 
 import re
 from functools import partial
 from typing import ClassVar
 
-_OPTION = re.compile(r"(trilat [a-z][^;:,)]*)|(?<![\w-])(--[a-z][a-z-]*|-o\b)( [\d*'\[{]\S*| [A-Z]{2,}\b)?")
+_OPTION = re.compile(
+    r"(trilat [a-z][^;:,)]*)|(?<![\w-])(--[a-z][a-z-]*|-o\b)( [\d*'\[{]\S*| [A-Z]{2,}\b)?"
+)
 _IRREGULAR = {"axis": "axes", "datum": "data", "is": "are", "was": "were", "has": "have"}
 _SWITCHES = ("--force", "--insecure", "--full", "--closed-loop")
 _ARGUMENTS = {
@@ -147,7 +150,9 @@ class CodeFailed(RunFailed):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Restores the error of another process."""
-        return partial(type(self), site=self.site, code=self.code, tick=self.tick), (self.problem,)
+        return partial(type(self), site=self.site, code=self.code, tick=self.tick), (
+            self.problem,
+        )
 
 
 class LawFailed(CodeFailed):
@@ -169,8 +174,8 @@ class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in
 def count_nouns(count: object, singular: str, plural: str = "") -> str:
     """Returns a number and what it counts, in the singular for 1.
 
-    >>> count_nouns(1, "record"), count_nouns(2, "record"), count_nouns(1, "mark waits", "marks wait")
-    ('1 record', '2 records', '1 mark waits')
+    >>> count_nouns(1, "record"), count_nouns(2, "record"), count_nouns(1, "mark waits", "marks
+    wait") ('1 record', '2 records', '1 mark waits')
 
     Args:
         count: the number, or its text, as in "1,000".

@@ -1,7 +1,9 @@
-"""Fields of a scenario: the base of its types, ranges of its numbers, and checks of an author's tables.
+"""Fields of a scenario: the base of its types, ranges of its numbers, and checks of an author's
+tables.
 
-Invariant: an error names the path of the key as the author wrote it, and the nearest valid name. No quantity
-of an arm, a gain or a torque exceeds `MAX_QUANTITY`, which keeps arithmetic far from its limits.
+Invariant: an error names the path of the key as the author wrote it, and the nearest valid
+name. No quantity of an arm, a gain or a torque exceeds `MAX_QUANTITY`, which keeps arithmetic
+far from its limits.
 """
 
 import difflib
@@ -28,12 +30,18 @@ K = TypeVar("K", bound=Frozen)
 
 
 def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
-    """Yields the kinds of a base, named by a tag, that the files of its package define, by file and place."""
+    """Yields the kinds of a base, named by a tag, that the files of its package define, by file
+    and place.
+    """
     for found in pkgutil.iter_modules(import_module(package).__path__):
         module = f"{package}.{found.name}"
         for one in vars(import_module(module)).values():
             own = isinstance(one, type) and issubclass(one, base) and one.__module__ == module
-            if own and one.__struct_config__.tag not in (None, one.__name__):  # else it is a base of others
+            # else it is a base of others
+            if own and one.__struct_config__.tag not in (
+                None,
+                one.__name__,
+            ):
                 yield one
 
 
@@ -44,7 +52,9 @@ NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_QUANTITY)]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 Real = Annotated[float, Meta(ge=-MAX_QUANTITY, le=MAX_QUANTITY)]
 _PER_JOINT = Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "joints"})
-_PER_PARAMETER = Meta(min_length=1, max_length=MAX_JOINTS * LINK_PARAMETERS, extra={"per": "parameters"})
+_PER_PARAMETER = Meta(
+    min_length=1, max_length=MAX_JOINTS * LINK_PARAMETERS, extra={"per": "parameters"}
+)
 _PER_COORDINATE = Meta(min_length=1, max_length=MAX_JOINTS, extra={"per": "shared"})
 _PER_AXIS = Meta(min_length=2, max_length=3, extra={"per": "axes"})
 Joints = Annotated[tuple[Real, ...], _PER_JOINT]
@@ -63,7 +73,9 @@ StructType = type[msgspec.Struct]
 
 
 class VectorCounts(NamedTuple):
-    """How many numbers the vectors of a site have: per joint, parameter, axis, shared coordinate."""
+    """How many numbers the vectors of a site have: per joint, parameter, axis, shared
+    coordinate.
+    """
 
     joints: int = JOINTS
     parameters: int = PARAMETERS
@@ -77,7 +89,9 @@ class VectorCounts(NamedTuple):
 
 
 class KeyProblem(NamedTuple):
-    """A key that cannot be as it is, below the table that is checked ("": the table itself), and why."""
+    """A key that cannot be as it is, below the table that is checked ("": the table itself),
+    and why.
+    """
 
     key: str
     problem: str
@@ -85,7 +99,9 @@ class KeyProblem(NamedTuple):
 
 @cache
 def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
-    """Returns the keys of a type whose vectors have a number per joint, parameter or axis, and per which."""
+    """Returns the keys of a type whose vectors have a number per joint, parameter or axis, and
+    per which.
+    """
     return {
         key: str(meta.extra[extra])
         for key, hint in get_type_hints(kind, include_extras=True).items()
@@ -95,7 +111,8 @@ def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
 
 
 def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> TomlTable:
-    """Returns a table with every single number or distribution written out as the vector of its type.
+    """Returns a table with every single number or distribution written out as the vector of its
+    type.
 
     A vector that is absent has its type's default, as long as the arm needs it.
     """
@@ -121,14 +138,18 @@ _OWNERS = {
 }
 
 
-def find_count_problem(table: TomlTable, kind: StructType, counts: VectorCounts) -> KeyProblem | None:
+def find_count_problem(
+    table: TomlTable, kind: StructType, counts: VectorCounts
+) -> KeyProblem | None:
     """Returns the first vector of a table that has too few or too many numbers, or None."""
     for key, per in {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}.items():
         wanted = getattr(counts, per)
         value = table.get(key)
         if isinstance(value, list) and len(value) != wanted:
             owner = f"{_OWNERS[per]} {wanted} {per if per != 'shared' else 'coordinates'}"
-            return KeyProblem(key, f"has {len(value)} number{'s' * (len(value) != 1)}, and {owner}")
+            return KeyProblem(
+                key, f"has {len(value)} number{'s' * (len(value) != 1)}, and {owner}"
+            )
     return None
 
 
@@ -158,13 +179,21 @@ def reword_problem(problem: str) -> str:
 
 MOST_LETTERS = 80
 MOST_COMPARED = 500
-"""Of a word that is compared with others, and how many these are: the time grows by more than the product."""
+"""Of a word that is compared with others, and how many these are: the time grows by more than
+the product.
+"""
 
 
 def suggest_nearest(word: str, valid: Sequence[str]) -> str:
-    """Returns "; did you mean ...?", or "" if nothing valid is near, or there is too much to compare."""
+    """Returns "; did you mean ...?", or "" if nothing valid is near, or there is too much to
+    compare.
+    """
     named = [name for name in valid[:MOST_COMPARED] if len(name) <= MOST_LETTERS]
-    match = difflib.get_close_matches(word, named, n=1, cutoff=0.5) if len(word) <= MOST_LETTERS else []
+    match = (
+        difflib.get_close_matches(word, named, n=1, cutoff=0.5)
+        if len(word) <= MOST_LETTERS
+        else []
+    )
     return f"; did you mean {match[0]!r}?" if match else ""
 
 
@@ -189,7 +218,9 @@ def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
     """Refuses a word that is not valid."""
     if word not in valid:
         hint = suggest_nearest(str(word), valid)
-        raise ScenarioError(f"is {word!r}, must be one of {', '.join(map(repr, valid))}{hint}", path=path)
+        raise ScenarioError(
+            f"is {word!r}, must be one of {', '.join(map(repr, valid))}{hint}", path=path
+        )
 
 
 def check_finite(value: Any, path: str) -> None:
@@ -197,7 +228,9 @@ def check_finite(value: Any, path: str) -> None:
     if isinstance(value, float) and not math.isfinite(value):
         raise ScenarioError(f"must be a finite number, is {value}", path=path)
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
-        raise ScenarioError(f"must be a number of at most 64 bits, has {value.bit_length()}", path=path)
+        raise ScenarioError(
+            f"must be a number of at most 64 bits, has {value.bit_length()}", path=path
+        )
     if isinstance(value, dict):
         for key, entry in value.items():
             check_finite(entry, f"{path}.{key}" if path else key)
@@ -228,11 +261,14 @@ UNITS = {
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Returns a name in words without its unit, and that: of the longest ending that is one, "" without any.
+    """Returns a name in words without its unit, and that: of the longest ending that is one, ""
+    without any.
 
     >>> split_unit("contact_stiffness_n_m")
     ('contact stiffness', 'N/m')
     """
     words = name.split("_")
-    endings = ((" ".join(words[:n]), UNITS.get("_".join(words[n:]), "")) for n in range(1, len(words)))
+    endings = (
+        (" ".join(words[:n]), UNITS.get("_".join(words[n:]), "")) for n in range(1, len(words))
+    )
     return next((found for found in endings if found[1]), (" ".join(words), ""))

@@ -1,11 +1,14 @@
-"""Output files and folders: refused where something exists, replaced only by force, written whole.
+"""Output files and folders: refused where something exists, replaced only by force, written
+whole.
 
 Invariant:
-- Nothing that exists is replaced unless the caller forces it, and an output bears its name only once it is
-  complete.
-- No output is written through a symbolic link that stands in place of an output file, or of a folder that the
-  program makes within its output: whoever planted the link would choose the file that is overwritten.
-- An optional package is imported where it is used; if it is missing, the error names what installs it.
+- Nothing that exists is replaced unless the caller forces it, and an output bears its name only
+  once it is complete.
+- No output is written through a symbolic link that stands in place of an output file, or of a
+  folder that the program makes within its output: whoever planted the link would choose the
+  file that is overwritten.
+- An optional package is imported where it is used; if it is missing, the error names what
+  installs it.
 """
 
 import errno
@@ -35,7 +38,8 @@ STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
 
 
 def require_libraries(*names: str) -> None:
-    """Refuses what needs these libraries, or all of `STUDY_LIBRARIES`, before any of it is done.
+    """Refuses what needs these libraries, or all of `STUDY_LIBRARIES`, before any of it is
+    done.
 
     Raises:
         UsageError: one of them is not installed.
@@ -46,7 +50,8 @@ def require_libraries(*names: str) -> None:
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
-    """Imports a module of an optional package; `purpose` names the features that need it, in the plural.
+    """Imports a module of an optional package; `purpose` names the features that need it, in
+    the plural.
 
     Raises:
         UsageError: the package is not installed.
@@ -61,7 +66,8 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
 def format_extra_install(extra: str) -> str:
     """Returns the command that installs an extra where this program runs.
 
-    - In the `.venv` of a clone: a target of the clone's Makefile, which installs locked versions.
+    - In the `.venv` of a clone: a target of the clone's Makefile, which installs locked
+      versions.
     - In another environment that uses a clone: pip, with the clone.
     - Anywhere else: pip, with the distribution.
     """
@@ -83,13 +89,20 @@ def find_version() -> str:
 
 
 def find_page(name: str) -> Path:
-    """Returns where a page of the documentation is on this machine: beside the sources, or as installed."""
+    """Returns where a page of the documentation is on this machine: beside the sources, or as
+    installed.
+    """
     sources = Path(__file__).parents[1] / "docs" / name
-    return sources if sources.is_file() else Path(sys.prefix) / "share" / "doc" / "trilat-net" / name
+    return (
+        sources
+        if sources.is_file()
+        else Path(sys.prefix) / "share" / "doc" / "trilat-net" / name
+    )
 
 
 def open_regular(path: Path, **how: Any) -> Any:
-    """Opens a file for reading, as text if its encoding is given; a pipe or a device may have no end.
+    """Opens a file for reading, as text if its encoding is given; a pipe or a device may have
+    no end.
 
     Raises:
         OSError: it is one of these, or cannot be opened.
@@ -125,14 +138,17 @@ def decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
 
     Args:
         raw: the content of the file.
-        any_code_page: True: other texts are read as well, since programs on Windows print in the code page
-            of their country. Their letters beyond ASCII come out as those of Latin-1.
+        any_code_page: True: other texts are read as well, since programs on Windows print in
+            the code page of their country. Their letters beyond ASCII come out as those of
+            Latin-1.
 
     Raises:
         ValueError: the content is not text; the message names a spreadsheet as a spreadsheet.
     """
     if raw[:4] == b"PK\x03\x04":
-        kind = next((kind for mark, kind in _ZIPPED_KINDS.items() if mark in raw), "a ZIP archive")
+        kind = next(
+            (kind for mark, kind in _ZIPPED_KINDS.items() if mark in raw), "a ZIP archive"
+        )
         raise ValueError(_say_not_text(kind))
     for mark, kind in _OTHER_KINDS.items():
         if raw.startswith(mark):
@@ -177,7 +193,9 @@ def digest_file(path: Path) -> str:
 
 
 def find_rights_of_others(path: Path) -> int:
-    """Returns the bits of a file's mode that let others in; 0 on Windows, where a list says who may."""
+    """Returns the bits of a file's mode that let others in; 0 on Windows, where a list says who
+    may.
+    """
     return 0 if os.name == "nt" else path.stat().st_mode & 0o077
 
 
@@ -222,7 +240,8 @@ def make_subfolder(folder: Path) -> Path:
 
 
 def create_file(path: Path) -> BinaryIO:
-    """Returns a new file without a buffer, in place of any earlier one, which is removed and not written to.
+    """Returns a new file without a buffer, in place of any earlier one, which is removed and
+    not written to.
 
     Raises:
         UsageError: a symbolic link stands in its place.
@@ -242,14 +261,20 @@ def extend_file(path: Path) -> BinaryIO:
     """
     refuse_link(path)
     no_link = getattr(os, "O_NOFOLLOW", 0)  # Windows has none
-    return open(path, "ab", buffering=0, opener=lambda name, flags: os.open(name, flags | no_link, 0o666))
+    return open(
+        path,
+        "ab",
+        buffering=0,
+        opener=lambda name, flags: os.open(name, flags | no_link, 0o666),
+    )
 
 
 def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:
     """Makes a folder for results: the given one, or the next free `runs/NAME-N`.
 
     Raises:
-        UsageError: it holds something (and `force` is not set; None: cannot be set), or it cannot be made.
+        UsageError: it holds something (and `force` is not set; None: cannot be set), or it
+            cannot be made.
     """
     if folder is None:
         return _make_next_folder(name)
@@ -286,7 +311,8 @@ def refuse_existing(
         path: the output.
         force: whether an earlier output of the same kind may be replaced.
         unfinished: name of the output while it is written, which must be free too.
-        manifest: file that marks a folder as an earlier output; None where the output is a file.
+        manifest: file that marks a folder as an earlier output; None where the output is a
+            file.
 
     Raises:
         UsageError: the name is taken, or is that of a symbolic link.
@@ -330,9 +356,11 @@ def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
 def write_whole(
     path: Path, data: bytes | str, *, force: bool = True, remedy: str = "", mode: int = 0o666
 ) -> None:
-    """Writes a file so that it exists whole or not at all; a device or pipe is written to directly.
+    """Writes a file so that it exists whole or not at all; a device or pipe is written to
+    directly.
 
-    A symbolic link in its place is refused; one that appears meanwhile is replaced, and not followed.
+    A symbolic link in its place is refused; one that appears meanwhile is replaced, and not
+    followed.
 
     Args:
         path: the file.
@@ -370,7 +398,8 @@ def write_whole(
 
 @contextmanager
 def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Iterator[Path]:
-    """Yields a scratch path; what is written there gets the output's name when the block ends well.
+    """Yields a scratch path; what is written there gets the output's name when the block ends
+    well.
 
     Args:
         path: the output.
@@ -411,7 +440,9 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
-def describe_write_error(path: Path, error: OSError, remedy: str = "") -> LogRefused | UsageError:
+def describe_write_error(
+    path: Path, error: OSError, remedy: str = ""
+) -> LogRefused | UsageError:
     """Returns the error of a failed write: `LogRefused`, with a remedy, if the disk refused it."""
     text = f"{path}: cannot be written: {error.strerror or error}"
     if error.errno in DISK_ERRNOS:

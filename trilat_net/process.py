@@ -1,8 +1,10 @@
-"""Process control: garbage collection, signals that end a program, commands for a shell, worker processes.
+"""Process control: garbage collection, signals that end a program, commands for a shell, worker
+processes.
 
-Invariants: garbage collection pauses only around code whose many objects form no cycles (records, lists of
-numbers). A signal ends nothing by itself: a loop polls it and ends in order. Worker processes leave Ctrl-C
-to the process that started them, and end with it or when it fails.
+Invariants: garbage collection pauses only around code whose many objects form no cycles
+(records, lists of numbers). A signal ends nothing by itself: a loop polls it and ends in order.
+Worker processes leave Ctrl-C to the process that started them, and end with it or when it
+fails.
 """
 
 import gc
@@ -55,7 +57,8 @@ def disable_gc() -> None:
 
 
 class LinePrinter:
-    """A context that prints lines in a thread of its own, so that a loop never waits for a terminal.
+    """A context that prints lines in a thread of its own, so that a loop never waits for a
+    terminal.
 
     Of lines that are not printed yet it keeps 256; more are lost.
     """
@@ -85,20 +88,25 @@ class LinePrinter:
                 self._say(text)
 
 
-_HANG_UP = getattr(signal, "SIGHUP", getattr(signal, "SIGBREAK", None))  # the terminal, or window, has gone
-ENDING_SIGNALS = tuple(one for one in (signal.SIGINT, signal.SIGTERM, _HANG_UP) if one is not None)
+# the terminal, or window, has gone
+_HANG_UP = getattr(signal, "SIGHUP", getattr(signal, "SIGBREAK", None))
+ENDING_SIGNALS = tuple(
+    one for one in (signal.SIGINT, signal.SIGTERM, _HANG_UP) if one is not None
+)
 """Signals that end a program in order."""
 _SAME_WISH_S = 0.2
-"""Signals that come within this time are one wish: a terminal and a parent process may both deliver it."""
+"""Signals that come within this time are one wish: a terminal and a parent process may both
+deliver it.
+"""
 
 
 class Interrupt:
     """A context that records the first signal that ends a program, as `number` (else 0).
 
-    The first signal asks for an orderly end, which may take seconds; a second one `insists` on an end at
-    once.
-    Whoever ignores the end of its terminal (`nohup`) goes on doing so. Where it `compiles`, and nothing else
-    is to be ended in order, a signal ends the process at once while the compiler runs.
+    The first signal asks for an orderly end, which may take seconds; a second one `insists` on
+    an end at once. Whoever ignores the end of its terminal (`nohup`) goes on doing so. Where it
+    `compiles`, and nothing else is to be ended in order, a signal ends the process at once
+    while the compiler runs.
     """
 
     def __init__(self, *, compiles: bool = False) -> None:
@@ -116,7 +124,10 @@ class Interrupt:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         for name, handler in self._before.items():
             signal.signal(name, handler)
@@ -137,7 +148,8 @@ class Interrupt:
     def raising(self) -> Iterator[None]:
         """Lets a signal interrupt the block at once, for long work that polls nothing.
 
-        Python swallows an exception raised inside a `__del__`; then the block is left at its end.
+        Python swallows an exception raised inside a `__del__`; then the block is left at its
+        end.
         """
         self.raises = True
         try:
@@ -152,7 +164,9 @@ class Interrupt:
         return self.number != 0
 
     def insists(self) -> bool:
-        """True once a second SIGINT or SIGTERM has arrived, later than one that a parent passes on."""
+        """True once a second SIGINT or SIGTERM has arrived, later than one that a parent passes
+        on.
+        """
         return self._insists
 
     @property
@@ -162,10 +176,12 @@ class Interrupt:
 
 
 def let_signals_kill() -> Callable[[], None]:
-    """Lets signals end the process at once where they may break off work; the function returned ends that.
+    """Lets signals end the process at once where they may break off work; the function returned
+    ends that.
 
-    Python sees a signal between two of its instructions: one call of a compiler takes minutes. The first
-    process of a container is not ended by what it leaves to the kernel: there a thread ends it.
+    Python sees a signal between two of its instructions: one call of a compiler takes minutes.
+    The first process of a container is not ended by what it leaves to the kernel: there a
+    thread ends it.
     """
     if threading.current_thread() is not threading.main_thread():
         return lambda: None
@@ -173,7 +189,9 @@ def let_signals_kill() -> Callable[[], None]:
     taken = {name: one for name, one in handlers if _breaks_off(getattr(one, "__self__", None))}
     first = bool(taken) and os.getpid() == 1
     for name in taken:
-        signal.signal(name, (lambda number, _: os._exit(128 + number)) if first else signal.SIG_DFL)
+        signal.signal(
+            name, (lambda number, _: os._exit(128 + number)) if first else signal.SIG_DFL
+        )
     unwatch = _watch_signals() if first else lambda: None
 
     def restore() -> None:
@@ -213,15 +231,20 @@ def join_words(words: Iterable[str]) -> str:
     """Returns a command as it is typed into a shell of this system."""
     if os.name != "nt":
         return shlex.join(words)
-    quoted = ('"' + word.replace('"', '\\"') + '"' for word in words)  # as cmd and PowerShell both take it
-    return " ".join(one[1:-1] if re.fullmatch(r'"[\w.:/\\=+-]+"', one) else one for one in quoted)
+    # as cmd and PowerShell both take it
+    quoted = ('"' + word.replace('"', '\\"') + '"' for word in words)
+    return " ".join(
+        one[1:-1] if re.fullmatch(r'"[\w.:/\\=+-]+"', one) else one for one in quoted
+    )
 
 
 def raise_priority(nice: int) -> bool:
-    """Runs the threads of this process but the main one above normal priority, where that is permitted.
+    """Runs the threads of this process but the main one above normal priority, where that is
+    permitted.
 
-    The main thread is left out because the processes that it starts would inherit the priority. Linux gives
-    every thread a nice value of its own; on other systems, and without the privilege, nothing changes.
+    The main thread is left out because the processes that it starts would inherit the priority.
+    Linux gives every thread a nice value of its own; on other systems, and without the
+    privilege, nothing changes.
 
     Args:
         nice: below 0 for a priority above normal; -20 is the highest.
@@ -246,20 +269,27 @@ def raise_priority(nice: int) -> bool:
 
 def count_cores() -> int:
     """Returns the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return (
+        len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count() or 1
+    )
 
 
 @contextmanager
 def worker_pool(count: int) -> Iterator[Executor]:
     """Yields an executor over worker processes; all of them are gone when the block ends.
 
-    The processes are started afresh (never forked, so threads and compiled code are safe) and do not import
-    the caller's script. An exception in the block, Ctrl-C included, kills them in the middle of their work.
+    The processes are started afresh (never forked, so threads and compiled code are safe) and
+    do not import the caller's script. An exception in the block, Ctrl-C included, kills them in
+    the middle of their work.
     """
     from loky import ProcessPoolExecutor
 
-    warnings.filterwarnings("ignore", "Failed to kill subprocesses")  # no pgrep: workers have no children
-    warnings.filterwarnings("ignore", "A worker was restarted")  # each keeps the laws that it compiled
+    # no pgrep: workers have no children
+    warnings.filterwarnings("ignore", "Failed to kill subprocesses")
+    # each keeps the laws that it compiled
+    warnings.filterwarnings("ignore", "A worker was restarted")
     facts = (os.getpid(), TrilatError.in_command)
     pool = ProcessPoolExecutor(count, initializer=_prepare_worker, initargs=facts)
     try:
@@ -273,10 +303,11 @@ def worker_pool(count: int) -> Iterator[Executor]:
 
 @contextmanager
 def hold_sigint() -> Iterator[None]:
-    """Holds Ctrl-C back in the block: processes that start there never get it, this one does afterwards.
+    """Holds Ctrl-C back in the block: processes that start there never get it, this one does
+    afterwards.
 
-    The mask is for the processes. It does not hold what arrives in another thread of this one, whose handler
-    Python runs here all the same: so the handler is exchanged too.
+    The mask is for the processes. It does not hold what arrives in another thread of this one,
+    whose handler Python runs here all the same: so the handler is exchanged too.
     """
     if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
         yield
@@ -303,7 +334,8 @@ def _exit_after(parent: int) -> None:
     from multiprocessing import connection, parent_process
 
     started_by = getattr(parent_process(), "sentinel", None)
-    if os.name == "nt" and started_by is not None:  # the number of a parent stays the same when it has gone
+    # the number of a parent stays the same when it has gone
+    if os.name == "nt" and started_by is not None:
         connection.wait([started_by])
         os._exit(1)
     pause = threading.Event()

@@ -1,8 +1,9 @@
-"""What a command found, as an object: in a line, as the text that the command prints, as a table, as JSON.
+"""What a command found, as an object: in a line, as the text that the command prints, as a
+table, as JSON.
 
-Invariant: a result holds values alone. Its text has one home, in `reporting`, which is imported when it is
-asked for: so a room that computes knows nothing of what is for eyes. JSON has no words for NaN and infinity;
-a quantity that is not known is null.
+Invariant: a result holds values alone. Its text has one home, in `reporting`, which is imported
+when it is asked for: so a room that computes knows nothing of what is for eyes. JSON has no
+words for NaN and infinity; a quantity that is not known is null.
 """
 
 import math
@@ -19,7 +20,9 @@ _REPR_LENGTH = 200
 
 
 class Result:
-    """What a command found. A type states `to_dict` where that is not its fields; `to_rows` for many rows."""
+    """What a command found. A type states `to_dict` where that is not its fields; `to_rows` for
+    many rows.
+    """
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of the command's --json."""
@@ -27,7 +30,13 @@ class Result:
 
     def to_rows(self) -> Sequence[Mapping[str, Any]]:
         """Returns the rows of `to_frame`."""
-        return [{key: one for key, one in self.to_dict().items() if not isinstance(one, dict | list)}]
+        return [
+            {
+                key: one
+                for key, one in self.to_dict().items()
+                if not isinstance(one, dict | list)
+            }
+        ]
 
     def summary(self) -> str:
         """Returns the text that the command prints."""
@@ -43,7 +52,9 @@ class Result:
 
     def headline(self) -> str:
         """Returns the result in one line."""
-        return next((line.strip() for line in self.summary().splitlines() if line.strip()), "nothing")
+        return next(
+            (line.strip() for line in self.summary().splitlines() if line.strip()), "nothing"
+        )
 
     def __repr__(self) -> str:
         text = self.headline()

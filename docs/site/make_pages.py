@@ -31,11 +31,16 @@ def main() -> None:
         write(name if name.endswith(".md") else f"{name}.md", read_beside_docs(name))
     write("index.md", read_beside_docs("README.md"))
     for page in PAGES.glob("*.md"):
-        page.write_text(page.read_text(encoding="utf-8").replace("](../", "]("), encoding="utf-8")
+        page.write_text(
+            page.read_text(encoding="utf-8").replace("](../", "]("), encoding="utf-8"
+        )
     write("reference/commands.md", list_commands())
     write("reference/python.md", list_functions())
     write("reference/scenario.md", show_template())
-    write("gallery.md", "\n\n".join(["# Gallery", *list_scenarios(pictures="--no-gallery" not in sys.argv)]))
+    write(
+        "gallery.md",
+        "\n\n".join(["# Gallery", *list_scenarios(pictures="--no-gallery" not in sys.argv)]),
+    )
     shutil.copy(HERE / "zensical.toml", SITE)
     (PAGES / "assets").mkdir()
     shutil.copy(HERE / "iframe-worker.js", PAGES / "assets")
@@ -104,9 +109,15 @@ def list_scenarios(*, pictures: bool) -> Iterator[str]:
         ]
         if pictures:
             write_figures(
-                tn.simulate(name), PAGES / "gallery" / name, ["overview"], width_in=7.0, formats=["png"]
+                tn.simulate(name),
+                PAGES / "gallery" / name,
+                ["overview"],
+                width_in=7.0,
+                formats=["png"],
             )
-            parts.append(f"![{name}: errors, speeds, torques and ages](gallery/{name}/overview.png)")
+            parts.append(
+                f"![{name}: errors, speeds, torques and ages](gallery/{name}/overview.png)"
+            )
         yield "\n\n".join(part for part in parts if part)
 
 

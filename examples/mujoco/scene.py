@@ -59,7 +59,10 @@ class Scene:
         place = facts.scenario.arms[facts.site].end_effector(facts.q0_rad)
         start[: len(place)] = place
         x_m, y_m, z_m = start + np.array([ahead_m, 0.0, 0.0])
-        half = {name: np.array(facts.bodies_m.get(name, size)) / 2.0 for name, size in SIZES_M.items()}
+        half = {
+            name: np.array(facts.bodies_m.get(name, size)) / 2.0
+            for name, size in SIZES_M.items()
+        }
         text = (
             describe_arm(arm.chain, arm.theta, facts.h_s)
             + {

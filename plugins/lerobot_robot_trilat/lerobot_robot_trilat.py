@@ -1,7 +1,9 @@
-"""A master of a session of trilat-net as a robot of LeRobot: a policy is one of two users of the slave.
+"""A master of a session of trilat-net as a robot of LeRobot: a policy is one of two users of
+the slave.
 
-Invariant: an action moves the hand that the scenario allows at the master, within its force and speed limits;
-the slave follows all of its users by their dominance factors. The features follow from the scenario alone.
+Invariant: an action moves the hand that the scenario allows at the master, within its force and
+speed limits; the slave follows all of its users by their dominance factors. The features follow
+from the scenario alone.
 """
 
 import time
@@ -52,7 +54,11 @@ class TrilatRobot(Robot):
         super().__init__(config)
         self.config = config
         scenario = tn.load_scenario(config.scenario or config.session)
-        live = [hand for hand in scenario.sites[config.site].hands if getattr(hand, "mode", "") in _ACTS]
+        live = [
+            hand
+            for hand in scenario.sites[config.site].hands
+            if getattr(hand, "mode", "") in _ACTS
+        ]
         if not live:
             raise ValueError(f"the scenario has no operator of kind 'live' at {config.site}")
         self._act, what = _ACTS[live[0].mode]
@@ -66,14 +72,17 @@ class TrilatRobot(Robot):
         self._sites = (config.slave, config.site)
         whats = ("pos", "vel", "tau_x")
         names = {site: arms[site].joint_names for site in self._sites}
-        self._joints = [f"{site}.{one}.{what}" for site in names for what in whats for one in names[site]]
+        self._joints = [
+            f"{site}.{one}.{what}" for site in names for what in whats for one in names[site]
+        ]
         self._hand: Any = None
         self._records: dict[str, Any] = {}
         self._stack = ExitStack()
 
     @property
     def observation_features(self) -> dict[str, type]:
-        """Per joint of the slave and of the own arm its angle, rad, speed, rad/s, external torque, N m.
+        """Per joint of the slave and of the own arm its angle, rad, speed, rad/s, external
+        torque, N m.
 
         Of the own hand its place, m (or angles, rad), and what it feels, N (or N m).
         """
@@ -81,7 +90,9 @@ class TrilatRobot(Robot):
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Where the hand goes, m (angles, rad), or what it pushes with, N, by its mode in the scenario."""
+        """Where the hand goes, m (angles, rad), or what it pushes with, N, by its mode in the
+        scenario.
+        """
         return dict.fromkeys(self._actions, float)
 
     @property
@@ -105,13 +116,19 @@ class TrilatRobot(Robot):
         own = self.config
         reach = {"connect": self.config.connect or None, "keys": self.config.keys or None}
         with ExitStack() as stack:
-            hand = tn.hand(own.session, own.site, source="policy", timeout_s=own.timeout_s, **reach)
+            hand = tn.hand(
+                own.session, own.site, source="policy", timeout_s=own.timeout_s, **reach
+            )
             entered = stack.enter_context(hand)
-            self._take = stack.enter_context(tn.session(own.session, **reach).records(*self._sites))
+            self._take = stack.enter_context(
+                tn.session(own.session, **reach).records(*self._sites)
+            )
             give_up_s = time.monotonic() + own.timeout_s
             while set(self._sites) - self._records.keys():
                 if time.monotonic() > give_up_s:
-                    raise DeviceNotConnectedError(f"no records of both {' and '.join(self._sites)}")
+                    raise DeviceNotConnectedError(
+                        f"no records of both {' and '.join(self._sites)}"
+                    )
                 time.sleep(0.002)
                 self._update()
             self._hand = entered
@@ -125,7 +142,12 @@ class TrilatRobot(Robot):
         hand = self._held()
         self._update()
         records = [self._records[site] for site in self._sites]
-        found = [value for one in records for vector in (one.q, one.qd, one.tau_x) for value in vector]
+        found = [
+            value
+            for one in records
+            for vector in (one.q, one.qd, one.tau_x)
+            for value in vector
+        ]
         felt = [-one for one in hand.force]
         return dict(zip(self.observation_features, [*found, *hand.pose, *felt], strict=True))
 

@@ -1,8 +1,10 @@
-"""A master of a session of trilat-net as a teleoperator of LeRobot: the person's arm, beside a policy's.
+"""A master of a session of trilat-net as a teleoperator of LeRobot: the person's arm, beside a
+policy's.
 
-Invariant: nothing is replaced when a person intervenes: the slave follows both users by their dominance
-factors, and an intervention is that the person's factor is above the program's. Feedback pulls the arm with
-the spring and the limits of its live hand, while torque is enabled and nobody else holds it.
+Invariant: nothing is replaced when a person intervenes: the slave follows both users by their
+dominance factors, and an intervention is that the person's factor is above the program's.
+Feedback pulls the arm with the spring and the limits of its live hand, while torque is enabled
+and nobody else holds it.
 """
 
 from contextlib import ExitStack
@@ -55,7 +57,11 @@ class TrilatTeleoperator(Teleoperator):
         super().__init__(config)
         self.config = config
         scenario = tn.load_scenario(config.scenario or config.session)
-        live = [hand for hand in scenario.sites[config.site].hands if getattr(hand, "mode", "") in _ACTS]
+        live = [
+            hand
+            for hand in scenario.sites[config.site].hands
+            if getattr(hand, "mode", "") in _ACTS
+        ]
         if not live:
             raise ValueError(f"the scenario has no operator of kind 'live' at {config.site}")
         self._act, what = _ACTS[live[0].mode]
@@ -70,12 +76,16 @@ class TrilatTeleoperator(Teleoperator):
 
     @property
     def action_features(self) -> dict[str, type]:
-        """Where the arm is, m (of a hand at the joints: angles, rad): the keys of the policy's robot."""
+        """Where the arm is, m (of a hand at the joints: angles, rad): the keys of the policy's
+        robot.
+        """
         return dict.fromkeys(self._places, float)
 
     @property
     def feedback_features(self) -> dict[str, type]:
-        """Where the arm is pulled, or what pushes it, N, by the mode of its hand in the scenario."""
+        """Where the arm is pulled, or what pushes it, N, by the mode of its hand in the
+        scenario.
+        """
         return dict.fromkeys(self._feedback, float)
 
     @property
@@ -99,9 +109,13 @@ class TrilatTeleoperator(Teleoperator):
         own = self.config
         reach = {"connect": self.config.connect or None, "keys": self.config.keys or None}
         with ExitStack() as stack:
-            hand = tn.hand(own.session, own.site, source="teleoperator", timeout_s=own.timeout_s, **reach)
+            hand = tn.hand(
+                own.session, own.site, source="teleoperator", timeout_s=own.timeout_s, **reach
+            )
             entered = stack.enter_context(hand)
-            self._find_shares = stack.enter_context(tn.session(own.session, **reach).shares(own.slave))
+            self._find_shares = stack.enter_context(
+                tn.session(own.session, **reach).shares(own.slave)
+            )
             self._hand = entered
             self._stack = stack.pop_all()
 
@@ -110,9 +124,14 @@ class TrilatTeleoperator(Teleoperator):
         return dict(zip(self._places, self._held().pose, strict=True))
 
     def get_felt(self) -> dict[str, float]:
-        """Returns the force of the arm on whoever holds it, N (of a hand at the joints: torques, N m)."""
+        """Returns the force of the arm on whoever holds it, N (of a hand at the joints:
+        torques, N m).
+        """
         felt = (-one for one in self._held().force)
-        return {key.replace(".pos", ".felt"): one for key, one in zip(self._places, felt, strict=True)}
+        return {
+            key.replace(".pos", ".felt"): one
+            for key, one in zip(self._places, felt, strict=True)
+        }
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
         """Pulls or pushes the arm, if torque is enabled; other keys mean nothing."""
@@ -134,7 +153,8 @@ class TrilatTeleoperator(Teleoperator):
         hand = self._held()
         shares = self._find_shares()
         return {
-            TeleopEvents.IS_INTERVENTION: shares[self.config.site] > shares[self.config.program],
+            TeleopEvents.IS_INTERVENTION: shares[self.config.site]
+            > shares[self.config.program],
             TeleopEvents.TERMINATE_EPISODE: bool(hand.over),
             TeleopEvents.SUCCESS: False,
             TeleopEvents.RERECORD_EPISODE: False,

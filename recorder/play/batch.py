@@ -1,10 +1,12 @@
 """Batches of messages in play order: an array of numbers over a few large byte buffers.
 
-Invariant: messages play by time and never out of order within a channel, whose order is that of its numbers.
-A message that stands later in the file than its number says (a backfilled one) plays in its place: at the
-latest together with the next one of its channel. Messages of one instant keep the order of the file.
+Invariant: messages play by time and never out of order within a channel, whose order is that of
+its numbers. A message that stands later in the file than its number says (a backfilled one)
+plays in its place: at the latest together with the next one of its channel. Messages of one
+instant keep the order of the file.
 
-A minute of 9000 messages/s takes some 100 MiB in this form, a third of the size as Python objects.
+A minute of 9000 messages/s takes some 100 MiB in this form, a third of the size as Python
+objects.
 """
 
 from array import array
@@ -19,11 +21,12 @@ from trilat_net.log.record_columns import Ints
 PlayedMessage = tuple[int, int, int, bytes]
 """Time in ns since the epoch, channel, number in it, and payload of a message.
 
-The number is the tick of a record, the place from 0 of another message of a site (of its events in each of
-its starts, which are `NUMBERS_OF_A_START` apart), else the time.
+The number is the tick of a record, the place from 0 of another message of a site (of its events
+in each of its starts, which are `NUMBERS_OF_A_START` apart), else the time.
 """
 PIECE_BYTES = 65_536
-"""Payload of a piece: small enough that preparing or receiving one does not delay the player."""
+"""Payload of a piece: small enough that preparing or receiving one does not delay the player.
+"""
 
 
 def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints, Ints]:
@@ -35,8 +38,8 @@ def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints,
         numbers: number in its channel, shape (K,); equal ones stay in file order.
 
     Returns:
-        The places, shape (K,), and the deadlines in that order, ns, shape (K,): ascending, and none later
-        than the message's time.
+        The places, shape (K,), and the deadlines in that order, ns, shape (K,): ascending, and
+        none later than the message's time.
     """
     places = np.arange(len(times_ns), dtype=np.int64)
     due_ns = times_ns.copy()
@@ -56,7 +59,8 @@ class MessageBatch:
     """Messages: a row of numbers each, over the bytes of their payloads.
 
     Attributes:
-        rows: time in ns since the epoch, channel, number in the channel, bounds of the payload; shape (K, 5).
+        rows: time in ns since the epoch, channel, number in the channel, bounds of the payload;
+            shape (K, 5).
     """
 
     rows: Ints
@@ -96,7 +100,9 @@ class MessageBatch:
         return MessageBatch(self.rows[places], self.data)
 
     def pieces(self, size: int = PIECE_BYTES) -> Iterator["MessageBatch"]:
-        """Yields the messages in pieces of some bytes, one message at least, over the same bytes."""
+        """Yields the messages in pieces of some bytes, one message at least, over the same
+        bytes.
+        """
         filled = np.cumsum(self.rows[:, 4] - self.rows[:, 3]) // size
         edges = [0, *(np.flatnonzero(np.diff(filled)) + 1).tolist(), len(self)]
         for begin, end in pairwise(edges):
@@ -110,7 +116,9 @@ class MessageBatch:
         rows[1:, 3] = rows[:-1, 4]
         rows[:1, 3] = 0
         view = memoryview(self.data)
-        return MessageBatch(rows, b"".join(view[start:end] for start, end in self.rows[:, 3:].tolist()))
+        return MessageBatch(
+            rows, b"".join(view[start:end] for start, end in self.rows[:, 3:].tolist())
+        )
 
 
 class BatchBuilder:
@@ -152,7 +160,9 @@ class BatchBuilder:
         return MessageBatch(rows, self._payloads)
 
     def _find_repeats(self, rows: Ints) -> list[int]:
-        """Returns the places of messages that are there before already, as in two parts of one session."""
+        """Returns the places of messages that are there before already, as in two parts of one
+        session.
+        """
         order = np.lexsort((rows[:, 2], rows[:, 1]))
         same = (np.diff(rows[order, 1:3], axis=0) == 0).all(axis=1)
         seen: set[tuple[int, int, bytes]] = set()

@@ -1,8 +1,9 @@
-"""The source of a player's messages: a preloaded batch, or a process that reads ahead and sorts.
+"""The source of a player's messages: a preloaded batch, or a process that reads ahead and
+sorts.
 
-Invariant: polling the source never waits. The reader process is bounded (L6) by `HORIZON_NS` of the log, the
-farthest that a message may stand from its turn, and by `LIMIT_BYTES`; it blocks on the pipe when the player
-does not read, and the two share nothing else.
+Invariant: polling the source never waits. The reader process is bounded (L6) by `HORIZON_NS` of
+the log, the farthest that a message may stand from its turn, and by `LIMIT_BYTES`; it blocks on
+the pipe when the player does not read, and the two share nothing else.
 """
 
 import multiprocessing
@@ -36,7 +37,9 @@ NICENESS = -5
 
 
 class RoundEnd(NamedTuple):
-    """The end of a round: messages that stood too far from their turn, and damaged files with the reason."""
+    """The end of a round: messages that stood too far from their turn, and damaged files with
+    the reason.
+    """
 
     strays: int
     torn: dict[Path, str]
@@ -59,7 +62,8 @@ class MessageSource:
     Attributes:
         ended: True once all messages of this round were given.
         whole: True if one batch is the whole round.
-        strays: messages that stood so far from their turn in the file that they are not played in it.
+        strays: messages that stood so far from their turn in the file that they are not played
+            in it.
     """
 
     def __init__(self, header: SessionHeader, batch: MessageBatch | None) -> None:
@@ -78,7 +82,8 @@ class MessageSource:
         """Starts the reader process; `loop`: it reads round after round."""
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe(duplex=False)
-        os.set_blocking(self._pipe.fileno(), False)  # as its own methods would wait for the rest of a piece
+        # as its own methods would wait for the rest of a piece
+        os.set_blocking(self._pipe.fileno(), False)
         self._process = context.Process(
             target=feed_player, args=(theirs, paths, selection, loop), daemon=True
         )
@@ -119,8 +124,11 @@ class MessageSource:
         except BlockingIOError:
             return False
         if not read:
-            if self._process.exitcode:  # None while it ends, which takes time that the player does not have
-                raise RuntimeFault(f"the process that reads the log ended with {self._process.exitcode}")
+            # None while it ends, which takes time that the player does not have
+            if self._process.exitcode:
+                raise RuntimeFault(
+                    f"the process that reads the log ended with {self._process.exitcode}"
+                )
             return False
         self._received += read
         while len(self._received) >= SIZE.size:
@@ -199,7 +207,9 @@ def sort_messages(
     yield release(1 << 62)
 
 
-def feed_player(pipe: Connection, paths: Sequence[Path], selection: PlaySelection, loop: bool) -> None:
+def feed_player(
+    pipe: Connection, paths: Sequence[Path], selection: PlaySelection, loop: bool
+) -> None:
     """Sends rounds of messages, until everything is read or the player has ended."""
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
@@ -209,7 +219,11 @@ def feed_player(pipe: Connection, paths: Sequence[Path], selection: PlaySelectio
         sink.write(SIZE.pack(len(pickled)) + pickled)
         sink.flush()
 
-    with suppress(BrokenPipeError), process.pause_gc(), open(pipe.fileno(), "wb", closefd=False) as sink:
+    with (
+        suppress(BrokenPipeError),
+        process.pause_gc(),
+        open(pipe.fileno(), "wb", closefd=False) as sink,
+    ):
         try:
             while True:
                 reader = SessionReader(paths, selection)

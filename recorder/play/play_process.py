@@ -60,7 +60,8 @@ class PlaybackSummary(NamedTuple):
         lateness: their lateness; None if they had no deadline.
         held_s: time spent waiting for receivers that did not keep up, s.
         cut: how often a receiver took nothing for 5 s and was cut off.
-        strays: messages that stood so far from their turn in the file that they were not played in it.
+        strays: messages that stood so far from their turn in the file that they were not played
+            in it.
         recorders: recorders that were present after the last message.
         stored: whether all of them reported that they have everything.
         refilled: messages given again to recorders that had missed them.
@@ -94,13 +95,21 @@ class Playback:
 
     def __post_init__(self) -> None:
         history = PlayedHistory(kept_ns=None if self.source.whole else HORIZON_NS)
-        self._stand_ins = SiteStandIns(self.bus, self.clock, self.options.session, self.header, history)
+        self._stand_ins = SiteStandIns(
+            bus=self.bus,
+            clock=self.clock,
+            session=self.options.session,
+            header=self.header,
+            history=history,
+        )
         self._shown_ns = self.clock.monotonic_ns()
         own = history, self.clock, self._publisher, self._attend, self.stopped
         self._player = Player(self.source, *own, low_cpu=self.options.low_cpu)
 
     def _publisher(self, channel: int) -> Callable[[bytes], None]:
-        key = map_key_to_session(self.header.topics[channel], self.header.session, self.options.session)
+        key = map_key_to_session(
+            self.header.topics[channel], self.header.session, self.options.session
+        )
         return self.bus.publisher(key, patient=True)
 
     def _attend(self, progress: PlayProgress) -> None:
@@ -111,7 +120,8 @@ class Playback:
             self.show(progress)
 
     def play(self, start_ns: int | None) -> PlaybackSummary:
-        """Plays from `start_ns` since the epoch of the log (None: from the first message) to the end.
+        """Plays from `start_ns` since the epoch of the log (None: from the first message) to
+        the end.
 
         It stays until all recorders have everything.
         """
@@ -166,7 +176,8 @@ class Playback:
             if stand_ins.attend():
                 give_up_ns = clock.monotonic_ns() + LINGER_NS
                 continue
-            if stand_ins.stored(stand_ins.recorders):  # the last messages may still be under way
+            # the last messages may still be under way
+            if stand_ins.stored(stand_ins.recorders):
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + LAST_EVENT_NS)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
@@ -195,7 +206,13 @@ def play_log(
         os.setpriority(os.PRIO_PROCESS, 0, NICE)
     with ExitStack() as stack:
         stack.enter_context(process.pause_gc())
-        bus = open_playback_bus(connection, clock, options.session, stopped, say)
+        bus = open_playback_bus(
+            connection=connection,
+            clock=clock,
+            session=options.session,
+            stopped=stopped,
+            say=say,
+        )
         if bus is None:
             return None
         stack.enter_context(closing(bus))
@@ -203,15 +220,24 @@ def play_log(
         source = stack.enter_context(closing(MessageSource(header, batch)))
         if batch is None:
             source.read(paths, selection, loop=options.loop)
-        playback = Playback(bus, clock, header, source, options, stopped, say, show)
+        playback = Playback(
+            bus=bus,
+            clock=clock,
+            header=header,
+            source=source,
+            options=options,
+            stopped=stopped,
+            say=say,
+            show=show,
+        )
         return playback.play(selection.start_ns)
 
 
 def map_key_to_session(topic: str, recorded_session: str, session: str) -> str:
     """Returns the key of a channel in the playback's session.
 
-    A topic of the recorded session becomes one of the new session; any other topic is played below the new
-    session, so that it meets no other.
+    A topic of the recorded session becomes one of the new session; any other topic is played
+    below the new session, so that it meets no other.
     """
     chunks = topic.strip("/").split("/")
     own = chunks[:2] == [topics.ROOT, recorded_session]

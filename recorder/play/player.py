@@ -1,9 +1,10 @@
 """The player: publishes each message once, in order, at its deadline.
 
-Invariant: deadlines are a pure function of log time, absolute, from one origin: a late message delays no
-later one. Sleep until shortly before the deadline, then poll the clock. Replies, reading ahead and progress
-use the slack between deadlines; without slack they get short slices a hundred times a second. The histogram
-of lateness (whole microseconds) is bounded for any length of play (L6).
+Invariant: deadlines are a pure function of log time, absolute, from one origin: a late message
+delays no later one. Sleep until shortly before the deadline, then poll the clock. Replies,
+reading ahead and progress use the slack between deadlines; without slack they get short slices
+a hundred times a second. The histogram of lateness (whole microseconds) is bounded for any
+length of play (L6).
 """
 
 import math
@@ -87,7 +88,9 @@ LATENESS_LIMIT_US = 100_000
 
 
 class LatenessSummary(NamedTuple):
-    """Median, 99th percentile and maximum of the lateness, us; a quantile above the limit is the maximum."""
+    """Median, 99th percentile and maximum of the lateness, us; a quantile above the limit is
+    the maximum.
+    """
 
     p50_us: int
     p99_us: int
@@ -127,7 +130,8 @@ IDLE_NS = 1_000_000
 HELD_NS = 2_000_000
 """A publisher that takes longer waits for others, or for a processor."""
 CUT_NS = 4_900_000_000
-"""A receiver that delays a publisher for so long loses the connection, and the messages on it."""
+"""A receiver that delays a publisher for so long loses the connection, and the messages on it.
+"""
 LOOP_PAUSE_NS = 100_000_000
 """Between the last message of a round and the first of the next."""
 
@@ -135,7 +139,9 @@ Publish = Callable[[bytes], None]
 
 
 class PlayProgress(NamedTuple):
-    """Time of the next message, ns since the epoch of the log; messages so far; their largest lateness."""
+    """Time of the next message, ns since the epoch of the log; messages so far; their largest
+    lateness.
+    """
 
     position_ns: int
     published: int
@@ -143,7 +149,8 @@ class PlayProgress(NamedTuple):
 
 
 class Player:
-    """One play of a log: `publisher` returns the publisher of a channel, `attend` does a little other work.
+    """One play of a log: `publisher` returns the publisher of a channel, `attend` does a little
+    other work.
 
     Attributes:
         counts: messages published, by channel.
@@ -177,7 +184,9 @@ class Player:
         self._first: MessageBatch | None = None
 
     def prepare(self) -> int | None:
-        """Waits for the first messages; returns the time of the first one, or None if there are none."""
+        """Waits for the first messages; returns the time of the first one, or None if there are
+        none.
+        """
         self._first = self._next()
         if self._first is None:
             return None

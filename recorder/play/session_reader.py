@@ -1,8 +1,10 @@
-"""Reads the messages to play out of a log: channel and time selection, one pass over the files, preloading.
+"""Reads the messages to play out of a log: channel and time selection, one pass over the files,
+preloading.
 
-Invariant: payloads pass through unchanged; only an event's number and a sender's boot are decoded. The
-default selection is what the sites published: neither the recorder's statistics nor the file's views. A
-preloaded log is bounded (L6); a larger one is read by another process during play (`message_source`).
+Invariant: payloads pass through unchanged; only an event's number and a sender's boot are
+decoded. The default selection is what the sites published: neither the recorder's statistics
+nor the file's views. A preloaded log is bounded (L6); a larger one is read by another process
+during play (`message_source`).
 """
 
 import math
@@ -42,8 +44,10 @@ class PlaySelection:
     """The messages of a log that are played.
 
     Attributes:
-        channels: the channels that are played; if it includes none by name: those that sites published.
-        start_ns: messages before this are not played, ns since the epoch; None: from the first one on.
+        channels: the channels that are played; if it includes none by name: those that sites
+            published.
+        start_ns: messages before this are not played, ns since the epoch; None: from the first
+            one on.
         stop_ns: messages after this are not played; None: to the last one.
     """
 
@@ -53,10 +57,16 @@ class PlaySelection:
     time: PlayTime = "publish"
 
     def takes(self, topic: str, sites: Collection[str]) -> bool:
-        """True if a channel is played, by its topic ("/trilat/paper/m1/state") and the scenario's sites."""
+        """True if a channel is played, by its topic ("/trilat/paper/m1/state") and the
+        scenario's sites.
+        """
         parsed = topics.parse_key(topic.strip("/"))
-        published = parsed is not None and parsed.member in sites and parsed.channel in SITE_CHANNELS
-        return self.channels.takes(topic.strip("/")) and (published or bool(self.channels.include))
+        published = (
+            parsed is not None and parsed.member in sites and parsed.channel in SITE_CHANNELS
+        )
+        return self.channels.takes(topic.strip("/")) and (
+            published or bool(self.channels.include)
+        )
 
     def holds(self, t_ns: int) -> bool:
         """True if an instant is played, ns since the epoch."""
@@ -79,7 +89,9 @@ def parse_selection(
         UsageError: the options contradict each other, or one is not valid.
     """
     if time not in get_args(PlayTime):
-        raise UsageError(f"--time is publish (as it was sent) or log (as it arrived), not {time!r}")
+        raise UsageError(
+            f"--time is publish (as it was sent) or log (as it arrived), not {time!r}"
+        )
     for name, seconds in (("--start", start_s), ("--stop", stop_s), ("--duration", duration_s)):
         if seconds is not None and not (math.isfinite(seconds) and abs(seconds) <= 1e9):
             raise UsageError(f"{name} is a number of seconds, not {seconds:g}")
@@ -91,13 +103,18 @@ def parse_selection(
         stop_s = (start_s or 0.0) + duration_s
     if start_s is not None and stop_s is not None and stop_s <= start_s:
         raise UsageError(f"--stop is after --start ({start_s:g} s), not {stop_s:g} s")
-    start_ns, stop_ns = (None if at_s is None else round(at_s * NS_PER_S) for at_s in (start_s, stop_s))
-    return PlaySelection(parse_channel_filter(include, exclude), start_ns, stop_ns, cast(PlayTime, time))
+    start_ns, stop_ns = (
+        None if at_s is None else round(at_s * NS_PER_S) for at_s in (start_s, stop_s)
+    )
+    return PlaySelection(
+        parse_channel_filter(include, exclude), start_ns, stop_ns, cast(PlayTime, time)
+    )
 
 
 HORIZON_NS = 70 * NS_PER_S
-"""How much later than its turn a message may stand in a file: sites keep a minute for recorders that missed
-something."""
+"""How much later than its turn a message may stand in a file: sites keep a minute for recorders
+that missed something.
+"""
 _LAST = 1 << 61
 """Bound of times and numbers, whatever a file says."""
 NUMBERS_OF_A_START = 1 << 40
@@ -128,7 +145,8 @@ class SessionHeader:
     Attributes:
         version: schema version of the messages; 0 if unknown.
         topics: topics of the channels that are played, by number.
-        first_ns: the earliest message of any channel so far, ns since the epoch; `last_ns`: the latest one.
+        first_ns: the earliest message of any channel so far, ns since the epoch; `last_ns`: the
+            latest one.
     """
 
     session: str
@@ -144,13 +162,17 @@ class SessionHeader:
 
 
 class _PlayedChannel:
-    """One channel of a file: its number if it is played, else -1, and the numbers of its messages."""
+    """One channel of a file: its number if it is played, else -1, and the numbers of its
+    messages.
+    """
 
     def __init__(self, topic: str, header: SessionHeader, selection: PlaySelection) -> None:
         parsed = topics.parse_key(topic.strip("/"))
         sites = header.scenario.sites
         own = parsed is not None and parsed.member in sites and parsed.session == header.session
-        self.site, self.kind = (parsed.member, parsed.channel) if parsed is not None and own else ("", "")
+        self.site, self.kind = (
+            (parsed.member, parsed.channel) if parsed is not None and own else ("", "")
+        )
         self.rate_hz = sites[self.site].rate_hz if self.site else 0
         self.place = -1
         if selection.takes(topic, sites):
@@ -177,7 +199,8 @@ class _PlayedChannel:
 class SessionReader:
     """One pass over the files of a session; several are its parts in their order.
 
-    `progress` is called with the bytes read and their total. `header` is None before the first message.
+    `progress` is called with the bytes read and their total. `header` is None before the first
+    message.
     """
 
     def __init__(
@@ -192,11 +215,14 @@ class SessionReader:
         """Yields the messages to play, in file order.
 
         Raises:
-            LogError: a file is missing, no log of trilat-net, or of another session than the first.
+            LogError: a file is missing, no log of trilat-net, or of another session than the
+                first.
         """
         for path in self._paths:
             with reading(path) as stream:
-                yield from self._read_file(path, McapReader(stream, str(path), self._progress, kept=False))
+                yield from self._read_file(
+                    path, McapReader(stream, str(path), self._progress, kept=False)
+                )
 
     def _read_file(self, path: Path, reader: McapReader) -> Iterator[PlayedMessage]:
         epoch_ns: int | None = None
@@ -215,7 +241,9 @@ class SessionReader:
                 return  # all that follows came later still
             channel = channels.get(item.topic)
             if channel is None:
-                channel = channels[item.topic] = _PlayedChannel(item.topic, header, self._selection)
+                channel = channels[item.topic] = _PlayedChannel(
+                    item.topic, header, self._selection
+                )
             header.first_ns = min(header.first_ns, t_ns)
             header.last_ns = max(header.last_ns, t_ns)
             if channel.site and channel.site not in header.boots:
@@ -232,7 +260,9 @@ class SessionReader:
             header.torn[path] = f"damaged in {count_nouns(len(reader.damaged), 'place')}"
 
     def _read_session(self, path: Path, reader: McapReader) -> tuple[int, SessionHeader]:
-        """Returns a file's epoch in Unix time, ns, and the session; refuses one of another session."""
+        """Returns a file's epoch in Unix time, ns, and the session; refuses one of another
+        session.
+        """
         metadata = reader.metadata.get(SESSION, {})
         if "session" not in metadata or SCENARIO not in reader.attachments:
             raise LogError(f"{path}: is an MCAP file, but no log of trilat-net")
@@ -243,7 +273,13 @@ class SessionReader:
             if self.header is None:
                 scenario = parse_embedded(text, f"{path}: scenario")
                 fingerprint = metadata.get("fingerprint", "")
-                self.header = SessionHeader(metadata["session"], scenario, text, fingerprint, version)
+                self.header = SessionHeader(
+                    session=metadata["session"],
+                    scenario=scenario,
+                    scenario_text=text,
+                    fingerprint=fingerprint,
+                    version=version,
+                )
         except (ScenarioError, ValueError) as error:
             raise LogError(f"{path}: its session cannot be read: {error}") from None
         if (self.header.session, self.header.scenario_text) != (metadata["session"], text):
@@ -259,9 +295,13 @@ SEARCH_LIMIT = 100_000
 
 
 def preload_messages(
-    paths: Sequence[Path], selection: PlaySelection, limit_bytes: int, progress: Progress | None = None
+    paths: Sequence[Path],
+    selection: PlaySelection,
+    limit_bytes: int,
+    progress: Progress | None = None,
 ) -> tuple[SessionHeader, MessageBatch | None]:
-    """Reads the session and the messages to play, in order; None in place of more than the limit of memory.
+    """Reads the session and the messages to play, in order; None in place of more than the
+    limit of memory.
 
     Raises:
         LogError: a file is missing, or no log of trilat-net.
@@ -288,7 +328,9 @@ def preload_messages(
     return reader.header, None
 
 
-def _describe_empty_selection(path: Path, selection: PlaySelection, header: SessionHeader) -> str:
+def _describe_empty_selection(
+    path: Path, selection: PlaySelection, header: SessionHeader
+) -> str:
     if header.last_ns < header.first_ns:
         return f"{path}: holds no message"
     span = f"from {header.first_ns / NS_PER_S:.3f} s to {header.last_ns / NS_PER_S:.3f} s"

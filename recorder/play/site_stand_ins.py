@@ -1,8 +1,10 @@
 """Stand-ins for the sites of a played session: tokens, identities, pings and backfill.
 
-Invariant: recorders, viewers and pings find what a running session would show a late joiner; apart from
-identities, nothing is published in a site's name that the log does not hold. Backfill covers messages already
-played: a minute of them when the log is read during play (L6), all of them when it is preloaded.
+Invariant: recorders, viewers and pings find what a running session would show a late joiner;
+apart from identities, nothing is published in a site's name that the log does not hold.
+Backfill covers messages already
+played: a minute of them when the log is read during play (L6), all of them when it is
+preloaded.
 """
 
 from bisect import bisect_left
@@ -18,7 +20,12 @@ from trilat_net.log.record_columns import Ints
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Query
 from trilat_net.net.clock import Clock
-from trilat_net.net.membership import MemberQuery, describe_member, liveliness_token, read_messages
+from trilat_net.net.membership import (
+    MemberQuery,
+    describe_member,
+    liveliness_token,
+    read_messages,
+)
 from trilat_net.net.messages import Event
 from trilat_net.net.pinging import answer_backfill, answer_pings
 from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES, BackfillRequest
@@ -28,7 +35,9 @@ from .batch import MessageBatch
 from .session_reader import NUMBERS_OF_A_START, SessionHeader
 
 _PlayedRun = tuple[Ints, Ints, MessageBatch]
-"""Messages of one channel within one batch: their numbers, ascending, their places in it, and the batch."""
+"""Messages of one channel within one batch: their numbers, ascending, their places in it, and
+the batch.
+"""
 
 
 class PlayedHistory:
@@ -66,7 +75,8 @@ class PlayedHistory:
 
         Args:
             channel: the channel.
-            first: number of the first one wanted; without a message of that number, the next one comes first.
+            first: number of the first one wanted; without a message of that number, the next
+                one comes first.
             last: number of the last one wanted.
         """
         runs = list(self._runs.get(channel, ()))
@@ -75,17 +85,23 @@ class PlayedHistory:
         size = 0
         wanted = first
         begun = first
-        for numbers, places, batch in runs[bisect_left(runs, first, key=lambda run: int(run[0][-1])) :]:
+        for numbers, places, batch in runs[
+            bisect_left(runs, first, key=lambda run: int(run[0][-1])) :
+        ]:
             begin = int(np.searchsorted(numbers, wanted))
             part = slice(begin, begin + BACKFILL_MESSAGES + 1)
-            for number, place in zip(numbers[part].tolist(), places[part].tolist(), strict=True):
+            for number, place in zip(
+                numbers[part].tolist(), places[part].tolist(), strict=True
+            ):
                 if not payloads:
                     begun = wanted = max(first, min(number, made))
                 if number < wanted:
                     continue  # a repeated number
                 payload = batch.payload(place)
                 size += len(payload)
-                full = len(payloads) == BACKFILL_MESSAGES or (payloads and size > BACKFILL_BYTES)
+                full = len(payloads) == BACKFILL_MESSAGES or (
+                    payloads and size > BACKFILL_BYTES
+                )
                 if number > min(last, made - 1) or number > wanted or full:
                     return begun, payloads
                 payloads.append(payload)
@@ -105,7 +121,12 @@ class SiteStandIns:
     """
 
     def __init__(
-        self, bus: Bus, clock: Clock, session: str, header: SessionHeader, history: PlayedHistory
+        self,
+        bus: Bus,
+        clock: Clock,
+        session: str,
+        header: SessionHeader,
+        history: PlayedHistory,
     ) -> None:
         self.recorders: set[str] = set()
         self.refilled = 0
@@ -116,16 +137,25 @@ class SiteStandIns:
         self._met: set[str] = set()
         self._boots: dict[str, tuple[int, int]] = {}
         self._presence = bus.presence(topics.presence_key(session, topics.RECORDER))
-        self._recorder_events = bus.inbox(topics.key(session, topics.RECORDER, topics.EVENT), 256)
+        self._recorder_events = bus.inbox(
+            topics.key(session, topics.RECORDER, topics.EVENT), 256
+        )
         self._recorder_query = MemberQuery(bus, clock, session, topics.RECORDER)
         self._infos = {
-            site: describe_member(site, boot, clock, header.scenario_text, fingerprint=header.fingerprint)
+            site: describe_member(
+                site, boot, clock, header.scenario_text, fingerprint=header.fingerprint
+            )
             for site, boot in header.boots.items()
         }
-        self._encoded: dict[str, tuple[int, bytes]] = {}  # per site its identity, and since when
+        self._encoded: dict[
+            str, tuple[int, bytes]
+        ] = {}  # per site its identity, and since when
         self._queries = {}
         for site, info in self._infos.items():
-            keys = topics.key(session, site, topics.INFO), topics.key(session, site, topics.PAST)
+            keys = (
+                topics.key(session, site, topics.INFO),
+                topics.key(session, site, topics.PAST),
+            )
             self._queries[site] = bus.questions(keys[0]), bus.questions(keys[1])
             answer_pings(bus, clock, session, info)
             bus.announce(liveliness_token(session, site, info.boot))
@@ -138,11 +168,14 @@ class SiteStandIns:
             "epoch_unix_ns": self._clock.unix_ns() + epoch_mono_ns - self._clock.monotonic_ns(),
             "boots": dict(self._header.boots),
         }
-        self._infos = {site: msgspec.structs.replace(info, **running) for site, info in self._infos.items()}
+        self._infos = {
+            site: msgspec.structs.replace(info, **running) for site, info in self._infos.items()
+        }
         self._encoded.clear()
 
     def attend(self) -> bool:
-        """Answers identity queries, notes presence and events of recorders, and answers one backfill query.
+        """Answers identity queries, notes presence and events of recorders, and answers one
+        backfill query.
 
         Returns:
             True if there was a backfill query.
@@ -177,7 +210,9 @@ class SiteStandIns:
         return not self.recorders - self._met
 
     def stored(self, recorders: Collection[str]) -> bool:
-        """True if all of these recorders have reported that they stored everything of every site."""
+        """True if all of these recorders have reported that they stored everything of every
+        site.
+        """
         return all(self._stored.get(boot, set()) >= self._infos.keys() for boot in recorders)
 
     def _find_channel(self, site: str, channel: str) -> int:
@@ -185,7 +220,9 @@ class SiteStandIns:
         return self._header.topics.index(topic) if topic in self._header.topics else -1
 
     def _find_start(self, site: str) -> tuple[int, int]:
-        """Returns which start of a site is played, from 0, and its boot: that of its newest event."""
+        """Returns which start of a site is played, from 0, and its boot: that of its newest
+        event.
+        """
         channel = self._find_channel(site, topics.EVENT)
         newest = self._history.made.get(channel, 0) - 1
         start = max(newest, 0) // NUMBERS_OF_A_START
@@ -203,7 +240,9 @@ class SiteStandIns:
             channel = self._find_channel(site, wanted.channel)
             before = start * NUMBERS_OF_A_START if wanted.channel == topics.EVENT else 0
             made = self._history.made.get(channel, 0) - before
-            first, payloads = self._history.chunk(channel, wanted.first + before, wanted.last + before)
+            first, payloads = self._history.chunk(
+                channel, wanted.first + before, wanted.last + before
+            )
             return max(first - before, 0), payloads, max(made, 0)
 
         self.refilled += answer_backfill(query, site, boot, find)

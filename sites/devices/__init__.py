@@ -1,7 +1,9 @@
-"""Devices in somebody's hand: where they are, how they move, their buttons, and the force that they render.
+"""Devices in somebody's hand: where they are, how they move, their buttons, and the force that
+they render.
 
-Invariant: a device is one class, found by its file in this folder, and nothing else lists them. All speak of
-whoever holds them: x to the right, y ahead, z up; m, m/s, N. Their buttons are "a", "b", "c", from the first.
+Invariant: a device is one class, found by its file in this folder, and nothing else lists them.
+All speak of whoever holds them: x to the right, y ahead, z up; m, m/s, N. Their buttons are
+"a", "b", "c", from the first.
 """
 
 from collections.abc import Mapping
@@ -15,7 +17,8 @@ Vector = tuple[float, float, float]
 
 
 class DeviceState(NamedTuple):
-    """What a device measures: its place, of which only changes count, its velocity, and what is pressed.
+    """What a device measures: its place, of which only changes count, its velocity, and what is
+    pressed.
 
     >>> tn.DeviceState((0.0, -0.12, 0.15), (0.0, 0.0, 0.0), {"a": True}).buttons["a"]
     True
@@ -27,7 +30,8 @@ class DeviceState(NamedTuple):
 
 
 class Device(Protocol):
-    """A device, read `rate_hz` times a second; a context, which is entered again after each loss of it.
+    """A device, read `rate_hz` times a second; a context, which is entered again after each
+    loss of it.
 
     >>> tn.session("play").lead("m1", MyDevice())  # doctest: +SKIP
     """
@@ -48,7 +52,8 @@ class Device(Protocol):
 
 
 def open_device(text: str) -> Device:
-    """Returns the device of a text such as "spacemouse" or "haply_inverse3=ws://127.0.0.1:10001".
+    """Returns the device of a text such as "spacemouse" or
+    "haply_inverse3=ws://127.0.0.1:10001".
 
     Raises:
         UsageError: there is no such device.
@@ -56,8 +61,12 @@ def open_device(text: str) -> Device:
     name, _, address = text.partition("=")
     known = sorted(found.name for found in iter_modules(__path__))
     if name not in known:
-        raise UsageError(f"--device is one of {', '.join(known)}, with its =ADDRESS if need be, not {text!r}")
+        raise UsageError(
+            f"--device is one of {', '.join(known)}, with its =ADDRESS if need be, not {text!r}"
+        )
     module = import_module(f"{__name__}.{name}")
-    kind = next(one for word, one in vars(module).items() if word.lower() == name.replace("_", ""))
+    kind = next(
+        one for word, one in vars(module).items() if word.lower() == name.replace("_", "")
+    )
     made: Device = kind(*([address] if address else []))
     return made

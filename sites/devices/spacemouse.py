@@ -1,7 +1,8 @@
-"""3Dconnexion's SpaceMouse, by the reports of Linux' hidraw: it moves to where its cap is pushed.
+"""3Dconnexion's SpaceMouse, by the reports of Linux' hidraw: it moves to where its cap is
+pushed.
 
-Invariant: a cap that reports nothing for `STILL_NS` is at rest, as one that is pushed reports all the time.
-No page need be open, as WebHID would need.
+Invariant: a cap that reports nothing for `STILL_NS` is at rest, as one that is pushed reports
+all the time. No page need be open, as WebHID would need.
 """
 
 import os
@@ -28,7 +29,8 @@ def find_spacemouse(devices: Path = Path("/sys/class/hidraw")) -> str:
 
 
 class SpaceMouse:
-    """A SpaceMouse, by its path or the first one: its first buttons are "a" and "b"; it renders no force.
+    """A SpaceMouse, by its path or the first one: its first buttons are "a" and "b"; it renders
+    no force.
 
     >>> tn.session("play").lead("m1", tn.SpaceMouse("/dev/hidraw3"))  # doctest: +SKIP
     """
@@ -64,7 +66,9 @@ class SpaceMouse:
         (u, v, w) = self._speed
         self._place = x + passed_s * u, y + passed_s * v, z + passed_s * w
         return DeviceState(
-            self._place, self._speed, {"a": bool(self._pressed & 1), "b": bool(self._pressed & 2)}
+            self._place,
+            self._speed,
+            {"a": bool(self._pressed & 1), "b": bool(self._pressed & 2)},
         )
 
     def _take_report(self, now_ns: int) -> bool:

@@ -120,7 +120,11 @@ to = { delay_ms = 1.0 }
 """Links of many kinds, two sites that lose a peer for a second, changes, one of them after the end."""
 
 ORDERED = {
-    "a": {500: Change(3.0, link="c->a", to={"model": "uniform", "delay_ms": 30.0, "half_width_ms": 30.0})}
+    "a": {
+        500: Change(
+            3.0, link="c->a", to={"model": "uniform", "delay_ms": 30.0, "half_width_ms": 30.0}
+        )
+    }
 }
 """What is ordered while it runs besides: per site and tick."""
 
@@ -141,7 +145,9 @@ def busy() -> Run:
     return driven(parse_scenario(BUSY))
 
 
-def driven(scenario: Scenario, lost: Collection[Sample] = (), twice: Collection[Sample] = ()) -> Run:
+def driven(
+    scenario: Scenario, lost: Collection[Sample] = (), twice: Collection[Sample] = ()
+) -> Run:
     """A run with `ORDERED` changes, where they fit, over a network that loses and doubles some samples."""
     at: dict[str, dict[int, list[list[int]]]] = {}
     for name in scenario.names:
@@ -205,10 +211,19 @@ def rewritten(
     for site in log.sites:
         for state in filter(keep, log[site].states):
             payload = encode(change(state))
-            writer.add(topics.key("again", site, topics.STATE), payload, state.t_ns, 0, state.tick, state)
+            writer.add(
+                topics.key("again", site, topics.STATE),
+                payload,
+                state.t_ns,
+                0,
+                state.tick,
+                state,
+            )
     for message in others:
         stats = isinstance(message, LinkStats)
-        member, channel = (message.site, topics.LINK) if stats else (message.member, topics.EVENT)
+        member, channel = (
+            (message.site, topics.LINK) if stats else (message.member, topics.EVENT)
+        )
         writer.add(topics.key("again", member, channel), encode(message), 0, 0, 0, message)
     writer.flush()
     if finished:
@@ -239,5 +254,7 @@ def replaced(state: State, **fields: object) -> State:
 def in_modes(modes: Sequence[str]) -> SiteLog:
     """The first records of a site of `paper`, with other modes."""
     part = simulated("paper")["m1"]
-    states = [replaced(state, mode=mode) for state, mode in zip(part.states, modes, strict=False)]
+    states = [
+        replaced(state, mode=mode) for state, mode in zip(part.states, modes, strict=False)
+    ]
     return SiteLog("m1", part.peers, part.rate_hz, [encode(state) for state in states], "again")

@@ -14,13 +14,20 @@ def test_a_whole_log_is_as_it_was_recorded() -> None:
         assert track.known.all()
         assert track.follows.all()
         assert np.array_equal(track.t_s, log[site].t_s)
-        assert all(np.array_equal(getattr(track, name), getattr(log[site], name)) for name in RECORD_COLUMNS)
-        assert all(np.array_equal(track.used[peer], log[site].used[peer]) for peer in log[site].peers)
+        assert all(
+            np.array_equal(getattr(track, name), getattr(log[site], name))
+            for name in RECORD_COLUMNS
+        )
+        assert all(
+            np.array_equal(track.used[peer], log[site].used[peer]) for peer in log[site].peers
+        )
 
 
 def test_a_gap_is_filled_straight_and_marked() -> None:
     whole = logs.simulated("paper")
-    log = logs.rewritten(whole, lambda state: not (state.site == "s" and 100 <= state.tick < 120))
+    log = logs.rewritten(
+        whole, lambda state: not (state.site == "s" and 100 <= state.tick < 120)
+    )
     track = align_records(log, common=True)["s"]
     assert np.flatnonzero(~track.known).tolist() == list(range(100, 120))
     assert track.q[110] == pytest.approx(track.q[99] + 11 / 21 * (track.q[120] - track.q[99]))
@@ -30,13 +37,24 @@ def test_a_gap_is_filled_straight_and_marked() -> None:
 def test_end_is_that_of_time_that_all_sites_have() -> None:
     log = logs.rewritten(
         logs.simulated("four"),
-        lambda state: (state.site != "a" or state.t_ns >= 5e8) and (state.site != "d" or state.t_ns < 12e8),
+        lambda state: (
+            (state.site != "a" or state.t_ns >= 5e8)
+            and (state.site != "d" or state.t_ns < 12e8)
+        ),
     )
     found = align_records(log, common=True)
-    assert {site: track.t_s[0] for site, track in found.items()} == {"a": 0.5, "b": 0.0, "c": 0.0, "d": 0.0}
+    assert {site: track.t_s[0] for site, track in found.items()} == {
+        "a": 0.5,
+        "b": 0.0,
+        "c": 0.0,
+        "d": 0.0,
+    }
     assert all(1.2 - 0.03 < track.t_s[-1] < 1.2 for track in found.values())
     assert (
-        align_records(logs.rewritten(log, lambda state: state.site != "a" or state.t_ns > 13e8), common=True)
+        align_records(
+            logs.rewritten(log, lambda state: state.site != "a" or state.t_ns > 13e8),
+            common=True,
+        )
         == {}
     )
 
@@ -47,12 +65,17 @@ def test_a_diverged_record_is_left_out_of_a_track() -> None:
     gone = [site for site in log.sites if log[site].states[-1].mode == "diverged"]
     assert gone
     assert all(last[site] < log[site].t_s[-1] for site in gone)
-    assert align_records(logs.rewritten(log, lambda state: state.site != "s"), common=True) == {}
+    assert (
+        align_records(logs.rewritten(log, lambda state: state.site != "s"), common=True) == {}
+    )
 
 
 def test_past_is_records_at_ticks_and_rest_before_them() -> None:
     track = align_records(logs.simulated("four"), common=True)["b"]
-    now, before = PeerTrajectory(track).at(track.t_s), PeerTrajectory(track).at(np.array([-0.5, -1e-3]))
+    now, before = (
+        PeerTrajectory(track).at(track.t_s),
+        PeerTrajectory(track).at(np.array([-0.5, -1e-3])),
+    )
     assert np.array_equal(now.q, track.q)
     assert np.array_equal(now.qd, track.qd)
     expected = cumulative_trapezoid(track.qd**2, track.t_s, axis=0, initial=0.0)

@@ -49,13 +49,19 @@ def drawn(joints: int, rows: int = 5) -> list[Array]:
 def test_torque_inertia_gradient_and_end_effector_are_those_of_pinocchio(name: str) -> None:
     arm = chain_of(name)
     for state in REFERENCES[name].states:
-        there = arm._replace(chain=arm.chain._replace(gravity_m_s2=tuple(state.gravity.tolist())))
+        there = arm._replace(
+            chain=arm.chain._replace(gravity_m_s2=tuple(state.gravity.tolist()))
+        )
         q, qd, v, a, r = (x[np.newaxis] for x in (state.q, state.qd, state.v, state.a, state.r))
         torque = there.law_torque(arm.theta[np.newaxis], q, qd, v, a)[0]
-        np.testing.assert_allclose(torque, state.inverse_dynamics, atol=1e-12 * (1 + np.abs(torque).max()))
+        np.testing.assert_allclose(
+            torque, state.inverse_dynamics, atol=1e-12 * (1 + np.abs(torque).max())
+        )
         gradient = there.gradient(q, qd, v, a, r)[0]
         np.testing.assert_allclose(gradient, state.regressor_transpose_r, atol=1e-11)
-        np.testing.assert_allclose(arm.multiply_inertia(q, a)[0], state.inertia @ state.a, atol=1e-12)
+        np.testing.assert_allclose(
+            arm.multiply_inertia(q, a)[0], state.inertia @ state.a, atol=1e-12
+        )
         tip = arm.place_end_effector(q, qd)
         np.testing.assert_allclose(tip.at[0], state.tip_position, atol=1e-12)
         np.testing.assert_allclose(tip.J[0], state.jacobian[:3], atol=1e-12)
@@ -92,7 +98,9 @@ def test_friction_and_stops_are_what_the_core_takes_and_gives() -> None:
 
 
 def test_the_planar_arm_is_the_same_as_a_chain() -> None:
-    written = Arm(l1_m=0.8, m1_kg=1.5, lc1_m=0.3, I1_kg_m2=0.05, l2_m=0.6, m2_kg=0.7, lc2_m=0.25)
+    written = Arm(
+        l1_m=0.8, m1_kg=1.5, lc1_m=0.3, I1_kg_m2=0.05, l2_m=0.6, m2_kg=0.7, lc2_m=0.25
+    )
     model = build_arm(written, Task(), {}, chains=True)
     assert model.chain is not None
     theta = build_arm(written, Task(), {}, chains=False).theta
@@ -100,15 +108,24 @@ def test_the_planar_arm_is_the_same_as_a_chain() -> None:
     chain = ChainArmRows(model.theta, model.chain)
     q, qd, v, a = drawn(2)
     np.testing.assert_allclose(plane.gravity_torque(q), chain.gravity_torque(q), atol=1e-12)
-    np.testing.assert_allclose(plane.multiply_inertia(q, a), chain.multiply_inertia(q, a), atol=1e-12)
+    np.testing.assert_allclose(
+        plane.multiply_inertia(q, a), chain.multiply_inertia(q, a), atol=1e-12
+    )
     theirs = chain.law_torque(model.theta[np.newaxis], q, qd, v, a)
-    np.testing.assert_allclose(plane.law_torque(np.tile(theta, (len(q), 1)), q, qd, v, a), theirs, atol=1e-12)
+    np.testing.assert_allclose(
+        plane.law_torque(np.tile(theta, (len(q), 1)), q, qd, v, a), theirs, atol=1e-12
+    )
     ours, theirs = plane.place_end_effector(q, qd), chain.place_end_effector(q, qd)
     np.testing.assert_allclose(ours.at, theirs.at[:, :2], atol=1e-12)
     np.testing.assert_allclose(ours.J, theirs.J[:, :2], atol=1e-12)
     energies = plane.potential_energy(q), chain.potential_energy(q)
     np.testing.assert_allclose(np.diff(energies[0]), np.diff(energies[1]), atol=1e-12)
-    judged = [((-np.pi / 2, 0.1), True), ((-1.4, -0.1), True), ((0.0, 0.0), False), ((1.6, 0.1), False)]
+    judged = [
+        ((-np.pi / 2, 0.1), True),
+        ((-1.4, -0.1), True),
+        ((0.0, 0.0), False),
+        ((1.6, 0.1), False),
+    ]
     for pose, hangs in judged:
         assert _hangs(plane, pose) is _hangs(chain, pose) is hangs
 
@@ -141,9 +158,8 @@ def test_base_parameters_leave_out_only_what_makes_no_torque(name: str) -> None:
     arm = chain_of(name)
     B = find_base_parameters(arm, np.ones(len(arm.theta), dtype=np.bool_)).combination
     for state in REFERENCES[name].states:
-        if np.any(
-            state.gravity[:2]
-        ):  # another direction of gravity excites other parameters of the first link
+        # another direction of gravity excites other parameters of the first link
+        if np.any(state.gravity[:2]):
             continue
         Yr = state.regressor_transpose_r
         left = Yr - B.T @ np.linalg.lstsq(B.T, Yr, rcond=None)[0]
@@ -166,7 +182,11 @@ def body(places: Array, masses: Array) -> Array:
     """Ten parameters of point masses."""
     m, mc = masses.sum(), masses @ places
     inertia = np.sum(
-        [w * ((p @ p) * np.eye(3) - np.outer(p, p)) for w, p in zip(masses, places, strict=True)], axis=0
+        [
+            w * ((p @ p) * np.eye(3) - np.outer(p, p))
+            for w, p in zip(masses, places, strict=True)
+        ],
+        axis=0,
     )
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = inertia
     return np.array([m, *mc, xx, xy, yy, xz, yz, zz])
@@ -179,7 +199,11 @@ def test_a_body_with_a_negative_mass_is_not_consistent() -> None:
     homogeneous = np.column_stack([places, np.ones(6)])
     wanted = (masses * homogeneous.T) @ homogeneous
     np.testing.assert_allclose(find_pseudo_inertias(sound)[0], wanted, atol=1e-12)
-    assert find_consistent_links(np.concatenate([sound, -sound, np.zeros(10)])) == [True, False, False]
+    assert find_consistent_links(np.concatenate([sound, -sound, np.zeros(10)])) == [
+        True,
+        False,
+        False,
+    ]
     long = body(np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), np.ones(2))
     long[4] = 5.0  # more about its own axis than the triangle inequality allows
     assert find_consistent_links(long) == [False]

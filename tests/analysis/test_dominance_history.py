@@ -33,7 +33,9 @@ ramps = st.tuples(st.integers(0, 60), st.integers(0, 30), st.floats(0.0, 1.0))
 def test_they_are_the_cores(drawn: list[tuple[int, int, float]]) -> None:
     tick_ns = 10**9 // RATE_HZ
     changes = [DominanceRamp(a * tick_ns, (a + n) * tick_ns, (x, 1.0 - x)) for a, n, x in drawn]
-    found = evaluate_ramps(np.array([0.5, 0.5]), changes, np.arange(100) / RATE_HZ, 1.0 / RATE_HZ)
+    found = evaluate_ramps(
+        np.array([0.5, 0.5]), changes, np.arange(100) / RATE_HZ, 1.0 / RATE_HZ
+    )
     rows = [[0.0, 0.0, 0.5, 0.5], *([r.start_ns, r.end_ns, *r.alpha] for r in sorted(changes))]
     links = np.zeros(2, link_dtype(2))
     for k in range(100):
@@ -44,7 +46,9 @@ def test_they_are_the_cores(drawn: list[tuple[int, int, float]]) -> None:
 
 def test_before_a_sudden_change_they_are_as_they_were() -> None:
     step = DominanceRamp(10**9, 10**9, (1.0, 0.0))
-    found = evaluate_ramps(np.array([0.5, 0.5]), [step], np.arange(100) / RATE_HZ, 1.0 / RATE_HZ)
+    found = evaluate_ramps(
+        np.array([0.5, 0.5]), [step], np.arange(100) / RATE_HZ, 1.0 / RATE_HZ
+    )
     assert found.before[49].tolist() == [0.5, 0.5]
     assert found.alpha[50].tolist() == [1.0, 0.0]
     assert not found.constant
@@ -85,14 +89,18 @@ def test_they_are_the_factors_of_the_recorded_references(ramped):
     reference = np.zeros_like(part.q)
     for peer, factor in zip(part.peers, alpha.T, strict=True):
         used, q = part.used[peer], ramped[peer].q
-        seen = np.where(used[:, None] >= 0, q[np.maximum(used, 0)], ramped.scenario.sites[peer].q0_rad)
+        seen = np.where(
+            used[:, None] >= 0, q[np.maximum(used, 0)], ramped.scenario.sites[peer].q0_rad
+        )
         reference += factor[:, None] * seen
     assert reference == pytest.approx(part.q_des, abs=1e-9)
 
 
 EXPERT = np.array([[0.0, 0.0, 1.0], [0.5, 0.0, 0.5], [1.0, 0.0, 0.0]])
 """Sites 0 and 2 are locked to each other, 1 follows them."""
-PAIRS = np.array([[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]])
+PAIRS = np.array(
+    [[0.0, 1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]]
+)
 THREE = np.full((3, 3), 0.5) - 0.5 * np.eye(3)
 
 
@@ -117,7 +125,9 @@ def test_scaled_kd_cancels_what_sites_pass_on(scales: list[float]) -> None:
 
 
 def test_equal_shares_and_kd_give_the_ones_of_the_paper() -> None:
-    assert compute_lyapunov_weights(THREE, np.full((3, 2), 3.0)).beta == pytest.approx(np.ones(3))
+    assert compute_lyapunov_weights(THREE, np.full((3, 2), 3.0)).beta == pytest.approx(
+        np.ones(3)
+    )
 
 
 def test_kd_of_different_shape_have_no_scalar() -> None:
@@ -140,7 +150,9 @@ def test_two_groups_that_follow_nobody_outside_are_named() -> None:
 def test_a_record_that_lacks_who_is_lost_is_told(mem: list[float]) -> None:
     rule = {"on_stale.action": "glide", "on_stale.on_lost": "degrade", "duration_s": 0.1}
     data = recorded("paper", rule | {"on_stale.align_limit_rad": 2.0})
-    broken = edited(data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r)
+    broken = edited(
+        data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r
+    )
     times_s = np.array([0.05])
     assert not find_lost_peers(opened(data), "s", times_s).any()
     with pytest.raises(LogError, match="a record of s does not have 12 numbers in `mem`"):

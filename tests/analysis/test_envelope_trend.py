@@ -8,7 +8,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from trilat_net.analysis.envelope_trend import FLOOR_RAD, EnvelopeFit, EnvelopeTrend, fit_envelopes
+from trilat_net.analysis.envelope_trend import (
+    FLOOR_RAD,
+    EnvelopeFit,
+    EnvelopeTrend,
+    fit_envelopes,
+)
 
 Array = NDArray[np.float64]
 
@@ -35,7 +40,9 @@ def oscillation(rate_per_s: float, omega: float, phase: float, scale: float = 1.
 
 @settings(max_examples=40)
 @given(rate=rates, omega=quick, phase=phases)
-def test_exponential_growth_is_growth_at_its_rate(rate: float, omega: float, phase: float) -> None:
+def test_exponential_growth_is_growth_at_its_rate(
+    rate: float, omega: float, phase: float
+) -> None:
     found = fit_envelope(T_S, oscillation(rate, omega, phase))
     assert found.trend is EnvelopeTrend.GROWS
     assert found.rate_per_s == pytest.approx(rate, rel=0.1, abs=0.005)
@@ -43,7 +50,9 @@ def test_exponential_growth_is_growth_at_its_rate(rate: float, omega: float, pha
 
 @settings(max_examples=40)
 @given(rate=rates, omega=quick, phase=phases)
-def test_exponential_decay_is_decay_from_a_factor_of_two_on(rate: float, omega: float, phase: float) -> None:
+def test_exponential_decay_is_decay_from_a_factor_of_two_on(
+    rate: float, omega: float, phase: float
+) -> None:
     """Half of the run is 20 s: ln 2 / 20 s is 0.035 /s."""
     trend = fit_envelope(T_S, oscillation(-rate, omega, phase)).trend
     if not 0.03 < rate < 0.045:  # there, which points the windows see decides
@@ -52,13 +61,19 @@ def test_exponential_decay_is_decay_from_a_factor_of_two_on(rate: float, omega: 
 
 @settings(max_examples=40)
 @given(omega=quick, phase=phases, scale=scales)
-def test_a_sustained_oscillation_of_whatever_size_is_steady(omega: float, phase: float, scale: float) -> None:
-    assert fit_envelope(T_S, oscillation(0.0, omega, phase, scale)).trend is EnvelopeTrend.STEADY
+def test_a_sustained_oscillation_of_whatever_size_is_steady(
+    omega: float, phase: float, scale: float
+) -> None:
+    assert (
+        fit_envelope(T_S, oscillation(0.0, omega, phase, scale)).trend is EnvelopeTrend.STEADY
+    )
 
 
 @settings(max_examples=40)
 @given(rate=st.floats(-0.3, 0.3), omega=st.floats(0.0, 40.0), phase=phases, scale=scales)
-def test_the_trend_depends_on_neither_unit(rate: float, omega: float, phase: float, scale: float) -> None:
+def test_the_trend_depends_on_neither_unit(
+    rate: float, omega: float, phase: float, scale: float
+) -> None:
     error = np.maximum(oscillation(rate, omega, phase), 1e-3)
     found = fit_envelope(T_S, error)
     larger, slower = fit_envelope(T_S, scale * error), fit_envelope(60.0 * T_S, error)
@@ -79,7 +94,9 @@ def test_nothing_grows_both_ways(rate: float, omega: float, phase: float) -> Non
 
 @settings(max_examples=40)
 @given(turn_s=st.floats(16.5, 23.5), power=st.floats(0.3, 3.0), scale=scales)
-def test_a_v_is_undecided_whichever_way_it_is_read(turn_s: float, power: float, scale: float) -> None:
+def test_a_v_is_undecided_whichever_way_it_is_read(
+    turn_s: float, power: float, scale: float
+) -> None:
     """A quarter of a swing before the middle of a run and one behind it: nobody knows how it goes on."""
     trend = fit_envelope(T_S, scale * np.abs(T_S - turn_s) ** power).trend
     assert trend in (EnvelopeTrend.UNDECIDED, EnvelopeTrend.STEADY)
@@ -87,7 +104,9 @@ def test_a_v_is_undecided_whichever_way_it_is_read(turn_s: float, power: float, 
 
 @settings(max_examples=40)
 @given(decay=st.floats(0.05, 2.0), rate=st.floats(0.03, 0.3), share=st.floats(0.01, 1.0))
-def test_growth_under_a_dying_start_is_growth_in_time(decay: float, rate: float, share: float) -> None:
+def test_growth_under_a_dying_start_is_growth_in_time(
+    decay: float, rate: float, share: float
+) -> None:
     """At the middle of the longer run the growing part is ten times the dying one."""
     t_s = np.linspace(0.0, 2.0 * max(4.0 / rate, math.log(10.0 / share) / (decay + rate)), 800)
     error = np.exp(-decay * t_s) + share * np.exp(rate * t_s)
@@ -96,7 +115,9 @@ def test_growth_under_a_dying_start_is_growth_in_time(decay: float, rate: float,
 
 @settings(max_examples=40)
 @given(at_s=st.floats(20.0, 39.0), height=st.floats(10.0, 1e4), decay=st.floats(0.1, 5.0))
-def test_a_disturbance_late_in_the_run_is_not_growth(at_s: float, height: float, decay: float) -> None:
+def test_a_disturbance_late_in_the_run_is_not_growth(
+    at_s: float, height: float, decay: float
+) -> None:
     since_s = np.maximum(0.0, T_S - at_s)
     kick = np.where(since_s > 0.0, height * np.exp(-decay * since_s), 0.0)
     assert fit_envelope(T_S, 1e-3 * (1.0 + kick)).trend is not EnvelopeTrend.GROWS
@@ -105,7 +126,9 @@ def test_a_disturbance_late_in_the_run_is_not_growth(at_s: float, height: float,
 @settings(max_examples=40)
 @given(time_constant_s=st.floats(0.5, 1e3))
 def test_a_response_that_settles_is_not_growth(time_constant_s: float) -> None:
-    assert fit_envelope(T_S, 1.0 - np.exp(-T_S / time_constant_s)).trend is not EnvelopeTrend.GROWS
+    assert (
+        fit_envelope(T_S, 1.0 - np.exp(-T_S / time_constant_s)).trend is not EnvelopeTrend.GROWS
+    )
 
 
 def test_what_has_converged_decays_whatever_noise_is_left() -> None:
@@ -116,7 +139,9 @@ def test_what_has_converged_decays_whatever_noise_is_left() -> None:
 
 def test_of_stationary_noise_next_to_nothing_is_called_growth() -> None:
     trends = [
-        fit_envelope(T_S, np.exp(0.3 * np.random.default_rng(seed).standard_normal(len(T_S)))).trend
+        fit_envelope(
+            T_S, np.exp(0.3 * np.random.default_rng(seed).standard_normal(len(T_S)))
+        ).trend
         for seed in range(300)
     ]
     assert trends.count(EnvelopeTrend.GROWS) <= 3

@@ -54,19 +54,29 @@ def counted(run, link):
 def test_counts_are_those_of_the_link_itself(link):
     counts, core = busy()[link].counts, counted(logs.busy(), link)
     assert counts.arrived + counts.duplicate == core.accepted
-    assert (counts.lost, counts.late, counts.duplicate) == (core.lost, core.late, core.duplicate)
+    assert (counts.lost, counts.late, counts.duplicate) == (
+        core.lost,
+        core.late,
+        core.duplicate,
+    )
     assert counts.copies == pytest.approx(core.copies, abs=5)  # of samples that came no more
-    waiting = 0.15 * 200  # at the end: released with others, as the link knows and no record shows
+    # at the end: released with others, as the link knows and no record shows
+    waiting = 0.15 * 200
     assert counts.superseded <= core.superseded <= counts.superseded + waiting
 
 
 def test_what_was_superseded_is_in_use_in_no_record():
     log = logs.busy().log
     for peer, site in [("b", "a"), ("c", "a"), ("c", "b")]:
-        release = predict_delivery(log, peer, site, log.scenario.ticks(peer)).release(log[site].rate_hz)
+        release = predict_delivery(log, peer, site, log.scenario.ticks(peer)).release(
+            log[site].rate_hz
+        )
         released = {n for n, tick in enumerate(release) if 0 <= tick <= log[site].tick[-1]}
         arrived = {
-            tick for state in log[site].states for j, tick, _ in state.rx if log[site].peers[j] == peer
+            tick
+            for state in log[site].states
+            for j, tick, _ in state.rx
+            if log[site].peers[j] == peer
         }
         never = (released & arrived) - set(log[site].used[peer].tolist())
         assert busy()[f"{peer}->{site}"].counts.superseded == len(never) > 0
@@ -85,17 +95,24 @@ def test_what_the_network_lost_and_doubled_is_counted():
     assert not lossy.plain
     assert found["m2->s"].counts.duplicate == 2
     assert counted(run, "m2->s").duplicate == 2
-    assert (found["s->m1"].counts.missing, found["s->m1"].burst, found["s->m1"].loss) == (0, None, 0.0)
+    assert (found["s->m1"].counts.missing, found["s->m1"].burst, found["s->m1"].loss) == (
+        0,
+        None,
+        0.0,
+    )
 
 
 def test_a_missing_records_samples_are_neither_lost_nor_arrived():
-    log = logs.rewritten(logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150)
+    log = logs.rewritten(
+        logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150
+    )
     found = uses(log)
     for link in ("m1->m2", "s->m2"):
         counts = found[link].counts
         assert (counts.missing, counts.lost, counts.late) == (0, 0, 0)
         assert counts.judged == counts.arrived == 399 - 50
-    assert found["m2->s"].counts.missing == 0  # its samples came, though its own records are gone
+    # its samples came, though its own records are gone
+    assert found["m2->s"].counts.missing == 0
 
 
 def test_a_link_cut_until_the_end_loses_all_samples():
@@ -119,7 +136,8 @@ def test_late_samples_are_those_of_the_core():
 def test_a_stamp_out_of_range_is_refused_and_nothing_else():
     def hostile(state):
         return logs.replaced(
-            state, rx=[*state.rx, [0, 2**39, 0], [1, 2**30, 0]] if state.tick == 50 else state.rx
+            state,
+            rx=[*state.rx, [0, 2**39, 0], [1, 2**30, 0]] if state.tick == 50 else state.rx,
         )
 
     found = uses(logs.rewritten(logs.simulated("paper"), change=hostile))
@@ -131,9 +149,15 @@ def test_record_of_tick_that_is_never_made_costs_no_memory():
     """Ticks are the sender's word: a false one must not make tables as long as it says."""
 
     def far(state):
-        return logs.replaced(state, tick=2**39) if (state.site, state.tick) == ("m2", 399) else state
+        return (
+            logs.replaced(state, tick=2**39)
+            if (state.site, state.tick) == ("m2", 399)
+            else state
+        )
 
-    with pytest.raises(LogError, match="m2 has a record of tick 549755813888; the scenario has 400"):
+    with pytest.raises(
+        LogError, match="m2 has a record of tick 549755813888; the scenario has 400"
+    ):
         uses(logs.rewritten(logs.simulated("paper"), change=far))
 
 
@@ -171,13 +195,31 @@ def hyperexponential(t_ms):
     return 0.7 * -np.expm1(-above / 5.0) + 0.3 * -np.expm1(-above / 60.0)
 
 
-MIXED = {"model": "hyperexponential", "floor_ms": 30.0, "fast_ms": 5.0, "slow_ms": 60.0, "slow_share": 0.3}
+MIXED = {
+    "model": "hyperexponential",
+    "floor_ms": 30.0,
+    "fast_ms": 5.0,
+    "slow_ms": 60.0,
+    "slow_share": 0.3,
+}
 LOG = stats.lognorm(math.sqrt(math.log1p(0.25)), scale=60.0 / math.sqrt(1.25))
 MODELS = {
-    "m1->m2": ({"model": "uniform", "delay_ms": 200.0, "half_width_ms": 50.0}, stats.uniform(150, 100).cdf),
-    "m1->s": ({"model": "uniform", "delay_ms": 200.0, "half_width_ms": 200.0}, stats.uniform(0, 400).cdf),
-    "m2->m1": ({"model": "gamma", "delay_ms": 120.0, "deviation_ms": 40.0}, stats.gamma(9, scale=40 / 3).cdf),
-    "m2->s": ({"model": "normal", "delay_ms": 80.0, "deviation_ms": 20.0}, stats.norm(80, 20).cdf),
+    "m1->m2": (
+        {"model": "uniform", "delay_ms": 200.0, "half_width_ms": 50.0},
+        stats.uniform(150, 100).cdf,
+    ),
+    "m1->s": (
+        {"model": "uniform", "delay_ms": 200.0, "half_width_ms": 200.0},
+        stats.uniform(0, 400).cdf,
+    ),
+    "m2->m1": (
+        {"model": "gamma", "delay_ms": 120.0, "deviation_ms": 40.0},
+        stats.gamma(9, scale=40 / 3).cdf,
+    ),
+    "m2->s": (
+        {"model": "normal", "delay_ms": 80.0, "deviation_ms": 20.0},
+        stats.norm(80, 20).cdf,
+    ),
     "s->m1": (MIXED, hyperexponential),
     "s->m2": ({"model": "lognormal", "delay_ms": 60.0, "deviation_ms": 30.0}, LOG.cdf),
 }
@@ -229,7 +271,8 @@ def test_the_figures_that_are_quoted():
 
 def test_loss_and_bursts_as_seen_are_those_of_the_model():
     scenario = load_scenario(
-        "two_sites", {"duration_s": 30.0, "rate_hz": 100, "link.loss": 0.2, "link.loss_burst": 5.0}
+        "two_sites",
+        {"duration_s": 30.0, "rate_hz": 100, "link.loss": 0.2, "link.loss_burst": 5.0},
     )
     for use in summarise_links(trilat_net.simulate(scenario)):
         bursts = use.counts.lost / 5.0
@@ -251,7 +294,9 @@ def test_playout_makes_jitter_below_its_budget_constant():
 def test_histogram_counts_every_tick_in_few_bins_of_round_width():
     for use in busy().values():
         bins = use.ages
-        assert sum(bins.ticks) == pytest.approx((6.0 - use.first_use_s) * logs.busy().log[use.site].rate_hz)
+        assert sum(bins.ticks) == pytest.approx(
+            (6.0 - use.first_use_s) * logs.busy().log[use.site].rate_hz
+        )
         assert len(bins.ticks) <= 50
         assert bins.first_ms <= use.age_ms.min
         assert use.age_ms.max < bins.first_ms + len(bins.ticks) * bins.width_ms
@@ -272,18 +317,23 @@ def test_an_empty_log_tells_nothing():
     for use in summarise_links(log):
         assert use.stated[0].link.delay_ms == 200.0
         assert use.plain
-        assert (use.age_ms, use.ages, use.counts, use.loss, use.burst, use.silence_ms) == (None,) * 6
+        assert (use.age_ms, use.ages, use.counts, use.loss, use.burst, use.silence_ms) == (
+            None,
+        ) * 6
 
 
 def test_measured_delays_are_those_in_the_records():
     def timed(state):
-        return logs.replaced(state, rx=[[j, tick, 100 * (j + 1) + tick] for j, tick, _ in state.rx])
+        return logs.replaced(
+            state, rx=[[j, tick, 100 * (j + 1) + tick] for j, tick, _ in state.rx]
+        )
 
     log = logs.rewritten(logs.simulated("paper"), change=timed, driver="live")
     use = uses(log)["m2->m1"]
     assert (use.one_way_us.min, use.one_way_us.max) == (100.0, 100.0 + 398)
     old = logs.rewritten(log, change=lambda s: logs.replaced(s, v=1), driver="live")
-    assert uses(old)["m2->m1"].one_way_us is None  # before version 2 it was the age of the stamp
+    # before version 2 it was the age of the stamp
+    assert uses(old)["m2->m1"].one_way_us is None
 
 
 COUNT = 900

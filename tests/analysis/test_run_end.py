@@ -25,7 +25,9 @@ from trilat_net.scenario import load_scenario
 
 @cache
 def still() -> Log:
-    return trilat_net.simulate("two_sites", {"duration_s": 12, "rate_hz": 50, "sites.m.hands": []})
+    return trilat_net.simulate(
+        "two_sites", {"duration_s": 12, "rate_hz": 50, "sites.m.hands": []}
+    )
 
 
 def moving(e: Callable[[float], float], qd: Callable[[float], float]) -> Log:
@@ -48,7 +50,12 @@ def swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]
         (swing(-0.8), swing(-0.7), EndBehaviour.CONVERGED, "converged: |e| "),
         (swing(-0.7), swing(-0.15), EndBehaviour.DECAYS, "decaying at m joint 1 (|e| -0.7"),
         (swing(-0.15), swing(-0.15), EndBehaviour.DECAYS, "|qd| -0.15"),
-        (swing(-0.15), swing(-0.1), EndBehaviour.HARDLY, "hardly decaying at m joint 1 (|e| -0.15"),
+        (
+            swing(-0.15),
+            swing(-0.1),
+            EndBehaviour.HARDLY,
+            "hardly decaying at m joint 1 (|e| -0.15",
+        ),
         (swing(-0.1), swing(-0.15), EndBehaviour.HARDLY, "|qd| -0.15"),
         (swing(0.0), swing(0.0), EndBehaviour.BOUNDED, "bounded oscillation at 1.5"),
         (swing(-0.8), swing(0.0), EndBehaviour.BOUNDED, "Hz at m joint 1"),
@@ -58,7 +65,12 @@ def swing(rate_per_s: float, amplitude: float = 0.1) -> Callable[[float], float]
         (swing(-0.3), swing(0.3), EndBehaviour.GROWS, "|qd| +0.3"),
         (swing(0.2), swing(0.0), EndBehaviour.UNDECIDED, "|e| grows, |qd| steady"),
         (lambda _: 0.2, swing(-0.8), EndBehaviour.CONVERGED, "at rest, with errors that stay"),
-        (lambda _: 0.1, lambda _: 0.4, EndBehaviour.UNDECIDED, "undecided, record longer at m joint 1"),
+        (
+            lambda _: 0.1,
+            lambda _: 0.4,
+            EndBehaviour.UNDECIDED,
+            "undecided, record longer at m joint 1",
+        ),
         (lambda t_s: 0.4 * t_s, lambda _: 0.4, EndBehaviour.DRIFTS, "drifting at m joint 1"),
     ],
 )
@@ -75,7 +87,9 @@ def test_a_known_signal_is_named(e, qd, motion: EndBehaviour, says: str) -> None
 def test_the_margin_of_p_d_is_seen_on_60_s(d: float, motion: EndBehaviour) -> None:
     """d = abs(lambda_min(alpha)) K T = 1 for three sites, alpha = 1/2, K = 10 N m/rad, T = 0.2 s."""
     assert (
-        classify_log_end(trilat_net.simulate("p_d_margin", {"control.d": d, "rate_hz": 50})).behaviour
+        classify_log_end(
+            trilat_net.simulate("p_d_margin", {"control.d": d, "rate_hz": 50})
+        ).behaviour
         is motion
     )
 
@@ -84,8 +98,12 @@ def test_the_margin_of_p_d_is_seen_on_60_s(d: float, motion: EndBehaviour) -> No
 def test_slow_loop_without_delay_sustains_what_faster_one_ends() -> None:
     """`digital` with the paper's gains: about 1 rad/s at 100 Hz, and 200 Hz settles."""
     held = {"scheme": "digital", "link.delay_ms": 0.0}
-    slow = classify_log_end(trilat_net.simulate("paper", {**held, "rate_hz": 100, "duration_s": 60.0}))
-    fast = classify_log_end(trilat_net.simulate("paper", {**held, "rate_hz": 200, "duration_s": 60.0}))
+    slow = classify_log_end(
+        trilat_net.simulate("paper", {**held, "rate_hz": 100, "duration_s": 60.0})
+    )
+    fast = classify_log_end(
+        trilat_net.simulate("paper", {**held, "rate_hz": 200, "duration_s": 60.0})
+    )
     assert slow.stability is not Stability.STABLE
     assert slow.end_speed_rad_s > 0.5
     assert fast.stability is not Stability.NOT_STABLE
@@ -111,7 +129,9 @@ def test_a_site_without_records_leaves_it_undecided() -> None:
 
 
 def test_only_times_of_which_all_sites_have_records_count() -> None:
-    torn = logs.rewritten(moving(swing(-0.8), swing(-0.8)), lambda s: (s.site == "m") == (s.tick < 300))
+    torn = logs.rewritten(
+        moving(swing(-0.8), swing(-0.8)), lambda s: (s.site == "m") == (s.tick < 300)
+    )
     assert classify_log_end(torn).behaviour is EndBehaviour.UNDECIDED
 
 
@@ -149,10 +169,19 @@ def test_a_growing_joint_is_not_hidden_by_a_decaying_one() -> None:
     assert found.stability is Stability.NOT_STABLE
 
 
-@pytest.mark.parametrize(("pushed", "stability"), [(True, Stability.OPEN), (False, Stability.NOT_STABLE)])
+@pytest.mark.parametrize(
+    ("pushed", "stability"), [(True, Stability.OPEN), (False, Stability.NOT_STABLE)]
+)
 def test_what_grows_while_an_operator_acts_is_open(pushed: bool, stability: Stability) -> None:
-    hand = {"kind": "pulse", "start_s": 5.0, "end_s": 11.0 if pushed else 5.5, "peak_nm": [1.0, 0.0]}
-    log = trilat_net.simulate("two_sites", {"duration_s": 12, "rate_hz": 50, "sites.m.hands": [hand]})
+    hand = {
+        "kind": "pulse",
+        "start_s": 5.0,
+        "end_s": 11.0 if pushed else 5.5,
+        "peak_nm": [1.0, 0.0],
+    }
+    log = trilat_net.simulate(
+        "two_sites", {"duration_s": 12, "rate_hz": 50, "sites.m.hands": [hand]}
+    )
 
     def changed(state):
         x = swing(0.2)(state.t_ns * 1e-9)
@@ -167,15 +196,25 @@ def test_what_grows_while_an_operator_acts_is_open(pushed: bool, stability: Stab
     ("angle", "e", "tau_x", "stability", "says"),
     [
         (0.05, 0.0, 0.0, Stability.OPEN, "m and s stand 0.05 rad apart"),
-        (0.05, 0.0, 1.0, Stability.OPEN, "m and s stand 0.05 rad apart"),  # what pulls at s has no effect
+        (
+            0.05,
+            0.0,
+            1.0,
+            Stability.OPEN,
+            "m and s stand 0.05 rad apart",
+        ),  # what pulls at s has no effect
         (0.05, 0.05, 1.0, Stability.STABLE, ""),
         (0.01, 0.0, 0.0, Stability.STABLE, ""),
     ],
 )
-def test_sites_at_rest_must_agree_unless_a_force_separates_them(angle, e, tau_x, stability, says) -> None:
+def test_sites_at_rest_must_agree_unless_a_force_separates_them(
+    angle, e, tau_x, stability, says
+) -> None:
     def changed(state):
         q = [angle if state.site == "s" else 0.0, 0.0]
-        return logs.replaced(state, q=q, q_des=[q[0] - e, 0.0], qd=[0.0, 0.0], tau_x=[tau_x, 0.0])
+        return logs.replaced(
+            state, q=q, q_des=[q[0] - e, 0.0], qd=[0.0, 0.0], tau_x=[tau_x, 0.0]
+        )
 
     found = classify_log_end(logs.rewritten(still(), change=changed))
     assert found.stability is stability
@@ -183,17 +222,24 @@ def test_sites_at_rest_must_agree_unless_a_force_separates_them(angle, e, tau_x,
 
 
 @pytest.mark.parametrize(
-    ("pose", "says"), [([-1.5, 0.05], "m, s hang: the arms fell"), ([2.5, 0.0], "away from every start pose")]
+    ("pose", "says"),
+    [([-1.5, 0.05], "m, s hang: the arms fell"), ([2.5, 0.0], "away from every start pose")],
 )
-def test_arms_that_hang_or_were_thrown_are_not_called_stable(pose: list[float], says: str) -> None:
+def test_arms_that_hang_or_were_thrown_are_not_called_stable(
+    pose: list[float], says: str
+) -> None:
     change = lambda s: logs.replaced(s, q=pose, q_des=pose, qd=[0.0, 0.0])  # noqa: E731
     found = classify_log_end(logs.rewritten(still(), change=change))
     assert found.stability is Stability.OPEN
     assert says in found.text
 
 
-@pytest.mark.parametrize(("wide", "motion"), [(0.5, EndBehaviour.UNDECIDED), (0.1, EndBehaviour.BOUNDED)])
-def test_a_joint_fed_by_a_faster_one_does_not_oscillate(wide: float, motion: EndBehaviour) -> None:
+@pytest.mark.parametrize(
+    ("wide", "motion"), [(0.5, EndBehaviour.UNDECIDED), (0.1, EndBehaviour.BOUNDED)]
+)
+def test_a_joint_fed_by_a_faster_one_does_not_oscillate(
+    wide: float, motion: EndBehaviour
+) -> None:
     """Joint 2 of s is steady at 0.05 rad/s; all else falls, to 0.15 rad/s at the end, or to 0.03."""
 
     def changed(state):
@@ -236,9 +282,15 @@ def test_a_small_speed_is_rest_only_if_it_falls(speed, behaviour: EndBehaviour) 
 
 @pytest.mark.parametrize(
     ("speed_rad_s", "behaviour"),
-    [(3e-4, EndBehaviour.CONVERGED), (1e-3, EndBehaviour.UNDECIDED), (4e-3, EndBehaviour.DRIFTS)],
+    [
+        (3e-4, EndBehaviour.CONVERGED),
+        (1e-3, EndBehaviour.UNDECIDED),
+        (4e-3, EndBehaviour.DRIFTS),
+    ],
 )
-def test_what_sinks_slowly_has_not_converged(speed_rad_s: float, behaviour: EndBehaviour) -> None:
+def test_what_sinks_slowly_has_not_converged(
+    speed_rad_s: float, behaviour: EndBehaviour
+) -> None:
     """By 5, 17 and 69 mrad in the second half, its speed falling by 10 % meanwhile."""
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S})
     sinking = trace(speed_rad_s * np.exp(-0.005 * T_S), one_way=True)
@@ -246,9 +298,12 @@ def test_what_sinks_slowly_has_not_converged(speed_rad_s: float, behaviour: EndB
 
 
 @pytest.mark.parametrize(
-    ("at_s", "stability"), [(15.0, Stability.STABLE), (35.0, Stability.STABLE), (39.0, Stability.OPEN)]
+    ("at_s", "stability"),
+    [(15.0, Stability.STABLE), (35.0, Stability.STABLE), (39.0, Stability.OPEN)],
 )
-def test_a_loop_that_changes_last_must_be_seen_after_that(at_s: float, stability: Stability) -> None:
+def test_a_loop_that_changes_last_must_be_seen_after_that(
+    at_s: float, stability: Stability
+) -> None:
     later = [{"at_s": at_s, "link": "m1->s", "to": {"delay_ms": 300.0}}]
     scenario = load_scenario("p_d_margin", {"duration_s": SPAN_S, "timeline": later})
     found = classify_run_end(scenario, trace(np.exp(-0.5 * T_S)))

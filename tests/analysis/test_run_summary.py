@@ -33,7 +33,8 @@ def test_numbers_agree_with_the_records():
         assert site["missing"] == 0
         assert site["q_end_rad"] == states[-1].q
         assert site["max_error_rad"] == max(errors)
-        assert site["max_error_end_rad"] == max(errors[200:])  # the last second of two, at 200 Hz
+        # the last second of two, at 200 Hz
+        assert site["max_error_end_rad"] == max(errors[200:])
         assert site["peak_tau_nm"] == max(abs(t) for s in states for t in s.tau)
         assert site["saturated_ticks"] == 0
         moved = [
@@ -45,7 +46,9 @@ def test_numbers_agree_with_the_records():
     age = dict.fromkeys(("mean", "p50", "p95", "p99", "min", "max"), 200.0)
     assert link["age_ms"] == {**age, "deviation": 0.0}
     assert link["late_samples"] == 0
-    assert link["stated"] == [{"from_s": 0.0, "link": "200 ms", "mean_ms": 200.0, "deviation_ms": 0.0}]
+    assert link["stated"] == [
+        {"from_s": 0.0, "link": "200 ms", "mean_ms": 200.0, "deviation_ms": 0.0}
+    ]
     assert facts["changes"] == []
     assert facts["diverged"] is False
     assert facts["settle_s"] is None  # two seconds are not enough
@@ -73,10 +76,17 @@ def test_times_of_the_loop():
 
 def test_overruns_begin_at_a_whole_period():
     def late(state):
-        return msgspec.structs.replace(state, late_us={10: 4999, 20: 5000, 30: 9000}.get(state.tick, 1))
+        return msgspec.structs.replace(
+            state, late_us={10: 4999, 20: 5000, 30: 9000}.get(state.tick, 1)
+        )
 
     facts = summarise_run(logs.rewritten(logs.simulated("paper"), change=late))
-    assert [site["overruns"] for site in facts["sites"].values()] == [2, 2, 2]  # 200 Hz: 5000 us
+    # 200 Hz: 5000 us
+    assert [site["overruns"] for site in facts["sites"].values()] == [
+        2,
+        2,
+        2,
+    ]
 
 
 def test_saturation_is_counted():
@@ -93,7 +103,11 @@ def test_a_run_that_diverged_says_so_and_misses_nothing():
     facts = strict(summarise_run(logs.diverged()))
     assert facts["diverged"] is True
     assert facts["missing"] == 0
-    assert 0.0 < min(s["diverged_at_s"] for s in facts["sites"].values() if s["diverged_at_s"]) < 2.0
+    assert (
+        0.0
+        < min(s["diverged_at_s"] for s in facts["sites"].values() if s["diverged_at_s"])
+        < 2.0
+    )
 
 
 def test_a_site_that_holds_at_the_end_has_not_diverged():
@@ -107,7 +121,10 @@ def test_a_site_that_holds_at_the_end_has_not_diverged():
 
 def test_what_was_changed_is_told_with_who_asked():
     facts = strict(summarise_run(logs.busy().log))
-    told = [(c["at_s"], c["about"], c["to"], c["site"], c["taken_at_tick"]) for c in facts["changes"]]
+    told = [
+        (c["at_s"], c["about"], c["to"], c["site"], c["taken_at_tick"])
+        for c in facts["changes"]
+    ]
     assert told == [
         (1.0, "a->c", "90 ms, loss 10 %", "c", None),
         (3.0, "c->a", "uniform 30 +- 17.3 ms", "a", 500),
@@ -117,16 +134,24 @@ def test_what_was_changed_is_told_with_who_asked():
 
 
 def test_a_measured_link_states_nothing():
-    log = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"})
+    log = trilat_net.simulate(
+        "two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"}
+    )
     facts = strict(summarise_run(log))
     for link in facts["links"].values():
-        assert (link["delay_ms"], link["drawn_ms"], link["stated"][0]["mean_ms"]) == (None, None, None)
+        assert (link["delay_ms"], link["drawn_ms"], link["stated"][0]["mean_ms"]) == (
+            None,
+            None,
+            None,
+        )
         assert link["age_ms"]["max"] == 5.0
     assert set(facts["scenario"]["delay_ms"].values()) == {None}
 
 
 def test_missing_records_are_counted():
-    log = logs.rewritten(logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150)
+    log = logs.rewritten(
+        logs.simulated("paper"), keep=lambda s: s.site != "m2" or not 100 <= s.tick < 150
+    )
     facts = summarise_run(log)
     assert [site["missing"] for site in facts["sites"].values()] == [0, 50, 0]
     assert facts["missing"] == 50
@@ -134,7 +159,9 @@ def test_missing_records_are_counted():
 
 @pytest.mark.parametrize("records", [0, 1, 2])
 def test_short_logs_have_nulls_and_no_nan(records):
-    log = logs.rewritten(logs.simulated("paper"), keep=lambda s: s.tick < records, finished=False)
+    log = logs.rewritten(
+        logs.simulated("paper"), keep=lambda s: s.tick < records, finished=False
+    )
     facts = strict(summarise_run(log, logs.twin("paper")))
     assert facts["session"]["complete"] is False
     for site in facts["sites"].values():

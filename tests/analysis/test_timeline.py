@@ -26,14 +26,23 @@ def test_spans_are_ticks_at_which_site_did_not_follow(modes):
         for k in range(round(span.from_s * part.rate_hz), round(span.to_s * part.rate_hz))
     ]
     assert found == away
-    for before, after in zip(find_mode_intervals(part), find_mode_intervals(part)[1:], strict=False):
-        assert (before.mode, before.to_s) != (after.mode, after.from_s)  # one span, not two in a row
+    for before, after in zip(
+        find_mode_intervals(part), find_mode_intervals(part)[1:], strict=False
+    ):
+        # one span, not two in a row
+        assert (before.mode, before.to_s) != (
+            after.mode,
+            after.from_s,
+        )
     assert (part.diverged_s is None) == (modes[-1:] != ["diverged"])
 
 
 def test_what_is_stated_of_a_link_changes_with_it():
     log = logs.busy().log
-    assert [(s.from_s, s.link.describe()) for s in list_stated_models(log, "a->c", list_changes(log))] == [
+    assert [
+        (s.from_s, s.link.describe())
+        for s in list_stated_models(log, "a->c", list_changes(log))
+    ] == [
         (0.0, "50 ms"),
         (1.0, "90 ms, loss 10 %"),
     ]
@@ -41,10 +50,14 @@ def test_what_is_stated_of_a_link_changes_with_it():
     assert recorded_end_s(log) == 6.0
 
 
-@pytest.mark.parametrize("text", ["nonsense", '{"at_s": 1.0, "link": "a->c", "to": {"model": "none"}}'])
+@pytest.mark.parametrize(
+    "text", ["nonsense", '{"at_s": 1.0, "link": "a->c", "to": {"model": "none"}}']
+)
 def test_a_record_that_names_a_foreign_change_is_refused(text):
     def spoiled(state):
-        return logs.replaced(state, cmd=[text] if (state.site, state.tick) == ("a", 3) else state.cmd)
+        return logs.replaced(
+            state, cmd=[text] if (state.site, state.tick) == ("a", 3) else state.cmd
+        )
 
     with pytest.raises(LogError):
         list_changes(logs.rewritten(logs.busy().log, change=spoiled))

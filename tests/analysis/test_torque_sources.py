@@ -23,11 +23,22 @@ gains = st.tuples(st.floats(0.0, 500.0), st.floats(0.0, 500.0))
 
 @st.composite
 def actors(draw: st.DrawFn) -> TorqueSource:
-    acts = draw(st.sampled_from([TorqueKind.HAND, TorqueKind.TASK_HAND, TorqueKind.VISCOUS, TorqueKind.WALL]))
+    acts = draw(
+        st.sampled_from(
+            [TorqueKind.HAND, TorqueKind.TASK_HAND, TorqueKind.VISCOUS, TorqueKind.WALL]
+        )
+    )
     start, move = draw(st.floats(0.0, 2.0)), draw(st.floats(0.0, 2.0))
     angle = draw(st.floats(0.0, 6.3))
-    after = (float(np.cos(angle)), float(np.sin(angle))) if acts is TorqueKind.WALL else draw(pairs)
-    ends = (start, start + draw(st.floats(0.1, 2.0)), move, move + draw(st.sampled_from([0.0, 0.5, 1.5])))
+    after = (
+        (float(np.cos(angle)), float(np.sin(angle))) if acts is TorqueKind.WALL else draw(pairs)
+    )
+    ends = (
+        start,
+        start + draw(st.floats(0.1, 2.0)),
+        move,
+        move + draw(st.sampled_from([0.0, 0.5, 1.5])),
+    )
     return TorqueSource(acts, *ends, draw(pairs), after, draw(gains), draw(gains))
 
 
@@ -42,7 +53,9 @@ def test_every_actor_does_what_the_core_says(
     rows, table = torque_source_rows((actor,))
     expected = np.zeros_like(q)
     for n in range(len(states)):
-        expected[n] = exogenous.source_torque(float(t_s[n]), q[n], qd[n], lengths, rows[0], table)[:2]
+        expected[n] = exogenous.source_torque(
+            float(t_s[n]), q[n], qd[n], lengths, rows[0], table
+        )[:2]
     found = compute_source_torque(
         actor, t_s, q, qd, PlanarArmRows(np.zeros(5), 0.0, lengths).place_end_effector(q, qd)
     )
@@ -69,7 +82,9 @@ def test_a_hand_that_nobody_wrote_down_has_no_script() -> None:
 
 @pytest.mark.parametrize("acts", [TorqueKind.HAND, TorqueKind.TASK_HAND])
 def test_a_script_is_its_torque_at_a_fixed_pose(acts: TorqueKind) -> None:
-    actor = TorqueSource(acts, 0.0, 9.0, 1.0, 3.0, (0.1, 0.2), (0.5, -0.4), (50.0, 20.0), (5.0, 2.0))
+    actor = TorqueSource(
+        acts, 0.0, 9.0, 1.0, 3.0, (0.1, 0.2), (0.5, -0.4), (50.0, 20.0), (5.0, 2.0)
+    )
     t_s = np.linspace(0.0, 4.0, 41)
     still = np.tile([0.3, 1.1], (len(t_s), 1))
     tip = PlanarArmRows(np.zeros(5), 0.0, (1.0, 1.0)).place_end_effector(still, 0.0 * still)

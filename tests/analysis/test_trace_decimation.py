@@ -6,7 +6,9 @@ from hypothesis.extra import numpy as hnp
 from trilat_net.analysis.site_signals import decimate, extreme_rows
 
 numbers = st.one_of(st.floats(-1e6, 1e6), st.just(np.nan))
-columns = hnp.arrays(np.float64, st.tuples(st.integers(1, 400), st.integers(1, 4)), elements=numbers)
+columns = hnp.arrays(
+    np.float64, st.tuples(st.integers(1, 400), st.integers(1, 4)), elements=numbers
+)
 
 
 @settings(max_examples=40)

@@ -8,7 +8,12 @@ import pytest
 import trilat_net as tn
 from trilat_net.analysis.envelope_trend import EnvelopeTrend
 from trilat_net.analysis.run_end import EndBehaviour, Stability, classify_log_end
-from trilat_net.analysis.twin_growth import PushedTwins, TwinGrowth, judge_end_by_twins, judge_twins
+from trilat_net.analysis.twin_growth import (
+    PushedTwins,
+    TwinGrowth,
+    judge_end_by_twins,
+    judge_twins,
+)
 from trilat_net.execution.twins import Push, TwinPath, Twins
 from trilat_net.scenario import load_scenario
 
@@ -40,7 +45,11 @@ def test_the_rate_of_a_mode_is_found_without_its_swing(rate_per_s: float) -> Non
 
 def test_the_words_follow_the_trend() -> None:
     trends = {rate: grown(rate).trend for rate in (-0.55, 0.0, 0.2)}
-    assert list(trends.values()) == [EnvelopeTrend.DECAYS, EnvelopeTrend.STEADY, EnvelopeTrend.GROWS]
+    assert list(trends.values()) == [
+        EnvelopeTrend.DECAYS,
+        EnvelopeTrend.STEADY,
+        EnvelopeTrend.GROWS,
+    ]
     log = tn.simulate("two_sites", duration_s=0.1)
     texts = [PushedTwins(log, 0.0, grown(rate)).headline() for rate in trends]
     rates = [grown(rate).pushes[0].rate_per_s for rate in trends]
@@ -71,9 +80,14 @@ def test_a_run_is_not_stable_where_its_twins_grow() -> None:
 
 @pytest.mark.parametrize(
     ("speed_rad_s", "rate_per_s"),
-    [(1e-4, -0.55), *(pytest.param(*one, marks=pytest.mark.long) for one in ((5e-3, -0.55), (1e-4, 0.0)))],
+    [
+        (1e-4, -0.55),
+        *(pytest.param(*one, marks=pytest.mark.long) for one in ((5e-3, -0.55), (1e-4, 0.0))),
+    ],
 )
-def test_a_slow_end_needs_no_trend_where_pushes_die(speed_rad_s: float, rate_per_s: float) -> None:
+def test_a_slow_end_needs_no_trend_where_pushes_die(
+    speed_rad_s: float, rate_per_s: float
+) -> None:
     """1e-4 rad/s are 1 mrad in 10 s; 5e-3 rad/s may be a drift, and what keeps a push may keep going."""
     end = classify_log_end(tn.simulate("two_sites"))
     slow = end._replace(behaviour=EndBehaviour.UNDECIDED, end_speed_rad_s=speed_rad_s)
@@ -90,5 +104,7 @@ def test_twins_tell_what_is_linear_from_what_is_not() -> None:
     assert found.linear is not None
     assert found.linear.smallest == 1e-8
     assert 1e-4 <= found.linear.largest <= 0.1
-    assert f"; a push of {10 * found.linear.largest:g} goes another way: x " in found.linear.text
+    assert (
+        f"; a push of {10 * found.linear.largest:g} goes another way: x " in found.linear.text
+    )
     assert len(found.to_frame()) == 9

@@ -44,7 +44,11 @@ from trilat_net.studies.sweep.sweep_cell import classify_cell
 from trilat_net.theory.equilibrium import follow_equilibrium, prolong_scenario
 from trilat_net.theory.linear_analysis import find_end_pose_roots
 from trilat_net.theory.linear_edge import find_contact_growth, find_rightmost_root
-from trilat_net.theory.operating_point import Equilibrium, derive_operating_conditions, is_constant_link
+from trilat_net.theory.operating_point import (
+    Equilibrium,
+    derive_operating_conditions,
+    is_constant_link,
+)
 
 from .drawn_loops import (
     SAMPLED,
@@ -79,7 +83,9 @@ SEEDS = 2000
 """Seeds below `WIDE_FROM` whose truth is stored."""
 
 
-def two_pairs(laws: tuple[Any, Any], q1_rad: tuple[float, ...], across: float = 0.0, **more: Any) -> Scenario:
+def two_pairs(
+    laws: tuple[Any, Any], q1_rad: tuple[float, ...], across: float = 0.0, **more: Any
+) -> Scenario:
     """{a, b} and {c, e}, each pair under one of two laws; `across` is the share of the other pair."""
     sites = {
         name: {
@@ -90,7 +96,9 @@ def two_pairs(laws: tuple[Any, Any], q1_rad: tuple[float, ...], across: float = 
         for name, q1 in zip("abce", q1_rad, strict=True)
     }
     own, other = dict(zip("abce", "baec", strict=True)), dict(zip("abce", "ceab", strict=True))
-    dominance = {i: {j: 1.0 - across, **({other[i]: across} if across else {})} for i, j in own.items()}
+    dominance = {
+        i: {j: 1.0 - across, **({other[i]: across} if across else {})} for i, j in own.items()
+    }
     given = {"sites": sites, "dominance": dominance, "link": {"delay_ms": 200.0}}
     return experiment("pairs", **{**given, **more})
 
@@ -117,7 +125,9 @@ NEVER_STABLE = ("not stable", "open")
 STABLE = ("stable",)
 
 
-def _load(name: str, overrides: Mapping[str, Any] | None = None, /, **more: Any) -> Callable[[], Scenario]:
+def _load(
+    name: str, overrides: Mapping[str, Any] | None = None, /, **more: Any
+) -> Callable[[], Scenario]:
     """Makes a shipped scenario with changes, at the speed limit for which its verdict was judged."""
     changes = {key.replace("__", "."): value for key, value in more.items()}
     limit = {"limits.qd_limit_rad_s": 100.0}
@@ -132,7 +142,9 @@ def _pairs(first: Any, second: Any, across: float = 0.0) -> Callable[[], Scenari
 
 
 def _wall(kilonewtons: float, *, sampled: bool = True, **more: Any) -> Callable[[], Scenario]:
-    return _load("windup", {SAMPLED: sampled, STIFFNESS: 1e3 * kilonewtons, "duration_s": 24.0, **more})
+    return _load(
+        "windup", {SAMPLED: sampled, STIFFNESS: 1e3 * kilonewtons, "duration_s": 24.0, **more}
+    )
 
 
 def _free(overrides: Mapping[str, Any] | None = None, /, **more: Any) -> Callable[[], Scenario]:
@@ -140,9 +152,19 @@ def _free(overrides: Mapping[str, Any] | None = None, /, **more: Any) -> Callabl
 
 
 def _margin(
-    overrides: Mapping[str, Any] | None = None, /, d: float = 5.0, T_ms: float = 200.0, **more: Any
+    overrides: Mapping[str, Any] | None = None,
+    /,
+    d: float = 5.0,
+    T_ms: float = 200.0,
+    **more: Any,
 ) -> Callable[[], Scenario]:
-    given = {"control.d": d, "link.delay_ms": T_ms, "rate_hz": 100, "duration_s": 40.0, **(overrides or {})}
+    given = {
+        "control.d": d,
+        "link.delay_ms": T_ms,
+        "rate_hz": 100,
+        "duration_s": 40.0,
+        **(overrides or {}),
+    }
     return _load("p_d_margin", given, **more)
 
 
@@ -161,18 +183,27 @@ PARAMETRIC = {
     "duration_s": 60.0,
 }
 
-HANGS = {"control.Gamma": [1.0, 1.0, 1.0, 0.01, 0.01], "control.theta_hat0": [3.0, 1.0, 1.0, 1.6, 0.8]}
+HANGS = {
+    "control.Gamma": [1.0, 1.0, 1.0, 0.01, 0.01],
+    "control.theta_hat0": [3.0, 1.0, 1.0, 1.6, 0.8],
+}
 NUDGE = [{"kind": "pulse", "start_s": 20.0, "end_s": 39.9, "peak_nm": [8.0, 8.0]}]
 
 LOSSY = {"link.loss": 1e-6}
-CLOSE = {"sites.m1.q0_rad": [0.1, 0.2], "sites.m2.q0_rad": [0.102, 0.199], "sites.s.q0_rad": [0.099, 0.203]}
+CLOSE = {
+    "sites.m1.q0_rad": [0.1, 0.2],
+    "sites.m2.q0_rad": [0.102, 0.199],
+    "sites.s.q0_rad": [0.099, 0.203],
+}
 STIFF = {"control.K": 100.0, "control.d": 200.0, "rate_hz": 1000, "duration_s": 20.0}
 
 
 def _slower_from(at_s: float, d: float) -> Callable[[], Scenario]:
     """P+d whose delay becomes longer, on links that lose a sample now and then."""
     to = {"delay_ms": 900.0, "loss": 1e-6}
-    later = [{"at_s": at_s, "link": link, "to": to} for link in load_scenario("p_d_margin").links]
+    later = [
+        {"at_s": at_s, "link": link, "to": to} for link in load_scenario("p_d_margin").links
+    ]
     return _margin(LOSSY | {"timeline": later}, d=d)
 
 
@@ -188,7 +219,8 @@ def _swinging(
     """P+d whose delay of 200 ms swings, from starts that are 1e-9 rad apart."""
     names = ("m1", "m2", "s") if name == "p_d_margin" else ("m", "s")
     starts = {
-        f"sites.{one}.q0_rad": [0.1 + 1e-9 * (n > 0), 0.2 + 1e-9 * (n == 1)] for n, one in enumerate(names)
+        f"sites.{one}.q0_rad": [0.1 + 1e-9 * (n > 0), 0.2 + 1e-9 * (n == 1)]
+        for n, one in enumerate(names)
     }
     link = {
         "link.model": "sine",
@@ -196,13 +228,24 @@ def _swinging(
         "link.amplitude_ms": swing_ms,
         "link.period_s": period_s,
     }
-    return _load(name, {**starts, **link, "control.d": d, "rate_hz": 200, "duration_s": 20.0}, **more)
+    return _load(
+        name, {**starts, **link, "control.d": d, "rate_hz": 200, "duration_s": 20.0}, **more
+    )
 
 
-def _turntables(d: float, period_s: float, c: tuple[float, float] = (0.88, 0.12)) -> Callable[[], Scenario]:
+def _turntables(
+    d: float, period_s: float, c: tuple[float, float] = (0.88, 0.12)
+) -> Callable[[], Scenario]:
     """Three arms of one joint about an upright axis, 0.3 rad apart; `c` has the shares of the last."""
-    rows = {"a": {"b": 0.12, "c": 0.88}, "b": {"a": 0.53, "c": 0.47}, "c": {"a": c[0], "b": c[1]}}
-    sites = {name: {"role": "slave" if n else "master", "q0_rad": [0.3 * n]} for n, name in enumerate(rows)}
+    rows = {
+        "a": {"b": 0.12, "c": 0.88},
+        "b": {"a": 0.53, "c": 0.47},
+        "c": {"a": c[0], "b": c[1]},
+    }
+    sites = {
+        name: {"role": "slave" if n else "master", "q0_rad": [0.3 * n]}
+        for n, name in enumerate(rows)
+    }
     link = {"model": "sine", "delay_ms": 200.0, "amplitude_ms": 199.0, "period_s": period_s}
     arm = {"urdf": "arm6.urdf", "tip": "shoulder", "armature_kg_m2": 2.5}
     law, given = {"law": "p_d", "K": 5.0, "d": d}, {"rate_hz": 100, "duration_s": 60.0}
@@ -215,7 +258,11 @@ def pair(first: Any, second: Any, **more: Any) -> Scenario:
     """Two sites that follow each other."""
     sites = {"a": {"role": "master", "q0_rad": [0.3, 0.4], **first}}
     sites["b"] = {"role": "slave", "q0_rad": [0.3, 0.4], **second}
-    given = {"scheme": "digital", "sites": sites, "dominance": {"a": {"b": 1.0}, "b": {"a": 1.0}}}
+    given = {
+        "scheme": "digital",
+        "sites": sites,
+        "dominance": {"a": {"b": 1.0}, "b": {"a": 1.0}},
+    }
     return experiment("pair", **{**given, **more})
 
 
@@ -223,7 +270,9 @@ def _unlike_rates(rates_hz: tuple[int, int], K: float, d: float) -> Callable[[],
     """P+d without delay between sites that tick at two rates."""
     first, second = ({"rate_hz": rate_hz} for rate_hz in rates_hz)
     law = {"law": "p_d", "K": K, "d": d}
-    return lambda: pair(first, second | {"q0_rad": [0.5, 0.4]}, control=law, link={"delay_ms": 0.0})
+    return lambda: pair(
+        first, second | {"q0_rad": [0.5, 0.4]}, control=law, link={"delay_ms": 0.0}
+    )
 
 
 def _reserve(
@@ -231,9 +280,13 @@ def _reserve(
 ) -> Callable[[], Scenario]:
     """Passivity control with a reserve, from starts next to each other; at arms that something resists."""
     law = {"law": "tdpa", "K": K, "B": B, "reserve_J": reserve_J}
-    around = {"environment": [{"kind": "viscous", "damping_nm_s_rad": damped}]} if damped else {}
+    around = (
+        {"environment": [{"kind": "viscous", "damping_nm_s_rad": damped}]} if damped else {}
+    )
     made = {"control": law, "link": {"delay_ms": 136.0}, "rate_hz": 500, "duration_s": 20.0}
-    return lambda: load_scenario(pair(around, around, **made), {"sites.b.q0_rad": [0.3 + apart_rad, 0.4]})
+    return lambda: load_scenario(
+        pair(around, around, **made), {"sites.b.q0_rad": [0.3 + apart_rad, 0.4]}
+    )
 
 
 def _held_apart(stiffness_nm_rad: float, by_rad: float) -> Callable[[], Scenario]:
@@ -260,7 +313,9 @@ def _held_apart(stiffness_nm_rad: float, by_rad: float) -> Callable[[], Scenario
 def _wave(b: float, K: float, damped: float = 0.0) -> Callable[[], Scenario]:
     """Wave variables between arms that start at rest, next to each other; at arms that something resists."""
     law = {"law": "wave", "b": b, "K": K, "B": 0.1 * K}
-    around = {"environment": [{"kind": "viscous", "damping_nm_s_rad": damped}]} if damped else {}
+    around = (
+        {"environment": [{"kind": "viscous", "damping_nm_s_rad": damped}]} if damped else {}
+    )
     made = {"control": law, "link": {"delay_ms": 50.0}, "rate_hz": 200}
     return lambda: pair(around, around, **made)
 
@@ -272,7 +327,9 @@ def _coasting(follows: dict[str, float], law: str = "tdpa") -> Callable[[], Scen
     made = {"link": {"delay_ms": 34.0}, "rate_hz": 200, "duration_s": 40.0}
     led = led if law in ("wave", "tdpa") else {**follows}
     return lambda: pair(
-        {"control": {"law": law, **follows}, "hands": [push]}, {"control": {"law": law, **led}}, **made
+        {"control": {"law": law, **follows}, "hands": [push]},
+        {"control": {"law": law, **led}},
+        **made,
     )
 
 
@@ -290,13 +347,29 @@ def _free_swinging(
 
 
 ROWS = (
-    Row("C1", "three sites, swinging at 1.4 s", _swinging("p_d_margin", 1.1, 1.4), NEVER_STABLE),
+    Row(
+        "C1", "three sites, swinging at 1.4 s", _swinging("p_d_margin", 1.1, 1.4), NEVER_STABLE
+    ),
     Row("C1", "the same, d 1.05", _swinging("p_d_margin", 1.05, 1.4), NEVER_STABLE),
-    Row("C1", "two sites, swinging at 1.25 s", _swinging("p_d_margin_two", 2.1, 1.25), NEVER_STABLE, "twins"),
+    Row(
+        "C1",
+        "two sites, swinging at 1.25 s",
+        _swinging("p_d_margin_two", 2.1, 1.25),
+        NEVER_STABLE,
+        "twins",
+    ),
     Row("C1", "the same, d 2", _swinging("p_d_margin_two", 2.0, 1.25), NEVER_STABLE, "twins"),
-    Row("C1", "and by 199 ms", _swinging("p_d_margin_two", 2.1, 1.25, 199.0), NEVER_STABLE, "twins"),
+    Row(
+        "C1",
+        "and by 199 ms",
+        _swinging("p_d_margin_two", 2.1, 1.25, 199.0),
+        NEVER_STABLE,
+        "twins",
+    ),
     Row("C1=", "three sites, d 2", _swinging("p_d_margin", 2.0, 1.4), STABLE),
-    Row("C1=", "a quarter of the swing, d 1.4", _swinging("p_d_margin", 1.4, 1.4, 50.0), STABLE),
+    Row(
+        "C1=", "a quarter of the swing, d 1.4", _swinging("p_d_margin", 1.4, 1.4, 50.0), STABLE
+    ),
     Row("C1=", "two sites, d 4", _swinging("p_d_margin_two", 4.0, 1.25), STABLE),
     Row("C2", "one joint, swinging at 2.5 s", _turntables(0.902, 2.5), NEVER_STABLE),
     Row("C2", "at 2.6 s", _turntables(0.902, 2.6), NEVER_STABLE),
@@ -316,22 +389,50 @@ ROWS = (
     Row("C6", "b 200", _wave(200.0, 0.0), NEVER_STABLE, "twins"),
     Row("C6=", "without motion, arms that something resists", _wave(5.0, 20.0, 4.0), STABLE),
     Row("C6=", "the same, b 60", _wave(60.0, 20.0, 2.0), STABLE),
-    Row("C7", "the paper's law, swinging at 0.5831 s", _free_swinging(0.5831), NEVER_STABLE, "twins"),
+    Row(
+        "C7",
+        "the paper's law, swinging at 0.5831 s",
+        _free_swinging(0.5831),
+        NEVER_STABLE,
+        "twins",
+    ),
     Row("C7", "for 150 s", _free_swinging(0.5831, duration_s=150.0), NEVER_STABLE, "twins"),
     Row("C7", "at 0.55 s", _free_swinging(0.55), NEVER_STABLE, "nobody pushed"),
     Row("C7=", "at 1.3 s", _free_swinging(1.3), STABLE),
     Row("C7=", "by 20 ms", _free_swinging(0.5831, 20.0), STABLE),
-    Row("S1", "a wave line that nobody holds", _coasting({"b": 5.0}, "wave"), ("open",), "coasting"),
-    Row("S1", "all follow, and nobody holds", _coasting({"K": 40.0, "B": 5.0}), NEVER_STABLE, "coasting"),
+    Row(
+        "S1",
+        "a wave line that nobody holds",
+        _coasting({"b": 5.0}, "wave"),
+        ("open",),
+        "coasting",
+    ),
+    Row(
+        "S1",
+        "all follow, and nobody holds",
+        _coasting({"K": 40.0, "B": 5.0}),
+        NEVER_STABLE,
+        "coasting",
+    ),
     # it coasts, and pushes grow at +2.7 /s (`find_wide_truth`) to the 3 mrad that the reserve of tdpa holds
     Row("S1=", "both follow, and are damped", _coasting({"K": 40.0, "d": 6.0}, "pd_d"), STABLE),
     Row("S4", "a hand at one arm only", _touched(1e-6), NEVER_STABLE, "apart"),
     Row("S4=", "two hands hold 0.4 rad apart", _held_apart(30.0, 0.0), STABLE),
     Row("S4=", "weaker ones, 0.5 rad apart", _held_apart(12.0, 0.1), STABLE),
     Row(
-        "F1", "the wide group decays, the small one grows", _pairs(p_d(2.4), p_d(1.7)), NEVER_STABLE, "joint"
+        "F1",
+        "the wide group decays, the small one grows",
+        _pairs(p_d(2.4), p_d(1.7)),
+        NEVER_STABLE,
+        "joint",
     ),
-    Row("F1", "and of that only one joint", _pairs(p_d(4.0), p_d([1.2, 4.0])), NEVER_STABLE, "joint"),
+    Row(
+        "F1",
+        "and of that only one joint",
+        _pairs(p_d(4.0), p_d([1.2, 4.0])),
+        NEVER_STABLE,
+        "joint",
+    ),
     Row("F1=", "both groups decay", _pairs(p_d(4.0), p_d(4.0)), STABLE),
     Row("F2", "a sampled wall of 20 kN/m", _wall(20.0), NEVER_STABLE, "this rest: unstable"),
     Row("F2", "a sampled wall of 28 kN/m", _wall(28.0), NEVER_STABLE, "this rest: unstable"),
@@ -339,9 +440,23 @@ ROWS = (
     Row("F2=", "a sampled wall of 8 kN/m", _wall(8.0), STABLE),
     Row("F2=", "a wall of 28 kN/m that is not sampled", _wall(28.0, sampled=False), STABLE),
     Row("F4", "the delay swings at 1.7 Hz", _load("free", PARAMETRIC), NEVER_STABLE, "v rises"),
-    Row("F4=", "by a tenth of that", _load("free", PARAMETRIC, link__amplitude_ms=20.0), STABLE),
-    Row("F5", "P+d, 1.6 s, d 2.7", _margin(d=2.7, T_ms=1600.0, duration_s=60.0), NEVER_STABLE, "unstable"),
-    Row("F5", "P+d, 0.8 s, d 2", _margin(d=2.0, T_ms=800.0, duration_s=60.0), NEVER_STABLE, "unstable"),
+    Row(
+        "F4=", "by a tenth of that", _load("free", PARAMETRIC, link__amplitude_ms=20.0), STABLE
+    ),
+    Row(
+        "F5",
+        "P+d, 1.6 s, d 2.7",
+        _margin(d=2.7, T_ms=1600.0, duration_s=60.0),
+        NEVER_STABLE,
+        "unstable",
+    ),
+    Row(
+        "F5",
+        "P+d, 0.8 s, d 2",
+        _margin(d=2.0, T_ms=800.0, duration_s=60.0),
+        NEVER_STABLE,
+        "unstable",
+    ),
     Row("F5=", "P+d, 1.6 s, d 16", _margin(d=16.0, T_ms=1600.0, duration_s=120.0), STABLE),
     Row("F5", "at its edge, if a sample is lost", _margin(CLOSE | LOSSY, d=0.96), NEVER_STABLE),
     Row("F5=", "beyond its edge, the same", _margin(CLOSE | LOSSY, d=1.2), STABLE),
@@ -352,16 +467,48 @@ ROWS = (
         NEVER_STABLE,
         "of the delays in use",
     ),
-    Row("F5=", "1.56 s, d 16, the same", _margin(LOSSY, d=16.0, T_ms=1560.0, duration_s=120.0), STABLE),
-    Row("F6", "two pairs that hardly hear of each other", _pairs(*LEARNT, 1e-6), NEVER_STABLE, "apart"),
+    Row(
+        "F5=",
+        "1.56 s, d 16, the same",
+        _margin(LOSSY, d=16.0, T_ms=1560.0, duration_s=120.0),
+        STABLE,
+    ),
+    Row(
+        "F6",
+        "two pairs that hardly hear of each other",
+        _pairs(*LEARNT, 1e-6),
+        NEVER_STABLE,
+        "apart",
+    ),
     Row("F6=", "two pairs that do", _pairs(*LEARNT, 0.3), STABLE),
     Row("F6", "a hand that cannot hold them apart", _touched(1e-6), NEVER_STABLE, "apart"),
-    Row("F7", "20 ms of free motion", _free({"sites.m1.hands": WIDER}), NEVER_STABLE, "operator acts"),
-    Row("F7", "100 ms of it, after a push", _free({"sites.m1.hands": NUDGE}), NEVER_STABLE, "operator acts"),
-    Row("F7=", "30 s of it", _free({"sites.m1.hands": EARLY}), STABLE),
-    Row("F8", "force reflection hammers", _load("contact", duration_s=60.0), ("not stable",), "bounded"),
     Row(
-        "F8=", "a fifth of the force", _load("contact", {"sites.m.control.k_f": 0.2}, duration_s=60.0), STABLE
+        "F7",
+        "20 ms of free motion",
+        _free({"sites.m1.hands": WIDER}),
+        NEVER_STABLE,
+        "operator acts",
+    ),
+    Row(
+        "F7",
+        "100 ms of it, after a push",
+        _free({"sites.m1.hands": NUDGE}),
+        NEVER_STABLE,
+        "operator acts",
+    ),
+    Row("F7=", "30 s of it", _free({"sites.m1.hands": EARLY}), STABLE),
+    Row(
+        "F8",
+        "force reflection hammers",
+        _load("contact", duration_s=60.0),
+        ("not stable",),
+        "bounded",
+    ),
+    Row(
+        "F8=",
+        "a fifth of the force",
+        _load("contact", {"sites.m.control.k_f": 0.2}, duration_s=60.0),
+        STABLE,
     ),
     Row("F8", "100 Hz, no delay: a limit cycle", _load("free", CYCLE), NEVER_STABLE, "v rises"),
     Row("F8=", "500 Hz, no delay", _load("free", CYCLE, rate_hz=500, duration_s=60.0), STABLE),
@@ -374,17 +521,39 @@ ROWS = (
         "hang",
     ),
     Row("F9", "gravity hardly learnt", _free(HANGS, duration_s=60.0), NEVER_STABLE),
-    Row("F9", "a torque limit of 15 N m", _free(limits__tau_limit_nm=15.0), NEVER_STABLE, "v ends"),
+    Row(
+        "F9",
+        "a torque limit of 15 N m",
+        _free(limits__tau_limit_nm=15.0),
+        NEVER_STABLE,
+        "v ends",
+    ),
     Row("F9=", "a torque limit of 100 N m", _free(limits__tau_limit_nm=100.0), STABLE),
     Row("F9=", "gravity known", _margin(duration_s=60.0), STABLE),
-    Row("F9", "arms that sink slowly", _margin(STIFF | {"control.gravity": 0.99}), NEVER_STABLE),
-    Row("F9=", "arms that do not", _margin(STIFF), STABLE),
-    Row("W", "a hand swings ever wider", _margin({"sites.m1.hands": WIDER}), ("open",), "operator acts"),
     Row(
-        "W", "a hand swings on at the slave", _margin({"sites.s.hands": LASTING}), ("open",), "operator acts"
+        "F9", "arms that sink slowly", _margin(STIFF | {"control.gravity": 0.99}), NEVER_STABLE
+    ),
+    Row("F9=", "arms that do not", _margin(STIFF), STABLE),
+    Row(
+        "W",
+        "a hand swings ever wider",
+        _margin({"sites.m1.hands": WIDER}),
+        ("open",),
+        "operator acts",
     ),
     Row(
-        "W", "a delay that is too long in the end", _slower_from(39.9, 2.0), NEVER_STABLE, "the loop changes"
+        "W",
+        "a hand swings on at the slave",
+        _margin({"sites.s.hands": LASTING}),
+        ("open",),
+        "operator acts",
+    ),
+    Row(
+        "W",
+        "a delay that is too long in the end",
+        _slower_from(39.9, 2.0),
+        NEVER_STABLE,
+        "the loop changes",
     ),
     Row("W=", "a longer delay since long", _slower_from(15.0, 5.0), STABLE),
     Row("W=", "the hand lets go", _margin({"sites.m1.hands": EARLY}), STABLE),
@@ -394,7 +563,9 @@ ROWS = (
 def under_noise(scenario: Scenario) -> Scenario:
     """An experiment with its delays, on links as of a live run: jitter of 1.5 ms, 1 % of samples lost."""
     noise = {"model": "uniform", "half_width_ms": 1.5, "loss": 0.01}
-    links = {f"links.{link}.{key}": value for link in scenario.links for key, value in noise.items()}
+    links = {
+        f"links.{link}.{key}": value for link in scenario.links for key, value in noise.items()
+    }
     delays = {f"links.{link}.delay_ms": spec.delay_ms for link, spec in scenario.links.items()}
     return load_scenario(scenario, links | delays)
 
@@ -422,7 +593,11 @@ def find_truth(drawn: Drawn) -> Truth:
         run.advance(float(t_s))
         states.append((run.q, run.theta_hat))
     run.advance(ends_s)
-    in_contact = find_contact_growth(scenario, *map(np.array, zip(*states, strict=True))) if states else -1.0
+    in_contact = (
+        find_contact_growth(scenario, *map(np.array, zip(*states, strict=True)))
+        if states
+        else -1.0
+    )
     run.advance(LONGER * ends_s)
     at = Equilibrium(run.q, run.theta_hat, "", 0.0)
     if run.diverged_s is not None:
@@ -434,7 +609,10 @@ def find_truth(drawn: Drawn) -> Truth:
         near = any(one is not None and (one > 0.0) != (root > 0.0) for one in beside)
     if run.diverged_s is not None:
         return Truth(True, root, near)
-    early, late = _peak_speeds(run, 0.75 * ends_s, ends_s), _peak_speeds(run, (LONGER - 1.0) * ends_s)
+    early, late = (
+        _peak_speeds(run, 0.75 * ends_s, ends_s),
+        _peak_speeds(run, (LONGER - 1.0) * ends_s),
+    )
     slow = root is not None and -SLOW_PER_S < root < 0.0
     lasts = bool((late > np.maximum((1.2 if slow else 0.5) * early, SEEN)).any())
     grows = root is not None and root > 0.0 and not scenario.links_random
@@ -449,7 +627,10 @@ def find_wide_truth(scenario: Scenario) -> Truth:
     push in it grows, for the while that it lasts, and one slower than `AT_REST_RAD_S` that drawn delays keep
     up although every push in it dies.
     """
-    whole, ends_s = prolong_scenario(scenario, LONGER * scenario.duration_s), scenario.duration_s
+    whole, ends_s = (
+        prolong_scenario(scenario, LONGER * scenario.duration_s),
+        scenario.duration_s,
+    )
     run = FusedRun(whole)
     run.advance(LONGER * ends_s)
     if run.diverged_s is not None:
@@ -516,7 +697,9 @@ def _largest_difference(run: FusedRun, pushed: FusedRun, start_s: float) -> floa
 
 def has_sampled_wall(scenario: Scenario) -> bool:
     """True if a wall is held over a tick."""
-    return any(one.actor.sampled for spec in scenario.sites.values() for one in spec.environment)
+    return any(
+        one.actor.sampled for spec in scenario.sites.values() for one in spec.environment
+    )
 
 
 def _peak_speeds(run: FusedRun, from_s: float, to_s: float = np.inf) -> Array:
@@ -528,7 +711,8 @@ def _peak_speeds(run: FusedRun, from_s: float, to_s: float = np.inf) -> Array:
 def _rightmost(scenario: Scenario, at: Equilibrium) -> float | None:
     """The real part of the rightmost root at the rest next to a pose; None without a loop or a rest there."""
     if scenario.links_random:
-        scenario = load_scenario(scenario, {"duration_s": 4.0})  # ages are counted sample by sample
+        # ages are counted sample by sample
+        scenario = load_scenario(scenario, {"duration_s": 4.0})
     try:
         rest = follow_equilibrium(scenario, at)
         root = find_rightmost_root(derive_operating_conditions(scenario), rest, sampled=True)
@@ -543,7 +727,9 @@ def _scaled(drawn: Drawn, factor: float) -> Scenario:
         value = drawn.scenario.sites["s"].environment[0].stiffness_n_m
         return load_scenario(drawn.scenario, {STIFFNESS: factor * value})
     sites = drawn.scenario.sites.items()
-    damping = {f"sites.{name}.control.d": [factor * d for d in spec.control.d] for name, spec in sites}
+    damping = {
+        f"sites.{name}.control.d": [factor * d for d in spec.control.d] for name, spec in sites
+    }
     return load_scenario(drawn.scenario, damping)
 
 
@@ -570,7 +756,10 @@ class RunInMemory:
 
     def __getitem__(self, site: str) -> Any:
         n, rate_hz = self.sites.index(site), self.scenario.sites[site].rate_hz
-        buckets, end = self._run.buckets[n], "run" if self._run.diverged_s is None else "diverged"
+        buckets, end = (
+            self._run.buckets[n],
+            "run" if self._run.diverged_s is None else "diverged",
+        )
         return LastOfBuckets(
             rate_hz=rate_hz,
             mode=[end],
@@ -599,7 +788,9 @@ def say_of_run(scenario: Scenario) -> str:
     run = RunInMemory(scenario)
     no_v = StabilityVerdict(StabilityFinding.NOT_JUDGED, "")
     ticks = {site: scenario.ticks(site) for site in scenario.names}
-    whole = Evidence(Coverage(ticks, ticks), None, MIN_COVERAGE, Integrity(DigestState.INTACT, ""))
+    whole = Evidence(
+        Coverage(ticks, ticks), None, MIN_COVERAGE, Integrity(DigestState.INTACT, "")
+    )
     roots = find_end_pose_roots(run)  # type: ignore[arg-type]
     end = run.find_end()
     twins = measure_virtual_twins(scenario, end, scenario.duration_s, TWINS)
@@ -609,7 +800,9 @@ def say_of_run(scenario: Scenario) -> str:
 def say_of_sweep(scenario: Scenario) -> str:
     """The word of a cell of `trilat sweep`."""
     stable = classify_cell(scenario.text, LONGER * scenario.duration_s).verdict.stable
-    return str({True: Stability.STABLE, False: Stability.NOT_STABLE, None: Stability.OPEN}[stable])
+    return str(
+        {True: Stability.STABLE, False: Stability.NOT_STABLE, None: Stability.OPEN}[stable]
+    )
 
 
 class Judged(NamedTuple):
@@ -632,7 +825,9 @@ def read_truth(seed: int, drawn: Drawn) -> Truth:
     """The truth of a seed, as it was stored for this very scenario."""
     digest, unstable, root_per_s, near = _read_rows()[seed]
     anew = "python -m tests.certificate.adversaries --find-truths"
-    assert digest == _digest(drawn), f"seed {seed} draws another scenario than its truth is of: run {anew}"
+    assert digest == _digest(drawn), (
+        f"seed {seed} draws another scenario than its truth is of: run {anew}"
+    )
     return Truth(unstable == "1", float(root_per_s) if root_per_s else None, near == "1")
 
 
@@ -689,10 +884,14 @@ def tally_clear(judged: Iterable[Judged], by: str = "certified") -> Tally:
 
 def main() -> None:
     """Prints the table of docs/certificate.md."""
-    parser = argparse.ArgumentParser(description="What is said of random experiments whose truth is known.")
+    parser = argparse.ArgumentParser(
+        description="What is said of random experiments whose truth is known."
+    )
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--first", type=int, default=0)
-    parser.add_argument("--find-truths", action="store_true", help="write those of truths.csv anew")
+    parser.add_argument(
+        "--find-truths", action="store_true", help="write those of truths.csv anew"
+    )
     asked = parser.parse_args()
     seeds = range(asked.first, asked.first + asked.seeds)
     with ProcessPoolExecutor(mp_context=get_context("spawn")) as pool:

@@ -27,7 +27,11 @@ def _toml(value: Any) -> str:
     if isinstance(value, float):
         return json.dumps(float(f"{value:.9g}"))
     if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{json.dumps(key)} = {_toml(one)}" for key, one in value.items()) + " }"
+        return (
+            "{ "
+            + ", ".join(f"{json.dumps(key)} = {_toml(one)}" for key, one in value.items())
+            + " }"
+        )
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_toml, value)) + "]"
     return json.dumps(value)
@@ -35,7 +39,13 @@ def _toml(value: Any) -> str:
 
 def experiment(name: str, **tables: Any) -> Scenario:
     """The scenario of some tables."""
-    given = {"name": name, "rate_hz": 100, "duration_s": 30.0, "scheme": "second_order", **tables}
+    given = {
+        "name": name,
+        "rate_hz": 100,
+        "duration_s": 30.0,
+        "scheme": "second_order",
+        **tables,
+    }
     return parse_scenario("\n".join(f"{key} = {_toml(value)}" for key, value in given.items()))
 
 
@@ -101,7 +111,11 @@ def _shares(rng: np.random.Generator, names: str) -> dict[str, dict[str, float]]
 
 def _loop(rng: np.random.Generator, names: str, **more: Any) -> dict[str, Any]:
     """A network of P+d or PD+d whose damping is about the edge of stability."""
-    shares, T_ms, K = _shares(rng, names), float(rng.uniform(80.0, 400.0)), float(rng.uniform(8.0, 40.0))
+    shares, T_ms, K = (
+        _shares(rng, names),
+        float(rng.uniform(80.0, 400.0)),
+        float(rng.uniform(8.0, 40.0)),
+    )
     alpha = np.array([[shares[i].get(j, 0.0) for j in names] for i in names])
     worst = max(float(np.abs(np.linalg.eigvals(alpha).real.min())), 0.2173)
     bound = worst * K * (T_ms + 10.0) / 1e3
@@ -129,7 +143,11 @@ def _draw_network(rng: np.random.Generator) -> Drawn:
 
 def _draw_noisy(rng: np.random.Generator) -> Drawn:
     made = _loop(rng, "abc"[: rng.integers(2, 4)])
-    made["link"] |= {"model": "uniform", "half_width_ms": min(3.0, made["link"]["delay_ms"]), "loss": 0.02}
+    made["link"] |= {
+        "model": "uniform",
+        "half_width_ms": min(3.0, made["link"]["delay_ms"]),
+        "loss": 0.02,
+    }
     return Drawn("noise", experiment("noise", **made), "control.d")
 
 
@@ -151,13 +169,17 @@ def _draw_adaptive(rng: np.random.Generator) -> Drawn:
     """The paper's law at rates at which sampling may feed it."""
     names = "abc"[: rng.integers(2, 4)]
     late = rng.random() < 0.6
-    made = _loop(rng, names, link={"delay_ms": float(rng.uniform(20.0, 500.0)) if late else 0.0})
+    made = _loop(
+        rng, names, link={"delay_ms": float(rng.uniform(20.0, 500.0)) if late else 0.0}
+    )
     made["control"] = {
         "law": "adaptive",
         "Kp": float(rng.uniform(0.5, 3.0)),
         "Kd": float(rng.uniform(1.0, 5.0)),
     }
-    return Drawn("adaptive", experiment("adaptive", **{**made, "rate_hz": int(rng.choice([50, 100]))}))
+    return Drawn(
+        "adaptive", experiment("adaptive", **{**made, "rate_hz": int(rng.choice([50, 100]))})
+    )
 
 
 def _draw_delay(rng: np.random.Generator) -> Drawn:
@@ -195,7 +217,9 @@ def _draw_operator(rng: np.random.Generator) -> Drawn:
     made = _loop(rng, "abc")
     made["control"] = p_d(float(rng.uniform(2.0, 6.0)))
     until_s = DRAWN_S - 0.02 if rng.random() < 0.5 else 0.3 * DRAWN_S
-    hand = swinging([(0.0, 0.0), (until_s, float(rng.uniform(2.0, 10.0)))], float(rng.uniform(0.3, 1.5)))
+    hand = swinging(
+        [(0.0, 0.0), (until_s, float(rng.uniform(2.0, 10.0)))], float(rng.uniform(0.3, 1.5))
+    )
     made["sites"]["a"]["hands"] = [hand]
     return Drawn("operator", experiment("operator", **made))
 
@@ -245,7 +269,9 @@ def _about(rng: np.random.Generator, value: float, factor: float = 2.0) -> float
 
 def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, Any]]:
     """A law with its gains, of every site."""
-    gains: dict[str, Any] = {"law": law} | {key: _about(rng, x) for key, x in _TYPICAL[law].items()}
+    gains: dict[str, Any] = {"law": law} | {
+        key: _about(rng, x) for key, x in _TYPICAL[law].items()
+    }
     if law in _LEARN and rng.random() < 0.5:
         gains["theta_hat0"] = [3.0, 1.0, 1.0, 2.0, 1.0]
     if law == "tdpa":
@@ -254,14 +280,19 @@ def _draw_law(rng: np.random.Generator, law: str, names: str) -> list[dict[str, 
             "energy": str(rng.choice(["step", "velocity"])),
         }
     if law == "tanks":
-        gains |= {"level_J": float(rng.choice([0.01, 0.1, 5.0])), "by_shares": bool(rng.random() < 0.5)}
+        gains |= {
+            "level_J": float(rng.choice([0.01, 0.1, 5.0])),
+            "by_shares": bool(rng.random() < 0.5),
+        }
     if law == "wave" and rng.random() < 0.3:
         gains |= {"K": 0.0, "B": 0.0}
     own: Callable[[int], dict[str, Any]] = {
         "authority": lambda n: {"leads": n < len(names) - 1},
         "impedance": lambda n: {"follows": n == len(names) - 1},
         "smith": lambda n: {"predicts": n == 0},
-        "p_f": lambda n: {"K": gains["K"], "k_f": 0.0} if n else {"K": 0.0, "k_f": gains["k_f"]},
+        "p_f": lambda n: (
+            {"K": gains["K"], "k_f": 0.0} if n else {"K": 0.0, "k_f": gains["k_f"]}
+        ),
     }.get(law, lambda _: {})
     return [gains | own(n) for n in range(len(names))]
 
@@ -279,7 +310,12 @@ def _draw_link(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
             round(T_ms * float(rng.uniform(0.1, 0.99)), 1),
             round(float(rng.uniform(0.4, 4.0)), 3),
         )
-        return kind, {"model": kind, "delay_ms": T_ms, "amplitude_ms": swing, "period_s": period_s}
+        return kind, {
+            "model": kind,
+            "delay_ms": T_ms,
+            "amplitude_ms": swing,
+            "period_s": period_s,
+        }
     if kind == "ar1":
         noise = {
             "deviation_ms": round(0.2 * T_ms, 1),
@@ -289,7 +325,8 @@ def _draw_link(rng: np.random.Generator) -> tuple[str, dict[str, Any]]:
         return kind, {"model": kind, "delay_ms": T_ms, **noise}
     walk = np.cumsum(rng.uniform(-0.2, 0.2, 40)).round(3)
     points = [
-        f"{500_000 * n} {round(1e3 * T_ms * float(np.clip(1.0 + x, 0.3, 2.0)))}" for n, x in enumerate(walk)
+        f"{500_000 * n} {round(1e3 * T_ms * float(np.clip(1.0 + x, 0.3, 2.0)))}"
+        for n, x in enumerate(walk)
     ]
     return kind, {"model": kind, "trace": ", ".join(points), "at_end": "loop"}
 
@@ -298,8 +335,16 @@ def _draw_touch(rng: np.random.Generator, sites: dict[str, Any]) -> str:
     """Lets a hand hold, let go or push, or an environment resist; what it is."""
     names, to = list(sites), [float(x) for x in rng.uniform(-0.8, 1.2, 2).round(3)]
     spring = {"kind": "spring", "to_rad": to, "stiffness_nm_rad": _about(rng, 30.0, 3.0)}
-    spring |= {"damping_nm_s_rad": _about(rng, 6.0, 3.0), "move_start_s": 1.0, "move_end_s": 4.0}
-    kind = str(rng.choice(["nobody", "hold", "lets go", "two hold", "push", "damper", "wall"], p=_TOUCHES))
+    spring |= {
+        "damping_nm_s_rad": _about(rng, 6.0, 3.0),
+        "move_start_s": 1.0,
+        "move_end_s": 4.0,
+    }
+    kind = str(
+        rng.choice(
+            ["nobody", "hold", "lets go", "two hold", "push", "damper", "wall"], p=_TOUCHES
+        )
+    )
     if kind in ("hold", "two hold", "wall"):
         sites[names[0]]["hands"] = [spring]
     if kind == "two hold":
@@ -307,12 +352,17 @@ def _draw_touch(rng: np.random.Generator, sites: dict[str, Any]) -> str:
     if kind == "lets go":
         sites[names[0]]["hands"] = [spring | {"end_s": 9.0}]
     if kind == "push":
-        sites[names[0]]["hands"] = [{"kind": "pulse", "start_s": 1.0, "end_s": 4.0, "peak_nm": [6.0, 3.0]}]
+        sites[names[0]]["hands"] = [
+            {"kind": "pulse", "start_s": 1.0, "end_s": 4.0, "peak_nm": [6.0, 3.0]}
+        ]
     if kind in ("damper", "wall"):
         wall: dict[str, Any] = {"kind": "viscous", "damping_nm_s_rad": _about(rng, 4.0, 3.0)}
         if kind == "wall":
             wall = {"kind": "wall", "point_m": [1.4, 0.0], "normal": [-1.0, 0.0]}
-            wall |= {"stiffness_n_m": _about(rng, 600.0, 4.0), "damping_n_s_m": _about(rng, 10.0, 5.0)}
+            wall |= {
+                "stiffness_n_m": _about(rng, 600.0, 4.0),
+                "damping_n_s_m": _about(rng, 10.0, 5.0),
+            }
         sites[names[-1]]["environment"] = [wall | {"sampled": bool(rng.random() < 0.5)}]
     return kind
 
@@ -364,8 +414,12 @@ def _draw_anything(rng: np.random.Generator) -> Drawn:
         sites[name]["q0_rad"] = starts.tolist()
     alike = experiment("wide", sites=sites, **made)
     apart = {
-        f"sites.{name}.q0_rad": [float(q + round(spread * x, 13)) for q, x in zip(starts, row, strict=True)]
-        for name, row in zip(names, rng.uniform(-1.0, 1.0, (len(names), len(starts))), strict=True)
+        f"sites.{name}.q0_rad": [
+            float(q + round(spread * x, 13)) for q, x in zip(starts, row, strict=True)
+        ]
+        for name, row in zip(
+            names, rng.uniform(-1.0, 1.0, (len(names), len(starts))), strict=True
+        )
     }
     return Drawn(law, load_scenario(alike, apart), has=f"{link}, {touch}, {space}")
 

@@ -42,9 +42,13 @@ def test_a_row_has_its_word_and_its_reason(row: Row) -> None:
     assert row.reason in " ".join([found.end.text, *found.reasons]).lower()
 
 
-@pytest.mark.parametrize("row", [row for row in ROWS if row.mark in ("F1=", "F6=", "F7=", "W=")], ids=_named)
+@pytest.mark.parametrize(
+    "row", [row for row in ROWS if row.mark in ("F1=", "F6=", "F7=", "W=")], ids=_named
+)
 def test_a_mirror_is_stable_on_live_links_too(row: Row) -> None:
-    assert trilat_net.certify(trilat_net.simulate(under_noise(row.make()))).stability == "stable"
+    assert (
+        trilat_net.certify(trilat_net.simulate(under_noise(row.make()))).stability == "stable"
+    )
 
 
 def test_every_row_has_its_mirror() -> None:
@@ -102,7 +106,13 @@ OF_THE_CORE = {"adaptive", "adaptive_box", "adaptive_robust", "lee_spong", "p_d"
 
 @pytest.mark.parametrize(
     "seeds",
-    [LOGGED, *(pytest.param(range(n, n + BLOCK), marks=pytest.mark.long) for n in range(0, SEEDS, BLOCK))],
+    [
+        LOGGED,
+        *(
+            pytest.param(range(n, n + BLOCK), marks=pytest.mark.long)
+            for n in range(0, SEEDS, BLOCK)
+        ),
+    ],
     ids=str,
 )
 @pytest.mark.push
@@ -139,7 +149,11 @@ def test_whatever_is_drawn_does_not_fool_it() -> None:
 def test_whatever_is_drawn_does_not_fool_a_sweep() -> None:
     """The same by the compiled run alone; chains and task space are layouts of their own to compile."""
     drawn = [(seed, draw_experiment(seed)) for seed in WIDELY]
-    known = [(seed, one) for seed, one in drawn if one.kind in OF_THE_CORE and one.has.endswith("joints")]
+    known = [
+        (seed, one)
+        for seed, one in drawn
+        if one.kind in OF_THE_CORE and one.has.endswith("joints")
+    ]
     assert len(LOGGED) + len(SWEPT) + len(known) == BLOCK
     _hold(tally_clear([_sweep(seed, one) for seed, one in known], "swept"))
 
@@ -162,10 +176,20 @@ def test_the_stored_truth_of_a_drawn_case_is_found_anew(seed: int) -> None:
 
 def test_a_run_without_motion_is_read_whole() -> None:
     """It is packed a thousandfold, which the file of somebody else may not be."""
-    sites = {name: {"role": "slave" if name == "c" else "master", "q0_rad": [0.1, 0.2]} for name in "abc"}
+    sites = {
+        name: {"role": "slave" if name == "c" else "master", "q0_rad": [0.1, 0.2]}
+        for name in "abc"
+    }
     shares = {name: dict.fromkeys(set("abc") - {name}, 0.5) for name in "abc"}
-    given = {"rate_hz": 200, "scheme": "digital", "dominance": shares, "link": {"delay_ms": 0.0}}
-    still = experiment("still", sites=sites, control={"law": "wave", "b": 60.0, "K": 0.0}, **given)
+    given = {
+        "rate_hz": 200,
+        "scheme": "digital",
+        "dominance": shares,
+        "link": {"delay_ms": 0.0},
+    }
+    still = experiment(
+        "still", sites=sites, control={"law": "wave", "b": 60.0, "K": 0.0}, **given
+    )
     log = trilat_net.simulate(still)
     assert [len(log[name]) for name in "abc"] == [6000] * 3
 
@@ -173,8 +197,13 @@ def test_a_run_without_motion_is_read_whole() -> None:
 @pytest.mark.parametrize(
     "seeds",
     [
-        pytest.param((1, 5, 4), id="network, adaptive, operator"),  # walls and delays that swing take longer
-        *(pytest.param(range(n, n + 100), id=str(n), marks=pytest.mark.long) for n in range(0, SEEDS, 100)),
+        pytest.param(
+            (1, 5, 4), id="network, adaptive, operator"
+        ),  # walls and delays that swing take longer
+        *(
+            pytest.param(range(n, n + 100), id=str(n), marks=pytest.mark.long)
+            for n in range(0, SEEDS, 100)
+        ),
     ],
 )
 def test_stored_truths_and_words_are_found_anew(seeds: Iterable[int]) -> None:
@@ -185,7 +214,9 @@ def test_stored_truths_and_words_are_found_anew(seeds: Iterable[int]) -> None:
         if None in (found.root_per_s, stored.root_per_s):
             assert found.root_per_s is stored.root_per_s, seed
         else:
-            assert found.root_per_s == pytest.approx(stored.root_per_s, rel=1e-3, abs=1e-5), seed
+            assert found.root_per_s == pytest.approx(stored.root_per_s, rel=1e-3, abs=1e-5), (
+                seed
+            )
         assert say_of(trilat_net.simulate(drawn.scenario)) == say_of_run(drawn.scenario), seed
 
 

@@ -87,7 +87,9 @@ def trilat(*arguments: str | Path, cwd: Path) -> Done:
         contextlib.redirect_stderr(err),
         mock.patch.object(sys, "argv", ["trilat", *map(str, arguments)]),
         mock.patch.dict(os.environ, PLAIN),
-        mock.patch.object(compiling_notice, "said", True),  # by which worker it is compiled is chance
+        mock.patch.object(
+            compiling_notice, "said", True
+        ),  # by which worker it is compiled is chance
     ):
         try:
             main()

@@ -40,7 +40,10 @@ def test_an_override_that_cannot_be_right_is_named(override: str, tmp_path: Path
 FILES = {
     "nothing": (b"", ("is missing",)),
     "no text": (b"\xff\xfe\x00", ("UTF-8",)),
-    "unknown key": (b'name="x"\nduratoin_s=1\n[sites]\n[dominance]\n', ("duratoin_s", "duration_s")),
+    "unknown key": (
+        b'name="x"\nduratoin_s=1\n[sites]\n[dominance]\n',
+        ("duratoin_s", "duration_s"),
+    ),
 }
 
 
@@ -52,7 +55,10 @@ def test_a_file_that_is_no_scenario_is_named(kind: str, tmp_path: Path) -> None:
 
 
 COMMANDS = {
-    "a scenario file that is not there": (["sim", "./none.toml"], ["none.toml", "No such file"]),
+    "a scenario file that is not there": (
+        ["sim", "./none.toml"],
+        ["none.toml", "No such file"],
+    ),
     "a directory as a scenario": (["sim", "./"], ["directory"]),
     "an unknown site": (["site", "m9", "--scenario", "paper"], ["m9", "m1"]),
     "a session's name that is no key": (
@@ -60,21 +66,30 @@ COMMANDS = {
         ["session", "a/*"],
     ),
     "no session's name": (["record", "--session", ""], ["session"]),
-    "a malformed endpoint": (["site", "m1", "--scenario", "paper", "--listen", "nonsense"], ["nonsense"]),
+    "a malformed endpoint": (
+        ["site", "m1", "--scenario", "paper", "--listen", "nonsense"],
+        ["nonsense"],
+    ),
     "an endpoint of an unknown kind": (
         ["record", "--session", "x", "--connect", "pigeon/1:2"],
         ["pigeon/1:2"],
     ),
     "an endless duration": (["sim", "paper", "--duration", "inf"], ["duration_s"]),
     "a negative seed": (["sim", "paper", "--seed", "-1"], ["seed"]),
-    "an output that cannot be made": (["sim", "paper", "-o", "no/where.mcap"], ["no/where.mcap"]),
+    "an output that cannot be made": (
+        ["sim", "paper", "-o", "no/where.mcap"],
+        ["no/where.mcap"],
+    ),
     "a directory as output": (["sim", "paper", "-o", ".", "--force"], ["."]),
     "a recording that cannot be made": (
         ["record", "--session", "x", "-o", "no/where.mcap", "--join-timeout", "1"],
         ["no/where.mcap"],
     ),
     "a recording onto a directory": (["record", "--session", "x", "-o", ".", "--force"], ["."]),
-    "an endless wait": (["site", "m1", "--scenario", "paper", "--join-timeout", "inf"], ["join-timeout"]),
+    "an endless wait": (
+        ["site", "m1", "--scenario", "paper", "--join-timeout", "inf"],
+        ["join-timeout"],
+    ),
     "a negative wait": (["record", "--session", "x", "--join-timeout", "-1"], ["join-timeout"]),
     "a clock that is nowhere": (
         ["site", "m1", "--scenario", "paper", "--clock-offset-s", "nan"],
@@ -98,11 +113,23 @@ def test_bad_input_is_one_line_and_exit_code_2(kind: str, tmp_path: Path) -> Non
 
 SEVEN = [0.0, -0.3, 0.0, -1.6, 0.0, 1.4, 0.0]
 ARMS: dict[str, tuple[str, dict[str, object], list[str]]] = {
-    "a singular task pose": ("planar", {"sites.s.q0_rad": [0.1, 0.0]}, ["sites.s.q0_rad", "singular pose"]),
-    "a joint beyond its stop": ("six", {"sites.s.q0_rad": [0, 0, 9, 0, 0, 0]}, ["q0_rad[2]", "joint elbow"]),
+    "a singular task pose": (
+        "planar",
+        {"sites.s.q0_rad": [0.1, 0.0]},
+        ["sites.s.q0_rad", "singular pose"],
+    ),
+    "a joint beyond its stop": (
+        "six",
+        {"sites.s.q0_rad": [0, 0, 9, 0, 0, 0]},
+        ["q0_rad[2]", "joint elbow"],
+    ),
     "arms of different joints": (
         "six",
-        {"sites.m1.arm.urdf": "arm7.urdf", "sites.m1.arm.armature_kg_m2": 0.2, "sites.m1.q0_rad": SEVEN}
+        {
+            "sites.m1.arm.urdf": "arm7.urdf",
+            "sites.m1.arm.armature_kg_m2": 0.2,
+            "sites.m1.q0_rad": SEVEN,
+        }
         | {f"sites.m1.control.{gain}": 1.0 for gain in ("Kp", "Kd")},
         ["sites.m2.arm", "6 joints", "7"],
     ),
@@ -129,11 +156,17 @@ def write_arms(kind: str, folder: Path) -> list[str]:
     )
     forearm = ARM6.read_text().split('<link name="forearm">')
     (folder / "heavy.urdf").write_text(
-        '<link name="forearm">'.join([forearm[0], forearm[1].replace('<mass value="', '<mass value="-', 1)])
+        '<link name="forearm">'.join(
+            [forearm[0], forearm[1].replace('<mass value="', '<mass value="-', 1)]
+        )
     )
     return [
         "arms.toml",
-        *(word for key, value in changes.items() for word in ("--set", f"{key}={json.dumps(value)}")),
+        *(
+            word
+            for key, value in changes.items()
+            for word in ("--set", f"{key}={json.dumps(value)}")
+        ),
     ]
 
 
@@ -153,7 +186,9 @@ READERS += ["log export --to csv", "log view --save x.rrd"]
 
 @pytest.mark.parametrize("command", READERS)
 def test_what_is_no_log_is_named(command: str, tmp_path: Path) -> None:
-    trilat(*command.split(), "none.mcap", cwd=tmp_path).refuses("none.mcap: cannot be read: No such file")
+    trilat(*command.split(), "none.mcap", cwd=tmp_path).refuses(
+        "none.mcap: cannot be read: No such file"
+    )
     trilat(*command.split(), ".", cwd=tmp_path).refuses("directory")
     for content in (b"", b"garbage" * 100, b"\x89MCAP0\r\n", bytes(10_000)):
         (tmp_path / "bad.mcap").write_bytes(content)
@@ -162,9 +197,18 @@ def test_what_is_no_log_is_named(command: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [["fly"], ["sim"], ["sim", "paper", "--fast"], ["sim", "paper", "--seed", "x"], ["scenario"]]
+    "arguments",
+    [
+        ["fly"],
+        ["sim"],
+        ["sim", "paper", "--fast"],
+        ["sim", "paper", "--seed", "x"],
+        ["scenario"],
+    ],
 )
-def test_usage_errors_exit_with_2_without_a_traceback(arguments: list[str], tmp_path: Path) -> None:
+def test_usage_errors_exit_with_2_without_a_traceback(
+    arguments: list[str], tmp_path: Path
+) -> None:
     done = trilat(*arguments, cwd=tmp_path)
     assert done.code == 2, done
     assert "Traceback" not in done.err
@@ -172,19 +216,34 @@ def test_usage_errors_exit_with_2_without_a_traceback(arguments: list[str], tmp_
 
 def test_a_demo_keeps_what_is_in_its_folder(tmp_path: Path) -> None:
     (tmp_path / "precious").write_text("precious")
-    trilat("demo", "two_sites", "--out", tmp_path, cwd=tmp_path).refuses("holds something", "--force")
-    trilat("demo", "two_sites", "--out", "precious", cwd=tmp_path).refuses("precious", "Not a directory")
+    trilat("demo", "two_sites", "--out", tmp_path, cwd=tmp_path).refuses(
+        "holds something", "--force"
+    )
+    trilat("demo", "two_sites", "--out", "precious", cwd=tmp_path).refuses(
+        "precious", "Not a directory"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["precious"]
 
 
 @pytest.mark.parametrize(
-    "command", [*READERS, "log info", "log check", "log recover", "log sign --key k", "sim", "scenario check"]
+    "command",
+    [
+        *READERS,
+        "log info",
+        "log check",
+        "log recover",
+        "log sign --key k",
+        "sim",
+        "scenario check",
+    ],
 )
 def test_a_pipe_is_no_file_and_is_not_waited_for(command: str, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.toml")
     (tmp_path / "k").touch()
     name = "pipe.toml" if command in ("sim", "scenario check") else "./pipe.toml"
-    trilat(*command.split(), name, cwd=tmp_path).refuses("k:" if "--key" in command else "a pipe or a device")
+    trilat(*command.split(), name, cwd=tmp_path).refuses(
+        "k:" if "--key" in command else "a pipe or a device"
+    )
 
 
 def test_other_files_that_command_is_given_are_no_pipes_either(tmp_path: Path) -> None:
@@ -192,7 +251,9 @@ def test_other_files_that_command_is_given_are_no_pipes_either(tmp_path: Path) -
     trilat("ping", "--zenoh-config", "pipe", cwd=tmp_path).refuses("a pipe or a device")
     for given in (["arm.urdf=pipe"], ["link.model=trace", "link.file=pipe"]):
         options = [word for one in given for word in ("--set", one)]
-        trilat("scenario", "check", "two_sites", *options, cwd=tmp_path).refuses("a pipe or a device")
+        trilat("scenario", "check", "two_sites", *options, cwd=tmp_path).refuses(
+            "a pipe or a device"
+        )
 
 
 ODD = ("$*", "9" * 5000, "\x1b[31m\u202e[/red]", "nan", "/dev/zero", "0x" + "f" * 5000)
@@ -210,7 +271,9 @@ TAKING = {
 
 
 @pytest.mark.parametrize("words", TAKING.values(), ids=TAKING)
-def test_odd_words_are_refused_in_one_line_without_their_controls(words: list[str], tmp_path: Path) -> None:
+def test_odd_words_are_refused_in_one_line_without_their_controls(
+    words: list[str], tmp_path: Path
+) -> None:
     for odd in ODD:
         done = trilat(*(word.replace("{}", odd) for word in words), cwd=tmp_path)
         done.refuses()
@@ -219,7 +282,9 @@ def test_odd_words_are_refused_in_one_line_without_their_controls(words: list[st
 
 
 @pytest.mark.parametrize("number", ["nan", "inf", "9" * 4000, "0x" + "f" * 5000])
-def test_an_unsendable_number_is_refused_before_anybody_is_asked(number: str, tmp_path: Path) -> None:
+def test_an_unsendable_number_is_refused_before_anybody_is_asked(
+    number: str, tmp_path: Path
+) -> None:
     order = ["link", "m1->s", "--to", f"deviation_ms={number}"]
     trilat("set", "--session", "x", *order, cwd=tmp_path).refuses("to.deviation_ms: must be a")
 

@@ -11,7 +11,16 @@ from tests.json_outline import is_documented
 
 from .running import trilat
 
-SOME = ("--study", "round-trips", "--task", "contact", "--law", "p_d", "--link", "rtt8,rtt68-loss10")
+SOME = (
+    "--study",
+    "round-trips",
+    "--task",
+    "contact",
+    "--law",
+    "p_d",
+    "--link",
+    "rtt8,rtt68-loss10",
+)
 
 
 def test_part_of_suite_leaves_its_results_and_goes_on(tmp_path: Path) -> None:
@@ -24,7 +33,9 @@ def test_part_of_suite_leaves_its_results_and_goes_on(tmp_path: Path) -> None:
     folder = tmp_path / "runs" / "bench-round-trips"
     with (folder / "places.csv").open() as stream:
         rows = list(csv.DictReader(stream))
-    assert [float(row["error_rad"]) for row in rows] == [place["error_rad"] for place in facts["places"]]
+    assert [float(row["error_rad"]) for row in rows] == [
+        place["error_rad"] for place in facts["places"]
+    ]
     page = (folder / "bench.md").read_text()
     assert f"    trilat bench {shlex.join(SOME)} --seeds 2" in page
     assert "## Delay against loss" in page
@@ -37,7 +48,11 @@ def test_part_of_suite_leaves_its_results_and_goes_on(tmp_path: Path) -> None:
 
 def test_a_cell_is_a_command_that_runs(tmp_path: Path) -> None:
     name = "contact/p_d/rtt68-loss10"
-    lines = trilat("bench", *SOME, "--seeds", "2", "--cell", name, cwd=tmp_path).succeeds().splitlines()
+    lines = (
+        trilat("bench", *SOME, "--seeds", "2", "--cell", name, cwd=tmp_path)
+        .succeeds()
+        .splitlines()
+    )
     assert len(lines) == 2
     trilat(*shlex.split(lines[1])[1:], "--duration", "0.1", cwd=tmp_path).succeeds()
     assert (tmp_path / "contact-p_d-rtt68-loss10-2.mcap").exists()

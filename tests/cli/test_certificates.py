@@ -33,7 +33,11 @@ def test_a_stable_run_ends_with_0(tmp_path: Path) -> None:
     printed = trilat("certify", file, cwd=tmp_path).succeeds()
     facts = json.loads(trilat("certify", "--json", file, cwd=tmp_path).succeeds())
     assert (facts["verdict"], facts["passed"]) == ("covered", True)
-    assert (facts["stability"], facts["reasons"], facts["roots"]["verdict"]) == ("stable", [], "stable")
+    assert (facts["stability"], facts["reasons"], facts["roots"]["verdict"]) == (
+        "stable",
+        [],
+        "stable",
+    )
     assert printed.startswith("ok   stable: converged")
     assert "ok   covered by the theorem: V did not rise: 29.78 J at 0 s, " in printed
     assert "ok   this rest: stable, -0.1" in printed
@@ -52,7 +56,9 @@ def test_a_run_that_diverged_ends_with_1(tmp_path: Path) -> None:
 
 def test_undecided_is_a_word_of_its_own_and_no_success(tmp_path: Path) -> None:
     done = trilat(
-        "certify", simulated(tmp_path, "free", "rate_hz=200", "control.law=p_d", seconds="0.5"), cwd=tmp_path
+        "certify",
+        simulated(tmp_path, "free", "rate_hz=200", "control.law=p_d", seconds="0.5"),
+        cwd=tmp_path,
     )
     assert done.code == 1
     assert "open e and qd: undecided, record longer at " in done.out
@@ -66,7 +72,10 @@ def test_two_closed_groups_are_named_for_people_and_programs(tmp_path: Path) -> 
     trilat("sim", "pairs.toml", "-o", "run.mcap", cwd=tmp_path)
     told = trilat("certify", "run.mcap", cwd=tmp_path)
     assert told.code == 1
-    assert "V cannot be judged: {a, b} and {c, d} follow nobody outside: beta is not unique" in told.out
+    assert (
+        "V cannot be judged: {a, b} and {c, d} follow nobody outside: beta is not unique"
+        in told.out
+    )
     facts = json.loads(trilat("certify", "--json", "run.mcap", cwd=tmp_path).out)
     assert facts["closed_groups"] == [["a", "b"], ["c", "d"]]
     assert facts["functional"] is None

@@ -20,7 +20,12 @@ from tests.log_editing import edited, opened
 from trilat_net.cli import app
 from trilat_net.errors import CodeWithheld, ScenarioError, UsageError
 from trilat_net.scenario.code_consent import list_imported_code
-from trilat_net.scenario.imported_code import CodeKey, allowed_code, import_class, remembered_settings
+from trilat_net.scenario.imported_code import (
+    CodeKey,
+    allowed_code,
+    import_class,
+    remembered_settings,
+)
 
 WITNESS = "import os\nwith open(os.environ['WITNESS'], 'a') as told:\n    told.write(__file__ + ';')\n"
 """A module that begins so tells that it was imported."""
@@ -92,9 +97,14 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("WITNESS", str(folder / "witness"))
         setting = ("--set", "sites.s.control.law=mylaws:Spring")
-        trilat("sim", "paper", "--duration", "0.05", *setting, "-o", "run.mcap", cwd=folder).succeeds()
+        trilat(
+            "sim", "paper", "--duration", "0.05", *setting, "-o", "run.mcap", cwd=folder
+        ).succeeds()
     assert (folder / "witness").exists()  # it does tell
-    before, now = (hashlib.sha256(one.encode()).hexdigest() for one in (LAW, FILES["not a law"]["mylaws.py"]))
+    before, now = (
+        hashlib.sha256(one.encode()).hexdigest()
+        for one in (LAW, FILES["not a law"]["mylaws.py"])
+    )
     log = (folder / "run.mcap").read_bytes()
     text = opened(log).scenario_text.replace(before, now)
     named = {"scenario_sha256": hashlib.sha256(text.encode()).hexdigest()}
@@ -118,13 +128,21 @@ def place(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterat
 
 def _marks(words: list[str], law: str) -> tuple[Any, ...]:
     brief = words[0] in ("verify", "rerun") or "--own-laws" in words
-    return () if brief and "--json" not in words and law == "beside the log" else (pytest.mark.long,)
+    return (
+        ()
+        if brief and "--json" not in words and law == "beside the log"
+        else (pytest.mark.long,)
+    )
 
 
 @pytest.mark.parametrize(
     ("words", "code", "law"),
     [
-        pytest.param(*case, id=f"{' '.join(case[0][:3])[:30]!r} {case[2]}", marks=_marks(case[0], case[2]))
+        pytest.param(
+            *case,
+            id=f"{' '.join(case[0][:3])[:30]!r} {case[2]}",
+            marks=_marks(case[0], case[2]),
+        )
         for case in CASES
     ],
 )
@@ -151,7 +169,10 @@ def test_no_command_imports_what_a_log_names(
     "code",
     [
         "distutils.core:Law",
-        *(pytest.param(code, marks=pytest.mark.long) for code in ("distutils:Law", "a.b.c:Law")),
+        *(
+            pytest.param(code, marks=pytest.mark.long)
+            for code in ("distutils:Law", "a.b.c:Law")
+        ),
     ],
 )
 def test_looking_for_a_module_runs_nothing_either(code: str, place: Path) -> None:
@@ -163,7 +184,9 @@ def test_looking_for_a_module_runs_nothing_either(code: str, place: Path) -> Non
     text = opened(log).scenario_text.replace("mylaws:Spring", code)
     named = {"scenario_sha256": hashlib.sha256(text.encode()).hexdigest()}
     (place / "run.mcap").write_bytes(edited(log, scenario=lambda _: text, session=named))
-    done = subprocess.run([*COMMAND, "verify", "run.mcap"], cwd=place, capture_output=True, text=True)
+    done = subprocess.run(
+        [*COMMAND, "verify", "run.mcap"], cwd=place, capture_output=True, text=True
+    )
     assert (done.returncode, imports(place)) == (4, []), done.stderr
     assert "Traceback" not in done.stderr
 
@@ -186,9 +209,17 @@ def list_commands(command: Any, *words: str) -> Iterator[str]:
 def test_the_page_lists_every_command() -> None:
     """A row of `docs/code-that-runs.md` says of each command whose code it runs."""
     page = Path(__file__).parents[2] / "docs" / "code-that-runs.md"
-    rows = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("| `trilat ")]
+    rows = [
+        line
+        for line in page.read_text(encoding="utf-8").splitlines()
+        if line.startswith("| `trilat ")
+    ]
     named = {
-        " ".join(word for word in words.removeprefix("trilat ").split() if word.islower() and word[0] != "-")
+        " ".join(
+            word
+            for word in words.removeprefix("trilat ").split()
+            if word.islower() and word[0] != "-"
+        )
         for row in rows
         for words in re.findall("`([^`]+)`", row.split(" | ")[0])
     }
@@ -215,7 +246,9 @@ def test_command_runs_own_code_as_the_page_says(name: str, place: Path) -> None:
     (place / "mylaws.py").write_text(LAW)
     setting = ("--set", "sites.s.control.law=mylaws:Spring", "--set", "duration_s=0.5")
     shown = trilat("scenario", "show", "paper", *setting, cwd=place).succeeds()
-    (place / "own.toml").write_text(shown.replace("synchronised_by_s = 12.0", "synchronised_by_s = 0.4"))
+    (place / "own.toml").write_text(
+        shown.replace("synchronised_by_s = 12.0", "synchronised_by_s = 0.4")
+    )
     trilat("experiment", "new", "own-reaching.toml", cwd=place).succeeds()
     shorten(place / "own-reaching.toml")
     protocol = (place / "own-reaching.toml").read_text(encoding="utf-8")
@@ -252,17 +285,34 @@ def test_what_is_cached_beside_a_law_is_not_run(place: Path) -> None:
     file.write_text(LAW)
     other.write_text("raise SystemExit('cached')")
     cached = importlib.util.cache_from_source(str(file))
-    py_compile.compile(str(other), cached, invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH)
+    py_compile.compile(
+        str(other), cached, invalidation_mode=py_compile.PycInvalidationMode.UNCHECKED_HASH
+    )
     assert tn.verify(tn.open_log("run.mcap", law=file)).passed
 
 
 @pytest.mark.parametrize(
     ("text", "name", "error", "fact"),
     [
-        (f"{LAW}# a word\n", "mylaws.py", UsageError, "is not the file that ran as mylaws:Spring"),
-        (f"{LAW}# a word\n", "other.py", UsageError, "is no law that the log names: these are mylaws:Spring"),
+        (
+            f"{LAW}# a word\n",
+            "mylaws.py",
+            UsageError,
+            "is not the file that ran as mylaws:Spring",
+        ),
+        (
+            f"{LAW}# a word\n",
+            "other.py",
+            UsageError,
+            "is no law that the log names: these are mylaws:Spring",
+        ),
         (f"{WITNESS}Spring = 1", "mylaws.py", ScenarioError, "defines no class Spring"),
-        (f"{WITNESS}class Spring: pass", "mylaws.py", ScenarioError, "is no law: it has no torque"),
+        (
+            f"{WITNESS}class Spring: pass",
+            "mylaws.py",
+            ScenarioError,
+            "is no law: it has no torque",
+        ),
         (f"{WITNESS}class Spring(", "mylaws.py", ScenarioError, "is no Python"),
         (None, "mylaws.py", ScenarioError, "cannot be read"),
     ],
@@ -317,10 +367,14 @@ class Other(Spring):
 """A harmless law that reads the file which its scenario names."""
 
 
-def save_log_of_reader(place: Path, name: str, settings: dict[str, Any], kind: str = "Spring") -> None:
+def save_log_of_reader(
+    place: Path, name: str, settings: dict[str, Any], kind: str = "Spring"
+) -> None:
     """Saves a log whose author ran the same file with settings of their choice."""
     written = {f"control.{key}": value for key, value in settings.items()}
-    log = tn.simulate("two_sites", {"control.law": f"mylaws:{kind}", **written}, duration_s=0.05)
+    log = tn.simulate(
+        "two_sites", {"control.law": f"mylaws:{kind}", **written}, duration_s=0.05
+    )
     log.save(name)
     allowed_code.clear()
     (place / "witness").unlink()
@@ -353,12 +407,16 @@ def test_remembered_file_runs_with_remembered_settings_alone(reader: Path) -> No
     named = trilat("verify", "stranger.mcap", "--law", "mylaws.py", "--remember", cwd=reader)
     assert named.code == 0
     assert 'secret.txt"' in named.err  # what it ran with is said
-    assert [trilat("verify", name, cwd=reader).code for name in ("own.mcap", "stranger.mcap")] == [0, 0]
+    assert [
+        trilat("verify", name, cwd=reader).code for name in ("own.mcap", "stranger.mcap")
+    ] == [0, 0]
 
 
 def test_law_of_own_run_allows_no_strangers_settings(reader: Path) -> None:
     """A notebook in which somebody ran a law opens a stranger's log of the same law."""
-    tn.simulate("two_sites", {"control.law": "mylaws:Spring", "control.K": 50.0}, duration_s=0.05)
+    tn.simulate(
+        "two_sites", {"control.law": "mylaws:Spring", "control.K": 50.0}, duration_s=0.05
+    )
     assert tn.verify("own.mcap").passed
     (reader / "witness").unlink(missing_ok=True)
     log = tn.open_log("stranger.mcap")
@@ -389,7 +447,9 @@ def test_remembered_file_without_settings_allows_nothing(reader: Path) -> None:
     store.write_text(json.dumps({sha256: str(reader / "mylaws.py")}))
     assert trilat("verify", "own.mcap", cwd=reader).code == 4
     assert not imports(reader)
-    assert trilat("verify", "own.mcap", "--law", "mylaws.py", "--remember", cwd=reader).code == 0
+    assert (
+        trilat("verify", "own.mcap", "--law", "mylaws.py", "--remember", cwd=reader).code == 0
+    )
     assert trilat("verify", "own.mcap", cwd=reader).code == 0
 
 
@@ -397,7 +457,11 @@ def test_remembered_file_without_settings_allows_nothing(reader: Path) -> None:
     "keys",
     [
         {"sites.s.plant": {"class": "tests.own_code:Carousel", "how": "few"}},
-        {"sites.m2.hands": [{"kind": "own", "class": "tests.own_code:Circle", "settings": {"turn_s": 1.0}}]},
+        {
+            "sites.m2.hands": [
+                {"kind": "own", "class": "tests.own_code:Circle", "settings": {"turn_s": 1.0}}
+            ]
+        },
         {"sites.s.control.law": "tests.own_laws:PD"},
     ],
     ids=["plant", "hand", "law"],
@@ -417,7 +481,12 @@ def test_a_law_of_this_process_own_run_needs_nothing(place: Path) -> None:
     log = tn.simulate("two_sites", {"control.law": "ownlaw:Spring"}, duration_s=0.05)
     log.save("own.mcap")
     assert tn.verify("own.mcap").passed
-    assert tn.rerun("run.mcap", ["s"], {"sites.s.control.law": "ownlaw:Spring"}).sites["s"].executed == 50
+    assert (
+        tn.rerun("run.mcap", ["s"], {"sites.s.control.law": "ownlaw:Spring"})
+        .sites["s"]
+        .executed
+        == 50
+    )
     with pytest.raises(CodeWithheld):
         tn.rerun("run.mcap", ["s"])
 
@@ -436,7 +505,15 @@ def test_a_compiled_law_runs_from_the_file_that_was_named(place: Path) -> None:
         "    def torque(self, now):\n        for i in range(now.joints):\n"
         "            now.tau[i] = now.gravity[i] - self.K * (now.q[i] - now.q_des[i])\n"
     )
-    made = trilat("sim", "two_sites", "--duration", "0.05", "--set", "control.law=quick:Spring", cwd=folder)
+    made = trilat(
+        "sim",
+        "two_sites",
+        "--duration",
+        "0.05",
+        "--set",
+        "control.law=quick:Spring",
+        cwd=folder,
+    )
     assert made.code == 0
     allowed_code.clear()
     shown = subprocess.run(

@@ -27,7 +27,12 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_logs_stand_side_by_side_under_what_differs(logs: Path) -> None:
     lines = trilat("compare", "a.mcap", "b.mcap", cwd=logs).succeeds().splitlines()
-    assert next(line.split() for line in lines if "every link" in line)[2:] == ["200", "ms", "50", "ms"]
+    assert next(line.split() for line in lines if "every link" in line)[2:] == [
+        "200",
+        "ms",
+        "50",
+        "ms",
+    ]
     assert any("RMS spread, undelayed" in line and " rad " in line for line in lines)
     assert all(word not in " ".join(lines) for word in ("better", "best", "winner", "rank"))
 
@@ -49,24 +54,43 @@ def test_json_is_for_programs(logs: Path) -> None:
     assert facts["columns"] == ["a", "hang"]
     assert [log["scenario"] for log in facts["logs"]] == ["free", "free"]
     assert {"control", "duration_s"} <= {one["key"] for one in facts["differences"]}
-    hanging = [log for log, remarks in facts["remarks"].items() if "hang at the end" in " ".join(remarks)]
+    hanging = [
+        log
+        for log, remarks in facts["remarks"].items()
+        if "hang at the end" in " ".join(remarks)
+    ]
     assert hanging == ["hang"]
     assert all(len(row["values"]) == 2 for row in facts["rows"])
 
 
 @pytest.mark.long
 def test_search_says_its_time_and_its_procedure_and_writes_folder(logs: Path) -> None:
-    options = ["--law", "p_d,known", "--budget", "8", "--jobs", "1", "--duration", "12", "--out", "fronts"]
+    options = [
+        "--law",
+        "p_d,known",
+        "--budget",
+        "8",
+        "--jobs",
+        "1",
+        "--duration",
+        "12",
+        "--out",
+        "fronts",
+    ]
     printed = trilat("compare", "--tune", "trio.toml", *options, cwd=logs).succeeds()
     assert "18 runs on 1 core: about " in printed
     assert "torques clamped at 60 N m" in printed
     assert "trilat sim trio.toml --set duration_s=12.0 --set 'control={law = " in printed
     written = sorted(path.name for path in (logs / "fronts").iterdir())
     assert written == ["front.json", "front.md", "front.pdf", "front.png"]
-    again = trilat("compare", "--tune", "trio.toml", *options, "--force", "--json", cwd=logs).succeeds()
+    again = trilat(
+        "compare", "--tune", "trio.toml", *options, "--force", "--json", cwd=logs
+    ).succeeds()
     assert json.loads(again) == json.loads((logs / "fronts" / "front.json").read_text())
     assert is_documented("compare --tune", json.loads(again))
-    trilat("compare", "--tune", "trio.toml", *options, cwd=logs).refuses("fronts: holds something", "--force")
+    trilat("compare", "--tune", "trio.toml", *options, cwd=logs).refuses(
+        "fronts: holds something", "--force"
+    )
 
 
 @pytest.mark.parametrize(
@@ -80,12 +104,17 @@ def test_search_says_its_time_and_its_procedure_and_writes_folder(logs: Path) ->
         (["a.mcap", "b.mcap", "--force"], ["--force belongs to --tune SCENARIO"]),
         (["a.mcap", "--tune", "free"], ["--tune makes its own runs"]),
         (["--tune", "fre"], ["no scenario of that name", "free"]),
-        (["--tune", "free", "--law", "adaptve"], ["no law 'adaptve'", "did you mean 'adaptive'"]),
+        (
+            ["--tune", "free", "--law", "adaptve"],
+            ["no law 'adaptve'", "did you mean 'adaptive'"],
+        ),
         (["--tune", "free", "--budget", "0"], ["--budget", "not 0"]),
         (["--tune", "training"], ["keep one of the operators"]),
     ],
 )
-def test_bad_input_is_refused_in_one_line(logs: Path, arguments: list[str], facts: list[str]) -> None:
+def test_bad_input_is_refused_in_one_line(
+    logs: Path, arguments: list[str], facts: list[str]
+) -> None:
     trilat("compare", *arguments, cwd=logs).refuses(*facts)
 
 
@@ -95,6 +124,8 @@ def test_a_built_in_law_is_called_by_its_name(tmp_path: Path) -> None:
         how = ["--set", f"control.law={law}", "--set", "scheme=digital", "--duration", "0.5"]
         trilat("sim", "two_sites", *how, "-o", f"{law}.mcap", cwd=tmp_path).succeeds()
     text = trilat("compare", "tdpa.mcap", "wave.mcap", "adaptive.mcap", cwd=tmp_path).succeeds()
-    assert "the law tdpa does not say which part of its torque is due to a peer" in " ".join(text.split())
+    assert "the law tdpa does not say which part of its torque is due to a peer" in " ".join(
+        text.split()
+    )
     for word in ("somebody", "own law", "law own"):
         assert word not in text

@@ -8,8 +8,13 @@ from .running import shorten, trilat
 
 
 def test_a_protocol_becomes_a_table(tmp_path: Path) -> None:
-    assert "run it with" in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).succeeds()
-    assert "12 participants" in trilat("experiment", "check", "reaching.toml", cwd=tmp_path).succeeds()
+    assert (
+        "run it with" in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).succeeds()
+    )
+    assert (
+        "12 participants"
+        in trilat("experiment", "check", "reaching.toml", cwd=tmp_path).succeeds()
+    )
     shorten(tmp_path / "reaching.toml")
     told = trilat("experiment", "run", "reaching.toml", "--jobs", "1", cwd=tmp_path).succeeds()
     folder = "runs/experiment-reaching-001"
@@ -18,7 +23,9 @@ def test_a_protocol_becomes_a_table(tmp_path: Path) -> None:
     again = json.loads(trilat("experiment", "run", folder, "--json", cwd=tmp_path).out)
     assert (again["done"], again["conditions"]) == (4, ["no_delay", "delay_300"])
     assert "4 of 4" in trilat("experiment", "status", folder, cwd=tmp_path).succeeds()
-    found = trilat("experiment", "analyse", folder, "--exclude", "P2=late", cwd=tmp_path).succeeds()
+    found = trilat(
+        "experiment", "analyse", folder, "--exclude", "P2=late", cwd=tmp_path
+    ).succeeds()
     assert "1 more was excluded (P2: late)" in found
     assert f"{folder}/analysis/methods.txt" in found
     next((tmp_path / folder / "logs").iterdir()).unlink()
@@ -32,9 +39,14 @@ def test_what_is_wrong_is_said_in_a_sentence(tmp_path: Path) -> None:
     file.write_text(text.replace("participants = 12", "participants = 11"), encoding="utf-8")
     refused = trilat("experiment", "check", "reaching.toml", cwd=tmp_path)
     assert refused.code == 2
-    assert "the number of participants must be a multiple of 4, is 11" in " ".join(refused.err.split())
+    assert "the number of participants must be a multiple of 4, is 11" in " ".join(
+        refused.err.split()
+    )
     assert "holds no experiment" in trilat("experiment", "status", ".", cwd=tmp_path).err
-    assert "reaching.toml: exists" in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).err
+    assert (
+        "reaching.toml: exists"
+        in trilat("experiment", "new", "reaching.toml", cwd=tmp_path).err
+    )
 
 
 def test_protocol_of_two_people_runs_as_it_is_written(tmp_path: Path) -> None:
@@ -51,5 +63,7 @@ def test_protocol_of_two_people_runs_as_it_is_written(tmp_path: Path) -> None:
     refused = trilat("experiment", "run", "models", "--live", "--no-browser", cwd=tmp_path)
     assert refused.code == 2
     assert "its trials are of synthetic participants" in " ".join(refused.err.split())
-    refused = trilat("experiment", "run", "two-people.toml", "--live", "--host", "0.0.0.0", cwd=tmp_path)
+    refused = trilat(
+        "experiment", "run", "two-people.toml", "--live", "--host", "0.0.0.0", cwd=tmp_path
+    )
     assert "say --insecure" in " ".join(refused.err.split())

@@ -15,7 +15,15 @@ def folder(log_file: Path) -> Path:
 
 def test_figures_are_written_by_name(folder: Path) -> None:
     done = trilat(
-        "figure", "run.mcap", "phase", "settling", "--format", "svg,pdf", "--out", "paper", cwd=folder
+        "figure",
+        "run.mcap",
+        "phase",
+        "settling",
+        "--format",
+        "svg,pdf",
+        "--out",
+        "paper",
+        cwd=folder,
     )
     names = ["phase.svg", "phase.pdf", "settling.svg", "settling.pdf"]
     assert done.succeeds().split() == [f"paper/{name}" for name in names]
@@ -29,7 +37,9 @@ def test_the_default_is_pdf_and_png_beside_the_log(folder: Path) -> None:
     paths = json.loads(done.succeeds())
     assert paths == [f"run-figures/control_torques.{kind}" for kind in ("pdf", "png")]
     assert b"MediaBox [ 0 0 504 " in (folder / paths[0]).read_bytes()
-    trilat("figure", "run.mcap", "control_torques", cwd=folder).refuses("torques.pdf: exists", "--force")
+    trilat("figure", "run.mcap", "control_torques", cwd=folder).refuses(
+        "torques.pdf: exists", "--force"
+    )
 
 
 def test_the_list_says_what_a_log_has_nothing_for(folder: Path) -> None:
@@ -51,5 +61,7 @@ def test_the_list_says_what_a_log_has_nothing_for(folder: Path) -> None:
         (["phase", "--out", "run.mcap"], ["run.mcap"]),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(folder: Path, words: list[str], facts: list[str]) -> None:
+def test_what_cannot_be_drawn_is_refused(
+    folder: Path, words: list[str], facts: list[str]
+) -> None:
     trilat("figure", "run.mcap", *words, cwd=folder).refuses(*facts)

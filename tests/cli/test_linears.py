@@ -12,8 +12,16 @@ AT = ("--pose", "0.07,0.23")
 
 
 def test_it_prints_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
-    printed = trilat("linear", "p_d_margin", "--set", "control.d=0.9", *AT, cwd=tmp_path).succeeds()
-    for text in ("all sites at (0.0700, 0.2300) rad", "re 1/s", "what moves", "q1 of m1, m2, s", "unstable:"):
+    printed = trilat(
+        "linear", "p_d_margin", "--set", "control.d=0.9", *AT, cwd=tmp_path
+    ).succeeds()
+    for text in (
+        "all sites at (0.0700, 0.2300) rad",
+        "re 1/s",
+        "what moves",
+        "q1 of m1, m2, s",
+        "unstable:",
+    ):
         assert text in printed
     assert "stable for common delays up to" in printed
     assert "2 roots are zero by structure" in printed
@@ -22,7 +30,9 @@ def test_it_prints_rest_roots_verdict_and_margin(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_it_says_where_stability_changes_over_a_key(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.1:3", "--over", "link.delay_ms=1:50")
-    printed = trilat("linear", "p_d_margin", "--no-ports", "--pose=-0.1,0.3", *over, cwd=tmp_path).succeeds()
+    printed = trilat(
+        "linear", "p_d_margin", "--no-ports", "--pose=-0.1,0.3", *over, cwd=tmp_path
+    ).succeeds()
     assert "all sites at (-0.1000, 0.3000) rad" in printed
     assert "control.d from 0.1 to 3: stable from 0.96" in printed
     assert "link.delay_ms from 1 to 50: stability of p_d_margin does not change" in printed
@@ -31,7 +41,9 @@ def test_it_says_where_stability_changes_over_a_key(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_json_has_all(tmp_path: Path) -> None:
     over = ("--over", "control.d=0.5:2")
-    told = json.loads(trilat("linear", "p_d_margin", *AT, *over, "--json", cwd=tmp_path).succeeds())
+    told = json.loads(
+        trilat("linear", "p_d_margin", *AT, *over, "--json", cwd=tmp_path).succeeds()
+    )
     assert told["verdict"] == "stable"
     assert len(told["continuous"]["roots"]) == 6
     (edge,) = told["edges"]["control.d"]
@@ -40,16 +52,27 @@ def test_json_has_all(tmp_path: Path) -> None:
 
 def test_a_figure_is_the_same_file_every_time(tmp_path: Path) -> None:
     for name in ("one.svg", "two.svg"):
-        trilat("linear", "p_d_margin", "--no-ports", *AT, "--figure", name, cwd=tmp_path).succeeds()
+        trilat(
+            "linear", "p_d_margin", "--no-ports", *AT, "--figure", name, cwd=tmp_path
+        ).succeeds()
     assert (tmp_path / "one.svg").read_bytes() == (tmp_path / "two.svg").read_bytes()
 
 
 REFUSED = {
     "a pose with letters": (["free", "--pose", "up"], ["--pose is angles in rad", "'up'"]),
-    "a range without a colon": (["free", "--over", "control.Kd=5"], ["--over reads KEY=LOW:HIGH"]),
+    "a range without a colon": (
+        ["free", "--over", "control.Kd=5"],
+        ["--over reads KEY=LOW:HIGH"],
+    ),
     "a figure of no kind": (["free", "--figure", "map.jpg"], ["map.jpg", ".pdf, .png, .svg"]),
-    "a figure in no folder": (["free", "--figure", "no/map.png"], ["no/map.png", "there is no folder"]),
-    "a measured link": (["free", "--set", "link.model=measured"], ["links.", "its delay is not known"]),
+    "a figure in no folder": (
+        ["free", "--figure", "no/map.png"],
+        ["no/map.png", "there is no folder"],
+    ),
+    "a measured link": (
+        ["free", "--set", "link.model=measured"],
+        ["links.", "its delay is not known"],
+    ),
 }
 
 
@@ -62,22 +85,36 @@ def test_bad_input_is_one_line_and_exit_code_2(kind: str, tmp_path: Path) -> Non
 
 def test_a_figure_that_exists_is_kept(tmp_path: Path) -> None:
     (tmp_path / "map.png").write_text("precious")
-    trilat("linear", "free", *AT, "--figure", "map.png", cwd=tmp_path).refuses("map.png", "exists", "--force")
+    trilat("linear", "free", *AT, "--figure", "map.png", cwd=tmp_path).refuses(
+        "map.png", "exists", "--force"
+    )
     assert (tmp_path / "map.png").read_text() == "precious"
 
 
 def test_a_hand_that_was_identified_holds_the_ports(tmp_path: Path) -> None:
     """As docs/ports.md has it, with the sines of its page."""
-    (sines,) = (block.text for block in find_blocks("docs/ports.md") if block.language == "toml")
-    shipped = (files("trilat_net") / "scenarios" / "p_d_margin_two.toml").read_text(encoding="utf-8")
+    (sines,) = (
+        block.text for block in find_blocks("docs/ports.md") if block.language == "toml"
+    )
+    shipped = (files("trilat_net") / "scenarios" / "p_d_margin_two.toml").read_text(
+        encoding="utf-8"
+    )
     (tmp_path / "moved.toml").write_text(f"{shipped}\n{sines}", encoding="utf-8")
     spring = 'sites.m.hands=[{kind="tip_spring",stiffness_n_m=[50,50],damping_n_s_m=[4,4]}]'
     told = ("--set", "control.d=30", "--set", spring, "--set", "rate_hz=250")
-    fast = ("--set", "limits.qd_limit_rad_s=20", "-o", "run.mcap")  # the sines move s at 11.5 rad/s
+    # the sines move s at 11.5 rad/s
+    fast = (
+        "--set",
+        "limits.qd_limit_rad_s=20",
+        "-o",
+        "run.mcap",
+    )
     trilat("sim", "moved.toml", "--duration", "30", *told, *fast, cwd=tmp_path).succeeds()
     asked = ("identify", "hand", "run.mcap", "--site", "m")
     assert "coherence" in trilat(*asked, cwd=tmp_path).succeeds()
-    (tmp_path / "m.json").write_text(trilat(*asked, "--json", cwd=tmp_path).succeeds(), encoding="utf-8")
+    (tmp_path / "m.json").write_text(
+        trilat(*asked, "--json", cwd=tmp_path).succeeds(), encoding="utf-8"
+    )
     held = ("linear", "p_d_margin_two", *AT, "--set", "control.d=1.96", "--operators", "m.json")
     line = "the measured operators at the masters, any at each: not shown at 0.001-"
     assert line in trilat(*held, cwd=tmp_path).succeeds()

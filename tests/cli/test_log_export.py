@@ -64,15 +64,26 @@ def test_a_folder_of_logs_becomes_a_set_of_episodes(folder: Path) -> None:
     (folder / "logs").mkdir()
     for n, data in enumerate(dealt(recorded("paper"), [range(150), range(100, count)])):
         (folder / "logs" / f"run-00{n + 1}.mcap").write_bytes(data)
-    (folder / "logs" / "other.mcap").write_bytes(recorded("paper", {"seed": 9, "duration_s": 0.12}))
+    (folder / "logs" / "other.mcap").write_bytes(
+        recorded("paper", {"seed": 9, "duration_s": 0.12})
+    )
     command = ("log", "export", "logs", "--to", "lerobot")
     text = trilat(*command, cwd=folder).succeeds()
-    assert text == "logs-lerobot: 8 frames in 2 episodes; 0 frames lie in gaps and are left out\n"
+    assert (
+        text == "logs-lerobot: 8 frames in 2 episodes; 0 frames lie in gaps and are left out\n"
+    )
     trilat(*command, cwd=folder).refuses("logs-lerobot: exists", "--force")
-    assert "12 frames in 2" in trilat(*command, "--set", "fps=50", "--force", cwd=folder).succeeds()
-    trilat(*command, "--set", "log=x", cwd=folder).refuses("no setting 'log'; it has fps, program")
+    assert (
+        "12 frames in 2"
+        in trilat(*command, "--set", "fps=50", "--force", cwd=folder).succeeds()
+    )
+    trilat(*command, "--set", "log=x", cwd=folder).refuses(
+        "no setting 'log'; it has fps, program"
+    )
     (folder / "none").mkdir()
-    trilat("log", "export", "none", "--to", "lerobot", cwd=folder).refuses("no log is in this directory")
+    trilat("log", "export", "none", "--to", "lerobot", cwd=folder).refuses(
+        "no log is in this directory"
+    )
 
 
 def test_what_cannot_be_done_is_said_before_anything_is_read(folder: Path) -> None:
@@ -83,7 +94,11 @@ def test_what_cannot_be_done_is_said_before_anything_is_read(folder: Path) -> No
 
 @pytest.mark.parametrize(
     ("form", "module", "name"),
-    [("parquet", "polars", "frames"), ("mat", "scipy.io", "mat"), ("lerobot", "pyarrow.parquet", "lerobot")],
+    [
+        ("parquet", "polars", "frames"),
+        ("mat", "scipy.io", "mat"),
+        ("lerobot", "pyarrow.parquet", "lerobot"),
+    ],
 )
 def test_package_that_is_missing_is_named_with_what_installs_it(
     form: str, module: str, name: str, folder: Path, monkeypatch: pytest.MonkeyPatch
@@ -95,7 +110,9 @@ def test_package_that_is_missing_is_named_with_what_installs_it(
 
 
 @pytest.mark.parametrize("form", ["csv", "npz"])
-def test_csv_and_npz_need_no_extra(form: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_csv_and_npz_need_no_extra(
+    form: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for module in ("polars", "scipy", "scipy.io"):
         monkeypatch.setitem(sys.modules, module, None)
     trilat("log", "export", "run.mcap", "--to", form, cwd=folder).succeeds()
@@ -104,7 +121,9 @@ def test_csv_and_npz_need_no_extra(form: str, folder: Path, monkeypatch: pytest.
 def test_a_record_that_cannot_be_read_leaves_nothing_behind(folder: Path) -> None:
     every = messages(recorded("paper"))
     topic = next(m[0] for m in every if m[0].endswith("/s/state"))
-    (folder / "bad.mcap").write_bytes(a_file(recorded("paper"), [*every, (topic, b"\x80", 0, 0, 0)]))
+    (folder / "bad.mcap").write_bytes(
+        a_file(recorded("paper"), [*every, (topic, b"\x80", 0, 0, 0)])
+    )
     done = trilat("log", "export", "bad.mcap", "--to", "csv", cwd=folder)
     done.refuses("bad.mcap: a record of s cannot be")
     assert sorted(path.name for path in folder.iterdir()) == ["bad.mcap", "run.mcap"]

@@ -24,7 +24,9 @@ def foreign() -> bytes:
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start()
-    channel = writer.register_channel("/t", "json", writer.register_schema("s", "jsonschema", b"{}"))
+    channel = writer.register_channel(
+        "/t", "json", writer.register_schema("s", "jsonschema", b"{}")
+    )
     for n in range(3):
         writer.add_message(channel, n * 10_000_000, b"{}", n)
     writer.finish()
@@ -33,9 +35,18 @@ def foreign() -> bytes:
 
 def test_info_tells_the_session_its_sites_links_and_channels(tmp_path: Path) -> None:
     text = trilat("log", "info", written(tmp_path, WHOLE), cwd=tmp_path).succeeds()
-    for fact in ("paper, virtual", "seed 1", "0.119 s of 0.12 s", "360, none missing", "m2->m1", "m1/state"):
+    for fact in (
+        "paper, virtual",
+        "seed 1",
+        "0.119 s of 0.12 s",
+        "360, none missing",
+        "m2->m1",
+        "m1/state",
+    ):
         assert fact in text
-    assert all(len(line) <= 120 for line in text.splitlines() if not line.startswith("file")), text
+    assert all(len(line) <= 120 for line in text.splitlines() if not line.startswith("file")), (
+        text
+    )
 
 
 def test_info_in_json_is_the_same_in_numbers(tmp_path: Path) -> None:
@@ -86,7 +97,10 @@ def test_a_log_that_lacks_records_fails_and_names_them(tmp_path: Path) -> None:
     found = json.loads(trilat("log", "check", "--json", path, cwd=tmp_path).out)
     assert not found["sound"]
     (sequence,) = (each for each in found["checks"] if each["check"] == "sequence")
-    assert {place["text"] for place in sequence["places"]} == {"missing s/state 7-9", "missing s/state 40"}
+    assert {place["text"] for place in sequence["places"]} == {
+        "missing s/state 7-9",
+        "missing s/state 40",
+    }
 
 
 def test_a_foreign_mcap_file_is_checked_for_its_structure(tmp_path: Path) -> None:
@@ -104,7 +118,9 @@ def test_no_mcap_file_is_bad_input_or_a_finding(tmp_path: Path) -> None:
     assert trilat("log", "check", path, cwd=tmp_path).code == 1
 
 
-@pytest.mark.parametrize("command", [["log", "info"], ["log", "check"], ["verify"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "command", [["log", "info"], ["log", "check"], ["verify"]], ids=" ".join
+)
 def test_every_command_says_what_mends_a_torn_file(command: list[str], tmp_path: Path) -> None:
     data = edited(WHOLE, chunk_bytes=4096)
     path = written(tmp_path, data[: len(data) // 2], "run.mcap.active")
@@ -144,7 +160,14 @@ def test_what_a_file_says_reaches_no_terminal_as_it_is(tmp_path: Path) -> None:
 # Advice on files that do not end as a finished one does: every command gives the same.
 
 PADDED = Path(__file__).parents[1] / "log" / "inputs" / "padded_after_end.mcap"
-READING = (["log", "info"], ["log", "check"], ["log", "recover"], ["verify"], ["certify"], ["report"])
+READING = (
+    ["log", "info"],
+    ["log", "check"],
+    ["log", "recover"],
+    ["verify"],
+    ["certify"],
+    ["report"],
+)
 
 
 @pytest.mark.parametrize("words", READING, ids=" ".join)

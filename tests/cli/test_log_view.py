@@ -8,7 +8,9 @@ from mcap.reader import make_reader
 from .running import trilat
 
 
-@pytest.mark.parametrize(("views", "least", "most"), [("off", 0, 0), ("50", 13, 14), ("full", 250, 250)])
+@pytest.mark.parametrize(
+    ("views", "least", "most"), [("off", 0, 0), ("50", 13, 14), ("full", 250, 250)]
+)
 def test_a_simulation_shows_itself_as_often_as_asked(
     tmp_path: Path, views: str, least: int, most: int
 ) -> None:
@@ -21,7 +23,9 @@ def test_a_simulation_shows_itself_as_often_as_asked(
 
 @pytest.mark.parametrize("views", ["0", "-1", "nan", "inf", "fast", ""])
 @pytest.mark.parametrize("command", [("sim", "two_sites"), ("record", "--session", "x")])
-def test_a_rate_that_is_none_is_refused(tmp_path: Path, command: tuple[str, ...], views: str) -> None:
+def test_a_rate_that_is_none_is_refused(
+    tmp_path: Path, command: tuple[str, ...], views: str
+) -> None:
     done = trilat(*command, "--views", views, cwd=tmp_path)
     done.refuses("--views is off, full, or messages a second from 1 on", repr(views))
     assert not list(tmp_path.iterdir())
@@ -33,4 +37,6 @@ def test_what_is_shown_can_be_kept(log_file: Path, tmp_path: Path) -> None:
     text = trilat("log", "view", log_file, "--save", "run.rrd", cwd=tmp_path).succeeds()
     assert "run.rrd: open it with: rerun run.rrd" in text
     assert (tmp_path / "run.rrd").read_bytes().startswith(b"RRF2")
-    trilat("log", "view", log_file, "--save", "run.rrd", cwd=tmp_path).refuses("run.rrd: exists", "--force")
+    trilat("log", "view", log_file, "--save", "run.rrd", cwd=tmp_path).refuses(
+        "run.rrd: exists", "--force"
+    )

@@ -16,7 +16,9 @@ from .running import trilat
 def test_two_runs_of_one_scenario_and_seed_are_same_file(tmp_path: Path) -> None:
     for name in ("a.mcap", "b.mcap"):
         trilat("sim", "two_sites", "--duration", "1", "-o", name, cwd=tmp_path).succeeds()
-    trilat("sim", "two_sites", "--duration", "1", "-o", "c.mcap", "--seed", "2", cwd=tmp_path).succeeds()
+    trilat(
+        "sim", "two_sites", "--duration", "1", "-o", "c.mcap", "--seed", "2", cwd=tmp_path
+    ).succeeds()
     a, b, c = ((tmp_path / name).read_bytes() for name in ("a.mcap", "b.mcap", "c.mcap"))
     assert a == b != c
     log = open_log(tmp_path / "a.mcap")
@@ -26,14 +28,18 @@ def test_two_runs_of_one_scenario_and_seed_are_same_file(tmp_path: Path) -> None
 def test_a_log_that_exists_is_kept_unless_forced(tmp_path: Path) -> None:
     path = tmp_path / "two_sites.mcap"  # the name that it has by default
     path.write_bytes(b"precious")
-    trilat("sim", "two_sites", "--duration", "0.1", cwd=tmp_path).refuses("two_sites.mcap", "--force")
+    trilat("sim", "two_sites", "--duration", "0.1", cwd=tmp_path).refuses(
+        "two_sites.mcap", "--force"
+    )
     assert path.read_bytes() == b"precious"
     trilat("sim", "two_sites", "--duration", "0.1", "--force", cwd=tmp_path).succeeds()
     assert open_log(path).complete
 
 
 def test_a_run_that_diverges_says_so_and_exits_with_1(tmp_path: Path) -> None:
-    done = trilat("sim", "paper", "--set", "limits.qd_limit_rad_s=0.5", "-o", "d.mcap", cwd=tmp_path)
+    done = trilat(
+        "sim", "paper", "--set", "limits.qd_limit_rad_s=0.5", "-o", "d.mcap", cwd=tmp_path
+    )
     done.refuses("diverged", "qd_limit_rad_s", code=1)
     log = open_log(tmp_path / "d.mcap")
     assert log.complete
@@ -51,7 +57,8 @@ def test_verify_compares_with_virtual_time_too(log_file: Path) -> None:
 def test_verify_names_the_first_record_that_differs(log_file: Path, short_log: bytes) -> None:
     def record(r: dict[str, Any]) -> dict[str, Any]:
         if (r["site"], r["tick"]) == ("m2", 300):
-            r["tau"][0] = math.nextafter(r["tau"][0], math.inf)  # the last bit of the first torque
+            # the last bit of the first torque
+            r["tau"][0] = math.nextafter(r["tau"][0], math.inf)
         return r
 
     log_file.write_bytes(edited(short_log, record=record))
@@ -91,10 +98,14 @@ def test_a_torn_log_is_verified_as_far_as_whole(tmp_path: Path) -> None:
     assert done.err.startswith("note: "), done
     assert f"trilat log recover {path}" in done.err
     assert trilat("verify", path, "--min-coverage", "0.3", cwd=tmp_path).code == 0
-    trilat("verify", path, "--min-coverage", "2", cwd=tmp_path).refuses("--min-coverage", "from 0 to 1")
+    trilat("verify", path, "--min-coverage", "2", cwd=tmp_path).refuses(
+        "--min-coverage", "from 0 to 1"
+    )
 
 
-def test_log_torn_before_its_first_record_shows_nothing_and_fails(log_file: Path, short_log: bytes) -> None:
+def test_log_torn_before_its_first_record_shows_nothing_and_fails(
+    log_file: Path, short_log: bytes
+) -> None:
     log_file.write_bytes(short_log[: len(short_log) * 2 // 3])  # inside its only chunk
     done = trilat("verify", log_file, cwd=log_file.parent)
     done_text = done.out + done.err
@@ -103,7 +114,14 @@ def test_log_torn_before_its_first_record_shows_nothing_and_fails(log_file: Path
     assert "no records to execute" in done.err
 
 
-JITTER = ("--set", "link.model=uniform", "--set", "link.delay_ms=50", "--set", "link.half_width_ms=40")
+JITTER = (
+    "--set",
+    "link.model=uniform",
+    "--set",
+    "link.delay_ms=50",
+    "--set",
+    "link.half_width_ms=40",
+)
 
 
 @pytest.mark.long
@@ -120,14 +138,19 @@ def test_report_goes_beside_its_log_and_keeps_what_is_there(tmp_path: Path) -> N
     assert page.lstrip().lower().startswith("<!doctype html")
     assert 'src="http' not in page  # it works offline
     assert json.loads((tmp_path / "run" / "summary.json").read_text(encoding="utf-8"))
-    assert {path.name for path in (tmp_path / "run").iterdir()} == {"report.html", "summary.json"}
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {
+        "report.html",
+        "summary.json",
+    }
     assert "  run/summary.json" in text.splitlines()
     drawn = trilat("report", "run.mcap", "-o", "drawn", "--png", cwd=tmp_path).succeeds()
     pictures = {f"  drawn/{path.name}" for path in (tmp_path / "drawn").glob("*.png")}
     assert "  drawn/certificate.png" in pictures
     assert pictures <= set(drawn.splitlines())
     links = [line for line in text.splitlines() if line.startswith("link ")]
-    assert [line.partition(": stated uniform 50 +- 23.1 ms; effective ")[0] for line in links] == [
+    assert [
+        line.partition(": stated uniform 50 +- 23.1 ms; effective ")[0] for line in links
+    ] == [
         "link s->m",
         "link m->s",
     ]
@@ -147,5 +170,7 @@ def test_report_into_folder_of_its_log_keeps_log(log_file: Path) -> None:
 
 
 def test_a_name_that_is_no_file_is_left_alone(tmp_path: Path) -> None:
-    done = trilat("sim", "two_sites", "--duration", "0.1", "-o", "/dev/full", "--force", cwd=tmp_path)
+    done = trilat(
+        "sim", "two_sites", "--duration", "0.1", "-o", "/dev/full", "--force", cwd=tmp_path
+    )
     done.refuses("/dev/full: exists, and is no file")

@@ -12,7 +12,9 @@ import trilat_net as tn
 from tests.cli.running import trilat
 
 
-def test_the_skeleton_is_a_law_and_replaces_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_skeleton_is_a_law_and_replaces_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = trilat("new", "law", "soft_law.py", cwd=tmp_path)
     assert made.code == 0
     assert "--set control.law=soft_law:SoftLaw" in made.out

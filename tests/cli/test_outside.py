@@ -33,7 +33,9 @@ def test_the_page_does_as_it_says(tmp_path: Path) -> None:
     trilat(*sim, "--duration", "2", cwd=tmp_path).succeeds()
     log = open_log(tmp_path / "spring.mcap")
     assert {site.control.settings["K"] for site in log.scenario.sites.values()} == {80}
-    assert max(np.abs(log[name].q[:1000]).max() for name in log.scenario.names) < 1e-12, "they sink"
+    assert max(np.abs(log[name].q[:1000]).max() for name in log.scenario.names) < 1e-12, (
+        "they sink"
+    )
     checked = trilat(*verify, cwd=tmp_path)
     assert checked.code == 0
     assert "6000/6000 records identical" in checked.out
@@ -45,14 +47,19 @@ def test_the_page_does_as_it_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_law_of_page_holds_arms_together_as_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_law_of_page_holds_arms_together_as_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "holding_laws.py").write_text(block("python"))
     log = tn.simulate("paper", {"control.law": "holding_laws:Spring", "control.K": 80})
     assert tn.certify(log).stability == "stable"
     errors = np.abs(np.stack([log[name].e for name in log.scenario.names]))
     rest = np.stack([log[name].q[-1] for name in log.scenario.names])
-    for said, measured in (("more than %.3f rad,", errors.max()), ("at (%.3f, %.3f) rad", rest.mean(axis=0))):
+    for said, measured in (
+        ("more than %.3f rad,", errors.max()),
+        ("at (%.3f, %.3f) rad", rest.mean(axis=0)),
+    ):
         assert said % (measured if measured.ndim == 0 else tuple(measured)) in DOC.read_text()
     assert errors[:, -1].max() < 1e-6
     assert np.ptp(rest, axis=0).max() < 1e-6
@@ -62,7 +69,9 @@ def test_what_page_says_of_law_is_what_law_gets() -> None:
     from trilat_net.core.user_law import LawContext, LawInput
 
     page = DOC.read_text(encoding="utf-8")
-    rows = dict(re.findall(r"^\| `(LawContext|LawInput)`, [^|]*\| (.*) \|$", page, re.MULTILINE))
+    rows = dict(
+        re.findall(r"^\| `(LawContext|LawInput)`, [^|]*\| (.*) \|$", page, re.MULTILINE)
+    )
     for kind in (LawContext, LawInput):
         assert set(re.findall(r"`(\w+)`", rows[kind.__name__])) == set(kind._fields)
 
@@ -72,7 +81,9 @@ def law(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
     name = "".join(letter for letter in request.node.name if letter.isalnum())
     file = tmp_path / f"cli_{name}.py"
     file.write_text("from tests.laws import Adaptive\nclass Law(Adaptive):\n    pass\n")
-    trilat("sim", "two_sites", *SHORT, "--set", f"control.law={file.stem}:Law", cwd=tmp_path).succeeds()
+    trilat(
+        "sim", "two_sites", *SHORT, "--set", f"control.law={file.stem}:Law", cwd=tmp_path
+    ).succeeds()
     return file
 
 
@@ -87,7 +98,9 @@ def test_before_code_from_outside_runs_it_is_said_which(law: Path, tmp_path: Pat
 def test_a_law_whose_file_was_changed_is_judged_on_request(law: Path, tmp_path: Path) -> None:
     law.write_text(law.read_text() + "# a word\n")
     how = ("--law", law, "--other-version")
-    trilat("verify", "two_sites.mcap", "--law", law, cwd=tmp_path).refuses("is not the file that ran as")
+    trilat("verify", "two_sites.mcap", "--law", law, cwd=tmp_path).refuses(
+        "is not the file that ran as"
+    )
     assert trilat("verify", "two_sites.mcap", cwd=tmp_path).code == 4
     done = trilat("verify", "two_sites.mcap", *how, cwd=tmp_path)
     assert done.code == 0
@@ -107,13 +120,24 @@ def test_a_law_whose_file_is_not_there_is_not_judged(law: Path, tmp_path: Path) 
     done = trilat("verify", "two_sites.mcap", cwd=tmp_path)
     assert done.code == 4
     assert "if you trust it: --law FILE" in done.err
-    trilat("verify", "two_sites.mcap", "--law", law, cwd=tmp_path).refuses(law.stem, "cannot be read")
+    trilat("verify", "two_sites.mcap", "--law", law, cwd=tmp_path).refuses(
+        law.stem, "cannot be read"
+    )
 
 
 def test_a_log_is_read_without_the_code_that_it_names(law: Path, tmp_path: Path) -> None:
     law.unlink()
-    assert "200, none missing" in trilat("log", "info", "two_sites.mcap", cwd=tmp_path).succeeds()
-    done = trilat("rerun", "two_sites.mcap", "--closed-loop", "--set", "control.law=adaptive", cwd=tmp_path)
+    assert (
+        "200, none missing" in trilat("log", "info", "two_sites.mcap", cwd=tmp_path).succeeds()
+    )
+    done = trilat(
+        "rerun",
+        "two_sites.mcap",
+        "--closed-loop",
+        "--set",
+        "control.law=adaptive",
+        cwd=tmp_path,
+    )
     assert done.code == 0
 
 
@@ -128,7 +152,14 @@ def test_run_whose_law_fails_is_one_sentence_and_finished_log(tmp_path: Path) ->
 
 @pytest.mark.parametrize("seeds", ["1", pytest.param("1..3", marks=pytest.mark.long)])
 def test_a_trial_whose_law_fails_is_a_trial_that_failed(seeds: str, tmp_path: Path) -> None:
-    jitter = ("--set", "link.model=uniform", "--set", "link.delay_ms=9", "--set", "link.half_width_ms=1")
+    jitter = (
+        "--set",
+        "link.model=uniform",
+        "--set",
+        "link.delay_ms=9",
+        "--set",
+        "link.half_width_ms=1",
+    )
     done = trilat("test", "two_sites", "--seeds", seeds, *jitter, *FAILING, cwd=tmp_path)
     assert done.code == 1
     assert "no result: " in done.out
@@ -145,5 +176,7 @@ def test_a_rerun_whose_law_fails_is_one_sentence(tmp_path: Path) -> None:
 @pytest.mark.parametrize("how", [["--closed-loop"], ["--replace", "s"]])
 def test_an_arm_outside_cannot_be_executed_afresh(how: list[str], tmp_path: Path) -> None:
     (tmp_path / "outside.mcap").write_bytes(external_log())
-    trilat("rerun", "outside.mcap", *how, cwd=tmp_path).refuses("sites.s.plant", "as in --replace m")
+    trilat("rerun", "outside.mcap", *how, cwd=tmp_path).refuses(
+        "sites.s.plant", "as in --replace m"
+    )
     assert trilat("rerun", "outside.mcap", "--replace", "m", cwd=tmp_path).code == 0

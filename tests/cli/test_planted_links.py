@@ -11,7 +11,18 @@ from .running import shorten, trilat
 
 LAW = ["--law", "p_d", "--budget", "4", "--jobs", "1", "--duration", "2", "--out", "fronts"]
 SWEEP = ["--over", "link.delay_ms=0:20:20", "--jobs", "1", "-o", "swept"]
-BENCH = ["--study", "round-trips", "--task", "contact", "--law", "p_d", "--link", "rtt8", "--jobs", "1"]
+BENCH = [
+    "--study",
+    "round-trips",
+    "--task",
+    "contact",
+    "--law",
+    "p_d",
+    "--link",
+    "rtt8",
+    "--jobs",
+    "1",
+]
 FORCED = [
     ["sim", "two_sites", "--duration", "0.05", "-o", "out.mcap"],
     ["scenario", "new", "mine.toml"],
@@ -59,7 +70,10 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     trilat("sim", "two_sites", "--duration", "0.2", "-o", "run.mcap", cwd=folder).succeeds()
     (folder / "trio.toml").write_text(SHORT)
-    rows = (f"[{n}.5] 64 bytes from 192.0.2.1: icmp_seq={n} ttl=64 time=1{n}.5 ms" for n in range(1, 9))
+    rows = (
+        f"[{n}.5] 64 bytes from 192.0.2.1: icmp_seq={n} ttl=64 time=1{n}.5 ms"
+        for n in range(1, 9)
+    )
     (folder / "ping.txt").write_text("\n".join(rows) + "\n")
     trilat("keys", "pair", "lab", cwd=folder).succeeds()
     return folder
@@ -67,18 +81,23 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def list_content(folder: Path) -> dict[Path, bytes | None]:
     return {
-        path.relative_to(folder): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")
+        path.relative_to(folder): path.read_bytes() if path.is_file() else None
+        for path in folder.rglob("*")
     }
 
 
 @pytest.mark.parametrize(
     "words",
     [
-        pytest.param(words, id=" ".join(words[:6]), marks=[] if words[0] in QUICK else [pytest.mark.long])
+        pytest.param(
+            words, id=" ".join(words[:6]), marks=[] if words[0] in QUICK else [pytest.mark.long]
+        )
         for words in CASES
     ],
 )
-def test_planted_links_lead_no_command_elsewhere(words: list[str], inputs: Path, tmp_path: Path) -> None:
+def test_planted_links_lead_no_command_elsewhere(
+    words: list[str], inputs: Path, tmp_path: Path
+) -> None:
     """Runs the command, puts links in place of each of its outputs, and runs it again."""
     work, victim = tmp_path / "work", tmp_path / "victim"
     shutil.copytree(inputs, work)
@@ -104,7 +123,11 @@ def test_planted_links_lead_no_command_elsewhere(words: list[str], inputs: Path,
         done = trilat(*words, cwd=again)
         assert "Traceback" not in done.err, output
         assert (victim / "thesis.tex").read_text() == "years", output
-        own = is_folder and str(output) in (*words, "runs")  # people link such folders to larger disks
+        # people link such folders to larger disks
+        own = is_folder and str(output) in (
+            *words,
+            "runs",
+        )
         assert own or [path.name for path in victim.iterdir()] == ["thesis.tex"], output
         shutil.rmtree(again)
         shutil.rmtree(victim)

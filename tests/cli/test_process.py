@@ -104,13 +104,17 @@ def elsewhere(folder: Path, *commands: str) -> str:
     """Runs commands with nothing but what every system has; returns what they print, as UTF-8."""
     program = PROGRAM.format(commands=[words.split() for words in commands])
     env = {**PLAIN, **prepare_process(folder / "start")}
-    done = subprocess.run([sys.executable, "-c", program], cwd=folder, env=env, capture_output=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=folder, env=env, capture_output=True
+    )
     assert done.returncode == 0, done.stderr.decode()
     return done.stdout.decode("utf-8")
 
 
 def test_logs_and_studies_need_what_every_system_has(tmp_path: Path) -> None:
-    (tmp_path / "mine.toml").write_text(read_template().replace('title = "', 'title = "θ → 0: '), "utf-8")
+    (tmp_path / "mine.toml").write_text(
+        read_template().replace('title = "', 'title = "θ → 0: '), "utf-8"
+    )
     printed = elsewhere(
         tmp_path,
         "scenario show mine.toml",
@@ -159,7 +163,8 @@ class Terminal(io.TextIOWrapper):
 
 
 @pytest.mark.parametrize(
-    ("kind", "printed"), [(io.TextIOWrapper, "±1 → ≥ 2\n".encode()), (Terminal, b"\xb11 \\u2192 \\u2265 2\n")]
+    ("kind", "printed"),
+    [(io.TextIOWrapper, "±1 → ≥ 2\n".encode()), (Terminal, b"\xb11 \\u2192 \\u2265 2\n")],
 )
 def test_what_is_printed_has_letters_on_every_system(
     kind: type[io.TextIOWrapper], printed: bytes, monkeypatch: pytest.MonkeyPatch
@@ -243,7 +248,8 @@ def test_a_robot_needs_no_library_of_studies(tmp_path: Path) -> None:
     refused = done.stderr.splitlines()
     assert len(refused) == len(NEED_STUDIES), done.stderr
     assert all(
-        line.endswith("which trilat-net-core does without: pip install trilat-net") for line in refused
+        line.endswith("which trilat-net-core does without: pip install trilat-net")
+        for line in refused
     )
     assert {path.name for path in tmp_path.iterdir()} == {"keys", "run.mcap"}
 
@@ -254,7 +260,9 @@ def test_help_imports_nothing_heavy(tmp_path: Path) -> None:
         "heavy = {'numba', 'numpy', 'zenoh', 'mcap', 'matplotlib', 'msgspec'} & set(sys.modules)\n"
         "sys.exit(str(heavy) if heavy else 0)"
     )
-    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
 
 

@@ -10,7 +10,9 @@ from trilat_net.reporting import terminal_output
 
 def terminal(monkeypatch: pytest.MonkeyPatch, *, interactive: bool) -> io.StringIO:
     stream = io.StringIO()
-    console = Console(file=stream, force_terminal=interactive, force_interactive=interactive, width=80)
+    console = Console(
+        file=stream, force_terminal=interactive, force_interactive=interactive, width=80
+    )
     monkeypatch.setattr(terminal_output, "err", console)
     return stream
 

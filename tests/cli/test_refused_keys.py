@@ -19,7 +19,13 @@ from tests.cli.running import COMMAND, PLAIN, trilat
 from trilat_net.errors import LogRefused, TrilatError, UsageError
 from trilat_net.net import member_keys
 from trilat_net.net.arm_client import ArmClient, SwitchClient
-from trilat_net.net.member_keys import CERTIFICATE, MEMBERS, PRIVATE_KEY, create_keys, read_member_keys
+from trilat_net.net.member_keys import (
+    CERTIFICATE,
+    MEMBERS,
+    PRIVATE_KEY,
+    create_keys,
+    read_member_keys,
+)
 
 MEMBERS_MADE = ("m1", "m2", "s", "recorder", "operator", "router", "bridge")
 AUTHORITY = "authority.pem"
@@ -67,7 +73,9 @@ OF_ANOTHER = [
 ]
 
 
-@pytest.mark.parametrize(("words", "whose", "due"), OF_ANOTHER, ids=lambda value: str(value)[:40])
+@pytest.mark.parametrize(
+    ("words", "whose", "due"), OF_ANOTHER, ids=lambda value: str(value)[:40]
+)
 def test_a_command_takes_the_keys_of_who_it_is(
     words: Sequence[str], whose: str, due: str, made: Path, tmp_path: Path
 ) -> None:
@@ -82,8 +90,16 @@ FROM_PYTHON = [
     (lambda keys: session("paper", keys=keys).enable(), "m1", "operator"),
     (lambda keys: session("paper", keys=keys).end(), "recorder", "operator"),
     (lambda keys: session("paper", keys=keys).set_link("m1->s", delay_ms=1), "s", "operator"),
-    (lambda keys: ArmClient.connected("two_sites", "s", ["tls/127.0.0.1:9"], keys), "operator", "s"),
-    (lambda keys: SwitchClient.connected("two_sites", "s", ["tls/127.0.0.1:9"], keys), "s", "operator"),
+    (
+        lambda keys: ArmClient.connected("two_sites", "s", ["tls/127.0.0.1:9"], keys),
+        "operator",
+        "s",
+    ),
+    (
+        lambda keys: SwitchClient.connected("two_sites", "s", ["tls/127.0.0.1:9"], keys),
+        "s",
+        "operator",
+    ),
 ]
 
 
@@ -101,7 +117,11 @@ ENDPOINTS = [
     ("--connect", "unixsock-stream//tmp/x", "with --keys an endpoint is encrypted"),
     ("--connect", "udp/127.0.0.1:7447", "UDP loses, repeats and trusts everything"),
     ("--router", "tcp/127.0.0.1:7447", "with --keys an endpoint is encrypted"),
-    ("--connect", "tls/127.0.0.1:7447#verify_name_on_connect=false", "how it is encrypted comes from --keys"),
+    (
+        "--connect",
+        "tls/127.0.0.1:7447#verify_name_on_connect=false",
+        "how it is encrypted comes from --keys",
+    ),
 ]
 
 
@@ -113,9 +133,18 @@ def test_an_endpoint_with_keys_is_encrypted_as_they_say(
 
 
 ZENOH_FILES = [
-    ('{ listen: { endpoints: ["tcp/127.0.0.1:7447"] } }', "with --keys an endpoint is encrypted"),
-    ("{ transport: { link: { protocols: ['tcp', 'tls'] } } }", "transport/link/protocols: comes from --keys"),
-    ("{ transport: { link: { tls: { enable_mtls: false } } } }", "transport/link/tls: comes from --keys"),
+    (
+        '{ listen: { endpoints: ["tcp/127.0.0.1:7447"] } }',
+        "with --keys an endpoint is encrypted",
+    ),
+    (
+        "{ transport: { link: { protocols: ['tcp', 'tls'] } } }",
+        "transport/link/protocols: comes from --keys",
+    ),
+    (
+        "{ transport: { link: { tls: { enable_mtls: false } } } }",
+        "transport/link/tls: comes from --keys",
+    ),
     ("{ access_control: { enabled: false } }", "access_control: comes from --keys"),
 ]
 
@@ -130,7 +159,9 @@ def test_ones_own_zenoh_settings_do_not_loosen_keys(
 
 
 def take(name: str, source: str) -> Change:
-    return lambda keys: (keys / "m1" / name).write_bytes((keys.parent / source / name).read_bytes())
+    return lambda keys: (keys / "m1" / name).write_bytes(
+        (keys.parent / source / name).read_bytes()
+    )
 
 
 def say(**facts: object) -> Change:
@@ -163,9 +194,18 @@ SPOILT: list[tuple[Change, str]] = [
     (mode(PRIVATE_KEY, 0o640), "can be read by others: chmod 600"),
     (lambda keys: (keys / "m1" / MEMBERS).unlink(), "members.json: No such file"),
     (lambda keys: (keys / "m1" / PRIVATE_KEY).unlink(), "private.key: No such file"),
-    (lambda keys: (keys / "m1" / MEMBERS).write_text("secret"), "damaged, no keys of `trilat keys new`"),
-    (lambda keys: (keys / "m1" / MEMBERS).write_text("[" * 9999), "damaged, no keys of `trilat keys new`"),
-    (lambda keys: (keys / "m1" / CERTIFICATE).write_text("secret"), "damaged, no keys of `trilat keys new`"),
+    (
+        lambda keys: (keys / "m1" / MEMBERS).write_text("secret"),
+        "damaged, no keys of `trilat keys new`",
+    ),
+    (
+        lambda keys: (keys / "m1" / MEMBERS).write_text("[" * 9999),
+        "damaged, no keys of `trilat keys new`",
+    ),
+    (
+        lambda keys: (keys / "m1" / CERTIFICATE).write_text("secret"),
+        "damaged, no keys of `trilat keys new`",
+    ),
     (say(member="m2"), "the certificate is that of m1, and members.json names m2"),
     (say(members=["m2", "s"]), "members.json does not list m1"),
     (say(members=["m1", "*"]), "a member's name is at most 64 letters"),
@@ -180,7 +220,9 @@ SPOILT: list[tuple[Change, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("change", "reason"), SPOILT, ids=[reason[:40] for _, reason in SPOILT])
+@pytest.mark.parametrize(
+    ("change", "reason"), SPOILT, ids=[reason[:40] for _, reason in SPOILT]
+)
 def test_keys_that_are_spoilt_are_refused(change: Change, reason: str, keys: Path) -> None:
     read_member_keys(keys / "m1")
     change(keys)
@@ -190,7 +232,9 @@ def test_keys_that_are_spoilt_are_refused(change: Change, reason: str, keys: Pat
 
 
 def test_the_keys_of_all_are_no_members(made: Path, tmp_path: Path) -> None:
-    trilat(*RECORD, made / "k", cwd=tmp_path).refuses("holds the keys of all; name the folder of one member")
+    trilat(*RECORD, made / "k", cwd=tmp_path).refuses(
+        "holds the keys of all; name the folder of one member"
+    )
 
 
 def test_a_folder_shared_with_the_sticky_bit_will_do(keys: Path) -> None:
@@ -226,14 +270,18 @@ NEW = [
 
 
 @pytest.mark.parametrize(("words", "reason"), NEW, ids=lambda value: str(value)[:40])
-def test_no_keys_are_made_for_many_and_nothing_is_left(words: list[str], reason: str, tmp_path: Path) -> None:
+def test_no_keys_are_made_for_many_and_nothing_is_left(
+    words: list[str], reason: str, tmp_path: Path
+) -> None:
     trilat("keys", "new", "k", *words, cwd=tmp_path).refuses(reason)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_keys_are_never_replaced(keys: Path) -> None:
     before = sorted(keys.rglob("*"))
-    trilat("keys", "new", keys, "m1", cwd=keys).refuses("keys are never replaced, name a new folder")
+    trilat("keys", "new", keys, "m1", cwd=keys).refuses(
+        "keys are never replaced, name a new folder"
+    )
     assert sorted(keys.rglob("*")) == before
 
 
@@ -259,21 +307,28 @@ def test_keys_are_made_whole_or_not_at_all(
 
         return act
 
-    for error, kind in ((OSError(28, "No space left on device"), LogRefused), (KeyboardInterrupt(),) * 2):
+    for error, kind in (
+        (OSError(28, "No space left on device"), LogRefused),
+        (KeyboardInterrupt(),) * 2,
+    ):
         written.clear()
         monkeypatch.setattr(member_keys, "_put", refuse(error))
         caught: Any = kind if isinstance(kind, type) else KeyboardInterrupt
         with pytest.raises(caught) as raised:
             create_keys(tmp_path / "k", ["m1", "m2"])
         if isinstance(raised.value, TrilatError):
-            assert f"{tmp_path / 'k'}: cannot be written: No space left on device" in str(raised.value)
+            assert f"{tmp_path / 'k'}: cannot be written: No space left on device" in str(
+                raised.value
+            )
         assert list(tmp_path.iterdir()) == []
 
 
 def test_keys_are_private_whatever_the_umask(tmp_path: Path) -> None:
     before = os.umask(0)
     try:
-        create_keys(tmp_path / "k", ["m1", "recorder"], ["192.0.2.1", "robot.example", "2001:db8::1"])
+        create_keys(
+            tmp_path / "k", ["m1", "recorder"], ["192.0.2.1", "robot.example", "2001:db8::1"]
+        )
     finally:
         os.umask(before)
     assert {path.stat().st_mode & 0o077 for path in (tmp_path / "k").rglob("*")} == {0}
@@ -284,7 +339,11 @@ def test_the_right_keys_are_taken(made: Path, tmp_path: Path) -> None:
     """By a process of its own, which listens over TLS where it would over TCP, and waits for the others."""
     words = [*COMMAND, *SITE, str(made / "k" / "m1"), "--join-timeout", "0"]
     done = subprocess.run(
-        words, cwd=tmp_path, env={**PLAIN, "NUMBA_DISABLE_JIT": "1"}, capture_output=True, text=True
+        words,
+        cwd=tmp_path,
+        env={**PLAIN, "NUMBA_DISABLE_JIT": "1"},
+        capture_output=True,
+        text=True,
     )
     assert "m1: others connect to tls/127.0.0.1:" in done.stdout
     assert "never came" in done.stderr

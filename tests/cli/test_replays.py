@@ -14,12 +14,20 @@ from .running import trilat
         (["--start", "7"], ["--start 7 s: is beyond the end", "from 0.000 s to 0.499 s"]),
         (["--include", "m1*"], ["--include is a key expression like", "'m1*'"]),
         (["--exclude", "**"], ["no message for this selection"]),
-        (["--time", "arrival"], ["--time is publish (as it was sent) or log (as it arrived), not 'arrival'"]),
+        (
+            ["--time", "arrival"],
+            ["--time is publish (as it was sent) or log (as it arrived), not 'arrival'"],
+        ),
         (["--preload", "-1"], ["--preload is a number of MiB, not -1"]),
-        (["--prefix", "a/b"], ["a session's name is at most 80 letters, digits, _", "not 'a/b-paper'"]),
+        (
+            ["--prefix", "a/b"],
+            ["a session's name is at most 80 letters, digits, _", "not 'a/b-paper'"],
+        ),
         (["--session", "a b"], ["a session's name is at most 80 letters", "'a b'"]),
         (["--connect", "tcp/127.0.0.1:1", "--router", "tcp/127.0.0.1:2"], ["--router"]),
     ],
 )
-def test_what_cannot_be_meant_is_refused(options: list[str], facts: list[str], log_file: Path) -> None:
+def test_what_cannot_be_meant_is_refused(
+    options: list[str], facts: list[str], log_file: Path
+) -> None:
     trilat("replay", log_file.name, *options, cwd=log_file.parent).refuses(*facts)

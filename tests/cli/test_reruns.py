@@ -21,7 +21,9 @@ def test_nothing_changed_says_that_it_is_the_log(log_file: Path) -> None:
 
 
 def test_change_says_what_became_of_it_in_lines_that_fit(log_file: Path) -> None:
-    done = trilat("rerun", log_file, "--replace", "s", "--set", "control.Kd=5", cwd=log_file.parent)
+    done = trilat(
+        "rerun", log_file, "--replace", "s", "--set", "control.Kd=5", cwd=log_file.parent
+    )
     text = done.succeeds()
     for words in (
         "control.Kd of s: 3 -> 5",
@@ -40,7 +42,14 @@ def test_a_closed_loop_has_a_row_for_every_site(log_file: Path) -> None:
     text = trilat("rerun", log_file, *options, cwd=log_file.parent).succeeds()
     assert "closed loop: m1, m2, s executed afresh\n" in text
     assert "every link: 200 ms -> 300 ms" in text
-    assert sum(line.split()[0] in ("m1", "m2", "s") for line in text.splitlines() if line[:1] in "ms") == 3
+    assert (
+        sum(
+            line.split()[0] in ("m1", "m2", "s")
+            for line in text.splitlines()
+            if line[:1] in "ms"
+        )
+        == 3
+    )
     assert "link m1->s: samples in use were 200 ms old" in text
 
 
@@ -96,7 +105,9 @@ def test_log_that_is_not_what_it_says_is_failure(log_file: Path, short_log: byte
     ],
     ids=" ".join,
 )
-def test_bad_input_is_one_sentence(options: tuple[str, ...], facts: tuple[str, ...], log_file: Path) -> None:
+def test_bad_input_is_one_sentence(
+    options: tuple[str, ...], facts: tuple[str, ...], log_file: Path
+) -> None:
     before = log_file.read_bytes()
     trilat("rerun", log_file, *options, cwd=log_file.parent).refuses(*facts)
     assert log_file.read_bytes() == before

@@ -13,9 +13,15 @@ COMMANDS = [("site", "m", "--scenario", "two_sites"), ("record", "--session", "t
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda words: words[0])
-def test_a_bad_configuration_is_refused_in_one_line(command: tuple[str, ...], tmp_path: Path) -> None:
-    trilat(*command, "--zenoh-config", "none.json5", cwd=tmp_path).refuses("none.json5", "No such file")
-    (tmp_path / "mine.json5").write_text("{transport: {link: {tls: {root_ca_certificate: 'none.pem'}}}}")
+def test_a_bad_configuration_is_refused_in_one_line(
+    command: tuple[str, ...], tmp_path: Path
+) -> None:
+    trilat(*command, "--zenoh-config", "none.json5", cwd=tmp_path).refuses(
+        "none.json5", "No such file"
+    )
+    (tmp_path / "mine.json5").write_text(
+        "{transport: {link: {tls: {root_ca_certificate: 'none.pem'}}}}"
+    )
     done = trilat(*command, "--zenoh-config", "mine.json5", cwd=tmp_path)
     done.refuses("mine.json5: transport/link/tls/root_ca_certificate: none.pem cannot be read")
     assert done.out == ""
@@ -38,11 +44,15 @@ def test_a_router_on_a_busy_port_says_so(tmp_path: Path) -> None:
     (endpoint,) = find_free_endpoints(1)
     other = ZenohBus([endpoint])
     try:
-        trilat("router", "--listen", endpoint, cwd=tmp_path).refuses(f"{endpoint}: the port is in use")
+        trilat("router", "--listen", endpoint, cwd=tmp_path).refuses(
+            f"{endpoint}: the port is in use"
+        )
     finally:
         other.close()
 
 
 @pytest.mark.parametrize("seconds", ["-1", "nan", "inf"])
 def test_a_time_that_is_none_is_refused_by_its_name(seconds: str, tmp_path: Path) -> None:
-    trilat("router", "--until-idle", seconds, cwd=tmp_path).refuses("--until-idle is a number of seconds")
+    trilat("router", "--until-idle", seconds, cwd=tmp_path).refuses(
+        "--until-idle is a number of seconds"
+    )

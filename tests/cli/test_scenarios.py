@@ -37,7 +37,15 @@ def test_what_show_prints_is_the_same_scenario(name: str, tmp_path: Path) -> Non
 
 def test_show_prints_overrides_resolved(tmp_path: Path) -> None:
     text = trilat(
-        *("scenario", "show", "paper", "--set", "control.Kd=5", "--set", "links.m1->s.delay_ms=7"),
+        *(
+            "scenario",
+            "show",
+            "paper",
+            "--set",
+            "control.Kd=5",
+            "--set",
+            "links.m1->s.delay_ms=7",
+        ),
         *("--duration", "3", "--seed", "9"),
         cwd=tmp_path,
     ).succeeds()

@@ -21,7 +21,9 @@ WITHOUT_COMPILING = {**PLAIN, "NUMBA_DISABLE_JIT": "1", "PYTHONDONTWRITEBYTECODE
 """Of short files Python would keep modules that are cut off."""
 
 
-def limited(kind: int, most: int, *words: str | Path, cwd: Path) -> "subprocess.CompletedProcess[str]":
+def limited(
+    kind: int, most: int, *words: str | Path, cwd: Path
+) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
         [*COMMAND, *map(str, words)],
         cwd=cwd,
@@ -39,10 +41,21 @@ def limited(kind: int, most: int, *words: str | Path, cwd: Path) -> "subprocess.
 )
 def test_figure_that_disk_refuses_is_named_and_not_there(form: str, tmp_path: Path) -> None:
     done = limited(
-        resource.RLIMIT_FSIZE, 1000, "figure", LOG, "positions", "--format", form, "-o", "f", cwd=tmp_path
+        resource.RLIMIT_FSIZE,
+        1000,
+        "figure",
+        LOG,
+        "positions",
+        "--format",
+        form,
+        "-o",
+        "f",
+        cwd=tmp_path,
     )
     assert done.returncode == 5
-    assert done.stderr.splitlines() == [f"error: f/positions.{form}: cannot be written: File too large"]
+    assert done.stderr.splitlines() == [
+        f"error: f/positions.{form}: cannot be written: File too large"
+    ]
     assert list((tmp_path / "f").iterdir()) == []
 
 
@@ -54,8 +67,12 @@ def test_keys_that_the_disk_refuses_are_named_and_not_there(tmp_path: Path) -> N
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(("mib", "words"), [(40, ("log", "check")), (420, ("certify",)), (900, ("verify",))])
-def test_too_little_memory_is_said_in_one_line(mib: int, words: Sequence[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("mib", "words"), [(40, ("log", "check")), (420, ("certify",)), (900, ("verify",))]
+)
+def test_too_little_memory_is_said_in_one_line(
+    mib: int, words: Sequence[str], tmp_path: Path
+) -> None:
     """As `ulimit -v` leaves it, where libraries cannot be loaded, or try for ever."""
     done = limited(resource.RLIMIT_AS, mib << 20, *words, LOG, cwd=tmp_path)
     assert done.returncode == 1
@@ -71,7 +88,12 @@ def test_without_docstrings_commands_work_but_have_no_help(tmp_path: Path) -> No
         (["keys", "new", "k", "m"], "k/m"),
     ):
         done = subprocess.run(
-            [*program, *words], cwd=tmp_path, env=PLAIN, capture_output=True, text=True, timeout=300
+            [*program, *words],
+            cwd=tmp_path,
+            env=PLAIN,
+            capture_output=True,
+            text=True,
+            timeout=300,
         )
         assert (done.returncode, done.stderr) == (0, "")
         assert said in done.stdout
@@ -99,7 +121,9 @@ def test_recovering_blames_the_file_that_cannot_be_written(tmp_path: Path) -> No
     ],
     ids=" ".join,
 )
-def test_what_a_foreign_file_says_is_not_repeated(words: tuple[str, ...], tmp_path: Path) -> None:
+def test_what_a_foreign_file_says_is_not_repeated(
+    words: tuple[str, ...], tmp_path: Path
+) -> None:
     """It may be one that whoever reads the error may not read."""
     for text in (
         "root:secret:19000:0\n",
@@ -115,7 +139,9 @@ def test_what_a_foreign_file_says_is_not_repeated(words: tuple[str, ...], tmp_pa
         assert "secret" not in done.err + done.out
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)]
+)
 @pytest.mark.parametrize(
     "words", [("site", "m1", "-s", "paper"), ("sim", "paper", "-o", "x.mcap")], ids=" ".join
 )
@@ -124,7 +150,9 @@ def test_cold_start_says_that_it_compiles_and_ends_at_once(
 ) -> None:
     """Python takes a signal between two instructions, and one call of the compiler takes minutes."""
     cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    started = subprocess.Popen([*COMMAND, *words], cwd=tmp_path, env=cold, stderr=subprocess.PIPE, text=True)
+    started = subprocess.Popen(
+        [*COMMAND, *words], cwd=tmp_path, env=cold, stderr=subprocess.PIPE, text=True
+    )
     assert started.stderr is not None
     try:
         assert started.stderr.readline().strip() == COMPILING  # this is no terminal
@@ -152,32 +180,49 @@ main()
 """A command that gets a signal when it has used so much of a processor, s."""
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(n, marks=pytest.mark.long) for n in range(2, 16))])
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(n, marks=pytest.mark.long) for n in range(2, 16))]
+)
 def test_a_signal_ends_a_cold_start_in_every_phase(seed: int, tmp_path: Path) -> None:
     """As it is imported, read, compiled or kept: whatever Python makes of the signal there."""
     draw = random.Random(seed)
     number, instant_s = draw.choice(ENDING_SIGNALS), draw.uniform(0.2, 8.0)
     words = draw.choice([("sim", "paper", "-o", "x.mcap"), ("demo", "--out", "x")])
-    command = [sys.executable, "-c", AT_AN_INSTANT, f"{instant_s:.3f}", str(int(number)), *words]
+    command = [
+        sys.executable,
+        "-c",
+        AT_AN_INSTANT,
+        f"{instant_s:.3f}",
+        str(int(number)),
+        *words,
+    ]
     cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    done = subprocess.run(command, cwd=tmp_path, env=cold, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        command, cwd=tmp_path, env=cold, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode in (-number, 128 + number), done.stderr
 
 
 def test_a_signal_ends_a_containers_first_process_while_it_compiles(tmp_path: Path) -> None:
     """The kernel lets no signal end such a process that it did not ask for."""
     first = ["unshare", "--user", "--map-root-user", "--pid", "--fork", "--kill-child"]
-    if shutil.which("unshare") is None or subprocess.run([*first, "true"], capture_output=True).returncode:
+    if (
+        shutil.which("unshare") is None
+        or subprocess.run([*first, "true"], capture_output=True).returncode
+    ):
         pytest.skip("no process can be the first of a namespace here")
     instant_s, number = "4.0", signal.SIGTERM
     command = [*first, sys.executable, "-c", AT_AN_INSTANT, instant_s, str(int(number))]
     cold = {**PLAIN, "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    done = subprocess.run([*command, "sim", "paper", "-o", "x.mcap"], cwd=tmp_path, env=cold, timeout=300)
+    done = subprocess.run(
+        [*command, "sim", "paper", "-o", "x.mcap"], cwd=tmp_path, env=cold, timeout=300
+    )
     assert done.returncode == 128 + number
 
 
 def test_signals_kill_while_the_compiler_runs_only_where_they_may() -> None:
-    ours = [name for name in ENDING_SIGNALS if signal.getsignal(name) is not signal.SIG_IGN]  # as under nohup
+    # as under nohup
+    ours = [name for name in ENDING_SIGNALS if signal.getsignal(name) is not signal.SIG_IGN]
 
     def handlers() -> list[object]:
         return [signal.getsignal(name) for name in ours]

@@ -22,7 +22,9 @@ from .running import trilat
 ROOT = Path(__file__).parents[2]
 RUN = {"duration_s": 60.0, "rate_hz": 50, "link.delay_ms": 200.0}
 ROWS = re.findall(
-    r"^\| \*\*(\w+)\*\*[^|]*\| (.+) \|$", (ROOT / "docs" / "log-tools.md").read_text(), re.MULTILINE
+    r"^\| \*\*(\w+)\*\*[^|]*\| (.+) \|$",
+    (ROOT / "docs" / "log-tools.md").read_text(),
+    re.MULTILINE,
 )
 COMMANDS = ("log check", "verify", "certify", "report", "log recover")
 
@@ -40,10 +42,14 @@ def sparse() -> bytes:
     taken = taken_apart(whole()).without_chain()
     topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
     taken.messages = [
-        m for m in taken.messages if topics[m.channel] != "/trilat/free/m1/state" or m.sequence % 10 != 5
+        m
+        for m in taken.messages
+        if topics[m.channel] != "/trilat/free/m1/state" or m.sequence % 10 != 5
     ]
     text = accounts["/trilat/free/m1/state"]
-    accounts["/trilat/free/m1/state"] = text.replace("received 3000, missing 0", "received 2700, missing 300")
+    accounts["/trilat/free/m1/state"] = text.replace(
+        "received 3000, missing 0", "received 2700, missing 300"
+    )
     return taken.bytes()
 
 
@@ -69,7 +75,9 @@ def forged() -> bytes:
     """The torque of m1 and m2 is zeroed, and the metadata claim that only s was executed."""
     claims = {"driver": "rerun", "rerun_executed": "s"}
     zeroed = {"tau": [0.0, 0.0]}
-    return edited(whole(), record=lambda r: r if r["site"] == "s" else {**r, **zeroed}, session=claims)
+    return edited(
+        whole(), record=lambda r: r if r["site"] == "s" else {**r, **zeroed}, session=claims
+    )
 
 
 def changed() -> bytes:
@@ -83,14 +91,17 @@ def newer() -> bytes:
 
 
 MADE: dict[str, Callable[[], bytes]] = {
-    one.__name__: cache(one) for one in (whole, torn, sparse, spliced, older, forged, changed, newer)
+    one.__name__: cache(one)
+    for one in (whole, torn, sparse, spliced, older, forged, changed, newer)
 }
 
 
 def table_cells() -> Iterator[Any]:
     """Every cell; on a push some states are passed over, and of a torn log alone a report is made."""
     for state, command in product([*MADE, "part"], COMMANDS):
-        slow = state in ("older", "changed", "part") or (command == "report" and state != "torn")
+        slow = state in ("older", "changed", "part") or (
+            command == "report" and state != "torn"
+        )
         yield pytest.param(state, command, marks=pytest.mark.long if slow else ())
 
 

@@ -15,13 +15,18 @@ from tests.json_outline import is_documented
 from .running import PLAIN, trilat
 
 OPTIONS = {name: names for name, names in all_options().items() if name != "trilat"}
-COMMANDS = [name for name in OPTIONS if not any(other.startswith(f"{name} ") for other in OPTIONS)]
+COMMANDS = [
+    name for name in OPTIONS if not any(other.startswith(f"{name} ") for other in OPTIONS)
+]
 GOLDEN_LOG = Path(__file__).parents[1] / "golden" / "live-paper.mcap"
 NO_RESULT = {
     *(
-        f"trilat {name}" for name in ("site", "hand", "record", "watch", "router", "ros2", "log view")
+        f"trilat {name}"
+        for name in ("site", "hand", "record", "watch", "router", "ros2", "log view")
     ),  # run until they end
-    *(f"trilat {name}" for name in ("stop", "enable", "reset", "set link", "set dominance")),  # orders
+    *(
+        f"trilat {name}" for name in ("stop", "enable", "reset", "set link", "set dominance")
+    ),  # orders
     *(f"trilat new {kind}" for kind in ("law", "hand", "plant")),
     "trilat experiment new",
     *(f"trilat {name}" for name in ("scenario show", "scenario new")),  # files
@@ -52,7 +57,9 @@ def test_the_version_is_that_of_the_package() -> None:
         ("scenario show p_d", {"p_d_margin", "p_d_margin_two"}),
         pytest.param("figure run.mcap se", {"settling"}, marks=pytest.mark.long),
         ("site --scenario two_sites ", {"m", "s"}),
-        pytest.param(f"rerun {GOLDEN_LOG} --replace ", {"m1", "m2", "s"}, marks=pytest.mark.long),
+        pytest.param(
+            f"rerun {GOLDEN_LOG} --replace ", {"m1", "m2", "s"}, marks=pytest.mark.long
+        ),
         pytest.param(f"twin {GOLDEN_LOG} --push m", {"m1", "m2"}, marks=pytest.mark.long),
     ],
 )
@@ -70,11 +77,16 @@ def test_a_shell_completes(words: str, found: set[str]) -> None:
 
 @pytest.mark.long
 def test_what_was_made_is_named_as_json(tmp_path: Path) -> None:
-    made = json.loads(trilat("sim", "two_sites", "--duration", "0.1", "--json", cwd=tmp_path).succeeds())
+    made = json.loads(
+        trilat("sim", "two_sites", "--duration", "0.1", "--json", cwd=tmp_path).succeeds()
+    )
     assert made["files"] == ["two_sites.mcap"]
     assert made["sites"]["m"]["records"] == 100
     asked = ("log", "export", "two_sites.mcap", "--to", "npz", "--json")
-    assert json.loads(trilat(*asked, cwd=tmp_path).succeeds())["records"] == {"m": 100, "s": 100}
+    assert json.loads(trilat(*asked, cwd=tmp_path).succeeds())["records"] == {
+        "m": 100,
+        "s": 100,
+    }
     shipped = json.loads(trilat("scenario", "list", "--json", cwd=tmp_path).succeeds())
     assert {"free", "paper"} < {one["name"] for one in shipped}
     told = json.loads(trilat("scenario", "check", "paper", "--json", cwd=tmp_path).succeeds())

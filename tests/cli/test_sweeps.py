@@ -18,7 +18,9 @@ OVER = ("--over", "link.delay_ms=0:40:20", "--over", "control.Kd=1:4:1")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("sweeps")
     (path / "trio.toml").write_text(SHORT)
-    text = trilat("sweep", "trio.toml", *OVER, "--map", "-o", "done", "--jobs", "1", cwd=path).succeeds()
+    text = trilat(
+        "sweep", "trio.toml", *OVER, "--map", "-o", "done", "--jobs", "1", cwd=path
+    ).succeeds()
     (path / "printed.txt").write_text(text)
     return path
 
@@ -31,7 +33,8 @@ def test_a_sweep_tells_its_plan_outcome_and_next_step(folder: Path, tmp_path: Pa
     (verdicts,) = (line for line in lines if line.startswith("12 runs of 12 cells: "))
     assert sum(int(part.split()[0]) for part in verdicts.partition(": ")[2].split(", ")) == 12
     assert "times real time per process" in text
-    assert len(re.findall(r"\d+ runs", text.replace("of 12 runs", ""))) == 1  # without lines of progress
+    # without lines of progress
+    assert len(re.findall(r"\d+ runs", text.replace("of 12 runs", ""))) == 1
     assert "results: runs/sweep-trio-001/results.csv" in lines
     again = trilat("sweep", "runs/sweep-trio-001", cwd=tmp_path).succeeds().splitlines()
     assert verdicts in again
@@ -43,7 +46,9 @@ def test_a_sweep_tells_its_plan_outcome_and_next_step(folder: Path, tmp_path: Pa
 def test_a_cell_is_a_command_that_runs(folder: Path) -> None:
     for source in ("done", "done/results.csv"):
         text = trilat("sweep", source, "--cell", "6", cwd=folder).succeeds()
-    assert text.startswith("trilat sim trio.toml --set link.delay_ms=20 --set control.Kd=3 --seed 1 ")
+    assert text.startswith(
+        "trilat sim trio.toml --set link.delay_ms=20 --set control.Kd=3 --seed 1 "
+    )
     trilat(*text.split()[1:], cwd=folder).succeeds()
     assert (folder / "cell-6.mcap").exists()
 
@@ -72,7 +77,10 @@ def test_seeds_are_a_number_or_a_list() -> None:
 
 
 BAD = {
-    "no key of that name": (["--over", "link.dely_ms=0:1:1"], ["link.dely_ms", "did you mean 'delay_ms'?"]),
+    "no key of that name": (
+        ["--over", "link.dely_ms=0:1:1"],
+        ["link.dely_ms", "did you mean 'delay_ms'?"],
+    ),
     "another sweep's folder": (
         ["--over", "control.Kd=1,2", "-o", "done"],
         ["done", "a sweep of other axes", "results are not mixed"],
@@ -94,7 +102,9 @@ def test_what_cannot_be_right_is_one_line_and_leaves_nothing(kind: str, folder: 
 
 def test_an_enormous_sweep_is_refused_with_count_and_time(folder: Path) -> None:
     before = sorted(folder.rglob("*"))
-    done = trilat("sweep", "trio.toml", "--over", "control.Kd=1:2:1e-6", "--over", OVER[1], cwd=folder)
+    done = trilat(
+        "sweep", "trio.toml", "--over", "control.Kd=1:2:1e-6", "--over", OVER[1], cwd=folder
+    )
     assert done.code == 2, done
     (problem,) = done.err.splitlines()
     for fact in ("error: 3000003 cells (1000001 x 3) would take about ", " on ", "--yes"):
@@ -112,28 +122,38 @@ def test_map_lies_beside_results_and_names_command_that_makes_it(folder: Path) -
 def test_a_map_shows_its_progress_and_what_was_fixed(folder: Path) -> None:
     lines = (folder / "printed.txt").read_text().splitlines()
     assert lines.index("map: the lines of theory ...") < lines.index("map: drawing ...")
-    assert any(re.fullmatch(r"  \d of 3 columns of the map, about .* left", line) for line in lines)
+    assert any(
+        re.fullmatch(r"  \d of 3 columns of the map, about .* left", line) for line in lines
+    )
     assert "not swept: adaptive: Lambda 1, Kp 1, Gamma 1, theta_hat0 0" in lines
     page = (folder / "done" / "map.md").read_text()
-    assert "- gains that were not swept: adaptive: Lambda 1, Kp 1, Gamma 1, theta_hat0 0\n" in page
+    assert (
+        "- gains that were not swept: adaptive: Lambda 1, Kp 1, Gamma 1, theta_hat0 0\n" in page
+    )
     assert "- laws at their best gains compare fairly by: `trilat compare --tune`\n" in page
 
 
 @pytest.mark.long
 def test_results_are_drawn_once_more_the_same(folder: Path) -> None:
-    before = {name: (folder / "done" / name).read_bytes() for name in ("map.md", "map.png", "map.svg")}
+    before = {
+        name: (folder / "done" / name).read_bytes() for name in ("map.md", "map.png", "map.svg")
+    }
     text = trilat("sweep", "done", "--map", "--jobs", "1", cwd=folder).succeeds()
     assert "done/map.png" in text
     for name, data in before.items():
         assert (folder / "done" / name).read_bytes() == data
-    trilat("sweep", "done/results.csv", "--map", "--width", "7", "--jobs", "1", cwd=folder).succeeds()
+    trilat(
+        "sweep", "done/results.csv", "--map", "--width", "7", "--jobs", "1", cwd=folder
+    ).succeeds()
     assert (folder / "done" / "map.png").read_bytes() != before["map.png"]
 
 
 @pytest.mark.long
 def test_margins_are_printed_and_kept(folder: Path) -> None:
     asked = ("--over", "link.delay_ms=0,40", "--margin", "control.Kd=1:4", "--tolerance", "0.1")
-    text = trilat("sweep", "trio.toml", *asked, "--jobs", "1", "-o", "edges", cwd=folder).succeeds()
+    text = trilat(
+        "sweep", "trio.toml", *asked, "--jobs", "1", "-o", "edges", cwd=folder
+    ).succeeds()
     assert "edge of Kd (N m s/rad)" in text
     facts = json.loads((folder / "edges" / "margin.json").read_text())
     assert [place["link.delay_ms"] for place in facts["places"]] == [0.0, 40.0]
@@ -163,5 +183,7 @@ def test_margins_are_printed_and_kept(folder: Path) -> None:
         (("trio.toml", *OVER, "--margin", "control.Kd=1:4"), "control.Kd: is swept twice"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_sentence(folder: Path, words: tuple[str, ...], problem: str) -> None:
+def test_what_cannot_be_is_refused_in_a_sentence(
+    folder: Path, words: tuple[str, ...], problem: str
+) -> None:
     trilat("sweep", *words, cwd=folder).refuses(problem)

@@ -27,14 +27,18 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_what_holds_is_0_with_a_table(folder: Path) -> None:
-    text = trilat("test", "./quick.toml", "--seeds", "1..3", "--jobs", "1", cwd=folder).succeeds()
+    text = trilat(
+        "test", "./quick.toml", "--seeds", "1..3", "--jobs", "1", cwd=folder
+    ).succeeds()
     assert "ok  ./quick.toml  peak_error_max_rad" in text
     assert "3/3" in text
     assert "3 runs, 1.5 s simulated in " in text
 
 
 def test_a_failed_expectation_is_1_with_commands_that_repeat_it(folder: Path) -> None:
-    done = trilat("test", "./quick.toml", "--seeds", "4,6", "--jobs", "1", *TOO_MUCH, cwd=folder)
+    done = trilat(
+        "test", "./quick.toml", "--seeds", "4,6", "--jobs", "1", *TOO_MUCH, cwd=folder
+    )
     assert done.code == 1, done
     assert done.err == ""
     assert "0/2" in done.out
@@ -44,7 +48,9 @@ def test_a_failed_expectation_is_1_with_commands_that_repeat_it(folder: Path) ->
     assert repeated.code == 1, repeated
     (figures,) = (line for line in done.out.splitlines() if "seed 6: mean_age_max_ms" in line)
     assert figures in repeated.out
-    (look,) = (line for line in done.out.splitlines() if "trilat sim" in line and "--seed 6" in line)
+    (look,) = (
+        line for line in done.out.splitlines() if "trilat sim" in line and "--seed 6" in line
+    )
     trilat(*look.split()[2:], cwd=folder).succeeds()
     assert (folder / "quick-seed6.mcap").exists()
 
@@ -91,7 +97,9 @@ def test_without_arguments_every_shipped_scenario_that_expects_something_is_mean
 
 
 @given(
-    first=st.integers(0, 500), count=st.integers(0, 30), others=st.lists(st.integers(0, 10**17), max_size=5)
+    first=st.integers(0, 500),
+    count=st.integers(0, 30),
+    others=st.lists(st.integers(0, 10**17), max_size=5),
 )
 def test_seeds_are_read_as_they_are_written(first: int, count: int, others: list[int]) -> None:
     text = ",".join([f"{first}..{first + count}", *map(str, others)])
@@ -114,8 +122,12 @@ def test_ctrl_c_ends_it_with_130_and_leaves_no_process(folder: Path) -> None:
 
     def workers() -> list[Path]:
         threads = Path(f"/proc/{process.pid}/task").glob("*/children")
-        children = [Path("/proc", pid) for thread in threads for pid in thread.read_text().split()]
-        return [child for child in children if b"LokyProcess" in (child / "cmdline").read_bytes()]
+        children = [
+            Path("/proc", pid) for thread in threads for pid in thread.read_text().split()
+        ]
+        return [
+            child for child in children if b"LokyProcess" in (child / "cmdline").read_bytes()
+        ]
 
     try:
         until(lambda: len(workers()) == 2, timeout_s=60)

@@ -26,7 +26,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_push_is_told_in_words_and_drawn(folder: Path) -> None:
-    asked = ("twin", "run.mcap", "--at", "1", "--push", "m.q1=1e-6", "--push", "s.qd2", "-o", "twin.png")
+    asked = (
+        "twin",
+        "run.mcap",
+        "--at",
+        "1",
+        "--push",
+        "m.q1=1e-6",
+        "--push",
+        "s.qd2",
+        "-o",
+        "twin.png",
+    )
     words = trilat(*asked, cwd=folder).succeeds().splitlines()
     assert words[0].startswith("a push of 1e-06 rad at m joint 1 at 1 s becomes ")
     assert words[1].startswith("a push of 1e-06 rad/s at s joint 2 at 1 s becomes ")
@@ -45,10 +56,14 @@ def test_one_joint_is_pushed_by_two_sizes(folder: Path) -> None:
 
 
 def test_sizes_are_told_apart_from_what_is_linear(folder: Path) -> None:
-    found = json.loads(trilat("twin", "run.mcap", "--delta", "1e-9:1e-3", "--json", cwd=folder).succeeds())
+    found = json.loads(
+        trilat("twin", "run.mcap", "--delta", "1e-9:1e-3", "--json", cwd=folder).succeeds()
+    )
     assert found["linear"]["smallest"] == 1e-9
     assert found["linear"]["text"].startswith("linear from 1e-09 to 0.001 rad at all joints")
-    assert [one["push"].split()[0] for one in found["pushes"]] == [f"{10.0**n:g}" for n in range(-9, -2)]
+    assert [one["push"].split()[0] for one in found["pushes"]] == [
+        f"{10.0**n:g}" for n in range(-9, -2)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -63,7 +78,10 @@ def test_sizes_are_told_apart_from_what_is_linear(folder: Path) -> None:
         (("--at", "nan"), ("--at nan",)),
         (("--delta", "1e-9"), ("two sizes", "1e-9:1e-3", "'1e-9'")),
         (("--delta", "1e-3:1e-9"), ("two sizes",)),
-        (("--delta", "1e-9:1e-3", "--push", "m.q1", "--push", "m.q2"), ("one push", "m.q1, m.q2")),
+        (
+            ("--delta", "1e-9:1e-3", "--push", "m.q1", "--push", "m.q2"),
+            ("one push", "m.q1, m.q2"),
+        ),
         (("-o", "twin.txt"), ("twin.txt", ".png")),
     ],
 )
@@ -90,7 +108,9 @@ def test_what_cannot_be_executed_again_has_no_twin() -> None:
         tn.twin(lost)
     with pytest.raises(NotRepeatable, match="sites that a rerun took over did not react"):
         tn.twin(tn.rerun(log, ["s"], {"control.Kd": 5}).after)
-    external = SimpleNamespace(scenario=tn.load_scenario("free", {"sites.m1.plant": "external"}))
+    external = SimpleNamespace(
+        scenario=tn.load_scenario("free", {"sites.m1.plant": "external"})
+    )
     assert "arm of m1, outside of the program" in explain_no_repetition(external)
 
 
@@ -100,7 +120,9 @@ def test_help_tells_of_twins(command: str, folder: Path) -> None:
 
 
 def test_a_certificate_without_twins_has_none(folder: Path) -> None:
-    without = json.loads(trilat("certify", "run.mcap", "--twins", "0", "--json", cwd=folder).out)
+    without = json.loads(
+        trilat("certify", "run.mcap", "--twins", "0", "--json", cwd=folder).out
+    )
     three = json.loads(trilat("certify", "run.mcap", "--twins", "3", "--json", cwd=folder).out)
     assert without["twins"] is None
     assert signature(certify_command).parameters["twins"].default == TWINS

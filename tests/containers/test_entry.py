@@ -57,7 +57,9 @@ def test_root_of_rootless_engine_is_person_who_started_it(mark: Path, tmp_path: 
 
 @needs_root
 @pytest.mark.parametrize("exists", [False, True])
-def test_what_the_engine_made_is_given_with_the_folder_above(tmp_path: Path, exists: bool) -> None:
+def test_what_the_engine_made_is_given_with_the_folder_above(
+    tmp_path: Path, exists: bool
+) -> None:
     results = tmp_path / "runs" / "compose"
     results.parent.mkdir()
     if exists:
@@ -96,7 +98,10 @@ def test_nobody_is_deprived(tmp_path: Path) -> None:
 
 
 def test_who_may_not_write_is_told_who_and_where(
-    tmp_path: Path, mark: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path,
+    mark: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(os, "getuid", lambda: 1234)
     monkeypatch.setattr(os, "getgid", lambda: 1235)
@@ -130,13 +135,17 @@ def test_cache_is_copied_and_missing_one_is_no_failure(tmp_path: Path) -> None:
         assert (own / "deep" / "code").read_bytes() == b"compiled"
 
 
-def test_it_becomes_the_command(tmp_path: Path, mark: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_becomes_the_command(
+    tmp_path: Path, mark: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     became: list[Sequence[str]] = []
     monkeypatch.setattr(os, "getuid", lambda: 1234)
     monkeypatch.setattr(os, "execvp", lambda _file, words: became.append(words))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     results = tmp_path / "runs"
-    entry.main(["--results", str(results), "--heir", str(mark), "trilat", "record", "--session", "x"])
+    entry.main(
+        ["--results", str(results), "--heir", str(mark), "trilat", "record", "--session", "x"]
+    )
     entry.main(["trilat", "sim", "-o", "x.mcap"])
     assert became == [["trilat", "record", "--session", "x"], ["trilat", "sim", "-o", "x.mcap"]]
     assert results.is_dir()
@@ -169,7 +178,9 @@ def volumes() -> Iterator[Path]:
 
 
 def hand_out(volumes: Path, user: Any) -> None:
-    entry.hand_out_keys(volumes, str(volumes.with_name("program")), user, volumes.with_name("scratch"))
+    entry.hand_out_keys(
+        volumes, str(volumes.with_name("program")), user, volumes.with_name("scratch")
+    )
 
 
 @needs_root
@@ -179,7 +190,9 @@ def test_every_member_gets_its_own_keys_and_authority_is_gone(volumes: Path) -> 
         for file in ("members.json", "private.key"):
             assert owner(volumes / name / file) == whose
             assert (volumes / name / file).stat().st_mode & 0o777 == 0o600
-            assert (volumes / name / file).read_text() == f"{name} by {SOMEBODY.user}"  # not by root
+            assert (
+                volumes / name / file
+            ).read_text() == f"{name} by {SOMEBODY.user}"  # not by root
     assert list(volumes.with_name("scratch").iterdir()) == []
     assert entry.are_fresh(volumes / "s")
 
@@ -188,7 +201,10 @@ def test_every_member_gets_its_own_keys_and_authority_is_gone(volumes: Path) -> 
 def test_keys_that_hold_are_kept_and_old_ones_made_anew(volumes: Path) -> None:
     def made_by(user: int) -> set[str]:
         hand_out(volumes, Owner(user, user))
-        return {(volumes / name / "private.key").read_text().split()[-1] for name in ("recorder", "m1", "s")}
+        return {
+            (volumes / name / "private.key").read_text().split()[-1]
+            for name in ("recorder", "m1", "s")
+        }
 
     assert made_by(4321) == {"4321"}
     assert made_by(4322) == {"4321"}

@@ -40,11 +40,26 @@ PUSH = 'hands = [{ kind = "pulse", start_s = 0.5, end_s = 1.5, peak_nm = [6.0, -
 
 
 def run(
-    law: str, *, Gamma: float, gravity: float = 9.81, elbow_rad: float = 1.2, hands: str = "", **more: float
+    law: str,
+    *,
+    Gamma: float,
+    gravity: float = 9.81,
+    elbow_rad: float = 1.2,
+    hands: str = "",
+    **more: float,
 ) -> Log:
-    keys = {"duration_s": 10.0, "gain": 0.0, "first_m": 1.0, "second_m": 1.0, "slave_m": 1.0, **more}
+    keys = {
+        "duration_s": 10.0,
+        "gain": 0.0,
+        "first_m": 1.0,
+        "second_m": 1.0,
+        "slave_m": 1.0,
+        **more,
+    }
     control = (GAINS + law).format(Gamma=Gamma, **keys)
-    text = SCENARIO.format(control=control, gravity=gravity, elbow_rad=elbow_rad, hands=hands, **keys)
+    text = SCENARIO.format(
+        control=control, gravity=gravity, elbow_rad=elbow_rad, hands=hands, **keys
+    )
     return trilat_net.simulate(parse_scenario(text))
 
 
@@ -100,7 +115,10 @@ def functional(log: Log) -> tuple[np.ndarray, np.ndarray]:
         lengths_m = np.array([state.mem[-4:-2] for state in here.states])[DELAY:]
         q = here.q[DELAY:]
         e = places(log, site)[DELAY:] - places(log, peer)[:-DELAY]
-        r = here.qd[DELAY:] + np.linalg.solve(jacobians(lengths_m, q), Lambda * e[..., None])[..., 0]
+        r = (
+            here.qd[DELAY:]
+            + np.linalg.solve(jacobians(lengths_m, q), Lambda * e[..., None])[..., 0]
+        )
         speed = speeds(log, peer)
         stored = integral((Kd * speed**2).sum(axis=1))
         V += 0.5 * (

@@ -10,7 +10,10 @@ from scipy.optimize import minimize_scalar
 
 import trilat_net
 from tests.analysis.rough_arms import ROUGH, rough_urdf
-from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
+from trilat_net.analysis.certificate.energy_balance import (
+    compute_energy_balance,
+    compute_site_energies,
+)
 from trilat_net.analysis.certificate.energy_terms import compute_dissipation, compute_work
 from trilat_net.core.control import ROBUST_RESIDUE, robust_torque
 from trilat_net.log.log_reader import Log
@@ -59,13 +62,17 @@ def mean_dissipation(log: Log, without: float) -> float:
     for weight, energy in zip(beta, energies.values(), strict=True):
         motion = energy.motion
         found = {name: one.total.sum() for name, one in compute_dissipation(motion).items()}
-        opposed = (motion.r * motion.constants.robust_torque(motion.r)).sum() * motion.records.h_s
+        opposed = (
+            motion.r * motion.constants.robust_torque(motion.r)
+        ).sum() * motion.records.h_s
         total += weight * (found["damping"] + found["disagreement"] - without * opposed)
     return float(total / log.scenario.duration_s)
 
 
 def test_the_residue_is_the_largest_of_its_function() -> None:
-    found = minimize_scalar(lambda x: x * x / np.sqrt(1.0 + x * x) - x, bounds=(0.0, 5.0), method="bounded")
+    found = minimize_scalar(
+        lambda x: x * x / np.sqrt(1.0 + x * x) - x, bounds=(0.0, 5.0), method="bounded"
+    )
     assert -found.fun == pytest.approx(ROBUST_RESIDUE, rel=1e-9)
     r = np.linspace(-30.0, 30.0, 2001)
     worst = max(abs(x) * 2.0 - x * robust_torque(2.0, 0.4, x) for x in r)
@@ -90,7 +97,9 @@ def test_its_energy_closes_with_friction_that_it_does_not_know() -> None:
     log = trilat_net.simulate(parse_scenario(f"{text}{rough_urdf()}'''"))
     energies = compute_site_energies(log)
     balance = compute_energy_balance(energies)
-    friction = sum(one.total for one in (compute_work(e.motion)["friction"] for e in energies.values()))
+    friction = sum(
+        one.total for one in (compute_work(e.motion)["friction"] for e in energies.values())
+    )
     assert np.abs(np.cumsum(friction)).max() >= 0.01 * balance.V.max()
     assert np.abs(balance.unexplained).max() <= 2e-4 * balance.V.max()
 
@@ -100,7 +109,9 @@ def test_to_a_small_motion_it_is_a_larger_kp() -> None:
 
     def static(law: str, more: str) -> np.ndarray:
         scenario = parse_scenario(SHAKEN.format(law=law, more=more))
-        return linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, (0.3, 0.2))).A
+        return linearise_loop(
+            derive_operating_conditions(scenario), find_equilibrium(scenario, (0.3, 0.2))
+        ).A
 
     robust = static("adaptive_robust", f"Kp = 1.0\n{ROBUST}")
     larger = static("adaptive_box", f"Kp = {1.0 + RHO_NM / WIDTH_RAD_S}")

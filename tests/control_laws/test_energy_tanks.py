@@ -56,7 +56,11 @@ def test_contact_feels_as_the_layer_makes_it() -> None:
 @pytest.mark.parametrize("by_shares", [False, True])
 def test_any_shares_keep_tanks_from_being_overdrawn(by_shares: bool) -> None:
     """A ring in which each follows the next, as irreversible as can be."""
-    ring = {"m1": {"m2": 1.0, "s": 0.0}, "m2": {"m1": 0.0, "s": 1.0}, "s": {"m1": 1.0, "m2": 0.0}}
+    ring = {
+        "m1": {"m2": 1.0, "s": 0.0},
+        "m2": {"m1": 0.0, "s": 1.0},
+        "s": {"m1": 1.0, "m2": 0.0},
+    }
     sites = {"m1": {"hands": [hand(0.3)]}, "m2": {}, "s": {}}
     law = {**TANKS, "by_shares": by_shares}
     for link in ({"preset": "4g"}, JITTER):
@@ -67,7 +71,9 @@ def test_any_shares_keep_tanks_from_being_overdrawn(by_shares: bool) -> None:
 
 
 def test_a_tank_sends_no_more_than_it_has() -> None:
-    lines = describe_law_conditions(pair({**TANKS, "packet_1_s": 2000.0}, clamped=False, duration_s=1.0))
+    lines = describe_law_conditions(
+        pair({**TANKS, "packet_1_s": 2000.0}, clamped=False, duration_s=1.0)
+    )
     assert "does not hold: a tank sends 2 of its energy a tick" in lines[0]
 
 
@@ -78,7 +84,8 @@ SEEDS = [
 
 
 @pytest.mark.parametrize(
-    "law", ["tanks", *(pytest.param(law, marks=pytest.mark.long) for law in LAWS if law != "tanks")]
+    "law",
+    ["tanks", *(pytest.param(law, marks=pytest.mark.long) for law in LAWS if law != "tanks")],
 )
 @pytest.mark.parametrize("seed", SEEDS)
 def test_observed_energies_are_never_negative(law: str, seed: int) -> None:
@@ -113,7 +120,9 @@ def test_compiled_and_per_tick_runs_agree_and_logs_verify(law: str) -> None:
         for field in ("q", "qd", "tau", "tau_x", "ch"):
             assert last[n, columns[field]].tolist() == getattr(site, field)[-1].tolist()
     stream = io.BytesIO()
-    virtual.write_virtual_log(pair(LAWS[law], clamped=True, duration_s=0.3, link=MOBILE), stream)
+    virtual.write_virtual_log(
+        pair(LAWS[law], clamped=True, duration_s=0.3, link=MOBILE), stream
+    )
     verdict = verify(opened(stream.getvalue()))
     assert verdict.passed
     assert verdict.identical == verdict.records == 600

@@ -25,7 +25,9 @@ def two(law: dict[str, Any], *, clamped: bool = False, **master: Any) -> Scenari
     return unit_scenario(sites, law, duration_s=30.0)
 
 
-def three(law: dict[str, Any], slave: tuple[float, float], sites: dict[str, Any], **more: Any) -> Scenario:
+def three(
+    law: dict[str, Any], slave: tuple[float, float], sites: dict[str, Any], **more: Any
+) -> Scenario:
     """Two masters that follow the others by halves, and a slave that follows them by two shares."""
     halves = {"m1": {"m2": 0.5, "s": 0.5}, "m2": {"m1": 0.5, "s": 0.5}}
     shares = {**halves, "s": {"m1": slave[0], "m2": slave[1]}}
@@ -84,11 +86,15 @@ def test_lee_and_spong_feel_clamp_and_drag_common_motion() -> None:
         ("digital", 0.0, 0.09, False),
     ],
 )
-def test_bound_of_lee_and_spong_is_met_at_edge(scheme: str, more_ms: float, P_e: float, holds: bool) -> None:
+def test_bound_of_lee_and_spong_is_met_at_edge(
+    scheme: str, more_ms: float, P_e: float, holds: bool
+) -> None:
     """As published, and with K h more for torques that are held."""
     link = {"model": "constant", "delay_ms": 200.0 + more_ms}
     law = {"law": "lee_spong", "K": 100.0, "T_max_ms": 200.0, "P_e": P_e}
-    told = describe_law_conditions(unit_scenario({"m": {}, "s": {}}, law, link=link, scheme=scheme))
+    told = describe_law_conditions(
+        unit_scenario({"m": {}, "s": {}}, law, link=link, scheme=scheme)
+    )
     text = "4 (d1 - K1 h / 2) (d2" if scheme == "digital" else "4 d1 d2 >= (T1 + T2)^2 K1 K2"
     assert f"lee_spong at m, s {'holds' if holds else 'does not hold'}: {text}" in told[0]
 
@@ -96,7 +102,11 @@ def test_bound_of_lee_and_spong_is_met_at_edge(scheme: str, more_ms: float, P_e:
 @pytest.mark.long
 def test_users_share_authority_and_feel_no_environment() -> None:
     """Hands that end at +-0.3 under the guidance that they feel, K (1 - a_i) 0.6."""
-    stiff: dict[str, Any] = {"kind": "spring", "stiffness_nm_rad": 1e5, "damping_nm_s_rad": 100.0}
+    stiff: dict[str, Any] = {
+        "kind": "spring",
+        "stiffness_nm_rad": 1e5,
+        "damping_nm_s_rad": 100.0,
+    }
     ends = (0.3 + 15.0 / 1e5, -0.3 - 45.0 / 1e5)
     sites = {
         name: {"hands": [{**stiff, "to_rad": [x, 0.5 * x]}], "q0_rad": [x, 0.5 * x]}
@@ -170,7 +180,9 @@ def test_saturated_pull_and_gravity_must_fit_below_torque_limit() -> None:
     spec, theta = scenario.sites["s"], scenario.arms["s"].theta
     poses = np.stack(np.meshgrid(*[np.linspace(0.0, 2.0 * np.pi, 201)] * 2)).reshape(2, -1)
     arm = PlacedArm(spec.arm.g_m_s2, scenario.arms["s"].lengths_m, poses)
-    gravity = np.abs(arm.gravity_torque(np.repeat(theta[:, None], poses.shape[1], axis=1))).max(axis=1)
+    gravity = np.abs(arm.gravity_torque(np.repeat(theta[:, None], poses.shape[1], axis=1))).max(
+        axis=1
+    )
     room = np.array(spec.limits.tau_limit_nm) - gravity - 5.0
     (line, *_) = describe_law_conditions(scenario)
     assert f"is within tau_limit_nm up to {room.min() / 4.0:.3g} rad/s" in line

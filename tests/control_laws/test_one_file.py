@@ -59,7 +59,9 @@ def test_a_file_beside_the_others_is_a_law_everywhere(tmp_path: Path) -> None:
     (tmp_path / "soft_spring.py").write_text(LAW)
     found = look(LOOK, tmp_path)
     assert found["control"] == [9.0, 9.0]
-    assert any("condition of soft_spring" in line and "K = 9 at s" in line for line in found["check"])
+    assert any(
+        "condition of soft_spring" in line and "K = 9 at s" in line for line in found["check"]
+    )
     assert found["identical"]
     assert (found["knobs"], found["tuned"]) == (["K"], ["soft_spring"])
     assert (found["suite"], found["two"]) == (True, False)

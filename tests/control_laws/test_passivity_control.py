@@ -10,11 +10,18 @@ from tests.energy_runs import pair as pair_of
 from tests.unit_arm import CLAMP, H50, hand, unit_scenario
 from trilat_net.errors import ScenarioError
 
-PUBLISHED = {"energy": "velocity", "reserve_J": 0.0, "drift_rad_s": 0.0, "acceleration_rad_s2": 0.0}
+PUBLISHED = {
+    "energy": "velocity",
+    "reserve_J": 0.0,
+    "drift_rad_s": 0.0,
+    "acceleration_rad_s2": 0.0,
+}
 """Energy as it is published: torque times velocity times period."""
 
 
-def run(delay_ms: float, *, clamped: bool, duration_s: float = 30.0, every: int = 10, **more: Any) -> Any:
+def run(
+    delay_ms: float, *, clamped: bool, duration_s: float = 30.0, every: int = 10, **more: Any
+) -> Any:
     control = {"law": "tdpa", **PUBLISHED, **more}
     link = {**CONSTANT, "delay_ms": delay_ms}
     return ticked(pair_of(control, clamped=clamped, duration_s=duration_s, link=link), every)
@@ -36,7 +43,10 @@ def watching(delay_ms: float, *, clamped: bool, duration_s: float = 30.0) -> Any
         "s": {"hands": env, "control": {**law, "K": [100.0, 100.0], "B": [10.0, 10.0]}},
     }
     return ticked(
-        unit_scenario(sites, law, duration_s=duration_s, link={**CONSTANT, "delay_ms": delay_ms}), 10
+        unit_scenario(
+            sites, law, duration_s=duration_s, link={**CONSTANT, "delay_ms": delay_ms}
+        ),
+        10,
     )
 
 
@@ -60,7 +70,8 @@ def test_without_controllers_contact_at_200_ms_diverges() -> None:
 
 
 @pytest.mark.parametrize(
-    ("delay_ms", "drift_rad_s", "slave"), [(50.0, 0.0, 0.2864), (200.0, 0.0, 0.2143), (200.0, 0.5, 0.3)]
+    ("delay_ms", "drift_rad_s", "slave"),
+    [(50.0, 0.0, 0.2864), (200.0, 0.0, 0.2143), (200.0, 0.5, 0.3)],
 )
 def test_free_motion_drifts_unless_drift_is_paid_for(
     delay_ms: float, drift_rad_s: float, slave: float
@@ -74,7 +85,8 @@ def test_free_motion_drifts_unless_drift_is_paid_for(
 def test_contact_stays_bounded() -> None:
     near, far = run(50.0, clamped=True), run(200.0, clamped=True)
     assert felt(near) == pytest.approx(68.88, rel=1e-3)
-    assert felt(far) == pytest.approx(26.7, rel=0.04)  # it chatters: the last digits are the integrator's
+    # it chatters: the last digits are the integrator's
+    assert felt(far) == pytest.approx(26.7, rel=0.04)
     assert np.abs(far["m"].qd[-100:, 0]).max() < 0.03
     assert least_energy(near) >= -1e-15
     assert least_energy(far) >= -1e-15
@@ -131,7 +143,11 @@ TURNED = {
 @pytest.mark.long
 def test_change_of_dominance_is_paid_by_motion_that_follows() -> None:
     """The weighted pose jumps, the goal does not; while masters rest, nothing pays for what is left."""
-    sites = {"m1": {"hands": [hand(0.3, 100.0, 15.0)]}, "m2": {"hands": [hand(-0.3, 100.0, 15.0)]}, "s": {}}
+    sites = {
+        "m1": {"hands": [hand(0.3, 100.0, 15.0)]},
+        "m2": {"hands": [hand(-0.3, 100.0, 15.0)]},
+        "s": {},
+    }
     for ramp_s in (0.0, 0.5):
         change = {"at_s": 6.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": ramp_s}
         scenario = unit_scenario(
@@ -152,14 +168,18 @@ def test_change_of_dominance_is_paid_by_motion_that_follows() -> None:
 def test_every_site_follows_unless_told_otherwise() -> None:
     """An arm that nobody holds comes to rest with the others, where a leader's alone would coast."""
     sites = {
-        "m": {"hands": [{"kind": "pulse", "start_s": 0.1, "end_s": 0.4, "peak_nm": [2.0, 1.0]}]},
+        "m": {
+            "hands": [{"kind": "pulse", "start_s": 0.1, "end_s": 0.4, "peak_nm": [2.0, 1.0]}]
+        },
         "s": {},
     }
     for follows in (True, False):
         control = {} if follows else {"control": {"law": "tdpa", "K": 0.0, "B": 0.0}}
         both = {**sites, "m": {**sites["m"], **control}}
         run = ticked(
-            unit_scenario(both, {"law": "tdpa"}, duration_s=10.0, link={**CONSTANT, "delay_ms": 50.0})
+            unit_scenario(
+                both, {"law": "tdpa"}, duration_s=10.0, link={**CONSTANT, "delay_ms": 50.0}
+            )
         )
         assert least_energy(run) >= 0.0
         speeds = np.abs(run["m"].qd[-1000:, 0])
@@ -182,7 +202,11 @@ def test_energy_is_what_the_arm_gets(clamped: bool) -> None:
 
 @pytest.mark.long
 def test_a_mesh_of_three_observes_no_energy_of_its_own() -> None:
-    shares = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.4, "s": 0.6}, "s": {"m1": 0.8, "m2": 0.2}}
+    shares = {
+        "m1": {"m2": 0.1, "s": 0.9},
+        "m2": {"m1": 0.4, "s": 0.6},
+        "s": {"m1": 0.8, "m2": 0.2},
+    }
     sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}, "s": {}}
     law = {"law": "tdpa", **FOLLOWER}
     for link in ({"preset": "4g"}, JITTER):

@@ -16,7 +16,10 @@ from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.describe import describe_scenario
 from trilat_net.scenario.laws import LAWS as ALL_LAWS
 
-LONG = [name if name == "saturated_pd" else pytest.param(name, marks=pytest.mark.long) for name in LAWS]
+LONG = [
+    name if name == "saturated_pd" else pytest.param(name, marks=pytest.mark.long)
+    for name in LAWS
+]
 
 
 def overrides(law: str) -> dict[str, Any]:
@@ -30,11 +33,15 @@ def scenario(law: str) -> Scenario:
 @pytest.mark.parametrize("law", LAWS)
 def test_a_scenario_names_it_and_its_check_tells_its_condition(law: str) -> None:
     lines = describe_scenario(scenario(law))
-    assert len([line for line in lines if line.startswith("condition of ") and law in line]) >= 1
+    assert (
+        len([line for line in lines if line.startswith("condition of ") and law in line]) >= 1
+    )
 
 
 @pytest.mark.parametrize("law", LONG)
-def test_its_runs_are_the_same_bits_by_whatever_driver(law: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_runs_are_the_same_bits_by_whatever_driver(
+    law: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     chosen = scenario(law)
     ticks = trajectories(chosen)
     fused = sampled(chosen, (0.12,))[:, 0]
@@ -88,12 +95,27 @@ def test_its_torque_changes_no_faster_than_it_may_whatever_happens(law: str) -> 
         "duration_s": 9.0,
         "link.outages_s": [[4.0, 4.5]],
         "limits.tau_rate_limit_nm_s": RATE_NM_S,
-        **({"arm.g_m_s2": 0.0} if law == "adaptive_kinematics" else {}),  # elbows bent, and none hangs
+        **(
+            {"arm.g_m_s2": 0.0} if law == "adaptive_kinematics" else {}
+        ),  # elbows bent, and none hangs
     }
     apart = set_apart(law, **more)
     orders = {
-        "s": {2800: "stop", 3200: "enable", 3230: "stop", 3300: "enable", 7000: "stop", 7040: "enable"},
-        apart.names[0]: {5500: "arm_lost", 5530: "stop", 6000: "reset", 6050: "arm_lost", 6400: "reset"},
+        "s": {
+            2800: "stop",
+            3200: "enable",
+            3230: "stop",
+            3300: "enable",
+            7000: "stop",
+            7040: "enable",
+        },
+        apart.names[0]: {
+            5500: "arm_lost",
+            5530: "stop",
+            6000: "reset",
+            6050: "arm_lost",
+            6400: "reset",
+        },
     }
     log = ordered(apart, orders)
     modes = {str(mode) for site in log.sites for mode in log[site].mode}
@@ -104,7 +126,9 @@ def test_its_torque_changes_no_faster_than_it_may_whatever_happens(law: str) -> 
     assert verify(log).differing == 0
 
 
-CALM = [law for law in ALL_LAWS if law not in ("own", "six_channel", "adaptive_kinematics", "sync")]
+CALM = [
+    law for law in ALL_LAWS if law not in ("own", "six_channel", "adaptive_kinematics", "sync")
+]
 """Those that are stable with these arms and shares, from so far apart."""
 
 

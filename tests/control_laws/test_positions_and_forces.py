@@ -36,7 +36,9 @@ def three_sites(a: float, driven: int, duration_s: float = 9.0, **more: Any) -> 
         i: {j: x for j, x in zip(names, row, strict=True) if j != i}
         for i, row in zip(names, alpha, strict=True)
     }
-    sites = {name: {"hands": acting} for name, acting in zip(names, (*hands, [WALL]), strict=True)}
+    sites = {
+        name: {"hands": acting} for name, acting in zip(names, (*hands, [WALL]), strict=True)
+    }
     control = {"law": "six_channel", "K": 100.0, "B": 20.0, **more}
     link = {"model": "constant", "delay_ms": 0.0}
     return unit_scenario(sites, control, dominance=shares, link=link, duration_s=duration_s)
@@ -48,14 +50,17 @@ def measured(scenario: Scenario, site: str) -> float:
     place = scenario.names.index(site)
     rows = last_rows(scenario, *times_s)
     turn = np.exp(-2j * np.pi * times_s)
-    torque, speed = (np.array([row[name][place, 0] for row in rows]) for name in ("tau_x", "qd"))
+    torque, speed = (
+        np.array([row[name][place, 0] for row in rows]) for name in ("tau_x", "qd")
+    )
     return float(abs((torque @ turn) / (speed @ turn)) / abs(500.0 / (2j * np.pi) + 5.0))
 
 
 @pytest.mark.parametrize(("variant", "delay_s"), TABLE)
 def test_two_sites_transmit_what_the_literature_says(variant: str, delay_s: float) -> None:
     found = [
-        transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant]) for hz in (0.1, 0.5, 1.0, 2.0, 5.0)
+        transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant])
+        for hz in (0.1, 0.5, 1.0, 2.0, 5.0)
     ]
     assert found == [printed(value) for value in TABLE[variant, delay_s]]
 
@@ -65,13 +70,19 @@ def test_the_dominance_factor_shares_out_what_users_feel(a: float) -> None:
     alpha = complementary_shares(a)
     *users, root, ratios = SHARED[a]
     for at, values in enumerate(users):
-        found = [transmitted(hz, alpha, at, acceleration=qdd) for qdd in (0.0, 1.0) for hz in (0.1, 1.0)]
+        found = [
+            transmitted(hz, alpha, at, acceleration=qdd)
+            for qdd in (0.0, 1.0)
+            for hz in (0.1, 1.0)
+        ]
         assert found == [printed(value) for value in values]
     assert rightmost_root(alpha, USERS) == pytest.approx(root, abs=5e-4)
     beta = np.array(complementary_weights(a))
     assert beta @ (np.eye(3) - alpha) == pytest.approx(0.0, abs=1e-15)
     with np.errstate(divide="ignore"):
-        assert (beta[2] / beta[:2]).tolist() == [pytest.approx(value, abs=5e-4) for value in ratios]
+        assert (beta[2] / beta[:2]).tolist() == [
+            pytest.approx(value, abs=5e-4) for value in ratios
+        ]
 
 
 @pytest.mark.long
@@ -86,7 +97,9 @@ def test_the_dominance_factor_shares_out_what_users_feel(a: float) -> None:
         (0.0, 1, 0.8968),
     ],
 )
-def test_a_run_of_the_six_channel_law_transmits_as_much(a: float, user: int, felt: float) -> None:
+def test_a_run_of_the_six_channel_law_transmits_as_much(
+    a: float, user: int, felt: float
+) -> None:
     assert measured(three_sites(a, user), ("u1", "u2")[user]) == pytest.approx(felt, abs=6e-5)
 
 
@@ -118,7 +131,9 @@ def test_run_of_four_channel_law_transmits_as_its_loop_says(
 def test_all_of_the_acceleration_is_unstable_a_tick_late() -> None:
     rows = last_rows(three_sites(0.5, 0, acceleration=1.0), 9.0)[0]
     assert np.abs(rows["qd"]).max() > 100.0
-    assert "does not hold: " in describe_law_conditions(three_sites(0.5, 0, acceleration=1.0))[0]
+    assert (
+        "does not hold: " in describe_law_conditions(three_sites(0.5, 0, acceleration=1.0))[0]
+    )
 
 
 def test_the_linear_loop_has_the_law_without_acceleration() -> None:
@@ -135,9 +150,18 @@ def test_shares_of_no_single_factor_are_told() -> None:
         "a = 0.25, weights beta = (0.4375, 0.9375, 0.8125)"
         in describe_law_conditions(three_sites(0.25, 0))[0]
     )
-    others = {"u1": {"u2": 0.5, "s": 0.5}, "u2": {"u1": 0.2, "s": 0.8}, "s": {"u1": 0.5, "u2": 0.5}}
-    scenario = unit_scenario({name: {} for name in others}, {"law": "six_channel"}, dominance=others)
-    assert "does not hold: the shares are not those of one factor" in describe_law_conditions(scenario)[0]
+    others = {
+        "u1": {"u2": 0.5, "s": 0.5},
+        "u2": {"u1": 0.2, "s": 0.8},
+        "s": {"u1": 0.5, "u2": 0.5},
+    }
+    scenario = unit_scenario(
+        {name: {} for name in others}, {"law": "six_channel"}, dominance=others
+    )
+    assert (
+        "does not hold: the shares are not those of one factor"
+        in describe_law_conditions(scenario)[0]
+    )
 
 
 def test_two_sites_cannot_share_by_one_factor() -> None:
@@ -151,7 +175,11 @@ def test_metrics_measure_the_felt_impedance_of_the_loop() -> None:
     stream = io.BytesIO()
     write_virtual_log(two_sites("without qdd", 0.001, duration_s=26.0), stream)
     responses = compute_log_metrics(opened(stream.getvalue())).responses
-    felt = next(one for one in responses if (one.kind, one.at, one.joint) == ("impedance", "m", 1))
-    expected = transmitted(1.0, PAIR, 0, delay_s=0.001, held_s=0.001) * abs(500.0 / (2j * np.pi) + 5.0)
+    felt = next(
+        one for one in responses if (one.kind, one.at, one.joint) == ("impedance", "m", 1)
+    )
+    expected = transmitted(1.0, PAIR, 0, delay_s=0.001, held_s=0.001) * abs(
+        500.0 / (2j * np.pi) + 5.0
+    )
     assert felt.ratio.frequency_hz == 1.0
     assert felt.ratio.gain == pytest.approx(expected, rel=0.01)

@@ -50,7 +50,11 @@ def test_under_gravity_it_ends_at_zero_wherever_it_starts(starts: tuple[float, .
     scenario = pendulums("sync", starts, 9.81)
     first, last = (row["q"][:, 0] for row in last_rows(scenario, 20.0, 200.0))
     assert abs(last).max() < 1e-13
-    if starts == (0.6, -0.5):  # a decaying rest, which the way of sampling moves by some per cent
+    # a decaying rest, which the way of sampling moves by some per cent
+    if starts == (
+        0.6,
+        -0.5,
+    ):
         assert first == pytest.approx([-6.4e-5, 5.9e-5], rel=0.035)
     assert "under gravity the arms end at q = 0" in describe_law_conditions(scenario)[0]
 
@@ -62,12 +66,16 @@ def test_the_papers_law_keeps_its_pose_under_gravity() -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("starts", "pose"), [((0.6, -0.5), 0.038255), ((0.6, -0.5, 0.1), 0.055753)])
+@pytest.mark.parametrize(
+    ("starts", "pose"), [((0.6, -0.5), 0.038255), ((0.6, -0.5, 0.1), 0.055753)]
+)
 def test_without_gravity_all_agree(starts: tuple[float, ...], pose: float) -> None:
     assert ends("sync", starts, 0.0, 200.0)[0] == pytest.approx(pose, abs=6e-7)
 
 
 @pytest.mark.parametrize("law", ["sync", "adaptive_kinematics"])
 def test_a_law_of_the_planar_arm_refuses_a_chain(law: str) -> None:
-    with pytest.raises(ScenarioError, match=f"control.law: {law} has the regressor of the planar arm"):
+    with pytest.raises(
+        ScenarioError, match=f"control.law: {law} has the regressor of the planar arm"
+    ):
         load_scenario("six_joints", [f"control={{law = '{law}'}}"])

@@ -26,12 +26,24 @@ WAVE = {"law": "wave"}
 def comparing(reception: str) -> dict[str, Any]:
     """The class itself, as `hold` is no choice of a scenario."""
     none = [0.0, 0.0]
-    gains = {"b": [b, b], "K": none, "B": none, "lines": {}, "beta": 1.0, "gravity": 1.0, "reserve_J": 1e-2}
+    gains = {
+        "b": [b, b],
+        "K": none,
+        "B": none,
+        "lines": {},
+        "beta": 1.0,
+        "gravity": 1.0,
+        "reserve_J": 1e-2,
+    }
     return {"law": "trilat_net.laws.wave:Wave", **gains, "reception": reception}
 
 
 def received(
-    reception: str, link: dict[str, Any], duration_s: float = 20.0, env: Any = (), push: Any = None
+    reception: str,
+    link: dict[str, Any],
+    duration_s: float = 20.0,
+    env: Any = (),
+    push: Any = None,
 ) -> Scenario:
     law = comparing(reception)
     slave = {**law, "K": [100.0, 100.0], "B": [b, b]}
@@ -81,7 +93,9 @@ def test_a_clamped_line_is_a_spring() -> None:
     assert s.q[-1, 0] == pytest.approx(felt * master / 1000.0, abs=5e-7)
     assert abs(m.tau_x[-1, 0]) == pytest.approx(felt * master, abs=1e-4)
     at_200_ms = (0.182353, 0.005882, 5.8824, 32.258)
-    assert (master, felt * master / 1000.0, felt * master, felt) == pytest.approx(at_200_ms, rel=2e-3)
+    assert (master, felt * master / 1000.0, felt * master, felt) == pytest.approx(
+        at_200_ms, rel=2e-3
+    )
 
 
 @pytest.mark.parametrize(
@@ -104,8 +118,12 @@ def test_what_a_line_feels_like(frequency_hz: float, clamp_nm_rad: float, ratio:
     assert felt == pytest.approx(ratio, rel=2e-3)
 
 
-@pytest.mark.parametrize(("reception", "end"), [("hold", 0.4214), ("zero", 0.1496), ("replay", 0.3)])
-def test_an_outage_leaves_an_offset_only_where_waves_are_held(reception: str, end: float) -> None:
+@pytest.mark.parametrize(
+    ("reception", "end"), [("hold", 0.4214), ("zero", 0.1496), ("replay", 0.3)]
+)
+def test_an_outage_leaves_an_offset_only_where_waves_are_held(
+    reception: str, end: float
+) -> None:
     slave = ticked(received(reception, CUT), every=20000)["s"]
     assert slave.q[-1, 0] == pytest.approx(end, rel=2e-3)
 
@@ -120,8 +138,12 @@ def varying(period_s: float = 2.0) -> dict[str, Any]:
     return {"model": "trace", "trace": points}
 
 
-@pytest.mark.parametrize(("reception", "least"), [("hold", -0.3345), ("scaled", 0.0), ("replay", 0.0)])
-def test_delay_that_varies_makes_energy_of_waves_that_are_held(reception: str, least: float) -> None:
+@pytest.mark.parametrize(
+    ("reception", "least"), [("hold", -0.3345), ("scaled", 0.0), ("replay", 0.0)]
+)
+def test_delay_that_varies_makes_energy_of_waves_that_are_held(
+    reception: str, least: float
+) -> None:
     push = {**hand(0.3, damping=0.0), "move_end_s": 1.5}
     env = [{**CLAMP, "stiffness_nm_rad": 200.0}]
     waves, _ = stored(ticked(received(reception, varying(), 4.0, env, push)))
@@ -129,7 +151,9 @@ def test_delay_that_varies_makes_energy_of_waves_that_are_held(reception: str, l
 
 
 LOSSY = [
-    pytest.param({"model": "constant", "delay_ms": 100.0, "loss": 0.5}, 20.0, marks=pytest.mark.long),
+    pytest.param(
+        {"model": "constant", "delay_ms": 100.0, "loss": 0.5}, 20.0, marks=pytest.mark.long
+    ),
     ({"model": "constant", "delay_ms": 68.0, "loss": 0.02}, 20.0),
     pytest.param({"preset": "4g"}, 240.0, marks=pytest.mark.long),
 ]
@@ -162,7 +186,10 @@ def test_contact_under_loss_bleeds_no_force(link: dict[str, Any], duration_s: fl
     ("link", "reserve_J"),
     [
         (JITTER, 0.01),
-        *(pytest.param(*one, marks=pytest.mark.long) for one in ((JITTER, 0.0), (CONSTANT, 0.01))),
+        *(
+            pytest.param(*one, marks=pytest.mark.long)
+            for one in ((JITTER, 0.0), (CONSTANT, 0.01))
+        ),
     ],
 )
 def test_a_push_grows_by_the_reserves_alone(link: dict[str, Any], reserve_J: float) -> None:
@@ -171,7 +198,9 @@ def test_a_push_grows_by_the_reserves_alone(link: dict[str, Any], reserve_J: flo
     sites = {"m": {"qd0_rad_s": [1e-6, 5e-7]}, "s": {}}
     run = ticked(unit_scenario(sites, control, duration_s=20.0, link=link))
     M = np.array([[5.0 / 6.0, 1.0 / 3.0], [1.0 / 3.0, 1.0 / 3.0]])
-    kinetic_J = sum(0.5 * np.einsum("ki,ij,kj->k", site.qd, M, site.qd) for site in run.values())
+    kinetic_J = sum(
+        0.5 * np.einsum("ki,ij,kj->k", site.qd, M, site.qd) for site in run.values()
+    )
     grows = link is JITTER and reserve_J > 0.0
     assert kinetic_J.max() <= kinetic_J[0] + (8.0 * reserve_J if grows else 0.0)
     assert (kinetic_J[-1] > 1e6 * kinetic_J[0]) == grows
@@ -229,7 +258,11 @@ def test_law_of_ones_own_is_same_to_last_digits(monkeypatch: pytest.MonkeyPatch)
     """examples/wave_law.py."""
     monkeypatch.chdir(Path(__file__).parents[2] / "examples")
     ours, theirs = (
-        trajectories(pair({"law": law}, clamped=False, duration_s=1.3, link={**CONSTANT, "delay_ms": 50.0}))
+        trajectories(
+            pair(
+                {"law": law}, clamped=False, duration_s=1.3, link={**CONSTANT, "delay_ms": 50.0}
+            )
+        )
         for law in ("wave", "wave_law:Wave")
     )
     assert np.abs(ours.stack("q")).max() > 1e-3

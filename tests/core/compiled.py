@@ -9,4 +9,6 @@ def printed(program: str, *, compiled: bool) -> str:
     """What a program prints in a process of its own."""
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "0" if compiled else "1"}
     command = [sys.executable, "-c", program]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    return subprocess.run(
+        command, env=environment, capture_output=True, text=True, check=True
+    ).stdout

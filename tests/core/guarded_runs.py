@@ -49,17 +49,26 @@ m = {{ s = 1.0 }}
 s = {{ m = 1.0 }}
 """
 RATE_NM_S = 500.0
-LIMITS = {"tau_rate_limit_nm_s": RATE_NM_S, "qd_des_limit_rad_s": 6.0, "q_min_rad": -4.0, "q_max_rad": 4.0}
+LIMITS = {
+    "tau_rate_limit_nm_s": RATE_NM_S,
+    "qd_des_limit_rad_s": 6.0,
+    "q_min_rad": -4.0,
+    "q_max_rad": 4.0,
+}
 KEYS = {"duration_s": 6.0, "rate_hz": 1000, "outages_s": "[]", "speed": 1.0, "limit": 4.0}
 
 
 def adaptive_text() -> str:
     """The scenario of the rule, with the paper's law."""
-    text = TEXT.replace("K = 60.0\nKd = 4.0\nd = 12.0", "Lambda = 2.0\nKp = 4.0\nKd = 5.0\nGamma = 3.0")
+    text = TEXT.replace(
+        "K = 60.0\nKd = 4.0\nd = 12.0", "Lambda = 2.0\nKp = 4.0\nKd = 5.0\nGamma = 3.0"
+    )
     return text.replace('law = "pd_d"', 'law = "adaptive"')
 
 
-def guarded(limits: dict[str, Any] = LIMITS, text: str = TEXT, where: str = "", **keys: object) -> Scenario:
+def guarded(
+    limits: dict[str, Any] = LIMITS, text: str = TEXT, where: str = "", **keys: object
+) -> Scenario:
     """The scenario of the rule, with limits of all sites or of one."""
     overrides = {f"{where}limits.{key}": value for key, value in limits.items()}
     return allow_own_code(parse_scenario(text.format(**{**KEYS, **keys}), "", overrides))

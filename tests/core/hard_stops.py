@@ -25,7 +25,11 @@ from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.rest_bounds import AT_REST_RAD_S, find_rest_bounds
 
-RULE = {"on_stale.action": "glide", "on_stale.align_limit_rad": 4.0, "on_stale.align_speed_rad_s": 2.0}
+RULE = {
+    "on_stale.action": "glide",
+    "on_stale.align_limit_rad": 4.0,
+    "on_stale.align_speed_rad_s": 2.0,
+}
 TWO: dict[str, dict[str, Any]] = {
     "p_f": {},
     "four_channel": {"control.acceleration": 0.5},
@@ -38,7 +42,17 @@ THREE: dict[str, dict[str, Any]] = {
     "authority": {"sites.s.control.leads": False},
     "impedance": {"sites.s.control.follows": True},
     "adaptive_kinematics": {"arm.g_m_s2": 0.0},
-    **{name: {} for name in ("adaptive", "adaptive_box", "adaptive_robust", "p_d", "pd_d", "saturated_pd")},
+    **{
+        name: {}
+        for name in (
+            "adaptive",
+            "adaptive_box",
+            "adaptive_robust",
+            "p_d",
+            "pd_d",
+            "saturated_pd",
+        )
+    },
     **{name: {} for name in ("lee_spong", "sync")},
 }
 CHAINS = ("adaptive", "adaptive_box", "adaptive_robust", "p_d", "pd_d")
@@ -91,13 +105,22 @@ class Stop(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        return self.energy <= MOST_ENERGY and self.speed <= MOST_SPEED and self.rest_s <= self.stated_s
+        return (
+            self.energy <= MOST_ENERGY
+            and self.speed <= MOST_SPEED
+            and self.rest_s <= self.stated_s
+        )
 
 
 @cache
 def make_scenario(number: int, rate_nm_s: float) -> Scenario:
     name, law, settings = CASES[number]
-    keys = {"duration_s": _DURATION_S, **RULE, "limits.tau_rate_limit_nm_s": rate_nm_s, **settings}
+    keys = {
+        "duration_s": _DURATION_S,
+        **RULE,
+        "limits.tau_rate_limit_nm_s": rate_nm_s,
+        **settings,
+    }
     if law:
         keys["control.law"] = law
     return load_scenario(name, keys)
@@ -142,7 +165,9 @@ def draw_state(
     )
 
 
-def run_stop(scenario: Scenario, site: str, before: TickRecord, last: TickRecord) -> list[TickRecord]:
+def run_stop(
+    scenario: Scenario, site: str, before: TickRecord, last: TickRecord
+) -> list[TickRecord]:
     """The records of a stop until the arm has been at rest for 0.3 s."""
     moving = Site(scenario.setup(site))
     moving.resume(before, last)
@@ -177,9 +202,9 @@ def measure_stop(
     learns = setup.gains.law is Law.ADAPTIVE
     known = np.array([record.theta_hat for record in records]) if learns else theta
     G = rows.law_torque(theta, q, still, still, still)
-    unknown = (rows.law_torque(known, q, still, still, still) - G if learns else still) - np.array(
-        [record.tau_x for record in records]
-    )
+    unknown = (
+        rows.law_torque(known, q, still, still, still) - G if learns else still
+    ) - np.array([record.tau_x for record in records])
     kinetic_j = 0.5 * (qd * rows.multiply_inertia(q, qd)).sum(axis=1)
     power = (unknown * qd).sum(axis=1)
     work_j = np.concatenate([[0.0], np.cumsum(0.5 * h_s * (power[1:] + power[:-1]))])

@@ -22,7 +22,9 @@ def build_model(chain: UrdfChain) -> pin.Model:
     at = 0
     for joint in chain.joints:
         moving = (
-            pin.JointModelRevoluteUnaligned if joint.kind == "revolute" else pin.JointModelPrismaticUnaligned
+            pin.JointModelRevoluteUnaligned
+            if joint.kind == "revolute"
+            else pin.JointModelPrismaticUnaligned
         )
         placement = pin.SE3(np.array(joint.rotation), np.array(joint.origin_m))
         at = model.addJoint(at, moving(np.array(joint.axis)), placement, joint.name)
@@ -82,7 +84,9 @@ def random_body(random: np.random.Generator) -> Array:
     )
     x, y, z = places.T
     moments = (y * y + z * z, -x * y, x * x + z * z, -x * z, -y * z, x * x + y * y)
-    return np.array([masses.sum(), *(masses @ places), *(masses @ moment for moment in moments)])
+    return np.array(
+        [masses.sum(), *(masses @ places), *(masses @ moment for moment in moments)]
+    )
 
 
 def random_chain(random: np.random.Generator, n: int, sliders: tuple[int, ...] = ()) -> dict:
@@ -144,8 +148,13 @@ def main() -> None:
             state = random_state(random, model.nv, weight=i == 0)
             whole = state | answer(model, chain, state)
             entry["states"].append({key: value.tolist() for key, value in whole.items()})
-    made = {"source": f"Pinocchio {pin.__version__}, tests/core/make_chain_references.py", "chains": chains}
-    PATH.write_text(json.dumps(made, separators=(",", ":")).replace('},{"gravity"', '},\n{"gravity"') + "\n")
+    made = {
+        "source": f"Pinocchio {pin.__version__}, tests/core/make_chain_references.py",
+        "chains": chains,
+    }
+    PATH.write_text(
+        json.dumps(made, separators=(",", ":")).replace('},{"gravity"', '},\n{"gravity"') + "\n"
+    )
 
 
 if __name__ == "__main__":

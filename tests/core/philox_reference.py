@@ -20,7 +20,9 @@ def philox_in_integers(counter: tuple[int, ...], key: tuple[int, int]) -> list[i
 
 
 @leaf
-def _table(key: np.uint64, count: int, kind: int, shape: float, numbers: NDArray[np.float64]) -> None:
+def _table(
+    key: np.uint64, count: int, kind: int, shape: float, numbers: NDArray[np.float64]
+) -> None:
     for n in range(count):
         if kind == 0:
             numbers[n], numbers[count + n] = uniforms(key, n, 3, 0)

@@ -66,7 +66,10 @@ def inertia(a: ArmLinks, q: NDArray) -> NDArray:
     s12, c12 = np.sin(q[0] + q[1]), np.cos(q[0] + q[1])
     J1 = a.lc1_m * np.array([[-s1, 0 * s1], [c1, 0 * s1]])
     J2 = np.array(
-        [[-a.l1_m * s1 - a.lc2_m * s12, -a.lc2_m * s12], [a.l1_m * c1 + a.lc2_m * c12, a.lc2_m * c12]]
+        [
+            [-a.l1_m * s1 - a.lc2_m * s12, -a.lc2_m * s12],
+            [a.l1_m * c1 + a.lc2_m * c12, a.lc2_m * c12],
+        ]
     )
     spins = np.array([[a.I1_kg_m2 + a.I2_kg_m2, a.I2_kg_m2], [a.I2_kg_m2, a.I2_kg_m2]])
     return a.m1_kg * J1.T @ J1 + a.m2_kg * J2.T @ J2 + spins
@@ -74,7 +77,9 @@ def inertia(a: ArmLinks, q: NDArray) -> NDArray:
 
 def inertia_rates(a: ArmLinks, q: Array) -> Array:
     """dM/dq_k, shape (2, 2, 2) with k last, by complex step."""
-    return np.stack([inertia(a, q + 1j * STEP * axis).imag / STEP for axis in np.eye(2)], axis=-1)
+    return np.stack(
+        [inertia(a, q + 1j * STEP * axis).imag / STEP for axis in np.eye(2)], axis=-1
+    )
 
 
 def coriolis(a: ArmLinks, q: Array, qd: Array) -> Array:

@@ -22,7 +22,9 @@ def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[A
     h_s = 1.0 / part.rate_hz
     q_ref, qd_ref = [part.q[first].copy()], [part.qd[first].copy()]
     for n in range(1, rows):
-        left_s = max(LEAST_STOP_S - (n - 1) * h_s, float((np.abs(qd_ref[-1]) / gains.deceleration).max()))
+        left_s = max(
+            LEAST_STOP_S - (n - 1) * h_s, float((np.abs(qd_ref[-1]) / gains.deceleration).max())
+        )
         share = 1.0 - h_s / left_s if left_s > h_s + 1e-9 else 0.0
         own = part.qd[first + n]
         slower = np.copysign(np.minimum(np.abs(share * qd_ref[-1]), np.abs(own)), own)
@@ -32,7 +34,9 @@ def reference(gains: RestGains, part: SiteLog, first: int, rows: int) -> tuple[A
     return np.array(q_ref), np.array(qd_ref)
 
 
-def rest_torque(gains: RestGains, part: SiteLog, law: Array, first: int, limit: Array) -> tuple[Array, Array]:
+def rest_torque(
+    gains: RestGains, part: SiteLog, law: Array, first: int, limit: Array
+) -> tuple[Array, Array]:
     """Law + w - B s from a record on, and w, of a slow arm whose law does not learn.
 
     Eq. (2) to (4) of docs/links.md, for rows of its law's torque; w is that with which a tick begins.
@@ -58,5 +62,8 @@ def integrals(part: SiteLog, rows: slice) -> Array:
     """w of the records after some: what their `mem` has of the torque at rest."""
     first = 2 * (part.layout.shared + 1) + len(part.peers)
     return np.array(
-        [part.mem[row][first : first + part.layout.joints] for row in range(*rows.indices(len(part)))]
+        [
+            part.mem[row][first : first + part.layout.joints]
+            for row in range(*rows.indices(len(part)))
+        ]
     )

@@ -18,9 +18,9 @@ VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 
 def setup(site: str = "m1", scenario: str = "paper", **overrides: Any) -> SiteSetup:
     """The setup of a site; overrides with `__` for the dot."""
-    return load_scenario(scenario, {key.replace("__", "."): value for key, value in overrides.items()}).setup(
-        site
-    )
+    return load_scenario(
+        scenario, {key.replace("__", "."): value for key, value in overrides.items()}
+    ).setup(site)
 
 
 def one_link(rate_hz: int, peer_rate_hz: int, delay_ns: int) -> Site:
@@ -37,7 +37,9 @@ def linked(
 ) -> Site:
     """A site with a single peer behind any link, by the name and seed of `channels.channel`."""
     key, traces = link_key(1, LINK_NAME), (trace,) * len(models)
-    link = LinkSetup("peer", 1.0, peer_rate_hz, (0.5, -0.25), key, tuple(models), traces, outages)
+    link = LinkSetup(
+        "peer", 1.0, peer_rate_hz, (0.5, -0.25), key, tuple(models), traces, outages
+    )
     return Site(setup()._replace(rate_hz=rate_hz, links=(link,)))
 
 
@@ -52,7 +54,9 @@ def stepped(site: Site, ticks: Iterable[TickInput]) -> list[TickRecord]:
 
 def bits(output: TickRecord) -> str:
     """All that a step computes of a tick, exactly, as text."""
-    return " ".join(v.hex() for field in VECTORS for v in getattr(output, field)) + str(output[-2:])
+    return " ".join(v.hex() for field in VECTORS for v in getattr(output, field)) + str(
+        output[-2:]
+    )
 
 
 def executed(scenario: str, **overrides: object) -> list[str]:

@@ -5,7 +5,15 @@ import numpy as np
 from tests.core.chain_references import chain_references
 from trilat_net.core.chain import ChainJoint
 from trilat_net.core.site_arrays import SiteArrays, build_site_arrays
-from trilat_net.core.site_setup import ChainSetup, Gains, Law, LinkSetup, Scheme, SiteSetup, TaskSetup
+from trilat_net.core.site_setup import (
+    ChainSetup,
+    Gains,
+    Law,
+    LinkSetup,
+    Scheme,
+    SiteSetup,
+    TaskSetup,
+)
 
 CHAIN = chain_references()["arm7"].chain
 THETA = np.concatenate([one.inertia for one in CHAIN.joints])
@@ -15,9 +23,12 @@ PLACE, POSE = TaskSetup((1.0,) * 3, 0.5), TaskSetup((1.0,) * 6, 1.0, posture_rat
 def build(task: TaskSetup) -> SiteArrays:
     """The arrays of the site with a task."""
     joints = tuple(
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m) for one in CHAIN.joints
+        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m)
+        for one in CHAIN.joints
     )
-    chain = ChainSetup(joints, tip_m=CHAIN.tip_origin_m, tip_rotation=CHAIN.tip_rotation, task=task)
+    chain = ChainSetup(
+        joints, tip_m=CHAIN.tip_origin_m, tip_rotation=CHAIN.tip_rotation, task=task
+    )
     numbers = {"theta": THETA, "g_m_s2": 9.81, "lengths_m": (0.0, 0.0), "tau_limit_nm": 1e3}
     return build_site_arrays(
         SiteSetup(

@@ -13,12 +13,20 @@ from tests.core.sites import linked, sample, stepped
 from trilat_net.core.channel import LOST
 from trilat_net.core.delay import DelayKind, LinkModel
 from trilat_net.core.site_step import Site
-from trilat_net.core.ticks import Arrival, CoreChange, TickInput, TickRecord, first_tick_at, tick_ns
+from trilat_net.core.ticks import (
+    Arrival,
+    CoreChange,
+    TickInput,
+    TickRecord,
+    first_tick_at,
+    tick_ns,
+)
 
 TICKS = 500
 PUSHED = ("uniform", "ar1", "trace", "measured", "bursts", "copies", "in order", "play-out")
 every_kind = pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in KINDS]
+    "name",
+    [pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in KINDS],
 )
 quick = settings(max_examples=12)
 
@@ -58,7 +66,10 @@ def test_in_use_is_the_newest_due_sample_that_arrived(
         assert output.used[0] >= before
         before = output.used[0]
         if before >= 0:
-            assert (output.q_des, output.qd_des) == (list(sample(before).q), list(sample(before).qd))
+            assert (output.q_des, output.qd_des) == (
+                list(sample(before).q),
+                list(sample(before).qd),
+            )
 
 
 @every_kind
@@ -104,7 +115,10 @@ def test_the_order_of_arrival_changes_no_bit(
 
     def run_with(schedule: dict[int, list[int]]) -> list[TickRecord]:
         ticks = [TickInput(k, [sample(m) for m in schedule.get(k, [])]) for k in range(450)]
-        return [output._replace(rx_crc=0) for output in stepped(behind(name, 1000, peer_rate_hz), ticks)]
+        return [
+            output._replace(rx_crc=0)
+            for output in stepped(behind(name, 1000, peer_rate_hz), ticks)
+        ]
 
     scattered: dict[int, list[int]] = {}
     for m, k in zip(order, at, strict=True):
@@ -132,8 +146,12 @@ def test_a_site_primed_in_the_middle_has_the_same_future(name: str, k: int) -> N
 @every_kind
 def test_a_long_silence_changes_nothing_afterwards(name: str) -> None:
     """The channel goes on by index while nothing comes."""
-    silent = stepped(behind(name), [TickInput(k, [sample(k - 1)] if k > 600 else []) for k in range(900)])
-    heard = stepped(behind(name), [TickInput(k, [sample(k - 1)] if k else []) for k in range(900)])
+    silent = stepped(
+        behind(name), [TickInput(k, [sample(k - 1)] if k > 600 else []) for k in range(900)]
+    )
+    heard = stepped(
+        behind(name), [TickInput(k, [sample(k - 1)] if k else []) for k in range(900)]
+    )
     settled = next(k for k in range(601, 900) if silent[k].used[0] >= 600)
     assert [o.used for o in silent[settled:]] == [o.used for o in heard[settled:]]
 
@@ -150,7 +168,9 @@ hostile = st.one_of(
 @every_kind
 @quick
 @given(came=st.lists(st.lists(hostile, max_size=5), max_size=6))
-def test_whatever_number_a_sample_claims_the_work_is_bounded(name: str, came: list[list[int]]) -> None:
+def test_whatever_number_a_sample_claims_the_work_is_bounded(
+    name: str, came: list[list[int]]
+) -> None:
     """A channel looks no further ahead than ten seconds, and nobody else's samples suffer."""
     site = behind(name)
     for k, now in enumerate(came):
@@ -159,7 +179,9 @@ def test_whatever_number_a_sample_claims_the_work_is_bounded(name: str, came: li
         assert output.used[0] < k
     k = len(came)
     counts = site.counts()[0]
-    assert counts.refused == sum(not 0 <= m <= k + 10_000 for k, now in enumerate(came) for m in now)
+    assert counts.refused == sum(
+        not 0 <= m <= k + 10_000 for k, now in enumerate(came) for m in now
+    )
     assert site.release_tick(0, 200) == behind(name).release_tick(0, 200)
 
 
@@ -184,9 +206,12 @@ def test_newest_wins_shortens_the_age_and_in_order_lengthens_it() -> None:
     """Mean delay 200 ms, half width 50 ms: 162 ms in use against 240 and more."""
 
     def mean_age(in_order: int) -> float:
-        model = LinkModel(kind=DelayKind.UNIFORM, location=200_000.0, scale=50_000.0, in_order=in_order)
+        model = LinkModel(
+            kind=DelayKind.UNIFORM, location=200_000.0, scale=50_000.0, in_order=in_order
+        )
         outputs = stepped(
-            linked(1000, 1000, [model]), (TickInput(k, [sample(k - 1)] if k else []) for k in range(5000))
+            linked(1000, 1000, [model]),
+            (TickInput(k, [sample(k - 1)] if k else []) for k in range(5000)),
         )
         return float(np.mean([o.tick - o.used[0] for o in outputs[1000:]]))
 
@@ -198,13 +223,21 @@ def test_newest_wins_shortens_the_age_and_in_order_lengthens_it() -> None:
     came=st.lists(st.integers(0, 30), min_size=30, max_size=30),
     rates=st.sampled_from([(1000, 1000), (400, 900)]),
 )
-def test_a_measured_sample_is_in_use_from_its_arrival(came: list[int], rates: tuple[int, int]) -> None:
+def test_a_measured_sample_is_in_use_from_its_arrival(
+    came: list[int], rates: tuple[int, int]
+) -> None:
     """But not at its own stamp: one that comes from ahead waits for the first tick behind it."""
     site = linked(*rates, [LinkModel(kind=DelayKind.MEASURED)])
     for k in range(80):
         now = [m for m, at in enumerate(came) if at == k]
-        usable = [m for m, at in enumerate(came) if at <= k and tick_ns(m, rates[1]) < tick_ns(k, rates[0])]
-        assert site.step(TickInput(k, [sample(m) for m in now])).used == [max(usable, default=-1)]
+        usable = [
+            m
+            for m, at in enumerate(came)
+            if at <= k and tick_ns(m, rates[1]) < tick_ns(k, rates[0])
+        ]
+        assert site.step(TickInput(k, [sample(m) for m in now])).used == [
+            max(usable, default=-1)
+        ]
     assert site.counts()[0].late == 0
     assert site.measures(0)
 
@@ -216,12 +249,16 @@ def test_measured_link_may_have_play_out_buffer_of_its_own() -> None:
     at: dict[int, list[int]] = {}
     for m in range(200):
         at.setdefault(m + jitter[m % 8], []).append(m)
-    outputs = stepped(site, [TickInput(k, [sample(m) for m in at.get(k, [])]) for k in range(200)])
+    outputs = stepped(
+        site, [TickInput(k, [sample(m) for m in at.get(k, [])]) for k in range(200)]
+    )
     assert [o.used[0] for o in outputs] == [max(k - 20, -1) for k in range(200)]
 
 
 def test_copy_with_earlier_delay_makes_its_sample_due_earlier() -> None:
-    alone, twice = (linked(1000, 1000, [KINDS["copies"]._replace(duplicate=p)]) for p in (0.0, 1.0))
+    alone, twice = (
+        linked(1000, 1000, [KINDS["copies"]._replace(duplicate=p)]) for p in (0.0, 1.0)
+    )
     pairs = [(twice.release_tick(0, m), alone.release_tick(0, m)) for m in range(300)]
     assert all(a is not None and b is not None and a <= b for a, b in pairs)
     assert any(a != b for a, b in pairs)
@@ -233,7 +270,8 @@ def test_a_link_that_is_cut_ages_and_heals() -> None:
     model = LinkModel(location=20_000.0)
     site = linked(1000, 1000, [model], outages=((100 * 10**6, 200 * 10**6),))
     used = [
-        o.used[0] for o in stepped(site, [TickInput(k, [sample(k - 1)] if k else []) for k in range(300)])
+        o.used[0]
+        for o in stepped(site, [TickInput(k, [sample(k - 1)] if k else []) for k in range(300)])
     ]
     assert used[20:120] == list(range(100))
     assert used[120:220] == [99] * 100

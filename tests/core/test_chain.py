@@ -24,7 +24,8 @@ each = pytest.mark.parametrize("name", REFERENCES)
 def build(name: str, **drive: float) -> Arm:
     joints = REFERENCES[name].chain.joints
     made = [
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive) for one in joints
+        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m, **drive)
+        for one in joints
     ]
     return Arm(build_chain(made, MAX_JOINTS), np.concatenate([one.inertia for one in joints]))
 
@@ -56,7 +57,9 @@ def test_forward_dynamics_are_those_of_pinocchio(name: str) -> None:
         assert apart(M, state.inertia) <= 1e-12
         find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, state.tau, qdd)
         wanted = state.forward_dynamics
-        assert np.abs(qdd - wanted).max() <= 100 * EPS * np.linalg.cond(M) * np.abs(wanted).max()
+        assert (
+            np.abs(qdd - wanted).max() <= 100 * EPS * np.linalg.cond(M) * np.abs(wanted).max()
+        )
 
 
 @each
@@ -64,8 +67,16 @@ def test_place_and_jacobian_are_those_of_pinocchio(name: str) -> None:
     arm, chain = build(name), REFERENCES[name].chain
     for state in REFERENCES[name].states:
         place_joints(arm.rows, state.q)
-        assert apart(np.array(place_end_effector(arm.rows, chain.tip_origin_m)), state.tip_position) <= 1e-12
-        assert apart(np.vstack([arm.rows["J_lin"].T, arm.rows["J_ang"].T]), state.jacobian) <= 1e-12
+        assert (
+            apart(
+                np.array(place_end_effector(arm.rows, chain.tip_origin_m)), state.tip_position
+            )
+            <= 1e-12
+        )
+        assert (
+            apart(np.vstack([arm.rows["J_lin"].T, arm.rows["J_ang"].T]), state.jacobian)
+            <= 1e-12
+        )
         rotation = arm.rows["R_base"][-1] @ np.array(chain.tip_rotation)
         assert apart(rotation, state.tip_rotation) <= 1e-12
 
@@ -82,12 +93,17 @@ def test_friction_and_drives_enter_both_dynamics_alike() -> None:
 
 def stop_torque(q: list[float], qd: list[float]) -> Array:
     """The generalised force of the stops of two joints, N m: what they change of M qdd."""
-    arms = build("random2", lower=-0.5, upper=0.5, stop_stiffness=1e3, stop_damping=10.0), build("random2")
+    arms = (
+        build("random2", lower=-0.5, upper=0.5, stop_stiffness=1e3, stop_damping=10.0),
+        build("random2"),
+    )
     qdds = np.zeros((2, 2))
     for arm, qdd in zip(arms, qdds, strict=True):
         place_joints(arm.rows, np.array(q))
         none = np.zeros(2)
-        find_acceleration(arm.rows, arm.theta, np.zeros(3), np.array(q), np.array(qd), none, qdd)
+        find_acceleration(
+            arm.rows, arm.theta, np.zeros(3), np.array(q), np.array(qd), none, qdd
+        )
     place_joints(arms[1].rows, np.array(q))
     return full_matrix(arms[1]) @ (qdds[0] - qdds[1])
 

@@ -19,7 +19,8 @@ def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
     """A site with the chain, in a state; its reference is such that v and a are those of the state."""
     chain = REFERENCES[name].chain
     joints = tuple(
-        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m) for one in chain.joints
+        ChainJoint(one.kind == "prismatic", one.axis, one.rotation, one.origin_m)
+        for one in chain.joints
     )
     n = len(joints)
     theta = np.concatenate([one.inertia for one in chain.joints])
@@ -44,7 +45,10 @@ def build(name: str, state: ChainState, **gains: object) -> SiteArrays:
         pages=8,
     )
     site = arrays.site[0]
-    site["q_des"][:n], site["qd_des"][:n] = state.q + state.v / LAMBDA, state.qd + state.a / LAMBDA
+    site["q_des"][:n], site["qd_des"][:n] = (
+        state.q + state.v / LAMBDA,
+        state.qd + state.a / LAMBDA,
+    )
     return arrays
 
 
@@ -75,7 +79,9 @@ def test_law_that_knows_gravity_adds_springs_and_dampers(name: str) -> None:
         arrays = build(name, state, law=Law.KNOWN, K=(7.0,), d=(2.0,), Kd=(5.0,))
         found = find_torque(arrays)
         still = 0.0 * state.q
-        arm = Arm(arrays.chain, np.concatenate([one.inertia for one in REFERENCES[name].chain.joints]))
+        arm = Arm(
+            arrays.chain, np.concatenate([one.inertia for one in REFERENCES[name].chain.joints])
+        )
         moving(arm, state._replace(qd=still, a=still), still)
         wanted = torque_for(arm, still, still)
         assert np.abs(wanted).max() > 1e-3

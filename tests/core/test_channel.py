@@ -12,7 +12,12 @@ from tests.core.compiled import printed
 from tests.core.kinds import KINDS, POINTS, fates
 from trilat_net.core.channel import LOST
 from trilat_net.scenario.delay_models import LinkBase
-from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay, GammaDelay, NoDelay, UniformDelay
+from trilat_net.scenario.delay_models.kernel_delays import (
+    ConstantDelay,
+    GammaDelay,
+    NoDelay,
+    UniformDelay,
+)
 
 COUNT = 1_000_000
 SIGMAS = 4.0
@@ -39,7 +44,9 @@ def bursts(lost: np.ndarray) -> Ints:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("link", LOSSES, ids=lambda link: f"{link.loss}-{link.loss_burst}-{link.loss_bad}")
+@pytest.mark.parametrize(
+    "link", LOSSES, ids=lambda link: f"{link.loss}-{link.loss_burst}-{link.loss_bad}"
+)
 def test_loss_rate_and_mean_burst_over_a_million_samples(link: LinkBase, seed: int) -> None:
     """Gilbert and Elliott; single losses are the chain without memory, whose mean burst is 1 / (1 - p).
 
@@ -61,7 +68,9 @@ def test_loss_rate_and_mean_burst_over_a_million_samples(link: LinkBase, seed: i
     assert abs(lengths.mean() - mean) <= allowed * math.sqrt(mean * (mean - 1))
     for length in (1, 2, 3):
         share = (1 - 1 / mean) ** (length - 1) / mean
-        assert abs(np.mean(lengths == length) - share) <= allowed * math.sqrt(share * (1 - share))
+        assert abs(np.mean(lengths == length) - share) <= allowed * math.sqrt(
+            share * (1 - share)
+        )
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -87,7 +96,8 @@ def test_what_is_lost_and_how_long_others_take_are_independent() -> None:
     link = UniformDelay(delay_ms=100, half_width_ms=50)
     whole = due(channel([link.core()]), 10_000)
     holed = due(
-        channel([UniformDelay(delay_ms=100, half_width_ms=50, loss=0.3, loss_burst=4).core()]), 10_000
+        channel([UniformDelay(delay_ms=100, half_width_ms=50, loss=0.3, loss_burst=4).core()]),
+        10_000,
     )
     kept = holed != LOST
     assert 0.6 < kept.mean() < 0.8
@@ -113,14 +123,18 @@ def test_the_earlier_of_sample_and_copy_counts() -> None:
     assert made.row.copies == 100_000
     assert (doubled <= single).all()
     smaller_ms = (doubled - stamps(100_000)) / 1e6
-    assert smaller_ms.mean() == pytest.approx(40 + 120 / 3, abs=SIGMAS * 120 / math.sqrt(18 * 100_000))
+    assert smaller_ms.mean() == pytest.approx(
+        40 + 120 / 3, abs=SIGMAS * 120 / math.sqrt(18 * 100_000)
+    )
 
 
 # Outages, order, play-out.
 
 
 def test_an_outage_takes_the_samples_stamped_within_it() -> None:
-    cut = np.array([(10_000_000, 20_000_000), (15_000_000, 25_500_000), (40_000_000, 40_000_001)])
+    cut = np.array(
+        [(10_000_000, 20_000_000), (15_000_000, 25_500_000), (40_000_000, 40_000_001)]
+    )
     lost = np.flatnonzero(due(channel([NoDelay().core()], points=cut, outages=3), 60) == LOST)
     assert lost.tolist() == [*range(10, 26), 40]
 
@@ -145,7 +159,10 @@ def test_link_that_becomes_ordered_holds_samples_back_behind_older_ones() -> Non
 @given(playout_ms=st.floats(0, 300))
 def test_play_out_holds_every_sample_at_least_so_long(playout_ms: float) -> None:
     free = due(channel([UniformDelay(delay_ms=100, half_width_ms=100).core()]), 500)
-    held = due(channel([UniformDelay(delay_ms=100, half_width_ms=100, playout_ms=playout_ms).core()]), 500)
+    held = due(
+        channel([UniformDelay(delay_ms=100, half_width_ms=100, playout_ms=playout_ms).core()]),
+        500,
+    )
     assert (held == np.maximum(free, stamps(500) + round(playout_ms * 1000) * 1000)).all()
 
 
@@ -154,7 +171,8 @@ def test_play_out_holds_every_sample_at_least_so_long(playout_ms: float) -> None
 
 def test_a_model_holds_from_its_first_stamp_on() -> None:
     models = [
-        ConstantDelay(delay_ms=d).core(n) for d, n in ((5, 0), (9, 3_000_001), (2, 7_000_000), (1, 7_000_000))
+        ConstantDelay(delay_ms=d).core(n)
+        for d, n in ((5, 0), (9, 3_000_001), (2, 7_000_000), (1, 7_000_000))
     ]
     delays = due(channel(models), 10) - stamps(10)
     assert (delays // 10**6).tolist() == [5, 5, 5, 5, 9, 9, 9, 1, 1, 1]
@@ -163,7 +181,10 @@ def test_a_model_holds_from_its_first_stamp_on() -> None:
 def test_delay_without_memory_does_not_notice_that_loss_changed() -> None:
     keys = {"delay_ms": 80.0, "deviation_ms": 20.0}
     whole = due(channel([GammaDelay(**keys).core()]), 2000)
-    changed = due(channel([GammaDelay(**keys).core(), GammaDelay(**keys, loss=0.2).core(500 * 10**6)]), 2000)
+    changed = due(
+        channel([GammaDelay(**keys).core(), GammaDelay(**keys, loss=0.2).core(500 * 10**6)]),
+        2000,
+    )
     assert (changed[:500] == whole[:500]).all()
     kept = changed != LOST
     assert (changed[kept] == whole[kept]).all()
@@ -175,7 +196,10 @@ def test_delay_without_memory_does_not_notice_that_loss_changed() -> None:
 
 @pytest.mark.parametrize("name", KINDS)
 @settings(max_examples=15)
-@given(steps=st.lists(st.integers(1, 60), min_size=1, max_size=30), pages=st.sampled_from([64, 128, 8192]))
+@given(
+    steps=st.lists(st.integers(1, 60), min_size=1, max_size=30),
+    pages=st.sampled_from([64, 128, 8192]),
+)
 def test_fates_are_the_same_in_whatever_steps_they_are_foreseen(
     name: str, steps: list[int], pages: int
 ) -> None:

@@ -38,13 +38,17 @@ def test_torque(
         - Kp * r
         - Kd * ed
     )
-    assert np.abs(tau - wanted).max() <= 1e-12 * (1 + np.abs(wanted).max() + 1e4 * theta_from_links(a).sum())
+    assert np.abs(tau - wanted).max() <= 1e-12 * (
+        1 + np.abs(wanted).max() + 1e4 * theta_from_links(a).sum()
+    )
 
 
 @given(limit=st.floats(0.1, 100.0), ed=speeds)
 def test_torque_is_held_within_its_limit(limit: float, ed: Array) -> None:
     one, none = np.ones(2), np.zeros(2)
-    tau = control.adaptive_torque(((0.0,) * 5,) * 2, np.zeros(5), one, 7.0 * one, none, ed, limit)
+    tau = control.adaptive_torque(
+        ((0.0,) * 5,) * 2, np.zeros(5), one, 7.0 * one, none, ed, limit
+    )
     assert list(tau) == np.clip(-7.0 * ed, -limit, limit).tolist()
 
 

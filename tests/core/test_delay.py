@@ -11,7 +11,14 @@ from scipy import stats
 
 from tests.core.channels import LINK_NAME, SEEDS, Ints, channel, delays_us, due
 from tests.core.philox_reference import philox_in_integers
-from trilat_net.core.delay import MAX_DELAY_US, DelayKind, LinkModel, TraceEnd, clamp_delay_us, trace_delay_us
+from trilat_net.core.delay import (
+    MAX_DELAY_US,
+    DelayKind,
+    LinkModel,
+    TraceEnd,
+    clamp_delay_us,
+    trace_delay_us,
+)
 from trilat_net.core.philox import link_key
 from trilat_net.scenario.delay_models import LinkBase
 from trilat_net.scenario.delay_models.kernel_delays import (
@@ -31,12 +38,16 @@ SIGMAS = 4.0
 
 
 def truncated(link: NormalDelay) -> Any:
-    return stats.truncnorm(-link.delay_ms / link.deviation_ms, np.inf, link.delay_ms, link.deviation_ms)
+    return stats.truncnorm(
+        -link.delay_ms / link.deviation_ms, np.inf, link.delay_ms, link.deviation_ms
+    )
 
 
 def log_normal(link: LogNormalDelay) -> Any:
     sigma = math.sqrt(math.log(1 + (link.deviation_ms / link.delay_ms) ** 2))
-    return stats.lognorm(sigma, scale=link.delay_ms / math.sqrt(1 + (link.deviation_ms / link.delay_ms) ** 2))
+    return stats.lognorm(
+        sigma, scale=link.delay_ms / math.sqrt(1 + (link.deviation_ms / link.delay_ms) ** 2)
+    )
 
 
 class Mixture:
@@ -47,13 +58,21 @@ class Mixture:
         self.shares = (1 - link.slow_share, link.slow_share)
 
     def cdf(self, x: Any) -> Any:
-        return sum(share * part.cdf(x) for share, part in zip(self.shares, self.parts, strict=True))
+        return sum(
+            share * part.cdf(x) for share, part in zip(self.shares, self.parts, strict=True)
+        )
 
     def mean(self) -> float:
-        return float(sum(share * part.mean() for share, part in zip(self.shares, self.parts, strict=True)))
+        return float(
+            sum(
+                share * part.mean() for share, part in zip(self.shares, self.parts, strict=True)
+            )
+        )
 
     def std(self) -> float:
-        second = sum(s * (p.var() + p.mean() ** 2) for s, p in zip(self.shares, self.parts, strict=True))
+        second = sum(
+            s * (p.var() + p.mean() ** 2) for s, p in zip(self.shares, self.parts, strict=True)
+        )
         return math.sqrt(second - self.mean() ** 2)
 
 
@@ -62,7 +81,10 @@ INDEPENDENT: list[tuple[LinkBase, Any]] = [
     for law, links in (
         (
             lambda u: stats.uniform(u.delay_ms - u.half_width_ms, 2 * u.half_width_ms),
-            [UniformDelay(delay_ms=200, half_width_ms=200), UniformDelay(delay_ms=35.5, half_width_ms=4)],
+            [
+                UniformDelay(delay_ms=200, half_width_ms=200),
+                UniformDelay(delay_ms=35.5, half_width_ms=4),
+            ],
         ),
         (
             truncated,
@@ -73,12 +95,20 @@ INDEPENDENT: list[tuple[LinkBase, Any]] = [
             ],
         ),
         (
-            lambda g: stats.gamma((g.delay_ms / g.deviation_ms) ** 2, scale=g.deviation_ms**2 / g.delay_ms),
-            [GammaDelay(delay_ms=50, deviation_ms=20), GammaDelay(delay_ms=20, deviation_ms=40)],
+            lambda g: stats.gamma(
+                (g.delay_ms / g.deviation_ms) ** 2, scale=g.deviation_ms**2 / g.delay_ms
+            ),
+            [
+                GammaDelay(delay_ms=50, deviation_ms=20),
+                GammaDelay(delay_ms=20, deviation_ms=40),
+            ],
         ),
         (
             log_normal,
-            [LogNormalDelay(delay_ms=80, deviation_ms=15), LogNormalDelay(delay_ms=30, deviation_ms=20)],
+            [
+                LogNormalDelay(delay_ms=80, deviation_ms=15),
+                LogNormalDelay(delay_ms=30, deviation_ms=20),
+            ],
         ),
         (
             Mixture,
@@ -108,7 +138,9 @@ def likely(delays_us: Ints, law: Any) -> bool:
     return bool(stats.kstwo.sf(distance, len(delays_us)) > 1e-4)
 
 
-def holds_its_moments(link: LinkBase, delays: Ints, mean_factor: float = 1.0, factor: float = 1.0) -> None:
+def holds_its_moments(
+    link: LinkBase, delays: Ints, mean_factor: float = 1.0, factor: float = 1.0
+) -> None:
     """Mean and deviation against the closed form, in standard errors; factors: variances, if correlated.
 
     Rounding to whole microseconds adds 1/12 us^2 to the variance; the cut at 10 s takes nothing that shows.
@@ -152,7 +184,9 @@ def test_the_distribution_is_the_stated_one(link: LinkBase, law: Any) -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("link", CORRELATED, ids=named)
-def test_correlated_delays_have_their_moments_and_correlations(link: CorrelatedDelay, seed: int) -> None:
+def test_correlated_delays_have_their_moments_and_correlations(
+    link: CorrelatedDelay, seed: int
+) -> None:
     """Variances of the estimates of an AR(1) sequence: Bartlett 1946."""
     delays = delays_us(link, seed, COUNT)
     c = link.correlation
@@ -220,9 +254,12 @@ def test_a_trace_gives_the_delay_of_its_last_point(
     gaps_us: list[int], delays: list[int], stamp_ns: int, at_end: TraceEnd
 ) -> None:
     t_us = np.cumsum([0, *gaps_us])
-    points = np.array([(7, 7), *zip(t_us, delays, strict=False), (9, 9)], dtype=np.int64)  # others around it
+    # others around it
+    points = np.array([(7, 7), *zip(t_us, delays, strict=False), (9, 9)], dtype=np.int64)
     rows = np.zeros(1, dtype=channel([LinkModel()]).models.dtype)
-    rows[0] = tuple(LinkModel(kind=DelayKind.TRACE, at_end=at_end, trace_first=1, trace_count=len(t_us)))
+    rows[0] = tuple(
+        LinkModel(kind=DelayKind.TRACE, at_end=at_end, trace_first=1, trace_count=len(t_us))
+    )
     now_us = stamp_ns // 1000
     if at_end is TraceEnd.LOOP and gaps_us:
         now_us %= int(t_us[-1]) + gaps_us[-1]
@@ -234,7 +271,16 @@ def test_a_trace_may_lose_samples() -> None:
     link = TraceDelay(trace=format_trace([(0.0, 5.0), (0.003, math.inf), (0.005, 6.0)]))
     points = parse_trace(link.trace)
     made = due(channel([link.core()._replace(trace_count=3)], points=points), 8)
-    assert made.tolist() == [5_000_000, 6_000_000, 7_000_000, -1, -1, 11_000_000, 12_000_000, 13_000_000]
+    assert made.tolist() == [
+        5_000_000,
+        6_000_000,
+        7_000_000,
+        -1,
+        -1,
+        11_000_000,
+        12_000_000,
+        13_000_000,
+    ]
     assert link.moments().mean_ms == pytest.approx((3 * 5.0 + 2 * 6.0) / 5)
 
 

@@ -17,7 +17,13 @@ def matrices(draw: st.DrawFn, zeros: bool = True) -> Array:
     """Rows that sum to one, zero diagonal, other entries zero or at least 1e-6."""
     size = draw(st.integers(2, 6))
     share = st.one_of(st.floats(-6, 0).map(lambda x: 10**x), *([st.just(0.0)] if zeros else []))
-    a = np.array(draw(st.lists(st.lists(share, min_size=size, max_size=size), min_size=size, max_size=size)))
+    a = np.array(
+        draw(
+            st.lists(
+                st.lists(share, min_size=size, max_size=size), min_size=size, max_size=size
+            )
+        )
+    )
     np.fill_diagonal(a, 0.0)
     assume((a.sum(1) > 0).all())
     a /= a.sum(1, keepdims=True)
@@ -31,7 +37,12 @@ def strongly_connected(a: Array) -> bool:
     def reached(edges: Array) -> set[int]:
         found, new = {0}, [0]
         while new:
-            new = [j for i in new for j in np.flatnonzero(edges[i]) if j not in found and not found.add(j)]
+            new = [
+                j
+                for i in new
+                for j in np.flatnonzero(edges[i])
+                if j not in found and not found.add(j)
+            ]
         return found
 
     return len(reached(a)) == len(reached(a.T)) == len(a)

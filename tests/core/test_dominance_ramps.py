@@ -39,7 +39,9 @@ def ramp_lists(draw: st.DrawFn) -> Ramps:
 
 
 def table(first: Row, ramps: Ramps) -> np.ndarray:
-    return np.array([(0, 0, *first), *((r.start_ns, r.end_ns, *r.alpha) for r in ramps)], dtype=np.float64)
+    return np.array(
+        [(0, 0, *first), *((r.start_ns, r.end_ns, *r.alpha) for r in ramps)], dtype=np.float64
+    )
 
 
 def shares(t_ns: int, first: Row, ramps: Ramps) -> tuple[list[float], list[float]]:
@@ -59,7 +61,9 @@ def exact(t_ns: int, first: Row, ramps: Ramps) -> list[Fraction]:
         return [Fraction(a) for a in after]
     before = first if last == 0 else exact(start_ns, first, ramps[:last])
     done = Fraction(t_ns - start_ns, end_ns - start_ns)
-    return [b + (Fraction(a) - b) * done for a, b in zip(after, map(Fraction, before), strict=True)]
+    return [
+        b + (Fraction(a) - b) * done for a, b in zip(after, map(Fraction, before), strict=True)
+    ]
 
 
 times = st.integers(0, 16 * S)
@@ -79,7 +83,9 @@ def test_a_row_sums_to_one_at_all_times(first: Row, ramps: Ramps, t_ns: int) -> 
     assert abs(math.fsum(alpha) - 1.0) <= 2 * ULP + off
     assert all(-ULP <= a <= 1.0 + ULP for a in alpha)
     lasting_s = [
-        (ramp.end_ns - ramp.start_ns) * 1e-9 for ramp in ramps if ramp.start_ns <= t_ns < ramp.end_ns
+        (ramp.end_ns - ramp.start_ns) * 1e-9
+        for ramp in ramps
+        if ramp.start_ns <= t_ns < ramp.end_ns
     ]
     assert abs(math.fsum(rates)) <= (4 * ULP + 2 * off) / min(lasting_s, default=1.0)
 
@@ -109,7 +115,9 @@ def moving(k: int) -> Arrival:
 
 
 def ran(made: Site, commands: dict[int, list[CoreChange]]) -> list[TickRecord]:
-    return stepped(made, [TickInput(k, [moving(k)] if k else [], commands.get(k, [])) for k in range(3000)])
+    return stepped(
+        made, [TickInput(k, [moving(k)] if k else [], commands.get(k, [])) for k in range(3000)]
+    )
 
 
 def test_a_sites_reference_and_its_derivative_follow_its_shares() -> None:
@@ -162,9 +170,13 @@ def test_each_ramp_begins_where_the_one_before_was() -> None:
 
 
 @given(rows(), ramp_lists(), st.integers(0, 12 * S), st.integers(0, 12 * S))
-def test_folded_ramps_write_the_same_bits_from_then_on(first: Row, ramps: Ramps, t: int, later: int) -> None:
+def test_folded_ramps_write_the_same_bits_from_then_on(
+    first: Row, ramps: Ramps, t: int, later: int
+) -> None:
     folded = table(first, ramps)
     count = fold_ramps(min(t, later), 1 + len(ramps), folded)
     links = np.zeros(PEERS, link_dtype(2))
     apply_ramps(max(t, later), count, folded, links)
-    assert (links["alpha"].tolist(), links["alpha_rate"].tolist()) == shares(max(t, later), first, ramps)
+    assert (links["alpha"].tolist(), links["alpha_rate"].tolist()) == shares(
+        max(t, later), first, ramps
+    )

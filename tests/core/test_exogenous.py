@@ -30,9 +30,16 @@ stiff = st.tuples(st.floats(0, 50), st.floats(0, 50))
 
 
 def torque(
-    t_s: float, q: Array, qd: Array, *actors: TorqueSource, sampled: bool = False, lengths: Array = LENGTHS
+    t_s: float,
+    q: Array,
+    qd: Array,
+    *actors: TorqueSource,
+    sampled: bool = False,
+    lengths: Array = LENGTHS,
 ) -> Array:
-    return np.array(torque_on_arm(t_s, q, qd, lengths, *torque_source_rows(actors), int(sampled))[:2])
+    return np.array(
+        torque_on_arm(t_s, q, qd, lengths, *torque_source_rows(actors), int(sampled))[:2]
+    )
 
 
 def tip(q: Array) -> Array:
@@ -44,7 +51,9 @@ def tip(q: Array) -> Array:
 def downhill(potential, q: Array) -> Array:
     """Minus the gradient of a potential, by central differences."""
     steps = np.eye(2) * STEP
-    return np.array([(potential(q - step) - potential(q + step)) / (2 * STEP) for step in steps])
+    return np.array(
+        [(potential(q - step) - potential(q + step)) / (2 * STEP) for step in steps]
+    )
 
 
 def still(q: Array) -> Array:
@@ -68,10 +77,20 @@ def test_what_acts_adds_up(q: Array, qd: Array, t_s: float) -> None:
     actors = (
         TorqueSource(TorqueKind.PULSE, 1.0, 6.0, a=(10.0, -4.0)),
         TorqueSource(
-            TorqueKind.HAND, K=(3.0, 4.0), B=(1.0, 0.5), a=(0.1, 0.2), b=(0.4, -0.2), move_end_s=2.0
+            TorqueKind.HAND,
+            K=(3.0, 4.0),
+            B=(1.0, 0.5),
+            a=(0.1, 0.2),
+            b=(0.4, -0.2),
+            move_end_s=2.0,
         ),
         TorqueSource(
-            TorqueKind.TASK_HAND, K=(30.0, 4.0), B=(1.0, 5.0), a=(0.1, 0.2), b=(0.4, -0.2), move_end_s=2.0
+            TorqueKind.TASK_HAND,
+            K=(30.0, 4.0),
+            B=(1.0, 5.0),
+            a=(0.1, 0.2),
+            b=(0.4, -0.2),
+            move_end_s=2.0,
         ),
         TorqueSource(TorqueKind.VISCOUS, B=(2.0, 3.0)),
         TorqueSource(TorqueKind.WALL, K=(100.0, 0.0), a=(0.5, 0.0), b=(-1.0, 0.0)),
@@ -102,7 +121,9 @@ def test_hand_at_tip_is_spring_in_plane(q: Array, K: Pair, target: Pair) -> None
 
 
 @given(q=angles, K=st.floats(0, 1000), place=pairs, direction=st.floats(-4, 4))
-def test_a_wall_is_a_spring_on_one_side(q: Array, K: float, place: Pair, direction: float) -> None:
+def test_a_wall_is_a_spring_on_one_side(
+    q: Array, K: float, place: Pair, direction: float
+) -> None:
     normal = (math.cos(direction), math.sin(direction))
     wall = TorqueSource(TorqueKind.WALL, K=(K, 0.0), a=place, b=normal)
 
@@ -110,23 +131,33 @@ def test_a_wall_is_a_spring_on_one_side(q: Array, K: float, place: Pair, directi
         return float(0.5 * K * max(0.0, (np.array(place) - tip(at)) @ normal) ** 2)
 
     expected = downhill(potential, q)
-    assert torque(1.0, q, still(q), wall) == pytest.approx(expected, abs=1e-3 * (1 + np.abs(expected).max()))
+    assert torque(1.0, q, still(q), wall) == pytest.approx(
+        expected, abs=1e-3 * (1 + np.abs(expected).max())
+    )
 
 
-@given(q=angles, qd=speeds, K=st.floats(0, 1000), B=st.floats(0, 1000), direction=st.floats(-4, 4))
+@given(
+    q=angles, qd=speeds, K=st.floats(0, 1000), B=st.floats(0, 1000), direction=st.floats(-4, 4)
+)
 def test_a_wall_never_pulls(q: Array, qd: Array, K: float, B: float, direction: float) -> None:
     """Whatever its damping, the force that it gives points along its normal, or is none."""
     normal = np.array([math.cos(direction), math.sin(direction)])
     pushed = torque(
-        1.0, q, qd, TorqueSource(TorqueKind.WALL, K=(K, 0.0), B=(B, 0.0), a=(0.3, 0.2), b=tuple(normal))
+        1.0,
+        q,
+        qd,
+        TorqueSource(TorqueKind.WALL, K=(K, 0.0), B=(B, 0.0), a=(0.3, 0.2), b=tuple(normal)),
     )
-    unit = downhill(lambda at: -float(tip(at) @ normal), q)  # the torque of a force of 1 N along the normal
+    # the torque of a force of 1 N along the normal
+    unit = downhill(lambda at: -float(tip(at) @ normal), q)
     assert pushed @ unit >= -1e-6 * (1 + np.abs(pushed).max())
 
 
 @given(q=angles, qd=speeds, B=stiff)
 def test_what_is_viscous_takes_power_in_any_motion(q: Array, qd: Array, B: Pair) -> None:
-    assert torque(1.0, q, qd, TorqueSource(TorqueKind.VISCOUS, B=B)) == pytest.approx(-np.array(B) * qd)
+    assert torque(1.0, q, qd, TorqueSource(TorqueKind.VISCOUS, B=B)) == pytest.approx(
+        -np.array(B) * qd
+    )
 
 
 @given(start=st.floats(-5, 5), length=st.floats(0.01, 5), x=st.floats(0, 1))
@@ -140,12 +171,20 @@ def test_a_move_has_minimum_jerk(start: float, length: float, x: float) -> None:
             conditions[row, power] = factor * at ** (power - derivative)
     polynomial = np.linalg.solve(conditions, [0, 0, 0, 1, 0, 0])
     assert way[0] == pytest.approx(np.polyval(polynomial[::-1], x), abs=1e-6)
-    assert way[1] * length == pytest.approx(np.polyval(np.polyder(polynomial[::-1]), x), abs=1e-5)
+    assert way[1] * length == pytest.approx(
+        np.polyval(np.polyder(polynomial[::-1]), x), abs=1e-5
+    )
 
 
 def test_a_target_stands_still_before_and_after_its_move() -> None:
     hand = TorqueSource(
-        TorqueKind.HAND, K=(1.0, 1.0), B=(7.0, 7.0), a=(1.0, 2.0), b=(3.0, 5.0), move_start_s=1, move_end_s=2
+        TorqueKind.HAND,
+        K=(1.0, 1.0),
+        B=(7.0, 7.0),
+        a=(1.0, 2.0),
+        b=(3.0, 5.0),
+        move_start_s=1,
+        move_end_s=2,
     )
     rest = np.zeros(2)
     assert torque(0.5, rest, rest, hand).tolist() == [1.0, 2.0]
@@ -154,13 +193,20 @@ def test_a_target_stands_still_before_and_after_its_move() -> None:
 
 @given(
     rows=st.lists(
-        st.tuples(st.floats(0, 10), number, number), min_size=1, max_size=20, unique_by=lambda r: r[0]
+        st.tuples(st.floats(0, 10), number, number),
+        min_size=1,
+        max_size=20,
+        unique_by=lambda r: r[0],
     ),
     t_s=st.floats(-1, 11),
 )
-def test_recorded_torque_is_linear_between_its_points(rows: list[tuple[float, ...]], t_s: float) -> None:
+def test_recorded_torque_is_linear_between_its_points(
+    rows: list[tuple[float, ...]], t_s: float
+) -> None:
     table = np.array(sorted(rows))
-    found = torque(t_s, np.zeros(2), np.zeros(2), TorqueSource(TorqueKind.RECORDED, table=table))
+    found = torque(
+        t_s, np.zeros(2), np.zeros(2), TorqueSource(TorqueKind.RECORDED, table=table)
+    )
     nothing = {"left": 0.0, "right": 0.0}
     expected = [np.interp(t_s, table[:, 0], table[:, 1 + i], **nothing) for i in (0, 1)]
     assert found == pytest.approx(expected, abs=1e-9)
@@ -187,7 +233,9 @@ def test_a_multisine_has_its_lines_and_nothing_else() -> None:
     expected = np.where(np.isin(np.arange(201) / 4.0, hz), 2.0, 0.0)
     assert amplitude == pytest.approx(expected, abs=1e-9)
     assert np.abs(found).max() < 0.75 * 2.0 * len(hz)
-    given_phases = Multisine(amplitude_nm=(1.0, 1.0), frequencies_hz=(2.0,), phases_rad=(0.5,)).actor
+    given_phases = Multisine(
+        amplitude_nm=(1.0, 1.0), frequencies_hz=(2.0,), phases_rad=(0.5,)
+    ).actor
     assert torque(0.1, np.zeros(2), np.zeros(2), given_phases)[0] == pytest.approx(
         math.sin(0.4 * math.pi + 0.5)
     )
@@ -212,7 +260,9 @@ def test_nobody_acts_before_the_start_or_after_the_end(acts: TorqueKind) -> None
     table = np.array([[0.0, 1.2, 1.0], [9.0, 1.0, 1.0]])
     vectors = {"a": (1.0, 0.0), "b": (-1.0, 0.0), "K": (9.0, 9.0), "B": (1.0, 1.0)}
     model = ConstantEffort() if acts in OWN_KINDS else None
-    actor = TorqueSource(acts, 2.0, 3.0, move_end_s=0.7, **vectors, table=table, grip=1.0, model=model)
+    actor = TorqueSource(
+        acts, 2.0, 3.0, move_end_s=0.7, **vectors, table=table, grip=1.0, model=model
+    )
     q, qd = np.array([0.1, 0.2]), np.array([0.3, -0.2])
     for t_s in (1.9, 3.0, 4.0):
         assert torque(t_s, q, qd, actor).tolist() == [0.0, 0.0]
@@ -229,4 +279,6 @@ def test_a_live_hand_is_a_spring_to_its_target(acts: str, like: str) -> None:
     np.testing.assert_allclose(half, 0.5 * spring, rtol=1e-14)
     limited = torque(1.0, q, qd, TorqueSource(TorqueKind[acts], **vectors, grip=1.0, limit=2.0))
     at = tip(q) if acts == "LIVE_TIP" else q
-    np.testing.assert_allclose(limited, spring * 2.0 / (50.0 * np.hypot(*(vectors["a"] - at))), rtol=1e-12)
+    np.testing.assert_allclose(
+        limited, spring * 2.0 / (50.0 * np.hypot(*(vectors["a"] - at))), rtol=1e-12
+    )

@@ -5,7 +5,9 @@ import pytest
 from tests.core.compiled import printed
 from trilat_net.core.fingerprint import compute_fingerprint
 
-PROGRAM = "from trilat_net.core.fingerprint import compute_fingerprint; print(compute_fingerprint())"
+PROGRAM = (
+    "from trilat_net.core.fingerprint import compute_fingerprint; print(compute_fingerprint())"
+)
 
 
 @pytest.mark.parametrize("compiled", [False, True])

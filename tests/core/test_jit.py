@@ -24,7 +24,9 @@ for n in {}:
 def test_symbols_of_leaves_tell_layouts_apart() -> None:
     """As Numba numbers them, the first layout of any process has the symbols of any other's."""
     one, other = (
-        dict(line.split() for line in printed(SYMBOLS.format(order), compiled=True).splitlines())
+        dict(
+            line.split() for line in printed(SYMBOLS.format(order), compiled=True).splitlines()
+        )
         for order in ((6, 7), (7, 6))
     )
     assert one == other
@@ -52,10 +54,16 @@ def test_equal_closures_of_two_processes_are_told_apart(
     file = tmp_path / "closures.py"
     file.write_text(CLOSURES)
     run = [
-        subprocess.run([sys.executable, file, *factors], capture_output=True, text=True, check=True).stdout
+        subprocess.run(
+            [sys.executable, file, *factors], capture_output=True, text=True, check=True
+        ).stdout
         for factors in ("2", "3", "23")
     ]
-    assert [said.split() for said in run] == [["2.0", "0"], ["3.0", "0"], ["2.0", "1", "3.0", "1"]]
+    assert [said.split() for said in run] == [
+        ["2.0", "0"],
+        ["3.0", "0"],
+        ["2.0", "1", "3.0", "1"],
+    ]
 
 
 LEAVES = """

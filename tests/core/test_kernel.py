@@ -17,7 +17,12 @@ G = 9.81
 
 
 def carried(
-    q0: Array, qd0: Array, h_s: float, periods: int, u: Array, actors: tuple[TorqueSource, ...] = ()
+    q0: Array,
+    qd0: Array,
+    h_s: float,
+    periods: int,
+    u: Array,
+    actors: tuple[TorqueSource, ...] = (),
 ) -> tuple[Array, Array]:
     q, qd, who = (q0[0], q0[1]), (qd0[0], qd0[1]), torque_source_rows(actors)
     for k in range(periods):
@@ -32,12 +37,15 @@ def energy(q: Array, qd: Array) -> float:
 @settings(max_examples=30)
 @given(q=angles, qd=physics.vectors(physics.st.floats(-3, 3)))
 def test_an_arm_that_is_left_alone_keeps_its_energy(q: Array, qd: Array) -> None:
-    assert energy(*carried(q, qd, 1e-3, 500, np.zeros(2))) == pytest.approx(energy(q, qd), abs=1e-5)
+    assert energy(*carried(q, qd, 1e-3, 500, np.zeros(2))) == pytest.approx(
+        energy(q, qd), abs=1e-5
+    )
 
 
 PULSES = np.array([[-0.1, 0.35, 12.0, -5.0], [0.0, 0.3, 1.0, 2.0]])
 HANDS = tuple(
-    TorqueSource(TorqueKind.PULSE, start, end, a=tuple(peak)) for start, end, *peak in PULSES.tolist()
+    TorqueSource(TorqueKind.PULSE, start, end, a=tuple(peak))
+    for start, end, *peak in PULSES.tolist()
 )
 SPAN_S = 0.1
 
@@ -47,7 +55,12 @@ def errors(q: Array, qd: Array, u: Array, *periods: int) -> list[float]:
 
     def rate(t: float, x: Array) -> Array:
         hands = sum(p[2:] * np.sin(np.pi * (t - p[0]) / (p[1] - p[0])) ** 2 for p in PULSES)
-        rest = u + hands - physics.coriolis(ARM, x[:2], x[2:]) @ x[2:] - physics.gravity(ARM, G, x[:2])
+        rest = (
+            u
+            + hands
+            - physics.coriolis(ARM, x[:2], x[2:]) @ x[2:]
+            - physics.gravity(ARM, G, x[:2])
+        )
         return np.concatenate([x[2:], np.linalg.solve(physics.inertia(ARM, x[:2]), rest)])
 
     start = np.concatenate([q, qd])
@@ -69,7 +82,11 @@ def test_its_order_is_four() -> None:
     orders = []
     for _ in range(25):
         coarse, fine = errors(
-            chance.uniform(-3, 3, 2), chance.uniform(-6, 6, 2), chance.uniform(-50, 50, 2), 50, 100
+            chance.uniform(-3, 3, 2),
+            chance.uniform(-6, 6, 2),
+            chance.uniform(-50, 50, 2),
+            50,
+            100,
         )
         orders.append(np.log2(coarse / fine))
     assert 3.8 < np.median(orders) < 4.2

@@ -12,7 +12,10 @@ from trilat_net.core.user_law import read_memory, write_memory
 reals = st.floats(-1e6, 1e6)
 shapes = st.sampled_from([(2,), (3, 2), (1, 2, 2)])
 values = st.recursive(
-    reals | st.booleans() | st.integers(-1000, 1000) | arrays(np.float64, shapes, elements=reals),
+    reals
+    | st.booleans()
+    | st.integers(-1000, 1000)
+    | arrays(np.float64, shapes, elements=reals),
     lambda inner: st.lists(inner, max_size=3) | st.lists(inner, max_size=3).map(tuple),
     max_leaves=6,
 )
@@ -31,7 +34,9 @@ def describe(value: Any) -> Any:
     """The form of a value: its types, and the shapes of its arrays."""
     if isinstance(value, np.ndarray):
         return value.dtype, value.shape
-    return [type(value), *map(describe, value)] if isinstance(value, list | tuple) else type(value)
+    return (
+        [type(value), *map(describe, value)] if isinstance(value, list | tuple) else type(value)
+    )
 
 
 @given(values)

@@ -64,7 +64,9 @@ def test_a_sample_is_released_when_due_never_at_its_stamp(
 
 def test_no_delay_means_one_period() -> None:
     site = one_link(1000, 1000, 0)
-    outputs = stepped(site, [TickInput(0), *(TickInput(k, [sample(k - 1), sample(k)]) for k in range(1, 6))])
+    outputs = stepped(
+        site, [TickInput(0), *(TickInput(k, [sample(k - 1), sample(k)]) for k in range(1, 6))]
+    )
     assert [o.used for o in outputs] == [[-1], [0], [1], [2], [3], [4]]
 
 

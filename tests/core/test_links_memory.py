@@ -51,7 +51,9 @@ def test_a_link_of_100_ms_takes_less_than_a_mebibyte(kind: str) -> None:
     """At 1 kHz and at 4 kHz, whatever the arms, the laws and the distribution."""
     source, changes = SCENARIOS[kind]
     for rate_hz in (1000, 4000):
-        scenario = load_scenario(source, {"rate_hz": rate_hz, "link.delay_ms": 100.0, **changes})
+        scenario = load_scenario(
+            source, {"rate_hz": rate_hz, "link.delay_ms": 100.0, **changes}
+        )
         for name in scenario.names:
             setup = scenario.setup(name)
             arrays = Site(setup)._arrays
@@ -71,7 +73,9 @@ def wide(site: Site, pages: int) -> Site:
 ORDERS = st.one_of(
     st.none(),
     st.builds(lambda us: LinkModel(location=float(us)), st.integers(0, 10_000_000)),
-    st.sampled_from([KINDS["gamma"], KINDS["ar1"], KINDS["in order"], KINDS["copies"], KINDS["lognormal"]]),
+    st.sampled_from(
+        [KINDS["gamma"], KINDS["ar1"], KINDS["in order"], KINDS["copies"], KINDS["lognormal"]]
+    ),
 )
 
 
@@ -111,7 +115,10 @@ def test_a_delay_that_is_ordered_to_grow_loses_no_sample() -> None:
     """From 1 ms to ten seconds: every sample that is sent comes into use when it is due."""
     site = one_link(1000, 1000, 1_000_000)
     order = CoreChange("longer", 0, LinkModel(from_ns=1_000_000_000, location=9_999_000.0))
-    ticks = (TickInput(k, [sample(k - 1)] if k else [], [order] if k == 800 else []) for k in range(13_000))
+    ticks = (
+        TickInput(k, [sample(k - 1)] if k else [], [order] if k == 800 else [])
+        for k in range(13_000)
+    )
     used = [record.used[0] for record in stepped(site, ticks)]
     assert used[1000:10_999] == [999] * 9999
     assert used[10_999:] == list(range(1000, 3001))
@@ -120,7 +127,9 @@ def test_a_delay_that_is_ordered_to_grow_loses_no_sample() -> None:
 
 def test_what_is_under_way_survives_the_widening() -> None:
     """Also what a law's peer sends, and of every peer."""
-    scenario = load_scenario("paper", {"link.delay_ms": 100.0, "control.law": "tests.channel_law:Talking"})
+    scenario = load_scenario(
+        "paper", {"link.delay_ms": 100.0, "control.law": "tests.channel_law:Talking"}
+    )
     setups = [scenario.setup("m1")] * 2
     small, large = Site(setups[0]), wide(Site(setups[1]), 1 << 15)
     for k in range(400):
@@ -142,11 +151,15 @@ def many(count: int, rate_hz: int, delay_ms: float) -> str:
     """The text of so many sites, each of which follows the one before it."""
     names = [f"a{n}" for n in range(count)]
     sites = "".join(f"[sites.{name}]\n" for name in names)
-    rows = "".join(f"[dominance.{name}]\n{names[n - 1]} = 1.0\n" for n, name in enumerate(names))
+    rows = "".join(
+        f"[dominance.{name}]\n{names[n - 1]} = 1.0\n" for n, name in enumerate(names)
+    )
     return f"name = 'x'\nrate_hz = {rate_hz}\n[link]\ndelay_ms = {delay_ms}\n{sites}{rows}"
 
 
-@pytest.mark.parametrize(("count", "rate_hz"), [(3, 4000), (8, 1000), (12, 1000), (12, 4000), (32, 1000)])
+@pytest.mark.parametrize(
+    ("count", "rate_hz"), [(3, 4000), (8, 1000), (12, 1000), (12, 4000), (32, 1000)]
+)
 def test_what_virtual_time_takes_a_recorder_takes(count: int, rate_hz: int) -> None:
     scenario = parse_scenario(many(count, rate_hz, 100.0))
     assert parse_embedded(scenario.text).names == scenario.names
@@ -183,7 +196,10 @@ def test_links_stay_within_the_limit_and_count_the_rest() -> None:
     tight._room.most_pages = 1024
     ahead = TickInput(0, [sample(m) for m in (0, 500, 900, 1100, 5000)])
     for site in (free, tight):
-        used = [record.used[0] for record in stepped(site, [ahead, *(TickInput(k) for k in range(1, 1000))])]
+        used = [
+            record.used[0]
+            for record in stepped(site, [ahead, *(TickInput(k) for k in range(1, 1000))])
+        ]
         assert used[-1] == 900
     assert free.counts()[0].refused == 0
     assert tight.counts()[0].refused == 2

@@ -33,11 +33,15 @@ RULES = HandRules(size=2, rate_hz=1000, speed_limit=1.5)
 ARM = (1.0, 0.5)
 
 
-def run(messages: dict[int, Sequence[HandCommand]], ticks: int, rules: HandRules = RULES) -> list[HandStep]:
+def run(
+    messages: dict[int, Sequence[HandCommand]], ticks: int, rules: HandRules = RULES
+) -> list[HandStep]:
     """Returns what a hand does in each tick, with the messages that come in before some of them."""
     memory, steps = HandMemory(), []
     for k in range(ticks):
-        step = advance_hand(rules, memory, k * 10**9 // rules.rate_hz, messages.get(k, ()), lambda: ARM)
+        step = advance_hand(
+            rules, memory, k * 10**9 // rules.rate_hz, messages.get(k, ()), lambda: ARM
+        )
         memory = step.memory
         steps.append(step)
     return steps
@@ -48,9 +52,17 @@ def hands(steps: list[HandStep]) -> list[HandInForce]:
     return [HandInForce.read(step.vector) for step in steps]
 
 
-def at(k: int, target: tuple[float, ...], n: int | None = None, **fields: Any) -> dict[int, Any]:
+def at(
+    k: int, target: tuple[float, ...], n: int | None = None, **fields: Any
+) -> dict[int, Any]:
     """Returns a message of hand 7 that comes at tick k."""
-    one = {"source": 7, "number": k if n is None else n, "grip": True, "target": target, "sent_ns": k * 10**6}
+    one = {
+        "source": 7,
+        "number": k if n is None else n,
+        "grip": True,
+        "target": target,
+        "sent_ns": k * 10**6,
+    }
     return {k: [HandCommand(**{**one, **fields})]}
 
 
@@ -100,7 +112,10 @@ def test_a_silent_hand_lets_go_and_fades() -> None:
 
 def test_who_lets_go_is_followed_by_whoever_takes_hold_next() -> None:
     release = at(50, (), n=50, grip=False)
-    second = {40: [HandCommand(9, 0, True, (2.0, 2.0), 0)], 160: [HandCommand(9, 1, True, (1.0, 0.6), 0)]}
+    second = {
+        40: [HandCommand(9, 0, True, (2.0, 2.0), 0)],
+        160: [HandCommand(9, 1, True, (1.0, 0.6), 0)],
+    }
     steps = run(at(0, (1.1, 0.5)) | release | second, 200)
     assert steps[40].refused == (ANOTHER_HOLDS,)
     assert steps[50].changes == ((7, RELEASED),)
@@ -116,7 +131,11 @@ def test_who_takes_hold_of_fading_grip_goes_on_from_it(source: int, from_arm: bo
     """After 20 ms of fading the grip was 0.79, and fell to 0 in one tick."""
     rules = RULES._replace(from_arm=from_arm)
     again = {220: [HandCommand(source, 220, True, (1.0, 0.6), 0)]}
-    steps = run(at(0, (1.1, 0.5)) | at(150, (1.1, 0.5), n=0) | at(199, (), grip=False) | again, 400, rules)
+    steps = run(
+        at(0, (1.1, 0.5)) | at(150, (1.1, 0.5), n=0) | at(199, (), grip=False) | again,
+        400,
+        rules,
+    )
     assert [steps[k].changes for k in (199, 220)] == [((7, RELEASED),), ((source, TAKEN),)]
     held = hands(steps)
     assert held[220].grip == pytest.approx(0.79)
@@ -129,7 +148,10 @@ def test_who_takes_hold_of_fading_grip_goes_on_from_it(source: int, from_arm: bo
 
 def test_a_message_that_was_overtaken_changes_nothing() -> None:
     """Also one that comes after the same hand has let go: it does not take hold again."""
-    late = {30: [HandCommand(7, 5, True, (9.0, 9.0), 0)], 70: [HandCommand(7, 49, True, (9.0, 9.0), 0)]}
+    late = {
+        30: [HandCommand(7, 5, True, (9.0, 9.0), 0)],
+        70: [HandCommand(7, 49, True, (9.0, 9.0), 0)],
+    }
     steps = run(at(10, (1.1, 0.5)) | at(50, (), n=50, grip=False) | late, 200)
     assert steps[30].refused == steps[70].refused == (OUT_OF_ORDER,)
     assert steps[-1].vector == free_hand(2)
@@ -168,7 +190,9 @@ def test_a_grip_never_jumps_and_its_target_keeps_its_limit(messages: Any) -> Non
         if before.source and now.source == before.source and now.grip > 0.0:
             moved = math.dist(before.target, now.target)
             assert moved <= 1.5e-3 + 1e-12
-    assert all(math.isfinite(x) for hand in steps for x in (*hand.target, *hand.rate, hand.grip))
+    assert all(
+        math.isfinite(x) for hand in steps for x in (*hand.target, *hand.rate, hand.grip)
+    )
 
 
 # The acceleration of a target
@@ -179,7 +203,9 @@ H_S = 1e-3
 
 
 @given(
-    speed=st.floats(1e-6, 10.0), acceleration=st.floats(0.1, 100.0), h_s=st.sampled_from([1e-4, 1e-3, 5e-3])
+    speed=st.floats(1e-6, 10.0),
+    acceleration=st.floats(0.1, 100.0),
+    h_s=st.sampled_from([1e-4, 1e-3, 5e-3]),
 )
 def test_the_way_from_the_stopping_speed_is_the_distance(
     speed: float, acceleration: float, h_s: float
@@ -240,11 +266,16 @@ def test_uneven_messages_of_a_device_never_jerk_its_force(gap: int) -> None:
     messages: dict[int, Any] = {}
     for k in range(0, 3000, 10):
         place = (1.0 + 0.1 * math.sin(3.0 * k * H_S), 0.5)
-        arrives = k + gap if (k // 100) % 2 else k  # every other 100 ms the machine hands over late
+        # every other 100 ms the machine hands over late
+        arrives = k + gap if (k // 100) % 2 else k
         messages.setdefault(arrives - arrives % gap, []).extend(at(k, place)[k])
     for limits, least, most in ((LIMITED, 0.0, 0.85), (RULES, 0.0 if gap == 10 else 2.0, 40.0)):
         steps = hands(run(messages, 3000, limits))
-        force = [stiffness_n_m * now.target[0] + damping_n_s_m * now.rate[0] for now in steps if now.source]
+        force = [
+            stiffness_n_m * now.target[0] + damping_n_s_m * now.rate[0]
+            for now in steps
+            if now.source
+        ]
         assert least <= np.abs(np.diff(force)).max() <= most + 1e-9
 
 

@@ -9,7 +9,10 @@ import pytest
 import trilat_net
 from tests.core.guarded_runs import reasons
 from tests.virtual_runs import sampled, trajectories
-from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
+from trilat_net.analysis.certificate.energy_balance import (
+    compute_energy_balance,
+    compute_site_energies,
+)
 from trilat_net.analysis.dominance_history import list_losses, trace_dominance
 from trilat_net.core.lost_peers import BACK_NS
 from trilat_net.core.ticks import LifeReason
@@ -19,13 +22,19 @@ from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import Scenario, load_scenario
 
-RULE = {"on_stale.action": "glide", "on_stale.on_lost": "degrade", "on_stale.align_limit_rad": 2.0}
+RULE = {
+    "on_stale.action": "glide",
+    "on_stale.on_lost": "degrade",
+    "on_stale.align_limit_rad": 2.0,
+}
 
 
 def scenario(*cuts: str, **more: Any) -> Scenario:
     """The paper's, with a delay of 100 ms; links that are cut lose what is stamped from 3 s to 4 s."""
     outages = {f"links.{cut}.outages_s": [[3.0, 4.0]] for cut in cuts}
-    return load_scenario("paper", {**RULE, "duration_s": 6.0, "link.delay_ms": 100.0, **outages, **more})
+    return load_scenario(
+        "paper", {**RULE, "duration_s": 6.0, "link.delay_ms": 100.0, **outages, **more}
+    )
 
 
 @functools.cache
@@ -74,7 +83,10 @@ def test_it_is_executed_again_and_its_energies_close() -> None:
     ticks, fused = trajectories(plan), sampled(plan, (6.0,))[:, 0]
     columns = plan.layout("s").columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
-        assert all((getattr(site, name)[-1] == row[columns[name]]).all() for name in ("q", "tau", "q_des"))
+        assert all(
+            (getattr(site, name)[-1] == row[columns[name]]).all()
+            for name in ("q", "tau", "q_des")
+        )
     balance = compute_energy_balance(compute_site_energies(log))
     assert np.abs(balance.residual).max() <= 1e-4 * np.abs(balance.V).max()
     assert list_losses(log) == ["m2 without m1 3.12 to 4.35 s", "s without m1 3.12 to 4.35 s"]
@@ -108,6 +120,8 @@ def test_nobody_is_dropped_without_whom_the_others_are_no_group() -> None:
         ("paper", {**RULE, "on_stale.on_lost": "drop"}, "'hold' or 'degrade'"),
     ],
 )
-def test_a_rule_that_cannot_be_kept_is_refused(name: str, overrides: dict[str, Any], words: str) -> None:
+def test_a_rule_that_cannot_be_kept_is_refused(
+    name: str, overrides: dict[str, Any], words: str
+) -> None:
     with pytest.raises(ScenarioError, match=words):
         load_scenario(name, overrides)

@@ -24,7 +24,9 @@ def acted(hand: OwnHand, k: int) -> HandInForce:
     return HandInForce.read(hand.advance(k, lambda: PLACE).vector)
 
 
-def run(decisions: dict[int, tuple[int, Sequence[float] | None]], delay: int = DELAY) -> list[HandInForce]:
+def run(
+    decisions: dict[int, tuple[int, Sequence[float] | None]], delay: int = DELAY
+) -> list[HandInForce]:
     """Returns what a hand does at every tick, of decisions by the tick at which they come."""
     hand = make_hand(delay)
     found = []
@@ -102,13 +104,20 @@ def test_a_goal_that_is_none_is_refused(goal: tuple[float, ...], problem: str) -
 
 
 @given(
-    st.lists(st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)) | st.none(), min_size=1, max_size=14),
+    st.lists(
+        st.tuples(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0)) | st.none(),
+        min_size=1,
+        max_size=14,
+    ),
     st.integers(0, 45),
     st.floats(0.05, 2.0),
     st.just(math.inf) | st.floats(1.0, 100.0),
 )
 def test_compiled_spans_are_the_ticks_bit_for_bit(
-    goals: list[tuple[float, float] | None], delay: int, speed_limit: float, acceleration_limit: float
+    goals: list[tuple[float, float] | None],
+    delay: int,
+    speed_limit: float,
+    acceleration_limit: float,
 ) -> None:
     """Goals come at every 20th tick, and then none for longer than a silence that lets go."""
     rules = HandRules(

@@ -42,10 +42,22 @@ def test_any_counter_and_key_as_defined(counter: tuple[int, ...], key: tuple[int
     assert drawn(counter, key) == philox_in_integers(counter, key)
 
 
-@given(key=st.integers(0, 2**64 - 1), sample=st.integers(0, 2**40), purpose=words, attempt=st.integers(0, 63))
-def test_uniforms_are_words_of_their_own_place(key: int, sample: int, purpose: int, attempt: int) -> None:
-    a, b, c, d = philox_in_integers((sample & U32, sample >> 32, purpose, attempt), (key & U32, key >> 32))
-    expected = (((a >> 6 << 26) + (b >> 6) + 0.5) / 2**52, ((c >> 6 << 26) + (d >> 6) + 0.5) / 2**52)
+@given(
+    key=st.integers(0, 2**64 - 1),
+    sample=st.integers(0, 2**40),
+    purpose=words,
+    attempt=st.integers(0, 63),
+)
+def test_uniforms_are_words_of_their_own_place(
+    key: int, sample: int, purpose: int, attempt: int
+) -> None:
+    a, b, c, d = philox_in_integers(
+        (sample & U32, sample >> 32, purpose, attempt), (key & U32, key >> 32)
+    )
+    expected = (
+        ((a >> 6 << 26) + (b >> 6) + 0.5) / 2**52,
+        ((c >> 6 << 26) + (d >> 6) + 0.5) / 2**52,
+    )
     assert uniforms(np.uint64(key), sample, purpose, attempt) == expected
 
 
@@ -55,7 +67,11 @@ def test_the_ends_of_the_open_interval() -> None:
 
 
 def test_links_and_seeds_have_keys_of_their_own() -> None:
-    keys = {link_key(seed, link) for seed in range(20) for link in ("m1->s", "s->m1", "m2->s", "m1->s2")}
+    keys = {
+        link_key(seed, link)
+        for seed in range(20)
+        for link in ("m1->s", "s->m1", "m2->s", "m1->s2")
+    }
     assert len(keys) == 80
     assert all(0 <= key < 2**64 for key in keys)
 

@@ -13,8 +13,18 @@ from trilat_net.scenario import load_scenario
 BUDGET_MS = 200.0
 BELOW: dict[str, dict[str, Any]] = {
     "uniform": {"model": "uniform", "delay_ms": 100.0, "half_width_ms": 99.9},
-    "uniform in order": {"model": "uniform", "delay_ms": 100.0, "half_width_ms": 99.9, "order": "in_order"},
-    "with copies": {"model": "uniform", "delay_ms": 100.0, "half_width_ms": 99.9, "duplicate": 0.3},
+    "uniform in order": {
+        "model": "uniform",
+        "delay_ms": 100.0,
+        "half_width_ms": 99.9,
+        "order": "in_order",
+    },
+    "with copies": {
+        "model": "uniform",
+        "delay_ms": 100.0,
+        "half_width_ms": 99.9,
+        "duplicate": 0.3,
+    },
     "normal": {"model": "normal", "delay_ms": 80.0, "deviation_ms": 15.0},
     "ar1": {"model": "ar1", "delay_ms": 100.0, "deviation_ms": 15.0, "correlation": 0.95},
     "sine": {"model": "sine", "delay_ms": 100.0, "amplitude_ms": 100.0, "period_s": 0.7},
@@ -47,7 +57,12 @@ def test_it_holds_to_the_end_of_the_paper() -> None:
 
 
 def test_jitter_above_the_budget_is_not() -> None:
-    link = {"model": "uniform", "delay_ms": 150.0, "half_width_ms": 100.0, "playout_ms": BUDGET_MS}
+    link = {
+        "model": "uniform",
+        "delay_ms": 150.0,
+        "half_width_ms": 100.0,
+        "playout_ms": BUDGET_MS,
+    }
     made = trajectory("free", {"link": link, "duration_s": 2.0})
     constant = run("free", {"duration_s": 2.0, "link.delay_ms": BUDGET_MS})
     assert not same_bits(made, constant)
@@ -57,7 +72,9 @@ def test_jitter_above_the_budget_is_not() -> None:
 def outputs(overrides: dict[str, Any]) -> list[TickRecord]:
     return [
         step.output
-        for step in virtual.execute_virtual(load_scenario("free", {"duration_s": 1.0, **overrides}))
+        for step in virtual.execute_virtual(
+            load_scenario("free", {"duration_s": 1.0, **overrides})
+        )
     ]
 
 

@@ -42,7 +42,9 @@ def run_by_hand(scenario: Scenario, ticks: int = TICKS) -> dict[str, list[TickRe
 
 
 def test_a_compiled_law_gives_the_bits_of_the_plain_one() -> None:
-    a, b = (run_by_hand(linked(f"tests.plugged_laws:{law}")) for law in ("Line", "CompiledLine"))
+    a, b = (
+        run_by_hand(linked(f"tests.plugged_laws:{law}")) for law in ("Line", "CompiledLine")
+    )
     assert a == b
     last = a["s"][-1]
     assert last.ch[0] != 0.0  # the energy, then what each of the two masters gets
@@ -69,10 +71,16 @@ def test_a_law_sees_peers_external_torque_and_its_past() -> None:
     pulse = {"kind": "pulse", "start_s": 0.004, "end_s": 0.015, "peak_nm": [2.0, -1.0]}
     scenario = linked("tests.laws:Adaptive", "free", **{"sites.m1.hands": [pulse]})
     made: list[Watching] = []
-    setup = scenario.setup("m1")._replace(own=lambda facts: made.append(Watching(facts)) or made[-1])
+    setup = scenario.setup("m1")._replace(
+        own=lambda facts: made.append(Watching(facts)) or made[-1]
+    )
     site, records = Site(setup), []
     for k in range(20):
-        arrived = [Arrival(1, k - 1, (0.1 * k, 0.2), (0.3, 0.4), 0, (0.5, -0.6))] if k % 4 == 3 else []
+        arrived = (
+            [Arrival(1, k - 1, (0.1 * k, 0.2), (0.3, 0.4), 0, (0.5, -0.6))]
+            if k % 4 == 3
+            else []
+        )
         records.append(site.step(TickInput(k, arrived)))
     for k, now in enumerate(made[0].seen):
         peer = now.peers[1]
@@ -94,7 +102,9 @@ def test_a_law_sees_peers_external_torque_and_its_past() -> None:
     gravity = [setup.g_m_s2 * th4 * math.cos(now.q[0]) + outer, outer]
     h, (v, w) = th2 * s2, now.qd
     np.testing.assert_allclose(now.gravity, gravity, rtol=1e-12)
-    np.testing.assert_allclose(now.inertia, [[th1 + 2 * th2 * c2, th3 + th2 * c2], [th3 + th2 * c2, th3]])
+    np.testing.assert_allclose(
+        now.inertia, [[th1 + 2 * th2 * c2, th3 + th2 * c2], [th3 + th2 * c2, th3]]
+    )
     coriolis = [-h * (2 * v * w + w * w), h * v * v]
     np.testing.assert_allclose(now.bias, np.add(gravity, coriolis), rtol=1e-12)
 
@@ -130,7 +140,9 @@ def test_what_numba_does_not_take_is_refused_with_its_reason(law: str) -> None:
 
 def test_a_law_may_lack_memory_and_its_vectors_have_arithmetic() -> None:
     whole, parts = (
-        trilat_net.simulate("two_sites", {"control.law": f"tests.plugged_laws:{law}"}, duration_s=0.2)
+        trilat_net.simulate(
+            "two_sites", {"control.law": f"tests.plugged_laws:{law}"}, duration_s=0.2
+        )
         for law in ("Arithmetic", "ByNumbers")
     )
     for site in whole:
@@ -141,7 +153,9 @@ def test_a_law_may_lack_memory_and_its_vectors_have_arithmetic() -> None:
 
 @pytest.mark.parametrize("law", ["Sums", "SumsEach"])
 def test_a_law_with_memory_says_so(law: str) -> None:
-    with pytest.raises(ScenarioError, match=rf"{law} writes self.sums: .* remembers = \('sums',\)"):
+    with pytest.raises(
+        ScenarioError, match=rf"{law} writes self.sums: .* remembers = \('sums',\)"
+    ):
         Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s"))
 
 
@@ -149,11 +163,16 @@ NUMBERS = st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3)
 
 
 @given(NUMBERS, NUMBERS, st.floats(0.1, 10.0))
-def test_arithmetic_of_vectors_is_that_of_arrays(a: list[float], b: list[float], x: float) -> None:
+def test_arithmetic_of_vectors_is_that_of_arrays(
+    a: list[float], b: list[float], x: float
+) -> None:
     for operate in (operator.add, operator.sub, operator.mul):
         expected = operate(np.array(a), np.array(b))
         for one, other in ((LawVector(a), LawVector(b)), (LawVector(a), b), (a, LawVector(b))):
-            if LawVector in (type(one), type(other)) and (type(one), operate) != (list, operator.mul):
+            if LawVector in (type(one), type(other)) and (type(one), operate) != (
+                list,
+                operator.mul,
+            ):
                 assert operate(one, other) == expected.tolist()
         assert np.array_equal(operate(LawVector(a), np.array(b)), expected)
         assert np.array_equal(operate(np.array(a), LawVector(b)), expected)
@@ -168,9 +187,14 @@ def test_arithmetic_of_vectors_is_that_of_arrays(a: list[float], b: list[float],
 
 
 def test_arithmetic_that_vectors_lack_says_what_has_it() -> None:
-    for law, fact in (("Squares", "as in numpy.asarray"), ("Mismatched", "arithmetic of 2 numbers with 3")):
+    for law, fact in (
+        ("Squares", "as in numpy.asarray"),
+        ("Mismatched", "arithmetic of 2 numbers with 3"),
+    ):
         with pytest.raises(LawFailed, match=fact):
-            trilat_net.simulate("two_sites", {"control.law": f"tests.plugged_laws:{law}"}, duration_s=0.1)
+            trilat_net.simulate(
+                "two_sites", {"control.law": f"tests.plugged_laws:{law}"}, duration_s=0.1
+            )
 
 
 FAILING = {
@@ -181,7 +205,10 @@ FAILING = {
 
 @pytest.mark.parametrize("law", FAILING)
 def test_a_compiled_law_that_fails_is_named_with_its_tick(law: str) -> None:
-    site, (tick, problem) = Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s")), FAILING[law]
+    site, (tick, problem) = (
+        Site(linked(f"tests.plugged_laws:{law}", "two_sites").setup("s")),
+        FAILING[law],
+    )
     for k in range(tick):
         site.step(TickInput(k))
     with pytest.raises(LawFailed, match=f"{law} of s failed at tick {tick}: {problem}"):
@@ -191,12 +218,17 @@ def test_a_compiled_law_that_fails_is_named_with_its_tick(law: str) -> None:
 @pytest.mark.long
 def test_on_chain_plain_compiled_and_fused_have_same_bits() -> None:
     """Its inertia, bias and gravity are used."""
-    scenarios = [linked(f"tests.plugged_laws:{law}", "six_joints") for law in ("Line", "CompiledLine")]
-    a, b = (run_by_hand(scenario, 30) for scenario in scenarios)  # soon after that the arms diverge
+    scenarios = [
+        linked(f"tests.plugged_laws:{law}", "six_joints") for law in ("Line", "CompiledLine")
+    ]
+    # soon after that the arms diverge
+    a, b = (run_by_hand(scenario, 30) for scenario in scenarios)
     assert a == b
     for scenario in scenarios:
         fused = FusedRun(scenario)
         fused.advance(0.03)
         for name, row in zip(scenario.names, fused.records, strict=True):
             fields = scenario.layout(name).columns()
-            assert row.tolist() == [number for field in fields for number in getattr(a[name][-1], field)]
+            assert row.tolist() == [
+                number for field in fields for number in getattr(a[name][-1], field)
+            ]

@@ -10,7 +10,10 @@ import trilat_net
 from tests.core.guarded_runs import largest_step, ordered
 from tests.core.task_sites import POSE, build
 from tests.task_arms import posed_arms
-from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
+from trilat_net.analysis.certificate.energy_balance import (
+    compute_energy_balance,
+    compute_site_energies,
+)
 from trilat_net.analysis.certificate.energy_terms import measure_torque_error
 from trilat_net.core.resting import rests
 from trilat_net.core.session_life import update_session_life
@@ -26,7 +29,9 @@ OWN = Rotation.from_rotvec([0.4, -0.9, 0.3])
 PEERS = Rotation.from_rotvec([-0.2, 0.5, 1.4])
 
 
-def drive(spin: tuple[float, float, float], heard: list[tuple[int, int]], ticks: int) -> dict[str, Array]:
+def drive(
+    spin: tuple[float, float, float], heard: list[tuple[int, int]], ticks: int
+) -> dict[str, Array]:
     """The reference of a site whose peers turn with this angular velocity, and are heard in some ticks.
 
     While they are not, their reference stays where it was, as a sample in use does. The arm is where its
@@ -35,7 +40,12 @@ def drive(spin: tuple[float, float, float], heard: list[tuple[int, int]], ticks:
     arrays = build(POSE)
     s: Row = arrays.site[0]
     link: Row = arrays.links[0]
-    s.on_stale, s.stale_ns, s.align_speed, s.align_limit = StaleAction.GLIDE, 20_000_000, SPEED, 3.0
+    s.on_stale, s.stale_ns, s.align_speed, s.align_limit = (
+        StaleAction.GLIDE,
+        20_000_000,
+        SPEED,
+        3.0,
+    )
     s.x[3:] = OWN.as_rotvec()
     rows = []
     last = 0
@@ -52,13 +62,20 @@ def drive(spin: tuple[float, float, float], heard: list[tuple[int, int]], ticks:
             rate = np.array(s.xd[3:]) * max(
                 0.0, 1.0 - 1.0 / max(1.0, 100.0 - (t_ns - s.return_from_ns) / 1e6)
             )
-            moved = Rotation.from_rotvec(0.5e-3 * (rate + s.xd[3:])) * Rotation.from_rotvec(np.array(s.x[3:]))
+            moved = Rotation.from_rotvec(0.5e-3 * (rate + s.xd[3:])) * Rotation.from_rotvec(
+                np.array(s.x[3:])
+            )
             s.x[3:], s.xd[3:] = moved.as_rotvec(), rate
         else:
             s.x[3:], s.xd[3:] = s.q_des[3:], s.qd_des[3:]
         rows.append((s.mode, *s.q_des[3:], *s.qd_des[3:], *there.as_rotvec()))
     table = np.array(rows)
-    return {"mode": table[:, 0], "turn": table[:, 1:4], "rate": table[:, 4:7], "peers": table[:, 7:]}
+    return {
+        "mode": table[:, 0],
+        "turn": table[:, 1:4],
+        "rate": table[:, 4:7],
+        "peers": table[:, 7:],
+    }
 
 
 def steps(turns: Array) -> Array:
@@ -102,7 +119,10 @@ def test_neither_orientation_nor_velocity_jumps_while_peers_fall_silent() -> Non
     assert np.ptp(run["turn"][3630:4600], axis=0).max() <= 1e-12
     assert holding[3521:4600].all()
     following = modes == Mode.RUN
-    apart = Rotation.from_rotvec(run["turn"][following]) * Rotation.from_rotvec(run["peers"][following]).inv()
+    apart = (
+        Rotation.from_rotvec(run["turn"][following])
+        * Rotation.from_rotvec(run["peers"][following]).inv()
+    )
     assert apart.magnitude().max() <= 1e-12
 
 
@@ -112,7 +132,12 @@ def test_farther_than_limit_is_not_gone_to_by_whole_turn() -> None:
     arrays = build(POSE)
     s: Row = arrays.site[0]
     link: Row = arrays.links[0]
-    s.on_stale, s.stale_ns, s.align_speed, s.align_limit = StaleAction.GLIDE, 20_000_000, SPEED, 1.1
+    s.on_stale, s.stale_ns, s.align_speed, s.align_limit = (
+        StaleAction.GLIDE,
+        20_000_000,
+        SPEED,
+        1.1,
+    )
     link.used, link.used_ns = 0, 0
     s.q_des[3:] = 1.8 / np.sqrt(3.0)
     update_session_life(0, s, arrays.links)
@@ -135,7 +160,9 @@ def posed() -> Log:
     """Three arms that agree on a pose, none of which hears another from 2.04 to 4.04 s."""
     text = posed_arms(5.0).replace("[link]", GLIDES)
     far = "posture_rad = [1.2, -0.3, -0.9, -1.6, -0.3, 1.4, 0.25] }"
-    text = text.replace("posture_rate_1_s = 0.6, scale = 1.1 }", f"posture_rate_1_s = 0.6, {far}")
+    text = text.replace(
+        "posture_rate_1_s = 0.6, scale = 1.1 }", f"posture_rate_1_s = 0.6, {far}"
+    )
     return trilat_net.simulate(parse_scenario(text))
 
 
@@ -164,17 +191,18 @@ def test_a_held_arm_returns_when_pushed_in_its_free_motion() -> None:
     """By the motion in which its end effector stays; it goes back by 3/s, less what its law damps."""
     text = posed_arms(6.5).replace("[link]", GLIDES.replace("4.0", "6.0"))
     text = text.replace('"adaptive"\nLambda = 1.5\nKp = 10.0', '"pd_d"\nd = 10.0\nK = 60.0')
-    text = text.replace("Gamma = 1.0\n", "").replace("posture_rate_1_s = 0.6", "posture_rate_1_s = 0.0")
-    push = (
-        '{ kind = "pulse", start_s = 2.5, end_s = 3.5, peak_nm = [53.9, 0.0, -40.6, 0.0, -13.3, 0.0, 11.9] }'
+    text = text.replace("Gamma = 1.0\n", "").replace(
+        "posture_rate_1_s = 0.6", "posture_rate_1_s = 0.0"
     )
+    push = '{ kind = "pulse", start_s = 2.5, end_s = 3.5, peak_nm = [53.9, 0.0, -40.6, 0.0, -13.3, 0.0, 11.9] }'
     text = text.replace("q0_rad = [0.0, -0.3", f"hands = [{push}]\nq0_rad = [0.0, -0.3")
     part = trilat_net.simulate(parse_scenario(text))["s"]
     first = int(np.argmax(part.mode == "hold"))
     assert np.abs(part.q[5999] - part.q[first]).max() <= 0.02
     off = np.abs(part.q[first:6000] - part.q[5999]).max(axis=1)
     assert off.max() >= 0.2
-    assert np.abs(part.x[first + 400 : 6000, :3] - part.x[first + 400, :3]).max() <= 0.05  # at rest by then
+    # at rest by then
+    assert np.abs(part.x[first + 400 : 6000, :3] - part.x[first + 400, :3]).max() <= 0.05
     falls = off[3700 - first : 4700 - first : 500]
     rate_1_s = 2.0 * np.log(falls[:-1] / falls[1:])
     assert ((rate_1_s >= 2.0) & (rate_1_s <= 3.0)).all()
@@ -190,7 +218,8 @@ def test_references_of_poses_in_session_are_integrals_of_their_velocities() -> N
         rest = rest[1:] & rest[:-1]
         off = steps(part.q_des[:, 3:]) - 0.5e-3 * (part.qd_des[1:, 3:] + part.qd_des[:-1, 3:])
         assert np.abs(off)[rest].max() <= 1e-9
-        begins = np.isin(part.mode[1:], ["hold"]) & ~np.isin(part.mode[:-1], ["hold"])  # leaves the peers'
+        # leaves the peers'
+        begins = np.isin(part.mode[1:], ["hold"]) & ~np.isin(part.mode[:-1], ["hold"])
         assert np.linalg.norm(steps(part.q_des[:, 3:]), axis=1)[~begins].max() <= 3e-3
         assert np.abs(np.diff(part.qd_des[:, 3:], axis=0)).max() <= 0.1
 
@@ -224,7 +253,9 @@ def test_arms_of_one_pose_stop_and_return_without_a_step() -> None:
     scenario = parse_scenario(text, "", {"limits.tau_rate_limit_nm_s": 500.0})
     orders = {"m2": {1200: "stop", 1500: "enable"}, "s": {3200: "arm_lost", 3600: "reset"}}
     log = ordered(scenario, orders)
-    assert {"stopped", "fault", "hold"} <= {str(mode) for site in log.sites for mode in log[site].mode}
+    assert {"stopped", "fault", "hold"} <= {
+        str(mode) for site in log.sites for mode in log[site].mode
+    }
     for site in log.sites:
         assert largest_step(log, site) <= 0.5 * (1.0 + 1e-9)
         assert set(log[site].mode[-200:]) == {"run"}

@@ -76,7 +76,9 @@ def test_storage_falls_by_what_is_dissipated(how: str) -> None:
 
     S is that of the adaptive law. w goes on by Euler's rule, whose own storage is less by 1/2 h w's.
     """
-    keys: dict[str, Any] = {"duration_s": 6.0, "outages_s": "[[1.0, 20.0]]"} if how == "cut" else {}
+    keys: dict[str, Any] = (
+        {"duration_s": 6.0, "outages_s": "[[1.0, 20.0]]"} if how == "cut" else {}
+    )
     text = adaptive_text().replace("[[sites.m.hands]]", "[[sites.s.hands]]")
     limits = {**LIMITS, "tau_rate_limit_nm_s": 1e6}  # no limit acts
     log = ordered(guarded(limits, text, **keys), {} if how == "cut" else {"m": {1500: "stop"}})
@@ -116,12 +118,17 @@ class Broken:
 
 
 def test_an_arm_whose_law_failed_is_held_where_it_is() -> None:
-    text = TEXT.replace('law = "pd_d"\nK = 60.0\nKd = 4.0\nd = 12.0', f'law = "{__name__}:Broken"')
+    text = TEXT.replace(
+        'law = "pd_d"\nK = 60.0\nKd = 4.0\nd = 12.0', f'law = "{__name__}:Broken"'
+    )
     log = trilat_net.simulate(guarded({}, text, duration_s=4.0))
     part = log["s"]
     assert set(part.mode[2000:]) == {"fault"}
     assert np.abs(part.q[2000:] - part.q[2000]).max() <= 0.02
-    assert np.abs(part.tau[-1] - gravity_of(log.scenario.arms["s"].theta, part.q[-1:])).max() <= 1e-3
+    assert (
+        np.abs(part.tau[-1] - gravity_of(log.scenario.arms["s"].theta, part.q[-1:])).max()
+        <= 1e-3
+    )
     assert verify(log).identical == 8000
 
 
@@ -153,8 +160,15 @@ def test_credible_estimates_are_those_that_the_motors_can_hold() -> None:
     moment = 200.0 / 9.81
     assert gains.low == (0.0,) * 5
     assert gains.high == pytest.approx((2.0 * moment, moment, moment, moment, moment))
-    own = {"control.law": "adaptive_box", "control.theta_low": [-1.0] * 5, "control.theta_high": [9.0] * 5}
-    assert load_scenario("free", {"on_stale.action": "glide", **own}).setup("m1").gains.high == (9.0,) * 5
+    own = {
+        "control.law": "adaptive_box",
+        "control.theta_low": [-1.0] * 5,
+        "control.theta_high": [9.0] * 5,
+    }
+    assert (
+        load_scenario("free", {"on_stale.action": "glide", **own}).setup("m1").gains.high
+        == (9.0,) * 5
+    )
     assert np.isinf(load_scenario("free").setup("m1").gains.high).all()
 
 
@@ -197,8 +211,14 @@ def stop_at_instants(log: Log, count: int, ticks: int = 1700) -> Iterator[Stop]:
         site = Site(log.scenario.setup(part.name))
         site.resume(*(read_output(part.states[row], part.peers) for row in (at - 2, at - 1)))
         order = [CoreChange("stop", order=LifeOrder.STOP)]
-        made = [site.step(TickInput(k, commands=order if k == at else ())) for k in range(at, at + ticks)]
-        qd, q = np.array([record.qd for record in made]), np.array([record.q for record in made])
+        made = [
+            site.step(TickInput(k, commands=order if k == at else ()))
+            for k in range(at, at + ticks)
+        ]
+        qd, q = (
+            np.array([record.qd for record in made]),
+            np.array([record.q for record in made]),
+        )
         speed = np.abs(qd).max(axis=1)
         pushed = np.array([record.tau_x for record in made])
         given = yielding(log.scenario.setup(part.name).rest, pushed, part.rate_hz)
@@ -215,7 +235,9 @@ def yielding(gains: RestGains, tau_x: Array, rate_hz: int) -> Array:
     t = np.arange(len(tau_x))[:, None] / rate_hz
     answer = t * np.exp(-t / (2.0 * gains.time_s)) / (np.array(gains.damping) * gains.time_s)
     steps = np.diff(tau_x, axis=0, prepend=tau_x[:1])
-    return np.stack([np.convolve(a, b)[: len(t)] for a, b in zip(steps.T, answer.T, strict=True)], axis=-1)
+    return np.stack(
+        [np.convolve(a, b)[: len(t)] for a, b in zip(steps.T, answer.T, strict=True)], axis=-1
+    )
 
 
 def largest_fall(scenario: Scenario, site: str) -> tuple[float, float]:
@@ -223,9 +245,13 @@ def largest_fall(scenario: Scenario, site: str) -> tuple[float, float]:
     arm, rows = scenario.arms[site], build_arm_rows(scenario, site)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (200, arm.counts.joints))
     still = np.zeros_like(q)
-    G = rows.law_torque(np.broadcast_to(arm.theta, (200, len(arm.theta))), q, still, still, still)
+    G = rows.law_torque(
+        np.broadcast_to(arm.theta, (200, len(arm.theta))), q, still, still, still
+    )
     unit = np.eye(arm.counts.joints)
-    M = np.stack([rows.multiply_inertia(q, np.broadcast_to(row, q.shape)) for row in unit], axis=-1)
+    M = np.stack(
+        [rows.multiply_inertia(q, np.broadcast_to(row, q.shape)) for row in unit], axis=-1
+    )
     return float(np.abs(np.linalg.solve(M, G[..., None])).max()), float(np.abs(G).max())
 
 
@@ -249,7 +275,9 @@ def assert_stops(log: Log, count: int) -> None:
     gives = {site: gravity_gives(log.scenario, site) for site in log.scenario.names}
     for stop in stop_at_instants(log, count):
         part, still = log[stop.site], log.scenario.setup(stop.site).rest
-        torque = np.abs(part.qd[stop.at] - part.qd[stop.at - 1]).max() * part.rate_hz * still.time_s
+        torque = (
+            np.abs(part.qd[stop.at] - part.qd[stop.at - 1]).max() * part.rate_hz * still.time_s
+        )
         given = max(gives[stop.site][stop.at < 100], torque)
         assert stop.most_rad_s <= max(1.1 * stop.begin_rad_s + given, AT_REST_RAD_S), stop
         assert stop.rest_s <= REST_WITHIN_S, stop
@@ -266,7 +294,11 @@ def test_a_stop_at_ten_instants_ends_in_rest() -> None:
 
 RUNS = [
     *(("two_sites", law, settings) for law, settings in TWO.items()),
-    *((name, law, settings) for law, settings in THREE.items() for name in ("free", "paper", "handover")),
+    *(
+        (name, law, settings)
+        for law, settings in THREE.items()
+        for name in ("free", "paper", "handover")
+    ),
     *(("six_joints", law, {}) for law in CHAINS),
 ]
 
@@ -279,5 +311,7 @@ def test_every_law_is_stopped_in_some_run() -> None:
 @pytest.mark.parametrize(
     ("name", "law", "settings"), RUNS, ids=lambda value: value if isinstance(value, str) else ""
 )
-def test_a_stop_at_two_hundred_instants_ends_in_rest(name: str, law: str, settings: dict[str, Any]) -> None:
+def test_a_stop_at_two_hundred_instants_ends_in_rest(
+    name: str, law: str, settings: dict[str, Any]
+) -> None:
     assert_stops(run_of(name, law, settings), 200)

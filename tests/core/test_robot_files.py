@@ -164,7 +164,10 @@ def read_robot(file: str) -> str:
     root = ElementTree.parse(robot_files()[file]).getroot()
     links = {link.get("name") for link in root.findall("link")}
     for joint in root.findall("joint"):
-        for element, key in ((joint, "name"), *((mimic, "joint") for mimic in joint.findall("mimic"))):
+        for element, key in (
+            (joint, "name"),
+            *((mimic, "joint") for mimic in joint.findall("mimic")),
+        ):
             if element.get(key) in links:
                 element.set(key, f"{element.get(key)} joint")
     return ElementTree.tostring(root, encoding="unicode")
@@ -183,8 +186,12 @@ def test_every_file_is_in_the_list() -> None:
     assert listed == robot_files().keys()
 
 
-@pytest.mark.parametrize(("file", "tip", "reason"), [(file, *why) for file, why in REFUSED.items()])
-def test_a_file_without_a_chain_is_refused_with_the_reason(file: str, tip: str, reason: str) -> None:
+@pytest.mark.parametrize(
+    ("file", "tip", "reason"), [(file, *why) for file, why in REFUSED.items()]
+)
+def test_a_file_without_a_chain_is_refused_with_the_reason(
+    file: str, tip: str, reason: str
+) -> None:
     with pytest.raises(ScenarioError) as caught:
         read_urdf(robot_files()[file].read_text(), tip=tip)
     assert reason in str(caught.value)
@@ -228,10 +235,18 @@ HEAVY = LinkInertia(
 PANDA, SO_ARM = "panda_description/urdf/panda.urdf", "so_arm_description/urdf/so101.urdf"
 GIVEN = [
     (PANDA, "panda_hand_tcp", {"panda_link4": HEAVY, "panda_hand": LinkInertia(mass_kg=0.4)}),
-    (PANDA, "panda_hand_tcp", {"panda_leftfinger": HEAVY, "panda_link7": LinkInertia(com_m=(0.0, 0.1, 0.2))}),
+    (
+        PANDA,
+        "panda_hand_tcp",
+        {"panda_leftfinger": HEAVY, "panda_link7": LinkInertia(com_m=(0.0, 0.1, 0.2))},
+    ),
     (SO_ARM, "gripper_frame_link", {"moving_jaw_so101_v1_link": HEAVY}),
     (ROBOTS / "kinematics_only.urdf", "", {"yaw": HEAVY, "tool": LinkInertia(mass_kg=0.25)}),
-    (ROBOTS / "finger_inertia.urdf", "lower", {"finger": HEAVY, "upper": LinkInertia(mass_kg=3.0)}),
+    (
+        ROBOTS / "finger_inertia.urdf",
+        "lower",
+        {"finger": HEAVY, "upper": LinkInertia(mass_kg=3.0)},
+    ),
 ]
 
 
@@ -274,8 +289,12 @@ def check_dynamics(text: str, chain: UrdfChain) -> None:
         relative = base_pose.inverse() * tip_pose
         assert near(ours["tip_position"], relative.translation, 1e-12)
         assert near(ours["tip_rotation"], relative.rotation, 1e-12)
-        jacobian = pin.computeFrameJacobian(model, data, q, frame, pin.LOCAL_WORLD_ALIGNED).reshape(6, n)
-        assert near(ours["jacobian"], np.vstack([R.T @ jacobian[:3], R.T @ jacobian[3:]]), 1e-12)
+        jacobian = pin.computeFrameJacobian(
+            model, data, q, frame, pin.LOCAL_WORLD_ALIGNED
+        ).reshape(6, n)
+        assert near(
+            ours["jacobian"], np.vstack([R.T @ jacobian[:3], R.T @ jacobian[3:]]), 1e-12
+        )
         model.gravity.linear = R @ state["gravity"]
         torque = pin.rnea(model, data, q, state["qd"], state["a"])
         assert near(ours["inverse_dynamics"], torque, 1e-12)
@@ -298,16 +317,26 @@ def check_joints(chain: UrdfChain, model: pin.Model) -> None:
             if any(limits) and abs(limits[0]) < 1e9:
                 assert (joint.lower, joint.upper) == limits
         stated = model.upperEffortLimit[i], model.upperVelocityLimit[i]
-        for ours, theirs in zip((joint.effort_limit, joint.velocity_limit), stated, strict=True):
+        for ours, theirs in zip(
+            (joint.effort_limit, joint.velocity_limit), stated, strict=True
+        ):
             assert ours == (theirs or np.inf)
-        assert (joint.viscous, joint.coulomb) == (model.damping[i], model.upperDryFrictionLimit[i])
+        assert (joint.viscous, joint.coulomb) == (
+            model.damping[i],
+            model.upperDryFrictionLimit[i],
+        )
 
 
 def check_core(chain: UrdfChain, state: ChainState) -> None:
     """The leaves of the core against what Pinocchio said."""
     n = len(chain.joints)
-    joints = [ChainJoint(j.kind == "prismatic", j.axis, j.rotation, j.origin_m) for j in chain.joints]
-    arm = Arm(build_chain(joints, MAX_JOINTS), np.concatenate([joint.inertia for joint in chain.joints]))
+    joints = [
+        ChainJoint(j.kind == "prismatic", j.axis, j.rotation, j.origin_m) for j in chain.joints
+    ]
+    arm = Arm(
+        build_chain(joints, MAX_JOINTS),
+        np.concatenate([joint.inertia for joint in chain.joints]),
+    )
     moving(arm, state, state.v)
     assert near(torque_for(arm, state.v, state.a), state.inverse_dynamics, 1e-12)
     gradient, qdd = np.zeros(LINK_PARAMETERS * n), np.zeros(n)
@@ -316,8 +345,11 @@ def check_core(chain: UrdfChain, state: ChainState) -> None:
     place_joints(arm.rows, state.q)
     assert near(full_matrix(arm), state.inertia, 1e-12)
     find_acceleration(arm.rows, arm.theta, state.gravity, state.q, state.qd, state.tau, qdd)
-    bias = state.tau - state.inertia @ state.forward_dynamics  # where it cancels tau, qdd is their difference
-    size = max(np.abs(np.linalg.solve(state.inertia, torque)).max() for torque in (state.tau, bias))
+    # where it cancels tau, qdd is their difference
+    bias = state.tau - state.inertia @ state.forward_dynamics
+    size = max(
+        np.abs(np.linalg.solve(state.inertia, torque)).max() for torque in (state.tau, bias)
+    )
     bound = 100 * np.finfo(float).eps * np.linalg.cond(state.inertia)
     assert np.abs(qdd - state.forward_dynamics).max() <= bound * size
     place_joints(arm.rows, state.q)
@@ -359,12 +391,18 @@ def test_the_torque_of_two_velocities_is_the_christoffel_one() -> None:
         asked = state._asdict() | {"a": np.zeros(n), "gravity": np.zeros(3)}
 
         def C(
-            v: Array, model: pin.Model = model, chain: UrdfChain = chain, asked: dict[str, Array] = asked
+            v: Array,
+            model: pin.Model = model,
+            chain: UrdfChain = chain,
+            asked: dict[str, Array] = asked,
         ) -> Array:
             return answer(model, chain, asked | {"v": v})["inverse_dynamics"]
 
         matrix = np.stack([C(axis) for axis in np.eye(n)], axis=1)
         assert near(matrix @ state.v, C(state.v), 1e-12)
         h = 1e-6
-        ends = [answer(model, chain, asked | {"q": state.q + s * h * state.qd})["inertia"] for s in (1, -1)]
+        ends = [
+            answer(model, chain, asked | {"q": state.q + s * h * state.qd})["inertia"]
+            for s in (1, -1)
+        ]
         assert near(matrix + matrix.T, (ends[0] - ends[1]) / (2 * h), 1e-7)

@@ -18,7 +18,10 @@ from tests.core.guarded_runs import (
     stopped_log,
 )
 from tests.core.rests import gravity_of, rest_torque
-from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
+from trilat_net.analysis.certificate.energy_balance import (
+    compute_energy_balance,
+    compute_site_energies,
+)
 from trilat_net.core.safeguards import BLEND_S
 from trilat_net.core.ticks import LifeReason
 from trilat_net.core.user_law import LawContext, LawInput
@@ -56,7 +59,9 @@ def test_a_site_that_is_stopped_goes_on_learning() -> None:
         ({"qd_limit_rad_s": 0.4}, LifeReason.LIMIT_QD),
     ],
 )
-def test_a_passed_limit_is_a_fault_until_it_is_reset(limits: dict[str, object], reason: LifeReason) -> None:
+def test_a_passed_limit_is_a_fault_until_it_is_reset(
+    limits: dict[str, object], reason: LifeReason
+) -> None:
     scenario = guarded(limits, where="sites.s.")
     log = ordered(scenario, {"m": {4500: "enable"}, "s": {4500: "stop", 5000: "reset"}})
     found = reasons(log, "s")
@@ -64,18 +69,24 @@ def test_a_passed_limit_is_a_fault_until_it_is_reset(limits: dict[str, object], 
     at = list(log["s"].mode).index("fault")
     assert set(log["s"].mode[at:5000]) == {"fault"}  # no other order ends it
     assert "diverged" not in set(log["m"].mode)
-    assert any(re.search("s is in FAULT from .*: a joint is", event.text) for event in log.events)
+    assert any(
+        re.search("s is in FAULT from .*: a joint is", event.text) for event in log.events
+    )
     assert verify(log).differing == 0
     assert len(log["s"]) == 6000
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 12))])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 12))]
+)
 def test_whatever_happens_the_torque_changes_no_faster_than_it_may(seed: int) -> None:
     """Peers 3 rad apart, cuts, stops, a fault by a limit, returns: in the end they follow each other."""
     random = np.random.default_rng(seed)
     cuts = np.sort(random.uniform(1.0, 6.0, 4)).round(3).reshape(2, 2).tolist()
-    text = TEXT.replace("q0_rad = [0.8, 0.3]", "q0_rad = [2.9, -1.1]").replace("[0.1, 0.4]", "[-0.1, 1.9]")
+    text = TEXT.replace("q0_rad = [0.8, 0.3]", "q0_rad = [2.9, -1.1]").replace(
+        "[0.1, 0.4]", "[-0.1, 1.9]"
+    )
     scenario = guarded(text=text, duration_s=14.0, outages_s=cuts)
     orders: dict[str, dict[int, str]] = {"m": {}, "s": {}}
     for site in orders:
@@ -97,7 +108,9 @@ def test_the_rate_limit_keeps_a_reference_jump_from_the_torque() -> None:
     )
     text = text.replace("align_speed_rad_s = {speed}\nalign_limit_rad = {limit}\n", "")
     keys = {key: LIMITS[key] for key in ("tau_rate_limit_nm_s", "qd_des_limit_rad_s")}
-    free, held = (trilat_net.simulate(guarded(limits, text, duration_s=1.0)) for limits in ({}, keys))
+    free, held = (
+        trilat_net.simulate(guarded(limits, text, duration_s=1.0)) for limits in ({}, keys)
+    )
     assert largest_step(free, "s") > 50.0
     assert largest_step(held, "s") <= RATE_NM_S * 1e-3 * (1.0 + 1e-9)
     steps = np.abs(np.diff(held["s"].q_des, axis=0))
@@ -147,7 +160,9 @@ def test_missed_ticks_are_held_or_a_fault_never_repeated(missed: int, mode: str)
     assert part.mode[2000] == mode
     assert largest_step(log, "s") <= RATE_NM_S * 1e-3 * (1.0 + 1e-9)
     theta_hat = part.theta_hat
-    assert np.abs(theta_hat[2001] - theta_hat[1999]).max() <= 0.01 * np.abs(theta_hat[1999]).max()
+    assert (
+        np.abs(theta_hat[2001] - theta_hat[1999]).max() <= 0.01 * np.abs(theta_hat[1999]).max()
+    )
     assert part.skipped == missed
     assert log.missing("s") == 0
     assert log.expected_ticks("s") == 4000 - missed
@@ -176,7 +191,9 @@ def test_stops_and_returns_step_no_more_than_run_without_them() -> None:
     free = trilat_net.simulate(scenario)
     for site in log.sites:
         assert largest_step(log, site, 100) <= 1.1 * largest_step(free, site, 100)
-    (jump,) = np.flatnonzero((log["s"].mode[1:] == "return") & (log["s"].mode[:-1] == "stopped"))
+    (jump,) = np.flatnonzero(
+        (log["s"].mode[1:] == "return") & (log["s"].mode[:-1] == "stopped")
+    )
     assert (log["s"].tau[jump + 1] == log["s"].tau[jump]).all()
     assert verify(log).identical == 16_000
     balance = compute_energy_balance(compute_site_energies(log))
@@ -193,7 +210,9 @@ class Pull:
 
     def torque(self, now: LawInput) -> None:
         for i in range(now.joints):
-            now.tau[i] = now.gravity[i] - self.d * now.qd[i] - self.K * (now.q[i] - now.peers[0].q[i])
+            now.tau[i] = (
+                now.gravity[i] - self.d * now.qd[i] - self.K * (now.q[i] - now.peers[0].q[i])
+            )
 
 
 class PullHeld(Pull):
@@ -201,7 +220,9 @@ class PullHeld(Pull):
 
 
 def with_own_law(name: str) -> Log:
-    text = TEXT.replace('law = "pd_d"\nK = 60.0\nKd = 4.0\nd = 12.0', f'law = "{__name__}:{name}"')
+    text = TEXT.replace(
+        'law = "pd_d"\nK = 60.0\nKd = 4.0\nd = 12.0', f'law = "{__name__}:{name}"'
+    )
     return trilat_net.simulate(guarded({}, text, outages_s="[[2.0, 2.6]]", duration_s=4.0))
 
 

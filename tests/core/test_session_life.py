@@ -16,9 +16,13 @@ from trilat_net.scenario import Scenario, parse_scenario
 OUTAGE = "[[2.0, 2.6]]"
 
 
-def glide(duration_s: float = 5.0, rate_hz: int = 1000, outages_s: str = OUTAGE, **keys: float) -> Scenario:
+def glide(
+    duration_s: float = 5.0, rate_hz: int = 1000, outages_s: str = OUTAGE, **keys: float
+) -> Scenario:
     keys = {"speed": 1.0, "limit": 1.5, **keys}
-    return parse_scenario(TEXT.format(duration_s=duration_s, rate_hz=rate_hz, outages_s=outages_s, **keys))
+    return parse_scenario(
+        TEXT.format(duration_s=duration_s, rate_hz=rate_hz, outages_s=outages_s, **keys)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +40,9 @@ def test_it_waits_at_its_own_pose_then_aligns_then_follows(log: Log) -> None:
         assert modes[100] == "return"
         engaged = int(np.argmax(modes == "run"))
         way = np.abs(part.q[0] - log[other].q[0]).max()
-        assert (engaged - 100) * 1e-3 == pytest.approx(max(1.5 * way / 1.0, 1e-9 * MIN_ALIGN_NS), abs=0.15)
+        assert (engaged - 100) * 1e-3 == pytest.approx(
+            max(1.5 * way / 1.0, 1e-9 * MIN_ALIGN_NS), abs=0.15
+        )
         late = log[other].q[engaged - 100 : 1900]
         assert np.abs(part.q_des[engaged:2000] - late).max() == 0.0
 
@@ -65,7 +71,8 @@ def test_the_reference_never_jumps_and_has_its_derivative(site: str, log: Log) -
     # at the first tick without a new sample, what is in use stays, and so does qd_des
     stale = np.zeros(len(steps), dtype=bool)
     stale[2099:2120] = True
-    assert np.abs(steps - means)[~stale].max() <= 2e-6  # h^3/12 of a torque's rate through its peer's inertia
+    # h^3/12 of a torque's rate through its peer's inertia
+    assert np.abs(steps - means)[~stale].max() <= 2e-6
     assert np.abs(np.diff(part.qd_des, axis=0))[~stale].max() <= 0.06
 
 
@@ -93,16 +100,22 @@ def test_every_driver_gives_the_same_bits() -> None:
     columns = scenario.layout("m").columns()
     for site, row in zip(ticks.sites.values(), fused, strict=True):
         assert all(
-            (getattr(site, name)[-1] == row[columns[name]]).all() for name in ("q", "qd", "tau", "q_des")
+            (getattr(site, name)[-1] == row[columns[name]]).all()
+            for name in ("q", "qd", "tau", "q_des")
         )
     log = trilat_net.simulate(scenario)
     assert verify(log).identical == 6000
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "silence", "words"), [(100, 5.0, "two periods of 100 Hz"), (1000, 1.0, "two periods")]
+    ("rate_hz", "silence", "words"),
+    [(100, 5.0, "two periods of 100 Hz"), (1000, 1.0, "two periods")],
 )
-def test_a_silence_shorter_than_two_periods_is_refused(rate_hz: int, silence: float, words: str) -> None:
+def test_a_silence_shorter_than_two_periods_is_refused(
+    rate_hz: int, silence: float, words: str
+) -> None:
     text = TEXT.replace('action = "glide"', f'action = "glide"\nsilence_ms = {silence}')
     with pytest.raises(ScenarioError, match=words):
-        parse_scenario(text.format(duration_s=1.0, rate_hz=rate_hz, outages_s="[]", speed=0.5, limit=1.0))
+        parse_scenario(
+            text.format(duration_s=1.0, rate_hz=rate_hz, outages_s="[]", speed=0.5, limit=1.0)
+        )

@@ -34,8 +34,13 @@ arrivals = st.lists(
 
 
 @settings(max_examples=40)
-@given(came=st.lists(arrivals, min_size=1, max_size=40), scheme=st.sampled_from(["second_order", "digital"]))
-def test_two_fresh_sites_fed_same_ticks_give_same_bits(came: list[list[Arrival]], scheme: str) -> None:
+@given(
+    came=st.lists(arrivals, min_size=1, max_size=40),
+    scheme=st.sampled_from(["second_order", "digital"]),
+)
+def test_two_fresh_sites_fed_same_ticks_give_same_bits(
+    came: list[list[Arrival]], scheme: str
+) -> None:
     ticks = [TickInput(k, c) for k, c in enumerate(came)]
     one, other = (Site(setup("m2", "free", scheme=scheme, link__delay_ms=7)) for _ in range(2))
     assert [bits(o) for o in stepped(one, ticks)] == [bits(o) for o in stepped(other, ticks)]
@@ -43,7 +48,9 @@ def test_two_fresh_sites_fed_same_ticks_give_same_bits(came: list[list[Arrival]]
 
 def test_record_holds_state_at_its_tick_and_its_inputs() -> None:
     """Stage 7 emits before stage 8 advances; tau_x is the negative of the torque ON the arm, Eq. (8)."""
-    site = Site(setup("m1", "paper", sites__m1__q0_rad=[0.3, -0.1], sites__m1__qd0_rad_s=[0.2, 0.4]))
+    site = Site(
+        setup("m1", "paper", sites__m1__q0_rad=[0.3, -0.1], sites__m1__qd0_rad_s=[0.2, 0.4])
+    )
     first = site.step(TickInput(0))
     assert (first.q, first.qd, first.t_ns) == ([0.3, -0.1], [0.2, 0.4], 0)
     outputs = stepped(site, [TickInput(k) for k in range(1, 3501)])
@@ -72,7 +79,9 @@ def test_without_the_compiler_a_run_has_the_same_bits() -> None:
 def test_site_resumed_from_two_records_goes_on_with_same_bits(scheme: str, k: int) -> None:
     """Every record is a key-frame: records k-2 and k-1 and what waits in the links."""
     built = setup("m1", "free", scheme=scheme, link__delay_ms=20)
-    ticks = [TickInput(n, [sample(n - 1, peer) for peer in (0, 1)] if n else []) for n in range(200)]
+    ticks = [
+        TickInput(n, [sample(n - 1, peer) for peer in (0, 1)] if n else []) for n in range(200)
+    ]
     whole = stepped(Site(built), ticks)
     site = Site(built)
     before, last = whole[max(0, k - 2)], whole[k - 1]
@@ -88,7 +97,9 @@ def test_rates_of_their_own_meet_on_the_grid(name: str) -> None:
     """Any mix of rates runs; every site ages what it uses by the delay and less than two periods."""
     scenario = load_scenario(name)
     rates = dict(zip(scenario.names, (1000, 450, 333), strict=False))
-    changed = load_scenario(name, {f"sites.{n}.rate_hz": r for n, r in rates.items()} | {"duration_s": 1.0})
+    changed = load_scenario(
+        name, {f"sites.{n}.rate_hz": r for n, r in rates.items()} | {"duration_s": 1.0}
+    )
     last: dict[str, TickRecord] = {}
     for site, _, output in virtual.execute_virtual(changed):
         last[site.name] = output
@@ -135,7 +146,10 @@ def test_a_site_beyond_its_speed_limit_diverges_once_and_stays() -> None:
     outputs = stepped(site, [TickInput(k) for k in range(400)])
     k = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
     assert max(map(abs, outputs[k].qd)) > 0.5 >= max(map(abs, outputs[k - 1].qd))
-    assert all(o.mode is Mode.DIVERGED and (o.q, o.qd) == (outputs[k].q, outputs[k].qd) for o in outputs[k:])
+    assert all(
+        o.mode is Mode.DIVERGED and (o.q, o.qd) == (outputs[k].q, outputs[k].qd)
+        for o in outputs[k:]
+    )
 
 
 def test_a_run_that_diverges_ends_at_that_instant() -> None:
@@ -160,7 +174,9 @@ def test_no_record_ever_holds_what_is_not_finite(
     """Whatever finite numbers a peer sends, and whatever gains a person chose."""
     site = Site(setup("m1", "paper", control__Lambda=Lambda, scheme=scheme, link__delay_ms=0))
     for k, numbers in enumerate([None, *came, None, None]):
-        numbers_of_tick = [] if numbers is None else [Arrival(0, k - 1, numbers[:2], numbers[2:])]
+        numbers_of_tick = (
+            [] if numbers is None else [Arrival(0, k - 1, numbers[:2], numbers[2:])]
+        )
         assert finite(site.step(TickInput(k, numbers_of_tick)))
 
 
@@ -174,11 +190,15 @@ LARGEST = 1e9
     [f"control.{gain}" for gain in ("Gamma", "Lambda", "theta_hat0", "Kp", "Kd")]
     + ["arm.g_m_s2", "sites.m1.q0_rad", "sites.m1.qd0_rad_s", "limits.tau_limit_nm"],
 )
-def test_absurd_scenarios_are_refused_or_stop_with_finite_numbers(key: str, scheme: str) -> None:
+def test_absurd_scenarios_are_refused_or_stop_with_finite_numbers(
+    key: str, scheme: str
+) -> None:
     with pytest.raises(ScenarioError, match=key.rpartition(".")[2]):
         load_scenario("paper", {key: 1e308})
     ran = list(
-        virtual.execute_virtual(load_scenario("paper", {key: LARGEST, "scheme": scheme, "duration_s": 0.3}))
+        virtual.execute_virtual(
+            load_scenario("paper", {key: LARGEST, "scheme": scheme, "duration_s": 0.3})
+        )
     )
     assert all(finite(r.output) for r in ran)
 
@@ -193,6 +213,9 @@ def test_more_arrivals_than_a_tick_takes_are_refused() -> None:
 def test_the_arrivals_crc_is_that_of_their_bytes() -> None:
     """rx_crc: little-endian (peer i64, tick i64, q f64s, qd f64s) of each arrival."""
 
-    came = [Arrival(1, 5, (0.1, -0.0), (3.0, 4.0), 77), Arrival(0, 2, (1.0, 2.0), (0.5, 5e-324), 9)]
+    came = [
+        Arrival(1, 5, (0.1, -0.0), (3.0, 4.0), 77),
+        Arrival(0, 2, (1.0, 2.0), (0.5, 5e-324), 9),
+    ]
     packed = b"".join(struct.pack("<qqdddd", a.peer, a.tick, *a.q, *a.qd) for a in came)
     assert Site(setup()).step(TickInput(0, came)).rx_crc == zlib.crc32(packed)

@@ -19,7 +19,9 @@ MS = 1_000_000
 RULE = StaleRule(StaleAction.HOLD, 20 * MS, 30 * MS)
 
 
-def site(rule: StaleRule, shares: tuple[float, float] = (0.5, 0.5), qd_limit_rad_s: float = 100.0) -> Site:
+def site(
+    rule: StaleRule, shares: tuple[float, float] = (0.5, 0.5), qd_limit_rad_s: float = 100.0
+) -> Site:
     """Two peers behind 5 ms; what it follows it gets from `moving`."""
     links = tuple(
         LinkSetup(name, share, 1000, (0.4 * n, -0.3), models=(LinkModel(location=5_000.0),))
@@ -53,13 +55,20 @@ def cut(rule: StaleRule, count: int = 200) -> list[TickRecord]:
 
 def runs_of(outputs: Sequence[TickRecord]) -> list[tuple[Mode, int]]:
     """(mode, first tick) of every stretch."""
-    edges = [0, *(k for k in range(1, len(outputs)) if outputs[k].mode is not outputs[k - 1].mode)]
+    edges = [
+        0,
+        *(k for k in range(1, len(outputs)) if outputs[k].mode is not outputs[k - 1].mode),
+    ]
     return [(outputs[k].mode, k) for k in edges]
 
 
-def followed(output: TickRecord, shares: Sequence[float] = (0.5, 0.5)) -> tuple[np.ndarray, np.ndarray]:
+def followed(
+    output: TickRecord, shares: Sequence[float] = (0.5, 0.5)
+) -> tuple[np.ndarray, np.ndarray]:
     """What the peers ask for, from the samples in use."""
-    poses = [((0.4 * j, -0.3), (0.0, 0.0)) if m < 0 else at(j, m) for j, m in enumerate(output.used)]
+    poses = [
+        ((0.4 * j, -0.3), (0.0, 0.0)) if m < 0 else at(j, m) for j, m in enumerate(output.used)
+    ]
     q, qd = (np.array([pose[n] for pose in poses]) for n in (0, 1))
     return np.array(shares) @ q, np.array(shares) @ qd
 
@@ -67,7 +76,9 @@ def followed(output: TickRecord, shares: Sequence[float] = (0.5, 0.5)) -> tuple[
 # The modes.
 
 
-@pytest.mark.parametrize(("action", "mode"), [(StaleAction.HOLD, Mode.HOLD), (StaleAction.BRAKE, Mode.BRAKE)])
+@pytest.mark.parametrize(
+    ("action", "mode"), [(StaleAction.HOLD, Mode.HOLD), (StaleAction.BRAKE, Mode.BRAKE)]
+)
 def test_cut_leads_to_hold_or_brake_and_back_by_return(action: StaleAction, mode: Mode) -> None:
     """Sample 49 is the last; in use at tick 54, too old after 69; sample 90 is in use at 95."""
     outputs = cut(RULE._replace(action=action))
@@ -81,12 +92,20 @@ def test_to_use_is_to_go_on() -> None:
 def test_a_peer_stale_again_during_the_return_is_held() -> None:
     ticks = [
         TickInput(
-            k, [moving(0, k - 1), *([moving(1, k - 1)] if k <= 50 or 90 < k <= 91 else [])] if k else []
+            k,
+            [moving(0, k - 1), *([moving(1, k - 1)] if k <= 50 or 90 < k <= 91 else [])]
+            if k
+            else [],
         )
         for k in range(200)
     ]
     outputs = stepped(site(RULE._replace(return_ns=50 * MS)), ticks)
-    assert runs_of(outputs) == [(Mode.RUN, 0), (Mode.HOLD, 70), (Mode.RETURN, 95), (Mode.HOLD, 111)]
+    assert runs_of(outputs) == [
+        (Mode.RUN, 0),
+        (Mode.HOLD, 70),
+        (Mode.RETURN, 95),
+        (Mode.HOLD, 111),
+    ]
     assert outputs[111].q_des == outputs[110].q_des
     assert outputs[110].q_des != outputs[70].q_des
 
@@ -107,7 +126,11 @@ def test_diverged_is_final_from_every_mode(action: StaleAction) -> None:
     """And forgets what it held: a record that says so holds nothing."""
     made = site(RULE._replace(action=action), qd_limit_rad_s=1e-3)
     outputs = stepped(
-        made, [TickInput(k, [moving(j, k - 1) for j in (0, 1)] if k > 60 else []) for k in range(120)]
+        made,
+        [
+            TickInput(k, [moving(j, k - 1) for j in (0, 1)] if k > 60 else [])
+            for k in range(120)
+        ],
     )
     diverged = next(o.tick for o in outputs if o.mode is Mode.DIVERGED)
     assert all(o.mode is Mode.DIVERGED and o.mem == [] for o in outputs[diverged:])
@@ -115,15 +138,17 @@ def test_diverged_is_final_from_every_mode(action: StaleAction) -> None:
     assert outputs[-1].q_des == pytest.approx(q, abs=1e-12)
 
 
-arrivals = st.lists(st.tuples(st.booleans(), st.booleans(), st.integers(1, 30)), min_size=1, max_size=12).map(
-    lambda parts: [heard for a, b, n in parts for heard in [(a, b)] * n]
-)
+arrivals = st.lists(
+    st.tuples(st.booleans(), st.booleans(), st.integers(1, 30)), min_size=1, max_size=12
+).map(lambda parts: [heard for a, b, n in parts for heard in [(a, b)] * n])
 
 
 @settings(max_examples=60)
 @given(
     heard=arrivals,
-    action=st.sampled_from([action for action in StaleAction if action is not StaleAction.GLIDE]),
+    action=st.sampled_from(
+        [action for action in StaleAction if action is not StaleAction.GLIDE]
+    ),
     age_ms=st.integers(1, 40),
     return_ms=st.integers(1, 60),
     shares=st.sampled_from([(0.5, 0.5), (0.25, 0.75), (1.0, 0.0)]),
@@ -155,14 +180,17 @@ def test_modes_and_references_are_those_of_the_law(
             x = (k - since) / return_ms
             q, qd = (
                 held + (3 * x**2 - 2 * x**3) * (q - held),
-                (3 * x**2 - 2 * x**3) * qd + (6 * x * (1 - x) / (return_ms / 1000)) * (q - held),
+                (3 * x**2 - 2 * x**3) * qd
+                + (6 * x * (1 - x) / (return_ms / 1000)) * (q - held),
             )
         elif mode is not Mode.RUN:
             q, qd = held, np.zeros(2)
         assert output.mode is mode
         assert output.q_des == pytest.approx(q, abs=1e-12)
         assert output.qd_des == pytest.approx(qd, abs=1e-9)
-        remembered = [] if mode is Mode.RUN else [*held, since * MS if mode is Mode.RETURN else 0.0]
+        remembered = (
+            [] if mode is Mode.RUN else [*held, since * MS if mode is Mode.RETURN else 0.0]
+        )
         assert output.mem == pytest.approx(remembered, abs=1e-12)
         before = np.array(output.q_des)
 
@@ -185,14 +213,21 @@ def test_the_returning_reference_has_no_step(action: StaleAction) -> None:
 
 @pytest.mark.parametrize("k", [72, 90, 96, 110, 126])
 @pytest.mark.parametrize("action", [StaleAction.HOLD, StaleAction.BRAKE])
-def test_site_resumed_from_two_records_goes_on_with_same_bits(action: StaleAction, k: int) -> None:
+def test_site_resumed_from_two_records_goes_on_with_same_bits(
+    action: StaleAction, k: int
+) -> None:
     """Whatever its mode was: the records hold what it remembers."""
     rule = RULE._replace(action=action)
     whole = cut(rule)
     made = site(rule)
     last = whole[k - 1]
     in_use = [moving(j, m) for j, m in enumerate(last.used)]
-    heard = [(j, m) for j in (0, 1) for m in range(last.used[j] + 1, k - 1) if not (j and 50 <= m < 90)]
+    heard = [
+        (j, m)
+        for j in (0, 1)
+        for m in range(last.used[j] + 1, k - 1)
+        if not (j and 50 <= m < 90)
+    ]
     made.prime(k, in_use, [moving(j, m) for j, m in heard])
     made.resume(whole[k - 2], last)
     assert stepped(made, cut_ticks()[k:]) == whole[k:]

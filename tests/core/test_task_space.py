@@ -60,9 +60,13 @@ def test_velocity_of_turn_is_limit_of_differences_and_is_undone(
     vector: tuple[float, float, float], rate: tuple[float, float, float], shorter: float
 ) -> None:
     turn = (shorter * vector[0], shorter * vector[1], shorter * vector[2])
-    after, before = (Rotation.from_rotvec(np.array(turn) + h * np.array(rate)) for h in (1e-5, -1e-5))
+    after, before = (
+        Rotation.from_rotvec(np.array(turn) + h * np.array(rate)) for h in (1e-5, -1e-5)
+    )
     velocity = turning_velocity(turn, rate)
-    assert np.array(velocity) == pytest.approx((after * before.inv()).as_rotvec() / 2e-5, abs=1e-8)
+    assert np.array(velocity) == pytest.approx(
+        (after * before.inv()).as_rotvec() / 2e-5, abs=1e-8
+    )
     assert turn_rate(turn, velocity) == pytest.approx(rate, abs=1e-11)
 
 
@@ -98,7 +102,9 @@ def test_r_is_what_the_task_asks_whatever_the_posture(seed: int) -> None:
 
 
 @tasks
-def test_the_reference_acceleration_is_the_derivative_of_the_reference_velocity(task: TaskSetup) -> None:
+def test_the_reference_acceleration_is_the_derivative_of_the_reference_velocity(
+    task: TaskSetup,
+) -> None:
     """Along a motion whose reference stands: v at a little before and after, and a between them."""
     arrays = build(task)
     q, h = np.array(arrays.site[0].q), 1e-6

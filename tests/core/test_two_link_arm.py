@@ -67,7 +67,9 @@ def test_the_inertia_is_symmetric_and_positive_definite(a: ArmLinks, q: Array) -
 
 
 @given(a=links, q=angles, qd=speeds)
-def test_the_inertia_gives_the_kinetic_energy_of_the_masses(a: ArmLinks, q: Array, qd: Array) -> None:
+def test_the_inertia_gives_the_kinetic_energy_of_the_masses(
+    a: ArmLinks, q: Array, qd: Array
+) -> None:
     M = M_of(theta_from_links(a), q)
     energy = physics.kinetic(a, q, qd)
     assert 0.5 * qd @ M @ qd == pytest.approx(energy, rel=1e-11, abs=1e-12 * size(a))
@@ -75,12 +77,16 @@ def test_the_inertia_gives_the_kinetic_energy_of_the_masses(a: ArmLinks, q: Arra
 
 
 @given(a=links, q=angles, qd=speeds)
-def test_the_coriolis_matrix_is_that_of_the_christoffel_symbols(a: ArmLinks, q: Array, qd: Array) -> None:
+def test_the_coriolis_matrix_is_that_of_the_christoffel_symbols(
+    a: ArmLinks, q: Array, qd: Array
+) -> None:
     assert near(C_of(theta_from_links(a), q, qd), physics.coriolis(a, q, qd), 20 * size(a))
 
 
 @given(a=links, g=g_values, q=angles)
-def test_gravity_is_the_gradient_of_the_potential_energy(a: ArmLinks, g: float, q: Array) -> None:
+def test_gravity_is_the_gradient_of_the_potential_energy(
+    a: ArmLinks, g: float, q: Array
+) -> None:
     assert near(G_of(theta_from_links(a), g, q), physics.gravity(a, g, q), g * size(a))
 
 
@@ -98,12 +104,18 @@ def test_the_regressor_takes_the_two_velocities_apart(
 ) -> None:
     """Eq. (12): Y(q, qd, v, a) theta = M a + C(q, qd) v + G."""
     theta = theta_from_links(a)
-    wanted = physics.inertia(a, q) @ acceleration + physics.coriolis(a, q, qd) @ v + physics.gravity(a, g, q)
+    wanted = (
+        physics.inertia(a, q) @ acceleration
+        + physics.coriolis(a, q, qd) @ v
+        + physics.gravity(a, g, q)
+    )
     assert near(Y_of(g, q, qd, v, acceleration) @ theta, wanted, 1000 * size(a))
 
 
 @given(g=g_values, q=angles, qd=speeds, qdd=speeds)
-def test_with_one_velocity_it_is_the_printed_one(g: float, q: Array, qd: Array, qdd: Array) -> None:
+def test_with_one_velocity_it_is_the_printed_one(
+    g: float, q: Array, qd: Array, qdd: Array
+) -> None:
     """Eq. (5), with Y12 and Y22 as Section IV prints them."""
     Y = Y_of(g, q, qd, qd, qdd)
     s2, c2 = math.sin(q[1]), math.cos(q[1])

@@ -20,7 +20,11 @@ OTHER_PLATFORM = {"fingerprint": "0" * 16}
 
 def numbers(state: State) -> list[list[float]]:
     """All that a step computes of a tick but which samples came to it."""
-    return [*(getattr(state, field) for field in STATE_VECTORS), list(state.used.values()), state.mem]
+    return [
+        *(getattr(state, field) for field in STATE_VECTORS),
+        list(state.used.values()),
+        state.mem,
+    ]
 
 
 def motion(log: Log, site: str) -> list[tuple[int, str, list[list[float]]]]:
@@ -45,7 +49,9 @@ def without_records(
     def record(r: dict[str, Any]) -> dict[str, Any] | None:
         return None if r["tick"] in lost.get(r["site"], ()) else r
 
-    return opened(edited(recorded("paper") if data is None else data, record=record, session=session))
+    return opened(
+        edited(recorded("paper") if data is None else data, record=record, session=session)
+    )
 
 
 def all_identical(again: Rerun) -> bool:
@@ -64,7 +70,9 @@ def external_log() -> bytes:
     stream = io.BytesIO()
     run = virtual.execute_virtual
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(virtual, "execute_virtual", lambda s, n=None, **_: run(s, n, measured={"s": moves}))
+        patch.setattr(
+            virtual, "execute_virtual", lambda s, n=None, **_: run(s, n, measured={"s": moves})
+        )
         patch.setattr(virtual, "check_virtual", lambda *_, **__: None)
         virtual.write_virtual_log(scenario, stream)
     return stream.getvalue()

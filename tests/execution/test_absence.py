@@ -69,7 +69,11 @@ def places(taken: Pieces, of: tuple[str, ...], ticks: range) -> list[int]:
     """Where in a file the records of some sites and ticks are."""
     topics = taken.topics()
     wanted = {f"/trilat/free/{site}/state" for site in of}
-    return [n for n, m in enumerate(taken.messages) if topics[m.channel] in wanted and m.sequence in ticks]
+    return [
+        n
+        for n, m in enumerate(taken.messages)
+        if topics[m.channel] in wanted and m.sequence in ticks
+    ]
 
 
 def remove(draw: Callable, taken: Pieces) -> None:
@@ -102,7 +106,9 @@ def replay(draw: Callable, taken: Pieces) -> None:
     taken.messages = [m for n, m in enumerate(taken.messages) if n not in later]
     for message in again:
         tick = message.sequence + len(ticks)
-        taken.messages.append(repacked(message, tick=tick, t_ns=tick * 1_000_000, sent_ns=tick * 1_000_000))
+        taken.messages.append(
+            repacked(message, tick=tick, t_ns=tick * 1_000_000, sent_ns=tick * 1_000_000)
+        )
 
 
 def renumber(draw: Callable, taken: Pieces) -> None:
@@ -122,7 +128,9 @@ def change_metadata(draw: Callable, taken: Pieces) -> None:
         case "rename" if hasattr(entry, "name") and entry.name != "trilat.session":
             entry.name += "x"
         case _:
-            entry.metadata[key] = entry.metadata.get(key, "") + draw(st.sampled_from(["0", " ", "s"]))
+            entry.metadata[key] = entry.metadata.get(key, "") + draw(
+                st.sampled_from(["0", " ", "s"])
+            )
 
 
 def change_description(draw: Callable, taken: Pieces) -> None:
@@ -182,7 +190,9 @@ def test_two_runs_over_a_gap_are_refused_without_a_chain() -> None:
     taken = pieces(chained=False)
     other = taken_apart(run(other=True)).messages
     topics = taken.topics()
-    taken.messages = [m for m in taken.messages if "state" not in topics[m.channel] or m.sequence < 60]
+    taken.messages = [
+        m for m in taken.messages if "state" not in topics[m.channel] or m.sequence < 60
+    ]
     taken.messages += [m for m in other if "state" in topics[m.channel] and m.sequence >= 62]
     found = judge_integrity(opened(taken.bytes()))
     assert found.state is DigestState.CHANGED
@@ -210,7 +220,9 @@ def test_a_torn_log_passes_no_more_than_is_asked_for() -> None:
     assert verify(log, min_coverage=share).passed
     assert not verify(log, min_coverage=share + 1e-6).passed
     whole = recorded("paper")
-    assert judge_integrity(opened(whole[: whole.index(b"trilat.chain")])).state is DigestState.OPEN
+    assert (
+        judge_integrity(opened(whole[: whole.index(b"trilat.chain")])).state is DigestState.OPEN
+    )
 
 
 def test_records_of_another_start_are_found_where_nothing_is_executed() -> None:
@@ -245,10 +257,13 @@ def test_open_loop_rerun_is_judged_with_its_log_beside_it(tmp_path: Path) -> Non
     verdict = verify(open_log(made))
     assert verdict.passed
     assert verdict.identical == 3 * TICKS
-    forged = edited(made.read_bytes(), record=lambda r: {**r, "tau": [0.0, 0.0]} if r["site"] == "m1" else r)
+    forged = edited(
+        made.read_bytes(), record=lambda r: {**r, "tau": [0.0, 0.0]} if r["site"] == "m1" else r
+    )
     made.write_bytes(forged)
     assert verify(open_log(made)).first[:3] == ("m1", 0, "record")
-    (tmp_path / "run.mcap").write_bytes(recorded("free") + b"x")  # no more the file that the rerun names
+    # no more the file that the rerun names
+    (tmp_path / "run.mcap").write_bytes(recorded("free") + b"x")
     alone = run_log_checks(open_log(made), virtual=True)
     assert not alone.passed
     assert "not beside it" in "".join(line.text for line in alone.findings)
@@ -259,8 +274,9 @@ def test_lost_samples_excuse_virtual_time_only_after_them() -> None:
     log = opened(delivered({}, lost))
     report = run_log_checks(log, virtual=True)
     assert report.passed, report.findings
-    assert "20 lost on the way, the first: sample 40 of s was due at tick 60 of m2 and never came" in (
-        report.findings[-1].check
+    assert (
+        "20 lost on the way, the first: sample 40 of s was due at tick 60 of m2 and never came"
+        in (report.findings[-1].check)
     )
     assert "the first that differs" in report.findings[-1].text
 
@@ -296,5 +312,7 @@ def test_site_that_others_lost_ends_where_it_was_last_seen() -> None:
     last = int(torn["s"].tick[-1])
     torn.events.append(Event(member="m1", boot=1, t_ns=1, n=9, kind="lost", text="", about="s"))
     assert [torn.expected_ticks(site) for site in SITES] == [TICKS, TICKS, last + 1]
-    torn.events.append(Event(member="m1", boot=1, t_ns=2, n=10, kind="back", text="", about="s"))
+    torn.events.append(
+        Event(member="m1", boot=1, t_ns=2, n=10, kind="back", text="", about="s")
+    )
     assert torn.expected_ticks("s") == TICKS

@@ -52,16 +52,24 @@ def test_six_joints_executed_again_are_virtual_time() -> None:
 
 
 def test_a_gap_of_six_joints_is_resumed_from_two_records() -> None:
-    log = opened(edited(made(), record=lambda r: None if r["site"] == "m2" and 30 <= r["tick"] < 33 else r))
+    log = opened(
+        edited(
+            made(), record=lambda r: None if r["site"] == "m2" and 30 <= r["tick"] < 33 else r
+        )
+    )
     verdict = verify(log)
     assert verdict.agreed, str(verdict.first)
     assert verdict.gaps == [("m2", 30, 32)]
 
 
-@pytest.mark.parametrize(("field", "numbers"), [("q", 5), ("q", 7), ("tau", 2), ("theta_hat", 5)])
+@pytest.mark.parametrize(
+    ("field", "numbers"), [("q", 5), ("q", 7), ("tau", 2), ("theta_hat", 5)]
+)
 def test_a_record_with_another_number_of_joints_is_refused(field: str, numbers: int) -> None:
     log = changed(field, numbers)
-    with pytest.raises(LogError, match=f"a record of s cannot be read: .*{field} has {numbers} numbers, not"):
+    with pytest.raises(
+        LogError, match=f"a record of s cannot be read: .*{field} has {numbers} numbers, not"
+    ):
         verify(log)
     with pytest.raises(LogError, match="a record of s cannot be read"):
         getattr(log["s"], field)
@@ -117,5 +125,8 @@ def test_planar_arm_written_as_chain_makes_same_run() -> None:
         for site in logs[0].sites:
             for name in ("q", "qd", "tau", "q_des"):
                 planar, chain = (getattr(log[site], name) for log in logs)
-                assert np.abs(planar - chain).max() <= 1e-12 * (1.0 + np.abs(planar).max()), (site, name)
+                assert np.abs(planar - chain).max() <= 1e-12 * (1.0 + np.abs(planar).max()), (
+                    site,
+                    name,
+                )
         assert np.ptp(logs[0]["m1"].q, axis=0).min() > 0.05

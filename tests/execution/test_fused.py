@@ -27,17 +27,48 @@ LINKS: tuple[dict[str, Any], ...] = (
     {"link.delay_ms": 0.0},
     {"link.delay_ms": 33.3},
     {"link.delay_ms": 150.0},
-    {"link.model": "uniform", "link.delay_ms": 40.0, "link.half_width_ms": 40.0, "link.loss": 0.3},
-    {"link.model": "uniform", "link.delay_ms": 40.0, "link.half_width_ms": 40.0, "link.order": "in_order"},
-    {"link.model": "normal", "link.delay_ms": 30.0, "link.deviation_ms": 20.0, "link.playout_ms": 60.0},
-    {"link.model": "sine", "link.delay_ms": 50.0, "link.amplitude_ms": 50.0, "link.period_s": 0.3},
+    {
+        "link.model": "uniform",
+        "link.delay_ms": 40.0,
+        "link.half_width_ms": 40.0,
+        "link.loss": 0.3,
+    },
+    {
+        "link.model": "uniform",
+        "link.delay_ms": 40.0,
+        "link.half_width_ms": 40.0,
+        "link.order": "in_order",
+    },
+    {
+        "link.model": "normal",
+        "link.delay_ms": 30.0,
+        "link.deviation_ms": 20.0,
+        "link.playout_ms": 60.0,
+    },
+    {
+        "link.model": "sine",
+        "link.delay_ms": 50.0,
+        "link.amplitude_ms": 50.0,
+        "link.period_s": 0.3,
+    },
     {"link.preset": "4g", "link.duplicate": 0.2},
 )
 
 
 def floats(output: TickRecord) -> list[float]:
     o = output
-    return [*o.q, *o.qd, *o.q_des, *o.qd_des, *o.tau, *o.tau_x, *o.theta_hat, *o.x, *o.xd, *o.wrench]
+    return [
+        *o.q,
+        *o.qd,
+        *o.q_des,
+        *o.qd_des,
+        *o.tau,
+        *o.tau_x,
+        *o.theta_hat,
+        *o.x,
+        *o.xd,
+        *o.wrench,
+    ]
 
 
 def per_tick(scenario: Scenario) -> dict[str, list[TickRecord]]:
@@ -49,7 +80,9 @@ def per_tick(scenario: Scenario) -> dict[str, list[TickRecord]]:
 
 def buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
     """The definition, record by record: |e| and |qd| of the ticks k with floor(20 k / rate) = n."""
-    found = np.full((len(outputs) and (len(outputs) - 1) * BUCKETS_PER_S // rate_hz + 1, 2), -1.0)
+    found = np.full(
+        (len(outputs) and (len(outputs) - 1) * BUCKETS_PER_S // rate_hz + 1, 2), -1.0
+    )
     for k, output in enumerate(outputs):
         error = max(abs(a - b) for a, b in zip(output.x or output.q, output.q_des, strict=True))
         speed = max(map(abs, output.qd))
@@ -67,7 +100,12 @@ def agree(scenario: Scenario) -> None:
         np.testing.assert_array_equal(record[: len(last)], last)
     for found, (name, outputs) in zip(fused.maxima, expected.items(), strict=True):
         np.testing.assert_array_equal(found, buckets(outputs, scenario.sites[name].rate_hz))
-    stops = [o.t_ns * 1e-9 for outputs in expected.values() for o in outputs if o.mode is Mode.DIVERGED]
+    stops = [
+        o.t_ns * 1e-9
+        for outputs in expected.values()
+        for o in outputs
+        if o.mode is Mode.DIVERGED
+    ]
     assert fused.diverged_s == (pytest.approx(min(stops)) if stops else None)
 
 
@@ -88,7 +126,10 @@ def test_every_shipped_scenario_has_the_same_bits(name: str) -> None:
 def test_whatever_the_links_the_rates_and_the_scheme(
     name: str, scheme: str, link: Mapping[str, Any], rates: tuple[int, ...], seed: int
 ) -> None:
-    changes = {f"sites.{site}.rate_hz": rate for site, rate in zip(("m1", "m2", "s"), rates, strict=True)}
+    changes = {
+        f"sites.{site}.rate_hz": rate
+        for site, rate in zip(("m1", "m2", "s"), rates, strict=True)
+    }
     run = {"duration_s": 0.4, "seed": seed, "scheme": scheme}
     agree(load_scenario(load_scenario(name), {**changes, **run, **link}))
 
@@ -123,7 +164,14 @@ def test_a_run_in_parts_is_the_run_in_one(stops: list[float]) -> None:
     [
         ("contact", {"duration_s": 6.0, "rate_hz": 500}),
         ("contact", {"duration_s": 6.0, "rate_hz": 500, "sites.s.environment.0.sampled": True}),
-        ("windup", {"duration_s": 6.0, "sites.m1.rate_hz": 250, "sites.m1.environment": [VISCOUS, HELD]}),
+        (
+            "windup",
+            {
+                "duration_s": 6.0,
+                "sites.m1.rate_hz": 250,
+                "sites.m1.environment": [VISCOUS, HELD],
+            },
+        ),
         ("free", {"duration_s": 3.0, "limits.qd_limit_rad_s": 1.5}),
     ],
 )
@@ -134,10 +182,16 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
     fused.advance(0.5 * scenario.duration_s)
     fused.advance(scenario.duration_s)
     log = virtual.simulate_scenario(scenario)
-    whole = {one.key: compute_log_metrics(log).whole(one).value for one in quantities() if one.key in TOTALS}
+    whole = {
+        one.key: compute_log_metrics(log).whole(one).value
+        for one in quantities()
+        if one.key in TOTALS
+    }
     found = fused.totals._asdict()
     for key in TOTALS:
-        assert found[key] == (whole[key] if whole[key] is None else pytest.approx(whole[key], rel=1e-9)), key
+        assert found[key] == (
+            whole[key] if whole[key] is None else pytest.approx(whole[key], rel=1e-9)
+        ), key
     squares = []
     for site in scenario.names:
         q, tau, theta = log[site].q, log[site].tau, scenario.arms[site].theta
@@ -156,7 +210,8 @@ def test_it_settles_when_the_last_error_falls_below_the_limit() -> None:
         output.t_ns
         for outputs in per_tick(scenario).values()
         for output in outputs
-        if max(abs(a - b) for a, b in zip(output.x or output.q, output.q_des, strict=True)) >= 0.01
+        if max(abs(a - b) for a, b in zip(output.x or output.q, output.q_des, strict=True))
+        >= 0.01
     ]
     assert fused.settled_s == max(apart) / 1e9
     early = FusedRun(scenario, apart_rad=0.01)
@@ -187,7 +242,9 @@ def test_without_the_compiler_it_has_the_same_bits() -> None:
 
 
 def test_what_the_compiled_loop_cannot_run_is_refused() -> None:
-    with pytest.raises(ScenarioError, match=r"sites\.m1\.plant: is external: .* runs live only"):
+    with pytest.raises(
+        ScenarioError, match=r"sites\.m1\.plant: is external: .* runs live only"
+    ):
         FusedRun(load_scenario("free", {"sites.m1.plant": "external"}))
     with pytest.raises(ScenarioError, match="makes 10000 ticks within one of the slowest"):
         FusedRun(load_scenario("free", {"rate_hz": 10_000, "sites.s.rate_hz": 1}))
@@ -198,7 +255,10 @@ def test_plugged_laws_have_the_bits_of_the_per_tick_driver(law: str) -> None:
     """One law among those of the kernel, which send nothing; and all sites, at two rates."""
     plugged = {"link.delay_ms": 5.0, "duration_s": 0.2}
     line = f"tests.plugged_laws:{law}"
-    for changes in ({"sites.s.control.law": line}, {"control.law": line, "sites.s.rate_hz": 500}):
+    for changes in (
+        {"sites.s.control.law": line},
+        {"control.law": line, "sites.s.rate_hz": 500},
+    ):
         scenario = load_scenario("asymmetric", {**plugged, **changes})
         fused = FusedRun(scenario)
         fused.advance(0.05)
@@ -213,7 +273,9 @@ def test_plugged_laws_have_the_bits_of_the_per_tick_driver(law: str) -> None:
 @pytest.mark.parametrize("law", ["Line", "CompiledLine"])
 def test_a_law_that_fails_in_a_fused_run_is_named(law: str) -> None:
     control = {"law": f"tests.plugged_laws:{law}", "fail_at": 42}
-    run = FusedRun(load_scenario("asymmetric", {"link.delay_ms": 5.0, "sites.m2.control": control}))
+    run = FusedRun(
+        load_scenario("asymmetric", {"link.delay_ms": 5.0, "sites.m2.control": control})
+    )
     problem = f"{law} of m2 failed at tick 41: ZeroDivisionError"
     with pytest.raises(LawFailed, match=problem):
         run.advance(0.2)

@@ -41,10 +41,13 @@ def test_each_peer_gets_its_own_vector_and_the_common_one() -> None:
             used = log[site].used[peer]
             assert used[-1] == TICKS - 1 - DELAY_TICKS
             heard = np.where(used[:, None] >= 0, log[peer].sent[f"target[{site}]"][used], 0.0)
-            energy += 10.0 * alpha[site].get(peer, 0.0) * ((heard - log[site].q) ** 2).sum(axis=1)
+            energy += (
+                10.0 * alpha[site].get(peer, 0.0) * ((heard - log[site].q) ** 2).sum(axis=1)
+            )
         assert log[site].sent["energy"][:, 0] == pytest.approx(energy, rel=1e-12)
         told = [log[site].sent[f"target[{peer}]"] - log[site].q for peer in log[site].peers]
-        assert all(np.ptp(one, axis=1).max() < 1e-12 for one in told)  # the same for both joints
+        # the same for both joints
+        assert all(np.ptp(one, axis=1).max() < 1e-12 for one in told)
         assert np.abs(told[0] - told[1]).min() > 5e-3  # and other for each peer
 
 
@@ -90,7 +93,9 @@ def test_a_changed_number_shows_at_its_own_tick(
 
 
 @pytest.mark.parametrize(("place", "differing"), [(0, 3), (1, 2), (3, 2)])
-def test_the_sum_of_arrivals_covers_exactly_what_a_site_gets(place: int, differing: int) -> None:
+def test_the_sum_of_arrivals_covers_exactly_what_a_site_gets(
+    place: int, differing: int
+) -> None:
     """A number that comes too late to be used shows where it came: at both peers, or at the one."""
 
     def record(r: Record) -> Record:
@@ -114,13 +119,20 @@ def test_viewers_get_a_channel_per_vector_with_its_unit(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     virtual.record_virtual(load_scenario("paper", SHORT), path, views_hz=FULL_RATE_HZ)
     channels = read_ros2_channels(path)
-    about = {topic.rpartition("/")[2]: one.about for topic, one in channels.items() if "/viz/m2/" in topic}
+    about = {
+        topic.rpartition("/")[2]: one.about
+        for topic, one in channels.items()
+        if "/viz/m2/" in topic
+    }
     sent = {name: one["unit"] for name, one in about.items() if name.startswith("sent_")}
     assert sent == {"sent_energy": "J", "sent_target_to_m1": "rad", "sent_target_to_s": "rad"}
     log = open_log(path)
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
-        shown = [[*one[3].data] for one in reader.iter_decoded_messages(topics=["/viz/m2/sent_target_to_s"])]
+        shown = [
+            [*one[3].data]
+            for one in reader.iter_decoded_messages(topics=["/viz/m2/sent_target_to_s"])
+        ]
     assert shown == log["m2"].sent["target[s]"].tolist()
     page = build_plot_layout(channels).pages["Sent by laws"]
     assert [plot.title for plot in page[0]] == [
@@ -132,7 +144,9 @@ def test_viewers_get_a_channel_per_vector_with_its_unit(tmp_path: Path) -> None:
 def test_tables_name_what_was_sent_with_its_unit() -> None:
     log = opened(talk())
     table = log.table("m2", "state")
-    columns = {column.source: column for column in table.columns if column.source.startswith("ch.")}
+    columns = {
+        column.source: column for column in table.columns if column.source.startswith("ch.")
+    }
     assert {source: (one.name, one.unit) for source, one in columns.items()} == {
         "ch.energy[0]": ("ch_energy_j", "J"),
         "ch.target[m1][0]": ("ch_target_m1_1_rad", "rad"),

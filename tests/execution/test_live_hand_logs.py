@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 
 from trilat_net.analysis.aligned import align_records
-from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
+from trilat_net.analysis.certificate.energy_balance import (
+    compute_energy_balance,
+    compute_site_energies,
+)
 from trilat_net.analysis.torque_sources import compute_live_torque, split_torque
 from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand
 from trilat_net.core.site_step import Site
@@ -36,7 +39,9 @@ class CirclingHand:
 
         commands = []
         if 200 <= k <= 700 and k % 17 == 0:
-            goal = [0.4 * np.sin(0.01 * (k - 200)), 0.3] if self._mode != "force" else [5.0, 5.0]
+            goal = (
+                [0.4 * np.sin(0.01 * (k - 200)), 0.3] if self._mode != "force" else [5.0, 5.0]
+            )
             start = (0.0, 0.0) if self._mode == "force" else place()
             target = tuple(float(a + b) for a, b in zip(start, goal, strict=True))
             commands = [HandCommand(7, k, True, target, k * 1_000_000)]
@@ -81,7 +86,11 @@ def test_the_force_is_zero_at_both_ends(held: Log) -> None:
 
 def test_a_table_of_records_names_what_the_hand_did(held: Log) -> None:
     table, mode = held.table("m1"), held.scenario.sites["m1"].hands[0].mode
-    first = {"tip": "hand_target_x_m", "joint": "hand_target_q1_rad", "force": "hand_force_x_n"}[mode]
+    first = {
+        "tip": "hand_target_x_m",
+        "joint": "hand_target_q1_rad",
+        "force": "hand_force_x_n",
+    }[mode]
     column = table[first]
     assert column.known is not None
     assert np.array_equal(column.known, held["m1"].hand[:, 2] == 7)
@@ -109,12 +118,20 @@ def test_a_changed_hand_is_found(held: Log) -> None:
     ("changes", "problem"),
     [
         ({"sites.m1.hands": [{"kind": "live"}, {"kind": "live"}]}, "an arm has one"),
-        ({"sites.m1.hands": [{"kind": "live"}], "sites.m1.plant": "external"}, "outside of the program"),
-        ({"sites.m1.hands": [{"kind": "live", "mode": "tip", "torque_limit_nm": 2.0}]}, "of mode 'joint'"),
+        (
+            {"sites.m1.hands": [{"kind": "live"}], "sites.m1.plant": "external"},
+            "outside of the program",
+        ),
+        (
+            {"sites.m1.hands": [{"kind": "live", "mode": "tip", "torque_limit_nm": 2.0}]},
+            "of mode 'joint'",
+        ),
         ({"sites.m1.hands": [{"kind": "live", "mode": "foot"}]}, "must be one of"),
     ],
 )
-def test_a_live_hand_that_cannot_be_is_refused(changes: dict[str, object], problem: str) -> None:
+def test_a_live_hand_that_cannot_be_is_refused(
+    changes: dict[str, object], problem: str
+) -> None:
     with pytest.raises(ScenarioError, match=problem):
         load_scenario("paper", changes)
 

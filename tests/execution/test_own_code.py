@@ -50,7 +50,9 @@ def without_code(log: SimulatedLog) -> Log:
     "keys", [{}, {"rate_hz": 100, "delay_ms": 0.0}, {"mode": "joint"}, {"delay_ms": 33.0}]
 )
 @pytest.mark.parametrize("name", ["paper", "free"])
-def test_compiled_run_pauses_where_a_hand_is_asked(name: str, kind: str, keys: dict[str, Any]) -> None:
+def test_compiled_run_pauses_where_a_hand_is_asked(
+    name: str, kind: str, keys: dict[str, Any]
+) -> None:
     scenario = load_scenario(name, at_m2(kind, **keys))
     log, run = simulate_scenario(scenario), FusedRun(scenario, keep=2000)
     run.advance(scenario.duration_s)
@@ -128,10 +130,16 @@ def test_letting_go_is_no_failure() -> None:
         ({"delay_ms": -1}, "delay_ms", "a time from 0 to 1000 ms"),
         ({"turn_s": 2}, "turn_s", "unknown key"),
         ({"settings": {"turn": 2}}, "hands", "cannot be made with turn = 2: TypeError"),
-        ({"mode": "force", "speed_limit_m_s": 1}, "speed_limit_m_s", "belongs to a live hand of mode 'tip'"),
+        (
+            {"mode": "force", "speed_limit_m_s": 1},
+            "speed_limit_m_s",
+            "belongs to a live hand of mode 'tip'",
+        ),
     ],
 )
-def test_a_hand_that_cannot_be_is_refused(keys: dict[str, Any], path: str, problem: str) -> None:
+def test_a_hand_that_cannot_be_is_refused(
+    keys: dict[str, Any], path: str, problem: str
+) -> None:
     with pytest.raises(ScenarioError, match=problem) as refused:
         tn.simulate("paper", at_m2(**keys))
     assert refused.value.path.endswith(path)
@@ -154,7 +162,9 @@ def test_scenarios_arm_as_plant_differs_by_the_integrators_order() -> None:
 
     def apart(rate_hz: int) -> float:
         overrides = {"rate_hz": rate_hz, "duration_s": 1.0, "link.delay_ms": 50}
-        built_in, plant = (tn.simulate("paper", {**more, **overrides}) for more in ({}, with_plant()))
+        built_in, plant = (
+            tn.simulate("paper", {**more, **overrides}) for more in ({}, with_plant())
+        )
         return float(np.abs(built_in["s"].q[-1] - plant["s"].q[-1]).max())
 
     coarse, fine = apart(500), apart(1000)
@@ -207,7 +217,9 @@ def test_bodies_of_a_plant_are_in_every_record() -> None:
     [("few", "not seven numbers for each of 2"), ("nan", "not finite"), ("short", "not seven")],
 )
 def test_bodies_that_are_nowhere_end_the_run(how: str, problem: str) -> None:
-    with pytest.raises(PlantFailed, match=f"Carousel of s failed at tick 99: ValueError: .*{problem}"):
+    with pytest.raises(
+        PlantFailed, match=f"Carousel of s failed at tick 99: ValueError: .*{problem}"
+    ):
         tn.simulate("paper", with_plant("Carousel", bodies=BODIES, how=how))
 
 
@@ -215,7 +227,11 @@ def test_bodies_that_are_nowhere_end_the_run(how: str, problem: str) -> None:
     ("bodies", "kind", "problem"),
     [
         (BODIES, "Arm", r"Arm has no poses\(\)"),
-        ({"box": [0.2, 0.2]}, "Carousel", r"three sizes, m, above 0 and up to 100, is \[0.2, 0.2\]"),
+        (
+            {"box": [0.2, 0.2]},
+            "Carousel",
+            r"three sizes, m, above 0 and up to 100, is \[0.2, 0.2\]",
+        ),
         ({"box": [0.2, 0.2, -1.0]}, "Carousel", "three sizes, m"),
         ({"The Box": [1.0, 1.0, 1.0]}, "Carousel", "a body is named by a to z"),
         (3, "Carousel", r"the sizes of at most 32 bodies, as in \{ box"),
@@ -229,7 +245,9 @@ def test_bodies_that_cannot_be_are_refused(bodies: Any, kind: str, problem: str)
 
 @pytest.mark.parametrize("rate_hz", [1000, 400])
 def test_compiled_run_pauses_where_a_plant_moves(rate_hz: int) -> None:
-    scenario = load_scenario("paper", {**with_plant(), "duration_s": 1.0, "sites.s.rate_hz": rate_hz})
+    scenario = load_scenario(
+        "paper", {**with_plant(), "duration_s": 1.0, "sites.s.rate_hz": rate_hz}
+    )
     log = simulate_scenario(scenario)
     run = FusedRun(scenario, keep=2000, plants=make_plant_players(scenario))
     for until_s in (0.3, 0.3015, 1.0):
@@ -248,7 +266,9 @@ def test_a_sweep_takes_no_plant_and_says_so() -> None:
 
 
 def test_the_text_of_a_scenario_holds_its_code_by_hash() -> None:
-    scenario: Scenario = load_scenario("paper", {**at_m2(settings={"turn_s": 2.5}), **with_plant()})
+    scenario: Scenario = load_scenario(
+        "paper", {**at_m2(settings={"turn_s": 2.5}), **with_plant()}
+    )
     again = load_scenario(scenario.text)
     assert again.sha256 == scenario.sha256
     assert again.sites["m2"].hands == scenario.sites["m2"].hands
@@ -257,7 +277,12 @@ def test_the_text_of_a_scenario_holds_its_code_by_hash() -> None:
 
 def test_a_person_takes_over_from_a_program_without_a_jump() -> None:
     """Both lead a moving slave in turn; ramps step q_id by no more than 1.2 times the motion itself."""
-    person = {"kind": "tip_spring", "to_m": [1.6, 0.5], "stiffness_n_m": 300.0, "damping_n_s_m": 30.0}
+    person = {
+        "kind": "tip_spring",
+        "to_m": [1.6, 0.5],
+        "stiffness_n_m": 300.0,
+        "damping_n_s_m": 30.0,
+    }
     ramps = [
         {"at_s": at_s, "dominance": "s", "to": {"m1": m1, "m2": 1.0 - m1}, "ramp_s": 1.0}
         for at_s, m1 in ((3.0, 0.9), (6.0, 0.1))

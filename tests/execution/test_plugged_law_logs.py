@@ -24,7 +24,9 @@ def plugged(law: str) -> bytes:
 
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("session", [None, OTHER_PLATFORM])
-def test_a_plugged_law_is_verified_whole_and_behind_gaps(law: str, session: dict[str, str] | None) -> None:
+def test_a_plugged_law_is_verified_whole_and_behind_gaps(
+    law: str, session: dict[str, str] | None
+) -> None:
     data = plugged(law)
     verdict = verify(opened(data))
     assert verdict.whole_run
@@ -51,9 +53,9 @@ def test_from_any_record_on_a_run_is_the_whole_run(law: str) -> None:
                 arrivals, missing = inputs.arrivals(state.rx)
                 assert not missing
                 record = site.step(TickInput(state.tick, arrivals))
-                assert record._replace(x=[], xd=[], wrench=[], hand=[], bodies=[]) == read_output(
-                    state, part.peers
-                )
+                assert record._replace(
+                    x=[], xd=[], wrench=[], hand=[], bodies=[]
+                ) == read_output(state, part.peers)
 
 
 def test_rerun_changes_what_changed_gain_changes_and_nothing_else() -> None:

@@ -6,7 +6,15 @@ import pytest
 from hypothesis import given, settings
 
 import trilat_net
-from tests.execution.deliveries import SITES, TICKS, Sample, delivered, never, site_sets, under_way
+from tests.execution.deliveries import (
+    SITES,
+    TICKS,
+    Sample,
+    delivered,
+    never,
+    site_sets,
+    under_way,
+)
 from tests.log_editing import edited, opened, recorded
 from trilat_net.core.fingerprint import compute_fingerprint
 from trilat_net.core.site_step import Site
@@ -22,7 +30,9 @@ SHORT = {"duration_s": 0.12, "link.delay_ms": 20.0}
 
 
 @pytest.mark.parametrize("name", list_shipped())
-@pytest.mark.parametrize("scheme", ["second_order", pytest.param("digital", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "scheme", ["second_order", pytest.param("digital", marks=pytest.mark.long)]
+)
 def test_nothing_changed_any_site_is_the_logs_bit_for_bit(name: str, scheme: str) -> None:
     log = opened(recorded(name, {"duration_s": 0.3, "scheme": scheme}))
     for site in log.sites:
@@ -38,15 +48,21 @@ def test_sites_with_rates_of_their_own_are_the_logs_too() -> None:
 
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
-@pytest.mark.parametrize("replace", [["m1"], ["m2"], ["s"], ["m2", "s"], ["m1", "m2", "s"]], ids=" ".join)
-def test_logs_of_every_version_with_changes_and_losses_rerun_equal(path: Path, replace: list[str]) -> None:
+@pytest.mark.parametrize(
+    "replace", [["m1"], ["m2"], ["s"], ["m2", "s"], ["m1", "m2", "s"]], ids=" ".join
+)
+def test_logs_of_every_version_with_changes_and_losses_rerun_equal(
+    path: Path, replace: list[str]
+) -> None:
     again = rerun(path, replace)
     assert not again.request.changes
     assert not again.broken
     if again.before.session["fingerprint"] == compute_fingerprint():
         assert all_identical(again)
         return
-    assert any("fingerprint" in note or "arithmetic" in note for note in again.notes), again.notes
+    assert any("fingerprint" in note or "arithmetic" in note for note in again.notes), (
+        again.notes
+    )
     for site in replace:
         for field in ("q", "qd", "tau", "theta_hat"):
             ours, theirs = getattr(again.after[site], field), getattr(again.before[site], field)
@@ -63,8 +79,14 @@ def test_samples_late_reordered_or_never_come_as_they_came(
 
 def test_change_of_one_site_is_its_step_with_recorded_samples() -> None:
     """By hand: the site of the changed scenario, fed what its records list of its peers' records."""
-    log = opened(delivered({("s", 0, 40): 37, ("s", 1, 41): 25, ("s", 1, 60): 12}, {("s", 0, 70)}))
-    changes = {"sites.s.control.Kd": 7.0, "links.m1->s.delay_ms": 11.0, "sites.s.q0_rad": [0.2, -0.1]}
+    log = opened(
+        delivered({("s", 0, 40): 37, ("s", 1, 41): 25, ("s", 1, 60): 12}, {("s", 0, 70)})
+    )
+    changes = {
+        "sites.s.control.Kd": 7.0,
+        "links.m1->s.delay_ms": 11.0,
+        "sites.s.q0_rad": [0.2, -0.1],
+    }
     again = rerun(log, ["s"], changes)
     site = Site(load_scenario(log.scenario, changes).setup("s"))
     samples = [{state.tick: state for state in log[peer].states} for peer in site.peers]
@@ -82,7 +104,12 @@ def test_change_of_one_site_is_its_step_with_recorded_samples() -> None:
         {"control.Kd": 5.0},
         {"control.law": "p_d", "control.K": 20.0},
         {"link.delay_ms": 33.0},
-        {"link.model": "uniform", "link.delay_ms": 20.0, "link.half_width_ms": 15.0, "link.loss": 0.2},
+        {
+            "link.model": "uniform",
+            "link.delay_ms": 20.0,
+            "link.half_width_ms": 15.0,
+            "link.loss": 0.2,
+        },
         {"link.playout_ms": 45.0},
         {"arm.m2_kg": 2.5, "limits.tau_limit_nm": 12.0},
         {"dominance.s.m1": 0.9, "dominance.s.m2": 0.1},
@@ -94,14 +121,17 @@ def test_change_of_one_site_is_its_step_with_recorded_samples() -> None:
     ],
     ids=lambda changes: " ".join(changes),
 )
-def test_a_change_in_a_closed_loop_is_the_changed_experiment(changes: dict[str, object]) -> None:
+def test_a_change_in_a_closed_loop_is_the_changed_experiment(
+    changes: dict[str, object],
+) -> None:
     """Where every sample comes long before it is due, the network does not matter (L2)."""
     again = rerun(opened(recorded("free")), [], changes, closed_loop=True)
     twin = simulated("free", {**SHORT, **changes})
     for site in SITES:
         ours, theirs = motion(again.after, site), motion(twin, site)
         assert ours == theirs[: len(ours)]
-        assert len(ours) >= len(theirs) - 2  # rates that do not divide: up to the last record of the log
+        # rates that do not divide: up to the last record of the log
+        assert len(ours) >= len(theirs) - 2
 
 
 def test_in_closed_loops_longer_delays_make_late_samples_harmless() -> None:
@@ -114,7 +144,10 @@ def test_in_closed_loops_longer_delays_make_late_samples_harmless() -> None:
 def test_on_a_measured_link_arrivals_are_all_that_counts() -> None:
     log = opened(delivered({("s", j, m): 9 for j in (0, 1) for m in range(120)}))
     again = rerun(log, ["s"], {"link.model": "measured"})
-    assert (again.links["m1->s"].age_mean_ms, again.links["m1->s"].age_max_ms) == ((20.0, 9.0), (20.0, 9.0))
+    assert (again.links["m1->s"].age_mean_ms, again.links["m1->s"].age_max_ms) == (
+        (20.0, 9.0),
+        (20.0, 9.0),
+    )
 
 
 def test_recorded_sites_do_not_react_and_executed_ones_do() -> None:
@@ -162,7 +195,14 @@ def test_a_log_that_diverged_is_executed_to_its_end() -> None:
         lambda r: r["rx"].insert(0, [1, r["tick"] + 9, 0]),  # of a tick that needs this one
         lambda r: r.update(rx=r["rx"] * 3000),
     ],
-    ids=["no peer", "before the first peer", "far ahead", "before the epoch", "from the future", "too many"],
+    ids=[
+        "no peer",
+        "before the first peer",
+        "far ahead",
+        "before the epoch",
+        "from the future",
+        "too many",
+    ],
 )
 def test_strange_arrivals_end_nothing(change: object) -> None:
     def record(r: dict[str, object]) -> dict[str, object]:
@@ -179,7 +219,9 @@ def test_strange_arrivals_end_nothing(change: object) -> None:
 def test_facts_are_plain_and_name_their_units() -> None:
     facts = rerun(opened(recorded("free")), ["s"], {"sites.s.control.Kd": 5.0}).to_dict()
     assert facts["mode"] == "open loop"
-    assert facts["changes"] == [{"key": "sites.s.control.Kd", "before": (3.0, 3.0), "after": (5.0, 5.0)}]
+    assert facts["changes"] == [
+        {"key": "sites.s.control.Kd", "before": (3.0, 3.0), "after": (5.0, 5.0)}
+    ]
     site = facts["sites"]["s"]
     assert site["error_rms_rad"].keys() == {"before", "after"}
     assert site["q_max_rad"] > site["q_rms_rad"] > 0.0

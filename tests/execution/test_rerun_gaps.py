@@ -36,7 +36,11 @@ def test_behind_a_gap_a_rerun_is_the_log_again(
 
 @pytest.mark.long
 @settings(max_examples=15)
-@given(replace=site_sets, lost=st.sets(st.integers(1, TICKS - 2), min_size=1, max_size=50), data=st.data())
+@given(
+    replace=site_sets,
+    lost=st.sets(st.integers(1, TICKS - 2), min_size=1, max_size=50),
+    data=st.data(),
+)
 def test_changed_site_goes_through_gaps_as_if_there_were_none(
     replace: list[str], lost: set[int], data: st.DataObject
 ) -> None:
@@ -51,7 +55,9 @@ def test_changed_site_goes_through_gaps_as_if_there_were_none(
         assert motion(again.after, name) == motion(whole.after, name)
 
 
-@pytest.mark.parametrize("changes", [{}, {"control.Kd": 5.0}], ids=["nothing changed", "changed"])
+@pytest.mark.parametrize(
+    "changes", [{}, {"control.Kd": 5.0}], ids=["nothing changed", "changed"]
+)
 def test_a_log_that_begins_late_is_executed_where_possible(changes: dict[str, float]) -> None:
     """Every recorder began at tick 40: with samples 20 ms old, from tick 61 on all in use are known."""
     log = without_records({site: range(40) for site in SITES}, recorded("free"))

@@ -43,15 +43,23 @@ def test_file_says_where_it_comes_from_and_what_is_otherwise(file: Path) -> None
     assert after.scenario_sha256 == session["scenario_sha256"]
 
 
-@pytest.mark.parametrize("changes", [{}, {"control.Kd": 5, "link.delay_ms": 12.0}], ids=["same", "changed"])
+@pytest.mark.parametrize(
+    "changes", [{}, {"control.Kd": 5, "link.delay_ms": 12.0}], ids=["same", "changed"]
+)
 def test_recorded_sites_stand_byte_for_byte(changes: dict[str, float]) -> None:
     log = opened(recorded("free"))
     after = rerun(log, ["s"], changes).after
-    assert (after.session["rerun_of"], after.session["rerun_of_sha256"]) == ("", "")  # it is in memory
+    # it is in memory
+    assert (after.session["rerun_of"], after.session["rerun_of_sha256"]) == (
+        "",
+        "",
+    )
     for name in ("m1", "m2"):
         assert list(after[name].payloads) == list(log[name].payloads)
         assert after.link_stats(name) == log.link_stats(name)
-        assert [e for e in after.events if e.member == name] == [e for e in log.events if e.member == name]
+        assert [e for e in after.events if e.member == name] == [
+            e for e in log.events if e.member == name
+        ]
     assert after.complete
     assert [e.ticks for e in after.events if e.kind == "end"] == [TICKS] * 3
 
@@ -65,7 +73,9 @@ def test_what_was_executed_is_verified_and_what_stands_is_not(replace: list[str]
     assert verdict.identical == verdict.records == TICKS * len(replace)
     lines = run_log_checks(after, virtual=True).findings
     others = [name for name in SITES if name not in replace]
-    assert [line.check for line in lines if not line.passed] == ["records"] * bool(others), lines
+    assert [line.check for line in lines if not line.passed] == ["records"] * bool(others), (
+        lines
+    )
     assert all(name in lines[2].text for name in others)
     assert ("did not react" in lines[-1].text) == bool(others)
 
@@ -88,10 +98,16 @@ def test_records_that_stand_are_not_judged() -> None:
 def test_an_older_log_becomes_one_of_this_version() -> None:
     again = rerun(GOLDEN, ["m2"])
     for name in again.before.sites:
-        for ours, theirs in zip(again.after[name].states, again.before[name].states, strict=True):
+        for ours, theirs in zip(
+            again.after[name].states, again.before[name].states, strict=True
+        ):
             assert (ours.v, theirs.v) == (VERSION, 2)
             assert (ours.rx, ours.cmd) == (theirs.rx, theirs.cmd)
-            for mine, old in ((ours.q, theirs.q), (ours.tau, theirs.tau)):  # its sines were another library's
+            # its sines were another library's
+            for mine, old in (
+                (ours.q, theirs.q),
+                (ours.tau, theirs.tau),
+            ):
                 assert mine == (pytest.approx(old, abs=1e-9) if name == "m2" else old)
     assert verify(again.after).agreed
     assert {event.n for event in again.after.events if event.member == "s"} == set(range(4))

@@ -7,15 +7,23 @@ import pytest
 
 from tests.log_editing import opened, recorded
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.execution.rerun_execution import RerunRequest, describe_rerun_changes, resolve_rerun_request
+from trilat_net.execution.rerun_execution import (
+    RerunRequest,
+    describe_rerun_changes,
+    resolve_rerun_request,
+)
 
 from .deliveries import SITES
 
 Overrides = Mapping[str, Any] | Sequence[str]
 
 
-def asked(replace: Sequence[str], overrides: Overrides = (), *, closed_loop: bool = False) -> RerunRequest:
-    return resolve_rerun_request(opened(recorded("paper")), replace, overrides, closed_loop=closed_loop)
+def asked(
+    replace: Sequence[str], overrides: Overrides = (), *, closed_loop: bool = False
+) -> RerunRequest:
+    return resolve_rerun_request(
+        opened(recorded("paper")), replace, overrides, closed_loop=closed_loop
+    )
 
 
 def test_nothing_changed_is_the_experiment_of_the_log() -> None:
@@ -24,7 +32,11 @@ def test_nothing_changed_is_the_experiment_of_the_log() -> None:
         for replace in (log.sites[:1], log.sites):
             found = resolve_rerun_request(log, replace, (), closed_loop=False)
             assert found.scenario == log.scenario
-            assert (found.changes, found.without_effect, describe_rerun_changes(found)) == ([], [], [])
+            assert (found.changes, found.without_effect, describe_rerun_changes(found)) == (
+                [],
+                [],
+                [],
+            )
 
 
 @pytest.mark.parametrize(
@@ -97,7 +109,9 @@ def test_every_site_is_a_closed_loop() -> None:
         (["s"], True, ["replace", "closed_loop=True"]),
     ],
 )
-def test_it_must_be_said_which_sites_once(replace: list[str], closed_loop: bool, facts: list[str]) -> None:
+def test_it_must_be_said_which_sites_once(
+    replace: list[str], closed_loop: bool, facts: list[str]
+) -> None:
     with pytest.raises(UsageError) as caught:
         asked(replace, closed_loop=closed_loop)
     assert all(fact in str(caught.value) for fact in facts)
@@ -120,7 +134,9 @@ def test_it_must_be_said_which_sites_once(replace: list[str], closed_loop: bool,
     ],
     ids=str,
 )
-def test_what_cannot_be_otherwise_is_refused_with_the_reason(overrides: list[str], facts: list[str]) -> None:
+def test_what_cannot_be_otherwise_is_refused_with_the_reason(
+    overrides: list[str], facts: list[str]
+) -> None:
     with pytest.raises(ScenarioError) as caught:
         asked(["s"], overrides)
     assert all(fact in str(caught.value) for fact in facts), caught.value

@@ -44,7 +44,9 @@ def test_errors_are_measured_and_drawn_in_metres(log: Log) -> None:
     metrics = compute_log_metrics(log)
     for site in log.sites:
         own, part = metrics.sites[site], log[site]
-        assert own["rms_error_m"].value == pytest.approx(np.sqrt((part.e**2).mean(axis=0)).max())
+        assert own["rms_error_m"].value == pytest.approx(
+            np.sqrt((part.e**2).mean(axis=0)).max()
+        )
         assert not own["rms_error_rad"].applies
         assert own["unaccounted_j"].value < 1e-6
     apart = np.ptp([log[site].x[-1, [0, 2]] for site in log.sites], axis=0).max()
@@ -75,14 +77,18 @@ def test_wall_is_felt_at_end_effector_as_shares_say() -> None:
     text = planar_task(8.0)
     head, rest = text.split("[control]")
     text = head + '[control]\nlaw = "p_d"\nK = 60.0\nd = 12.0\n[task]' + rest.split("[task]")[1]
-    log = trilat_net.simulate(parse_scenario(text.replace("[dominance]", TOUCH + "[dominance]")))
+    log = trilat_net.simulate(
+        parse_scenario(text.replace("[dominance]", TOUCH + "[dominance]"))
+    )
     metrics = compute_log_metrics(log)
     pair = next(one for one in metrics.sharing_ratios if one.by_wall)
     assert (metrics.label(pair.joint), metrics.unit("N m", pair.joint)) == ("x", "N")
     assert pair.expected_nm.value is not None
     assert pair.felt_nm == pytest.approx(pair.expected_nm.value, rel=1e-3)
     assert pair.pushed_nm == pytest.approx(-log["s"].wrench[-500:, 0].mean(), rel=1e-2)
-    assert metrics.walls["s/1"]["end_force_mean_n"].value == pytest.approx(-pair.pushed_nm, rel=1e-2)
+    assert metrics.walls["s/1"]["end_force_mean_n"].value == pytest.approx(
+        -pair.pushed_nm, rel=1e-2
+    )
     entry = next(one for one in metrics.to_dict()["force_sharing"] if one["axis"] == "x")
     assert entry["felt_n"] == pair.felt_nm
     assert "felt_nm" not in entry

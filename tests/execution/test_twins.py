@@ -46,7 +46,9 @@ def test_the_difference_of_a_linear_loop_obeys_its_root(d: float, seconds: float
 def test_a_push_of_nothing_changes_no_bit() -> None:
     scenario = load_scenario("paper")
     by = np.zeros((3, 2))
-    twins = run_virtual_twins(scenario, [Push("nothing", "q", by), Push("nothing later", "qd", by, 1.3)], 3.0)
+    twins = run_virtual_twins(
+        scenario, [Push("nothing", "q", by), Push("nothing later", "qd", by, 1.3)], 3.0
+    )
     assert not np.isfinite([path.largest for path in twins.paths]).any()
     assert twins.speed.max() > 0.1
 
@@ -109,7 +111,13 @@ def test_a_push_is_at_its_instant() -> None:
     path = twins.paths[0]
     assert path.pushed == (25,)
     assert not np.isfinite(path.largest[:25]).any()
-    assert np.isfinite(path.largest[25]).tolist() == [False, False, True, True]  # m has not heard of it yet
+    # m has not heard of it yet
+    assert np.isfinite(path.largest[25]).tolist() == [
+        False,
+        False,
+        True,
+        True,
+    ]
     assert path.push.largest == math.inf > LARGEST
     with pytest.raises(NotRepeatable, match="within the run"):
         run_virtual_twins(scenario, [path.push._replace(at_s=2.0)], 2.0)
@@ -126,7 +134,9 @@ def test_a_push_is_at_its_instant() -> None:
         ("theta", "1e-06 of all estimates", [(i, j) for i in range(3) for j in range(5)]),
     ],
 )
-def test_a_push_is_aimed_by_words(target: str, name: str, pushed: list[tuple[int, int]]) -> None:
+def test_a_push_is_aimed_by_words(
+    target: str, name: str, pushed: list[tuple[int, int]]
+) -> None:
     push = aim_push(load_scenario("paper"), target)
     assert push.name == name
     assert [tuple(at) for at in np.argwhere(push.by).tolist()] == pushed

@@ -33,7 +33,8 @@ def test_a_law_that_repeats_the_papers_gives_its_bits(name: str) -> None:
     theirs = opened(recorded(name, {**SHORT, "control.law": LAW}))
     for site in ours.sites:
         for a, b in zip(ours[site].states, theirs[site].states, strict=True):
-            assert numbers(a)[:-1] == numbers(b)[:-1]  # but for what a law from outside remembers
+            # but for what a law from outside remembers
+            assert numbers(a)[:-1] == numbers(b)[:-1]
     verdict = verify(theirs)
     assert verdict.whole_run
     assert verdict.identical == verdict.records == 3 * TICKS
@@ -72,7 +73,9 @@ def test_started_afresh_from_its_records_a_site_is_the_same(law: str) -> None:
         {"dominance": "s", "to": {"m1": 0.9, "m2": 0.1}, "ramp_s": 0.1},
     ]
     changes = [
-        to_core_change(scenario, resolve_change(scenario, LinkTables(scenario.links, ()), order, 10**8))
+        to_core_change(
+            scenario, resolve_change(scenario, LinkTables(scenario.links, ()), order, 10**8)
+        )
         for order in orders
     ]
     stream = io.BytesIO()
@@ -102,7 +105,9 @@ def test_a_changed_memory_shows_at_its_own_tick() -> None:
 
 
 @pytest.fixture
-def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Path:
+def file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> Path:
     """A law in a file of the folder that the person is in; its module is this test's own."""
     monkeypatch.chdir(tmp_path)
     name = "".join(letter for letter in request.node.name if letter.isalnum())
@@ -114,7 +119,8 @@ def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.Fixtur
 def log_of(file: Path) -> io.BytesIO:
     stream = io.BytesIO()
     virtual.write_virtual_log(
-        load_scenario("two_sites", {"duration_s": 0.05, "control.law": f"{file.stem}:Law"}), stream
+        load_scenario("two_sites", {"duration_s": 0.05, "control.law": f"{file.stem}:Law"}),
+        stream,
     )
     stream.seek(0)
     return stream
@@ -131,7 +137,12 @@ def test_changed_file_is_judged_if_one_asks_for_that_version(file: Path) -> None
     assert not law.allowed
     assert f"--law {file} --other-version (it was changed" in str(law)
     verdict = verify(log)
-    assert (verdict.withheld, verdict.records, verdict.agreed, verdict.passed) == (["m", "s"], 0, True, False)
+    assert (verdict.withheld, verdict.records, verdict.agreed, verdict.passed) == (
+        ["m", "s"],
+        0,
+        True,
+        False,
+    )
     with pytest.raises(UsageError, match="is not the file that ran"):
         reopened(stream, law=file)
     assert verify(reopened(stream, law=file, other_version=True)).passed
@@ -148,7 +159,9 @@ def test_a_file_that_is_not_there_says_what_to_do(file: Path) -> None:
     log = open_log(log_of(file))
     file.unlink()
     (law,) = find_user_laws(log.scenario)
-    assert str(law).endswith("code from outside, which may not run; if you trust it: --law FILE")
+    assert str(law).endswith(
+        "code from outside, which may not run; if you trust it: --law FILE"
+    )
     assert verify(log).withheld == ["m", "s"]
 
 
@@ -181,9 +194,13 @@ def test_a_failing_law_ends_the_run_with_a_finished_log(how: str, at: int) -> No
     law = {"law": "tests.laws:Failing", "how": how, "at": at}
     stream = io.BytesIO()
     with pytest.raises(LawFailed) as caught:
-        virtual.write_virtual_log(load_scenario("paper", {**SHORT, "sites.s.control": law}), stream)
+        virtual.write_virtual_log(
+            load_scenario("paper", {**SHORT, "sites.s.control": law}), stream
+        )
     text = str(caught.value)
-    assert text.startswith(f"the law tests.laws:Failing of s failed at tick {at}: {FAILURES[how]}")
+    assert text.startswith(
+        f"the law tests.laws:Failing of s failed at tick {at}: {FAILURES[how]}"
+    )
     assert "\n" not in text
     stream.seek(0)
     log = open_log(stream)

@@ -119,9 +119,14 @@ def test_a_changed_mode_is_found_and_named(site: str, tick: int) -> None:
 
 @settings(max_examples=20)
 @given(
-    site=st.sampled_from(SITES), tick=ticks.filter(bool), arrival=st.integers(0, 1), bit=st.integers(0, 12)
+    site=st.sampled_from(SITES),
+    tick=ticks.filter(bool),
+    arrival=st.integers(0, 1),
+    bit=st.integers(0, 12),
 )
-def test_one_bit_of_an_arrivals_tick_is_found_and_named(site: str, tick: int, arrival: int, bit: int) -> None:
+def test_one_bit_of_an_arrivals_tick_is_found_and_named(
+    site: str, tick: int, arrival: int, bit: int
+) -> None:
     def change(r: Record) -> None:
         r["rx"][arrival][1] ^= 1 << bit
 
@@ -162,7 +167,10 @@ def test_fields_that_nothing_computes_from_are_compared_too(field: str) -> None:
         ("Kd = [3.0, 3.0]", "Kd = [3.0, 3.0000000000000004]"),
         ("Kp = [1.0, 1.0]", "Kp = [1.0000000000000002, 1.0]"),
         ("Lambda = [1.0, 1.0]", "Lambda = [1.0, 1.0000000000000002]"),
-        ("Gamma = [1.0, 1.0, 1.0, 1.0, 1.0]", "Gamma = [1.0, 1.0, 1.0, 1.0, 1.0000000000000002]"),
+        (
+            "Gamma = [1.0, 1.0, 1.0, 1.0, 1.0]",
+            "Gamma = [1.0, 1.0, 1.0, 1.0, 1.0000000000000002]",
+        ),
         ("g_m_s2 = 9.81", "g_m_s2 = 9.810000000000002"),
         ("delay_ms = 20.0", "delay_ms = 20.001"),
         ('scheme = "second_order"', 'scheme = "digital"'),
@@ -184,7 +192,17 @@ def ranges(lost: set[int]) -> list[tuple[int, int]]:
 
 @pytest.mark.parametrize("site", SITES)
 @pytest.mark.parametrize(
-    "lost", [{0}, {0, 1, 2}, {1}, {40}, set(range(40, 45)), {40, 42}, {10, 50, 51, 90}, set(range(5, 80))]
+    "lost",
+    [
+        {0},
+        {0, 1, 2},
+        {1},
+        {40},
+        set(range(40, 45)),
+        {40, 42},
+        {10, 50, 51, 90},
+        set(range(5, 80)),
+    ],
 )
 def test_a_gap_is_reported_and_execution_resumes_behind_it(site: str, lost: set[int]) -> None:
     verdict = verify(without_records({site: lost}))
@@ -207,10 +225,14 @@ def test_a_gap_at_the_end_is_reported(site: str, first: int) -> None:
 @settings(max_examples=25)
 @given(
     site=st.sampled_from(SITES),
-    holes=st.lists(st.tuples(st.integers(0, TICKS - 2), st.integers(1, 12)), min_size=1, max_size=4),
+    holes=st.lists(
+        st.tuples(st.integers(0, TICKS - 2), st.integers(1, 12)), min_size=1, max_size=4
+    ),
     whole_run=st.booleans(),
 )
-def test_gaps_are_never_a_false_alarm(site: str, holes: list[tuple[int, int]], whole_run: bool) -> None:
+def test_gaps_are_never_a_false_alarm(
+    site: str, holes: list[tuple[int, int]], whole_run: bool
+) -> None:
     lost = {t for start, length in holes for t in range(start, start + length) if t < TICKS - 1}
     verdict = verify(without_records({site: lost}, session={} if whole_run else OTHER_PLATFORM))
     assert verdict.agreed, str(verdict.first)
@@ -230,7 +252,10 @@ def test_samples_out_of_order_late_or_never_are_no_difference(
 @settings(max_examples=20)
 @given(delays=under_way, never=never, lost=gaps(30, least=0), whole_run=st.booleans())
 def test_gaps_with_late_or_lost_samples_raise_no_false_alarm(
-    delays: dict[Sample, int], never: frozenset[Sample], lost: dict[str, set[int]], whole_run: bool
+    delays: dict[Sample, int],
+    never: frozenset[Sample],
+    lost: dict[str, set[int]],
+    whole_run: bool,
 ) -> None:
     """On links that keep their order, as those of a session do."""
     data = delivered(first_in_first_out(delays), never)
@@ -274,7 +299,9 @@ def test_on_another_platform_each_tick_follows_from_two_before_it(name: str) -> 
 
 @pytest.mark.parametrize("field", sorted(VECTORS))
 @pytest.mark.parametrize("tick", [0, 1, 60, TICKS - 1])
-def test_on_another_platform_a_change_beyond_the_tolerance_is_found(field: str, tick: int) -> None:
+def test_on_another_platform_a_change_beyond_the_tolerance_is_found(
+    field: str, tick: int
+) -> None:
     def change(r: Record) -> None:
         r[field][1] += 1e-6 * (1 + abs(r[field][1]))
 
@@ -287,7 +314,9 @@ def test_on_another_platform_rounding_is_no_difference() -> None:
         r["tau"] = [v * (1 + 1e-13) for v in r["tau"]]
         return r
 
-    assert verify(opened(edited(recorded("free"), record=record, session=OTHER_PLATFORM))).passed
+    assert verify(
+        opened(edited(recorded("free"), record=record, session=OTHER_PLATFORM))
+    ).passed
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.7])

@@ -30,8 +30,13 @@ rates = st.sampled_from([1, 7, 100, 333, 450, 1000])
 
 
 def small(rate_hz: Sequence[int], duration_s: float = 0.1, delay_ms: float = 20.0) -> Scenario:
-    changes = {f"sites.{name}.rate_hz": rate for name, rate in zip(("m1", "m2", "s"), rate_hz, strict=True)}
-    return load_scenario("free", {**changes, "duration_s": duration_s, "link.delay_ms": delay_ms})
+    changes = {
+        f"sites.{name}.rate_hz": rate
+        for name, rate in zip(("m1", "m2", "s"), rate_hz, strict=True)
+    }
+    return load_scenario(
+        "free", {**changes, "duration_s": duration_s, "link.delay_ms": delay_ms}
+    )
 
 
 @settings(max_examples=15)
@@ -39,7 +44,8 @@ def small(rate_hz: Sequence[int], duration_s: float = 0.1, delay_ms: float = 20.
 def test_sites_step_in_order_of_time_and_then_of_scenario(rate_hz: Rates) -> None:
     scenario = small(rate_hz)
     ran = [
-        (o.t_ns, scenario.names.index(site.name), o.tick) for site, _, o in virtual.execute_virtual(scenario)
+        (o.t_ns, scenario.names.index(site.name), o.tick)
+        for site, _, o in virtual.execute_virtual(scenario)
     ]
     assert ran == sorted(ran)
     for index, name in enumerate(scenario.names):
@@ -69,7 +75,9 @@ class ScatteredNetwork(PromptNetwork):
 
     def __init__(self, scenario: Scenario, slack: Sequence[int]) -> None:
         super().__init__({name: spec.rate_hz for name, spec in scenario.sites.items()})
-        self._held: dict[str, list[tuple[int, int, Arrival]]] = {name: [] for name in scenario.names}
+        self._held: dict[str, list[tuple[int, int, Arrival]]] = {
+            name: [] for name in scenario.names
+        }
         self._slack = slack
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
@@ -92,7 +100,9 @@ def without_arrivals(ran: Sequence[virtual.SiteTick]) -> list[TickRecord]:
 def test_the_network_decides_nothing_while_samples_come_before_due(slack: list[int]) -> None:
     scenario = small((1000, 1000, 1000))
     scattered = virtual.execute_virtual(scenario, ScatteredNetwork(scenario, slack))
-    assert without_arrivals(list(scattered)) == without_arrivals(list(virtual.execute_virtual(scenario)))
+    assert without_arrivals(list(scattered)) == without_arrivals(
+        list(virtual.execute_virtual(scenario))
+    )
 
 
 def test_a_sample_beyond_its_due_tick_does_change_the_run() -> None:
@@ -105,7 +115,9 @@ def test_a_sample_beyond_its_due_tick_does_change_the_run() -> None:
 def test_record_says_whether_the_run_stayed_within_its_limits() -> None:
     fine, wild = io.BytesIO(), io.BytesIO()
     assert virtual.write_virtual_log(small((1000,) * 3), fine)
-    assert not virtual.write_virtual_log(load_scenario("free", {"limits.qd_limit_rad_s": 0.3}), wild)
+    assert not virtual.write_virtual_log(
+        load_scenario("free", {"limits.qd_limit_rad_s": 0.3}), wild
+    )
     assert [e.kind for e in opened(fine.getvalue()).events] == ["end"] * 3
     kinds = [(e.member, e.kind) for e in opened(wild.getvalue()).events]
     assert "diverged" in {kind for _, kind in kinds}
@@ -116,7 +128,10 @@ def test_simulate_gives_the_log_of_a_scenario_with_overrides() -> None:
     log = simulate("paper", set={"control.Kd": 5, "duration_s": 0.05})
     assert log.scenario.sites["s"].control.Kd == (5.0, 5.0)
     assert (log.driver, len(log["s"])) == ("virtual", 50)
-    assert log["s"].q.tolist() == simulate("paper", ["control.Kd=5", "duration_s=0.05"])["s"].q.tolist()
+    assert (
+        log["s"].q.tolist()
+        == simulate("paper", ["control.Kd=5", "duration_s=0.05"])["s"].q.tolist()
+    )
 
 
 @pytest.mark.parametrize("site", ["m1", "s"])
@@ -136,7 +151,9 @@ links = st.tuples(st.sampled_from(SCENARIO.names), st.integers(0, 1), st.integer
 
 @settings(max_examples=10)
 @given(delays=st.dictionaries(links, st.integers(1, DUE), max_size=30))
-def test_a_run_without_late_samples_equals_plain_virtual_time(delays: dict[Sample, int]) -> None:
+def test_a_run_without_late_samples_equals_plain_virtual_time(
+    delays: dict[Sample, int],
+) -> None:
     twins = compare_with_virtual(opened_delivered(delays))
     assert twins.late == []
     assert twins.fed == (360, 360, None)
@@ -145,12 +162,18 @@ def test_a_run_without_late_samples_equals_plain_virtual_time(delays: dict[Sampl
 
 @settings(max_examples=10)
 @given(delays=st.dictionaries(links, st.integers(1, 39), min_size=1, max_size=30))
-def test_fed_with_a_logs_arrivals_virtual_time_equals_it_always(delays: dict[Sample, int]) -> None:
+def test_fed_with_a_logs_arrivals_virtual_time_equals_it_always(
+    delays: dict[Sample, int],
+) -> None:
     log = opened_delivered(delays)
     twins = compare_with_virtual(log)
     assert twins.fed == (360, 360, None)
-    expected = {(receiver, peer, tick) for (receiver, peer, tick), way in delays.items() if way > DUE}
-    assert {(late.site, PEERS[late.site].index(late.peer), late.tick) for late in twins.late} == expected
+    expected = {
+        (receiver, peer, tick) for (receiver, peer, tick), way in delays.items() if way > DUE
+    }
+    assert {
+        (late.site, PEERS[late.site].index(late.peer), late.tick) for late in twins.late
+    } == expected
     if twins.plain.first is not None:
         assert twins.plain.first.tick >= min(late.due_tick for late in twins.late)
 

@@ -23,7 +23,9 @@ Sample = tuple[int, int]
 Way = dict[Sample, int | None]
 """How many ticks a sample is under way; None: it never comes."""
 
-delays = st.dictionaries(st.tuples(st.integers(0, 1), st.integers(0, 110)), st.integers(1, 12), max_size=60)
+delays = st.dictionaries(
+    st.tuples(st.integers(0, 1), st.integers(0, 110)), st.integers(1, 12), max_size=60
+)
 lost_ticks = st.sets(st.integers(1, TICKS - 2), min_size=1, max_size=50)
 
 
@@ -46,7 +48,9 @@ def in_order(under_way: Way) -> Way:
 def record(k: int) -> TickRecord:
     """The record of a tick at which nothing moves."""
     two, five = [0.0] * 2, [0.0] * 5
-    return TickRecord(k, k * 10**6, Mode.RUN, two, two, two, two, two, two, five, [-1, -1], 0, [], [])
+    return TickRecord(
+        k, k * 10**6, Mode.RUN, two, two, two, two, two, two, five, [-1, -1], 0, [], []
+    )
 
 
 def short(way: Way, lost: set[int] = frozenset()) -> SiteLog:
@@ -86,14 +90,21 @@ def test_of_a_whole_log_it_is_what_the_records_list() -> None:
 
 @given(lost=lost_ticks, ticks=st.integers(1, 9))
 def test_on_a_steady_network_missing_records_are_found(lost: set[int], ticks: int) -> None:
-    whole, came = short(steady(ticks)), complete_deliveries(short(steady(ticks), lost), *SENDERS)
+    whole, came = (
+        short(steady(ticks)),
+        complete_deliveries(short(steady(ticks), lost), *SENDERS),
+    )
     assert came.unrecorded == lost
     pairs = {k: sorted(entry[:2] for entry in at) for k, at in came.at.items() if at}
-    assert pairs == {state.tick: sorted(e[:2] for e in state.rx) for state in whole.states if state.rx}
+    assert pairs == {
+        state.tick: sorted(e[:2] for e in state.rx) for state in whole.states if state.rx
+    }
 
 
 @given(under_way=delays, lost=lost_ticks)
-def test_on_any_network_every_arrived_sample_is_there_once(under_way: Way, lost: set[int]) -> None:
+def test_on_any_network_every_arrived_sample_is_there_once(
+    under_way: Way, lost: set[int]
+) -> None:
     """In order, of samples older than the newest that a record lists: of later ones nobody knows."""
     whole, gapped = short(in_order(under_way)), short(in_order(under_way), lost)
     came = complete_deliveries(gapped, *SENDERS)
@@ -119,7 +130,9 @@ rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])
 
 
 @given(ticks=st.integers(1, 30), rate_hz=rates, peer_rate_hz=rates)
-def test_at_other_rates_every_sample_travels_as_long(ticks: int, rate_hz: int, peer_rate_hz: int) -> None:
+def test_at_other_rates_every_sample_travels_as_long(
+    ticks: int, rate_hz: int, peer_rate_hz: int
+) -> None:
     came = recorded_deliveries(short(steady(ticks)))
     there = retime_deliveries(came, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000])
     assert there.last == 119 * rate_hz // 1000

@@ -55,7 +55,8 @@ def judge_seeds(count: int, jobs: int | None) -> Seeds:
 
 def find_tests(wanted: Sequence[str]) -> list[str]:
     files = {
-        path.relative_to(ROOT).as_posix(): path.read_text("utf-8") for path in (ROOT / LIVE).glob("test_*.py")
+        path.relative_to(ROOT).as_posix(): path.read_text("utf-8")
+        for path in (ROOT / LIVE).glob("test_*.py")
     }
     found = []
     for name in wanted:
@@ -68,10 +69,21 @@ def find_tests(wanted: Sequence[str]) -> list[str]:
 
 
 def run_tests(names: Sequence[str]) -> dict[str, str]:
-    command = [sys.executable, "-m", "pytest", "-q", "-rA", "-p", "no:cacheprovider", *dict.fromkeys(names)]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-rA",
+        "-p",
+        "no:cacheprovider",
+        *dict.fromkeys(names),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
     ends: dict[str, set[str]] = {}
-    for word, name in re.findall(r"^(PASSED|FAILED|ERROR|SKIPPED) (\S+)", done.stdout, re.MULTILINE):
+    for word, name in re.findall(
+        r"^(PASSED|FAILED|ERROR|SKIPPED) (\S+)", done.stdout, re.MULTILINE
+    ):
         for asked in names:
             if name.startswith(asked):
                 ends.setdefault(asked, set()).add(word)
@@ -86,9 +98,14 @@ def describe_row(row: Row, seeds: Seeds, ends: dict[str, str]) -> str:
     cells = []
     for tests, shown in ((row.virtual, virtual), (row.real, [])):
         names = find_tests(tests)
-        words = [f"{ends.get(name, 'not run')}: `{name.rpartition('::test_')[2] or name}`" for name in names]
+        words = [
+            f"{ends.get(name, 'not run')}: `{name.rpartition('::test_')[2] or name}`"
+            for name in names
+        ]
         cells.append("; ".join([*shown, *words]) or "–")
-    failed = broken or any(ends.get(name) != "passed" for name in find_tests((*row.virtual, *row.real)))
+    failed = broken or any(
+        ends.get(name) != "passed" for name in find_tests((*row.virtual, *row.real))
+    )
     state = "not ok" if failed else f"ok, gap: {row.gap}" if row.gap else "ok"
     return f"| {row.mark} | {row.fault} | {row.required} | {cells[0]} | {cells[1]} | {state} |"
 
@@ -134,7 +151,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=200, help="how many")
     parser.add_argument(
-        "--write", action="store_true", help="run the matrix's tests too, and write docs/faults.md"
+        "--write",
+        action="store_true",
+        help="run the matrix's tests too, and write docs/faults.md",
     )
     parser.add_argument("--jobs", type=int, help="processes at a time; all cores if left out")
     asked = parser.parse_args()
@@ -142,7 +161,9 @@ def main() -> int:
     lines = describe_seeds(seeds)
     print("\n".join(lines))
     if asked.write:
-        ends = run_tests(find_tests([name for row in ROWS for name in (*row.virtual, *row.real)]))
+        ends = run_tests(
+            find_tests([name for row in ROWS for name in (*row.virtual, *row.real)])
+        )
         table = [describe_row(row, seeds, ends) for row in ROWS]
         heads = ["| | fault | required | virtual time | real | |", "|---|---|---|---|---|---|"]
         text = PAGE.read_text("utf-8")

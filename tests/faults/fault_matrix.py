@@ -112,7 +112,11 @@ ROWS = (
         gap="Zenoh's TCP and TLS lose nothing: for real it is a delay (F5)",
     ),
     Row(
-        "F10", "duplicates", "counted, nothing else", ("duplicate",), gap="Zenoh's TCP and TLS double nothing"
+        "F10",
+        "duplicates",
+        "counted, nothing else",
+        ("duplicate",),
+        gap="Zenoh's TCP and TLS double nothing",
     ),
     Row(
         "F11",
@@ -179,7 +183,10 @@ ROWS = (
         "on its way a flipped bit ends the connection, which is made again; what a member sends wrong is "
         "dropped and counted, or shows in the log",
         ("corrupt", "nonsense"),
-        (SITES + "test_loop.py::test_strangers_and_their_garbage_change_no_bit_and_are_counted",),
+        (
+            SITES
+            + "test_loop.py::test_strangers_and_their_garbage_change_no_bit_and_are_counted",
+        ),
         (_KEYS + "a_bit_that_flips_on_its_way_ends_the_connection_which_is_made_again",),
     ),
     Row(
@@ -195,7 +202,10 @@ ROWS = (
         "another version of the program",
         "never meets; both versions are named",
         (),
-        (SITES + "test_change_server.py::test_a_client_of_another_version_is_refused_with_both_versions",),
+        (
+            SITES
+            + "test_change_server.py::test_a_client_of_another_version_is_refused_with_both_versions",
+        ),
         gap="the other version is a made-up one, in one process",
     ),
     Row(
@@ -265,7 +275,10 @@ ROWS = (
         "it is made again by itself",
         (),
         (),
-        (NET + "test_zenoh_bus.py::test_members_meet_again_through_a_router_that_was_started_again",),
+        (
+            NET
+            + "test_zenoh_bus.py::test_members_meet_again_through_a_router_that_was_started_again",
+        ),
         "UDP, on which it was seen, is refused",
     ),
     Row(
@@ -283,7 +296,10 @@ ROWS = (
         "one epoch for all; who waits says for whom",
         (),
         (_LEAVING + "a_site_may_come_late_where_the_first_one_begins_without_it",),
-        ("three_machines_in_any_order_of_starts", "who_waits_in_vain_says_for_whom_and_leaves_no_file"),
+        (
+            "three_machines_in_any_order_of_starts",
+            "who_waits_in_vain_says_for_whom_and_leaves_no_file",
+        ),
     ),
     Row("F31", "several at once", "the invariants", ("several",), gap="in virtual time alone"),
 )

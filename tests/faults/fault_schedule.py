@@ -123,7 +123,9 @@ KINDS = {
     "loss": Kind(1.5, _a_way, (0.02, 0.9)),
     "duplicate": Kind(1.0, _a_way, (0.05, 1.0)),
     "corrupt": Kind(1.0, _a_way),  # a bit flips, which ends the connection
-    "nonsense": Kind(1.0, _what_a_site_sends, (0.02, 1.0)),  # a site sends it, with bits that are wrong
+    "nonsense": Kind(
+        1.0, _what_a_site_sends, (0.02, 1.0)
+    ),  # a site sends it, with bits that are wrong
     "replay": Kind(1.0, _a_way),  # old messages once more
     "stranger": Kind(1.0, _a_site),  # in the name of a site, of another start
     "wall clock": Kind(1.0, _a_site, (-3600.0, 3600.0)),  # s
@@ -142,7 +144,9 @@ def draw_faults(seed: int, timetable: Timetable = WHOLE) -> list[Fault]:
     for kind in rng.choices(names, weights, k=rng.randint(1, MOST_FAULTS)):
         at_s = round(rng.uniform(*timetable.trouble_s), 4)
         longest_s = timetable.healed_s - at_s
-        for_s = round(min(longest_s, rng.choice([0.01, 0.03, 0.1, 0.5, 1.5]) * rng.uniform(0.5, 1.5)), 4)
+        for_s = round(
+            min(longest_s, rng.choice([0.01, 0.03, 0.1, 0.5, 1.5]) * rng.uniform(0.5, 1.5)), 4
+        )
         size = round(rng.uniform(*KINDS[kind].sizes), 4)
         faults.append(Fault(kind, at_s, for_s, KINDS[kind].of(rng), size))
     return sorted(faults, key=lambda fault: fault.at_s)

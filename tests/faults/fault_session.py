@@ -26,7 +26,16 @@ from trilat_net.net.wire import decode, encode, split_states
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario, load_scenario
 
-from .fault_schedule import MEMBERS, SITES, WHOLE, ArmSettings, Fault, Timetable, order_of, storm_of
+from .fault_schedule import (
+    MEMBERS,
+    SITES,
+    WHOLE,
+    ArmSettings,
+    Fault,
+    Timetable,
+    order_of,
+    storm_of,
+)
 from .faulty_network import FaultyNetwork
 
 NEVER_NS = 2_000 * 10**9
@@ -58,7 +67,9 @@ def make_scenario(timetable: Timetable = WHOLE, arms: ArmSettings = DEFAULT_ARMS
     if any(arms.start_rad_s):
         keys |= {f"sites.{name}.qd0_rad_s": list(arms.start_rad_s) for name in SITES}
     if arms.learnt:
-        keys["control.theta_hat0"] = (arms.learnt * load_scenario("free").arms["s"].theta).tolist()
+        keys["control.theta_hat0"] = (
+            arms.learnt * load_scenario("free").arms["s"].theta
+        ).tolist()
     return load_scenario("free", {"duration_s": timetable.length_s, **KEYS, **keys})
 
 
@@ -111,9 +122,15 @@ class FaultSession(Session):
         watcher = self.network.join_as("watcher")
         for name in SITES:
             records = self._payloads[name]
-            watcher.tap(topics.key(SESSION, name, topics.STATE), lambda _, load, to=records: to.append(load))
+            watcher.tap(
+                topics.key(SESSION, name, topics.STATE),
+                lambda _, load, to=records: to.append(load),
+            )
             recent = self._recent[name]
-            watcher.tap(topics.key(SESSION, name, topics.SAMPLE), lambda _, load, to=recent: to.append(load))
+            watcher.tap(
+                topics.key(SESSION, name, topics.SAMPLE),
+                lambda _, load, to=recent: to.append(load),
+            )
             link = topics.key(SESSION, name, topics.LINK)
             watcher.tap(link, lambda _, load, name=name: self._stats.update({name: load}))
         watcher.tap(topics.key(SESSION, "*", topics.EVENT), self._take_event)
@@ -152,7 +169,9 @@ class FaultSession(Session):
         for fault in self.faults:
             act = getattr(self, "_" + fault.kind.replace(" ", "_"), None)
             if act is not None:
-                self.relay.happens(self._at(fault.at_s), lambda act=act, fault=fault: act(fault))
+                self.relay.happens(
+                    self._at(fault.at_s), lambda act=act, fault=fault: act(fault)
+                )
 
     def _at(self, t_s: float) -> int:
         return self.epoch_ns + round(t_s * 1e9)
@@ -201,7 +220,9 @@ class FaultSession(Session):
     def _corrupt(self, fault: Fault) -> None:
         self.network.disconnect(*fault.of)
         again_s = fault.at_s + max(RECONNECT_S, fault.for_s)
-        self.relay.happens(self._at(again_s), lambda: self._mend_ways([fault.of, fault.of[::-1]]))
+        self.relay.happens(
+            self._at(again_s), lambda: self._mend_ways([fault.of, fault.of[::-1]])
+        )
 
     def _nonsense(self, fault: Fault) -> None:
         self._set_way(fault, "wrong", fault.size)
@@ -224,7 +245,11 @@ class FaultSession(Session):
         for load in [load for load in self._recent[name] if load not in junk][-50:]:
             sample = msgpack.unpackb(load)
             loads.append(msgpack.packb({**sample, "boot": sample["boot"] ^ 1, "q": [9.0, 9.0]}))
-            loads.append(msgpack.packb({**sample, "boot": sample["boot"] ^ 1, "tick": sample["tick"] + 9700}))
+            loads.append(
+                msgpack.packb(
+                    {**sample, "boot": sample["boot"] ^ 1, "tick": sample["tick"] + 9700}
+                )
+            )
         self._publish(topics.key(SESSION, name, topics.SAMPLE), [*loads, *junk])
 
     def _wall_clock(self, fault: Fault) -> None:
@@ -270,7 +295,9 @@ class FaultSession(Session):
             mock.patch("sites.site_parts.WARM_UP_TICKS", 2),
             mock.patch("sites.retransmit_buffer.KEPT_S", math.ceil(self.timetable.length_s)),
         ]
-        for disk in (SmallDisk(int(fault.size)) for fault in self.faults if fault.kind == "full disk"):
+        for disk in (
+            SmallDisk(int(fault.size)) for fault in self.faults if fault.kind == "full disk"
+        ):
             opened = partial(_file_on, disk)
             patches.append(mock.patch("trilat_net.log.log_writer.LogFile", opened))
         with ExitStack() as stack:
@@ -305,7 +332,9 @@ def run_faults(
 ) -> FaultSession:
     """A session with these faults, run to its end."""
     scenario = make_scenario(timetable, arms)
-    session = FaultSession(scenario, folder / "run.mcap", faults=faults, seed=seed, timetable=timetable)
+    session = FaultSession(
+        scenario, folder / "run.mcap", faults=faults, seed=seed, timetable=timetable
+    )
     session.prepare()
     session.play()
     return session

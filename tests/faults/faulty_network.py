@@ -82,7 +82,9 @@ class FaultyNetwork(LocalNetwork):
     def open(self, sender: str, receiver: str) -> bool:
         return self._way(sender, receiver).cut_ns is None
 
-    def find_takers(self, sender: LocalBus, name: str, key: str) -> Iterator[tuple[Way, Deliver]]:
+    def find_takers(
+        self, sender: LocalBus, name: str, key: str
+    ) -> Iterator[tuple[Way, Deliver]]:
         """Who takes what a member sends under a key, and over which way."""
         for member in self.members:
             if member is not sender:
@@ -96,7 +98,8 @@ class FaultyNetwork(LocalNetwork):
             if not way.ended:
                 way.kept.append(lambda: sink(key, payload))
             return
-        often = key.endswith(("/sample", "/state", "/link"))  # the others are sent again by the transport
+        # the others are sent again by the transport
+        often = key.endswith(("/sample", "/state", "/link"))
         if often and way.loss and chance.random() < way.loss:
             return
         if often and way.wrong and chance.random() < way.wrong:
@@ -171,7 +174,11 @@ class FaultyBus(LocalBus):
         return super().inbox(key, capacity)
 
     def stamped(
-        self, key: str, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int = RING_CAPACITY
+        self,
+        key: str,
+        now_ns: Callable[[], int],
+        read: Callable[[bytes], T],
+        capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
         self._faulty.changes += 1
         return super().stamped(key, now_ns, read, capacity)
@@ -204,7 +211,9 @@ class FaultyBus(LocalBus):
     def ask(self, key: str, payload: bytes = b"") -> Inbox:
         """See `Bus`; who cannot be reached, or cannot reach the asker, does not answer."""
         everyone = self._faulty.members
-        self._faulty.members = [member for member in everyone if member is self or self._meets(member)]
+        self._faulty.members = [
+            member for member in everyone if member is self or self._meets(member)
+        ]
         try:
             return super().ask(key, payload)
         finally:

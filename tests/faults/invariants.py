@@ -28,7 +28,13 @@ from .rest_invariants import (
 )
 
 SILENT_TICKS = 20
-_LIFE = {("waiting", "return"), ("return", "run"), ("return", "hold"), ("run", "hold"), ("hold", "return")}
+_LIFE = {
+    ("waiting", "return"),
+    ("return", "run"),
+    ("return", "hold"),
+    ("run", "hold"),
+    ("hold", "return"),
+}
 _FREE = ("waiting", "return", "run", "hold")
 LEGAL = {
     *_LIFE,
@@ -55,7 +61,11 @@ def check_edges(session: FaultSession) -> Iterator[str]:
     """I1: modes change only as `session_life` draws it."""
     for name, states in session.published.states.items():
         for stretch in stretches(states):
-            if stretch[0].mode not in ("waiting", "stopped"):  # it may be ordered before its first tick
+            # it may be ordered before its first tick
+            if stretch[0].mode not in (
+                "waiting",
+                "stopped",
+            ):
                 yield f"{name} begins with {stretch[0].mode} at tick {stretch[0].tick}"
             for before, after in pairwise(stretch):
                 if before.mode != after.mode and (before.mode, after.mode) not in LEGAL:
@@ -132,7 +142,9 @@ def largest_steps(published: Published, from_tick: int) -> dict[str, float]:
             tau = np.array([state.tau for state in stretch])
             steps = np.abs(np.diff(tau, axis=0)).max(axis=1, initial=0.0)
             modes = np.array(
-                ["start" if n < START_TICKS else state.mode for n, state in enumerate(stretch)][1:]
+                ["start" if n < START_TICKS else state.mode for n, state in enumerate(stretch)][
+                    1:
+                ]
             )
             for mode in set(modes[from_tick:]):
                 largest = float(steps[from_tick:][modes[from_tick:] == mode].max())
@@ -150,10 +162,15 @@ def check_torque(session: FaultSession, undisturbed_nm: float) -> Iterator[str]:
         still = session.scenario.setup(name).rest
         assert still is not None
         for stretch in stretches(states):
-            tau, qd = (np.array([getattr(state, key) for state in stretch]) for key in ("tau", "qd"))
+            tau, qd = (
+                np.array([getattr(state, key) for state in stretch]) for key in ("tau", "qd")
+            )
             resting = np.array([state.mode in RESTING for state in stretch])[1:, None]
             steps, brake = np.diff(tau, axis=0), -np.asarray(still.damping) * qd[1:] * resting
-            beyond = np.maximum(steps - np.maximum(brake, 0.0), np.minimum(brake, 0.0) - steps) > allowed_nm
+            beyond = (
+                np.maximum(steps - np.maximum(brake, 0.0), np.minimum(brake, 0.0) - steps)
+                > allowed_nm
+            )
             for row in np.flatnonzero(beyond.any(axis=1))[:1]:
                 most = np.abs(steps[row]).max()
                 at = stretch[row + 1]
@@ -163,7 +180,9 @@ def check_torque(session: FaultSession, undisturbed_nm: float) -> Iterator[str]:
 def allowed_step(scenario: Scenario, undisturbed_nm: float) -> float:
     """The most that a torque may step between ticks, brakes aside, N m."""
     setup = scenario.setup(SITES[0])
-    return max(STEP_SHARE * undisturbed_nm, float(np.max(setup.limits.tau_rate)) / setup.rate_hz)
+    return max(
+        STEP_SHARE * undisturbed_nm, float(np.max(setup.limits.tau_rate)) / setup.rate_hz
+    )
 
 
 def check_liveness(session: FaultSession) -> Iterator[str]:
@@ -180,10 +199,14 @@ def check_liveness(session: FaultSession) -> Iterator[str]:
     tight &= any(states[-1].mode == "fault" for states in session.published.states.values())
     starts_fast = any(limits.qd0)
     for name, states in session.published.states.items():
-        modes = {state.mode for state in states if state.tick >= last - timetable.engaged_s * rate_hz}
+        modes = {
+            state.mode for state in states if state.tick >= last - timetable.engaged_s * rate_hz
+        }
         if starts_fast and "waiting" in modes and modes <= {"hold", "run", "return", "waiting"}:
             continue
-        if modes != {"run"} and not (tight and modes <= {"hold", "run", "return", "waiting", "fault"}):
+        if modes != {"run"} and not (
+            tight and modes <= {"hold", "run", "return", "waiting", "fault"}
+        ):
             yield f"{name} ends in {' and '.join(sorted(modes)) or 'silence'}"
 
 
@@ -210,7 +233,8 @@ def check_log(session: FaultSession) -> Iterator[str]:
         return
     fed = {fault.of[1] for fault in session.faults if fault.kind == "nonsense"}
     altered = {
-        name: find_altered(states, log[name].states) for name, states in session.published.states.items()
+        name: find_altered(states, log[name].states)
+        for name, states in session.published.states.items()
     }
     if found.differing and not fed:
         yield f"{found.differing} records differ when they are executed again"
@@ -240,10 +264,16 @@ def find_heard(published: Published, name: str, there: Set[int]) -> set[int]:
     for start, following in pairwise(starts):
         came = [start[0].tick - 1]
         for other, states in published.states.items():
-            place = [peer for peer in published.states if peer != other].index(name) if other != name else -1
+            place = (
+                [peer for peer in published.states if peer != other].index(name)
+                if other != name
+                else -1
+            )
             for stretch in stretches(states) if other != name else ():
                 if stretch[-1].tick >= following[0].tick:
-                    came += [tick for state in stretch for peer, tick, _ in state.rx if peer == place]
+                    came += [
+                        tick for state in stretch for peer, tick, _ in state.rx if peer == place
+                    ]
         newest = max(tick for tick in came if tick <= start[-1].tick)
         last = max((tick for tick in there if tick <= newest), default=-1)
         newest = last if newest - last <= SILENT_TICKS else newest
@@ -262,7 +292,8 @@ def find_altered(published: Sequence[State], there: Sequence[State]) -> list[int
     return [
         state.tick
         for state in others
-        if state.tick not in made or same(state, **TELEMETRY) != same(made[state.tick], **TELEMETRY)
+        if state.tick not in made
+        or same(state, **TELEMETRY) != same(made[state.tick], **TELEMETRY)
     ]
 
 

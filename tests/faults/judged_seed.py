@@ -12,7 +12,15 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from .fault_schedule import WHOLE, ArmSettings, Fault, Timetable, describe, draw_faults, draw_settings
+from .fault_schedule import (
+    WHOLE,
+    ArmSettings,
+    Fault,
+    Timetable,
+    describe,
+    draw_faults,
+    draw_settings,
+)
 from .fault_session import DEFAULT_ARMS, FaultSession, run_faults
 from .invariants import INVARIANTS, START_TICKS, check_torque, find_holds, largest_steps
 from .rest_invariants import find_rises
@@ -42,12 +50,17 @@ class Judged(NamedTuple):
     rises_j: tuple[float, float]
 
     def __str__(self) -> str:
-        found = [f"  {name}: {text}" for name, texts in self.violations.items() for text in texts[:3]]
+        found = [
+            f"  {name}: {text}" for name, texts in self.violations.items() for text in texts[:3]
+        ]
         return "\n".join([f"  {self.arms}", describe(self.faults), *found])
 
 
 def judge_seed(seed: int, *, again: bool = True, timetable: Timetable = WHOLE) -> Judged:
-    faults, arms = draw_faults(seed, timetable), draw_settings(seed) if timetable == WHOLE else DEFAULT_ARMS
+    faults, arms = (
+        draw_faults(seed, timetable),
+        draw_settings(seed) if timetable == WHOLE else DEFAULT_ARMS,
+    )
     return judge_faults(faults, seed, again=again, timetable=timetable, arms=arms)
 
 
@@ -75,7 +88,10 @@ def judge_faults(
             digest = digest_session(session)
         if again:
             with tempfile.TemporaryDirectory() as folder:
-                if digest_session(run_faults(faults, Path(folder), seed, timetable, arms)) != digest:
+                if (
+                    digest_session(run_faults(faults, Path(folder), seed, timetable, arms))
+                    != digest
+                ):
                     found[AGAIN] = ["the same seed publishes or records other bytes"]
         violations = {name: texts for name, texts in found.items() if texts}
         rises_j = [rises for _, rises in find_rises(session)] or [(-math.inf, -math.inf)]
@@ -86,7 +102,10 @@ def judge_faults(
             count_visited(session),
             list(find_holds(session)),
             largest_steps(session.published, 0),
-            (float(max(at_rest for at_rest, _ in rises_j)), float(max(before for _, before in rises_j))),
+            (
+                float(max(at_rest for at_rest, _ in rises_j)),
+                float(max(before for _, before in rises_j)),
+            ),
         )
 
 

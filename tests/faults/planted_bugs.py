@@ -56,7 +56,9 @@ def jumps_back() -> Iterator[None]:
 
     def faster(setup: SiteSetup) -> SiteSetup:
         unlimited = setup.limits._replace(tau_rate=(math.inf,))
-        return setup._replace(limits=unlimited, on_stale=setup.on_stale._replace(align_speed=1e9))
+        return setup._replace(
+            limits=unlimited, on_stale=setup.on_stale._replace(align_speed=1e9)
+        )
 
     with _with_setups(faster), mock.patch("trilat_net.core.session_life.MIN_ALIGN_NS", 1):
         yield
@@ -83,7 +85,9 @@ def feeds_what_moves() -> AbstractContextManager[Any]:
 
 
 def _with_slower_rest(share: float) -> AbstractContextManager[Any]:
-    return _with_rest(lambda rest: rest._replace(deceleration=tuple(share * a for a in rest.deceleration)))
+    return _with_rest(
+        lambda rest: rest._replace(deceleration=tuple(share * a for a in rest.deceleration))
+    )
 
 
 def creeps_on() -> AbstractContextManager[Any]:
@@ -124,7 +128,9 @@ def begins_at_zero() -> AbstractContextManager[Any]:
     """A site that comes back counts its ticks from 0."""
     begin = RunningSite.__init__
 
-    def at_zero(site: RunningSite, parts: Any, publisher: Any, pinger: Any, epoch: Epoch) -> None:
+    def at_zero(
+        site: RunningSite, parts: Any, publisher: Any, pinger: Any, epoch: Epoch
+    ) -> None:
         begin(site, parts, publisher, pinger, epoch._replace(first=0))
 
     return mock.patch.object(RunningSite, "__init__", at_zero)

@@ -67,7 +67,9 @@ class Rest(NamedTuple):
     @property
     def judged(self) -> int:
         """The first record in a mode other than `waiting`; as many as there are if there is none."""
-        return next((n for n, state in enumerate(self.states) if state.mode in JUDGED), len(self.states))
+        return next(
+            (n for n, state in enumerate(self.states) if state.mode in JUDGED), len(self.states)
+        )
 
 
 def find_rests(session: FaultSession) -> Iterator[Rest]:
@@ -76,12 +78,16 @@ def find_rests(session: FaultSession) -> Iterator[Rest]:
         setup, theta = session.scenario.setup(name), session.scenario.arms[name].theta
         limited = find_limited_ticks(session.scenario, name, states)
         place = 0
-        for (_, resting), group in groupby(states, key=lambda at: (at.boot, at.mode in RESTING)):
+        for (_, resting), group in groupby(
+            states, key=lambda at: (at.boot, at.mode in RESTING)
+        ):
             rows = list(group)
             of = slice(place, place + len(rows))
             place = of.stop
             if resting:
-                q, qd = (np.array([getattr(state, key) for state in rows]) for key in ("q", "qd"))
+                q, qd = (
+                    np.array([getattr(state, key) for state in rows]) for key in ("q", "qd")
+                )
                 kinetic_j = 0.5 * (qd * _multiply_inertia(theta, q, qd)).sum(axis=1)
                 binds = np.append(limited[of], False)
                 blend = max(round(BLEND_S * setup.rate_hz), int(np.argmin(binds)))
@@ -98,7 +104,8 @@ def find_limited_ticks(scenario: Scenario, name: str, states: Sequence[State]) -
     tau = np.array([state.tau for state in states])
     limited = np.any(np.abs(np.diff(tau, axis=0, prepend=tau[:1])) >= most, axis=1)
     limited |= np.any(np.abs(tau) >= np.asarray(setup.tau_limit_nm) * (1.0 - RESIDUAL), axis=1)
-    qd = np.array([state.qd for state in states])  # of a fast arm the torque is not that of its law
+    # of a fast arm the torque is not that of its law
+    qd = np.array([state.qd for state in states])
     limited |= np.any(np.abs(qd) * setup.rest.damping > setup.tau_limit_nm, axis=1)
     found: np.ndarray = limited | np.r_[False, limited[:-1]]
     return found
@@ -189,10 +196,16 @@ def check_energy(session: FaultSession) -> Iterator[str]:
     """
     for rest in find_rests(session):
         first = rest.judged
-        booked_j = find_gravity_work(session.scenario, rest) + find_blend_work(session.scenario, rest)
+        booked_j = find_gravity_work(session.scenario, rest) + find_blend_work(
+            session.scenario, rest
+        )
         allowed_j = MOST_ENERGY * rest.kinetic_j[0] + booked_j + LEAST_ENERGY_J
         for row in np.flatnonzero(rest.kinetic_j[first:] > allowed_j[first:])[:1]:
-            at, has_j, most_j = rest.states[first + row], rest.kinetic_j[first + row], allowed_j[first + row]
+            at, has_j, most_j = (
+                rest.states[first + row],
+                rest.kinetic_j[first + row],
+                allowed_j[first + row],
+            )
             yield f"{rest.name} has {has_j:.3g} J at tick {at.tick} in {at.mode}; at most {most_j:.3g}"
 
 
@@ -202,7 +215,9 @@ def _find_gravity(scenario: Scenario, rest: Rest) -> tuple[np.ndarray, np.ndarra
     q, known = rest.rows("q"), rest.rows("theta_hat")
     still = np.zeros_like(q)
     theta = np.broadcast_to(scenario.arms[rest.name].theta, known.shape)
-    return arm.law_torque(theta, q, still, still, still), arm.law_torque(known, q, still, still, still)
+    return arm.law_torque(theta, q, still, still, still), arm.law_torque(
+        known, q, still, still, still
+    )
 
 
 def find_gravity_work(scenario: Scenario, rest: Rest) -> np.ndarray:
@@ -221,7 +236,9 @@ def find_blend_work(scenario: Scenario, rest: Rest) -> float:
     """Eq. (5): what the last torque beyond known gravity may add while it is taken away, J."""
     _, known = _find_gravity(scenario, rest)
     beyond_nm = np.abs(rest.rows("tau")[0] - known[0])
-    return float((beyond_nm**2 / np.asarray(rest.setup.rest.damping)).sum() / (2.0 * rest.setup.rate_hz))
+    return float(
+        (beyond_nm**2 / np.asarray(rest.setup.rest.damping)).sum() / (2.0 * rest.setup.rate_hz)
+    )
 
 
 def check_speed(session: FaultSession) -> Iterator[str]:
@@ -289,6 +306,8 @@ def find_stopping_distance(scenario: Scenario, rest: Rest) -> float:
     q, v = (rest.rows(key)[: rest.blend + 1] for key in ("q", "qd"))
     stop_s = max(LEAST_STOP_S, float((np.abs(v[0]) / still.deceleration).max()))
     a = np.diff(v, axis=0) * rest.setup.rate_hz
-    d_nm = np.abs(_multiply_inertia(scenario.arms[rest.name].theta, q[1:], a)).max(axis=0, initial=0.0)
+    d_nm = np.abs(_multiply_inertia(scenario.arms[rest.name].theta, q[1:], a)).max(
+        axis=0, initial=0.0
+    )
     aside_rad = 4.0 * still.time_s * d_nm / still.damping
     return MOST_WAY * float((np.abs(v[0]) * stop_s / 2.0 + aside_rad).max())

@@ -37,7 +37,10 @@ def test_invariants_hold_in_a_hundred_whole_sessions() -> None:
 
 
 def test_site_tells_peer_that_was_cut_off_as_it_came() -> None:
-    cut, end = Fault("cut", 0.571, 1.2286, ("m2", "m1"), 0.0), Fault("end", 1.453, 0.01, ("m2",), 0.0)
+    cut, end = (
+        Fault("cut", 0.571, 1.2286, ("m2", "m1"), 0.0),
+        Fault("end", 1.453, 0.01, ("m2",), 0.0),
+    )
     assert_holds(judge_faults((cut, end)))
 
 
@@ -80,7 +83,9 @@ def faults_of(kind: str) -> st.SearchStrategy[Fault]:
 
 def draw_of(kind: str) -> tuple[str, ...]:
     """Whom a kind befalls, for once."""
-    return next(fault.of for seed in range(10_000) for fault in draw_faults(seed) if fault.kind == kind)
+    return next(
+        fault.of for seed in range(10_000) for fault in draw_faults(seed) if fault.kind == kind
+    )
 
 
 @pytest.mark.long

@@ -16,7 +16,8 @@ def channel_digests(path: Path) -> dict[str, str]:
         for _, channel, message in make_reader(stream).iter_messages(log_time_order=False):
             digest = sums.setdefault(channel.topic, hashlib.sha256())
             data = message.data
-            if channel.message_encoding == "msgpack":  # maps that begin with the version, 3 then
+            # maps that begin with the version, 3 then
+            if channel.message_encoding == "msgpack":
                 data = data[:8].replace(b"\xa1v\x04", b"\xa1v\x03") + data[8:]
             digest.update(len(data).to_bytes(8, "little"))
             digest.update(data)

@@ -9,7 +9,11 @@ import typer.main
 
 def options(command: click.Command, path: str = "trilat") -> dict[str, list[str]]:
     """Returns every command by its words, with the names of its options and arguments."""
-    found = {path: sorted(name for param in command.params for name in (*param.opts, *param.secondary_opts))}
+    found = {
+        path: sorted(
+            name for param in command.params for name in (*param.opts, *param.secondary_opts)
+        )
+    }
     for name, below in getattr(command, "commands", {}).items():
         found |= options(below, f"{path} {name}")
     return found

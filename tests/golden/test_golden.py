@@ -46,7 +46,11 @@ def test_a_golden_log_is_what_virtual_time_gives_today(path: Path) -> None:
 
 
 def test_only_the_newest_has_the_arithmetic_of_today() -> None:
-    same = [path.stem for path in GOLDEN if open_log(path).session["fingerprint"] == compute_fingerprint()]
+    same = [
+        path.stem
+        for path in GOLDEN
+        if open_log(path).session["fingerprint"] == compute_fingerprint()
+    ]
     assert same == ["v3-own-sines"]
 
 
@@ -57,7 +61,15 @@ def test_every_released_version_has_one() -> None:
 @pytest.mark.long
 def test_a_log_with_a_users_own_law_is_executed_again() -> None:
     made = subprocess.run(
-        [*COMMAND, "verify", "own-law.mcap", "--json", "--law", "spring_law.py", "--other-version"],
+        [
+            *COMMAND,
+            "verify",
+            "own-law.mcap",
+            "--json",
+            "--law",
+            "spring_law.py",
+            "--other-version",
+        ],
         cwd=Path(__file__).parent,
         capture_output=True,
         text=True,

@@ -43,10 +43,15 @@ def limits_then(scenario: str) -> list[str]:
 
 @pytest.mark.parametrize(
     "scenario",
-    [pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in BEFORE["sim"]],
+    [
+        pytest.param(name, marks=() if name in PUSHED else pytest.mark.long)
+        for name in BEFORE["sim"]
+    ],
 )
 @pytest.mark.push
-def test_the_payloads_of_a_simulated_scenario_are_the_same_bytes(scenario: str, tmp_path: Path) -> None:
+def test_the_payloads_of_a_simulated_scenario_are_the_same_bytes(
+    scenario: str, tmp_path: Path
+) -> None:
     path = tmp_path / "sim.mcap"
     then = ["--duration", SHORTER_THEN[scenario]] if scenario in SHORTER_THEN else []
     asked = [*COMMAND, "sim", scenario, "-o", str(path), *then, *limits_then(scenario)]
@@ -55,9 +60,15 @@ def test_the_payloads_of_a_simulated_scenario_are_the_same_bytes(scenario: str, 
 
 
 @pytest.mark.parametrize(
-    "log", [pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in BEFORE["live"]]
+    "log",
+    [
+        pytest.param(name, marks=() if name in PUSHED else pytest.mark.long)
+        for name in BEFORE["live"]
+    ],
 )
-def test_payloads_of_live_session_executed_again_are_same_bytes(log: str, tmp_path: Path) -> None:
+def test_payloads_of_live_session_executed_again_are_same_bytes(
+    log: str, tmp_path: Path
+) -> None:
     path = tmp_path / "rerun.mcap"
     asked = [*COMMAND, "rerun", str(HERE / log), "--closed-loop", "-o", str(path)]
     subprocess.run(asked, check=True, capture_output=True)

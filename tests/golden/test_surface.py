@@ -46,7 +46,9 @@ def _marks(asked: list[str]) -> tuple:
 def test_every_command_and_option_is_still_there() -> None:
     now = all_options()
     assert not BEFORE["options"].keys() - now.keys()
-    assert not {c: gone for c, names in BEFORE["options"].items() if (gone := set(names) - set(now[c]))}
+    assert not {
+        c: gone for c, names in BEFORE["options"].items() if (gone := set(names) - set(now[c]))
+    }
 
 
 @pytest.mark.parametrize("case", _params(BEFORE["json"]))
@@ -62,4 +64,7 @@ def test_every_json_key_and_exit_code_is_still_there(case: dict, tmp_path: Path)
 @pytest.mark.parametrize("case", _params(BEFORE["exit"]))
 def test_every_exit_code_stays(case: dict, tmp_path: Path) -> None:
     asked = [str(HERE / word) if word.endswith(".mcap") else word for word in case["asked"]]
-    assert subprocess.run([*COMMAND, *asked], cwd=tmp_path, capture_output=True).returncode == case["exit"]
+    assert (
+        subprocess.run([*COMMAND, *asked], cwd=tmp_path, capture_output=True).returncode
+        == case["exit"]
+    )

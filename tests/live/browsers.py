@@ -16,7 +16,11 @@ from tests.net.waiting import until
 
 from .processes import Process
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+CHROMIUM = (
+    shutil.which("chromium")
+    or shutil.which("chromium-browser")
+    or shutil.which("google-chrome")
+)
 QUIET = (
     "--no-sandbox",
     "--disable-quic",
@@ -30,7 +34,9 @@ PAINTED_BY_SOFTWARE = (
     "--disable-accelerated-2d-canvas",
     "--disable-gpu-compositing",
 )
-needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
+needs_browser = pytest.mark.skipif(
+    CHROMIUM is None, reason="needs chromium: apt-get install chromium"
+)
 
 
 def launch(playwright: Playwright, *, gl: bool = False) -> Browser:
@@ -40,7 +46,10 @@ def launch(playwright: Playwright, *, gl: bool = False) -> Browser:
         if gl
         else ("--disable-3d-apis",)
     )
-    program, env = Path(__file__).with_name("chromium.sh"), {**os.environ, "CHROMIUM": str(CHROMIUM)}
+    program, env = (
+        Path(__file__).with_name("chromium.sh"),
+        {**os.environ, "CHROMIUM": str(CHROMIUM)},
+    )
     return playwright.chromium.launch(executable_path=program, env=env, args=[*QUIET, *drawing])
 
 
@@ -49,7 +58,11 @@ def chromium_pid() -> int:
     for folder in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
             line = (folder / "cmdline").read_bytes()
-            if b"--type=" not in line and b"--remote-debugging-pipe" in line and _descends(int(folder.name)):
+            if (
+                b"--type=" not in line
+                and b"--remote-debugging-pipe" in line
+                and _descends(int(folder.name))
+            ):
                 found.append(int(folder.name))
     return min(found)
 
@@ -58,12 +71,16 @@ def _descends(pid: int) -> bool:
     while pid > 1:
         if pid == os.getpid():
             return True
-        pid = int(Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[1])
+        pid = int(
+            Path(f"/proc/{pid}/stat").read_text(encoding="ascii").rpartition(")")[2].split()[1]
+        )
     return False
 
 
 @contextmanager
-def browser_page(url: str, *, gl: bool = False, script: str = "", **options: Any) -> Iterator[Page]:
+def browser_page(
+    url: str, *, gl: bool = False, script: str = "", **options: Any
+) -> Iterator[Page]:
     with sync_playwright() as playwright:
         browser = launch(playwright, gl=gl)
         try:

@@ -13,7 +13,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if Path(__file__).parent in item.path.parents:
             item.add_marker(pytest.mark.live)
-            item.add_marker(pytest.mark.skipif(sys.platform != "linux", reason="live sites run on Linux"))
+            item.add_marker(
+                pytest.mark.skipif(sys.platform != "linux", reason="live sites run on Linux")
+            )
 
 
 @pytest.fixture(autouse=True)

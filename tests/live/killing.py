@@ -76,5 +76,7 @@ def _messages(path: Path) -> list[tuple[str, bytes]]:
 
 def _newest(log: Log) -> list[int]:
     """Per site when its newest record was sent, on the machine's monotonic clock."""
-    (epoch_ns,) = {at for event in log.events if event.kind == "start" for at in event.epochs.values()}
+    (epoch_ns,) = {
+        at for event in log.events if event.kind == "start" for at in event.epochs.values()
+    }
     return [epoch_ns + log[name].states[-1].sent_ns for name in log.sites]

@@ -82,7 +82,16 @@ class Machines:
         Raises:
             NoNamespaces: there is no `iptables`, or it may not.
         """
-        self._use(name, "iptables", "-D" if ends else "-I", "INPUT", "-s", self.address[other], "-j", "DROP")
+        self._use(
+            name,
+            "iptables",
+            "-D" if ends else "-I",
+            "INPUT",
+            "-s",
+            self.address[other],
+            "-j",
+            "DROP",
+        )
 
     def shape(self, name: str, *queue: str) -> None:
         """Puts all that a machine sends into a queue of the tool `tc`; nothing of it is lost by another one.
@@ -94,7 +103,9 @@ class Machines:
 
     def _use(self, name: str, *words: str) -> None:
         try:
-            done = subprocess.run([*self.on(name), *words], capture_output=True, text=True, timeout=30)
+            done = subprocess.run(
+                [*self.on(name), *words], capture_output=True, text=True, timeout=30
+            )
         except FileNotFoundError as error:
             raise NoNamespaces(str(error)) from None
         if done.returncode:
@@ -186,7 +197,11 @@ class Apart(Session):
             return [*clock, "--router", f"tcp/{self._apart.centre[name]}:7447"]
         others = PAPER if name == "recorder" else PAPER[: PAPER.index(name)]
         listen = () if name == "recorder" else ("--insecure", "--listen", PORT)
-        return [*clock, *listen, *connections([f"tcp/{self._apart.address[other]}:7447" for other in others])]
+        return [
+            *clock,
+            *listen,
+            *connections([f"tcp/{self._apart.address[other]}:7447" for other in others]),
+        ]
 
     @classmethod
     def following(cls, stage: Stage, apart: Machines, duration_s: int) -> Self:

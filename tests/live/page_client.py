@@ -49,7 +49,9 @@ class PageClient:
 
     def take(self) -> dict[str, Any]:
         message = json.loads(self.socket.recv(PATIENCE_S))
-        self.hello, self.frame = (message["hello"], {}) if "hello" in message else (self.hello, message)
+        self.hello, self.frame = (
+            (message["hello"], {}) if "hello" in message else (self.hello, message)
+        )
         self.send(do="seen", n=self.hello["n"] if "hello" in message else message["n"])
         return self.frame
 

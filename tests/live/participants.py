@@ -72,7 +72,9 @@ def write_protocol(
 ) -> Path:
     file = folder / "short.toml"
     walls = WALL if "contact" in task else ""
-    text = PROTOCOL.format(trials=trials, more=more, conditions=conditions, task=task, walls=walls)
+    text = PROTOCOL.format(
+        trials=trials, more=more, conditions=conditions, task=task, walls=walls
+    )
     file.write_text(text, encoding="utf-8")
     return file
 
@@ -126,7 +128,9 @@ class Participant:
             { slider.value = 40; slider.click(); } }"""
         )
         if shown["phase"] in ("consent", "trial", "questionnaire"):
-            self.page.evaluate("document.querySelector('#sheet button.main:not([disabled])')?.click()")
+            self.page.evaluate(
+                "document.querySelector('#sheet button.main:not([disabled])')?.click()"
+            )
 
     def _reach(self, shown: dict[str, Any]) -> None:
         if "tip" not in shown or not shown.get("graspable"):
@@ -148,7 +152,9 @@ def join(browser: Browser, running: Process, site: str) -> Participant:
 
 
 @contextmanager
-def participants(running: Process, sites: Sequence[str] = ("m1", "m2")) -> Iterator[list[Participant]]:
+def participants(
+    running: Process, sites: Sequence[str] = ("m1", "m2")
+) -> Iterator[list[Participant]]:
     with sync_playwright() as playwright:
         browser = launch(playwright)
         try:
@@ -161,7 +167,9 @@ def participants(running: Process, sites: Sequence[str] = ("m1", "m2")) -> Itera
             browser.close()
 
 
-def take_part(people: Sequence[Participant], until: Callable[[], object], timeout_s: float = 120.0) -> None:
+def take_part(
+    people: Sequence[Participant], until: Callable[[], object], timeout_s: float = 120.0
+) -> None:
     """Lets all act in turn until something is so."""
     clock = SystemClock()
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)

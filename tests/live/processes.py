@@ -62,7 +62,9 @@ with trilat_net.hand("t", sys.argv[1], connect=sys.argv[2:], source="to be kille
 class Process:
     """One process, with what it prints in a file; `before` are words before its command."""
 
-    def __init__(self, name: str, arguments: Sequence[str], folder: Path, before: Sequence[str] = ()) -> None:
+    def __init__(
+        self, name: str, arguments: Sequence[str], folder: Path, before: Sequence[str] = ()
+    ) -> None:
         self.name, self.folder = name, folder
         self._printed = folder / f"{name}.printed"
         with self._printed.open("wb") as sink:
@@ -162,7 +164,9 @@ class Session:
         options: what every site is given besides, as in `--set KEY=VALUE`.
     """
 
-    def __init__(self, stage: Stage, scenario: str, sites: Sequence[str], *options: str) -> None:
+    def __init__(
+        self, stage: Stage, scenario: str, sites: Sequence[str], *options: str
+    ) -> None:
         self.stage, self._scenario, self._options = stage, scenario, options
         self.sites = tuple(sites)
         *self.endpoints, self.recorder_endpoint = find_free_endpoints(len(sites) + 1)
@@ -180,12 +184,18 @@ class Session:
         words = ("site", name, "--scenario", self._scenario, *self._options)
         return self._start(name, words, more, called or name)
 
-    def recorder(self, *more: str, called: str = "recorder", log: Path | None = None) -> Process:
+    def recorder(
+        self, *more: str, called: str = "recorder", log: Path | None = None
+    ) -> Process:
         return self._start("recorder", ("record", "-o", str(log or self.log)), more, called)
 
-    def _start(self, name: str, words: Sequence[str], more: Sequence[str], called: str) -> Process:
+    def _start(
+        self, name: str, words: Sequence[str], more: Sequence[str], called: str
+    ) -> Process:
         words = (*words, "--session", "t", *self.ways(name), *more)
-        self.processes[called] = self.stage.start(called, *words, before=self.before.get(name, ()))
+        self.processes[called] = self.stage.start(
+            called, *words, before=self.before.get(name, ())
+        )
         return self.processes[called]
 
     def all(self, *order: str) -> None:
@@ -235,10 +245,13 @@ def whole(*paths: Path, in_full: bool = True) -> Log:
     log = open_log(*paths)
     assert log.complete
     for name in log.sites:
-        (made,) = (event.ticks for event in log.events if (event.member, event.kind) == (name, "end"))
+        (made,) = (
+            event.ticks for event in log.events if (event.member, event.kind) == (name, "end")
+        )
         ticks = [state.tick for state in log[name].states]
         assert ticks[-1] == made - 1
-        if name not in log.scenario.external:  # a site at an arm outside leaves out what it misses
+        # a site at an arm outside leaves out what it misses
+        if name not in log.scenario.external:
             assert ticks == list(range(made))
         assert len(ticks) == len(set(ticks)) == made - log[name].skipped
         assert not in_full or made == log.scenario.ticks(name)
@@ -285,7 +298,10 @@ def ticks_to_hold(log: Log) -> dict[str, list[int]]:
         for stretch in stretches(log[site].states):
             before = ""
             for state, silent in count_silence(stretch):
-                assert state.mode not in ("run", "return") or silent <= SILENT_TICKS, (site, state.tick)
+                assert state.mode not in ("run", "return") or silent <= SILENT_TICKS, (
+                    site,
+                    state.tick,
+                )
                 if state.mode == "hold" != before:
                     holds.append(silent)
                 before = state.mode

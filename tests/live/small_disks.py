@@ -26,13 +26,20 @@ class SmallDisk:
         self.folder = folder
         mount = f"mount -t tmpfs -o size={mib}m none {folder} && echo ready && exec sleep 600"
         self._holder = subprocess.Popen(
-            ["unshare", "-m", "sh", "-c", mount], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            ["unshare", "-m", "sh", "-c", mount],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
         )
         assert self._holder.stdout is not None
         if self._holder.stdout.readline() != "ready\n":
             _, problem = self._holder.communicate(timeout=10)
             raise NoSmallDisk(problem.strip())
-        self.before = ("nsenter", f"--mount=/proc/{self._holder.pid}/ns/mnt", f"--wd={folder.parent}")
+        self.before = (
+            "nsenter",
+            f"--mount=/proc/{self._holder.pid}/ns/mnt",
+            f"--wd={folder.parent}",
+        )
 
     def seen(self, path: Path) -> Path:
         return Path(f"/proc/{self._holder.pid}/root{path}")

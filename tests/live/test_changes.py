@@ -27,23 +27,39 @@ timeline=[
 @pytest.mark.long
 def test_timeline_of_ten_changes_is_executed_again_record_by_record(stage: Stage) -> None:
     """With a stale peer at the end, that a site holds for."""
-    options = ("--set", SCRIPT.strip().replace("\n", ""), "--set", "on_stale.action=hold", "--duration", "6")
+    options = (
+        "--set",
+        SCRIPT.strip().replace("\n", ""),
+        "--set",
+        "on_stale.action=hold",
+        "--duration",
+        "6",
+    )
     session = Session(stage, "paper", PAPER, *options)
     session.all()
     log = session.is_reproduced()
     assert len(log.scenario.timeline) == 10
-    assert {state.mode for state in log["s"].states} == {Mode.RUN.name.lower(), Mode.HOLD.name.lower()}
+    assert {state.mode for state in log["s"].states} == {
+        Mode.RUN.name.lower(),
+        Mode.HOLD.name.lower(),
+    }
 
 
 @pytest.mark.long
-def test_changes_of_a_running_session_are_answered_recorded_and_reproduced(stage: Stage) -> None:
+def test_changes_of_a_running_session_are_answered_recorded_and_reproduced(
+    stage: Stage,
+) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "6")
     session.all()
     session.begun()
     session.recording()
     to = ("set", "--session", "t", *connections(session.endpoints))
-    link = trilat(*to, "link", "m1->s", "--delay", "350ms", "--loss", "5%", cwd=stage.folder).succeeds()
-    shares = trilat(*to, "dominance", "s", "m1=0.9", "m2=0.1", "--ramp", "0.5s", cwd=stage.folder).succeeds()
+    link = trilat(
+        *to, "link", "m1->s", "--delay", "350ms", "--loss", "5%", cwd=stage.folder
+    ).succeeds()
+    shares = trilat(
+        *to, "dominance", "s", "m1=0.9", "m2=0.1", "--ramp", "0.5s", cwd=stage.folder
+    ).succeeds()
     assert "it holds from tick" in link
     assert "it holds from tick" in shares
     trilat(*to, "dominance", "s", "m1=0.9", "m2=0.2", cwd=stage.folder).refuses("sum to 1")
@@ -63,7 +79,9 @@ def test_python_changes_stops_measures_and_ends_session_as_commands_do(stage: St
     running.recording()
     session = tn.session("t", connect=running.endpoints)
     assert "it holds from tick" in session.set_link("m1->s", delay_ms=250.0, loss=0.05)
-    assert "it holds from tick" in session.set_dominance("s", {"m1": 0.9, "m2": 0.1}, ramp_s=0.5)
+    assert "it holds from tick" in session.set_dominance(
+        "s", {"m1": 0.9, "m2": 0.1}, ramp_s=0.5
+    )
     with pytest.raises(RunFailed, match="sum to 1"):
         session.set_dominance("s", {"m1": 0.9, "m2": 0.2})
     with pytest.raises(RunFailed, match="reset is for a site in fault"):

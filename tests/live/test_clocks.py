@@ -30,7 +30,9 @@ def test_delays_are_inside_their_bound_and_clocks_are_found(stage: Stage) -> Non
     for name in ("s", "m2", "m1"):  # the leader comes last
         session.site(name, "--needs-recorder", *SKEWS.get(name, ()))
     session.begun()
-    seen = trilat("ping", "--session", "t", "--json", *connections(session.endpoints), cwd=stage.folder)
+    seen = trilat(
+        "ping", "--session", "t", "--json", *connections(session.endpoints), cwd=stage.folder
+    )
     log = session.is_reproduced()
     for site in PAPER:
         for peer in log.scenario.peers(site):
@@ -45,14 +47,14 @@ def test_delays_are_inside_their_bound_and_clocks_are_found(stage: Stage) -> Non
     clocks = members(log)
     for own, other, about_s in (("m1", "m2", 3.0), ("recorder", "m1", -86_400.0)):
         found = re.search(
-            rf"clock of {other}: another one, offset (\S+) s \+- (\d+) us", session.processes[own].text()
+            rf"clock of {other}: another one, offset (\S+) s \+- (\d+) us",
+            session.processes[own].text(),
         )
         assert found is not None, session.processes[own]
         true_s = clocks[own].offset_to_ns(clocks[other], 0) / 1e9
         assert true_s == pytest.approx(about_s, abs=0.1)
-        assert float(found[1]) == pytest.approx(
-            true_s, abs=1e-6 * (float(found[2]) + 1.0)
-        )  # it prints whole us
+        # it prints whole us
+        assert float(found[1]) == pytest.approx(true_s, abs=1e-6 * (float(found[2]) + 1.0))
     told = json.loads(seen.succeeds())
     pinged = {member["member"]: member for member in told["members"]}
     assert set(pinged) == {*PAPER}
@@ -80,4 +82,6 @@ def test_a_session_that_waits_answers_pings_without_knowing_of_them(stage: Stage
 
 def test_a_ping_that_nobody_answers_says_where_it_looked(stage: Stage) -> None:
     done = trilat("ping", "--session", "nobody-here", "--timeout", "0.5", cwd=stage.folder)
-    done.refuses("no site of session 'nobody-here' answered at tcp/127.0.0.1:", "--connect", code=1)
+    done.refuses(
+        "no site of session 'nobody-here' answered at tcp/127.0.0.1:", "--connect", code=1
+    )

@@ -38,13 +38,17 @@ def test_a_run_that_diverged_fails_though_its_log_is_sound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def recorded(storage: LogStorage, afterwards: Callable[[], None], **_others: object) -> int:
-        assert not record_virtual(load_scenario("two_sites", {"limits.qd_limit_rad_s": 0.01}), storage.path)
+        assert not record_virtual(
+            load_scenario("two_sites", {"limits.qd_limit_rad_s": 0.01}), storage.path
+        )
         afterwards()
         return 0
 
     monkeypatch.setattr(recorder.record_process, "record_session", recorded)
     done = trilat("record", "--session", "x", "--conclude", cwd=tmp_path)
-    assert re.findall("^FAIL .*$", done.out, re.MULTILINE) == ["FAIL stability: not stable: diverged"]
+    assert re.findall("^FAIL .*$", done.out, re.MULTILINE) == [
+        "FAIL stability: not stable: diverged"
+    ]
     assert (tmp_path / "runs" / "x-001" / "report.html").is_file()  # a folder of its own
     done.refuses("run.mcap", "diverged at t = ", code=1)
 

@@ -18,7 +18,9 @@ from .small_disks import NoSmallDisk, SmallDisk, small_disk
 
 @pytest.mark.parametrize("durable", [False, True])
 @pytest.mark.long
-def test_recorder_that_is_killed_leaves_all_that_it_had_flushed(durable: bool, stage: Stage) -> None:
+def test_recorder_that_is_killed_leaves_all_that_it_had_flushed(
+    durable: bool, stage: Stage
+) -> None:
     done = killed(stage, random.uniform(0.1, 1.0), *(["--durable"] if durable else []))
     assert done.recovery.lossless, done.recovery.lost
     assert done.kept == done.flushed
@@ -52,7 +54,9 @@ def _full_disk(stage: Stage, disk: SmallDisk) -> None:
     for name in SITES:
         session.site(name, "--needs-recorder")
     assert small.code() == 5
-    assert f"error: {path}: the disk is full; the log ends there, finished, with" in small.text()
+    assert (
+        f"error: {path}: the disk is full; the log ends there, finished, with" in small.text()
+    )
     assert not disk.seen(path.with_name("run.mcap.active")).exists()
     session.ends_well()
     with disk.seen(path).open("rb") as stream:
@@ -86,7 +90,9 @@ def test_a_restarted_recorder_writes_the_next_part(stage: Stage) -> None:
     second = session.log.with_name("run-002.mcap")
     log = open_log(session.log, second)
     for name in SITES:
-        (made,) = (event.ticks for event in log.events if (event.member, event.kind) == (name, "end"))
+        (made,) = (
+            event.ticks for event in log.events if (event.member, event.kind) == (name, "end")
+        )
         assert [state.tick for state in log[name].states] == list(range(made))
     with second.open("rb") as stream:
         metadata = {entry.name: entry.metadata for entry in make_reader(stream).iter_metadata()}

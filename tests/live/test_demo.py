@@ -24,7 +24,9 @@ def demo(stage: Stage, duration: str = "3") -> Process:
 
 
 def child(demo: Process, words: str) -> int:
-    return until(lambda: next((pid for pid, line in demo.children().items() if words in line), 0), 30)
+    return until(
+        lambda: next((pid for pid, line in demo.children().items() if words in line), 0), 30
+    )
 
 
 def recording(stage: Stage) -> Path:
@@ -90,7 +92,9 @@ def test_signal_before_session_begins_ends_all_and_leaves_no_log(
 
 def test_a_demo_bears_its_scenarios_name_and_shows_errors(stage: Stage) -> None:
     """So `tn.hand("play", "m1")` finds it, as sites that are started one by one."""
-    running = stage.start("demo", "demo", "play", "--duration", "30", "--out", str(stage.folder / "out"))
+    running = stage.start(
+        "demo", "demo", "play", "--duration", "30", "--out", str(stage.folder / "out")
+    )
     recording(stage)
     with trilat_net.hand("play", "m1", source="test", timeout_s=30.0) as hand:
         hand.move(*hand.pose)

@@ -56,7 +56,14 @@ def held(stage: Stage) -> Iterator[Held]:
         session.all()
         session.begun()
         session.recording()
-        words = ("hand", "m1", "--session", "t", "--device", f"haply_inverse3={service.address}")
+        words = (
+            "hand",
+            "m1",
+            "--session",
+            "t",
+            "--device",
+            f"haply_inverse3={service.address}",
+        )
         process = stage.start("device", *words, *connections(session.endpoints))
         session.processes["device"] = process
         process.prints("button 'a' takes hold")
@@ -78,7 +85,9 @@ def test_a_haply_leads_an_arm_and_renders_its_reaction(held: Held) -> None:
     held.service.presses_anew = True  # a busy machine may be silent, and let go, in between
     held.circles()
     begun_s = time.perf_counter()
-    until(lambda: held.service.asked and held.service.asked[-1][0] - begun_s > 2.0 * TURN_S, 60.0)
+    until(
+        lambda: held.service.asked and held.service.asked[-1][0] - begun_s > 2.0 * TURN_S, 60.0
+    )
     held.service.pressed, held.service.presses_anew = {"b"}, False
     until(lambda: held.service.forces[-1] == (0.0, 0.0, 0.0), 10.0)
     log = held.led()
@@ -96,7 +105,10 @@ def test_a_haply_leads_an_arm_and_renders_its_reaction(held: Held) -> None:
     assert np.abs(part.tau_x[mine]).max() > 1.0
     assert "from its place to the force of it p50" in held.said[-1]
     texts = [event.text.partition(" at t")[0] for event in log.events if event.kind == "hand"]
-    assert (texts[0], texts[-1]) == ("m1: HaplyInverse3 takes hold", "m1: HaplyInverse3 lets go")
+    assert (texts[0], texts[-1]) == (
+        "m1: HaplyInverse3 takes hold",
+        "m1: HaplyInverse3 lets go",
+    )
 
 
 @pytest.mark.long
@@ -128,7 +140,9 @@ def test_killed_service_lets_go_and_leads_again_once_back(held: Held) -> None:
         until(lambda: any(force != (0.0, 0.0, 0.0) for force in again.forces), 30.0)
         log = held.led()
     texts = [event.text.partition(" at t")[0] for event in log.events if event.kind == "hand"]
-    assert texts[:3] == [f"m1: HaplyInverse3 {what}" for what in ("takes hold", "lets go", "takes hold")]
+    assert texts[:3] == [
+        f"m1: HaplyInverse3 {what}" for what in ("takes hold", "lets go", "takes hold")
+    ]
     closed = f"m1: the service at {held.service.address} has closed the connection"
     assert f"{closed}; the arm is let go, and the device is tried again" in held.said
 
@@ -143,4 +157,6 @@ def test_killed_program_of_a_device_lets_go(held: Held) -> None:
     log = held.led()
     moved_s, gone_s = last_moved(log)
     assert gone_s - moved_s <= LET_GO_S + 0.01
-    assert "is silent: let go" in [event.text for event in log.events if event.kind == "hand"][-1]
+    assert (
+        "is silent: let go" in [event.text for event in log.events if event.kind == "hand"][-1]
+    )

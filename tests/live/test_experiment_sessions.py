@@ -17,7 +17,16 @@ from trilat_net.studies.experiment.experiment_run import Experiment, open_experi
 from trilat_net.studies.experiment.trial_run import ExperimentTrial
 
 from .browsers import needs_browser, page_address, shows
-from .participants import FAR, REACH, Participant, begin, join, participants, take_part, write_protocol
+from .participants import (
+    FAR,
+    REACH,
+    Participant,
+    begin,
+    join,
+    participants,
+    take_part,
+    write_protocol,
+)
 from .processes import Process, Stage, is_running
 
 pytestmark = needs_browser
@@ -51,7 +60,9 @@ def judged_again(done: Experiment, row: dict[str, Any]) -> tuple[bool, float, fl
     return bool(dwelt[ended]), goal.appears_s, float(part.t_s[ended])
 
 
-def assert_log_table_and_page_agree(folder: Path, people: list[Participant], running: Process) -> None:
+def assert_log_table_and_page_agree(
+    folder: Path, people: list[Participant], running: Process
+) -> None:
     done, rows = open_experiment(folder), rows_of(folder)
     assert len(rows) == len(done.plan.trials)
     assert len(list((folder / "logs").iterdir())) == len(rows)
@@ -59,7 +70,10 @@ def assert_log_table_and_page_agree(folder: Path, people: list[Participant], run
         log = open_log(folder / row["log"])
         assert verify(log).passed
         succeeded, appears_s, ended_s = judged_again(done, row)
-        assert (row["succeeded"], float(row["completion_s"])) == (str(int(succeeded)), ended_s - appears_s)
+        assert (row["succeeded"], float(row["completion_s"])) == (
+            str(int(succeeded)),
+            ended_s - appears_s,
+        )
         assert f"P1, P2, condition {row['condition']}" in log.scenario.about
         assert done.plan.digest in log.scenario.about
         marks = [event.text for event in log.events if event.kind == "mark"]
@@ -82,15 +96,23 @@ def test_two_people_reach_together_and_logs_say_so(trials: int, stage: Stage) ->
     """Two browsers, two roles, real pointers: boundaries and measures are those of verified logs."""
     folder, conditions = stage.folder / "out", FAR if trials % 2 == 0 else ""
     count = trials // (2 if conditions else 1)
-    running = begin(stage, write_protocol(stage.folder, count, CONSENT, conditions), "--out", str(folder))
+    running = begin(
+        stage, write_protocol(stage.folder, count, CONSENT, conditions), "--out", str(folder)
+    )
     with participants(running) as people:
         take_part(people, running.ended, 60.0 * trials)
         assert people[0].page.inner_text("#sheet h2") == "That was all. Thank you."
     assert running.code() == 0, running
     assert_log_table_and_page_agree(folder, people, running)
     answers = rows_of(folder, "questionnaires.csv")
-    assert {(row["participant"], row["item"]) for row in answers} >= {("P1", "mental"), ("P2", "effort")}
-    assert {row["event"] for row in rows_of(folder, "events.csv")} == {"consent", "questionnaire"}
+    assert {(row["participant"], row["item"]) for row in answers} >= {
+        ("P1", "mental"),
+        ("P2", "effort"),
+    }
+    assert {row["event"] for row in rows_of(folder, "events.csv")} == {
+        "consent",
+        "questionnaire",
+    }
 
 
 TRACK = 'kind = "track"\nduration_s = 5.0\namplitude_m = 0.05\nwidth_m = 0.1\napart_m = 0.1'

@@ -60,7 +60,9 @@ def interrupt_members(stage: Stage, freeze: Freeze) -> tuple[Log, dict[str, int]
     pause(freeze.after_s)
     recorder.signal(signal.SIGCONT)
     assert session.codes() == dict.fromkeys(session.processes, 130)
-    return open_log(session.log), ticks_made(*(session.processes[site].text() for site in PAPER))
+    return open_log(session.log), ticks_made(
+        *(session.processes[site].text() for site in PAPER)
+    )
 
 
 def interrupt_demo(stage: Stage, freeze: Freeze) -> tuple[Log, dict[str, int]]:

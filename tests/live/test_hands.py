@@ -31,7 +31,9 @@ class Circling(threading.Thread):
         self._wait = threading.Event()
 
     def run(self) -> None:
-        connected = trilat_net.hand("t", self._site, connect=self._places, source=self.name, timeout_s=60.0)
+        connected = trilat_net.hand(
+            "t", self._site, connect=self._places, source=self.name, timeout_s=60.0
+        )
         with connected as hand:
             x, y = hand.pose
             for n in range(self._rounds):
@@ -41,7 +43,9 @@ class Circling(threading.Thread):
                 self._wait.wait(1.0 / 60.0)
 
 
-def held(session: Session, seconds: float, orders: Sequence[Sequence[str]], page_moves: int = 0) -> Log:
+def held(
+    session: Session, seconds: float, orders: Sequence[Sequence[str]], page_moves: int = 0
+) -> Log:
     """A session whose masters two programs hold, while links and shares are changed; it is reproduced.
 
     A page holds the slave for so many moves of its pointer, if for any.
@@ -100,9 +104,19 @@ def test_a_minute_of_hands_and_changes_is_verified_and_repeated(stage: Stage) ->
 
     At 500 Hz two processors have room for the page too, in a browser that draws by software.
     """
-    orders = [("link", f"{a}->{b}", "--delay", f"{20 * n + 20}ms") for n, (a, b) in enumerate(LINKS)]
-    orders += [("dominance", "s", f"m1={share}", f"m2={1 - share:.1f}", "--ramp", "0s") for share in SHARED]
-    log = held(Session(stage, "play", PAPER, "--duration", "60", "--set", "rate_hz=500"), 40.0, orders, 300)
+    orders = [
+        ("link", f"{a}->{b}", "--delay", f"{20 * n + 20}ms") for n, (a, b) in enumerate(LINKS)
+    ]
+    orders += [
+        ("dominance", "s", f"m1={share}", f"m2={1 - share:.1f}", "--ramp", "0s")
+        for share in SHARED
+    ]
+    log = held(
+        Session(stage, "play", PAPER, "--duration", "60", "--set", "rate_hz=500"),
+        40.0,
+        orders,
+        300,
+    )
     said = [event.text for event in log.events if event.kind == "hand"]
     assert any(text.startswith("s: page 1 takes hold") for text in said)
     assert np.abs(log["s"].hand[:, 0]).max() == 1.0
@@ -117,7 +131,9 @@ SHARED = (0.9, 0.1, 0.7, 0.5)
 
 
 @pytest.mark.long
-def test_program_that_is_killed_in_grip_leaves_no_force_behind(stage: Stage, tmp_path: Path) -> None:
+def test_program_that_is_killed_in_grip_leaves_no_force_behind(
+    stage: Stage, tmp_path: Path
+) -> None:
     """By the log: from its last message to the last force, and the event that says so."""
     session = Session(stage, "play", PAPER, "--duration", "15")
     session.all()
@@ -131,12 +147,16 @@ def test_program_that_is_killed_in_grip_leaves_no_force_behind(stage: Stage, tmp
 
 
 @pytest.mark.long
-def test_a_program_cut_off_in_grip_leaves_no_force(stage: Stage, tmp_path: Path, apart: Machines) -> None:
+def test_a_program_cut_off_in_grip_leaves_no_force(
+    stage: Stage, tmp_path: Path, apart: Machines
+) -> None:
     """The session is on one machine, the program on another; no tick is missing because of the cut."""
     bridged(apart, ("lab", "holder"))
     session = Session(stage, "play", PAPER, "--duration", "15", "--insecure")
     session.before = dict.fromkeys((*PAPER, "recorder"), apart.on("lab"))
-    session.endpoints = [place.replace("127.0.0.1", apart.address["lab"]) for place in session.endpoints]
+    session.endpoints = [
+        place.replace("127.0.0.1", apart.address["lab"]) for place in session.endpoints
+    ]
     session.all()
     holder = Holder(session, tmp_path, apart.on("holder"))
     try:

@@ -38,7 +38,9 @@ MOVE = """([side, x, y, z]) => {
   headset.controllers[side].position.set(x, y, z);
   return trilat.parts.headset.frames;
 }"""
-HELD = "trilat.parts.headset.controllers.right.card !== null && trilat.frame.holds.includes('m1')"
+HELD = (
+    "trilat.parts.headset.controllers.right.card !== null && trilat.frame.holds.includes('m1')"
+)
 PRESS = "([side, button, value]) => headset.controllers[side].updateButtonValue(button, value)"
 SCENARIO = Path(__file__).parents[2] / "examples" / "headset.toml"
 SETTLED = 20
@@ -62,7 +64,8 @@ class Controllers:
 
 def enter(page: Page) -> Controllers:
     shows(
-        page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart && trilat.parts.arms.cards[0].graspable"
+        page,
+        "trilat.frame && trilat.frame.t > 1 && trilat.takesPart && trilat.parts.arms.cards[0].graspable",
     )
     shows(page, "Boolean(document.querySelector('#enter-vr'))")
     page.click("#enter-vr")
@@ -107,7 +110,9 @@ def leads(page: Page, hands: Controllers) -> bool:
 def test_a_controller_leads_an_arm_of_six_joints(stage: Stage) -> None:
     """By the log: half as far, ahead as x, left as y, up as z; what jumps by 0.6 m moves nothing."""
     running = served(stage)
-    with browser_page(with_query(page_address(running), "flat"), script=RUNTIME, gl=True, **VIEW) as page:
+    with browser_page(
+        with_query(page_address(running), "flat"), script=RUNTIME, gl=True, **VIEW
+    ) as page:
         assert page.evaluate("isSecureContext && location.protocol === 'https:'")
         hands = enter(page)
         assert any(leads(page, hands) for _ in range(5))

@@ -12,7 +12,9 @@ from .processes import PAPER, Session, Stage
 
 
 @pytest.mark.long
-def test_a_person_takes_over_from_a_policy_live(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_person_takes_over_from_a_policy_live(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The log of both is verified, and is repeated in virtual time."""
     monkeypatch.setenv("HF_HOME", str(stage.folder))
     session = Session(stage, "play", PAPER, "--duration", "8")
@@ -20,7 +22,12 @@ def test_a_person_takes_over_from_a_policy_live(stage: Stage, monkeypatch: pytes
     session.begun()
     session.recording()
     running = trilat_net.session("t", connect=session.endpoints)
-    reach = {"session": "t", "scenario": "play", "connect": session.endpoints, "timeout_s": 60.0}
+    reach = {
+        "session": "t",
+        "scenario": "play",
+        "connect": session.endpoints,
+        "timeout_s": 60.0,
+    }
     with plugins() as found:
         seen = drive(found, running, threading.Event().wait, **reach)
     assert_taken_over(seen, session.is_reproduced())

@@ -17,7 +17,12 @@ from .processes import Session, Stage, executed_again, whole
 
 pytestmark = pytest.mark.long
 PAIR = ("m", "s")
-PUBLISHED = {"energy": "velocity", "reserve_J": 0.0, "drift_rad_s": 0.0, "acceleration_rad_s2": 0.0}
+PUBLISHED = {
+    "energy": "velocity",
+    "reserve_J": 0.0,
+    "drift_rad_s": 0.0,
+    "acceleration_rad_s2": 0.0,
+}
 STORED = {"wave": FOLLOWER, "tdpa": FOLLOWER, "tanks": {}}
 """Laws that keep account of energy, and what the slave has besides."""
 
@@ -33,10 +38,14 @@ def run_live(stage: Stage, scenario: str, sites: tuple[str, ...], *options: str)
     return open_log(session.log)
 
 
-def on_unit_arms(stage: Stage, control: dict[str, Any], slave: dict[str, Any], **more: Any) -> Log:
+def on_unit_arms(
+    stage: Stage, control: dict[str, Any], slave: dict[str, Any], **more: Any
+) -> Log:
     sites = {"m": {"hands": [H50]}, "s": {"control": {**control, **slave}}}
     file = stage.folder / "unit.toml"
-    file.write_text(unit_text(**{"sites": sites, "control": control, "duration_s": 12.0, **more}))
+    file.write_text(
+        unit_text(**{"sites": sites, "control": control, "duration_s": 12.0, **more})
+    )
     return run_live(stage, str(file), PAIR)
 
 
@@ -63,7 +72,12 @@ def test_passivity_control_through_50_ms(stage: Stage) -> None:
 
 
 def test_four_channels_transmit_through_20_ms(stage: Stage) -> None:
-    drive = {"kind": "multisine", "amplitude_nm": [2.0, 1.0], "frequencies_hz": [1.0], "end_s": 1000.0}
+    drive = {
+        "kind": "multisine",
+        "amplitude_nm": [2.0, 1.0],
+        "frequencies_hz": [1.0],
+        "end_s": 1000.0,
+    }
     sites = {"m": {"hands": [drive, hand(0.0)]}, "s": {"hands": [hand(0.0, 500.0, 5.0)]}}
     law = {"law": "four_channel", "K": 100.0, "B": 20.0}
     link = {"model": "constant", "delay_ms": 20.0}
@@ -78,7 +92,9 @@ def test_live_run_of_every_law_is_executed_again_to_bit(law: str, stage: Stage) 
     scenario, changes = LAWS.get(law, ("two_sites", {"scheme": "digital"}))
     changes = {**changes, "duration_s": 2.0, "link.delay_ms": 20.0, "control.law": law}
     changes |= {f"sites.s.control.{key}": value for key, value in STORED.get(law, {}).items()}
-    options = [word for key, value in changes.items() for word in ("--set", f"{key}={_written(value)}")]
+    options = [
+        word for key, value in changes.items() for word in ("--set", f"{key}={_written(value)}")
+    ]
     sites = tuple(load_scenario(scenario).names)
     log = run_live(stage, scenario, sites, *options)
     assert sum(len(log[name]) for name in sites) == 2000 * len(sites)

@@ -17,7 +17,10 @@ from tests.net.local_bus import LocalNetwork
 from tests.net.waiting import until
 from tests.page.whole_pages import watched_page
 from trilat_net.analysis.arm_rows import joint_positions_m
-from trilat_net.analysis.certificate.energy_balance import compute_energy_balance, compute_site_energies
+from trilat_net.analysis.certificate.energy_balance import (
+    compute_energy_balance,
+    compute_site_energies,
+)
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 from trilat_net.scenario import load_scenario
@@ -40,7 +43,9 @@ pytestmark = needs_browser
 
 
 def live(stage: Stage, scenario: str, *options: str) -> Process:
-    return stage.start("live", "live", scenario, "--no-browser", "--out", str(stage.folder / "out"), *options)
+    return stage.start(
+        "live", "live", scenario, "--no-browser", "--out", str(stage.folder / "out"), *options
+    )
 
 
 def assert_energies_are_those_of(log: Log, energies: list[list[float]]) -> None:
@@ -51,7 +56,10 @@ def assert_energies_are_those_of(log: Log, energies: list[list[float]]) -> None:
     inside = rows < len(balance.t_s)
     assert inside.sum() > 40
     most = np.abs(balance.V).max()
-    assert np.abs(V - balance.V[np.minimum(rows, len(balance.t_s) - 1)])[inside].max() <= 1e-9 * most
+    assert (
+        np.abs(V - balance.V[np.minimum(rows, len(balance.t_s) - 1)])[inside].max()
+        <= 1e-9 * most
+    )
     gave = balance.external_work[np.minimum(rows, len(balance.t_s) - 1)]
     assert np.abs(supplied - gave)[inside].max() <= 1e-9 * most
 
@@ -68,7 +76,8 @@ def grips(log: Log, site: str) -> "np.ndarray[tuple[int, int], np.dtype[np.float
 
 
 def test_people_see_hold_and_change_a_session_and_end_it(stage: Stage) -> None:
-    running = live(stage, "play", "--set", "rate_hz=100")  # drawing takes what a machine of two cores has
+    # drawing takes what a machine of two cores has
+    running = live(stage, "play", "--set", "rate_hz=100")
     with browser_page(page_address(running)) as page:
         shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
         assert page.locator(".arm").count() == 3
@@ -77,7 +86,8 @@ def test_people_see_hold_and_change_a_session_and_end_it(stage: Stage) -> None:
         take_hold(page, 0, 60.0, 10.0)
         shows(page, "trilat.frame.holds.includes('m1')")
         shows(page, f"trilat.frame.sites.m1.points.at(-1)[0] > {before[0]} + 0.02")
-        shows(page, "document.querySelector('.arm').innerText.includes('you hold it')")  # once it is drawn
+        # once it is drawn
+        shows(page, "document.querySelector('.arm').innerText.includes('you hold it')")
         page.mouse.up()
         page.fill("#mark-text", "felt it")
         page.click("#mark")
@@ -138,7 +148,8 @@ def test_a_finger_drags_an_arm_on_a_phone(stage: Stage) -> None:
         assert page.evaluate("trilat.frame.holds") == ["m1"]
         touch("touchEnd")
         shows(page, "trilat.frame.sites.m1.grip === 0 && !trilat.frame.holds.length")
-        assert page.evaluate("scrollY") == 0  # the page does not scroll under a finger that leads an arm
+        # the page does not scroll under a finger that leads an arm
+        assert page.evaluate("scrollY") == 0
     running.signal(signal.SIGINT)
     running.prints("checking the log")
 
@@ -165,9 +176,13 @@ PICTURE = ("link.delay_ms=50", "sites.m1.view.delay_ms=300", "sites.m1.view.loss
     [(150, IN_USE), (150, PICTURE), (1000, IN_USE)],
     ids=["in use", "picture", "in use, long"],
 )
-def test_a_users_page_draws_what_the_log_says(count: int, delays: tuple[str, ...], stage: Stage) -> None:
+def test_a_users_page_draws_what_the_log_says(
+    count: int, delays: tuple[str, ...], stage: Stage
+) -> None:
     """At 300 ms, while the user moves: every frame that the browser draws, held against the log."""
-    running = live(stage, "play", *chain.from_iterable(("--set", one) for one in ("rate_hz=250", *delays)))
+    running = live(
+        stage, "play", *chain.from_iterable(("--set", one) for one in ("rate_hz=250", *delays))
+    )
     with browser_page(role_address(running, "user m1")) as page:
         shows(page, "trilat.frame && trilat.frame.t > 1 && trilat.takesPart")
         page.evaluate(KEEP_DRAWN)
@@ -192,7 +207,9 @@ def test_a_users_page_draws_what_the_log_says(count: int, delays: tuple[str, ...
         for name, (tick, points) in frame.items():
             assert tick == (own if name == "m1" else shown[name][own])
             q = np.array([log[name].states[tick].q])
-            assert points == np.round(joint_positions_m(log.scenario.arms[name], q)[0], 5).tolist()
+            assert (
+                points == np.round(joint_positions_m(log.scenario.arms[name], q)[0], 5).tolist()
+            )
         ages.append(own - frame["s"][0])
     assert min(ages) >= 75  # 300 ms of 250 ticks a second
 
@@ -298,13 +315,19 @@ def test_a_hostile_page_costs_the_loops_nothing(stage: Stage) -> None:
     with browser_page(address) as page:
         shows(page, "trilat.frame && trilat.frame.t > 1")
         for _ in range(3):
-            with connect(socket_address, max_size=None) as hostile, contextlib.suppress(ConnectionClosed):
+            with (
+                connect(socket_address, max_size=None) as hostile,
+                contextlib.suppress(ConnectionClosed),
+            ):
                 hostile.send('{"do":"control","want":true}')
                 hostile.send('{"do":"hand","site":"m1","grip":true,"to":[1000.0,0.0]}')
                 hostile.send('{"do":"hand","site":"m1","grip":true,"to":[NaN,0.0]}')
                 for _ in range(100_000):
                     hostile.send('{"do":"hand","site":"m1","grip":true,"to":[1000.0,0.0]}')
-            with connect(socket_address, max_size=None) as hostile, contextlib.suppress(ConnectionClosed):
+            with (
+                connect(socket_address, max_size=None) as hostile,
+                contextlib.suppress(ConnectionClosed),
+            ):
                 hostile.send("x" * (10 << 20))
         shows(page, "trilat.frame.refused > 3000")
         assert page.evaluate("trilat.frame.sites.m1.grip") == 0
@@ -322,7 +345,9 @@ def test_three_arms_are_drawn_with_webgl_and_without(gl: bool, stage: Stage) -> 
     running = live(stage, "paper", "--duration", "30")
     with browser_page(with_query(page_address(running), "webgl"), gl=gl) as page:
         shows(page, "trilat.frame && trilat.frame.t > 2")
-        until(lambda: page.inner_text("#painter").startswith("drawn with" if gl else "no WebGL"))
+        until(
+            lambda: page.inner_text("#painter").startswith("drawn with" if gl else "no WebGL")
+        )
         for n in range(3):  # something of the arm's colour is drawn in every card
             assert (
                 page.evaluate(
@@ -379,16 +404,22 @@ def test_a_stopped_arm_and_a_lost_peer_are_plain(stage: Stage) -> None:
         page.wait_for_selector("#alarms .raised")
         words = page.inner_text("#alarms .raised")
         assert "s STOPPED" in words
-        shows(page, "document.querySelector('#alarms .raised').innerText.includes('ordered by the operator')")
+        shows(
+            page,
+            "document.querySelector('#alarms .raised').innerText.includes('ordered by the operator')",
+        )
         assert page.inner_text("#alarms button") == "Enable"
         assert "trilat enable" not in page.inner_text("body")
         box = page.locator("#alarms .raised").bounding_box()
         assert box is not None
         assert box["height"] > 50.0
         assert 0.0 < box["y"] < page.evaluate("innerHeight") - box["height"]
-        assert page.locator(".arm").first.bounding_box() == arm  # what somebody holds stays under the pointer
+        # what somebody holds stays under the pointer
+        assert page.locator(".arm").first.bounding_box() == arm
         shows(page, "document.querySelector('#state').textContent === 's STOPPED'")
-        page.evaluate("document.querySelector('#state').textContent = 's STOPPED, m STOPPED, and more'")
+        page.evaluate(
+            "document.querySelector('#state').textContent = 's STOPPED, m STOPPED, and more'"
+        )
         assert page.locator(".arm").first.bounding_box() == arm
         drawn = page.locator(".arm canvas").first.bounding_box()
         page.evaluate(LARGE)
@@ -396,9 +427,17 @@ def test_a_stopped_arm_and_a_lost_peer_are_plain(stage: Stage) -> None:
         if "TRILAT_PICTURES" in os.environ:
             page.screenshot(path=f"{os.environ['TRILAT_PICTURES']}/stopped.png")
         page.click("#alarms button")
-        shows(page, "trilat.frame.sites.s.mode === 'run' && !document.querySelector('#alarms .raised')")
-        for sentence in ("s was stopped by the operator at", "s was enabled by the experimenter at"):
-            shows(page, f"document.querySelector('#event-list').innerText.includes('{sentence}')")
+        shows(
+            page,
+            "trilat.frame.sites.s.mode === 'run' && !document.querySelector('#alarms .raised')",
+        )
+        for sentence in (
+            "s was stopped by the operator at",
+            "s was enabled by the experimenter at",
+        ):
+            shows(
+                page, f"document.querySelector('#event-list').innerText.includes('{sentence}')"
+            )
         assert "{" not in page.inner_text("#event-list")
     running.signal(signal.SIGINT)
     assert running.code(180.0) == 0, running
@@ -426,7 +465,9 @@ def test_every_role_stops_every_arm(who: str, way: str, stage: Stage) -> None:
             page.keyboard.press("Escape")
         elif way == "pad":
             page.evaluate(PAD)
-            page.evaluate("dispatchEvent(new Event('gamepadconnected')); pad.buttons[8].pressed = true")
+            page.evaluate(
+                "dispatchEvent(new Event('gamepadconnected')); pad.buttons[8].pressed = true"
+            )
         else:
             box = page.locator("#stop").bounding_box()
             assert box is not None
@@ -443,7 +484,9 @@ def test_a_browser_gets_in_by_the_token_of_its_link() -> None:
     """It stands in the fragment, which the page hands to its socket; a wrong one is said."""
     said: list[str] = []
     options = PageOptions(host="0.0.0.0", insecure=True)
-    with PageServer(LocalNetwork().join(), SystemClock(), "s1", options, say=said.append) as server:
+    with PageServer(
+        LocalNetwork().join(), SystemClock(), "s1", options, say=said.append
+    ) as server:
         server.view.scenario = load_scenario("paper")
         until(lambda: any(line.startswith("user m1: ") for line in said))
         (line,) = (line for line in said if line.startswith("user m1: "))

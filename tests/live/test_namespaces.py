@@ -13,8 +13,28 @@ from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.net.clock import SystemClock
 
-from .namespaces import ALL, CLOCKS, PORT, Apart, Machines, NoNamespaces, bridged, pairs, reaches, starred
-from .processes import JOINS, PAPER, Stage, engaged_after_s, executed_again, pause, ticks_to_hold, whole
+from .namespaces import (
+    ALL,
+    CLOCKS,
+    PORT,
+    Apart,
+    Machines,
+    NoNamespaces,
+    bridged,
+    pairs,
+    reaches,
+    starred,
+)
+from .processes import (
+    JOINS,
+    PAPER,
+    Stage,
+    engaged_after_s,
+    executed_again,
+    pause,
+    ticks_to_hold,
+    whole,
+)
 
 
 def clocks_as_injected(log: Log) -> None:
@@ -42,7 +62,9 @@ def clocks_as_injected(log: Log) -> None:
         pytest.param(("m2", "recorder", "m1", "s"), id="mixed", marks=pytest.mark.long),
     ],
 )
-def test_three_machines_in_any_order_of_starts(order: tuple[str, ...], stage: Stage, apart: Machines) -> None:
+def test_three_machines_in_any_order_of_starts(
+    order: tuple[str, ...], stage: Stage, apart: Machines
+) -> None:
     bridged(apart, ALL)
     session = Apart(stage, apart, "--duration", "3")
     session.all(*order)
@@ -51,7 +73,9 @@ def test_three_machines_in_any_order_of_starts(order: tuple[str, ...], stage: St
 
 
 @pytest.mark.long
-def test_machines_that_cannot_reach_each_other_meet_at_a_router(stage: Stage, apart: Machines) -> None:
+def test_machines_that_cannot_reach_each_other_meet_at_a_router(
+    stage: Stage, apart: Machines
+) -> None:
     starred(apart, "centre", ALL)
     assert all(reaches(apart, name, apart.centre[name]) for name in ALL)
     assert not any(reaches(apart, one, apart.address[other]) for one, other in pairs(ALL))
@@ -87,7 +111,9 @@ class Heard:
 
 def heard(log: Log, site: str, peer: str) -> Heard:
     states, place = log[site].states, log.scenario.peers(site).index(peer)
-    arrivals = [(state.tick, tick) for state in states for index, tick, _ in state.rx if index == place]
+    arrivals = [
+        (state.tick, tick) for state in states for index, tick, _ in state.rx if index == place
+    ]
     ticks = sorted({tick for tick, _ in arrivals})
     outages = [(before, after) for before, after in pairwise(ticks) if after - before > 1000]
     return Heard(arrivals, [state.tick - state.used[peer] for state in states], outages)
@@ -130,7 +156,9 @@ def test_way_that_is_cut_heals_and_loops_never_stop(stage: Stage, apart: Machine
 
 
 @pytest.mark.long
-def test_separate_machines_hold_during_a_cut_and_return_after_kills(stage: Stage, apart: Machines) -> None:
+def test_separate_machines_hold_during_a_cut_and_return_after_kills(
+    stage: Stage, apart: Machines
+) -> None:
     """The way is cut for longer than Zenoh's lease; who is killed is the first site, whose grid counts."""
     bridged(apart, ALL)
     session = Apart.following(stage, apart, 40)
@@ -182,7 +210,11 @@ def test_a_one_way_cut_is_held_at_both_ends(stage: Stage, apart: Machines) -> No
     executed_again(log)
     for site, peer in (("m1", "m2"), ("m2", "m1")):
         assert len(heard(log, site, peer).outages) == 2
-        said = [one.text for one in log.events if one.member == site and "a peer is silent" in one.text]
+        said = [
+            one.text
+            for one in log.events
+            if one.member == site and "a peer is silent" in one.text
+        ]
         assert len(said) >= 2
     deaf, dumb = heard(log, "m2", "m1").outages, heard(log, "m1", "m2").outages
     assert all(first <= last + 100 for (first, _), (last, _) in zip(deaf, dumb, strict=True))
@@ -211,7 +243,9 @@ def back_to_nominal(log: Log, site: str, peer: str, delay: int, nominal: int) ->
         # a sample may come within the tick in which it was made: its age begins at 0
         assert max(link.age[before:after]) >= after - before - 1
         ages = [
-            stats.age_us[peer] for stats in log.link_stats(site) if before + delay + 100 < stats.tick < after
+            stats.age_us[peer]
+            for stats in log.link_stats(site)
+            if before + delay + 100 < stats.tick < after
         ]
         assert len(ages) >= (after - before - delay) // 100 - 2
         assert ages == sorted(set(ages))

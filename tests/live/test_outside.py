@@ -11,7 +11,16 @@ from trilat_net.execution.virtual_comparison import compare_with_virtual
 from trilat_net.log.log_reader import open_log
 from trilat_net.scenario import load_scenario
 
-from .processes import OUTSIDE, PATIENCE_S, PLAIN, TALKING, Session, Stage, executed_again, whole
+from .processes import (
+    OUTSIDE,
+    PATIENCE_S,
+    PLAIN,
+    TALKING,
+    Session,
+    Stage,
+    executed_again,
+    whole,
+)
 
 ARM = Path(__file__).parents[2] / "examples" / "external_arm.py"
 SLOW = """
@@ -29,14 +38,20 @@ class Law(Adaptive):
 
 
 @pytest.mark.long
-def test_law_that_is_too_slow_ends_session_in_order(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_law_that_is_too_slow_ends_session_in_order(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (stage.folder / "slow_law.py").write_text(SLOW)
     monkeypatch.chdir(stage.folder)
     law = ("--set", "sites.s.control.law=slow_law:Law")
     session = Session(stage, "two_sites", ("m", "s"), *law, "--duration", "20")
     session.all()
     assert session.codes() == {"recorder": 0, "m": 1, "s": 1}
-    (told,) = (line for line in session.processes["s"].text().splitlines() if line.startswith("error: "))
+    (told,) = (
+        line
+        for line in session.processes["s"].text().splitlines()
+        if line.startswith("error: ")
+    )
     assert "the law slow_law:Law of s failed at tick 4" in told
     assert "it is too slow" in told
     assert told.removeprefix("error: ") in session.processes["m"].text()
@@ -65,7 +80,16 @@ def test_a_foreign_arm_joins_a_session_of_two_sites(stage: Stage) -> None:
 
 def drive_arm(session: Session, scenario: str, *options: str) -> str:
     """Runs the program of the example until it ends; what it printed."""
-    words = ("s", "--scenario", scenario, "--session", "t", "--connect", session.endpoints[-1], *options)
+    words = (
+        "s",
+        "--scenario",
+        scenario,
+        "--session",
+        "t",
+        "--connect",
+        session.endpoints[-1],
+        *options,
+    )
     done = subprocess.run(
         [sys.executable, str(ARM), *words],
         env=PLAIN,
@@ -86,7 +110,15 @@ def test_seven_measured_joints_run_after_six_were_refused(stage: Stage) -> None:
     session.all()
     site = session.processes["s"]
     site.prints("waiting for its arm on trilat/t/s/measured")
-    words = ("s", "--scenario", "six_joints", "--session", "t", "--connect", session.endpoints[-1])
+    words = (
+        "s",
+        "--scenario",
+        "six_joints",
+        "--session",
+        "t",
+        "--connect",
+        session.endpoints[-1],
+    )
     wrong = subprocess.Popen([sys.executable, str(ARM), *words], env=PLAIN)
     try:
         site.prints("its arm sends measurements of 6 joints; the scenario has 7")
@@ -99,5 +131,6 @@ def test_seven_measured_joints_run_after_six_were_refused(stage: Stage) -> None:
     executed_again(log)
     assert compare_with_virtual(log).fed.identical == 9000 - log["s"].skipped
     felt = log["s"].tau_x
-    assert -0.5 <= felt[:, 0].min() < -0.1  # somebody leans on the first joint with a half sine of 0.5 N m
+    # somebody leans on the first joint with a half sine of 0.5 N m
+    assert -0.5 <= felt[:, 0].min() < -0.1
     assert not felt[:, 1:].any()

@@ -44,7 +44,9 @@ def test_records_are_those_of_virtual_time(
 
 
 @pytest.mark.long
-def test_a_person_takes_over_from_a_running_program(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_person_takes_over_from_a_running_program(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Ramps of a second: no reference steps further than 1.2 times the motion itself, and no site holds."""
     monkeypatch.chdir(stage.folder)
     tn.new_hand("my_hand.py")
@@ -72,14 +74,26 @@ def test_a_person_takes_over_from_a_running_program(stage: Stage, monkeypatch: p
 
 
 @pytest.mark.long
-def test_a_killed_program_lets_go_and_the_others_go_on(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_killed_program_lets_go_and_the_others_go_on(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """SIGKILL in the middle: silence of 200 ms, a grip that fades within 100 ms, no site that holds."""
     monkeypatch.chdir(stage.folder)
     tn.new_hand("my_hand.py")
     chosen = overrides(process=True)
     session = Session(stage, "paper", ("m1", "m2", "s"), *chosen)
     endpoint = session.endpoints[1]
-    words = ("hand", "m2", "--scenario", "paper", "--session", "t", "--connect", endpoint, *chosen)
+    words = (
+        "hand",
+        "m2",
+        "--scenario",
+        "paper",
+        "--session",
+        "t",
+        "--connect",
+        endpoint,
+        *chosen,
+    )
     program: Process = stage.start("hand", *words)
     session.all()
     session.processes["m2"].prints("takes hold")

@@ -15,11 +15,16 @@ from .page_client import PageClient, page_client
 from .processes import PAPER, Process, Stage
 
 LINKS = [f"{peer}->{site}" for peer in PAPER for site in PAPER if peer != site]
-letters = st.text(st.characters(exclude_categories=()), max_size=12)  # surrogates too: JSON can write them
+# surrogates too: JSON can write them
+letters = st.text(st.characters(exclude_categories=()), max_size=12)
 odd = st.sampled_from(
     ["", "?", "??", "#", "a#b", "$", "$*", "*", "**", "/", "a/b", "@", "m1", "recorder", "->"]
 )
-names = letters | odd | st.builds("{}->{}".format, letters | odd, letters | odd | st.sampled_from(PAPER))
+names = (
+    letters
+    | odd
+    | st.builds("{}->{}".format, letters | odd, letters | odd | st.sampled_from(PAPER))
+)
 numbers = st.floats() | st.integers() | st.floats(0.0, 1.0)
 
 
@@ -41,7 +46,9 @@ messages = st.one_of(
             "do": st.just("link"),
             "link": either(LINKS),
             "to": st.dictionaries(
-                either(["delay_ms", "loss", "deviation_ms", "preset", "model"]), numbers | names, max_size=3
+                either(["delay_ms", "loss", "deviation_ms", "preset", "model"]),
+                numbers | names,
+                max_size=3,
             ),
         }
     ),
@@ -54,17 +61,31 @@ messages = st.one_of(
         }
     ),
     st.fixed_dictionaries({"do": st.just("mark"), "text": names}),
-    st.fixed_dictionaries({"do": st.just("answer"), "page": st.integers(), "yes": st.booleans()}),
+    st.fixed_dictionaries(
+        {"do": st.just("answer"), "page": st.integers(), "yes": st.booleans()}
+    ),
     st.sampled_from([{"do": "stop"}, {"do": "control", "want": True}]),
     st.dictionaries(names, numbers | names, max_size=3),
 )
 lines = st.text(st.characters(codec="latin-1", exclude_characters="\r\n"), max_size=30)
-targets = st.sampled_from(["//[", "/", "/socket", "http://[::1", "*", "/?token=%ff", "/%2e%2e/x"]) | lines
-hosts = st.sampled_from(["[", "localhost", "127.0.0.1:x", "[::1", "", "a@b", "evil.example"]) | lines
-heads = st.lists(st.tuples(st.sampled_from(["Host", "Origin", "Upgrade"]) | lines, hosts), max_size=4)
+targets = (
+    st.sampled_from(["//[", "/", "/socket", "http://[::1", "*", "/?token=%ff", "/%2e%2e/x"])
+    | lines
+)
+hosts = (
+    st.sampled_from(["[", "localhost", "127.0.0.1:x", "[::1", "", "a@b", "evil.example"])
+    | lines
+)
+heads = st.lists(
+    st.tuples(st.sampled_from(["Host", "Origin", "Upgrade"]) | lines, hosts), max_size=4
+)
 requests = st.binary(max_size=60) | st.builds(
     lambda target, head: "".join(
-        [f"GET {target} HTTP/1.1\r\n", *(f"{name}: {value}\r\n" for name, value in head), "\r\n"]
+        [
+            f"GET {target} HTTP/1.1\r\n",
+            *(f"{name}: {value}\r\n" for name, value in head),
+            "\r\n",
+        ]
     ).encode("latin-1"),
     targets,
     heads,
@@ -101,13 +122,25 @@ def answer_to(address: str, request: bytes) -> bytes:
             return b""
 
 
-@pytest.mark.filterwarnings("ignore:Do not use the .random. module")  # its socket does, in a thread
+# its socket does, in a thread
+@pytest.mark.filterwarnings("ignore:Do not use the .random. module")
 @pytest.mark.parametrize(
-    ("count", "raw"), [(60, 12), pytest.param(3000, 300, marks=pytest.mark.long)], ids=["light", "whole"]
+    ("count", "raw"),
+    [(60, 12), pytest.param(3000, 300, marks=pytest.mark.long)],
+    ids=["light", "whole"],
 )
 def test_whatever_a_page_sends_ends_no_server(count: int, raw: int, stage: Stage) -> None:
     rare = ("--set", "rate_hz=100")  # records are few, messages are not
-    words = ("live", "play", "--no-browser", "--duration", "600", "--out", str(stage.folder / "out"), *rare)
+    words = (
+        "live",
+        "play",
+        "--no-browser",
+        "--duration",
+        "600",
+        "--out",
+        str(stage.folder / "out"),
+        *rare,
+    )
     running: Process = stage.start("live", *words)
     address = page_address(running)
     with page_client(address) as page:
@@ -137,7 +170,9 @@ def test_whatever_a_page_sends_ends_no_server(count: int, raw: int, stage: Stage
     assert "executed again" in running.text()
 
 
-ANSWERS = [b"HTTP/1.1 " + code for code in (b"200", b"400", b"403", b"404", b"414", b"426", b"431")]
+ANSWERS = [
+    b"HTTP/1.1 " + code for code in (b"200", b"400", b"403", b"404", b"414", b"426", b"431")
+]
 
 
 def send_all(page: PageClient, count: int) -> int:

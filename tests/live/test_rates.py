@@ -20,13 +20,17 @@ def many(folder: Path, count: int) -> Path:
     path = folder / "many.toml"
     rows = [f"[dominance.{name}]\n{names[n - 1]} = 1.0\n" for n, name in enumerate(names)]
     sites = [f"[sites.{name}]\n" for name in names]
-    path.write_text(f"name = 'many'\nduration_s = 10.0\n[link]\ndelay_ms = 100\n{''.join([*sites, *rows])}")
+    path.write_text(
+        f"name = 'many'\nduration_s = 10.0\n[link]\ndelay_ms = 100\n{''.join([*sites, *rows])}"
+    )
     assert len(parse_scenario(path.read_text()).names) == count
     return path
 
 
 def demo(stage: Stage, *words: str) -> tuple[Process, Log]:
-    running = stage.start("demo", "demo", *words, "--duration", "10", "--out", str(stage.folder / "out"))
+    running = stage.start(
+        "demo", "demo", *words, "--duration", "10", "--out", str(stage.folder / "out")
+    )
     assert running.code(PATIENCE_S) == 0, running
     return running, open_log(stage.folder / "out" / "run.mcap")
 
@@ -35,7 +39,9 @@ def accounted(log: Log) -> None:
     """Of every site the end is in the log, and every record that it made is there or counted as missing."""
     assert log.complete
     for name in log.sites:
-        (made,) = (event.ticks for event in log.events if (event.member, event.kind) == (name, "end"))
+        (made,) = (
+            event.ticks for event in log.events if (event.member, event.kind) == (name, "end")
+        )
         assert made == log.scenario.ticks(name)
         assert len(log[name]) + log.missing(name) == made
     verdict = verify(log)

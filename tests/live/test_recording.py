@@ -51,7 +51,9 @@ def from_the_start(path: Path) -> Log:
 def test_a_frozen_recorder_has_every_record_in_the_end(stage: Stage) -> None:
     """With small buffers on the way, so that the network drops what it cannot deliver."""
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "7")
-    session.endpoints = [f"{endpoint}#so_sndbuf=8192;so_rcvbuf=8192" for endpoint in session.endpoints]
+    session.endpoints = [
+        f"{endpoint}#so_sndbuf=8192;so_rcvbuf=8192" for endpoint in session.endpoints
+    ]
     session.all()
     session.recording()
     recorder = session.processes["recorder"]
@@ -63,7 +65,9 @@ def test_a_frozen_recorder_has_every_record_in_the_end(stage: Stage) -> None:
 
 
 @pytest.mark.parametrize("law", [(), pytest.param(TALKING, marks=pytest.mark.long)])
-def test_a_killed_recorders_successor_has_all_records(law: tuple[str, ...], stage: Stage) -> None:
+def test_a_killed_recorders_successor_has_all_records(
+    law: tuple[str, ...], stage: Stage
+) -> None:
     session = Session(stage, "two_sites", ("m", "s"), "--duration", "50", *law)
     session.all()
     session.recording()

@@ -25,12 +25,21 @@ class Again:
     def replay(self, *options: str, called: str = "replay", listen: str = "") -> Process:
         return self._stage.start(
             called,
-            *("replay", str(self._log), "--session", "again", "--listen", listen or self.endpoint, *options),
+            *(
+                "replay",
+                str(self._log),
+                "--session",
+                "again",
+                "--listen",
+                listen or self.endpoint,
+                *options,
+            ),
         )
 
     def recorder(self, log: Path) -> Process:
         return self._stage.start(
-            "second recorder", *("record", "--session", "again", "-o", str(log), "--connect", self.endpoint)
+            "second recorder",
+            *("record", "--session", "again", "-o", str(log), "--connect", self.endpoint),
         )
 
 
@@ -72,7 +81,9 @@ def test_a_latecomer_to_a_replay_gets_all_of_it(stage: Stage) -> None:
     again = Again(stage, path)
     replay = again.replay("--loop")
     replay.prints("playing")
-    ping = stage.start("ping", "ping", "--session", "again", "--connect", again.endpoint, "--count", "5")
+    ping = stage.start(
+        "ping", "ping", "--session", "again", "--connect", again.endpoint, "--count", "5"
+    )
     (elsewhere,) = find_free_endpoints(1)
     other = again.replay("--connect", again.endpoint, called="other replay", listen=elsewhere)
     second = stage.folder / "second.mcap"

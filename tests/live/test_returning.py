@@ -10,7 +10,17 @@ from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import Log, open_log
 from trilat_net.log.session_check import check_file
 
-from .processes import FOLLOWS, GLIDE, JOINS, PAPER, Session, Stage, engaged_after_s, pause, ticks_to_hold
+from .processes import (
+    FOLLOWS,
+    GLIDE,
+    JOINS,
+    PAPER,
+    Session,
+    Stage,
+    engaged_after_s,
+    pause,
+    ticks_to_hold,
+)
 
 
 def killed_and_started_again(stage: Stage, victims: Sequence[str]) -> tuple[Session, Log]:
@@ -41,7 +51,9 @@ def killed_and_started_again(stage: Stage, victims: Sequence[str]) -> tuple[Sess
 
 @pytest.mark.long
 @pytest.mark.parametrize("victims", [("m1", "s", "m1")])
-def test_a_killed_site_started_again_follows_within_two_seconds(victims: Sequence[str], stage: Stage) -> None:
+def test_a_killed_site_started_again_follows_within_two_seconds(
+    victims: Sequence[str], stage: Stage
+) -> None:
     session, log = killed_and_started_again(stage, victims)
     took_s = engaged_after_s(log)
     assert len(took_s) == len(victims)

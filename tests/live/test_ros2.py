@@ -32,9 +32,7 @@ from .processes import (
 )
 
 ROS = get_typestore(Stores.ROS2_JAZZY)
-TRIGGER = (
-    "std_srvs::srv::dds_::Trigger_/RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
-)
+TRIGGER = "std_srvs::srv::dds_::Trigger_/RIHS01_eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
 
 
 SLOWER = ("--set", "rate_hz=250")
@@ -57,14 +55,18 @@ class Stranger:
 
     def _hear(self, sample: Any) -> None:
         came = sample.attachment.to_bytes() if sample.attachment is not None else b""
-        self.heard["/".join(str(sample.key_expr).split("/")[1:-2])].append((sample.payload.to_bytes(), came))
+        self.heard["/".join(str(sample.key_expr).split("/")[1:-2])].append(
+            (sample.payload.to_bytes(), came)
+        )
 
     def _attachment(self) -> bytes:
         self._sent += 1
         return struct.pack("<qqB16s", self._sent, time.time_ns(), 16, self._gid)
 
     def tokens(self) -> list[str]:
-        return [str(reply.ok.key_expr) for reply in self._session.liveliness().get("@ros2_lv/0/**")]
+        return [
+            str(reply.ok.key_expr) for reply in self._session.liveliness().get("@ros2_lv/0/**")
+        ]
 
     def publish(self, topic: str, kind: str, message: Any) -> None:
         dds = kind.replace("/msg/", "::msg::dds_::") + "_"
@@ -112,8 +114,12 @@ def pose(x: float, y: float) -> Any:
     types = ROS.types
     stamp = types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
     turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
-    where = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](x=x, y=y, z=0.0), turn)
-    return types["geometry_msgs/msg/PoseStamped"](types["std_msgs/msg/Header"](stamp, "m1/base"), where)
+    where = types["geometry_msgs/msg/Pose"](
+        types["geometry_msgs/msg/Point"](x=x, y=y, z=0.0), turn
+    )
+    return types["geometry_msgs/msg/PoseStamped"](
+        types["std_msgs/msg/Header"](stamp, "m1/base"), where
+    )
 
 
 def joint_state(names: Sequence[str], q: Sequence[float], qd: Sequence[float]) -> Any:
@@ -121,7 +127,9 @@ def joint_state(names: Sequence[str], q: Sequence[float], qd: Sequence[float]) -
     types, seconds = ROS.types, time.monotonic_ns()
     stamp = types["builtin_interfaces/msg/Time"](sec=seconds // 10**9, nanosec=seconds % 10**9)
     numbers = (np.array(one) for one in (q, qd, [0.0] * len(q)))
-    return types["sensor_msgs/msg/JointState"](types["std_msgs/msg/Header"](stamp, ""), [*names], *numbers)
+    return types["sensor_msgs/msg/JointState"](
+        types["std_msgs/msg/Header"](stamp, ""), [*names], *numbers
+    )
 
 
 def shares(*numbers: float) -> Any:
@@ -137,7 +145,9 @@ def bridged_session(stage: Stage, duration_s: int) -> Iterator[tuple[Session, An
     session = Session(stage, "play", PAPER, "--duration", str(duration_s), *SLOWER)
     session.all()
     session.begun()
-    bridge = stage.start("ros2", "ros2", "--session", "t", "--ros", router, *connections(session.endpoints))
+    bridge = stage.start(
+        "ros2", "ros2", "--session", "t", "--ros", router, *connections(session.endpoints)
+    )
     bridge.prints("is in the graph of ROS 2")
     stranger = Stranger(router)
     try:
@@ -191,7 +201,11 @@ def test_a_bridge_that_is_killed_leaves_no_force_behind(stage: Stage) -> None:
     with bridged_session(stage, 15) as (session, bridge, ros):
         start = ros.newest("t/m1/tip_pose", "geometry_msgs/msg/PoseStamped").pose.position
         for _ in range(60):
-            ros.publish("t/m1/target_pose", "geometry_msgs/msg/PoseStamped", pose(start.x - 0.1, start.y))
+            ros.publish(
+                "t/m1/target_pose",
+                "geometry_msgs/msg/PoseStamped",
+                pose(start.x - 0.1, start.y),
+            )
             pause(1.0 / 60.0)
         bridge.signal(signal.SIGKILL)
         log = session.is_reproduced()
@@ -204,7 +218,9 @@ def test_a_router_that_comes_late_is_joined_and_latecomers_see(stage: Stage) -> 
     session = Session(stage, "play", PAPER, "--duration", "120", *SLOWER)
     session.all()
     session.begun()
-    bridge = stage.start("ros2", "ros2", "--session", "t", "--ros", router, *connections(session.endpoints))
+    bridge = stage.start(
+        "ros2", "ros2", "--session", "t", "--ros", router, *connections(session.endpoints)
+    )
     bridge.prints(f"no router of ROS answers at {router}: waiting for it")
     first = stage.start("router", "router", "--listen", router)
     bridge.prints("is in the graph of ROS 2")
@@ -252,7 +268,15 @@ def test_a_robot_of_ros_brakes_when_its_site_is_silent(stage: Stage) -> None:
     (stage.folder / "robot.toml").write_text(ROBOT)
     session = Session(stage, "two_sites", ("m", "s"), *OUTSIDE, "--duration", "8", *SLOWER)
     session.all()
-    words = ("--session", "t", "--ros", router, "--names", "robot.toml", *connections(session.endpoints))
+    words = (
+        "--session",
+        "t",
+        "--ros",
+        router,
+        "--names",
+        "robot.toml",
+        *connections(session.endpoints),
+    )
     bridge = stage.start("ros2", "ros2", *words)
     running.prints("listening at")
     ros, robot = Stranger(router), tn.SimulatedArm(tn.load_scenario("two_sites"), "s")
@@ -286,7 +310,9 @@ def test_a_robot_of_ros_brakes_when_its_site_is_silent(stage: Stage) -> None:
     executed_again(log)
     assert {tuple(q) for q in log["s"].q.tolist()} <= {tuple(q) for q in said}
     torques = {tuple(tau) for tau in log["s"].tau.tolist()}
-    assert {(shoulder, elbow) for elbow, shoulder in commands(ros)} - torques <= {(SAFE[1], SAFE[0])}
+    assert {(shoulder, elbow) for elbow, shoulder in commands(ros)} - torques <= {
+        (SAFE[1], SAFE[0])
+    }
     assert abs(log["s"].q - log["s"].q[0]).max() > 0.01
 
 

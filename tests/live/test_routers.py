@@ -16,7 +16,9 @@ SITES = ("m", "s")
 
 
 class Routed(Session):
-    def __init__(self, stage: Stage, duration: str, protocol: str = "tcp", *network: str) -> None:
+    def __init__(
+        self, stage: Stage, duration: str, protocol: str = "tcp", *network: str
+    ) -> None:
         super().__init__(stage, "two_sites", SITES, "--duration", duration)
         self.endpoint = self.recorder_endpoint.replace("tcp", protocol)
         self._network = network
@@ -29,7 +31,9 @@ class Routed(Session):
         return ["--router", self.endpoint, *self.network(name)]
 
     def router(self, called: str = "router") -> Process:
-        return self.stage.start(called, "router", "--listen", self.endpoint, *self.network("router"))
+        return self.stage.start(
+            called, "router", "--listen", self.endpoint, *self.network("router")
+        )
 
 
 class Keyed(Routed):
@@ -49,7 +53,11 @@ def test_sites_with_keys_that_meet_without_a_router(stage: Stage) -> None:
     session.recorder_endpoint = session.recorder_endpoint.replace("tcp", "tls")
     for name in (RECORDER, *PAPER):
         keys = ("--keys", str(stage.folder / "keys" / name))
-        _ = session.recorder(*keys) if name == RECORDER else session.site(name, "--needs-recorder", *keys)
+        _ = (
+            session.recorder(*keys)
+            if name == RECORDER
+            else session.site(name, "--needs-recorder", *keys)
+        )
     session.is_reproduced()
 
 
@@ -108,7 +116,9 @@ def test_with_keys_all_stop_an_arm_only_the_operator_enables(stage: Stage) -> No
 
     def order(words: str, whose: str) -> tuple[int, str]:
         ways = connections(session.endpoints)
-        asked = stage.start(f"{words} by {whose}", *words.split(), "--session", "t", *ways, *keys(whose))
+        asked = stage.start(
+            f"{words} by {whose}", *words.split(), "--session", "t", *ways, *keys(whose)
+        )
         return asked.code(), asked.text()
 
     session.recorder(*keys(RECORDER))

@@ -30,13 +30,17 @@ from .processes import (
 
 @pytest.mark.long  # on a push `make live` does the same with the commands
 @pytest.mark.parametrize("law", [(), TALKING], ids=["its law", "a law that sends"])
-def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(law: tuple[str, ...], stage: Stage) -> None:
+def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(
+    law: tuple[str, ...], stage: Stage
+) -> None:
     session = Session(stage, "paper", PAPER, "--duration", "3", *law)
     session.all()
     log = session.is_reproduced()
     assert sum(len(log[name]) for name in PAPER) == 9_000
     for name in PAPER:
-        assert f"{name}: 3000 of 3000 records, 0 missing" in session.processes["recorder"].text()
+        assert (
+            f"{name}: 3000 of 3000 records, 0 missing" in session.processes["recorder"].text()
+        )
         kinds = [event.kind for event in log.events if event.member == name]
         assert kinds.count("ready") + kinds.count("epoch") >= 1
         assert kinds[-1] == "end"
@@ -47,7 +51,9 @@ def test_the_papers_experiment_live_is_virtual_time_bit_for_bit(law: tuple[str, 
 @pytest.mark.parametrize(
     ("scenario", "duration_s"), [("six_joints", 3), ("seven_joints", 20), ("unlike_arms", 5)]
 )
-def test_arms_of_many_joints_live_are_virtual_time(scenario: str, duration_s: int, stage: Stage) -> None:
+def test_arms_of_many_joints_live_are_virtual_time(
+    scenario: str, duration_s: int, stage: Stage
+) -> None:
     for name in ("m1", "s"):  # compiled once for all sites of as many joints
         warm_up(load_scenario(scenario), name)
     session = Session(stage, scenario, PAPER, "--duration", str(duration_s))
@@ -64,7 +70,17 @@ def test_garbage_of_a_stranger_is_counted_and_changes_nothing(stage: Stage) -> N
     session.begun()
     (elsewhere,) = find_free_endpoints(1)
     second = stage.start(
-        *("second m1", "site", "m1", "--scenario", "paper", "--session", "t", "--listen", elsewhere),
+        *(
+            "second m1",
+            "site",
+            "m1",
+            "--scenario",
+            "paper",
+            "--session",
+            "t",
+            "--listen",
+            elsewhere,
+        ),
         *connections(session.endpoints),
     )
     junk = [b"", b"\xc1", b"garbage", bytes(70_000), b"\x91" * 9000]
@@ -168,7 +184,9 @@ def test_an_interrupted_recorder_finishes_its_file_and_sites_continue(stage: Sta
 
 @pytest.mark.long
 def test_site_that_leaves_its_limits_ends_session_and_says_so(stage: Stage) -> None:
-    session = Session(stage, "paper", PAPER, "--set", "limits.qd_limit_rad_s=0.5", "--duration", "10")
+    session = Session(
+        stage, "paper", PAPER, "--set", "limits.qd_limit_rad_s=0.5", "--duration", "10"
+    )
     session.all()
     assert session.codes() == {"recorder": 0, **dict.fromkeys(PAPER, 1)}
     for name in PAPER:

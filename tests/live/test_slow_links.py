@@ -12,7 +12,10 @@ from trilat_net.log.log_reader import Log
 from .namespaces import ALL, Apart, Machines, NoNamespaces, bridged
 from .processes import PAPER, Session, Stage, executed_again, pause, ticks_to_hold, whole
 
-OPEN = {"netem": ("netem", "delay", "0ms"), "tbf": ("tbf", "rate", "1gbit", "burst", "1mb", "latency", "2s")}
+OPEN = {
+    "netem": ("netem", "delay", "0ms"),
+    "tbf": ("tbf", "rate", "1gbit", "burst", "1mb", "latency", "2s"),
+}
 
 
 @pytest.fixture
@@ -34,13 +37,20 @@ def delays_ms(log: Log, site: str, peer: str) -> NDArray[np.float64]:
     """From the stamp of each sample that came to the tick that took it in."""
     place = log.scenario.peers(site).index(peer)
     return np.array(
-        [state.tick - tick for state in log[site].states for index, tick, _ in state.rx if index == place],
+        [
+            state.tick - tick
+            for state in log[site].states
+            for index, tick, _ in state.rx
+            if index == place
+        ],
         dtype=np.float64,
     )
 
 
 @pytest.mark.long
-def test_sites_hold_while_a_delay_is_too_long_then_follow(queue: str, stage: Stage, apart: Machines) -> None:
+def test_sites_hold_while_a_delay_is_too_long_then_follow(
+    queue: str, stage: Stage, apart: Machines
+) -> None:
     """All that m1 sends comes later and later, or 0.4 s later; then what waits comes at once."""
     slow = {"netem": ("netem", "delay", "400ms", "limit", "100000")}
     slow["tbf"] = ("tbf", "rate", "400kbit", "burst", "16kb", "latency", "2s")

@@ -39,7 +39,10 @@ def watching(stage: Stage, session: str) -> Iterator[int]:
         owns = {"stdin": terminal, "start_new_session": True, "preexec_fn": own_terminal}
         watch = subprocess.Popen(words, cwd=stage.folder, env=PLAIN, stdout=sink, **owns)
     try:
-        until(lambda: "m1" in printed.read_text(encoding="utf-8") or watch.poll() is not None, 60.0)
+        until(
+            lambda: "m1" in printed.read_text(encoding="utf-8") or watch.poll() is not None,
+            60.0,
+        )
         yield keys
         watch.send_signal(signal.SIGINT)
         assert watch.wait(30.0) == 128 + signal.SIGINT
@@ -76,14 +79,18 @@ def enabled(stage: Stage, page: PageClient) -> None:
 
 
 @pytest.mark.parametrize("scenario", HELD)
-def test_every_held_arm_is_stopped_from_everywhere_and_follows_again(scenario: str, stage: Stage) -> None:
+def test_every_held_arm_is_stopped_from_everywhere_and_follows_again(
+    scenario: str, stage: Stage
+) -> None:
     running = live(stage, scenario)
     with page_client(page_address(running)) as page:
         page.shows("run")
         session = page.hello["session"]
         stop = run(stage, "stop", "--session", session).text()
         assert stop.startswith(f"stopping every arm of session {session} ...\n")
-        assert len(re.findall(r"^\w+: stop at tick \d+$", stop, re.MULTILINE)) == len(page.frame["sites"])
+        assert len(re.findall(r"^\w+: stop at tick \d+$", stop, re.MULTILINE)) == len(
+            page.frame["sites"]
+        )
         enabled(stage, page)
         page.send(do="stop")
         enabled(stage, page)
@@ -123,7 +130,8 @@ def is_asked(first: Page, second: Page) -> bool:
         shows(first, "trilat.frame.holds.includes('m1')")
     second.evaluate("document.getElementById('part').click()")
     until(lambda: second.evaluate("trilat.takesPart || trilat.frame.asks"))
-    if second.evaluate("trilat.takesPart"):  # the first was too slow for a moment, so nobody was in its way
+    # the first was too slow for a moment, so nobody was in its way
+    if second.evaluate("trilat.takesPart"):
         second.evaluate("document.getElementById('part').click()")
         shows(second, "!trilat.takesPart")
         return False

@@ -44,6 +44,7 @@ def test_a_recorded_session_is_read_by_everybody(stage: Stage) -> None:
     with AnyReader([bag]) as opened:
         counts = {connection.topic: connection.msgcount for connection in opened.connections}
     assert all(
-        counts[f"/{log.session['session']}/{site}/joint_states"] == len(log[site]) for site in log.sites
+        counts[f"/{log.session['session']}/{site}/joint_states"] == len(log[site])
+        for site in log.sites
     )
     assert rerun_faults(session.log) == []

@@ -39,13 +39,17 @@ def rewritten(data: bytes, chunk_bytes: int, **options: object) -> bytes:
     for schema, channel, message in reader.iter_messages(log_time_order=False):
         assert schema is not None
         if schema.name not in schemas:
-            schemas[schema.name] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            schemas[schema.name] = writer.register_schema(
+                schema.name, schema.encoding, schema.data
+            )
         if channel.topic not in channels:
             channels[channel.topic] = writer.register_channel(
                 channel.topic, channel.message_encoding, schemas[schema.name], channel.metadata
             )
         number = channels[channel.topic]
-        writer.add_message(number, message.log_time, message.data, message.publish_time, message.sequence)
+        writer.add_message(
+            number, message.log_time, message.data, message.publish_time, message.sequence
+        )
     for name, entries in metadata.items():
         writer.add_metadata(name, entries)
     writer.finish()
@@ -80,7 +84,9 @@ class DamagedFile:
     pages: tuple[tuple[str, int], ...]
 
 
-def damaged(files: Mapping[str, bytes], names: Sequence[str], draw: random.Random) -> DamagedFile:
+def damaged(
+    files: Mapping[str, bytes], names: Sequence[str], draw: random.Random
+) -> DamagedFile:
     """One of some logs with up to two bad pages, in six of ten cases cut off anywhere."""
     name = draw.choice(names)
     whole = files[name]
@@ -134,7 +140,11 @@ class RecoveryTally:
 
 
 def recovered_all(
-    files: Mapping[str, bytes], cases: Sequence[DamagedFile], folder: Path, *, verified: bool = True
+    files: Mapping[str, bytes],
+    cases: Sequence[DamagedFile],
+    folder: Path,
+    *,
+    verified: bool = True,
 ) -> RecoveryTally:
     """Recovers files one after the other, and compares what is in them with the undamaged ones."""
     truth = {name: Counter(messages(data)) for name, data in files.items()}
@@ -146,7 +156,11 @@ def recovered_all(
 
 
 def _recovered(
-    case: DamagedFile, truth: Counter[Message], folder: Path, tally: RecoveryTally, verified: bool
+    case: DamagedFile,
+    truth: Counter[Message],
+    folder: Path,
+    tally: RecoveryTally,
+    verified: bool,
 ) -> str:
     source, output = folder / "damaged.mcap", folder / "recovered.mcap"
     source.write_bytes(case.data)

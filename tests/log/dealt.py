@@ -32,7 +32,9 @@ def messages(data: bytes) -> list[Message]:
 
 
 def changed(message: Message, **fields: object) -> Message:
-    return message._replace(payload=msgpack.packb({**msgpack.unpackb(message.payload), **fields}))
+    return message._replace(
+        payload=msgpack.packb({**msgpack.unpackb(message.payload), **fields})
+    )
 
 
 def foreign(payloads: Sequence[bytes] = (b"{}",), **options: Any) -> bytes:
@@ -40,7 +42,9 @@ def foreign(payloads: Sequence[bytes] = (b"{}",), **options: Any) -> bytes:
     stream = io.BytesIO()
     writer = Writer(stream, **options)
     writer.start()
-    channel = writer.register_channel("/t", "json", writer.register_schema("s", "jsonschema", b"{}"))
+    channel = writer.register_channel(
+        "/t", "json", writer.register_schema("s", "jsonschema", b"{}")
+    )
     for n, payload in enumerate(payloads):
         writer.add_message(channel, n, payload, n, n)
     writer.finish()
@@ -72,7 +76,9 @@ def a_file(
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start()
-    (head,) = (entry.metadata for entry in reader.iter_metadata() if entry.name == "trilat.session")
+    (head,) = (
+        entry.metadata for entry in reader.iter_metadata() if entry.name == "trilat.session"
+    )
     head.pop("digest_chain", None)
     writer.add_metadata("trilat.session", {**head, **(session or {})})
     if part:
@@ -108,7 +114,9 @@ def split(folder: Path, *, refilled: range) -> list[Path]:
     data = recorded("paper")
     scenario = opened(data).scenario
     items = [item for item in McapReader(io.BytesIO(data), "log").messages() if item.topic]
-    kept_back = [i for i in items if i.topic == "/trilat/paper/s/state" and i.sequence in refilled]
+    kept_back = [
+        i for i in items if i.topic == "/trilat/paper/s/state" and i.sequence in refilled
+    ]
     items = [item for item in items if item not in kept_back]
     items[len(items) * 3 // 4 : len(items) * 3 // 4] = kept_back
     accounts = {item.topic: Account() for item in items}
@@ -119,7 +127,8 @@ def split(folder: Path, *, refilled: range) -> list[Path]:
     place = LogStorage(folder / "run.mcap", split_ns=40_000_000)
     now_ns = 0
     with LogParts(
-        place, lambda stream, part: LogWriter(stream, scenario, "paper", "virtual", 0, part=part)
+        place,
+        lambda stream, part: LogWriter(stream, scenario, "paper", "virtual", 0, part=part),
     ) as log:
         log.so_far = told
         for item in items:

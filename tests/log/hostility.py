@@ -22,7 +22,20 @@ from trilat_net.log.mcap_records import RecordScanner, iterate_records, unpack_c
 from trilat_net.log.recover import recover
 from trilat_net.log.session_check import check_file
 
-LENGTHS = (0, 1, 7, 22, 255, 1 << 16, 1 << 20, 1 << 31, (1 << 32) - 1, 1 << 40, (1 << 63) - 1, (1 << 64) - 1)
+LENGTHS = (
+    0,
+    1,
+    7,
+    22,
+    255,
+    1 << 16,
+    1 << 20,
+    1 << 31,
+    (1 << 32) - 1,
+    1 << 40,
+    (1 << 63) - 1,
+    (1 << 64) - 1,
+)
 NUMBERS = (
     *(0, -1, 1, 3, 119, 120, 255, 1 << 31, 1 << 40, (1 << 40) - 1),
     *((1 << 63) - 1, -(1 << 63), (1 << 64) - 1),
@@ -42,7 +55,19 @@ VALUES: tuple[Any, ...] = (
     ["x" * 5000],
 )
 """What a field of a message may be turned into."""
-TEXTS = ("", "0", "-1", "9" * 400, "x" * 3000, "\x1b[31m", "live", "virtual", "m1 m2 s", "1e999", "²")
+TEXTS = (
+    "",
+    "0",
+    "-1",
+    "9" * 400,
+    "x" * 3000,
+    "\x1b[31m",
+    "live",
+    "virtual",
+    "m1 m2 s",
+    "1e999",
+    "²",
+)
 SCENARIO_VALUES = (
     *("0x" + "f" * 300, "-1", "1e308", "5e-324", "nan", "''", "[]", "{}", "[[]]"),
     *("true", "86400", "20000", "1"),
@@ -92,7 +117,9 @@ def lengthened(data: bytes, draws: Draws) -> bytes:
     changed = bytearray(data)
     size = one_of(draws, (2, 4, 8))
     at = draws.randrange(0, len(data) - size)
-    changed[at : at + size] = (one_of(draws, LENGTHS) & ((1 << 8 * size) - 1)).to_bytes(size, "little")
+    changed[at : at + size] = (one_of(draws, LENGTHS) & ((1 << 8 * size) - 1)).to_bytes(
+        size, "little"
+    )
     return bytes(changed)
 
 
@@ -117,9 +144,15 @@ def chunk(
     }[compression]()
     name = compression.encode()
     head = struct.pack(
-        "<QQQI", 0, 0, len(records) if size is None else size, zlib.crc32(records) if crc is None else crc
+        "<QQQI",
+        0,
+        0,
+        len(records) if size is None else size,
+        zlib.crc32(records) if crc is None else crc,
     )
-    content = head + struct.pack("<I", len(name)) + name + struct.pack("<Q", len(packed)) + packed
+    content = (
+        head + struct.pack("<I", len(name)) + name + struct.pack("<Q", len(packed)) + packed
+    )
     return struct.pack("<BQ", 6, len(content)) + content
 
 
@@ -172,7 +205,16 @@ def field_changed(data: bytes, draws: Draws) -> bytes:
     """A field is another from some record of a site on."""
     names = "tick t_ns used rx cmd mem mode late_us boot site echo v sent_ns rx_crc busy_us q"
     name = one_of(draws, names.split())
-    kinds = {"used": {}, "rx": [], "cmd": [], "mem": [], "echo": [], "q": [], "mode": "", "site": ""}
+    kinds = {
+        "used": {},
+        "rx": [],
+        "cmd": [],
+        "mem": [],
+        "echo": [],
+        "q": [],
+        "mode": "",
+        "site": "",
+    }
     value = another(kinds.get(name, 0), draws)
     since, site = draws.randrange(0, 30), one_of(draws, ("m1", "m2", "s"))
 

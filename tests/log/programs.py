@@ -18,7 +18,11 @@ def printed(*command: str) -> str:
 
 def rerun_faults(path: Path, *options: str) -> list[str]:
     """The channels with which `rerun mcap check` finds fault, and why."""
-    table = printed(*RERUN, "mcap", "check", *options, str(path)).partition("Status")[2].splitlines()[2:]
+    table = (
+        printed(*RERUN, "mcap", "check", *options, str(path))
+        .partition("Status")[2]
+        .splitlines()[2:]
+    )
     rows = list(takewhile(str.strip, table))  # its first run on a machine says more below
     assert rows
     return [row for row in rows if row.split()[0] != "ok"]

@@ -33,14 +33,23 @@ def live(storage: LogStorage) -> None:
 
     def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
         return LogWriter(
-            stream, SCENARIO, "lab", "live", EPOCH_NS, part=part, choice=storage.choice, views_hz=VIEWS_HZ
+            stream,
+            SCENARIO,
+            "lab",
+            "live",
+            EPOCH_NS,
+            part=part,
+            choice=storage.choice,
+            views_hz=VIEWS_HZ,
         )
 
     with LogParts(storage, begin) as log:
         for step in virtual.execute_virtual(SCENARIO):
             name, k, t_ns = step.site.name, step.output.tick, step.output.t_ns
             sent_ns, log_ns = t_ns + 80_000, EPOCH_NS + t_ns + 300_000
-            payload = encode_state(name, 7, step.site.peers, step.output, step.arrivals, 70, 20, sent_ns)
+            payload = encode_state(
+                name, 7, step.site.peers, step.output, step.arrivals, 70, 20, sent_ns
+            )
             state = decode(payload, State)
             log.add(f"trilat/lab/{name}/state", payload, sent_ns, log_ns, k, state)
             if k % 100 == 0:
@@ -48,8 +57,22 @@ def live(storage: LogStorage) -> None:
                 log.add(f"trilat/lab/{name}/link", encode(stats), t_ns, log_ns, k, stats)
                 log.flush()
         for n, name in enumerate(SCENARIO.names):
-            end = Event(member=name, boot=7, kind="end", text=f"{name} made 500 ticks", t_ns=5 * 10**8, n=0)
-            log.add(f"trilat/lab/{name}/event", encode(end), end.t_ns, EPOCH_NS + 6 * 10**8 + n, 0, end)
+            end = Event(
+                member=name,
+                boot=7,
+                kind="end",
+                text=f"{name} made 500 ticks",
+                t_ns=5 * 10**8,
+                n=0,
+            )
+            log.add(
+                f"trilat/lab/{name}/event",
+                encode(end),
+                end.t_ns,
+                EPOCH_NS + 6 * 10**8 + n,
+                0,
+                end,
+            )
         log.finish({})
 
 
@@ -57,7 +80,15 @@ def statistics(site: str, peer: str, tick: int, t_ns: int) -> LinkStats:
     """Statistics of a site with one peer, as a live loop publishes them."""
     counts = {name: {peer: 0} for name in ("accepted", "late", "duplicate", "refused")}
     measured = {"offset_us": {peer: -120}, "bound_us": {peer: 40}, "rtt_us": {peer: 400}}
-    facts = {"v": 3, "site": site, "boot": 7, "tick": tick, "t_ns": t_ns, "mode": "run", "dropped": {}}
+    facts = {
+        "v": 3,
+        "site": site,
+        "boot": 7,
+        "tick": tick,
+        "t_ns": t_ns,
+        "mode": "run",
+        "dropped": {},
+    }
     loop = {"age_us": {peer: 1000 + tick}, "late_max_us": 90, "busy_max_us": 30, "overruns": 0}
     delays = {"delay_us": {peer: 210 + tick}, "delay_max_us": {peer: 900}}
     return LinkStats(**facts, **loop, **delays, **measured, **counts)
@@ -72,7 +103,9 @@ def made(folder: Path) -> dict[str, Path]:
     live(LogStorage(folder / "parts.mcap", split_ns=200_000_000))
     parts = sorted(folder.glob("parts-*.mcap"))
     torn = folder / "torn.mcap"
-    torn.write_bytes((folder / "live.mcap").read_bytes()[: (folder / "live.mcap").stat().st_size * 7 // 10])
+    torn.write_bytes(
+        (folder / "live.mcap").read_bytes()[: (folder / "live.mcap").stat().st_size * 7 // 10]
+    )
     recover(torn, folder / "recovered.mcap")
     bag = folder / "live-ros2.mcap"
     export_ros2(open_log(folder / "live.mcap"), bag)

@@ -33,14 +33,20 @@ def test_an_account_is_what_the_set_of_ticks_says(stream: list[int], ticks: int)
     account.expect(ticks)
     gaps = gaps_of(came, max(ticks, newest + 1))
     assert account.gaps == gaps
-    assert (account.received, account.duplicate, account.reordered) == (len(came), duplicate, reordered)
+    assert (account.received, account.duplicate, account.reordered) == (
+        len(came),
+        duplicate,
+        reordered,
+    )
     assert account.missing == max(ticks, newest + 1) - len(came)
     assert account.largest_gap == max((last - first + 1 for first, last in gaps), default=0)
     assert account.last == max(ticks - 1, newest)
 
 
 @given(stream=streams, ticks=st.integers(0, 70), most=st.integers(1, 4))
-def test_gaps_are_bounded_and_missing_is_exact_all_the_same(stream: list[int], ticks: int, most: int) -> None:
+def test_gaps_are_bounded_and_missing_is_exact_all_the_same(
+    stream: list[int], ticks: int, most: int
+) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(accounting, "MAX_GAPS", most)
         account, taken = Account(), set[int]()
@@ -56,7 +62,9 @@ def test_gaps_are_bounded_and_missing_is_exact_all_the_same(stream: list[int], t
 
 
 @given(
-    stream=st.lists(st.tuples(st.sampled_from(["came", "from memory"]), st.integers(0, 40)), max_size=80),
+    stream=st.lists(
+        st.tuples(st.sampled_from(["came", "from memory"]), st.integers(0, 40)), max_size=80
+    ),
     hopeless=st.integers(0, 50),
 )
 def test_records_from_memory_are_there_once_and_in_order(
@@ -85,7 +93,9 @@ def test_records_from_memory_are_there_once_and_in_order(
 
 
 @given(st.lists(st.integers(0, 10**12), min_size=1, max_size=30).map(sorted), st.booleans())
-def test_longest_silence_is_longest_time_between_two_that_came(came: list[int], again: bool) -> None:
+def test_longest_silence_is_longest_time_between_two_that_came(
+    came: list[int], again: bool
+) -> None:
     account = Account()
     for number, at_ns in enumerate(came):
         account.take(0 if again else number, at_ns)
@@ -154,7 +164,9 @@ def test_records_under_way_at_a_kill_are_not_made() -> None:
     assert (account.gaps, account.unmade) == ([[0, 3], [5, 7]], 2)
 
 
-@pytest.mark.parametrize("order", [*permutations(("join", "heard 7", "heard 6", "records"))], ids=" ".join)
+@pytest.mark.parametrize(
+    "order", [*permutations(("join", "heard 7", "heard 6", "records"))], ids=" ".join
+)
 def test_what_others_heard_of_a_killed_start_is_missing(
     order: Sequence[str],
 ) -> None:

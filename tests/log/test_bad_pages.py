@@ -77,7 +77,9 @@ def test_a_torn_chunk_with_a_zeroed_page_adds_nothing(tmp_path: Path) -> None:
 
 def chunk_offsets(data: bytes) -> list[tuple[int, int]]:
     scanner = RecordScanner(io.BytesIO(data))
-    return [(frame.offset, frame.end) for frame in scanner.frames() if frame.opcode == Opcode.CHUNK]
+    return [
+        (frame.offset, frame.end) for frame in scanner.frames() if frame.opcode == Opcode.CHUNK
+    ]
 
 
 @pytest.mark.parametrize("finished", [True, False])
@@ -136,7 +138,8 @@ def test_a_head_of_another_virtual_run_is_refused(whole: bool, tmp_path: Path) -
     result, saved = recovered(bytes(torn), tmp_path)
     assert not Counter(messages(saved)) - Counter(messages(data))
     assert result.messages > 1500
-    assert "in whose place are those of another session" in result.lost[0]  # the first, which lists show
+    # the first, which lists show
+    assert "in whose place are those of another session" in result.lost[0]
     assert "commands of trilat-net do not" in result.lost[0]
     assert b"scenario.toml.damaged" in saved
 
@@ -170,7 +173,11 @@ def test_without_anything_to_save_no_file_is_made(kind: str, tmp_path: Path) -> 
     (tmp_path / "zz.mcap").write_bytes(b"precious")
     with pytest.raises(NothingSaved, match="nothing in it that could be saved") as error:
         recovered(bytes(data), tmp_path)
-    expected = "without the scenario no message can be checked" if kind == "without checksums" else "chunk"
+    expected = (
+        "without the scenario no message can be checked"
+        if kind == "without checksums"
+        else "chunk"
+    )
     assert expected in str(error.value)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["z.mcap.active", "zz.mcap"]
     assert (tmp_path / "zz.mcap").read_bytes() == b"precious"
@@ -183,7 +190,12 @@ def test_a_log_that_no_command_opens_is_stated(scenario: str, tmp_path: Path) ->
     stream = io.BytesIO()
     writer = Writer(stream)
     writer.start()
-    session = {"session": "paper", "driver": "virtual", "schema_version": "4", "epoch_unix_ns": "0"}
+    session = {
+        "session": "paper",
+        "driver": "virtual",
+        "schema_version": "4",
+        "epoch_unix_ns": "0",
+    }
     session["scenario_sha256"] = hashlib.sha256(text).hexdigest()
     writer.add_metadata(SESSION, session)
     writer.add_attachment(0, 0, SCENARIO, "application/toml", text)
@@ -207,7 +219,8 @@ def test_a_lost_scenario_is_taken_from_beside_the_log(tmp_path: Path) -> None:
     data = recorded("paper")
     result, saved = recovered(without_scenario(data), tmp_path)
     assert any("commands of trilat-net do not" in text for text in result.lost)
-    assert b"scenario.toml.damaged" in saved  # kept, and not under a name that promises a right checksum
+    # kept, and not under a name that promises a right checksum
+    assert b"scenario.toml.damaged" in saved
     (tmp_path / SCENARIO).write_bytes(open_log(io.BytesIO(data)).scenario_text.encode())
     recovered(without_scenario(data), tmp_path)
     assert verify(open_log(tmp_path / "zz.mcap")).agreed
@@ -252,4 +265,5 @@ def test_a_block_with_one_bad_message_is_left_out(tmp_path: Path) -> None:
     result, saved = recovered(bytes(torn), tmp_path)
     assert 0 < result.salvaged < whole.salvaged
     assert not Counter(messages(saved)) - Counter(messages(data))
-    assert zstandard.frame_header_size(data[begin + 9 + 44 : begin + 9 + 60]) > 0  # the chunk is packed
+    # the chunk is packed
+    assert zstandard.frame_header_size(data[begin + 9 + 44 : begin + 9 + 60]) > 0

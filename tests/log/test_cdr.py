@@ -111,7 +111,9 @@ def arrays(draw: st.DrawFn) -> tuple[list[tuple[str, int]], list[float]]:
 
 
 @given(arrays())
-def test_arrays_are_read_as_they_were_written(case: tuple[list[tuple[str, int]], list[float]]) -> None:
+def test_arrays_are_read_as_they_were_written(
+    case: tuple[list[tuple[str, int]], list[float]],
+) -> None:
     dimensions, numbers = case
     data = make_float_array_packer(*dimensions)(*numbers)
     strides = [math.prod(size for _, size in dimensions[n:]) for n in range(len(dimensions))]
@@ -140,41 +142,62 @@ def test_line_of_log_is_read_as_it_was_written(
     data = pack_log(stamp_ns, level, name, text)
     for message in (decoded(cdr.LOG, data), by_rosbags(cdr.LOG, data)):
         assert message.stamp.sec * 10**9 + message.stamp.nanosec == stamp_ns
-        assert (message.level, message.name, message.msg, message.line) == (level, name, text, 0)
+        assert (message.level, message.name, message.msg, message.line) == (
+            level,
+            name,
+            text,
+            0,
+        )
         assert (message.file, message.function) == ("", "")
     time = type_of("builtin_interfaces/msg/Time")(*divmod(stamp_ns, 10**9))
-    own = type_of(cdr.LOG)(stamp=time, level=level.value, name=name, msg=text, file="", function="", line=0)
+    own = type_of(cdr.LOG)(
+        stamp=time, level=level.value, name=name, msg=text, file="", function="", line=0
+    )
     assert data == serialized(cdr.LOG, own)
 
 
 def test_a_stamp_beyond_ros_2_is_its_last_second() -> None:
-    message = by_rosbags(cdr.JOINT_STATE, JointStatePacker(["a"]).pack(2**63, [1.0], [2.0], [3.0]))
+    message = by_rosbags(
+        cdr.JOINT_STATE, JointStatePacker(["a"]).pack(2**63, [1.0], [2.0], [3.0])
+    )
     assert message.header.stamp.sec == 2**31 - 1
 
 
 def pose(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
     point, turn = type_of("geometry_msgs/msg/Point"), type_of("geometry_msgs/msg/Quaternion")
-    where = type_of("geometry_msgs/msg/Pose")(position=point(*numbers[:3]), orientation=turn(*numbers[3:]))
+    where = type_of("geometry_msgs/msg/Pose")(
+        position=point(*numbers[:3]), orientation=turn(*numbers[3:])
+    )
     return type_of("geometry_msgs/msg/PoseStamped")(header=header(stamp_ns, frame), pose=where)
 
 
 def wrench(stamp_ns: int, frame: str, numbers: list[float]) -> Any:
     vector = type_of("geometry_msgs/msg/Vector3")
-    pull = type_of("geometry_msgs/msg/Wrench")(force=vector(*numbers[:3]), torque=vector(*numbers[3:]))
-    return type_of("geometry_msgs/msg/WrenchStamped")(header=header(stamp_ns, frame), wrench=pull)
+    pull = type_of("geometry_msgs/msg/Wrench")(
+        force=vector(*numbers[:3]), torque=vector(*numbers[3:])
+    )
+    return type_of("geometry_msgs/msg/WrenchStamped")(
+        header=header(stamp_ns, frame), wrench=pull
+    )
 
 
 @given(stamps_ns, words, st.lists(floats, min_size=7, max_size=7))
-def test_poses_and_wrenches_are_those_of_rosbags(stamp_ns: int, frame: str, numbers: list[float]) -> None:
+def test_poses_and_wrenches_are_those_of_rosbags(
+    stamp_ns: int, frame: str, numbers: list[float]
+) -> None:
     for kind, make, count in (("PoseStamped", pose, 7), ("WrenchStamped", wrench, 6)):
         data = cdr.pack_frame_vectors(stamp_ns, frame, *numbers[:count])
-        assert data == serialized(f"geometry_msgs/msg/{kind}", make(stamp_ns, frame, numbers[:count]))
+        assert data == serialized(
+            f"geometry_msgs/msg/{kind}", make(stamp_ns, frame, numbers[:count])
+        )
         named, read = cdr.read_frame_vectors(data, count)
         assert (named, bits(read)) == (frame, bits(numbers[:count]))
 
 
 @given(stamps_ns, words, st.lists(words, max_size=4), st.booleans())
-def test_joint_states_of_others_are_read(stamp_ns: int, frame: str, names: list[str], moves: bool) -> None:
+def test_joint_states_of_others_are_read(
+    stamp_ns: int, frame: str, names: list[str], moves: bool
+) -> None:
     speeds = [0.5] * len(names) if moves else []
     message = type_of(cdr.JOINT_STATE)(
         header=header(stamp_ns, frame),
@@ -188,19 +211,31 @@ def test_joint_states_of_others_are_read(stamp_ns: int, frame: str, names: list[
 
 
 @given(
-    stamps_ns, st.lists(st.tuples(st.integers(0, 3), words, words, st.dictionaries(words, words, max_size=3)))
+    stamps_ns,
+    st.lists(
+        st.tuples(st.integers(0, 3), words, words, st.dictionaries(words, words, max_size=3))
+    ),
 )
 def test_diagnostics_are_those_of_rosbags(stamp_ns: int, parts: list[tuple[Any, ...]]) -> None:
-    status, pair = type_of("diagnostic_msgs/msg/DiagnosticStatus"), type_of("diagnostic_msgs/msg/KeyValue")
+    status, pair = (
+        type_of("diagnostic_msgs/msg/DiagnosticStatus"),
+        type_of("diagnostic_msgs/msg/KeyValue"),
+    )
     theirs = [
         status(
-            level=n, name=name, message=text, hardware_id="", values=[pair(*one) for one in values.items()]
+            level=n,
+            name=name,
+            message=text,
+            hardware_id="",
+            values=[pair(*one) for one in values.items()],
         )
         for n, name, text, values in parts
     ]
     kind = "diagnostic_msgs/msg/DiagnosticArray"
     message = type_of(kind)(header=header(stamp_ns, ""), status=theirs)
-    assert cdr.pack_diagnostics(stamp_ns, [cdr.Diagnosis(*one) for one in parts]) == serialized(kind, message)
+    assert cdr.pack_diagnostics(stamp_ns, [cdr.Diagnosis(*one) for one in parts]) == serialized(
+        kind, message
+    )
 
 
 @given(st.booleans(), words)

@@ -17,7 +17,12 @@ from trilat_net.core.site_setup import Layout
 from trilat_net.core.ticks import NS_PER_S
 from trilat_net.errors import LogError, UsageError
 from trilat_net.files import format_extra_install
-from trilat_net.log.data_tables import UNIT_SUFFIXES, Column, build_arrivals_table, read_field_docs
+from trilat_net.log.data_tables import (
+    UNIT_SUFFIXES,
+    Column,
+    build_arrivals_table,
+    read_field_docs,
+)
 from trilat_net.log.log_reader import Log
 from trilat_net.net.messages import Event, LinkStats, RecorderStats, State
 
@@ -52,7 +57,10 @@ def test_column_names_are_unique_end_in_units_and_are_explained(which: str) -> N
 
 @pytest.mark.parametrize(
     ("live", "said"),
-    [(False, "the age of its stamp; in virtual time"), (True, "its one-way delay, by the offset of")],
+    [
+        (False, "the age of its stamp; in virtual time"),
+        (True, "its one-way delay, by the offset of"),
+    ],
 )
 def test_delays_of_arrivals_say_what_they_are(*, live: bool, said: str) -> None:
     """In virtual time nothing is under way: a sample's delay there is no network's."""
@@ -75,14 +83,20 @@ def test_a_row_of_states_is_its_record(which: str) -> None:
             assert (rows["late_us"][n], rows["busy_us"][n]) == (state.late_us, state.busy_us)
             assert rows["t_s"][n] == state.t_ns / NS_PER_S
             for field, unit in units.items():
-                assert [rows[f"{field}{k + 1}_{unit}"][n] for k in range(2)] == getattr(state, field)
-            theta = [rows[f"theta_hat{k + 1}_{'kg_m2' if k < 3 else 'kg_m'}"][n] for k in range(5)]
+                assert [rows[f"{field}{k + 1}_{unit}"][n] for k in range(2)] == getattr(
+                    state, field
+                )
+            theta = [
+                rows[f"theta_hat{k + 1}_{'kg_m2' if k < 3 else 'kg_m'}"][n] for k in range(5)
+            ]
             assert theta == state.theta_hat
             for peer in log[site].peers:
                 used = state.used[peer]
                 stamp = used * NS_PER_S // log.scenario.sites[peer].rate_hz
                 assert rows[f"used_{peer}_tick"][n] == (used if used >= 0 else None)
-                assert rows[f"age_{peer}_ms"][n] == ((state.t_ns - stamp) / 1e6 if used >= 0 else None)
+                assert rows[f"age_{peer}_ms"][n] == (
+                    (state.t_ns - stamp) / 1e6 if used >= 0 else None
+                )
     assert set(STATE_VECTORS) == {*units, "theta_hat"}
 
 
@@ -109,12 +123,23 @@ def test_a_row_of_statistics_is_its_message() -> None:
         late_max_us=8, busy_max_us=9, overruns=10, offset_us={"b": -1}, delay_us={"b": -1, "c": 12},
     )  # fmt: skip
     later = msgspec.structs.replace(stats, tick=40, dropped={})
-    table = logs.rewritten(log, keep=lambda s: s.tick < 3, others=[later, stats]).table("a", "link")
+    table = logs.rewritten(log, keep=lambda s: s.tick < 3, others=[later, stats]).table(
+        "a", "link"
+    )
     first = {column.name: column.rows(0, 1)[0] for column in table.columns}
     assert first["tick"] == 20
-    assert (first["t_s"], first["mode"], first["late_max_us"], first["overruns"]) == (0.1, "hold", 8, 10)
+    assert (first["t_s"], first["mode"], first["late_max_us"], first["overruns"]) == (
+        0.1,
+        "hold",
+        8,
+        10,
+    )
     assert (first["age_b_us"], first["age_c_us"]) == (None, 7)  # -1: none yet
-    assert (first["offset_b_us"], first["offset_c_us"]) == (-1, None)  # an offset of -1 us; none known
+    # an offset of -1 us; none known
+    assert (first["offset_b_us"], first["offset_c_us"]) == (
+        -1,
+        None,
+    )
     assert (first["delay_b_us"], first["delay_c_us"]) == (None, 12)
     assert (first["accepted_b_count"], first["late_b_count"]) == (4, None)
     assert table["dropped_not_finite_count"].rows(0, 2) == [2, 0]
@@ -149,9 +174,14 @@ def test_events_are_in_the_order_in_which_they_came() -> None:
     every = messages(recorded("paper"))
     ends = [m for m in every if m[0].endswith("/event")]
     late = [
-        (topic, payload, 10**9 - n, sent, number) for n, (topic, payload, _, sent, number) in enumerate(ends)
+        (topic, payload, 10**9 - n, sent, number)
+        for n, (topic, payload, _, sent, number) in enumerate(ends)
     ]
-    assert opened(a_file(recorded("paper"), late)).table("events")["member"].rows(0, 3) == ["s", "m2", "m1"]
+    assert opened(a_file(recorded("paper"), late)).table("events")["member"].rows(0, 3) == [
+        "s",
+        "m2",
+        "m1",
+    ]
 
 
 def test_what_there_is_not_is_answered_with_what_there_is() -> None:
@@ -188,7 +218,9 @@ def test_a_column_of_numbers_has_nan_where_there_is_none() -> None:
     assert Column("x_us", np.array([3, 4]), known=~known | known).numbers().dtype == np.int64
 
 
-@pytest.mark.parametrize(("name", "kind"), [("a", ""), ("a", "link"), ("b", "arrivals"), ("events", "")])
+@pytest.mark.parametrize(
+    ("name", "kind"), [("a", ""), ("a", "link"), ("b", "arrivals"), ("events", "")]
+)
 def test_a_frame_is_its_table(name: str, kind: str) -> None:
     log = logs.busy().log
     table, frame = log.table(name, kind), log.frame(name, kind)

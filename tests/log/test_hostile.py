@@ -59,7 +59,10 @@ def test_several_changes_at_once(seed: int) -> None:
 
 def _file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> bytes:
     """A log of a mebibyte whose site m1 has these records, and as many of them as a reader may be given."""
-    log = edited(WHOLE, scenario=lambda text: text.replace("duration_s = 0.04", f"duration_s = {seconds}"))
+    log = edited(
+        WHOLE,
+        scenario=lambda text: text.replace("duration_s = 0.04", f"duration_s = {seconds}"),
+    )
     framing = RecordScanner(io.BytesIO(log))
     first = next(frame for frame in framing.frames() if frame.opcode == Opcode.CHUNK)
     inside, names = unpack_chunk(framing.content(first)), b""
@@ -75,16 +78,31 @@ def _file(messages: Iterator[bytes], most: int, seconds: float = 3600.0) -> byte
         struct.pack("<BQHIQQ", 5, 22 + len(payload), channel, 0, 0, 0) + payload
         for _, payload in zip(range(most), messages, strict=False)
     ]
-    packed = [chunk(names + b"".join(records[k : k + 20_000])) for k in range(0, len(records), 20_000)]
-    return log[: first.offset] + struct.pack("<BQ", 9, len(content)) + content + b"".join(packed)
+    packed = [
+        chunk(names + b"".join(records[k : k + 20_000])) for k in range(0, len(records), 20_000)
+    ]
+    return (
+        log[: first.offset] + struct.pack("<BQ", 9, len(content)) + content + b"".join(packed)
+    )
 
 
 def _records(**fields: Any) -> Iterator[bytes]:
     """Records of m1 that are valid, small, and say what is given besides."""
     zeros = {"q": 2, "qd": 2, "q_des": 2, "qd_des": 2, "tau": 2, "tau_x": 2, "theta_hat": 5}
-    about = {"v": 3, "site": "m1", "boot": 1, "mode": "run", "used": {}, "rx": [], "rx_crc": 0, "cmd": []}
+    about = {
+        "v": 3,
+        "site": "m1",
+        "boot": 1,
+        "mode": "run",
+        "used": {},
+        "rx": [],
+        "rx_crc": 0,
+        "cmd": [],
+    }
     plain = (
-        {name: [0] * count for name, count in zeros.items()} | about | {"mem": [], "late_us": 0, "busy_us": 0}
+        {name: [0] * count for name, count in zeros.items()}
+        | about
+        | {"mem": [], "late_us": 0, "busy_us": 0}
     )
     k = 0
     while True:
@@ -93,14 +111,17 @@ def _records(**fields: Any) -> Iterator[bytes]:
 
 
 HUGE: dict[str, Callable[[], bytes]] = {
-    "records that take in what nobody sent": lambda: _file(_records(rx=[[0, 0, 0]] * 30), 23_000),
+    "records that take in what nobody sent": lambda: _file(
+        _records(rx=[[0, 0, 0]] * 30), 23_000
+    ),
     "messages without a byte": lambda: _file(iter(lambda: b"", None), 100_000),
 }
 
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=pytest.mark.long if "records" in kind else ()) for kind in HUGE]
+    "kind",
+    [pytest.param(kind, marks=pytest.mark.long if "records" in kind else ()) for kind in HUGE],
 )
 def test_a_mebibyte_never_takes_more_than_256(kind: str, tmp_path: Path) -> None:
     """Peak resident memory of a process that reads such a file in every way, the interpreter and all."""
@@ -119,7 +140,9 @@ def test_a_mebibyte_never_takes_more_than_256(kind: str, tmp_path: Path) -> None
     )
     hungriest = ("arrays", "verify", "check", "recover")
     command = [sys.executable, "-c", program, str(path), *hungriest]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2])
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=Path(__file__).parents[2]
+    )
     assert done.returncode == 0, done.stderr
     assert int(done.stdout) / 1024 < MEMORY_MIB
 
@@ -128,13 +151,17 @@ def test_a_tick_that_the_scenario_does_not_have_is_refused() -> None:
     """Nobody counts up to a number that a stranger wrote, nor keeps a place for every one before it."""
     data = edited(DATA, record=lambda r: {**r, "tick": (1 << 40) - 1} if r["tick"] == 9 else r)
     log = opened(data)
-    with pytest.raises(LogError, match=r"has a record of tick 1099511627775; the scenario has 40"):
+    with pytest.raises(
+        LogError, match=r"has a record of tick 1099511627775; the scenario has 40"
+    ):
         _ = log["m1"]
 
 
 def test_site_that_says_it_made_endless_ticks_is_not_believed() -> None:
     log = opened(edited(WHOLE, record=lambda r: None if r["tick"] > 30 else r))
-    endless = [msgspec.structs.replace(e, ticks=1 << 60) if e.kind == "end" else e for e in log.events]
+    endless = [
+        msgspec.structs.replace(e, ticks=1 << 60) if e.kind == "end" else e for e in log.events
+    ]
     log.events = endless
     assert verify(log).gaps == [(site, 31, 39) for site in log.sites]
     assert [log.missing(site) for site in log.sites] == [9] * 3
@@ -148,7 +175,10 @@ def test_site_that_says_it_made_endless_ticks_is_not_believed() -> None:
         ("seed = 0x" + "f" * 4000, "at most 64 bits, has 16000"),
         ("[" + "a." * 3000 + "a]", "more than 32 parts"),
         ("a" * 100 + " = {" + "a." * 20_000 + "a = 1}", "line 1: a key has more than 32 parts"),
-        ("name = 'x'\n[dominance]\n" + "".join(f"[sites.a{n}]\n" for n in range(40)), "at most 32"),
+        (
+            "name = 'x'\n[dominance]\n" + "".join(f"[sites.a{n}]\n" for n in range(40)),
+            "at most 32",
+        ),
     ],
 )
 def test_a_scenario_of_a_stranger_is_refused_in_a_sentence(text: str, problem: str) -> None:
@@ -159,7 +189,9 @@ def test_a_scenario_of_a_stranger_is_refused_in_a_sentence(text: str, problem: s
 def test_a_scenario_in_a_log_names_no_file() -> None:
     """It is resolved; a name in it would have the reader open what a stranger likes."""
     constant = re.compile(r'model = "constant"\ndelay_ms = [0-9.]+\n')
-    text = constant.sub('model = "trace"\nfile = "/dev/zero"\n', load_scenario("paper").text, count=1)
+    text = constant.sub(
+        'model = "trace"\nfile = "/dev/zero"\n', load_scenario("paper").text, count=1
+    )
     with pytest.raises(ScenarioError, match="no file may be named here"):
         parse_embedded(text)
 
@@ -179,16 +211,22 @@ def test_links_that_would_fill_the_memory_are_refused() -> None:
     """A calendar of ten seconds at 20 kHz for each of many peers."""
     names = [f"a{n}" for n in range(6)]
     sites = "".join(f"[sites.{name}]\n" for name in names)
-    rows = "".join(f"[dominance.{name}]\n{names[n - 1]} = 1.0\n" for n, name in enumerate(names))
+    rows = "".join(
+        f"[dominance.{name}]\n{names[n - 1]} = 1.0\n" for n, name in enumerate(names)
+    )
     text = f"name = 'x'\nrate_hz = 20000\n[link]\ndelay_ms = 9e3\n{sites}{rows}"
     assert parse_embedded(text.replace("20000", "1000")).names == tuple(names)
     assert parse_embedded(text.replace("9e3", "1.0")).names == tuple(names)
-    with pytest.raises(ScenarioError, match=r"its links would take \d+ MiB, at most 64 are given"):
+    with pytest.raises(
+        ScenarioError, match=r"its links would take \d+ MiB, at most 64 are given"
+    ):
         parse_embedded(text)
 
 
 def test_json_of_anything_is_finite(tmp_path: Path) -> None:
     """What a machine is told can be read by it, whatever the file says."""
     path = tmp_path / "strange.mcap"
-    path.write_bytes(edited(DATA, record=lambda r: {**r, "late_us": -(1 << 63), "t_ns": 1 << 62}))
+    path.write_bytes(
+        edited(DATA, record=lambda r: {**r, "late_us": -(1 << 63), "t_ns": 1 << 62})
+    )
     json.dumps(info(path).facts, allow_nan=False)

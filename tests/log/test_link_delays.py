@@ -19,13 +19,19 @@ from trilat_net.scenario import load_scenario
 from trilat_net.scenario.delay_traces import parse_trace
 
 TICKS = 400
-OVERRIDES: dict[str, Any] = {"duration_s": TICKS / 1000, "sites.m2.rate_hz": 333, "link.delay_ms": 50.0}
+OVERRIDES: dict[str, Any] = {
+    "duration_s": TICKS / 1000,
+    "sites.m2.rate_hz": 333,
+    "link.delay_ms": 50.0,
+}
 LOST = {7, 8, 9, 100}
 
 
 def delay_us(peer: str, site: str, tick: int) -> int:
     """A known delay of each sample, 1 to 30 ms; some clocks are off, so that some are below zero."""
-    drawn = np.random.default_rng([ord(c) for c in f"{peer}->{site}"] + [tick]).integers(1_000, 30_000)
+    drawn = np.random.default_rng([ord(c) for c in f"{peer}->{site}"] + [tick]).integers(
+        1_000, 30_000
+    )
     return -500 if (peer, tick) == ("m1", 40) else int(drawn)
 
 
@@ -39,7 +45,9 @@ def log_bytes() -> bytes:
         for index, peer in enumerate(peers[site]):
             for tick in range(scenario.ticks(peer)):
                 us = delay_us(peer, site, tick)
-                at = first_tick_at(tick_ns(tick, scenario.sites[peer].rate_hz) + max(us, 1) * 1000, rate_hz)
+                at = first_tick_at(
+                    tick_ns(tick, scenario.sites[peer].rate_hz) + max(us, 1) * 1000, rate_hz
+                )
                 if tick not in LOST:
                     schedule[site].setdefault(at, []).append([index, tick, us])
                 if tick == 60:  # and once more, later
@@ -61,12 +69,17 @@ def path(data: bytes, tmp_path: Path) -> Path:
     return file
 
 
-@pytest.mark.parametrize(("peer", "site"), [("m1", "s"), ("s", "m1"), ("m2", "s"), ("m1", "m2")])
-def test_every_sample_has_the_delay_that_its_receiver_recorded(path: Path, peer: str, site: str) -> None:
+@pytest.mark.parametrize(
+    ("peer", "site"), [("m1", "s"), ("s", "m1"), ("m2", "s"), ("m1", "m2")]
+)
+def test_every_sample_has_the_delay_that_its_receiver_recorded(
+    path: Path, peer: str, site: str
+) -> None:
     """By its own stamp; lost ones as infinity, negative ones as none, the shorter of two."""
     rate_hz = 333 if peer == "m2" else 1000
     rows = dict(read_link_delays(path, f"{peer}->{site}"))
-    known = (TICKS - 41) * rate_hz // 1000  # some that were sent later were under way at the end
+    # some that were sent later were under way at the end
+    known = (TICKS - 41) * rate_hz // 1000
     for tick in range(known):
         delay_ms = rows.pop((tick * 10**9 // rate_hz // 1000) / 1e6)
         expected = math.inf if tick in LOST else max(delay_us(peer, site, tick), 0) / 1e3
@@ -75,7 +88,9 @@ def test_every_sample_has_the_delay_that_its_receiver_recorded(path: Path, peer:
 
 
 @pytest.mark.parametrize("rate_hz", [1000, 333])
-def test_link_that_replays_log_gives_each_sample_its_measured_delay(path: Path, rate_hz: int) -> None:
+def test_link_that_replays_log_gives_each_sample_its_measured_delay(
+    path: Path, rate_hz: int
+) -> None:
     """In [link] each link reads its own; to the microsecond, at any rate."""
     link = {"model": "trace", "file": str(path)}
     scenario = load_scenario("paper", {**OVERRIDES, "link": link})
@@ -94,7 +109,9 @@ def test_link_that_replays_log_gives_each_sample_its_measured_delay(path: Path, 
 
 def test_each_link_names_the_links_delays_that_it_wants(path: Path) -> None:
     shared = {"model": "trace", "file": str(path), "at_end": "loop"}
-    links = load_scenario("paper", {**OVERRIDES, "link": shared, "links.m1->s": {"of": "s->m1"}}).links
+    links = load_scenario(
+        "paper", {**OVERRIDES, "link": shared, "links.m1->s": {"of": "s->m1"}}
+    ).links
     texts = {name: link.trace for name, link in links.items()}
     assert len(set(texts.values())) == 5
     assert texts["m1->s"] == texts["s->m1"]
@@ -102,7 +119,9 @@ def test_each_link_names_the_links_delays_that_it_wants(path: Path) -> None:
 
 
 def test_a_scenario_that_ran_does_not_need_the_log_again(path: Path) -> None:
-    scenario = load_scenario("paper", {**OVERRIDES, "link": {"model": "trace", "file": str(path)}})
+    scenario = load_scenario(
+        "paper", {**OVERRIDES, "link": {"model": "trace", "file": str(path)}}
+    )
     path.unlink()
     assert load_scenario(scenario, {"seed": 1}) == scenario
     assert "run.mcap" not in scenario.text
@@ -111,12 +130,16 @@ def test_a_scenario_that_ran_does_not_need_the_log_again(path: Path) -> None:
 def test_delays_within_missing_records_are_left_out(data: bytes, path: Path) -> None:
     """A gap in the receiver's records hides arrivals: those samples are unknown, not lost."""
     path.write_bytes(
-        edited(data, record=lambda r: None if r["site"] == "s" and 200 <= r["tick"] < 220 else r)
+        edited(
+            data, record=lambda r: None if r["site"] == "s" and 200 <= r["tick"] < 220 else r
+        )
     )
     rows = read_link_delays(path, "m1->s")
     ticks = {round(t_s * 1000): delay_ms for t_s, delay_ms in rows}
     assert {tick for tick, delay_ms in ticks.items() if math.isinf(delay_ms)} == LOST
-    came_in = {t: first_tick_at(t * 10**6 + delay_us("m1", "s", t) * 1000, 1000) for t in range(350)}
+    came_in = {
+        t: first_tick_at(t * 10**6 + delay_us("m1", "s", t) * 1000, 1000) for t in range(350)
+    }
     hidden = {t for t in came_in if t not in ticks}
     assert hidden == {t for t, tick in came_in.items() if 200 <= tick < 220}
 
@@ -125,7 +148,9 @@ def test_delays_within_missing_records_are_left_out(data: bytes, path: Path) -> 
     ("link", "words"),
     [("m1->ss", "did you mean 'm1->s'"), ("x", "Its links are m2->m1"), ("m1->m1", "no link")],
 )
-def test_link_that_log_does_not_have_is_named_with_nearest(path: Path, link: str, words: str) -> None:
+def test_link_that_log_does_not_have_is_named_with_nearest(
+    path: Path, link: str, words: str
+) -> None:
     with pytest.raises(ValueError, match="no link") as error:
         read_link_delays(path, link)
     assert words in str(error.value)
@@ -150,7 +175,9 @@ def test_file_that_is_no_log_is_refused_with_keys_path(tmp_path: Path, content: 
 
 def test_log_that_is_not_there_is_refused_with_keys_path(tmp_path: Path) -> None:
     with pytest.raises(ScenarioError, match="No such file") as error:
-        load_scenario("paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "none.mcap")}})
+        load_scenario(
+            "paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "none.mcap")}}
+        )
     assert error.value.path == "links.m1->s.file"
 
 
@@ -162,7 +189,9 @@ def test_losses_at_both_ends_of_a_log_count(data: bytes, path: Path) -> None:
         if record["site"] == "m1" and record["tick"] < 10:
             return None  # it came later
         if record["site"] == "s":
-            record["rx"] = [entry for entry in record["rx"] if entry[0] != 0 or entry[1] not in quiet]
+            record["rx"] = [
+                entry for entry in record["rx"] if entry[0] != 0 or entry[1] not in quiet
+            ]
         return record
 
     path.write_bytes(edited(data, record=cut))

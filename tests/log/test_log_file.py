@@ -30,14 +30,18 @@ from trilat_net.log.recover import recover
 
 from .disks import Sent, SmallDisk, begun, file_on, sent
 
-in_this_folder = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
+in_this_folder = settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30
+)
 
 
 def messages(path: Path) -> list[Sent]:
     with path.open("rb") as stream:
         return [
             (m.channel_id, m.log_time, m.data, m.publish_time, m.sequence)
-            for _, _, m in make_reader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+            for _, _, m in make_reader(stream, validate_crcs=True).iter_messages(
+                log_time_order=False
+            )
         ]
 
 
@@ -69,7 +73,9 @@ def test_only_what_is_flushed_is_in_the_file(tmp_path: Path) -> None:
         assert active_path(path).stat().st_size > before
         with active_path(path).open("rb") as stream:
             found = list(islice(StreamReader(stream).records, 4 + 2 * (n + 1)))
-        assert sum(isinstance(record, Message) for record in found) == container.messages == n + 1
+        assert (
+            sum(isinstance(record, Message) for record in found) == container.messages == n + 1
+        )
     file.close()
 
 
@@ -85,7 +91,9 @@ def test_a_log_that_was_not_finished_keeps_its_other_name(tmp_path: Path) -> Non
         fail()
     assert [entry.name for entry in tmp_path.iterdir()] == ["run.mcap.active"]
     with (
-        pytest.raises(UsageError, match=r"never finished.*trilat log recover .*run\.mcap\.active"),
+        pytest.raises(
+            UsageError, match=r"never finished.*trilat log recover .*run\.mcap\.active"
+        ),
         LogFile(path),
     ):
         pass
@@ -104,7 +112,9 @@ def test_an_existing_log_is_replaced_by_a_whole_one(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(b"precious")
     with (
-        pytest.raises(UsageError, match="exists; choose another name, or replace it with force=True"),
+        pytest.raises(
+            UsageError, match="exists; choose another name, or replace it with force=True"
+        ),
         LogFile(path),
     ):
         pass
@@ -123,7 +133,9 @@ def test_a_name_that_was_taken_meanwhile_is_left_alone(tmp_path: Path) -> None:
             begun(file).finish()
             path.write_bytes(b"precious")
 
-    with pytest.raises(UsageError, match=r"exists by now; the finished file is .*run\.mcap\.active"):
+    with pytest.raises(
+        UsageError, match=r"exists by now; the finished file is .*run\.mcap\.active"
+    ):
         write()
     assert path.read_bytes() == b"precious"
     assert messages(active_path(path)) == []
@@ -144,7 +156,9 @@ def test_a_log_open_elsewhere_is_kept_beside_as_windows_does(
             begun(file).finish()
 
     monkeypatch.setattr(Path, "replace", refuse)
-    with pytest.raises(LogRefused, match=r"Permission denied; the finished log is .*active: give it a name"):
+    with pytest.raises(
+        LogRefused, match=r"Permission denied; the finished log is .*active: give it a name"
+    ):
         make()
     assert path.read_bytes() == b"earlier"
     assert messages(active_path(path)) == []
@@ -178,7 +192,9 @@ def little_margin(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @in_this_folder
 @given(count=st.integers(1, 40), most=st.integers(1, 100))
-def test_a_disk_that_takes_little_at_a_time_takes_all(count: int, most: int, tmp_path: Path) -> None:
+def test_a_disk_that_takes_little_at_a_time_takes_all(
+    count: int, most: int, tmp_path: Path
+) -> None:
     path = tmp_path / "run.mcap"
     path.unlink(missing_ok=True)
     wanted = sent(count)
@@ -329,7 +345,9 @@ except LogRefused as refused:
 
 def test_a_file_of_the_largest_size_is_cut_and_recovered(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    done = subprocess.run([sys.executable, "-c", LIMITED, path], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED, path], capture_output=True, text=True, timeout=60
+    )
     assert done.returncode == 5, done
     assert f"{active_path(path)}: the file system takes no longer file" in done.stdout
     assert "split_size" in done.stdout
@@ -372,7 +390,9 @@ def test_disk_that_refuses_what_it_had_taken_ends_log(
         with LogFile(path, now_ns=times_ns.__next__) as file:
             recorded(file, sent(100), [])
 
-    with pytest.raises(LogRefused, match="the disk fails; the log ends there, finished, with") as refusal:
+    with pytest.raises(
+        LogRefused, match="the disk fails; the log ends there, finished, with"
+    ) as refusal:
         write()
     assert refusal.value.exit_code == 5
     assert 0 < len(messages(path)) < 100
@@ -399,8 +419,12 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 def test_what_was_flushed_survives_a_kill(tmp_path: Path) -> None:
     path, count = tmp_path / "run.mcap", 100
-    done = subprocess.run([sys.executable, "-c", KILLED, path, str(count)], capture_output=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, path, str(count)], capture_output=True, timeout=60
+    )
     assert done.returncode == -signal.SIGKILL, done.stderr
     result = recover(active_path(path))
     assert result.lossless
-    assert [message[2] for message in messages(path)] == [b"%d" % n for n in range(count // 7 * 7)]
+    assert [message[2] for message in messages(path)] == [
+        b"%d" % n for n in range(count // 7 * 7)
+    ]

@@ -60,8 +60,16 @@ def test_an_unchosen_channel_is_absent_and_the_file_says_so() -> None:
     stream = io.BytesIO()
     chosen = ChannelFilter(("trilat/*/m$*/**",), ("**/link",))
     writer = LogWriter(stream, load_scenario("paper"), "lab", "live", 0, choice=chosen)
-    kept = [f"trilat/lab/{site}/{channel}" for site in ("m1", "m2") for channel in ("state", "event")]
-    every = [f"trilat/lab/{site}/{channel}" for site in ("m1", "m2", "s") for channel in SITE_CHANNELS]
+    kept = [
+        f"trilat/lab/{site}/{channel}"
+        for site in ("m1", "m2")
+        for channel in ("state", "event")
+    ]
+    every = [
+        f"trilat/lab/{site}/{channel}"
+        for site in ("m1", "m2", "s")
+        for channel in SITE_CHANNELS
+    ]
     every += [f"trilat/lab/recorder/{channel}" for channel in RECORDER_CHANNELS]
     for key in every:
         writer.add(key, b"\x80", 0, 0, 0)
@@ -70,7 +78,9 @@ def test_an_unchosen_channel_is_absent_and_the_file_says_so() -> None:
     metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
     assert metadata["trilat.session"]["include"] == "trilat/*/m$*/**"
     assert metadata["trilat.session"]["exclude"] == "**/link"
-    assert set(metadata["trilat.accounts"]) == {f"/{key}" for key in kept} | {"dropped: stranger"}
+    assert set(metadata["trilat.accounts"]) == {f"/{key}" for key in kept} | {
+        "dropped: stranger"
+    }
     topics = {channel.topic for _, channel, _ in reader.iter_messages()}
     assert topics == {f"/{key}" for key in kept}
     summary = reader.get_summary()

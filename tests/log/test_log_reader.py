@@ -30,13 +30,17 @@ def test_two_virtual_runs_of_one_scenario_are_the_same_file(name: str) -> None:
     digests = set()
     for _ in range(2):
         stream = io.BytesIO()
-        virtual.write_virtual_log(load_scenario(name, {"duration_s": 0.3}), stream, views_hz=100.0)
+        virtual.write_virtual_log(
+            load_scenario(name, {"duration_s": 0.3}), stream, views_hz=100.0
+        )
         digests.add(hashlib.sha256(stream.getvalue()).hexdigest())
     assert len(digests) == 1
 
 
 def test_another_seed_is_another_file() -> None:
-    assert recorded("paper", {"duration_s": 0.05}) != recorded("paper", {"duration_s": 0.05, "seed": 2})
+    assert recorded("paper", {"duration_s": 0.05}) != recorded(
+        "paper", {"duration_s": 0.05, "seed": 2}
+    )
 
 
 def test_a_virtual_log_has_no_path_and_no_wall_clock() -> None:
@@ -50,7 +54,13 @@ def test_the_plain_reader_finds_every_payload_byte_for_byte() -> None:
     scenario = load_scenario("paper", {"duration_s": 0.12, "link.delay_ms": 20.0})
     sent = {
         (site.name, output.tick): encode_state(
-            site.name, virtual.virtual_boot(scenario, site.name), site.peers, output, arrivals, 0, 0
+            site.name,
+            virtual.virtual_boot(scenario, site.name),
+            site.peers,
+            output,
+            arrivals,
+            0,
+            0,
         )
         for site, arrivals, output in virtual.execute_virtual(scenario)
     }
@@ -74,12 +84,21 @@ def test_the_plain_reader_finds_every_payload_byte_for_byte() -> None:
 
 def required_and_typed(schema: dict, value: object) -> None:
     """Checks a value against the parts of JSON Schema that our schemas use."""
-    kinds = {"object": dict, "array": list, "string": str, "integer": int, "number": (int, float)}
+    kinds = {
+        "object": dict,
+        "array": list,
+        "string": str,
+        "integer": int,
+        "number": (int, float),
+    }
     assert isinstance(value, kinds[schema["type"]])
     if isinstance(value, dict):
         assert set(schema.get("required", [])) <= set(value)
         for key, entry in value.items():
-            assert key in schema.get("properties", {}) or schema["additionalProperties"] is not False
+            assert (
+                key in schema.get("properties", {})
+                or schema["additionalProperties"] is not False
+            )
             extra = schema.get("additionalProperties")
             inner = schema.get("properties", {}).get(key, extra)
             if isinstance(inner, dict) and "type" in inner:
@@ -109,7 +128,9 @@ def test_session_scenario_and_accounts_stand_in_the_file() -> None:
     assert session["scenario_sha256"] == scenario.sha256
     assert session["seed"] == "1"
     assert session["fingerprint"] == compute_fingerprint()
-    assert {"commit", "python", "platform", "version_numpy", "version_trilat-net"} <= set(session)
+    assert {"commit", "python", "platform", "version_numpy", "version_trilat-net"} <= set(
+        session
+    )
     (attachment,) = reader.iter_attachments()
     assert (attachment.name, attachment.data.decode()) == ("scenario.toml", scenario.text)
     for site in scenario.names:
@@ -118,7 +139,9 @@ def test_session_scenario_and_accounts_stand_in_the_file() -> None:
             "expected 120, received 120, missing 0, duplicate 0, reordered 0, refilled 0, "
         )
         text = metadata["trilat.accounts"][f"/trilat/paper/{site}/link"]
-        assert text.startswith("expected 2, received 2, missing 0, duplicate 0, reordered 0, refilled 0, ")
+        assert text.startswith(
+            "expected 2, received 2, missing 0, duplicate 0, reordered 0, refilled 0, "
+        )
 
 
 def test_session_and_scenario_stand_before_the_first_message() -> None:
@@ -151,7 +174,11 @@ def test_the_reader_gives_arrays_with_time() -> None:
     m1 = log["m1"]
     assert (m1.tick == np.arange(TICKS)).all()
     assert np.allclose(m1.t_s, np.arange(TICKS) * 1e-3)
-    assert (m1.q.shape, m1.theta_hat.shape, m1.busy_us.shape) == ((TICKS, 2), (TICKS, 5), (TICKS - 1,))
+    assert (m1.q.shape, m1.theta_hat.shape, m1.busy_us.shape) == (
+        (TICKS, 2),
+        (TICKS, 5),
+        (TICKS - 1,),
+    )
     assert (m1.e == m1.q - m1.q_des).all()
     assert (m1.used["s"] == np.maximum(np.arange(TICKS) - 20, -1)).all()
     age = m1.age_s("s", 1000)
@@ -183,7 +210,9 @@ def test_file_cut_anywhere_opens_as_far_as_it_is_whole() -> None:
     assert opened(data).complete
 
 
-@pytest.mark.parametrize("data", [b"", b"no log at all", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + b"\0" * 99])
+@pytest.mark.parametrize(
+    "data", [b"", b"no log at all", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + b"\0" * 99]
+)
 def test_what_is_no_mcap_file_is_refused(data: bytes, tmp_path: Path) -> None:
     with pytest.raises(LogError):
         opened(data)
@@ -203,7 +232,9 @@ def test_an_mcap_file_that_merely_uses_our_names_is_refused() -> None:
     writer = Writer(stream)
     writer.start()
     writer.add_metadata("trilat.session", {})
-    writer.add_attachment(0, 0, "scenario.toml", "application/toml", load_scenario("free").text.encode())
+    writer.add_attachment(
+        0, 0, "scenario.toml", "application/toml", load_scenario("free").text.encode()
+    )
     writer.finish()
     with pytest.raises(LogError):
         len(opened(stream.getvalue())["m1"])
@@ -212,9 +243,15 @@ def test_an_mcap_file_that_merely_uses_our_names_is_refused() -> None:
 def test_unreadable_events_are_left_out_and_the_log_is_read() -> None:
     """One odd channel does not make a whole log unreadable; it is said, and the log is not complete."""
     whole = opened(recorded("paper"))
-    odd = opened(edited(recorded("paper"), event=lambda payload: b"\xc1" if b"m1" in payload else payload))
+    odd = opened(
+        edited(
+            recorded("paper"), event=lambda payload: b"\xc1" if b"m1" in payload else payload
+        )
+    )
     assert np.array_equal(odd["m1"].q, whole["m1"].q)
-    assert [event.member for event in odd.events] == [e.member for e in whole.events if e.member != "m1"]
+    assert [event.member for event in odd.events] == [
+        e.member for e in whole.events if e.member != "m1"
+    ]
     assert len(odd.timed_events().messages) == len(odd.events)
     assert not odd.complete
     assert whole.unreadable == []
@@ -237,7 +274,9 @@ def test_a_log_whose_scenario_cannot_be_read_is_refused(text: str) -> None:
         opened(edited(recorded("paper"), scenario=scenario))
 
 
-@pytest.mark.parametrize("change", [{"v": VERSION + 1}, {"q": [0.0]}, {"used": 3}, {"tick": -1}])
+@pytest.mark.parametrize(
+    "change", [{"v": VERSION + 1}, {"q": [0.0]}, {"used": 3}, {"tick": -1}]
+)
 def test_a_log_with_a_record_that_is_none_is_refused(change: dict[str, object]) -> None:
     data = edited(recorded("paper"), record=lambda r: {**r, **change} if r["tick"] == 5 else r)
     with pytest.raises(LogError, match="record of m1"):

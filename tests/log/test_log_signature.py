@@ -61,8 +61,12 @@ def test_ed25519_is_that_of_rfc_8032_over_digests_in_words(signed: tuple[Path, P
     public.verify(base64.b64decode(stated["signature"]), f"{stated['format']}\n{text}".encode())
 
 
-@pytest.mark.parametrize("what", ["log", "chain", "signature", "log and chain", "another's", "gone", "text"])
-def test_whatever_is_changed_shows(what: str, signed: tuple[Path, Path], tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "what", ["log", "chain", "signature", "log and chain", "another's", "gone", "text"]
+)
+def test_whatever_is_changed_shows(
+    what: str, signed: tuple[Path, Path], tmp_path: Path
+) -> None:
     path, key = signed
     file = path.with_name("run.mcap.sig")
     stated = json.loads(file.read_text())
@@ -72,7 +76,9 @@ def test_whatever_is_changed_shows(what: str, signed: tuple[Path, Path], tmp_pat
     elif what == "chain":
         file.write_text(json.dumps({**stated, "chain": {**stated["chain"], "messages": "1"}}))
     elif what == "signature":
-        file.write_text(json.dumps({**stated, "signature": base64.b64encode(bytes(64)).decode()}))
+        file.write_text(
+            json.dumps({**stated, "signature": base64.b64encode(bytes(64)).decode()})
+        )
     elif what == "log and chain":  # a file that was made anew: the chain agrees with it
         path.write_bytes(other)
     elif what == "another's":
@@ -97,7 +103,9 @@ def test_only_what_agrees_with_its_chain_is_signed(tmp_path: Path) -> None:
     assert problem(made, key) == ""
 
 
-def test_keys_that_are_none_or_open_to_others_are_refused(signed: tuple[Path, Path], tmp_path: Path) -> None:
+def test_keys_that_are_none_or_open_to_others_are_refused(
+    signed: tuple[Path, Path], tmp_path: Path
+) -> None:
     path, public = signed
     private = tmp_path / "lab.key"
     with pytest.raises(UsageError, match=r"exists; choose another name"):
@@ -137,8 +145,13 @@ def test_the_command_says_yes_by_0_and_no_by_1(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").write_bytes(recorded("paper"))
     trilat("keys", "pair", "lab", cwd=tmp_path).succeeds()
     trilat("log", "sign", "run.mcap", "--key", "lab.key", cwd=tmp_path).succeeds()
-    assert "signature" in trilat("log", "check", "run.mcap", "--key", "lab.pub", cwd=tmp_path).succeeds()
+    assert (
+        "signature"
+        in trilat("log", "check", "run.mcap", "--key", "lab.pub", cwd=tmp_path).succeeds()
+    )
     (tmp_path / "run.mcap.sig").unlink()
     done = trilat("log", "check", "run.mcap", "--key", "lab.pub", "--json", cwd=tmp_path)
     assert done.code == 1
-    assert [one["check"] for one in json.loads(done.out)["checks"] if not one["passed"]] == ["signature"]
+    assert [one["check"] for one in json.loads(done.out)["checks"] if not one["passed"]] == [
+        "signature"
+    ]

@@ -36,7 +36,9 @@ def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
 def read(path: Path) -> tuple[list[Message], dict[str, Mapping[str, str]]]:
     with path.open("rb") as stream:
         reader = make_reader(stream, validate_crcs=True)
-        assert [attachment.name for attachment in reader.iter_attachments()] == ["scenario.toml"]
+        assert [attachment.name for attachment in reader.iter_attachments()] == [
+            "scenario.toml"
+        ]
         metadata = {entry.name: entry.metadata for entry in reader.iter_metadata()}
         found: list[Message] = []
         for schema, channel, message in reader.iter_messages(log_time_order=False):
@@ -100,10 +102,16 @@ def test_the_parts_one_behind_the_other_are_the_unsplit_file(
         found += own
         assert metadata["trilat.session"]["session"] == "t"
         follows = {"previous_records": digest} if digest else {}
-        assert metadata["trilat.part"] == {"index": str(number), "previous": previous, **follows}
+        assert metadata["trilat.part"] == {
+            "index": str(number),
+            "previous": previous,
+            **follows,
+        }
         previous, digest = part.name, metadata["trilat.chain"]["records"]
         last = number == len(parts)
-        assert metadata["trilat.accounts"] == ({"in all": str(len(messages))} if last else {"so far": "yes"})
+        assert metadata["trilat.accounts"] == (
+            {"in all": str(len(messages))} if last else {"so far": "yes"}
+        )
         if size is not None:
             assert part.stat().st_size <= size or len(own) <= 1
         if duration_ns is not None and own:
@@ -143,7 +151,9 @@ def test_to_continue_is_to_write_the_next_part(
 ) -> None:
     for name in there:
         (tmp_path / name).write_bytes(b"precious")
-    place = LogStorage(tmp_path / "run.mcap", carry_on=True, split_ns=10**12 if splits else None)
+    place = LogStorage(
+        tmp_path / "run.mcap", carry_on=True, split_ns=10**12 if splits else None
+    )
     written(place, [(KEYS[0], b"\x80", 10**18, 0)])
     _, metadata = read(tmp_path / expected)
     assert metadata.get("trilat.part", {}).get("previous") == previous
@@ -151,7 +161,9 @@ def test_to_continue_is_to_write_the_next_part(
         assert (tmp_path / name).read_bytes() == b"precious"
 
 
-@pytest.mark.parametrize("there", ["run.mcap", "run.mcap.active", "run-001.mcap", "run-017.mcap.active"])
+@pytest.mark.parametrize(
+    "there", ["run.mcap", "run.mcap.active", "run-001.mcap", "run-017.mcap.active"]
+)
 def test_a_taken_name_is_refused_unless_it_may_be_replaced(there: str, tmp_path: Path) -> None:
     (tmp_path / there).write_bytes(b"precious")
     place = LogStorage(tmp_path / "run.mcap", split_ns=1)
@@ -160,7 +172,9 @@ def test_a_taken_name_is_refused_unless_it_may_be_replaced(there: str, tmp_path:
     assert (tmp_path / there).read_bytes() == b"precious"
     messages = [(KEYS[0], b"\x80", 10**18 + k, k) for k in range(3)]
     written(LogStorage(tmp_path / "run.mcap", split_ns=1, force=True), messages)
-    assert [path.name for path in sorted(tmp_path.iterdir())] == [f"run-00{n}.mcap" for n in (1, 2, 3)]
+    assert [path.name for path in sorted(tmp_path.iterdir())] == [
+        f"run-00{n}.mcap" for n in (1, 2, 3)
+    ]
 
 
 def test_a_log_without_parts_leaves_the_parts_of_others_alone(tmp_path: Path) -> None:
@@ -177,7 +191,9 @@ def test_any_name_will_do(name: str, tmp_path: Path) -> None:
     (tmp_path / "run1-001.mcap").write_bytes(b"")
     written(place, messages)
     assert sorted(find_parts(place.path)) == [1, 2, 3]
-    assert [message for path in find_parts(place.path).values() for message in read(path)[0]] == messages
+    assert [
+        message for path in find_parts(place.path).values() for message in read(path)[0]
+    ] == messages
 
 
 @pytest.mark.parametrize("number", [0.5, float("nan"), 0.0, 1e7])
@@ -225,7 +241,9 @@ def test_disk_that_is_full_at_seam_keeps_parts_before(tmp_path: Path) -> None:
     for room in range(80_000, 200_000, 7900):
         path = cleared(tmp_path)
         taken = recorded_on(room, path, messages)
-        found = [message for _, part in sorted(find_parts(path).items()) for message in read(part)[0]]
+        found = [
+            message for _, part in sorted(find_parts(path).items()) for message in read(part)[0]
+        ]
         assert found == taken
         assert all(part.name.endswith(".mcap") for part in tmp_path.iterdir())
 

@@ -82,7 +82,9 @@ def test_a_damaged_chunk_is_passed_over_and_named(number: int, data: st.DataObje
     """A bit that is wrong in the data of a chunk costs that chunk, and no other."""
     frame = CHUNKS[number]
     head = RecordScanner(io.BytesIO(DATA)).head(frame)
-    place = data.draw(st.integers(frame.offset + RECORD_HEAD_BYTES + head.data_offset, frame.end - 1))
+    place = data.draw(
+        st.integers(frame.offset + RECORD_HEAD_BYTES + head.data_offset, frame.end - 1)
+    )
     changed = bytearray(DATA)
     changed[place] ^= 1 << data.draw(st.integers(0, 7))
     walk, items = walked(bytes(changed))
@@ -107,7 +109,8 @@ def test_a_record_of_false_length_hides_few_chunks(frame: RecordFrame, length: i
     except LogError:
         return
     told = length in (frame.length,) or walk.damaged or walk.torn is not None
-    near = length < len(DATA)  # within the file it may skip what is whole, or look like a longer record
+    # within the file it may skip what is whole, or look like a longer record
+    near = length < len(DATA)
     assert told or near
     if length > len(DATA) and frame.opcode != Opcode.FOOTER:
         hidden = in_chunk(frame) if frame.opcode == Opcode.CHUNK else []
@@ -123,29 +126,47 @@ def test_a_chunk_unpacks_to_no_more_than_it_may(monkeypatch: pytest.MonkeyPatch)
     for compression in ("zstd", "lz4"):
         for size in (len(bomb), 10_000, 1 << 62, 0):
             with pytest.raises(UnreadableRecord):
-                unpack_chunk(chunk(bomb, size=size, compression=compression)[RECORD_HEAD_BYTES:])
+                unpack_chunk(
+                    chunk(bomb, size=size, compression=compression)[RECORD_HEAD_BYTES:]
+                )
 
 
 @pytest.mark.parametrize("claim", [1 << 40, (1 << 63) - 1])
 def test_a_frame_that_claims_to_be_huge_is_not_believed(claim: int) -> None:
     """The sizes inside the compressed data are compared before a byte is set aside for them."""
     zstd = b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", claim) + b"\x01\x00\x00"
-    head = struct.pack("<QQQI", 0, 0, 100, 0) + struct.pack("<I", 4) + b"zstd" + struct.pack("<Q", len(zstd))
+    head = (
+        struct.pack("<QQQI", 0, 0, 100, 0)
+        + struct.pack("<I", 4)
+        + b"zstd"
+        + struct.pack("<Q", len(zstd))
+    )
     with pytest.raises(UnreadableRecord):
         unpack_chunk(head + zstd)
     honest = lz4.frame.compress(bytes(100), store_size=True)
     lz4_ = honest[:6] + struct.pack("<Q", claim) + honest[14:]
-    head = struct.pack("<QQQI", 0, 0, 100, 0) + struct.pack("<I", 3) + b"lz4" + struct.pack("<Q", len(lz4_))
+    head = (
+        struct.pack("<QQQI", 0, 0, 100, 0)
+        + struct.pack("<I", 3)
+        + b"lz4"
+        + struct.pack("<Q", len(lz4_))
+    )
     with pytest.raises(UnreadableRecord):
         unpack_chunk(head + lz4_)
 
 
-def test_file_that_holds_absurdly_much_is_refused_with_place(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_that_holds_absurdly_much_is_refused_with_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Who keeps messages is given no more than there is room for; who lets them go is given all."""
     monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 1 << 20)
-    bombs = b"".join(chunk(struct.pack("<BQHIQQ", 5, 22, n, 0, 0, 0) * 48_000) for n in range(1, 6))
+    bombs = b"".join(
+        chunk(struct.pack("<BQHIQQ", 5, 22, n, 0, 0, 0) * 48_000) for n in range(1, 6)
+    )
     data = DATA[: CHUNKS[1].offset] + bombs + DATA[CHUNKS[1].offset :]
-    with pytest.raises(LogError, match=r"file: holds absurdly much for a file of \d+ bytes: up to byte \d+"):
+    with pytest.raises(
+        LogError, match=r"file: holds absurdly much for a file of \d+ bytes: up to byte \d+"
+    ):
         walked(data)
     streaming = McapReader(io.BytesIO(data), "file", kept=False)
     assert sum(1 for _ in streaming.messages()) == len(ITEMS) + 240_000
@@ -169,7 +190,9 @@ def test_an_absurdly_large_channel_ends_there_alone(
     assert odd in cut.problem
 
 
-def test_arms_at_rest_are_not_absurd_however_well_they_pack(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_arms_at_rest_are_not_absurd_however_well_they_pack(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """The hands of `outage` do not push before 3 s, and its arms know their weight."""
     monkeypatch.setattr(mcap_reader, "KEPT_BYTES", 0)
     stream = io.BytesIO()
@@ -194,7 +217,9 @@ def test_a_channel_is_what_it_was_first_called() -> None:
 
     message = struct.pack("<BQHIQQ", 5, 23, 7, 1, 2, 3) + b"x"
     lost = struct.pack("<BQHIQQ", 5, 22, 9, 1, 2, 3)
-    data = DATA[: CHUNKS[0].offset] + chunk(channel(7, b"/a") + message + channel(7, b"/b") + message + lost)
+    data = DATA[: CHUNKS[0].offset] + chunk(
+        channel(7, b"/a") + message + channel(7, b"/b") + message + lost
+    )
     _, items = walked(data)
     assert items == [
         McapMessage("/a", b"x", 2, 3, 1),

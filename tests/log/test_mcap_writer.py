@@ -14,13 +14,25 @@ from trilat_net.log.mcap_writer import McapWriter
 U64 = st.integers(0, 2**64 - 1)
 TEXTS = st.dictionaries(st.text(max_size=8), st.text(max_size=8), max_size=3)
 MESSAGES = st.tuples(
-    st.just("add_message"), st.integers(1, 3), U64, st.binary(max_size=80), U64, st.integers(0, 2**32 - 1)
+    st.just("add_message"),
+    st.integers(1, 3),
+    U64,
+    st.binary(max_size=80),
+    U64,
+    st.integers(0, 2**32 - 1),
 )
 METADATA = st.tuples(st.just("add_metadata"), st.text(max_size=8), TEXTS)
 ATTACHMENTS = st.tuples(
-    st.just("add_attachment"), U64, U64, st.text(max_size=5), st.text(max_size=5), st.binary(max_size=50)
+    st.just("add_attachment"),
+    U64,
+    U64,
+    st.text(max_size=5),
+    st.text(max_size=5),
+    st.binary(max_size=50),
 )
-CALLS = st.lists(st.one_of(MESSAGES, MESSAGES, MESSAGES, METADATA, ATTACHMENTS, st.tuples(st.just("flush"))))
+CALLS = st.lists(
+    st.one_of(MESSAGES, MESSAGES, MESSAGES, METADATA, ATTACHMENTS, st.tuples(st.just("flush")))
+)
 
 
 def begun(file: Any) -> None:

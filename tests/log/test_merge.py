@@ -113,7 +113,9 @@ def test_files_of_different_sessions_are_refused_with_what_differs(
     one, two = tmp_path / "one.mcap", tmp_path / "two.mcap"
     one.write_bytes(whole())
     two.write_bytes(a_file(whole(), [], session=session, scenario=scenario))
-    with pytest.raises(LogError, match=rf"two\.mcap: is no part of the session in .*one\.mcap: {named}"):
+    with pytest.raises(
+        LogError, match=rf"two\.mcap: is no part of the session in .*one\.mcap: {named}"
+    ):
         open_log(one, two)
 
 
@@ -141,19 +143,25 @@ def test_an_unnamed_or_unfinished_part_leaves_the_whole_incomplete() -> None:
     assert not joined(parts[0], parts[2]).complete
     assert not opened(parts[2]).complete
     every = messages(whole())
-    assert not joined(a_file(whole(), every[:50]), a_file(whole(), every[50:], finished=False)).complete
+    assert not joined(
+        a_file(whole(), every[:50]), a_file(whole(), every[50:], finished=False)
+    ).complete
 
 
 def by(recorder: int, *, at_ns: int, dropped: int, part: int) -> bytes:
     """A part that a recorder wrote, with what it counted so far."""
     stream = io.BytesIO()
     scenario = load_scenario("free")
-    writer = LogWriter(stream, scenario, "lab", "live", 10**18, part={"index": str(part), "previous": ""})
+    writer = LogWriter(
+        stream, scenario, "lab", "live", 10**18, part={"index": str(part), "previous": ""}
+    )
     stats = RecorderStats(boot=recorder, t_ns=at_ns, expected={}, received={}, missing={})
     event = Event(member="recorder", boot=recorder, kind="late", text="late", n=0)
     for channel, message in ((topics.STATS, stats), (topics.EVENT, event)):
         payload = encode(message)
-        writer.add(topics.key("lab", topics.RECORDER, channel), payload, at_ns, 10**18 + at_ns, 0)
+        writer.add(
+            topics.key("lab", topics.RECORDER, channel), payload, at_ns, 10**18 + at_ns, 0
+        )
     writer.finish({"dropped: stranger": str(dropped), "/trilat/lab/m1/state": "received 7"})
     return stream.getvalue()
 
@@ -174,7 +182,9 @@ def test_events_without_numbers_are_told_apart_by_their_content() -> None:
     every = messages(whole())
     place = place_of("m1/event")
     old = [changed(every[place], n=-1, text=text) for text in ("a", "b")]
-    log = joined(a_file(whole(), old), a_file(whole(), [*old, every[place_of("m1/state")]], part=2))
+    log = joined(
+        a_file(whole(), old), a_file(whole(), [*old, every[place_of("m1/state")]], part=2)
+    )
     assert [event.text for event in log.events] == ["a", "b"]
 
 
@@ -195,8 +205,12 @@ def test_a_part_with_an_invalid_message_is_refused_by_name(tmp_path: Path) -> No
     every = messages(whole())
     first, second = tmp_path / "run-001.mcap", tmp_path / "run-002.mcap"
     first.write_bytes(a_file(whole(), every[:100]))
-    second.write_bytes(a_file(whole(), [(every[place_of("m1/state")][0], b"\x80", 0, 0, 0)], part=2))
-    with pytest.raises(LogError, match=r"run-002\.mcap: a message on /trilat/paper/m1/state cannot be read"):
+    second.write_bytes(
+        a_file(whole(), [(every[place_of("m1/state")][0], b"\x80", 0, 0, 0)], part=2)
+    )
+    with pytest.raises(
+        LogError, match=r"run-002\.mcap: a message on /trilat/paper/m1/state cannot be read"
+    ):
         open_log(first, second)
 
 

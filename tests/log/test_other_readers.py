@@ -52,11 +52,13 @@ def decoded(path: Path, prefix: str = "/viz") -> Iterator[Any]:
 def test_mcap_package_reads_same_with_index_and_without(log_file: Path) -> None:
     data = log_file.read_bytes()
     by_index = make_reader(io.BytesIO(data), validate_crcs=True).iter_messages()
-    plain = NonSeekingReader(io.BytesIO(data), validate_crcs=True).iter_messages(log_time_order=False)
-    in_order = [(channel.topic, *vars(message).values()) for _, channel, message in plain]
-    assert Counter((channel.topic, *vars(message).values()) for _, channel, message in by_index) == Counter(
-        in_order
+    plain = NonSeekingReader(io.BytesIO(data), validate_crcs=True).iter_messages(
+        log_time_order=False
     )
+    in_order = [(channel.topic, *vars(message).values()) for _, channel, message in plain]
+    assert Counter(
+        (channel.topic, *vars(message).values()) for _, channel, message in by_index
+    ) == Counter(in_order)
     times = [message.log_ns for message in messages(data)]
     assert times == sorted(times)
 
@@ -90,7 +92,9 @@ def test_every_view_has_exact_numbers(files: dict[str, Path]) -> None:
             shown[site, number].append([*ros.position, *ros.velocity[:2], *ros.effort[:2]])
     for site, made_by in outputs().items():
         for first in range(0, len(made_by), BUCKET):
-            rows = np.array([[*o.q, *o.q_des, *o.qd, *o.tau] for o in made_by[first : first + BUCKET]])
+            rows = np.array(
+                [[*o.q, *o.q_des, *o.qd, *o.tau] for o in made_by[first : first + BUCKET]]
+            )
             got = np.array(shown.pop((site, first // BUCKET)))
             assert len(got) == 2
             assert np.array_equal(got.min(axis=0), rows.min(axis=0))
@@ -144,12 +148,17 @@ def test_rosbags_reads_every_record_of_the_bag(files: dict[str, Path], log: Log)
                 others[connection.topic].append(message.data.tolist())
     for site in log.sites:
         part = log[site]
-        states, references = joints[f"/lab/{site}/joint_states"], joints[f"/lab/{site}/reference"]
+        states, references = (
+            joints[f"/lab/{site}/joint_states"],
+            joints[f"/lab/{site}/reference"],
+        )
         assert [log_ns for log_ns, _ in states] == part.log_time_ns.tolist()
         stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for _, m in states]
         assert stamps == [EPOCH_NS + k * 10**6 for k in part.tick.tolist()]
         for field, list_of in (("q", "position"), ("qd", "velocity"), ("tau", "effort")):
-            assert np.array_equal([getattr(m, list_of) for _, m in states], getattr(part, field))
+            assert np.array_equal(
+                [getattr(m, list_of) for _, m in states], getattr(part, field)
+            )
         assert np.array_equal([m.position for _, m in references], part.q_des)
         assert np.array_equal([m.velocity for _, m in references], part.qd_des)
         assert all(len(m.effort) == 0 for _, m in references)
@@ -165,7 +174,15 @@ def test_the_bag_keeps_when_every_record_was_sent(files: dict[str, Path], log: L
     for topic, _, message in decoded(files["bag"], "/"):
         times[topic].append(message.publish_time)
     for site in log.sites:
-        for name in ("joint_states", "reference", "error", "tau_x", "theta_hat", "tip_pose", "mode_number"):
+        for name in (
+            "joint_states",
+            "reference",
+            "error",
+            "tau_x",
+            "theta_hat",
+            "tip_pose",
+            "mode_number",
+        ):
             assert times[f"/lab/{site}/{name}"] == log[site].publish_time_ns.tolist()
 
 
@@ -187,13 +204,20 @@ def test_the_bag_is_one_of_ros_2(files: dict[str, Path]) -> None:
     with Reader(files["bag"]) as bag:
         for connection in bag.connections:
             (profile,) = connection.ext.offered_qos_profiles
-            latched = connection.topic.rpartition("/")[2] in ("mode", "dominance", "robot_description")
+            latched = connection.topic.rpartition("/")[2] in (
+                "mode",
+                "dominance",
+                "robot_description",
+            )
             durability = "TRANSIENT_LOCAL" if latched else "VOLATILE"
             found = profile.depth, profile.reliability.name, profile.durability.name
             assert found == (1 if latched else 10, "RELIABLE", durability)
 
 
-LONG = [pytest.param(kind, marks=pytest.mark.long) for kind in ("virtual", "first part", "last part")]
+LONG = [
+    pytest.param(kind, marks=pytest.mark.long)
+    for kind in ("virtual", "first part", "last part")
+]
 
 
 @pytest.mark.parametrize("kind", ["live", "recovered", "bag", *LONG])
@@ -202,13 +226,19 @@ def test_rerun_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:
 
 
 @pytest.mark.long
-def test_rerun_has_curves_with_the_names_of_joints(files: dict[str, Path], tmp_path: Path) -> None:
+def test_rerun_has_curves_with_the_names_of_joints(
+    files: dict[str, Path], tmp_path: Path
+) -> None:
     """Of a recording as it converts it, the names of the series and their numbers."""
     recording = tmp_path / "run.rrd"
     printed(*RERUN, "mcap", "convert", str(files["live"]), "-o", str(recording))
     text = printed(*RERUN, "rrd", "print", "-vvv", str(recording))
     for site in SCENARIO.names:
-        for entity in (f"/viz/{site}/joint_states/position", f"/viz/{site}/error", f"/viz/{site}/link_delay"):
+        for entity in (
+            f"/viz/{site}/joint_states/position",
+            f"/viz/{site}/error",
+            f"/viz/{site}/link_delay",
+        ):
             assert entity in text
         assert f"{site}_q1_ref" in text
     assert "Scalars:scalars" in text
@@ -216,7 +246,8 @@ def test_rerun_has_curves_with_the_names_of_joints(files: dict[str, Path], tmp_p
 
 
 @pytest.mark.parametrize(
-    "kind", ["live", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("recovered", "bag"))]
+    "kind",
+    ["live", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("recovered", "bag"))],
 )
 @pytest.mark.push
 def test_pymcap_cli_finds_nothing_wrong(files: dict[str, Path], kind: str) -> None:

@@ -18,15 +18,19 @@ STATE_VECTORS = Layout().lengths()
 
 PEERS = ("m2", "s")
 whole = st.integers(-(2**62), 2**62)
-numbers = st.floats(allow_nan=False, allow_infinity=False).map(
-    lambda x: x / 16
-)  # so that sums are finite too
-stamps = st.lists(st.tuples(st.integers(0, 1), st.integers(-5, 2**40), whole.map(lambda n: n >> 4)).map(list))
+# so that sums are finite too
+numbers = st.floats(allow_nan=False, allow_infinity=False).map(lambda x: x / 16)
+stamps = st.lists(
+    st.tuples(st.integers(0, 1), st.integers(-5, 2**40), whole.map(lambda n: n >> 4)).map(list)
+)
 
 
 @st.composite
 def records(draw: st.DrawFn) -> dict[str, object]:
-    vectors = {field: draw(st.lists(numbers, min_size=n, max_size=n)) for field, n in STATE_VECTORS.items()}
+    vectors = {
+        field: draw(st.lists(numbers, min_size=n, max_size=n))
+        for field, n in STATE_VECTORS.items()
+    }
     record: dict[str, object] = {
         "v": draw(st.sampled_from(READABLE)),
         "site": "m1",
@@ -56,7 +60,9 @@ def site_log(payloads: list[bytes]) -> SiteLog:
 @given(st.lists(records(), max_size=5))
 def test_every_column_is_its_field_of_every_record(entries: list[dict[str, object]]) -> None:
     payloads = [msgpack.packb(entry) for entry in entries]
-    states = sorted((decode(payload, State, READABLE) for payload in payloads), key=lambda s: s.tick)
+    states = sorted(
+        (decode(payload, State, READABLE) for payload in payloads), key=lambda s: s.tick
+    )
     part, together = site_log(payloads), site_log(payloads)
     together.prepare(*STATE_VECTORS)
     assert list(part.states) == states
@@ -65,7 +71,10 @@ def test_every_column_is_its_field_of_every_record(entries: list[dict[str, objec
         rows = getattr(part, field)
         assert rows.shape == (len(states), count)
         assert rows.tobytes() == getattr(together, field).tobytes()
-        assert rows.tobytes() == np.array([getattr(s, field) for s in states], dtype=np.float64).tobytes()
+        assert (
+            rows.tobytes()
+            == np.array([getattr(s, field) for s in states], dtype=np.float64).tobytes()
+        )
     for field in ("t_ns", "late_us", "busy_us", "sent_ns"):
         assert part.numbers(field).tolist() == [getattr(s, field) for s in states]
     assert part.mode.tolist() == [s.mode for s in states]
@@ -111,7 +120,9 @@ def test_a_column_with_an_invalid_value_is_refused(field: str, value: object) ->
     assert type(raised.value).__name__ == "LogError"
 
 
-@pytest.mark.parametrize("change", [{"v": 5}, {"v": "3"}, {"tick": -1}, {"tick": 2**40}, {"tick": None}])
+@pytest.mark.parametrize(
+    "change", [{"v": 5}, {"v": "3"}, {"tick": -1}, {"tick": 2**40}, {"tick": None}]
+)
 def test_a_record_without_version_or_tick_is_refused_at_once(change: dict[str, object]) -> None:
     with pytest.raises(WireError):
         record_columns.decode_ticks([msgpack.packb(GOOD), msgpack.packb({**GOOD, **change})])
@@ -142,6 +153,11 @@ def test_disordered_records_are_put_in_order_with_their_times() -> None:
 
 def test_a_site_without_records_is_empty_arrays() -> None:
     part = site_log([])
-    assert (part.q.shape, part.theta_hat.shape, part.tick.shape, part.missing) == ((0, 2), (0, 5), (0,), 0)
+    assert (part.q.shape, part.theta_hat.shape, part.tick.shape, part.missing) == (
+        (0, 2),
+        (0, 5),
+        (0,),
+        0,
+    )
     assert part.used["m2"].shape == (0,)
     assert repr(part) == "<m1: no records>"

@@ -28,7 +28,9 @@ from trilat_net.log.log_reader import open_log
 from trilat_net.log.log_writer import LogWriter
 from trilat_net.log.recover import Recovery, recover, recovered_path
 
-anywhere = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=12)
+anywhere = settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=12
+)
 positions = st.floats(0, 1, exclude_max=True)
 
 
@@ -117,7 +119,8 @@ def test_of_a_file_cut_anywhere_every_whole_chunk_is_kept(
     assert result.salvaged == len(found) - len(kept)
     if any(chunk.begin < end < chunk.end for chunk in chunks(data)):
         assert not result.lossless
-    elif chunks(data)[0].end <= end <= data.find(b"trilat.accounts") - 13:  # before the accounts
+    # before the accounts
+    elif chunks(data)[0].end <= end <= data.find(b"trilat.accounts") - 13:
         assert result.lossless, result.lost
     assert result.finished == (end == len(data))
     if len(found):
@@ -129,7 +132,10 @@ def test_of_a_file_cut_anywhere_every_whole_chunk_is_kept(
 
 
 @anywhere
-@given(made_by=LOGS, flips=st.lists(st.tuples(positions, st.integers(1, 255)), min_size=1, max_size=3))
+@given(
+    made_by=LOGS,
+    flips=st.lists(st.tuples(positions, st.integers(1, 255)), min_size=1, max_size=3),
+)
 def test_of_damaged_file_every_chunk_that_is_intact_is_kept(
     made_by: Callable[[], bytes], flips: list[tuple[float, int]], tmp_path: Path
 ) -> None:
@@ -147,7 +153,8 @@ def test_of_damaged_file_every_chunk_that_is_intact_is_kept(
     result, saved = made(bytes(data), tmp_path, "run.mcap")
     found = messages(saved)
     summary_begins = chunks(whole)[-1].end
-    if any(place >= summary_begins for place in places):  # what names the channels may be damaged twice
+    # what names the channels may be damaged twice
+    if any(place >= summary_begins for place in places):
         intact = [message._replace(topic="") for message in intact]
         found = [message._replace(topic="") for message in found]
     rest = iter(found)
@@ -168,12 +175,18 @@ def test_a_whole_file_loses_nothing(tmp_path: Path) -> None:
     assert list(old.iter_attachments()) == list(new.iter_attachments())
     before, after = ({e.name: e.metadata for e in each.iter_metadata()} for each in (old, new))
     assert after["trilat.session"] == before["trilat.session"]
-    assert (after["trilat.recovered"]["lost"], after["trilat.recovered"]["from"]) == ("nothing", "run.mcap")
+    assert (after["trilat.recovered"]["lost"], after["trilat.recovered"]["from"]) == (
+        "nothing",
+        "run.mcap",
+    )
     assert set(after["trilat.accounts"]) == set(before["trilat.accounts"])
     assert all("missing 0" in account for account in after["trilat.accounts"].values())
     defined = [
         (
-            sorted((c.topic, c.message_encoding, sorted(c.metadata.items())) for c in s.channels.values()),
+            sorted(
+                (c.topic, c.message_encoding, sorted(c.metadata.items()))
+                for c in s.channels.values()
+            ),
             sorted((c.name, c.encoding, c.data) for c in s.schemas.values()),
         )
         for s in (old.get_summary(), new.get_summary())
@@ -214,9 +227,14 @@ def of_others(compression: CompressionType, chunked: bool) -> bytes:
     writer = Writer(stream, chunk_size=500, compression=compression, use_chunking=chunked)
     writer.start(profile="ros1", library="theirs")
     schema = writer.register_schema("S", "jsonschema", b"{}")
-    channels = [writer.register_channel("/a", "json", schema), writer.register_channel("/b", "raw", 0)]
+    channels = [
+        writer.register_channel("/a", "json", schema),
+        writer.register_channel("/b", "raw", 0),
+    ]
     for k in range(60):
-        writer.add_message(channels[k % 2], k * 10, os.urandom(30) if k % 3 else b"x" * 40, k * 10 + 1, k)
+        writer.add_message(
+            channels[k % 2], k * 10, os.urandom(30) if k % 3 else b"x" * 40, k * 10 + 1, k
+        )
         if k == 30:
             writer.add_metadata("theirs", {"k": "v"})
             writer.add_attachment(1, 2, "note", "text/plain", b"hello")
@@ -254,7 +272,9 @@ def test_a_file_of_anybody_is_recovered_wherever_it_is_cut(
 
 
 @pytest.mark.parametrize("compression", list(CompressionType))
-def test_the_complete_records_of_a_cut_chunk_are_kept(compression: CompressionType, tmp_path: Path) -> None:
+def test_the_complete_records_of_a_cut_chunk_are_kept(
+    compression: CompressionType, tmp_path: Path
+) -> None:
     data = foreign([os.urandom(300) for _ in range(2000)], compression=compression)
     (chunk,) = chunks(data)
     result, saved = made(data[: (chunk.begin + chunk.end) // 2], tmp_path)
@@ -301,7 +321,9 @@ def test_no_number_in_a_file_is_believed(data: bytes, tmp_path: Path) -> None:
 
 @anywhere
 @given(data=st.binary(max_size=300), at=positions)
-def test_whatever_is_in_a_file_it_is_recovered_or_refused(data: bytes, at: float, tmp_path: Path) -> None:
+def test_whatever_is_in_a_file_it_is_recovered_or_refused(
+    data: bytes, at: float, tmp_path: Path
+) -> None:
     whole = log()
     place = int(at * len(whole))
     for content in (data, HEAD + data, whole[:place] + data + whole[place:]):
@@ -381,7 +403,9 @@ def test_the_exit_code_says_what_came_of_it(
     assert done.err == ""
     done = trilat("verify", "run.mcap", cwd=tmp_path)
     assert (done.code, "less than 99.9 %" in done.err) == (int(code == 3), code == 3), done
-    done = trilat("log", "recover", "run.mcap.active", "-o", "other.mcap", "--json", cwd=tmp_path)
+    done = trilat(
+        "log", "recover", "run.mcap.active", "-o", "other.mcap", "--json", cwd=tmp_path
+    )
     facts: dict[str, Any] = json.loads(done.out)
     assert done.code == code
     assert facts["lossless"] == (code == 0)
@@ -392,7 +416,9 @@ def test_the_exit_code_says_what_came_of_it(
     assert facts["output"] == "other.mcap"
     assert facts["messages"] == len(messages((tmp_path / "other.mcap").read_bytes()))
     assert not active_path(tmp_path / "other.mcap").exists()
-    trilat("log", "recover", "run.mcap.active", cwd=tmp_path).refuses("run.mcap: exists", "--force")
+    trilat("log", "recover", "run.mcap.active", cwd=tmp_path).refuses(
+        "run.mcap: exists", "--force"
+    )
 
 
 def test_a_file_that_is_not_there_is_bad_input(tmp_path: Path) -> None:

@@ -56,17 +56,23 @@ def reference_tip(arm: str) -> str:
     return tip
 
 
-@pytest.mark.parametrize("down", [(0.0, 0.0, -1.0), (0.0, 0.0, 2.0), (1.0, 0.0, 0.0), (0.3, -0.5, 0.4)])
+@pytest.mark.parametrize(
+    "down", [(0.0, 0.0, -1.0), (0.0, 0.0, 2.0), (1.0, 0.0, 0.0), (0.3, -0.5, 0.4)]
+)
 def test_bases_stand_apart_and_gravity_points_down(down):
     models = [RobotModel(scenario(down=str([*down])), site) for site in ("m", "s")]
     (m, turned), (s, _) = (model.transforms(POSES["arm6"])[0] for model in models)
     assert math.dist(m, s) == SPACING_M
-    assert rotate_vector(turned, tuple(np.array(down) / math.hypot(*down))) == pytest.approx((0, 0, -1))
+    assert rotate_vector(turned, tuple(np.array(down) / math.hypot(*down))) == pytest.approx(
+        (0, 0, -1)
+    )
 
 
 def test_a_message_is_read_by_the_decoder_of_ros():
     model = RobotModel(scenario(), "m")
-    schema = Schema(id=1, name=cdr.TRANSFORMS, encoding="ros2msg", data=cdr.ROS2_SCHEMAS[cdr.TRANSFORMS])
+    schema = Schema(
+        id=1, name=cdr.TRANSFORMS, encoding="ros2msg", data=cdr.ROS2_SCHEMAS[cdr.TRANSFORMS]
+    )
     q = POSES["arm6"]
     message = DecoderFactory().decoder_for("cdr", schema)(model.pack(5_000_000_007, q))
     assert [(t.header.frame_id, t.child_frame_id) for t in message.transforms] == model.frames
@@ -82,7 +88,9 @@ def test_the_robot_description_has_the_links_and_shapes():
     given = ElementTree.fromstring((ARMS / "arm6.urdf").read_text())
     names = [link.get("name") for link in root.findall("link")]
     assert names == [f"s/{link.get('name')}" for link in given.findall("link")]
-    assert [j.get("name") for j in root.findall("joint")] == [j.get("name") for j in given.findall("joint")]
+    assert [j.get("name") for j in root.findall("joint")] == [
+        j.get("name") for j in given.findall("joint")
+    ]
     arm = next(link for link in root.findall("link") if link.get("name") == "s/upper_arm")
     assert float(arm.find("visual/geometry/cylinder").get("length")) == pytest.approx(0.425)
 
@@ -99,7 +107,9 @@ def test_end_of_every_unlike_arm_is_where_its_site_says():
             at = np.add(at, rotate_vector(turned, origin))
             turned = multiply_quaternions(turned, own)
         wanted = unlike.arms[site].shared_pose(spec.q0_rad)
-        assert spec.task.scale * (at - [0.0, n * SPACING_M, 0.0]) == pytest.approx(wanted, abs=1e-12)
+        assert spec.task.scale * (at - [0.0, n * SPACING_M, 0.0]) == pytest.approx(
+            wanted, abs=1e-12
+        )
     assert model.frames[-1][1] == "s/" + reference_tip("arm7")
 
 

@@ -20,7 +20,13 @@ from tests.log_editing import edited, recorded, without
 from trilat_net.errors import LogError
 from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
-from trilat_net.log.mcap_records import MAGIC, RECORD_HEAD_BYTES, RecordFrame, RecordScanner, unpack_chunk
+from trilat_net.log.mcap_records import (
+    MAGIC,
+    RECORD_HEAD_BYTES,
+    RecordFrame,
+    RecordScanner,
+    unpack_chunk,
+)
 from trilat_net.log.recover import recover
 from trilat_net.log.session_check import LogCheckResult, check_file
 
@@ -43,7 +49,9 @@ def failed(found: LogCheckResult) -> set[str]:
 
 
 def first(opcode: int) -> RecordFrame:
-    return next(frame for frame in RecordScanner(io.BytesIO(DATA)).frames() if frame.opcode == opcode)
+    return next(
+        frame for frame in RecordScanner(io.BytesIO(DATA)).frames() if frame.opcode == opcode
+    )
 
 
 def poked(data: bytes, offset: int, flip: int = 1) -> bytes:
@@ -81,7 +89,10 @@ WRONG: dict[str, tuple[bytes, set[str]]] = {
     "the place of metadata": (within(Opcode.METADATA_INDEX), {"index", "checksums"}),
     "where the index begins": (within(Opcode.FOOTER), {"checksums"}),
     "the checksum of the index": (poked(DATA, first(Opcode.FOOTER).end - 1), {"checksums"}),
-    "an entry of a message index": (poked(DATA, first(Opcode.MESSAGE_INDEX).end - 1), {"index"}),
+    "an entry of a message index": (
+        poked(DATA, first(Opcode.MESSAGE_INDEX).end - 1),
+        {"index"},
+    ),
     "the times of a chunk": (within(Opcode.CHUNK, 8), {"index"}),
 }
 
@@ -171,7 +182,9 @@ def test_what_is_wrong_with_the_session_fails_its_check(kind: str, tmp_path: Pat
     data, checks, text = SAID[kind]
     found = judged(tmp_path, data())
     assert failed(found) == checks, found.findings
-    assert any(text in f"{f.text} {f.places}" for f in found.findings if not f.passed), found.findings
+    assert any(text in f"{f.text} {f.places}" for f in found.findings if not f.passed), (
+        found.findings
+    )
 
 
 def test_the_parts_of_a_log_are_one(tmp_path: Path) -> None:
@@ -253,7 +266,12 @@ def test_a_file_that_is_not_there_is_an_error(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_pymcap_cli_finds_wrong_what_we_find_wrong(tmp_path: Path) -> None:
     """Another program, run beside: on how files are built it and we agree."""
-    kinds = ["a byte of a chunk", "cut off", "the length of a chunk", "the checksum of the index"]
+    kinds = [
+        "a byte of a chunk",
+        "cut off",
+        "the length of a chunk",
+        "the checksum of the index",
+    ]
     cases = {"sound": DATA, "as written": WHOLE, **{kind: WRONG[kind][0] for kind in kinds}}
     executable = Path(sys.executable).with_name("pymcap-cli")
     running = {}

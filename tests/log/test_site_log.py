@@ -74,7 +74,9 @@ def test_few_records_are_a_list() -> None:
 
 
 @pytest.mark.parametrize("field", ["rx", "echo", "cmd", "mem", "used"])
-def test_records_with_long_lists_are_held_few_at_a_time(field: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_records_with_long_lists_are_held_few_at_a_time(
+    field: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whichever list it is, and in either record: memory is bounded by all that a record may hold."""
     monkeypatch.setattr(site_log, "HEAVY_BYTES", 9_000)
     values = {f"m{n}": n for n in range(300)} if field == "used" else [0] * 300
@@ -98,9 +100,12 @@ def test_records_by_tick_are_the_dictionary_of_them(ticks: list[int]) -> None:
 def test_errors_of_orientations_are_turns_as_scipy_has_them() -> None:
     rng = np.random.default_rng(5)
     x, x_des = rng.normal(size=(2, 400, 6))
-    x_des[:100, 3:] = x[:100, 3:] + 10.0 ** rng.uniform(-12.0, -1.0, (100, 1)) * rng.normal(size=(100, 3))
+    x_des[:100, 3:] = x[:100, 3:] + 10.0 ** rng.uniform(-12.0, -1.0, (100, 1)) * rng.normal(
+        size=(100, 3)
+    )
     x_des[100:110, 3:], x[110:120, 3:] = x[100:110, 3:], 0.0
-    x[120:140, 3:] *= np.pi / np.linalg.norm(x[120:140, 3:], axis=1, keepdims=True)  # half a turn
+    # half a turn
+    x[120:140, 3:] *= np.pi / np.linalg.norm(x[120:140, 3:], axis=1, keepdims=True)
     there, here = (Rotation.from_rotvec(one[:, 3:]) for one in (x_des, x))
     e = find_task_errors(x, x_des, [1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
     assert np.abs(e[:, 3:] - (here * there.inv()).as_rotvec()).max() <= 1e-14

@@ -48,7 +48,9 @@ class Seen:
 class Desk:
     """The views of a session, and what they put."""
 
-    def __init__(self, views_hz: float, scenario: Scenario = SCENARIO, epoch_ns: int = 0) -> None:
+    def __init__(
+        self, views_hz: float, scenario: Scenario = SCENARIO, epoch_ns: int = 0
+    ) -> None:
         self.seen: list[Seen] = []
         self.views = VizChannels(scenario, "lab", epoch_ns, views_hz, self._put)
 
@@ -90,7 +92,9 @@ def record(tick: int, numbers: Sequence[float], mode: Mode = Mode.RUN) -> TickRe
     n = iter(numbers)
     vectors = [[next(n) for _ in range(size)] for size in (2, 2, 2, 2, 2, 2, 5)]
     q, qd, q_des, qd_des, tau, tau_x, theta_hat = vectors
-    return TickRecord(tick, tick * 10**6, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, [-1], 0, [], [])
+    return TickRecord(
+        tick, tick * 10**6, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, [-1], 0, [], []
+    )
 
 
 def joint_row(one: TickRecord) -> list[float]:
@@ -113,7 +117,9 @@ def slow_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
     """The slow arrays put together again, in the order of `slow_row`."""
     parts = [desk.arrays(f"/viz/m/{name}") for name in ("tau_x", "theta_hat", "mode")]
     assert len({tuple(t for t, _ in part) for part in parts}) == 1
-    return [(rows[0][0], [x for _, row in rows for x in row]) for rows in zip(*parts, strict=True)]
+    return [
+        (rows[0][0], [x for _, row in rows for x in row]) for rows in zip(*parts, strict=True)
+    ]
 
 
 def joint_arrays(desk: Desk) -> list[tuple[int, list[float]]]:
@@ -144,7 +150,8 @@ def runs(draw: st.DrawFn) -> list[TickRecord]:
     numbers = rng.integers(-3, 4, (len(ticks), 17)) * rng.choice([1.0, 1e-9, 1e5], 17)
     modes = rng.choice([Mode.RUN, Mode.HOLD, Mode.DIVERGED], len(ticks), p=[0.9, 0.05, 0.05])
     return [
-        record(tick, row.tolist(), Mode(mode)) for tick, row, mode in zip(ticks, numbers, modes, strict=True)
+        record(tick, row.tolist(), Mode(mode))
+        for tick, row, mode in zip(ticks, numbers, modes, strict=True)
     ]
 
 
@@ -195,7 +202,9 @@ def test_messages_bear_times_of_records_in_order_of_log_time(records: list[TickR
 
 
 @given(runs(), st.randoms(use_true_random=False))
-def test_disorder_within_a_bucket_does_not_show(records: list[TickRecord], chance: random.Random) -> None:
+def test_disorder_within_a_bucket_does_not_show(
+    records: list[TickRecord], chance: random.Random
+) -> None:
     in_order = sorted(records, key=lambda one: one.tick)
     shuffled = sorted(in_order, key=lambda one: (one.tick // BUCKET, chance.random()))
     desks = Desk(100.0), Desk(100.0)
@@ -242,7 +251,12 @@ def test_what_waits_is_bounded_by_bucket_and_not_by_silence() -> None:
 
 
 def stats(**facts: Any) -> LinkStats:
-    counts = {"accepted": {"s": 1}, "late": {"s": 0}, "duplicate": {"s": 0}, "refused": {"s": 0}}
+    counts = {
+        "accepted": {"s": 1},
+        "late": {"s": 0},
+        "duplicate": {"s": 0},
+        "refused": {"s": 0},
+    }
     return LinkStats(
         **{
             "v": 3, "site": "m", "boot": 1, "tick": 100, "t_ns": 100_000_000, "mode": "run",
@@ -265,8 +279,13 @@ def test_statistics_are_arrays_with_units_and_unmeasured_ones_are_nan() -> None:
         "timing": [70.0, 40.0],
     }
     nothing = Desk(100.0)
-    nothing.take([stats(age_us={"s": -1}, delay_us={"s": -1}, delay_max_us={"s": -1})], "trilat/lab/m/link")
-    by_topic = {seen.topic.rpartition("/")[2]: numbers_of(*seen.message) for seen in nothing.seen}
+    nothing.take(
+        [stats(age_us={"s": -1}, delay_us={"s": -1}, delay_max_us={"s": -1})],
+        "trilat/lab/m/link",
+    )
+    by_topic = {
+        seen.topic.rpartition("/")[2]: numbers_of(*seen.message) for seen in nothing.seen
+    }
     assert math.isnan(by_topic["link_age"][0])
     assert all(map(math.isnan, by_topic["link_delay"] + by_topic["link_offset"]))
 
@@ -283,16 +302,26 @@ def test_event_is_text_and_line_with_level(kind: str, level: int) -> None:
     event = Event(member="m", boot=1, kind=kind, text="ü happened", t_ns=5)
     desk.views.takers["trilat/lab/recorder/event"](event, EPOCH_NS + 9)
     text, line = desk.seen
-    assert (text.topic, _decoder(text.message[0])(text.message[1]).data) == ("/viz/events", "m: ü happened")
+    assert (text.topic, _decoder(text.message[0])(text.message[1]).data) == (
+        "/viz/events",
+        "m: ü happened",
+    )
     shown = _decoder(line.message[0])(line.message[1])
-    assert (line.topic, shown.level, shown.name, shown.msg) == ("/viz/log", level, "m", "ü happened")
+    assert (line.topic, shown.level, shown.name, shown.msg) == (
+        "/viz/log",
+        level,
+        "m",
+        "ü happened",
+    )
     assert shown.stamp.sec * 10**9 + shown.stamp.nanosec == EPOCH_NS + 5
     assert text.publish_ns == text.log_ns == line.publish_ns == line.log_ns == EPOCH_NS + 9
 
 
 def test_event_before_epoch_has_time_of_its_arrival() -> None:
     desk = Desk(100.0, epoch_ns=EPOCH_NS)
-    desk.views.takers["trilat/lab/m/event"](Event(member="m", boot=1, kind="epoch", text=""), EPOCH_NS - 9)
+    desk.views.takers["trilat/lab/m/event"](
+        Event(member="m", boot=1, kind="epoch", text=""), EPOCH_NS - 9
+    )
     kind, data = desk.seen[1].message
     stamp = _decoder(kind)(data).stamp
     assert stamp.sec * 10**9 + stamp.nanosec == EPOCH_NS - 9
@@ -302,7 +331,9 @@ def test_logs_own_messages_are_same_with_views_and_without() -> None:
     own, shown = [], []
     for views_hz in (0.0, 100.0):
         stream = io.BytesIO()
-        virtual.write_virtual_log(load_scenario("paper", {"duration_s": 0.5}), stream, views_hz=views_hz)
+        virtual.write_virtual_log(
+            load_scenario("paper", {"duration_s": 0.5}), stream, views_hz=views_hz
+        )
         every = messages(stream.getvalue())
         own.append([message for message in every if not message.topic.startswith("/viz")])
         shown.append(len(every) > len(own[-1]))
@@ -313,7 +344,9 @@ def test_logs_own_messages_are_same_with_views_and_without() -> None:
 def test_a_part_ends_with_all_that_it_has_seen() -> None:
     """So that nothing is lost at the seam: the parts' extremes are those of the whole."""
     scenario = load_scenario("two_sites", {"duration_s": 0.2})
-    outputs = [step.output for step in virtual.execute_virtual(scenario) if step.site.name == "m"]
+    outputs = [
+        step.output for step in virtual.execute_virtual(scenario) if step.site.name == "m"
+    ]
     shown = []
     for part in (outputs[:77], outputs[77:]):
         stream = io.BytesIO()
@@ -323,7 +356,9 @@ def test_a_part_ends_with_all_that_it_has_seen() -> None:
             state = decode(payload, State)
             writer.add(KEY, payload, one.t_ns, EPOCH_NS + one.t_ns, one.tick, state)
         writer.finish({})
-        reader = make_reader(io.BytesIO(stream.getvalue()), decoder_factories=[DecoderFactory()])
+        reader = make_reader(
+            io.BytesIO(stream.getvalue()), decoder_factories=[DecoderFactory()]
+        )
         shown += [
             [*ros.position, *ros.velocity[:2], *ros.effort[:2]]
             for _, _, _, ros in reader.iter_decoded_messages("/viz/m/joint_states")

@@ -39,7 +39,12 @@ def floor(other: Other, sent_ns: int, delay_ns: int) -> OffsetLimit:
 
 
 def second(
-    other: Other, begin_ns: int, there: Delay, back: Delay, rnd: random.Random, messages: int = 50
+    other: Other,
+    begin_ns: int,
+    there: Delay,
+    back: Delay,
+    rnd: random.Random,
+    messages: int = 50,
 ) -> tuple[OffsetLimit, OffsetLimit]:
     """The tightest of a second of messages both ways, all of which have come before it is over."""
     ceilings, floors = [], []

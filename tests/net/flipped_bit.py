@@ -39,7 +39,10 @@ class Flipping:
     def _serve(self) -> None:
         with suppress(OSError):
             while True:
-                self._ends += (one := self._door.accept()[0], other := socket.create_connection(self._to))
+                self._ends += (
+                    one := self._door.accept()[0],
+                    other := socket.create_connection(self._to),
+                )
                 self.connections += 1
                 self._begin(self._carry, one, other)
                 self._begin(self._carry, other, one)

@@ -61,7 +61,11 @@ class LocalBus:
         return ring
 
     def stamped(
-        self, key: str, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int = RING_CAPACITY
+        self,
+        key: str,
+        now_ns: Callable[[], int],
+        read: Callable[[bytes], T],
+        capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
         ring = StampingRing(now_ns, read, capacity)
         self._sinks.append((key, lambda _, payload: ring.take(payload)))

@@ -53,11 +53,15 @@ class Mesh(Connected):
     def __init__(self, protocol: str = "tcp", own: Mapping[str, Any] | None = None) -> None:
         super().__init__()
         self.own = own
-        self._endpoints = [endpoint.replace("tcp", protocol) for endpoint in find_free_endpoints(SEATS)]
+        self._endpoints = [
+            endpoint.replace("tcp", protocol) for endpoint in find_free_endpoints(SEATS)
+        ]
 
     def join(self) -> Bus:
         seat = len(self._members)
-        return self._enter(ZenohBus(self._endpoints[seat : seat + 1], self._endpoints[:seat], own=self.own))
+        return self._enter(
+            ZenohBus(self._endpoints[seat : seat + 1], self._endpoints[:seat], own=self.own)
+        )
 
 
 class Routed(Connected):

@@ -26,7 +26,10 @@ CLOCK = ManualClock().identity()
 def told(name: str, boot: int, **facts: object) -> Info:
     """What a member answers when asked who it is; `facts` override."""
     recorder = name == topics.RECORDER
-    own = {"scenario_sha256": "" if recorder else HASH, "scenario": "" if recorder else "the scenario"}
+    own = {
+        "scenario_sha256": "" if recorder else HASH,
+        "scenario": "" if recorder else "the scenario",
+    }
     own |= {"host": "h", "clock": CLOCK, "fingerprint": "f"}
     return Info(**{"member": name, "boot": boot, **own, **facts})
 

@@ -14,7 +14,9 @@ from .networks import NETWORKS, Network
 from .waiting import answered, drained, received, until
 
 
-@pytest.fixture(params=[pytest.param(name, marks=[pytest.mark.long] * (name == "tls")) for name in NETWORKS])
+@pytest.fixture(
+    params=[pytest.param(name, marks=[pytest.mark.long] * (name == "tls")) for name in NETWORKS]
+)
 def network(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Network]:
     made = NETWORKS[request.param](tmp_path)
     yield made
@@ -55,7 +57,10 @@ def test_a_ring_gives_what_others_published_in_their_order(pair: tuple[Bus, Bus]
 def test_an_expression_stands_for_many_keys_and_no_others(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     one, any_number = receiver.inbox("t/*/x"), receiver.inbox("t/**")
-    publishers = {key: sender.publisher(key) for key in ("t/b/y", "t/a/x", "t/b/b/x", "other/a/x", "t/b/x")}
+    publishers = {
+        key: sender.publisher(key)
+        for key in ("t/b/y", "t/a/x", "t/b/b/x", "other/a/x", "t/b/x")
+    }
     opened(publishers["t/b/x"], one, any_number)
     for key, publish in publishers.items():
         publish(key.encode())
@@ -88,7 +93,9 @@ def test_a_tap_is_called_with_every_message_in_order(pair: tuple[Bus, Bus]) -> N
     assert heard == [("t/a", number) for number in NUMBERS]
 
 
-def test_patient_publisher_loses_nothing_however_much_it_has_to_say(pair: tuple[Bus, Bus]) -> None:
+def test_patient_publisher_loses_nothing_however_much_it_has_to_say(
+    pair: tuple[Bus, Bus],
+) -> None:
     """Several times what a connection holds; who takes it is slower."""
     sender, receiver = pair
     heard: list[bytes] = []
@@ -106,7 +113,11 @@ def test_patient_publisher_loses_nothing_however_much_it_has_to_say(pair: tuple[
 
 def test_full_ring_loses_its_oldest_and_leaves_other_rings_alone(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
-    small, large, publish = receiver.inbox("t/a", 16), receiver.inbox("t/a"), sender.publisher("t/a")
+    small, large, publish = (
+        receiver.inbox("t/a", 16),
+        receiver.inbox("t/a"),
+        sender.publisher("t/a"),
+    )
     opened(publish, small, large)
     for number in NUMBERS:
         publish(number)
@@ -117,7 +128,9 @@ def test_full_ring_loses_its_oldest_and_leaves_other_rings_alone(pair: tuple[Bus
 
 def test_everyone_who_answers_is_heard_once(network: Network) -> None:
     asker, *others = (network.join() for _ in range(3))
-    rings = {name: bus.questions(f"t/{name}/info") for name, bus in zip("ab", others, strict=True)}
+    rings = {
+        name: bus.questions(f"t/{name}/info") for name, bus in zip("ab", others, strict=True)
+    }
 
     def answers() -> list[tuple[str, bytes]]:
         replies = asker.ask("t/*/info")
@@ -147,7 +160,8 @@ def test_a_question_carries_what_was_sent_with_it(pair: tuple[Bus, Bus]) -> None
         def asked(sent: bytes = sent) -> bool:
             asker.ask("t/*/info", sent)
             question = questions.poll()
-            return question is not None and question.payload == sent  # or one that was asked before
+            # or one that was asked before
+            return question is not None and question.payload == sent
 
         until(asked)
 
@@ -232,7 +246,9 @@ def test_stamped_ring_that_is_full_loses_the_oldest(pair: tuple[Bus, Bus]) -> No
 
 
 @given(capacity=st.integers(1, 5), takes=st.lists(st.booleans(), max_size=60))
-def test_a_stamped_message_is_polled_waits_or_is_the_oldest(capacity: int, takes: list[bool]) -> None:
+def test_a_stamped_message_is_polled_waits_or_is_the_oldest(
+    capacity: int, takes: list[bool]
+) -> None:
     ring = StampingRing(Ticking(), bytes, capacity)
     held: list[int] = []
     taken = 0

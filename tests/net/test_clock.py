@@ -17,7 +17,9 @@ CLOCKS = {
     "system": SystemClock,
     "manual": lambda: ManualClock(5, 1_700_000_000_000_000_000),
     "skewed system": lambda: SkewedClock(SystemClock(), 3_000_000_000, 100_000),
-    "skewed manual": lambda: SkewedClock(ManualClock(5, 1_700_000_000_000_000_000), -7, -100_000),
+    "skewed manual": lambda: SkewedClock(
+        ManualClock(5, 1_700_000_000_000_000_000), -7, -100_000
+    ),
 }
 
 
@@ -30,7 +32,8 @@ def test_it_never_goes_back_and_wall_clock_goes_with_it(clock: Clock) -> None:
     readings = [clock.monotonic_ns() for _ in range(100)]
     assert readings == sorted(readings)
     unix_ns = clock.unix_ns()
-    clock.sleep_until(readings[-1] - 10_000_000_000)  # it has passed: no sleep, and no step back
+    # it has passed: no sleep, and no step back
+    clock.sleep_until(readings[-1] - 10_000_000_000)
     assert clock.monotonic_ns() >= readings[-1]
     clock.sleep_until(readings[-1] + 5_000_000)
     assert clock.unix_ns() > unix_ns
@@ -79,7 +82,9 @@ def test_the_clock_is_not_the_coarse_one_of_windows() -> None:
 
 def test_processes_of_one_machine_share_their_clock() -> None:
     program = "from trilat_net.net.clock import SystemClock; print(SystemClock().identity())"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
     assert done.stdout.strip() == SystemClock().identity()
 
 

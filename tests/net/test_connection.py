@@ -48,7 +48,9 @@ def member(
 
 def test_who_names_nothing_is_on_this_machine() -> None:
     assert member() == Connection(HERE, THERE, "peer", {})
-    assert member(own=file(namespace="n")) == Connection(HERE, THERE, "peer", {"namespace": "n"})
+    assert member(own=file(namespace="n")) == Connection(
+        HERE, THERE, "peer", {"namespace": "n"}
+    )
 
 
 def test_place_that_is_named_replaces_one_on_this_machine() -> None:
@@ -57,10 +59,11 @@ def test_place_that_is_named_replaces_one_on_this_machine() -> None:
     assert member(listen=[], connect=[]) == Connection([], [])
     assert member(own=file(listen={"endpoints": [A]})).listen == [A]
     assert member(own=file(connect={"endpoints": [A]})).connect == [A]
+    # --connect first
     assert member(connect=[B], own=file(connect={"endpoints": [A, B]})).connect == [
         B,
         A,
-    ]  # --connect first
+    ]
 
 
 def test_client_of_router_listens_nowhere_and_connects_to_nothing_else() -> None:
@@ -74,12 +77,24 @@ def test_client_of_router_listens_nowhere_and_connects_to_nothing_else() -> None
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        ({"listen": [A], "own": file(listen={"endpoints": [B]})}, "listen/endpoints: given by listen too"),
+        (
+            {"listen": [A], "own": file(listen={"endpoints": [B]})},
+            "listen/endpoints: given by listen too",
+        ),
         ({"routers": [A], "listen": [B]}, "router: a client of a router listens nowhere"),
         ({"routers": [A], "connect": [B]}, "router: a client connects to a router only"),
-        ({"routers": [A], "own": file(listen={"endpoints": [B]})}, "router: a client .* listens nowhere"),
-        ({"routers": [A], "own": file(mode="peer")}, "mine.json5: mode: peer contradicts router"),
-        ({"own": file(mode="client")}, "mine.json5: mode: client: there is no router to connect to"),
+        (
+            {"routers": [A], "own": file(listen={"endpoints": [B]})},
+            "router: a client .* listens nowhere",
+        ),
+        (
+            {"routers": [A], "own": file(mode="peer")},
+            "mine.json5: mode: peer contradicts router",
+        ),
+        (
+            {"own": file(mode="client")},
+            "mine.json5: mode: client: there is no router to connect to",
+        ),
         (
             {"own": file(mode="client"), "listen": [A]},
             "mine.json5: mode: client: a client .* listens nowhere",
@@ -87,7 +102,14 @@ def test_client_of_router_listens_nowhere_and_connects_to_nothing_else() -> None
         ({"own": file(mode="router")}, "mine.json5: mode: router is for `trilat router`"),
         *(
             ({"routers": [endpoint]}, "router: an endpoint is like tcp/192.0.2.1:7447, not")
-            for endpoint in ("", "nonsense", "tcp/", "tcp/host", "carrier-pigeon/1:2", "192.0.2.1:7447")
+            for endpoint in (
+                "",
+                "nonsense",
+                "tcp/",
+                "tcp/host",
+                "carrier-pigeon/1:2",
+                "192.0.2.1:7447",
+            )
         ),
     ],
 )
@@ -98,13 +120,21 @@ def test_what_contradicts_itself_is_refused(arguments: dict[str, object], proble
 
 @pytest.mark.parametrize(
     "endpoint",
-    [A, "tls/[::1]:7447", "quic/host:7447#iface=eth0", "udp/h:1?rel=0", "unixsock-stream//run/zenoh.sock"],
+    [
+        A,
+        "tls/[::1]:7447",
+        "quic/host:7447#iface=eth0",
+        "udp/h:1?rel=0",
+        "unixsock-stream//run/zenoh.sock",
+    ],
 )
 def test_a_router_may_be_anywhere_that_zenoh_reaches(endpoint: str) -> None:
     assert member(routers=[endpoint]).connect == [endpoint]
 
 
-def router(listen: list[str] | None, connect: list[str] | None, own: ZenohFile | None) -> Connection:
+def router(
+    listen: list[str] | None, connect: list[str] | None, own: ZenohFile | None
+) -> Connection:
     return resolve_member_connection(listen, connect, None, own, HERE, routes=True)
 
 
@@ -122,11 +152,17 @@ def test_a_router_listens_and_connects_as_told() -> None:
 class Answering(ManualClock):
     """A clock on which a router comes, or a signal, after a number of sleeps."""
 
-    def __init__(self, endpoints: list[str], comes_after: int = 0, stops_after: int = 0) -> None:
+    def __init__(
+        self, endpoints: list[str], comes_after: int = 0, stops_after: int = 0
+    ) -> None:
         super().__init__()
         self.sleeps = 0
         self.router: ZenohBus | None = None
-        self._endpoints, self._comes_after, self._stops_after = endpoints, comes_after, stops_after
+        self._endpoints, self._comes_after, self._stops_after = (
+            endpoints,
+            comes_after,
+            stops_after,
+        )
 
     def sleep_until(self, deadline_ns: int) -> None:
         super().sleep_until(deadline_ns)
@@ -154,7 +190,9 @@ def test_router_that_never_comes_is_said_and_signal_ends_waiting() -> None:
     endpoints = find_free_endpoints(2)
     clock = Answering(endpoints)
     connection = Connection((), endpoints, "client")
-    with pytest.raises(SessionError, match=f"no router answers at {', '.join(endpoints)} within 1 s"):
+    with pytest.raises(
+        SessionError, match=f"no router answers at {', '.join(endpoints)} within 1 s"
+    ):
         open_bus(connection, clock, clock.stopped, 1.0, lambda _: None)
     clock = Answering(endpoints, stops_after=4)
     assert open_bus(connection, clock, clock.stopped, None, lambda _: None) is None
@@ -164,7 +202,9 @@ def test_router_that_never_comes_is_said_and_signal_ends_waiting() -> None:
 def test_a_peer_waits_for_nobody() -> None:
     endpoints = find_free_endpoints(2)
     clock = Answering(endpoints)
-    bus = open_bus(Connection(endpoints[:1], endpoints[1:]), clock, clock.stopped, 0.0, lambda _: None)
+    bus = open_bus(
+        Connection(endpoints[:1], endpoints[1:]), clock, clock.stopped, 0.0, lambda _: None
+    )
     assert bus is not None
     bus.close()
     assert clock.sleeps == 0
@@ -180,7 +220,9 @@ def port(endpoint: str) -> int:
 
 
 @given(NAMES, st.integers(0, 1000))
-def test_defaults_are_unprivileged_loopback_ports_below_the_ephemeral_ones(session: str, index: int) -> None:
+def test_defaults_are_unprivileged_loopback_ports_below_the_ephemeral_ones(
+    session: str, index: int
+) -> None:
     assert 1024 <= port(default_endpoint(session, index)) < 32_768
 
 
@@ -223,7 +265,10 @@ def test_two_sessions_of_one_name_get_their_own_ports() -> None:
     """Each keeps what it chose, and its sites can listen there all the same."""
     sites = ("a", "b", "c")
     with ExitStack() as stack:
-        chosen = [stack.enter_context(reserve_session_endpoints("endpoints-test", sites)) for _ in range(3)]
+        chosen = [
+            stack.enter_context(reserve_session_endpoints("endpoints-test", sites))
+            for _ in range(3)
+        ]
         places = list(chain.from_iterable(chosen))
         assert len(set(places)) == 9
         for place in places:
@@ -249,7 +294,9 @@ class Played(ManualClock):
         return self.over
 
 
-def routed(clock: Played, network: LocalNetwork, until_idle_s: float | None = None) -> list[str]:
+def routed(
+    clock: Played, network: LocalNetwork, until_idle_s: float | None = None
+) -> list[str]:
     said: list[str] = []
     run_router(network.join(), clock, clock.stopped, said.append, until_idle_s)
     return said

@@ -35,9 +35,13 @@ class Answering:
         (self.endpoint,) = find_free_endpoints(1)
         self._bus = ZenohBus([self.endpoint])
         scenario = load_scenario("paper")
-        info = told("s", 1, scenario_sha256=scenario.sha256, scenario=scenario.text, running=running)
+        info = told(
+            "s", 1, scenario_sha256=scenario.sha256, scenario=scenario.text, running=running
+        )
         self._publisher = EventPublisher(self._bus, SESSION, info)
-        questions = self._bus.questions(topics.key(SESSION, "s" if not deaf else "x", topics.SET))
+        questions = self._bus.questions(
+            topics.key(SESSION, "s" if not deaf else "x", topics.SET)
+        )
         self._changes = ChangeServer(scenario, "s", questions)
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._answer)
@@ -88,19 +92,27 @@ def test_site_of_scenario_that_is_not_there_does_not_answer(running: Answering) 
 
 
 def test_a_session_that_has_not_begun_takes_no_changes() -> None:
-    with closing(Answering(running=False)) as site, pytest.raises(SessionError, match="has not begun"):
+    with (
+        closing(Answering(running=False)) as site,
+        pytest.raises(SessionError, match="has not begun"),
+    ):
         site.asked("s", link="m1->s", to={"delay_ms": 350.0})
 
 
 def test_whoever_gives_no_answer_is_named() -> None:
-    with closing(Answering(running=True, deaf=True)) as site, pytest.raises(SessionError, match="no answer"):
+    with (
+        closing(Answering(running=True, deaf=True)) as site,
+        pytest.raises(SessionError, match="no answer"),
+    ):
         site.asked("s", link="m1->s", to={"delay_ms": 350.0})
 
 
 def find(*payloads: bytes) -> list[Info]:
     network, clock = LocalNetwork(), ManualClock()
     for n, payload in enumerate(payloads):
-        network.join().respond(topics.key(SESSION, f"m{n}", topics.INFO), lambda _, sent=payload: sent)
+        network.join().respond(
+            topics.key(SESSION, f"m{n}", topics.INFO), lambda _, sent=payload: sent
+        )
     asker = network.join()
     return list(find_members(asker, clock, SESSION, stopped=lambda: False, timeout_s=0.5))
 
@@ -113,7 +125,9 @@ def test_members_are_found_again_and_again_beside_unreadable_answers() -> None:
 
 
 def test_answers_of_another_version_alone_are_error_that_names_member() -> None:
-    with pytest.raises(SessionError, match=f"the answer of m0 cannot be read: .* version {VERSION + 1}"):
+    with pytest.raises(
+        SessionError, match=f"the answer of m0 cannot be read: .* version {VERSION + 1}"
+    ):
         find(encode(told("m0", 1, v=VERSION + 1)))
 
 

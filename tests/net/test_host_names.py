@@ -91,7 +91,9 @@ COMMANDS = [
 
 @pytest.mark.long
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda text: text.partition(f" {UNKNOWN}")[0])
-def test_every_command_names_the_host_that_does_not_resolve(command: str, tmp_path: Path) -> None:
+def test_every_command_names_the_host_that_does_not_resolve(
+    command: str, tmp_path: Path
+) -> None:
     words = [sys.executable, "-m", "trilat_net", *command.split()]
     made = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert made.returncode in (1, 2)  # 1: the examination of `doctor` found a failure

@@ -35,7 +35,12 @@ def test_a_running_site_is_known_to_its_user_alone(state: Path) -> None:
     assert find_known_sites("t") == []
     with make_site_known("t", "s", SITES, 7, HERE, b"order"):
         (one,) = find_known_sites("t")
-        assert (one.site, tuple(one.sites), one.stop, one.keyed) == ("s", SITES, b"order", False)
+        assert (one.site, tuple(one.sites), one.stop, one.keyed) == (
+            "s",
+            SITES,
+            b"order",
+            False,
+        )
         assert one.places == ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]
         assert find_known_sites("another") == []
         (file,) = state.iterdir()
@@ -78,7 +83,10 @@ def test_endpoints_are_known_as_the_member_reaches_them() -> None:
     with make_site_known("t", "m", SITES, 6, HERE, b"order"):
         assert find_known_places("t", Connection(connect=None)) is None
         with make_site_known("t", "s", SITES, 7, Connection(("tcp/127.0.0.1:2",)), b"order"):
-            assert find_known_places("t", Connection(connect=None)) == ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]
+            assert find_known_places("t", Connection(connect=None)) == [
+                "tcp/127.0.0.1:1",
+                "tcp/127.0.0.1:2",
+            ]
             assert find_known_places("t", Connection(connect=None, keys_of="operator")) is None
             assert find_known_places("t", Connection(connect=None, mode="client")) is None
 
@@ -88,7 +96,9 @@ def test_site_with_settings_of_its_user_is_for_nobody_else() -> None:
         assert find_known_sites("t") == []
 
 
-@pytest.mark.parametrize("words", [[], ["--session"], ["--session", "t", "--end"], ["--help"], ["s"]])
+@pytest.mark.parametrize(
+    "words", [[], ["--session"], ["--session", "t", "--end"], ["--help"], ["s"]]
+)
 def test_what_is_no_stop_of_arms_goes_long_way_silently(
     words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -109,7 +119,9 @@ def test_it_says_at_once_that_it_tries(capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_keys_that_are_missing_are_said(capsys: pytest.CaptureFixture[str]) -> None:
-    with make_site_known("t", "s", SITES, 7, replace(HERE, keys_of="operator", own={"x": 1}), b"order"):
+    with make_site_known(
+        "t", "s", SITES, 7, replace(HERE, keys_of="operator", own={"x": 1}), b"order"
+    ):
         assert stop_at_once(["--session", "t"]) == 2
     assert "have keys: add --keys DIR" in capsys.readouterr().err
 
@@ -119,5 +131,7 @@ def test_a_stop_imports_nothing_that_it_does_not_need() -> None:
         "import sys; from trilat_net.net.known_sites import stop_at_once; stop_at_once(['--session', 't']); "
         "print(*{'numba', 'numpy', 'scipy', 'typer', 'rich', 'cryptography', 'mcap'} & {*sys.modules})"
     )
-    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True
+    )
     assert done.stdout == "stopping every arm of session t ...\n\n"

@@ -74,7 +74,9 @@ def test_of_two_recorders_at_the_start_one_is_late() -> None:
     assert epoch is not None
     assert all(site.epoch == epoch for site in sites)
     both = (first, session.members[RECORDER])
-    assert [member.epoch for member in both if member.info.boot == epoch.boots[RECORDER]] == [epoch]
+    assert [member.epoch for member in both if member.info.boot == epoch.boots[RECORDER]] == [
+        epoch
+    ]
     session.rounds(100)
     assert [member.epoch.mono_ns for member in both if member.epoch] == [epoch.mono_ns] * 2
 
@@ -106,7 +108,8 @@ def test_who_contradicts_himself_is_not_believed(forged: dict[str, object]) -> N
         publisher = session.members[name].publisher
         publisher.info = msgspec.structs.replace(publisher.info, **forged)
     session.start(RECORDER)
-    with suppress(SessionError):  # a session that runs and does not say since when takes nobody in
+    # a session that runs and does not say since when takes nobody in
+    with suppress(SessionError):
         joined(session, 3 * LATE_GATHER_NS)
     assert session.members[RECORDER].epoch is None
 

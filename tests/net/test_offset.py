@@ -24,9 +24,10 @@ DAY = 86_400 * S
 
 others = st.builds(Other, st.integers(-3 * DAY, 3 * DAY), st.floats(-200_000, 200_000))
 delays = st.one_of(st.integers(0, 2_000_000), st.integers(0, 3 * S))
+# (pause before it, whether it goes there, how long it takes)
 messages = st.lists(
     st.tuples(st.integers(0, 5 * S), st.booleans(), delays), min_size=1, max_size=80
-)  # (pause before it, whether it goes there, how long it takes)
+)
 
 
 @given(others, messages, st.integers(0, 100 * S))
@@ -77,8 +78,12 @@ def test_one_exchange_gives_classical_offset_and_half_its_round_trip(
     assert trip_ns / 2 - spread_ns <= bound_ns <= trip_ns / 2 + spread_ns
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 5))])
-@pytest.mark.parametrize(("offset_ns", "drift_ppb"), [(3 * S, 100_000), (-2 * DAY, -100_000), (5, 0)])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in range(1, 5))]
+)
+@pytest.mark.parametrize(
+    ("offset_ns", "drift_ppb"), [(3 * S, 100_000), (-2 * DAY, -100_000), (5, 0)]
+)
 def test_offset_and_drift_are_recovered(seed: int, offset_ns: int, drift_ppb: int) -> None:
     """Within 100 us and 20 ppm after 10 s, 5 ppm after 60 s, of ways as they are on one busy machine."""
     other, rnd, estimator = Other(offset_ns, drift_ppb), random.Random(seed), OffsetEstimator()
@@ -129,7 +134,9 @@ def test_bad_minute_among_good_ones_does_not_move_drift() -> None:
 
 @given(st.floats(1.0, 100.0), st.floats(0.0, 2 * math.pi), st.integers(0, 2**32))
 @settings(max_examples=12, deadline=None)
-def test_drift_that_wanders_as_far_as_it_may_stays_inside(period_s: float, phase: float, seed: int) -> None:
+def test_drift_that_wanders_as_far_as_it_may_stays_inside(
+    period_s: float, phase: float, seed: int
+) -> None:
     """The offset's rate swings by a quarter of a part per million, so over any stretch within WANDER."""
     size = 250.0 * period_s / (2 * math.pi)
 
@@ -174,7 +181,9 @@ def test_memory_is_bounded_and_the_oldest_goes_first() -> None:
     other, estimator = Other(S, 0), OffsetEstimator()
     for n in range(3 * WINDOWS_KEPT):
         estimator.add(ceiling(other, n * S, 1000), floor(other, n * S, 1000))
-    assert {len(limits) for limits in (estimator._ceilings, estimator._floors)} == {WINDOWS_KEPT}
+    assert {len(limits) for limits in (estimator._ceilings, estimator._floors)} == {
+        WINDOWS_KEPT
+    }
     assert estimator._ceilings[0].at_ns == 2 * WINDOWS_KEPT * S
 
 
@@ -210,7 +219,9 @@ estimates = st.builds(
 
 
 @given(st.lists(st.tuples(estimates, st.integers(1, 3 * S)), min_size=1, max_size=6))
-def test_it_is_continuous_whatever_estimates_come_and_when(bends: list[tuple[OffsetEstimate, int]]) -> None:
+def test_it_is_continuous_whatever_estimates_come_and_when(
+    bends: list[tuple[OffsetEstimate, int]],
+) -> None:
     course, now_ns = SlewedOffset(exact_offset(5)), 0
     for estimate, passed_ns in bends:
         now_ns += passed_ns
@@ -232,7 +243,9 @@ def test_it_reaches_an_estimate_in_its_time_and_follows_it(estimate: OffsetEstim
 
 @given(st.integers(0, 2**32), st.integers(-(10**12), 10**12), st.floats(-150_000, 150_000))
 @settings(max_examples=12, deadline=None)
-def test_the_truth_is_inside_its_bound_at_every_instant(seed: int, offset_ns: int, drift_ppb: float) -> None:
+def test_the_truth_is_inside_its_bound_at_every_instant(
+    seed: int, offset_ns: int, drift_ppb: float
+) -> None:
     """From the first exchange on, with estimates that come late, and through a silence of a minute."""
     other, rnd, estimator = Other(offset_ns, drift_ppb), random.Random(seed), OffsetEstimator()
     estimator.add(*second(other, 0, queueing(300, 1000), queueing(50, 1000), rnd, 3))

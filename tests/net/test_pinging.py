@@ -70,9 +70,13 @@ class World:
         self.bus = Slow(self.network.join(), self.clock, there_ns, back_ns)
         self.pinger = Pinger(self.bus, self.clock, SESSION)
 
-    def member(self, name: str, boot: int, offset_ns: int = 0, drift_ppb: int = 0) -> SkewedClock:
+    def member(
+        self, name: str, boot: int, offset_ns: int = 0, drift_ppb: int = 0
+    ) -> SkewedClock:
         clock = SkewedClock(self.clock, offset_ns, drift_ppb)
-        answer_pings(self.network.join(), clock, SESSION, told(name, boot, clock=clock.identity()))
+        answer_pings(
+            self.network.join(), clock, SESSION, told(name, boot, clock=clock.identity())
+        )
         return clock
 
     def wait(self, passed_ns: int, *wanted: int) -> None:
@@ -102,8 +106,14 @@ def test_a_clock_is_known_to_half_a_round_trip(
     truth, value = clock.monotonic_ns() - now_ns, estimate.offset_at(now_ns)
     assert abs(truth - value) <= estimate.bound_at(now_ns, value) + 2
     trip_ns = world.pinger.trips[7].shortest_ns
-    assert trip_ns // STEP_NS in (there_ms + back_ms, there_ms + back_ms + 1, there_ms + back_ms + 2)
-    assert estimate.bound_at(estimate.at_ns, estimate.offset_ns) <= trip_ns / 2 + 0.4 * S * 600e-6
+    assert trip_ns // STEP_NS in (
+        there_ms + back_ms,
+        there_ms + back_ms + 1,
+        there_ms + back_ms + 2,
+    )
+    assert (
+        estimate.bound_at(estimate.at_ns, estimate.offset_ns) <= trip_ns / 2 + 0.4 * S * 600e-6
+    )
 
 
 def test_pings_come_fast_until_all_are_known_and_then_rarely() -> None:
@@ -151,7 +161,9 @@ STRANGERS = {
     "of another version": encode(pong(v=VERSION + 1)),
     "left before it came": encode(pong(came_ns=5, left_ns=4)),
     "held longer than it was away": encode(pong(came_ns=0, left_ns=10**15)),
-    "beyond any clock": msgspec.msgpack.encode({**msgspec.structs.asdict(pong()), "came_ns": 2**62}),
+    "beyond any clock": msgspec.msgpack.encode(
+        {**msgspec.structs.asdict(pong()), "came_ns": 2**62}
+    ),
 }
 
 
@@ -167,7 +179,11 @@ def test_answers_that_cannot_be_are_passed_over(payload: bytes) -> None:
 def test_a_stepping_clock_is_unknown_until_enough_messages_agree() -> None:
     trips = RoundTrips(PINGS)
     for n in range(PINGS):
-        trips.take(n * STEP_NS, pong(came_ns=n * STEP_NS + 50, left_ns=n * STEP_NS + 50), n * STEP_NS + 100)
+        trips.take(
+            n * STEP_NS,
+            pong(came_ns=n * STEP_NS + 50, left_ns=n * STEP_NS + 50),
+            n * STEP_NS + 100,
+        )
     assert trips.known
     before = trips.latest
     far_ns = 10 * S

@@ -47,7 +47,9 @@ def test_keys_are_those_of_the_design_of_rmw_zenoh() -> None:
     assert topic_key(2, "add_two_ints", "example_interfaces/srv/AddTwoInts", ADD_HASH) == (
         f"2/add_two_ints/example_interfaces::srv::dds_::AddTwoInts_/{ADD_HASH}"
     )
-    assert topic_key(0, "a/b", STRING, find_type_hash(STRING, "humble")).endswith("/TypeHashNotSupported")
+    assert topic_key(0, "a/b", STRING, find_type_hash(STRING, "humble")).endswith(
+        "/TypeHashNotSupported"
+    )
 
 
 def test_tokens_are_those_of_the_design_of_rmw_zenoh() -> None:
@@ -69,7 +71,9 @@ def test_tokens_are_those_of_the_design_of_rmw_zenoh() -> None:
     talker = GraphPlace(0, "999bf91283606d2068c7524e5badfa6c", "robot1", "talker")
     assert talker.endpoint_token(
         1, EndpointKind.PUBLISHER, "rosout", LOG, "RIHS01_e28c", QualityOfService()
-    ).startswith("@ros2_lv/0/999bf91283606d2068c7524e5badfa6c/0/1/MP/%/%robot1/talker/%rosout/rcl_interfaces")
+    ).startswith(
+        "@ros2_lv/0/999bf91283606d2068c7524e5badfa6c/0/1/MP/%/%robot1/talker/%rosout/rcl_interfaces"
+    )
 
 
 @pytest.mark.parametrize(
@@ -93,12 +97,21 @@ SERVICE = {
         [
             ("event_type", (Nodetype.BASE, ("uint8", 0))),
             ("stamp", (NAME, "builtin_interfaces/msg/Time")),
-            ("client_gid", (Nodetype.ARRAY, ((Nodetype.BASE, ("uint8", 0)), 16))),  # char is uint8 in ROS 2
+            (
+                "client_gid",
+                (Nodetype.ARRAY, ((Nodetype.BASE, ("uint8", 0)), 16)),
+            ),  # char is uint8 in ROS 2
             ("sequence_number", (Nodetype.BASE, ("int64", 0))),
         ],
     ),
     ASKED: ([], []),
-    TOLD: ([], [("success", (Nodetype.BASE, ("bool", 0))), ("message", (Nodetype.BASE, ("string", 0)))]),
+    TOLD: (
+        [],
+        [
+            ("success", (Nodetype.BASE, ("bool", 0))),
+            ("message", (Nodetype.BASE, ("string", 0))),
+        ],
+    ),
     EVENT: (
         [],
         [
@@ -127,8 +140,12 @@ def test_hashes_of_types_are_those_of_every_distribution(store: str) -> None:
         assert types.hash_rihs01(kind) == f"RIHS01_{digest}"
 
 
-@given(st.integers(1, 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
-def test_an_attachment_has_33_bytes_and_comes_back(number: int, sent_unix_ns: int, gid: bytes) -> None:
+@given(
+    st.integers(1, 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16)
+)
+def test_an_attachment_has_33_bytes_and_comes_back(
+    number: int, sent_unix_ns: int, gid: bytes
+) -> None:
     sent = Attachment(number, sent_unix_ns, gid)
     assert len(sent.encode()) == 33
     assert sent.encode()[16] == 0x10
@@ -143,7 +160,9 @@ def test_what_is_no_attachment_is_none(data: bytes) -> None:
 
 def test_names_of_endpoints_differ() -> None:
     tokens = [
-        LISTENER.endpoint_token(n, EndpointKind.PUBLISHER, "a", STRING, STRING_HASH, QualityOfService())
+        LISTENER.endpoint_token(
+            n, EndpointKind.PUBLISHER, "a", STRING, STRING_HASH, QualityOfService()
+        )
         for n in range(50)
     ]
     assert len({make_gid(token) for token in tokens}) == 50
@@ -175,13 +194,19 @@ def test_a_name_of_ros_is_taken_without_its_slash() -> None:
         (0, STRING, "RIHS01_0", "with another definition of std_msgs/msg/String, RIHS01_0"),
     ],
 )
-def test_a_publisher_that_does_not_fit_is_named(domain: int, kind: str, type_hash: str, misfit: str) -> None:
+def test_a_publisher_that_does_not_fit_is_named(
+    domain: int, kind: str, type_hash: str, misfit: str
+) -> None:
     talker = GraphPlace(domain, "999bf91283606d2068c7524e5badfa6c", "robot1", "talker")
-    sent = talker.endpoint_token(1, EndpointKind.PUBLISHER, "a/b", kind, type_hash, QualityOfService())
+    sent = talker.endpoint_token(
+        1, EndpointKind.PUBLISHER, "a/b", kind, type_hash, QualityOfService()
+    )
     assert find_misfit(sent, 0, STRING) == misfit
 
 
-@given(st.lists(st.text(max_size=9).filter(lambda part: "/" not in part), min_size=10, max_size=15))
+@given(
+    st.lists(st.text(max_size=9).filter(lambda part: "/" not in part), min_size=10, max_size=15)
+)
 def test_a_token_of_strangers_has_a_misfit_and_raises_nothing(parts: list[str]) -> None:
     assert find_misfit("/".join(parts), 0, STRING)
 
@@ -193,7 +218,9 @@ class Wire:
         self.place, self.said, self._kept = place, list[str](), list[Any]()
         self.router = opened("router", place)
         self.stranger = opened("client", place)
-        self.graph = Ros2Graph(Refusals(self.said.append), [place], "play", "trilat", SystemClock())
+        self.graph = Ros2Graph(
+            Refusals(self.said.append), [place], "play", "trilat", SystemClock()
+        )
 
     def say(self, key: str, data: bytes, attachment: bytes | None) -> None:
         with self.stranger.declare_publisher(key) as publisher:
@@ -205,7 +232,9 @@ class Wire:
         came: list[bytes] = []
         history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
         take = lambda sample: came.append(sample.payload.to_bytes())  # noqa: E731
-        self._kept.append(zenoh.ext.declare_advanced_subscriber(self.stranger, key, take, history=history))
+        self._kept.append(
+            zenoh.ext.declare_advanced_subscriber(self.stranger, key, take, history=history)
+        )
         return came
 
     def close(self) -> None:
@@ -235,7 +264,9 @@ def test_a_message_of_another_type_or_unattached_is_refused(wire: Wire) -> None:
     for attachment in (None, b"", b"x" * 33):
         wire.say(right, b"bare", attachment)
     for kind, type_hash in ((LOG, STRING_HASH), (STRING, "RIHS01_0")):
-        wire.stranger.put(topic_key(0, "a", kind, type_hash), b"other", attachment=SENT.encode())
+        wire.stranger.put(
+            topic_key(0, "a", kind, type_hash), b"other", attachment=SENT.encode()
+        )
     wire.say(topic_key(0, "a", STRING, "TypeHashNotSupported"), b"humble", SENT.encode())
     wire.say(right, b"jazzy", SENT.encode())
     until(lambda: len(came) == 2)
@@ -261,7 +292,9 @@ def test_a_message_that_raises_is_refused_and_the_next_comes(wire: Wire) -> None
 def test_publishers_that_do_not_fit_are_named_as_they_appear(wire: Wire) -> None:
     wire.graph.subscribe("a", STRING, lambda *_: None)
     place = GraphPlace(3, str(wire.stranger.zid()), "", "talker")
-    token = place.endpoint_token(1, EndpointKind.PUBLISHER, "a", STRING, STRING_HASH, QualityOfService())
+    token = place.endpoint_token(
+        1, EndpointKind.PUBLISHER, "a", STRING, STRING_HASH, QualityOfService()
+    )
     with_token = wire.stranger.liveliness().declare_token(token)
     until(lambda: wire.said == ["refused: a is published in domain 3, and this is domain 0"])
     with_token.undeclare()
@@ -306,7 +339,10 @@ def test_a_router_that_comes_back_carries_every_topic_again(wire: Wire) -> None:
 
 def test_a_peer_forwards_nothing_and_is_named_with_the_cure() -> None:
     (place,) = find_free_endpoints(1)
-    with closing(opened("peer", place)), pytest.raises(UsageError, match=r"is no router.*rmw_zenohd"):
+    with (
+        closing(opened("peer", place)),
+        pytest.raises(UsageError, match=r"is no router.*rmw_zenohd"),
+    ):
         Ros2Graph(Refusals(print), [place], "play", "trilat", SystemClock())
 
 

@@ -116,7 +116,9 @@ def test_a_leader_that_comes_last_leads() -> None:
     session.rounds(50)
     session.start("m1")
     session.agreed()
-    assert {event.member for event in session.listen() if event.kind in ("epoch", "start")} == {"m1"}
+    assert {event.member for event in session.listen() if event.kind in ("epoch", "start")} == {
+        "m1"
+    }
 
 
 def test_a_member_lost_before_the_start_is_waited_for_again() -> None:
@@ -143,7 +145,8 @@ def test_leader_lost_before_start_is_followed_by_its_next_start() -> None:
 
 def test_a_recorder_that_announces_itself_is_waited_for() -> None:
     session = party(*SITES)
-    session.stranger.announce(f"trilat/{SESSION}/{RECORDER}/alive/7")  # there, and not joining yet
+    # there, and not joining yet
+    session.stranger.announce(f"trilat/{SESSION}/{RECORDER}/alive/7")
     session.rounds(100)
     assert session.kinds() == []
     assert session.members["m1"].joining.membership.missing() == [RECORDER]
@@ -254,15 +257,21 @@ def test_whoever_joins_a_running_session_is_refused(name: str) -> None:
 
 @given(
     ahead_ns=st.dictionaries(
-        st.sampled_from([*SITES, RECORDER]), st.integers(-(10**9) + 1, 10**15), min_size=1, max_size=4
+        st.sampled_from([*SITES, RECORDER]),
+        st.integers(-(10**9) + 1, 10**15),
+        min_size=1,
+        max_size=4,
     ),
     unix_ns=st.integers(0, 2**60),
 )
 @settings(max_examples=15)
-def test_members_on_other_clocks_begin_at_the_same_instant(ahead_ns: dict[str, int], unix_ns: int) -> None:
+def test_members_on_other_clocks_begin_at_the_same_instant(
+    ahead_ns: dict[str, int], unix_ns: int
+) -> None:
     session = Party(SITES)
     clocks = {
-        name: session.elsewhere(ns, unix_ns + ns, f"machine of {name}") for name, ns in ahead_ns.items()
+        name: session.elsewhere(ns, unix_ns + ns, f"machine of {name}")
+        for name, ns in ahead_ns.items()
     }
     for name in (*SITES, RECORDER):
         session.start(name, **({"on_clock": clocks[name]} if name in clocks else {}))
@@ -301,7 +310,9 @@ def test_an_epoch_lies_further_ahead_where_the_network_is_slow() -> None:
     session.members["m1"].bus.ask = later(session.members["m1"].bus.ask, session.clock, trip_ns)
     session.rounds(200)
     (announced,) = (event for event in session.listen() if event.kind == "epoch")
-    assert re.search(rf"tick 0 is {(EPOCH_AHEAD_NS + 2 * trip_ns) // 1_000_000} ms from now", announced.text)
+    assert re.search(
+        rf"tick 0 is {(EPOCH_AHEAD_NS + 2 * trip_ns) // 1_000_000} ms from now", announced.text
+    )
     assert all(member.epoch for member in session.members.values())
 
 
@@ -328,7 +339,15 @@ def test_a_recorder_without_the_scenario_is_not_ready() -> None:
     assert "start" not in session.kinds()
 
 
-GARBAGE = [b"", b"\xc1", b"\x80", b"\xff" * 100, b"\x81\xa1v\x02", b"\x93\x01\x02\x03", b"\x91" * 5_000]
+GARBAGE = [
+    b"",
+    b"\xc1",
+    b"\x80",
+    b"\xff" * 100,
+    b"\x81\xa1v\x02",
+    b"\x93\x01\x02\x03",
+    b"\x91" * 5_000,
+]
 GARBAGE.append(bytes(70_000))
 
 
@@ -357,10 +376,22 @@ def test_tokens_that_are_none_of_ours_are_passed_over() -> None:
 
 FORGED = {
     "an epoch of a stranger": Event(
-        member="nobody", boot=1, kind="epoch", text="", epoch_mono_ns=5, attempt=1, boots={"m2": 1}
+        member="nobody",
+        boot=1,
+        kind="epoch",
+        text="",
+        epoch_mono_ns=5,
+        attempt=1,
+        boots={"m2": 1},
     ),
     "an epoch for other boots": Event(
-        member="s", boot=1, kind="epoch", text="", epoch_mono_ns=5, attempt=1, boots={"s": 1, "m2": 1}
+        member="s",
+        boot=1,
+        kind="epoch",
+        text="",
+        epoch_mono_ns=5,
+        attempt=1,
+        boots={"s": 1, "m2": 1},
     ),
     "a start of nothing": Event(member="m1", boot=1, kind="start", text="", attempt=1),
     "a ready of nobody": Event(member="nobody", boot=1, kind="ready", text="", attempt=1),

@@ -36,7 +36,9 @@ NAMES = ("a", "b")
 
 def sample(tick: int, sent_ns: int, echo: list[list[int]] | None = None) -> PeerSample:
     rest = {"q": [0, 0], "qd": [0, 0], "tau_x": [0, 0]}
-    return PeerSample(v=VERSION, site="x", boot=1, tick=tick, sent_ns=sent_ns, echo=echo or [], **rest)
+    return PeerSample(
+        v=VERSION, site="x", boot=1, tick=tick, sent_ns=sent_ns, echo=echo or [], **rest
+    )
 
 
 @dataclass
@@ -52,7 +54,9 @@ class Site:
 class Session:
     """Two sites, a leads; messages take as long as the ways say, in true time."""
 
-    def __init__(self, skews: tuple[tuple[int, int], tuple[int, int]], ways: tuple[Delay, Delay]) -> None:
+    def __init__(
+        self, skews: tuple[tuple[int, int], tuple[int, int]], ways: tuple[Delay, Delay]
+    ) -> None:
         self.true = ManualClock(10**12)
         self.ways, self.rnd = ways, random.Random(5)
         clocks = [SkewedClock(self.true, *skew) for skew in skews]
@@ -64,7 +68,9 @@ class Session:
         for own, other in ((0, 1), (1, 0)):
             ahead = clocks[other].monotonic_ns() - clocks[own].monotonic_ns()
             now_ns = clocks[own].monotonic_ns()
-            first = OffsetEstimate(now_ns, ahead + 150_000, 0.0, ahead - 400_000, ahead + 400_000, -5e5, 5e5)
+            first = OffsetEstimate(
+                now_ns, ahead + 150_000, 0.0, ahead - 400_000, ahead + 400_000, -5e5, 5e5
+            )
             peer = PeerClock(NAMES[other], epochs[other], 0, first, OffsetEstimator())
             self.sites.append(Site(clocks[own], SiteTiming(epochs[own], RATE_HZ, [peer], "a")))
             self.sites[-1].news += self.sites[-1].timing.opening()
@@ -126,7 +132,10 @@ def test_delays_are_inside_their_bound_and_grid_follows_leader(skew: tuple[int, 
         assert len(site.errors_ns) == 20 * RATE_HZ
         assert all(abs(error_ns) <= bound_ns + 50 for _, error_ns, bound_ns in site.errors_ns)
         assert sorted(bound for _, _, bound in site.errors_ns)[2000] <= 200_000
-        assert max(abs(error) for tick, error, _ in site.errors_ns if tick > 10 * RATE_HZ) <= 100_000
+        assert (
+            max(abs(error) for tick, error, _ in site.errors_ns if tick > 10 * RATE_HZ)
+            <= 100_000
+        )
     leader, follower = session.sites
     late_ns = [b - a for a, b in zip(leader.ticked_ns, follower.ticked_ns, strict=True)]
     assert abs(late_ns[0] - 300_000) <= 101_000
@@ -197,7 +206,9 @@ def meter(estimator: OffsetEstimator | None = None) -> tuple[LinkTimingMonitor, 
 
 def figures(link: LinkTimingMonitor) -> tuple[int, ...]:
     measured = link.measured(0)
-    return tuple(measured[name] for name in ("delay_us", "delay_max_us", "rtt_us", "clock_faults"))
+    return tuple(
+        measured[name] for name in ("delay_us", "delay_max_us", "rtt_us", "clock_faults")
+    )
 
 
 def test_on_one_clock_delays_and_round_trips_are_exact() -> None:
@@ -275,13 +286,16 @@ EPOCH_NS = 5_000_000_123
 
 
 @given(st.integers(0, 10**9), st.integers(1, 4000))
-def test_without_steering_it_is_the_absolute_grid_to_the_nanosecond(k: int, rate_hz: int) -> None:
+def test_without_steering_it_is_the_absolute_grid_to_the_nanosecond(
+    k: int, rate_hz: int
+) -> None:
     assert TickSchedule(EPOCH_NS, rate_hz).due_ns(k) == EPOCH_NS + k * S // rate_hz
 
 
 @given(
     st.lists(
-        st.tuples(st.integers(1, 2000), st.integers(-(10**10), 10**10), st.floats(-1e6, 1e6)), max_size=20
+        st.tuples(st.integers(1, 2000), st.integers(-(10**10), 10**10), st.floats(-1e6, 1e6)),
+        max_size=20,
     ),
     st.sampled_from([333, 1000, 4000]),
 )
@@ -303,7 +317,9 @@ def test_it_never_steps_and_never_slews_beyond_the_limit(
 
 @pytest.mark.parametrize("drift_ppb", [-150_000, -100_000, 0, 37_000, 150_000])
 @pytest.mark.parametrize("begin_ns", [-400_000, 0, 400_000])
-def test_it_follows_the_leaders_grid_on_a_clock_that_drifts(drift_ppb: int, begin_ns: int) -> None:
+def test_it_follows_the_leaders_grid_on_a_clock_that_drifts(
+    drift_ppb: int, begin_ns: int
+) -> None:
     """From an epoch that was converted wrong by begin_ns, steered ten times a second by the true offset."""
     leader = Other(0, drift_ppb)
     grid = TickSchedule(begin_ns, 1000)

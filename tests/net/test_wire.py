@@ -48,7 +48,15 @@ STATE_VECTORS = Layout().lengths()
 
 KINDS = (State, PeerSample, LinkStats, Event, Info, Pong, ChangeRequest, ChangeReply)
 PEERS = ("m2", "s")
-LIMITS = [0.0, -0.0, 5e-324, -2.2e-308, math.pi, 1.7976931348623157e308, -1.7976931348623157e308]
+LIMITS = [
+    0.0,
+    -0.0,
+    5e-324,
+    -2.2e-308,
+    math.pi,
+    1.7976931348623157e308,
+    -1.7976931348623157e308,
+]
 
 finite = st.one_of(st.sampled_from(LIMITS), st.floats(allow_nan=False, allow_infinity=False))
 not_finite = st.sampled_from([math.nan, -math.nan, math.inf, -math.inf])
@@ -89,7 +97,9 @@ def payload(**changes: Any) -> bytes:
     output = TickRecord(
         tick=7, t_ns=7_000_000, mode=Mode.RUN, used=[-1, 3], rx_crc=1, cmd=[], mem=[], **vectors
     )
-    record = msgpack.unpackb(encode_state("m1", 9, PEERS, output, [Arrival(1, 6, [0, 0], [0, 0], 2)], 0, 0))
+    record = msgpack.unpackb(
+        encode_state("m1", 9, PEERS, output, [Arrival(1, 6, [0, 0], [0, 0], 2)], 0, 0)
+    )
     return msgpack.packb({**record, **changes})
 
 
@@ -122,7 +132,11 @@ instants = st.integers(-(2**59), 2**59 - 1)
 
 
 @settings(max_examples=30)
-@given(output=outputs, sent_ns=instants, echo=st.lists(st.tuples(st.integers(0, 1), ticks, instants)))
+@given(
+    output=outputs,
+    sent_ns=instants,
+    echo=st.lists(st.tuples(st.integers(0, 1), ticks, instants)),
+)
 def test_stamps_come_back_and_in_virtual_time_they_are_nominal(
     output: TickRecord, sent_ns: int, echo: list[tuple[int, int, int]]
 ) -> None:
@@ -135,8 +149,12 @@ def test_stamps_come_back_and_in_virtual_time_they_are_nominal(
 
 def test_a_version_1_record_is_read_in_files_only() -> None:
     record = msgpack.unpackb(payload(v=1))
-    first = msgpack.packb({name: record[name] for name in record if name not in ("sent_ns", "echo")})
-    assert decode(first, State, READABLE) == msgspec.structs.replace(decode(payload(sent_ns=0), State), v=1)
+    first = msgpack.packb(
+        {name: record[name] for name in record if name not in ("sent_ns", "echo")}
+    )
+    assert decode(first, State, READABLE) == msgspec.structs.replace(
+        decode(payload(sent_ns=0), State), v=1
+    )
     with pytest.raises(WireError) as refused:
         decode(first, State)
     assert refused.value.reason == "version"
@@ -153,14 +171,18 @@ pose = st.one_of(st.just(()), row(3))
     echo=st.lists(st.tuples(ticks, ticks, instants), max_size=MOST_PEERS),
 )
 def test_each_field_of_a_sample_is_one_of_its_record(
-    output: TickRecord, task: tuple[list[float], list[float], list[float]], echo: list[tuple[int, int, int]]
+    output: TickRecord,
+    task: tuple[list[float], list[float], list[float]],
+    echo: list[tuple[int, int, int]],
 ) -> None:
     if task[0]:
         output = output._replace(x=task[0], xd=task[1], wrench=task[2])
     small = decode(encode_sample("m1", 3, output, 77, echo), PeerSample)
     state = decode(encode_state("m1", 3, PEERS, output, [], 0, 0, 77, echo), State)
     for name in PeerSample.__struct_fields__:
-        of_state = {"q": "x", "qd": "xd", "tau_x": "wrench"}.get(name, name) if task[0] else name
+        of_state = (
+            {"q": "x", "qd": "xd", "tau_x": "wrench"}.get(name, name) if task[0] else name
+        )
         ours, theirs = getattr(small, name), getattr(state, of_state)
         assert ours == theirs
         assert name not in ("q", "qd", "tau_x", "ch") or bits(ours) == bits(theirs)
@@ -198,7 +220,9 @@ def test_msgspec_writes_what_is_read_just_so(output: TickRecord, came: list[Arri
     """Either library reads the other's bytes."""
     state = decode(encode_state("m1", 1, PEERS, output, came, 0, 0), State)
     again = decode(msgspec.msgpack.encode(state), State)
-    assert all(bits(getattr(again, name)) == bits(getattr(state, name)) for name in STATE_VECTORS)
+    assert all(
+        bits(getattr(again, name)) == bits(getattr(state, name)) for name in STATE_VECTORS
+    )
     assert again.rx == state.rx
 
 
@@ -215,7 +239,9 @@ def test_what_is_not_finite_is_refused_at_both_ends(
     record = msgpack.unpackb(encode_state("m1", 1, PEERS, output, [], 0, 0))
     data = msgpack.packb({**record, name: numbers})
     small = {field: record[field] for field in PeerSample.__struct_fields__ if field in record}
-    kinds = {State: data} | ({PeerSample: msgpack.packb({**small, name: numbers})} if name in small else {})
+    kinds = {State: data} | (
+        {PeerSample: msgpack.packb({**small, name: numbers})} if name in small else {}
+    )
     for kind, bad in kinds.items():
         with pytest.raises(WireError) as refused:
             decode(bad, kind)
@@ -234,7 +260,9 @@ def test_law_sends_as_many_numbers_as_it_declares_each_finite(count: int) -> Non
         with pytest.raises(WireError, match=rf"ch has {count} numbers?, not {count + 1}"):
             decode(data, kind, layout=Layout(sent=count + 1))
     output = decode(payload(), State)
-    output = TickRecord(7, 0, Mode.RUN, *[output.q] * 6, output.theta_hat, [], 0, [], [], ch=[math.inf])
+    output = TickRecord(
+        7, 0, Mode.RUN, *[output.q] * 6, output.theta_hat, [], 0, [], [], ch=[math.inf]
+    )
     with pytest.raises(WireError, match="not finite"):
         encode_sample("m1", 1, output, 0, [])
     with pytest.raises(WireError, match="not finite"):
@@ -270,9 +298,13 @@ def test_a_vector_of_another_length_is_refused(name: str, off: int) -> None:
         ({"echo": [[0, 1]]}, "malformed"),
     ],
 )
-def test_what_is_no_record_of_ours_is_refused_by_reason(changes: dict[str, Any], reason: str) -> None:
+def test_what_is_no_record_of_ours_is_refused_by_reason(
+    changes: dict[str, Any], reason: str
+) -> None:
     of_both = changes.keys() <= {*PeerSample.__struct_fields__, "stranger"}
-    for kind, data in ((State, payload(**changes)), (PeerSample, sample(**changes)))[: 1 + of_both]:
+    for kind, data in ((State, payload(**changes)), (PeerSample, sample(**changes)))[
+        : 1 + of_both
+    ]:
         with pytest.raises(WireError) as refused:
             decode(data, kind)
         assert refused.value.reason == reason
@@ -308,7 +340,13 @@ def test_a_truncated_record_is_refused() -> None:
             decode(data[:end], State)
 
 
-@given(st.lists(st.tuples(st.integers(0, len(payload()) - 1), st.integers(0, 255)), min_size=1, max_size=4))
+@given(
+    st.lists(
+        st.tuples(st.integers(0, len(payload()) - 1), st.integers(0, 255)),
+        min_size=1,
+        max_size=4,
+    )
+)
 def test_a_mutated_record_raises_wire_errors_only(changes: list[tuple[int, int]]) -> None:
     data = bytearray(payload())
     for at, byte in changes:
@@ -318,8 +356,16 @@ def test_a_mutated_record_raises_wire_errors_only(changes: list[tuple[int, int]]
 
 @given(
     st.recursive(
-        st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text() | st.binary(),
-        lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=6), inner, max_size=4),
+        st.none()
+        | st.booleans()
+        | st.integers(-(2**63), 2**64 - 1)
+        | st.floats()
+        | st.text()
+        | st.binary(),
+        lambda inner: (
+            st.lists(inner, max_size=4)
+            | st.dictionaries(st.text(max_size=6), inner, max_size=4)
+        ),
         max_leaves=12,
     )
 )
@@ -350,15 +396,36 @@ def test_lengths_that_promise_more_than_there_is_are_refused() -> None:
     others=st.dictionaries(st.text(max_size=8), boots, max_size=3),
 )
 def test_events_come_back(kind: str, text: str, boot: int, others: dict[str, int]) -> None:
-    event = Event(member="m1", boot=boot, kind=kind, text=text, boots=others, epoch_mono_ns=2**58)
+    event = Event(
+        member="m1", boot=boot, kind=kind, text=text, boots=others, epoch_mono_ns=2**58
+    )
     assert decode(encode(event), Event) == event
 
 
-@given(counts=st.dictionaries(st.sampled_from(PEERS), st.integers(-1, 2**40)), boot=boots, tick=ticks)
+@given(
+    counts=st.dictionaries(st.sampled_from(PEERS), st.integers(-1, 2**40)),
+    boot=boots,
+    tick=ticks,
+)
 def test_statistics_and_infos_come_back(counts: dict[str, int], boot: int, tick: int) -> None:
     own = {"v": VERSION, "site": "m1", "boot": boot, "tick": tick, "t_ns": 5, "mode": "run"}
-    each = ("age_us", "accepted", "late", "duplicate", "refused", "dropped", "offset_us", "bound_us")
-    whole = {"late_max_us": 1, "busy_max_us": 2, "overruns": 3, "grid_error_us": -4, "slew_ppb": 5}
+    each = (
+        "age_us",
+        "accepted",
+        "late",
+        "duplicate",
+        "refused",
+        "dropped",
+        "offset_us",
+        "bound_us",
+    )
+    whole = {
+        "late_max_us": 1,
+        "busy_max_us": 2,
+        "overruns": 3,
+        "grid_error_us": -4,
+        "slew_ppb": 5,
+    }
     stats = LinkStats(**own, **dict.fromkeys((*each, "delay_us"), counts), **whole)
     assert decode(encode(stats), LinkStats) == stats
     info = told("s", boot)
@@ -366,7 +433,9 @@ def test_statistics_and_infos_come_back(counts: dict[str, int], boot: int, tick:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_json_schema_is_an_object_that_names_every_field(kind: type[msgspec.Struct]) -> None:
+def test_the_json_schema_is_an_object_that_names_every_field(
+    kind: type[msgspec.Struct],
+) -> None:
     """What viewers accept: an object at the root, no reference out of it, plain JSON."""
     schema = json_schema(kind)
     assert schema["type"] == "object"
@@ -391,7 +460,9 @@ def test_the_schemas_of_a_log_are_the_same_without_docstrings() -> None:
         "import json\nfrom trilat_net.net.messages import Event, LinkStats, State, json_schema\n"
         "print(json.dumps([json_schema(kind) for kind in (State, LinkStats, Event)]))"
     )
-    done = subprocess.run([sys.executable, "-OO", "-c", program], capture_output=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-OO", "-c", program], capture_output=True, check=True
+    )
     assert json.loads(done.stdout) == [json_schema(kind) for kind in kinds]
 
 

@@ -29,7 +29,10 @@ def test_a_message_of_no_member_is_not_taken_in() -> None:
     """Rings hold hundreds of messages; of hundreds of megabytes they would fill a memory."""
     (endpoint,) = find_free_endpoints(1)
     with closing(ZenohBus([endpoint])) as here, closing(ZenohBus([], [endpoint])) as there:
-        inbox, publish = here.inbox("trilat/x/m/event"), there.publisher("trilat/x/m/event", patient=True)
+        inbox, publish = (
+            here.inbox("trilat/x/m/event"),
+            there.publisher("trilat/x/m/event", patient=True),
+        )
 
         def hear() -> tuple[str, bytes] | None:
             publish(bytes(MOST_PUT_BYTES + 1))
@@ -97,7 +100,9 @@ def test_a_router_admits_by_password_and_passes_what_is_allowed(tmp_path: Path) 
 
     def enter(password: str) -> ZenohBus:
         member = tmp_path / "member.json5"
-        member.write_text(f"{{transport: {{auth: {{usrpwd: {{user: 'lab', password: '{password}'}}}}}}}}")
+        member.write_text(
+            f"{{transport: {{auth: {{usrpwd: {{user: 'lab', password: '{password}'}}}}}}}}"
+        )
         members.append(ZenohBus([], endpoints, "client", read_zenoh_file(member).settings))
         return members[-1]
 
@@ -109,9 +114,18 @@ def test_a_router_admits_by_password_and_passes_what_is_allowed(tmp_path: Path) 
         one, other = enter("secret"), enter("secret")
         one.announce("trilat/lab/one/alive/1")
         one.respond("trilat/lab/one/ping", lambda sent: sent)
-        assert until(other.presence("trilat/lab/*/alive/*").poll) == ("trilat/lab/one/alive/1", True)
-        assert until(lambda: answered(other, "trilat/lab/*/ping")) == ("trilat/lab/one/ping", b"?")
-        elsewhere, publish = other.inbox("trilat/elsewhere/state"), one.publisher("trilat/elsewhere/state")
+        assert until(other.presence("trilat/lab/*/alive/*").poll) == (
+            "trilat/lab/one/alive/1",
+            True,
+        )
+        assert until(lambda: answered(other, "trilat/lab/*/ping")) == (
+            "trilat/lab/one/ping",
+            b"?",
+        )
+        elsewhere, publish = (
+            other.inbox("trilat/elsewhere/state"),
+            one.publisher("trilat/elsewhere/state"),
+        )
         publish(b"not allowed")
         meet(one.publisher("trilat/lab/one/state"), other, "trilat/lab/one/state")
         publish(b"nor this")
@@ -149,7 +163,11 @@ def routed() -> Iterator[Routed]:
 def test_members_meet_again_through_a_router_that_was_started_again(routed: Routed) -> None:
     one, other = routed.join(), routed.join()
     one.announce("t/one/alive/1")
-    presence, inbox, publish = other.presence("t/*/alive/*"), other.inbox("t/a"), one.publisher("t/a")
+    presence, inbox, publish = (
+        other.presence("t/*/alive/*"),
+        other.inbox("t/a"),
+        one.publisher("t/a"),
+    )
     one.respond("t/one/ping", lambda sent: sent)
     assert until(presence.poll) == ("t/one/alive/1", True)
     routed.restart()
@@ -167,7 +185,10 @@ def test_members_meet_again_through_a_router_that_was_started_again(routed: Rout
 @pytest.mark.long
 def test_routers_that_connect_to_each_other_are_one() -> None:
     endpoints = find_free_endpoints(2)
-    routers = [ZenohBus(endpoints[:1], mode="router"), ZenohBus(endpoints[1:], endpoints[:1], "router")]
+    routers = [
+        ZenohBus(endpoints[:1], mode="router"),
+        ZenohBus(endpoints[1:], endpoints[:1], "router"),
+    ]
     members = [ZenohBus([], [endpoint], "client") for endpoint in endpoints]
     try:
         meet(members[0].publisher("t/a"), members[1], "t/a")

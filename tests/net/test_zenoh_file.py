@@ -53,8 +53,12 @@ WRONG = {
     "transport/shared_memory/enabled": True,
     "qos/publication": [{"key_exprs": ["**"], "config": {"congestion_control": "block"}}],
     "qos/network": [{"messages": ["put"], "flows": ["egress"], "overwrite": {"express": True}}],
-    "downsampling": [{"messages": ["put"], "flows": ["egress"], "rules": [{"key_expr": "**", "freq": 1}]}],
-    "low_pass_filter": [{"messages": ["put"], "flows": ["egress"], "key_exprs": ["**"], "size_limit": 1}],
+    "downsampling": [
+        {"messages": ["put"], "flows": ["egress"], "rules": [{"key_expr": "**", "freq": 1}]}
+    ],
+    "low_pass_filter": [
+        {"messages": ["put"], "flows": ["egress"], "key_exprs": ["**"], "size_limit": 1}
+    ],
     **{path: 2 for path in REQUIREMENTS if "/queue/size/" in path},
 }
 
@@ -73,7 +77,9 @@ def test_no_file_that_is_taken_changes_what_a_session_needs(data: st.DataObject)
     stated: dict[str, Any] = {}
     for path in data.draw(st.lists(st.sampled_from(sorted(REQUIREMENTS)), max_size=4)):
         value = data.draw(
-            st.sampled_from([WRONG[path], 0, 1, 16, 5000, 65_535, True, False, None, [], {}, "", 15.9, "16"])
+            st.sampled_from(
+                [WRONG[path], 0, 1, 16, 5000, 65_535, True, False, None, [], {}, "", 15.9, "16"]
+            )
         )
         stated = merge_settings(stated, nested(path, value))
     try:
@@ -122,16 +128,22 @@ def test_a_stock_file_is_refused_for_gossip_alone() -> None:
     """All else that a session sets itself has the session's values there."""
     with pytest.raises(UsageError) as refused:
         read_zenoh_file(STOCK)
-    assert str(refused.value).startswith(f"{STOCK}: scouting/gossip/enabled: true must be false")
+    assert str(refused.value).startswith(
+        f"{STOCK}: scouting/gossip/enabled: true must be false"
+    )
     assert str(refused.value).count("must be") == 1
 
 
 def test_a_stock_file_without_gossip_is_taken(tmp_path: Path) -> None:
     path = tmp_path / "session.json5"
-    path.write_text(STOCK.read_text().replace("gossip: { enabled: true }", "gossip: { enabled: false }"))
+    path.write_text(
+        STOCK.read_text().replace("gossip: { enabled: true }", "gossip: { enabled: false }")
+    )
     file = read_zenoh_file(path)
     assert file.endpoints("connect", "peer") == ["tcp/127.0.0.1:17447"]
-    settings = make_zenoh_config([], file.endpoints("connect", "peer") or [], "peer", file.settings)
+    settings = make_zenoh_config(
+        [], file.endpoints("connect", "peer") or [], "peer", file.settings
+    )
     assert found(settings, "transport/unicast/open_timeout") == 60_000
     plain = make_zenoh_config([], [])
     for key in ("connect/timeout_ms", "connect/exit_on_failure", "listen/exit_on_failure"):
@@ -148,14 +160,18 @@ def test_values_that_a_session_uses_anyway_are_taken(mode: str) -> None:
         assert checked({"mode": mode, **nested(key, used)}).mode == mode
         assert checked(nested(key, {mode: used})).mode == ""
         for wrong in ({"mode": mode, **nested(key, other)}, nested(key, {mode: other})):
-            with pytest.raises(UsageError, match=f"{key}: .* must be left out, or as a session sets it"):
+            with pytest.raises(
+                UsageError, match=f"{key}: .* must be left out, or as a session sets it"
+            ):
                 checked(wrong)
     with pytest.raises(UsageError, match="listen/timeout_ms"):
         checked(nested("listen/timeout_ms", False))
 
 
 def test_all_keys_that_contradict_a_session_are_named_at_once() -> None:
-    stated: dict[str, Any] = {"transport": {"link": {"tls": {"root_ca_certificate": "/nowhere.pem"}}}}
+    stated: dict[str, Any] = {
+        "transport": {"link": {"tls": {"root_ca_certificate": "/nowhere.pem"}}}
+    }
     for path, value in WRONG.items():
         stated = merge_settings(stated, nested(path, value))
     stated["access_control"] = {"default_permission": "deny"}
@@ -209,7 +225,9 @@ def test_endpoints_and_mode_are_apart_and_may_depend_on_mode() -> None:
 
 def test_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_path: Path) -> None:
     key = "transport/link/tls/root_ca_certificate"
-    with pytest.raises(UsageError, match=rf"{SOURCE}: {key}: {tmp_path}/none.pem cannot be read: No such"):
+    with pytest.raises(
+        UsageError, match=rf"{SOURCE}: {key}: {tmp_path}/none.pem cannot be read: No such"
+    ):
         checked(nested(key, f"{tmp_path}/none.pem"))
     with pytest.raises(UsageError, match="dictionary_file"):
         checked(nested("transport/auth/usrpwd/dictionary_file", str(tmp_path)))
@@ -237,15 +255,35 @@ def test_certificate_that_cannot_be_read_is_said_before_anything_begins(tmp_path
             "transport/link/tx/keep_alive: error parsing number",
         ),
         ("{transport: 3}", "transport: invalid type"),
-        ("{mode: 'pear'}", "mode: unknown variant `pear`, expected one of `router`, `peer`, `client`"),
-        ("{connect: {endpoints: {pear: []}}}", r"connect/endpoints/pear: no key .*did you mean peer\?"),
-        ("{connect: {endpoints: ['nope']}}", "connect/endpoints: Endpoints must be of the form <protocol>"),
-        ("{access_control: {rules: [{id: 'x'}]}}", "access_control/rules: missing field `key_exprs`"),
-        ("{access_control: {default_permission: 'deny'}}", "access_control: has no `enabled: true`"),
-        ("{transport: {link: {tx: {lease: 500}}}}", "transport/link/tx/lease: 500 must be 5000 or more"),
+        (
+            "{mode: 'pear'}",
+            "mode: unknown variant `pear`, expected one of `router`, `peer`, `client`",
+        ),
+        (
+            "{connect: {endpoints: {pear: []}}}",
+            r"connect/endpoints/pear: no key .*did you mean peer\?",
+        ),
+        (
+            "{connect: {endpoints: ['nope']}}",
+            "connect/endpoints: Endpoints must be of the form <protocol>",
+        ),
+        (
+            "{access_control: {rules: [{id: 'x'}]}}",
+            "access_control/rules: missing field `key_exprs`",
+        ),
+        (
+            "{access_control: {default_permission: 'deny'}}",
+            "access_control: has no `enabled: true`",
+        ),
+        (
+            "{transport: {link: {tx: {lease: 500}}}}",
+            "transport/link/tx/lease: 500 must be 5000 or more",
+        ),
     ],
 )
-def test_a_bad_file_is_refused_with_file_and_place(text: str, problem: str, tmp_path: Path) -> None:
+def test_a_bad_file_is_refused_with_file_and_place(
+    text: str, problem: str, tmp_path: Path
+) -> None:
     path = tmp_path / SOURCE
     path.write_text(text)
     with pytest.raises(UsageError, match=problem) as refused:
@@ -256,9 +294,12 @@ def test_a_bad_file_is_refused_with_file_and_place(text: str, problem: str, tmp_
 
 
 @pytest.mark.parametrize(
-    ("content", "problem"), [(None, "No such file"), (b"\xff\xfe{}", "no text in UTF-8"), (b"", "here are 0")]
+    ("content", "problem"),
+    [(None, "No such file"), (b"\xff\xfe{}", "no text in UTF-8"), (b"", "here are 0")],
 )
-def test_a_file_that_cannot_be_read_is_named(content: bytes | None, problem: str, tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_is_named(
+    content: bytes | None, problem: str, tmp_path: Path
+) -> None:
     path = tmp_path / SOURCE
     if content is not None:
         path.write_bytes(content)
@@ -285,7 +326,9 @@ def test_zenoh_takes_what_a_session_needs_in_every_mode(tmp_path: Path) -> None:
         settings = make_zenoh_config([], [], mode)
         for side in ("listen", "connect"):
             settings[side] = {
-                key: settings[side][key] for key in settings[side] if key in ("endpoints", "retry")
+                key: settings[side][key]
+                for key in settings[side]
+                if key in ("endpoints", "retry")
             }
         path.write_text(str(settings).replace("True", "true").replace("False", "false"))
         assert read_zenoh_file(path).mode == mode

@@ -55,7 +55,9 @@ class People(ManualClock):
     def run(self, fault: Fault = lambda _, __: None) -> bool:
         """Goes on with the experiment; a fault may end a session instead."""
 
-        def run_session(watch: TrialWatch, folder: Path, begins: Callable[[], bool]) -> SessionResult:
+        def run_session(
+            watch: TrialWatch, folder: Path, begins: Callable[[], bool]
+        ) -> SessionResult:
             while not begins():
                 if self.ends:
                     return SessionResult(folder / "run.mcap")
@@ -64,7 +66,9 @@ class People(ManualClock):
             if failed is None:
                 trial, plan = watch.trial, self.experiment.plan
                 scenario = plan.find_scenario(trial.planned, self.experiment.list_choices())
-                SyntheticTrial(plan.protocol, scenario, trial.planned, plan.digest).write(folder / "run.mcap")
+                SyntheticTrial(plan.protocol, scenario, trial.planned, plan.digest).write(
+                    folder / "run.mcap"
+                )
             return failed or SessionResult(folder / "run.mcap")
 
         made = ExperimentSessions(

@@ -102,13 +102,17 @@ class RecordedSession:
             page.goto(with_query(address, query))
             newest = self.frames[role][-1]["n"]
             until(lambda: page.evaluate("window.trilat?.frame?.n") == newest, 60.0)
-            page.evaluate("new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 250)))")
+            page.evaluate(
+                "new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 250)))"
+            )
             yield watched
 
 
 def record_session(folder: Path, duration_s: float = 4.0) -> RecordedSession:
     """Returns a session at 300 ms in which somebody leads m1."""
-    scenario = load_scenario("play", {"duration_s": duration_s, "rate_hz": 200, "link.delay_ms": 300})
+    scenario = load_scenario(
+        "play", {"duration_s": duration_s, "rate_hz": 200, "link.delay_ms": 300}
+    )
     return record_views(Session.whole(scenario, folder), "m1", leads=True)
 
 
@@ -158,7 +162,11 @@ def _record(
                 "energies": pages.energies.since(energies, 10_000),
                 "events": [show_event(event) for event in view.events.since(events, 100)],
             }
-            points, energies, events = pages.points.count, pages.energies.count, view.events.count
+            points, energies, events = (
+                pages.points.count,
+                pages.energies.count,
+                view.events.count,
+            )
             every = {"n": n, **_ABOUT_PAGES}
             nothing: Json = {key: [] for key in added}
             known = pages.narrow(frame, found.user, ages=True)

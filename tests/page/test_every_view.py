@@ -75,31 +75,46 @@ def parse(text: str, **overrides: Any) -> Scenario:
 
 
 CAROUSEL = {"class": "tests.own_code:Carousel", "bodies": {"box": [0.2, 0.2, 0.1]}}
-MIXED = {"model": "gamma", "delay_ms": 120.0, "deviation_ms": 40.0, "loss": 0.2, "loss_burst": 4.0}
+MIXED = {
+    "model": "gamma",
+    "delay_ms": 120.0,
+    "deviation_ms": 40.0,
+    "loss": 0.2,
+    "loss_burst": 4.0,
+}
 SESSIONS: dict[str, Views] = {
     "one leads": record_session,
     "two sites": record(load_scenario("two_sites", {"duration_s": 3.0, "link": MIXED}), "m"),
     "four sites": record(parse_scenario(FOUR, overrides={"duration_s": 3.0}), "a"),
     "links of many kinds": record(parse_scenario(BUSY, overrides={"duration_s": 5.0}), "b"),
     "no injected delay": record(
-        load_scenario("two_sites", {"duration_s": 3.0, "rate_hz": 200, "link": {"model": "measured"}}), "m"
+        load_scenario(
+            "two_sites", {"duration_s": 3.0, "rate_hz": 200, "link": {"model": "measured"}}
+        ),
+        "m",
     ),
     "six joints": record(parse(six_joints(3.0)), "m1"),
     "planar task": record(parse(planar_task(3.0)), "m"),
     "posed task": record(parse(posed_arms(3.0)), "m2"),
     "carried bodies": record(
-        load_scenario("paper", {"duration_s": 3.0, "rate_hz": 200, "sites.s.plant": CAROUSEL}), "m1"
+        load_scenario("paper", {"duration_s": 3.0, "rate_hz": 200, "sites.s.plant": CAROUSEL}),
+        "m1",
     ),
     "wall": record(load_scenario("contact", {"duration_s": 3.0, "rate_hz": 200}), "m"),
     "stopped": record(gliding(5.0), "m", {2.5: "stop"}),
     "stopped and enabled": record(gliding(6.0), "m", {2.0: "stop", 3.5: "enable"}),
     "fault": record(gliding(4.0, **{"sites.s.limits.qd_limit_rad_s": 0.1}), "m"),
     "diverged": record(
-        load_scenario("free", {"duration_s": 4.0, "rate_hz": 200, "limits.qd_limit_rad_s": 4.5}), "m1"
+        load_scenario(
+            "free", {"duration_s": 4.0, "rate_hz": 200, "limits.qd_limit_rad_s": 4.5}
+        ),
+        "m1",
     ),
 }
 PUSHED = ("one leads", "links of many kinds")
-NAMES = [pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in SESSIONS]
+NAMES = [
+    pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in SESSIONS
+]
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +133,11 @@ def sessions(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Record
 @pytest.mark.parametrize("role", ROLES)
 @pytest.mark.parametrize("name", NAMES)
 def test_view_draws_everything(
-    name: str, role: str, sessions: Callable[[str], RecordedSession], browser: Browser, address: str
+    name: str,
+    role: str,
+    sessions: Callable[[str], RecordedSession],
+    browser: Browser,
+    address: str,
 ) -> None:
     session = sessions(name)
     with session.watched(browser, address, role, "desktop", "light") as watched:
@@ -140,7 +159,9 @@ def use(page: Page) -> None:
     page.emulate_media(color_scheme="dark")
     page.set_viewport_size({"width": 600, "height": 900})
     page.click("#apart")
-    page.evaluate("new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 250)))")
+    page.evaluate(
+        "new Promise((resolve) => requestAnimationFrame(() => setTimeout(resolve, 250)))"
+    )
 
 
 def test_view_of_waiting_session_has_no_empty_frame(address: str, browser: Browser) -> None:
@@ -166,7 +187,10 @@ OF_A_STAGE = (
     "told.succeeded", "form.ends.*",
 )  # fmt: skip
 """Fields of a stage that depend on the phase, on the role and on what the protocol asks for."""
-OF_STAGED_PAGES = ["hello", *(f"{place}.{name}" for place in ("stage", "hello.stage") for name in OF_A_STAGE)]
+OF_STAGED_PAGES = [
+    "hello",
+    *(f"{place}.{name}" for place in ("stage", "hello.stage") for name in OF_A_STAGE),
+]
 PHASES = ("no step", "consent", "invitation", "rest", "success", "failure", "repetition", "starting",
           "checking", "sliders", "buttons", "over")  # fmt: skip
 
@@ -175,19 +199,26 @@ PHASES = ("no step", "consent", "invitation", "rest", "success", "failure", "rep
 def experiment(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
     folder = tmp_path_factory.mktemp("experiment")
     file = write_protocol(folder, '["m1", "m2"]')
-    file.write_text(file.read_text(encoding="utf-8").replace("trials = 2\n", ASKS), encoding="utf-8")
+    file.write_text(
+        file.read_text(encoding="utf-8").replace("trials = 2\n", ASKS), encoding="utf-8"
+    )
     return begin_experiment(file, folder / "out")
 
 
-def set_phase(stage: Stage, experiment: Experiment, phase: str, clock: Clock, folder: Path) -> None:
+def set_phase(
+    stage: Stage, experiment: Experiment, phase: str, clock: Clock, folder: Path
+) -> None:
     """Brings a stage to a phase."""
     plan = experiment.plan
     steps = {
-        (step.kind, step.form.name if step.form else ""): step for step in reversed(list(plan.list_steps()))
+        (step.kind, step.form.name if step.form else ""): step
+        for step in reversed(list(plan.list_steps()))
     }
     trial = steps["trial", ""]
     if phase in ("success", "failure"):
-        made = SyntheticTrial(plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest)
+        made = SyntheticTrial(
+            plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest
+        )
         entry = made.write(folder / "log.mcap")
         stage.tell(msgspec.structs.replace(entry, succeeded=phase == "success"))
     if phase == "repetition":
@@ -206,7 +237,9 @@ def set_phase(stage: Stage, experiment: Experiment, phase: str, clock: Clock, fo
             "sliders": ("questionnaire", "tlx"),
             "buttons": ("questionnaire", "trust"),
         }
-        stage.ask(steps[step.get(phase, ("trial", ""))], rest_s=30.0 if phase == "rest" else 0.0)
+        stage.ask(
+            steps[step.get(phase, ("trial", ""))], rest_s=30.0 if phase == "rest" else 0.0
+        )
 
 
 def watched_trial(experiment: Experiment) -> ExperimentTrial:
@@ -218,7 +251,11 @@ STAGED_VIEWS = {"participant": "as=m1", "experimenter": "", "watcher": "watch"}
 
 
 @pytest.mark.parametrize(
-    "phase", [pytest.param(phase, marks=() if phase == "sliders" else pytest.mark.long) for phase in PHASES]
+    "phase",
+    [
+        pytest.param(phase, marks=() if phase == "sliders" else pytest.mark.long)
+        for phase in PHASES
+    ],
 )
 def test_stage_between_trials_has_no_empty_frame(
     phase: str, experiment: Experiment, browser: Browser, tmp_path: Path
@@ -247,16 +284,22 @@ def test_stage_between_trials_has_no_empty_frame(
         pytest.param("corridor", marks=pytest.mark.long),
     ],
 )
-def test_stage_in_a_trial_draws_everything(task: str, browser: Browser, address: str, tmp_path: Path) -> None:
+def test_stage_in_a_trial_draws_everything(
+    task: str, browser: Browser, address: str, tmp_path: Path
+) -> None:
     text = {"reach": REACH, "apart": APART, "corridor": f"{REACH}\ncorridor_m = 0.03"}[task]
-    experiment = begin_experiment(write_protocol(tmp_path, '["m1", "m2"]', text), tmp_path / "out")
+    experiment = begin_experiment(
+        write_protocol(tmp_path, '["m1", "m2"]', text), tmp_path / "out"
+    )
     clock = ManualClock(1)
     stage = Stage(experiment.plan, clock)
     stage.ask(next(step for step in experiment.plan.list_steps() if step.kind == "trial"))
     trial = watched_trial(experiment)
     stage.begin(TrialWatch(trial, clock))
     (tmp_path / "log").mkdir()
-    session = record_views(Session.whole(trial.scenario, tmp_path / "log", ends={}), "m1", stage=stage)
+    session = record_views(
+        Session.whole(trial.scenario, tmp_path / "log", ends={}), "m1", stage=stage
+    )
     for role in ROLES:
         with session.watched(browser, address, role, "desktop", "light") as watched:
             optional = [*list_optional_fields(session, role), *OF_STAGED_PAGES]

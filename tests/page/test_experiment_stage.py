@@ -23,7 +23,11 @@ from trilat_net.execution.verify import verify
 from trilat_net.log.log_reader import open_log
 from trilat_net.net.clock import SystemClock
 from trilat_net.studies.experiment.experiment_analysis import analyse_experiment
-from trilat_net.studies.experiment.experiment_run import Experiment, begin_experiment, open_experiment
+from trilat_net.studies.experiment.experiment_run import (
+    Experiment,
+    begin_experiment,
+    open_experiment,
+)
 from trilat_net.studies.experiment.trial_run import ExperimentTrial, SyntheticTrial, TrialJudge
 
 from .people import NO_SESSION, Killed, People
@@ -43,7 +47,9 @@ feedback = ["completion_s"]
 @pytest.fixture
 def experiment(tmp_path: Path) -> Experiment:
     file = write_protocol(tmp_path, '["m1", "m2"]')
-    file.write_text(file.read_text(encoding="utf-8").replace("trials = 2\n", ASKS), encoding="utf-8")
+    file.write_text(
+        file.read_text(encoding="utf-8").replace("trials = 2\n", ASKS), encoding="utf-8"
+    )
     return begin_experiment(file, tmp_path / "out")
 
 
@@ -70,10 +76,13 @@ def assert_whole(experiment: Experiment) -> None:
     assert all(verify(open_log(experiment.folder / row["log"])).passed for row in rows)
     assert len(list((experiment.folder / "logs").iterdir())) == 2
     answers = [
-        (row["participant"], row["block"], row["item"]) for row in rows_of(experiment, "questionnaires.csv")
+        (row["participant"], row["block"], row["item"])
+        for row in rows_of(experiment, "questionnaires.csv")
     ]
     assert len(set(answers)) == len(answers) == 2 * (2 * 6 + 1)
-    assert [row["who"] for row in rows_of(experiment, "events.csv") if row["event"] == "consent"] == [
+    assert [
+        row["who"] for row in rows_of(experiment, "events.csv") if row["event"] == "consent"
+    ] == [
         "P1",
         "P2",
     ]
@@ -114,14 +123,18 @@ def killed_in(when: str, number: int) -> Any:
 
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.parametrize("when", ["the session", "its start"])
-def test_killed_program_goes_on_at_the_trial(when: str, number: int, experiment: Experiment) -> None:
+def test_killed_program_goes_on_at_the_trial(
+    when: str, number: int, experiment: Experiment
+) -> None:
     with pytest.raises(Killed):
         People(experiment).run(killed_in(when, number))
     again = People(open_experiment(experiment.folder))
     assert again.run()
     assert ("m1", "consent 1") not in again.steps
     assert_whole(experiment)
-    aborted = [row["text"] for row in rows_of(experiment, "events.csv") if row["event"] == "aborted"]
+    aborted = [
+        row["text"] for row in rows_of(experiment, "events.csv") if row["event"] == "aborted"
+    ]
     assert aborted == (["the program was ended"] if when == "the session" else [])
 
 
@@ -150,7 +163,9 @@ def test_full_disk_is_said_and_loses_nothing(experiment: Experiment) -> None:
         problems = ["recorder ended with code 5: No space left on device"]
         second = watch.trial.planned.number == 2
         return (
-            SessionResult(folder / "run.mcap", problems, exit_code=LogRefused.exit_code) if second else None
+            SessionResult(folder / "run.mcap", problems, exit_code=LogRefused.exit_code)
+            if second
+            else None
         )
 
     with pytest.raises(LogRefused, match="No space left"):
@@ -161,7 +176,9 @@ def test_full_disk_is_said_and_loses_nothing(experiment: Experiment) -> None:
 
 
 @pytest.mark.parametrize("step_ns", [-(10**13), 10**13])
-def test_wall_clock_that_steps_changes_only_times_of_notes(step_ns: int, experiment: Experiment) -> None:
+def test_wall_clock_that_steps_changes_only_times_of_notes(
+    step_ns: int, experiment: Experiment
+) -> None:
     people = People(experiment)
 
     def steps(watch: TrialWatch, _: Path) -> None:
@@ -247,7 +264,9 @@ def test_answers_are_those_of_the_scale(experiment: Experiment, stage: Stage) ->
     stage.poll(NO_SESSION, [("m1", 1), ("m2", 2)])
     for answers in ([], [40.0] * 5, [41.0] * 6, [105.0] * 6, [-5.0] * 6):
         assert not stage.take("m1", 1, DoStep(key=step.key, answers=answers))
-    assert stage.take("m1", 1, DoStep(key=step.key, answers=[0.0, 100.0, 5.0, 50.0, 60.0, 95.0]))
+    assert stage.take(
+        "m1", 1, DoStep(key=step.key, answers=[0.0, 100.0, 5.0, 50.0, 60.0, 95.0])
+    )
     assert asked.replies["m1"][0]["physical"] == 100.0
     assert stage.take("m2", 2, DoStep(key=step.key, answers=[0.0, None, 5.0, None, 60.0, 95.0]))
     assert asked.replies["m2"][0]["physical"] is None  # a slider that nobody touched
@@ -256,7 +275,10 @@ def test_answers_are_those_of_the_scale(experiment: Experiment, stage: Stage) ->
 def test_users_are_not_told_the_condition(experiment: Experiment, stage: Stage) -> None:
     stage.ask(first_trial(experiment))
     stage.poll(NO_SESSION, [("m1", 1)])
-    shown = {who: stage.describe(who, site, 1, None) for who, site in (("user", "m1"), ("experimenter", ""))}
+    shown = {
+        who: stage.describe(who, site, 1, None)
+        for who, site in (("user", "m1"), ("experimenter", ""))
+    }
     assert "near" not in str(shown["user"])
     assert shown["experimenter"]["condition"] == "near"
     assert [one["state"] for one in shown["user"]["users"]] == ["here", ""]
@@ -279,11 +301,17 @@ def view_of(trial: ExperimentTrial, log: Any, last: int, mode: str = "run") -> A
     return SimpleNamespace(running=True, sites={"s": site})
 
 
-def test_each_user_is_shown_its_own_target_and_the_corridor(tmp_path: Path, clock: ManualClock) -> None:
+def test_each_user_is_shown_its_own_target_and_the_corridor(
+    tmp_path: Path, clock: ManualClock
+) -> None:
     def shown(task: str, site: str) -> Any:
         (folder := tmp_path / task[-3:] / (site or "-")).mkdir(parents=True)
-        plan = begin_experiment(write_protocol(folder, '["m1", "m2"]', task), folder / "out").plan
-        trial = ExperimentTrial(plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest)
+        plan = begin_experiment(
+            write_protocol(folder, '["m1", "m2"]', task), folder / "out"
+        ).plan
+        trial = ExperimentTrial(
+            plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest
+        )
         return TrialWatch(trial, clock).describe(trial.appears_s + 0.5, site)
 
     first, second, middle = (shown(APART, site)["target"]["at"] for site in ("m1", "m2", ""))
@@ -316,7 +344,9 @@ def test_arm_that_is_stopped_ends_the_trial(watched: Any, clock: ManualClock) ->
     assert watch.over
 
 
-def test_page_that_stays_away_ends_the_trial(experiment: Experiment, stage: Stage, watched: Any) -> None:
+def test_page_that_stays_away_ends_the_trial(
+    experiment: Experiment, stage: Stage, watched: Any
+) -> None:
     trial, _, log = watched
     clock = stage._clock
     stage.ask(first_trial(experiment))
@@ -324,7 +354,12 @@ def test_page_that_stays_away_ends_the_trial(experiment: Experiment, stage: Stag
     stage.poll(NO_SESSION, both)
     watch = TrialWatch(trial, clock)
     stage.begin(watch)
-    for pages, passed_ns in ((both, 0), (both[:1], AWAY_NS // 2), ([("m1", 1), ("m2", 3)], 1), (both[:1], 1)):
+    for pages, passed_ns in (
+        (both, 0),
+        (both[:1], AWAY_NS // 2),
+        ([("m1", 1), ("m2", 3)], 1),
+        (both[:1], 1),
+    ):
         clock.sleep_until(clock.monotonic_ns() + passed_ns)
         stage.poll(view_of(trial, log, 5), pages)
         assert not watch.aborted  # a page that was reloaded is back in time

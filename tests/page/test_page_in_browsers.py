@@ -29,7 +29,10 @@ def grave_findings(page: Page) -> list[str]:
     page.evaluate(AXE.read_text(encoding="utf-8"))
     found: list[dict[str, Any]] = page.evaluate("axe.run().then((found) => found.violations)")
     grave = [one for one in found if one["impact"] in ("serious", "critical")]
-    return [f"{one['id']}: {one['nodes'][0]['html']}: {one['nodes'][0]['failureSummary']}" for one in grave]
+    return [
+        f"{one['id']}: {one['nodes'][0]['html']}: {one['nodes'][0]['failureSummary']}"
+        for one in grave
+    ]
 
 
 @pytest.mark.parametrize("role", ROLES)
@@ -47,7 +50,13 @@ def test_axe_finds_nothing_serious(
 def raise_alarm(site: str, **changed: str) -> dict[str, str]:
     """What a page is told of an arm that was stopped."""
     assert site in ("m1", "m2", "s")
-    return {"word": "STOPPED", "reason": "ordered to stop", "advice": "", "order": "enable", **changed}
+    return {
+        "word": "STOPPED",
+        "reason": "ordered to stop",
+        "advice": "",
+        "order": "enable",
+        **changed,
+    }
 
 
 @pytest.mark.parametrize("screen", SCREENS)
@@ -62,7 +71,9 @@ def test_axe_finds_nothing_serious_in_what_is_raised(
     }
     ended = {"ended": True, "results": ["/x/report.html", "/x/run.mcap"], "asked": [2]}
     for scheme in SCHEMES:
-        with session.shown(browser, address, "experimenter", screen, scheme, sites=sites, asked=[2]) as page:
+        with session.shown(
+            browser, address, "experimenter", screen, scheme, sites=sites, asked=[2]
+        ) as page:
             assert "m1, m2, s STOPPED" in page.inner_text("#alarms .raised")
             assert page.inner_text("#alarms button") == "Enable"
             assert page.inner_text("#state") == "m1, m2, s STOPPED"
@@ -78,13 +89,19 @@ def test_alarms_of_one_reason_are_raised_together(
     alarms = {
         "m1": raise_alarm("m1"),
         "m2": raise_alarm(
-            "m2", word="HOLD", reason="s is silent", advice="it goes on once it is heard", order=""
+            "m2",
+            word="HOLD",
+            reason="s is silent",
+            advice="it goes on once it is heard",
+            order="",
         ),
         "s": raise_alarm("s"),
     }
     newest = session.frames["experimenter"][-1]["sites"]
     sites = {name: {**newest[name], "alarm": alarm} for name, alarm in alarms.items()}
-    with session.shown(browser, address, "experimenter", "desktop", "light", sites=sites) as page:
+    with session.shown(
+        browser, address, "experimenter", "desktop", "light", sites=sites
+    ) as page:
         raised = [one.inner_text().split("\n") for one in page.locator("#alarms .raised").all()]
         assert raised == [
             ["m1, s STOPPED", "ordered to stop", "Enable"],
@@ -93,7 +110,9 @@ def test_alarms_of_one_reason_are_raised_together(
         assert page.inner_text("#state") == "2 alarms"
 
 
-def test_arms_have_half_of_the_window(session: RecordedSession, address: str, browser: Browser) -> None:
+def test_arms_have_half_of_the_window(
+    session: RecordedSession, address: str, browser: Browser
+) -> None:
     for role in ROLES:
         with session.shown(browser, address, role, "desktop", "light") as page:
             box = page.locator("#arms").bounding_box()
@@ -143,7 +162,9 @@ def test_keys_lead_an_arm_wherever_one_has_clicked(
         assert page.evaluate(HELD) == []
 
 
-def test_a_page_that_is_cut_off_says_so(session: RecordedSession, address: str, browser: Browser) -> None:
+def test_a_page_that_is_cut_off_says_so(
+    session: RecordedSession, address: str, browser: Browser
+) -> None:
     """It calls no arm silent for its own lag, and its buttons are off."""
     with session.shown(browser, address, "experimenter", "desktop", "light") as page:
         session.cut = True

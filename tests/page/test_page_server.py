@@ -60,7 +60,9 @@ def hears(client: ClientConnection) -> dict[str, object]:
 
 
 def raw(server: PageServer, request: bytes) -> bytes:
-    with create_connection((urlsplit(server.address).hostname, urlsplit(server.address).port), 5) as there:
+    with create_connection(
+        (urlsplit(server.address).hostname, urlsplit(server.address).port), 5
+    ) as there:
         there.sendall(request)
         if b"\r\n\r\n" not in request:
             there.shutdown(SHUT_WR)
@@ -133,7 +135,14 @@ def test_every_socket_needs_the_token_of_its_link(host: str, network: LocalNetwo
     with PageServer(network.join(), SystemClock(), "s1", PageOptions(host=host)) as server:
         token = urlsplit(server.address).fragment
         assert len(token) > len("token=") + 20
-        for query in ("", "?token=", "?token=guess", f"?{token}x", "?token=%C3%A9", f"?as=m1&{token}x"):
+        for query in (
+            "",
+            "?token=",
+            "?token=guess",
+            f"?{token}x",
+            "?token=%C3%A9",
+            f"?as=m1&{token}x",
+        ):
             assert get(server, f"/socket{query}")[0] == 403
         for query in ("?watch", "?as=m1"):
             assert get(server, f"/socket{query}")[0] == 403
@@ -143,7 +152,9 @@ def test_every_socket_needs_the_token_of_its_link(host: str, network: LocalNetwo
         assert get(server, "/")[0] == 200  # what everybody may read; a fragment is not sent
 
 
-def test_page_by_keys_is_encrypted_and_its_links_say_so(network: LocalNetwork, tmp_path: Path) -> None:
+def test_page_by_keys_is_encrypted_and_its_links_say_so(
+    network: LocalNetwork, tmp_path: Path
+) -> None:
     """Page and socket, by the certificate of a member; beyond loopback nobody need say insecure."""
     (keys,) = create_keys(tmp_path / "keys", ["operator"])
     options = PageOptions(host="0.0.0.0", tls=keys)
@@ -158,7 +169,10 @@ def test_page_by_keys_is_encrypted_and_its_links_say_so(network: LocalNetwork, t
         wss = at.replace("https", "wss") + f"socket?{token}"
         with connect(wss, ssl=trusted, origin=Origin(at.rstrip("/"))) as client:
             assert "hello" in hears(client)
-        with pytest.raises(InvalidStatus, match="403"), connect(wss, ssl=trusted, origin=Origin("http://a")):
+        with (
+            pytest.raises(InvalidStatus, match="403"),
+            connect(wss, ssl=trusted, origin=Origin("http://a")),
+        ):
             pass
         with pytest.raises(ssl.SSLCertVerificationError):
             HTTPSConnection(urlsplit(at).netloc, context=ssl.create_default_context()).connect()
@@ -201,7 +215,9 @@ def test_nonsense_is_counted_and_dropped(server: PageServer, text: str, reason: 
 
 
 @pytest.mark.long
-def test_ten_megabytes_and_a_hundred_thousand_messages_end_the_connection(server: PageServer) -> None:
+def test_ten_megabytes_and_a_hundred_thousand_messages_end_the_connection(
+    server: PageServer,
+) -> None:
     with socket(server) as page:
         page.send("x" * (10 << 20))
         with pytest.raises(ConnectionClosed) as closed:
@@ -302,7 +318,9 @@ def test_a_socket_that_breaks_the_protocol_is_counted(server: PageServer) -> Non
     with socket(server) as page:
         page.socket.sendall(b"\xff" * 64)
         until(lambda: server.refused["broken frames"] == 1)
-    request = f"GET /socket?{urlsplit(server.address).fragment} HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    request = (
+        f"GET /socket?{urlsplit(server.address).fragment} HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    )
     assert raw(server, request.encode()).startswith(b"HTTP/1.1 426 ")
     assert server.refused["malformed request"] == 1
 
@@ -318,7 +336,11 @@ def test_marks_hands_and_control_have_rates_letting_go_has_none(server: PageServ
     with socket(server) as page:
         for _ in range(450):
             page.send('{"do":"hand","site":"m1","grip":true,"to":[1.0,0.5]}')
-        until(lambda: server.refused["nobody can hold it"] + server.refused["too many: hand"] == 450)
+        until(
+            lambda: (
+                server.refused["nobody can hold it"] + server.refused["too many: hand"] == 450
+            )
+        )
         refused = server.refused["nobody can hold it"]
         page.send('{"do":"hand","site":"m1","grip":false}')
         until(lambda: server.refused["nobody can hold it"] == refused + 1)
@@ -336,7 +358,9 @@ def test_any_page_stops_every_arm_past_what_waits_for_answer(
         until(changes.poll)  # nobody answers
         second.send('{"do":"stop"}')
         query = until(stops.poll)
-        assert decode(query.payload, ChangeRequest) == ChangeRequest(order="stop", source="the experimenter")
+        assert decode(query.payload, ChangeRequest) == ChangeRequest(
+            order="stop", source="the experimenter"
+        )
         second.send('{"do":"shares","site":"s","to":{"m1":1.0}}')
         until(lambda: server.refused["does not take part"] == 1)
 
@@ -357,7 +381,8 @@ def test_an_experimenter_releases_arms_and_a_stop_takes_that_back(
         page.send('{"do":"stop"}')
         until(stops.poll)
         query.answer(encode(ChangeReply(member="s", accepted=True, text="s: enable at tick 5")))
-        page.send('{"do":"link","link":"m1->s","to":{"delay_ms":1}}')  # is asked after whatever waits
+        # is asked after whatever waits
+        page.send('{"do":"link","link":"m1->s","to":{"delay_ms":1}}')
         query = until(changes.poll)
         assert decode(query.payload, ChangeRequest).link == "m1->s"
         page.send('{"do":"release","order":"enable","sites":["s","unknown"]}')
@@ -385,7 +410,10 @@ def test_a_stop_that_an_older_site_refuses_is_ordered_again(
 def test_what_fails_inside_is_counted_said_and_over(capfd: pytest.CaptureFixture[str]) -> None:
     """Names that Zenoh takes for expressions: no session has them, and the bus refuses them."""
     said: list[str] = []
-    with closing(ZenohBus()) as bus, PageServer(bus, SystemClock(), "s1", say=said.append) as server:
+    with (
+        closing(ZenohBus()) as bus,
+        PageServer(bus, SystemClock(), "s1", say=said.append) as server,
+    ):
         server.view.sites, server.view.links = {"a#b": None}, {"m1->a#b": {}}  # type: ignore[dict-item]
         with socket(server) as page:
             for _ in range(3):
@@ -447,17 +475,23 @@ def told_links(server: PageServer, said: list[str]) -> dict[str, str]:
     return dict(line.split(": ", 1) for line in said)
 
 
-@pytest.fixture(params=[PageOptions(), PageOptions(host="0.0.0.0", insecure=True)], ids=["open", "tokens"])
+@pytest.fixture(
+    params=[PageOptions(), PageOptions(host="0.0.0.0", insecure=True)], ids=["open", "tokens"]
+)
 def roles(
     network: LocalNetwork, request: pytest.FixtureRequest
 ) -> Iterator[tuple[PageServer, dict[str, str]]]:
     said: list[str] = []
     options: PageOptions = request.param
-    with PageServer(network.join(), SystemClock(), "s1", options, ends=True, say=said.append) as made:
+    with PageServer(
+        network.join(), SystemClock(), "s1", options, ends=True, say=said.append
+    ) as made:
         yield made, told_links(made, said)
 
 
-def test_each_role_has_a_link_that_says_who_it_is(roles: tuple[PageServer, dict[str, str]]) -> None:
+def test_each_role_has_a_link_that_says_who_it_is(
+    roles: tuple[PageServer, dict[str, str]],
+) -> None:
     server, links = roles
     assert list(links) == ["experimenter", "user m1", "user m2", "watcher"]
     seen = {}
@@ -479,7 +513,9 @@ def test_users_and_watchers_give_no_orders_but_stop(
     roles: tuple[PageServer, dict[str, str]], who: str, network: LocalNetwork
 ) -> None:
     server, links = roles
-    stops, changes = (network.join().questions(f"trilat/s1/s/{kind}") for kind in ("stop", "set"))
+    stops, changes = (
+        network.join().questions(f"trilat/s1/s/{kind}") for kind in ("stop", "set")
+    )
     with socket(server, link=links[who]) as page:
         server.view.sites, server.view.links = {"s": None}, {"m1->s": {}}  # type: ignore[dict-item]
         for order in ORDERS:
@@ -493,7 +529,9 @@ def test_users_and_watchers_give_no_orders_but_stop(
         page.send('{"do":"stop"}')
         query = until(stops.poll)
         source = "the user of m1" if who == "user m1" else "a watcher"
-        assert decode(query.payload, ChangeRequest) == ChangeRequest(order="stop", source=source)
+        assert decode(query.payload, ChangeRequest) == ChangeRequest(
+            order="stop", source=source
+        )
     assert changes.poll() is None
     assert not server.end_requested.is_set()
 
@@ -501,7 +539,9 @@ def test_users_and_watchers_give_no_orders_but_stop(
 def test_a_users_token_opens_no_other_view() -> None:
     said: list[str] = []
     guarded = PageOptions(host="0.0.0.0", insecure=True)
-    with PageServer(LocalNetwork().join(), SystemClock(), "s1", guarded, say=said.append) as server:
+    with PageServer(
+        LocalNetwork().join(), SystemClock(), "s1", guarded, say=said.append
+    ) as server:
         links = told_links(server, said)
         token = urlsplit(links["user m1"]).fragment
         for query in ("", "?as=m2", "?as=s", "?as=", "?watch", "?watch&as=m2"):
@@ -516,7 +556,10 @@ def test_a_users_token_opens_no_other_view() -> None:
 def test_users_take_part_beside_experimenters(network: LocalNetwork) -> None:
     """Nobody asks a user, and a user asks nobody."""
     with PageServer(network.join(), SystemClock(), "s1") as server:
-        with socket(server, link=with_query(server.address, "as=m1")) as user, socket(server) as page:
+        with (
+            socket(server, link=with_query(server.address, "as=m1")) as user,
+            socket(server) as page,
+        ):
             hears(user), hears(page)
             until(lambda: len(server._pages) == 2)
             taking = {one.role.kind: one.takes_part for one in server._pages}
@@ -560,7 +603,10 @@ def test_report_and_log_are_the_experimenters_alone(
 def test_watchers_take_no_places_of_others(network: LocalNetwork) -> None:
     """Whoever has the watchers' link takes all places of watchers, and locks nobody else out."""
     said: list[str] = []
-    with PageServer(network.join(), SystemClock(), "s1", say=said.append) as server, ExitStack() as stack:
+    with (
+        PageServer(network.join(), SystemClock(), "s1", say=said.append) as server,
+        ExitStack() as stack,
+    ):
         links = told_links(server, said)
         for _ in range(MOST_PAGES["watcher"]):
             hears(stack.enter_context(socket(server, link=links["watcher"])))
@@ -576,7 +622,10 @@ def test_watchers_take_no_places_of_others(network: LocalNetwork) -> None:
 def test_newest_page_of_experimenter_or_user_gets_in(who: str, network: LocalNetwork) -> None:
     """Pages that were left open elsewhere give way, the one that takes part last."""
     said: list[str] = []
-    with PageServer(network.join(), SystemClock(), "s1", say=said.append) as server, ExitStack() as stack:
+    with (
+        PageServer(network.join(), SystemClock(), "s1", say=said.append) as server,
+        ExitStack() as stack,
+    ):
         links = told_links(server, said)
         kind = who.split()[0]
         pages = []
@@ -585,7 +634,8 @@ def test_newest_page_of_experimenter_or_user_gets_in(who: str, network: LocalNet
             assert "hello" in hears(pages[-1])
         other = stack.enter_context(socket(server, link=links["user m2"]))
         assert "hello" in hears(other)
-        oldest = pages[1] if kind == "experimenter" else pages[0]  # the first experimenter takes part
+        # the first experimenter takes part
+        oldest = pages[1] if kind == "experimenter" else pages[0]
         with pytest.raises(ConnectionClosed) as closed:
             until(lambda: hears(oldest) and False)
         assert closed.value.rcvd is not None
@@ -618,7 +668,9 @@ def test_silent_connections_are_closed(server: PageServer) -> None:
         assert silent.recv(100) == b""
 
 
-def test_silent_connections_to_encrypted_page_are_closed(network: LocalNetwork, tmp_path: Path) -> None:
+def test_silent_connections_to_encrypted_page_are_closed(
+    network: LocalNetwork, tmp_path: Path
+) -> None:
     (keys,) = create_keys(tmp_path / "keys", ["operator"])
     with PageServer(network.join(), SystemClock(), "s1", PageOptions(tls=keys)) as server:
         at = urlsplit(server.address)
@@ -626,7 +678,9 @@ def test_silent_connections_to_encrypted_page_are_closed(network: LocalNetwork, 
             assert silent.recv(100) == b""
 
 
-def test_browser_is_opened_by_a_file_of_the_user(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_browser_is_opened_by_a_file_of_the_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The token stands in no command line, which every user of the machine can list."""
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", opened.append)

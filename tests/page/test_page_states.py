@@ -63,7 +63,9 @@ def test_experimenter_who_watches_takes_part_first(
     session: RecordedSession, address: str, browser: Browser
 ) -> None:
     sites = alarmed(session, "experimenter", "stopped")
-    shown = session.shown(browser, address, "experimenter", "phone", "light", sites=sites, takes_part=False)
+    shown = session.shown(
+        browser, address, "experimenter", "phone", "light", sites=sites, takes_part=False
+    )
     with shown as page:
         until(lambda: page.inner_text("#alarms button") == "Take part")
         page.click("#alarms button")
@@ -127,10 +129,14 @@ def test_after_the_end_nothing_is_red_and_nothing_stops(
     """Whatever the last records say: sites hold for their peers, which ended a moment before them."""
     held = alarmed(session, role, "hold")
     sites = {
-        name: {**site, "ended": True, "clamped": True, "silent_s": 0.0} if "mode" in site else site
+        name: {**site, "ended": True, "clamped": True, "silent_s": 0.0}
+        if "mode" in site
+        else site
         for name, site in held.items()
     }
-    with session.shown(browser, address, role, screen, "light", sites=sites, ended=True) as page:
+    with session.shown(
+        browser, address, role, screen, "light", sites=sites, ended=True
+    ) as page:
         until(lambda: page.inner_text("#state") == "ended")
         until(lambda: page.locator(".arm .chip").all_inner_texts() == ["ended"] * 3)
         assert page.locator(".chip.bad:visible, .arm.alarm, .raised").count() == 0
@@ -147,12 +153,16 @@ def test_a_site_that_is_silent_alone_says_for_how_long(
 ) -> None:
     newest = session.frames["experimenter"][-1]["sites"]
     sites = {**newest, "m2": {**newest["m2"], "silent_s": 4.2}}
-    with session.shown(browser, address, "experimenter", "desktop", "light", sites=sites) as page:
+    with session.shown(
+        browser, address, "experimenter", "desktop", "light", sites=sites
+    ) as page:
         until(lambda: page.inner_text("#state") == "m2 silent")
         assert "SILENT 4 s" in page.locator(".arm").nth(1).inner_text()
 
 
-def test_orders_are_listed_as_sentences(session: RecordedSession, address: str, browser: Browser) -> None:
+def test_orders_are_listed_as_sentences(
+    session: RecordedSession, address: str, browser: Browser
+) -> None:
     text = "m2 was stopped by the experimenter at 58.2 s"
     event = {"t": 58.2, "member": "m2", "kind": "change", "text": text}
     with session.shown(browser, address, "experimenter", "desktop", "light") as page:

@@ -49,10 +49,19 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Json]:
 
 
 @contextmanager
-def form_page(browser: Browser, address: str, stage: Json, screen: str) -> Iterator[tuple[Page, list[Json]]]:
+def form_page(
+    browser: Browser, address: str, stage: Json, screen: str
+) -> Iterator[tuple[Page, list[Json]]]:
     """A user's page that is asked a questionnaire, and the messages that it sends besides `seen`."""
     sent: list[Json] = []
-    hello = {"running": False, "session": "t", "here": [], "missing": [], "role": "user", "as": "m1"}
+    hello = {
+        "running": False,
+        "session": "t",
+        "here": [],
+        "missing": [],
+        "role": "user",
+        "as": "m1",
+    }
 
     def attend(route: WebSocketRoute) -> None:
         def answer(message: Any) -> None:
@@ -121,7 +130,9 @@ def test_choices_that_nobody_makes_are_missing(
         assert sent[0]["answers"] == [None, 7]
 
 
-def test_a_forced_choice_waits_for_its_answer(address: str, browser: Browser, asked: dict[str, Json]) -> None:
+def test_a_forced_choice_waits_for_its_answer(
+    address: str, browser: Browser, asked: dict[str, Json]
+) -> None:
     stage = {**asked["trust"], "form": {**asked["trust"]["form"], "forced": True}}
     with form_page(browser, address, stage, "desktop") as (page, sent):
         assert page.is_disabled("#sheet button.main")
@@ -136,7 +147,10 @@ def test_a_forced_choice_waits_for_its_answer(address: str, browser: Browser, as
 def trial(tmp_path_factory: pytest.TempPathFactory) -> RecordedSession:
     """A session as a user's page is shown it in a trial."""
     session = record_session(tmp_path_factory.mktemp("trial"), 3.0)
-    users = [{"site": site, "who": who, "state": "done"} for site, who in (("m1", "P1"), ("m2", "P2"))]
+    users = [
+        {"site": site, "who": who, "state": "done"}
+        for site, who in (("m1", "P1"), ("m2", "P2"))
+    ]
     shown = {"phase": "trial", "title": "A trial", "told": {}, "key": "trial 1", "users": users}
     place = {"trial": 1, "trials": 2, "block": 1, "blocks": 1, "practice": False}
     at = session.frames["user"][-1]["sites"]["s"]["points"][-1]

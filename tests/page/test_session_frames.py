@@ -22,11 +22,19 @@ from trilat_net.scenario import load_scenario
 
 FRAME_NS = 33_333_333
 KNOWN_OF_PEERS = {"points", "q", "tick", "bodies", "age_ms"}
-JITTER = {"model": "gamma", "delay_ms": 260.0, "deviation_ms": 50.0, "loss": 0.3, "loss_burst": 4.0}
+JITTER = {
+    "model": "gamma",
+    "delay_ms": 260.0,
+    "deviation_ms": 50.0,
+    "loss": 0.3,
+    "loss_burst": 4.0,
+}
 Frames = list[dict[str, Any]]
 
 
-def looking(frames: Frames, site: str, *, ages: bool = True) -> Callable[[Bus, RelayClock], None]:
+def looking(
+    frames: Frames, site: str, *, ages: bool = True
+) -> Callable[[Bus, RelayClock], None]:
     """A page's server without sockets, which keeps what it would show as a site."""
 
     def look(bus: Bus, clock: RelayClock) -> None:
@@ -53,7 +61,12 @@ def drawn(log: Log, site: str, tick: int) -> list[Any]:
     [
         ("paper", "m1", ("m2", "s"), {"link.delay_ms": 300}),
         ("paper", "s", ("m1", "m2"), {"link.delay_ms": 300}),
-        ("two_sites", "m", ("s",), {"link.model": "gamma", "link.deviation_ms": 80, "link.loss": 0.3}),
+        (
+            "two_sites",
+            "m",
+            ("s",),
+            {"link.model": "gamma", "link.deviation_ms": 80, "link.loss": 0.3},
+        ),
         ("paper", "m1", ("m2", "s"), {"link.delay_ms": 50, "sites.m1.view.delay_ms": 300}),
         ("two_sites", "m", ("s",), {"sites.m.view": JITTER, "sites.s.rate_hz": 400}),
     ],
@@ -104,7 +117,9 @@ def test_a_user_is_shown_how_its_law_pulls(tmp_path: Path) -> None:
 
 def test_a_peer_stays_until_its_missing_record_has_come(tmp_path: Path) -> None:
     """Never a newer one, and the one in use again once it can be had."""
-    session = Session.whole(load_scenario("two_sites", {"duration_s": 3.0, "link.delay_ms": 20}), tmp_path)
+    session = Session.whole(
+        load_scenario("two_sites", {"duration_s": 3.0, "link.delay_ms": 20}), tmp_path
+    )
     session.lose("m", f"trilat/{SESSION}/s/state", 2_500_000_000, 3_000_000_000)
     frames: Frames = []
     session.stranger(looking(frames, "m"))
@@ -149,7 +164,9 @@ def test_bodies_of_a_peer_are_as_old_as_its_arm(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("view", [{}, {"sites.m1.view": JITTER}], ids=["in use", "picture"])
-def test_pages_terminals_and_programs_know_the_same(view: dict[str, Any], tmp_path: Path) -> None:
+def test_pages_terminals_and_programs_know_the_same(
+    view: dict[str, Any], tmp_path: Path
+) -> None:
     """A page as m1 beside `trilat watch --as m1` and `states(as_site="m1")`, at the same moments."""
     keys = {"duration_s": 1.5, "rate_hz": 500, "link.delay_ms": 150, "link.loss": 0.2, **view}
     session = Session.whole(load_scenario("paper", keys), tmp_path)

@@ -34,7 +34,9 @@ FAULTS = {
     "<figure><figcaption>torques</figcaption><div></div></figure>": "nothing is drawn in figure (torques)",
     "<div data-section='delays'>.</div>": "nothing is drawn in div",
     "<table aria-label='loops'><tr><th>site</th></tr></table>": "nothing is drawn in table (loops)",
-    CHART.format(library="LIBRARY", values="[null, null, null]", points="false"): "line 2 (b) of",
+    CHART.format(
+        library="LIBRARY", values="[null, null, null]", points="false"
+    ): "line 2 (b) of",
     CHART.format(library="LIBRARY", values="[1, null, 3]", points="false"): "line 2 (b) of",
     CHART.format(library="LIBRARY", values="[7, 8, 9]", points="false"): "line 2 (b) of",
     PARSED: "a script reads charts[].points, which nobody has sent",
@@ -45,7 +47,9 @@ WHOLE = {
     "canvas": PAINTED,
     "shapes": "<svg width='50' height='50'><polyline points='1,1 9,9' stroke='red'/></svg>",
     "chart": CHART.format(library="LIBRARY", values="[2, 2, 2]", points="false"),
-    "lines over each other": CHART.format(library="LIBRARY", values="[1, 2, 3]", points="false"),
+    "lines over each other": CHART.format(
+        library="LIBRARY", values="[1, 2, 3]", points="false"
+    ),
     "points": CHART.format(library="LIBRARY", values="[1, null, 3]", points="true"),
     "hidden": "<canvas hidden></canvas><figure style='display: none'></figure>",
     "field with a question": PARSED.replace("chart.points", '"points" in chart'),
@@ -64,7 +68,9 @@ def find_faults(browser: Browser, body: str, folder: Path) -> list[str]:
     """Returns what is wrong with a page of a body."""
     file = folder / "page.html"
     html = f"<!DOCTYPE html><meta charset=utf-8>{body}"
-    file.write_text(html.replace("LIBRARY", LIBRARY.read_text(encoding="utf-8")), encoding="utf-8")
+    file.write_text(
+        html.replace("LIBRARY", LIBRARY.read_text(encoding="utf-8")), encoding="utf-8"
+    )
     with watched_page(browser) as watched:
         watched.page.goto(file.as_uri())
         faults = watched.find_faults()

@@ -29,9 +29,13 @@ class WatchedPage:
         self.errors: list[str] = []
         context.add_init_script(path=OBSERVER)
         self.page = context.new_page()
-        self.page.on("pageerror", lambda error: self.errors.append(f"uncaught: {error.stack or error}"))
+        self.page.on(
+            "pageerror", lambda error: self.errors.append(f"uncaught: {error.stack or error}")
+        )
         self.page.on("console", self._take_message)
-        self.page.on("requestfailed", lambda request: self.errors.append(f"not loaded: {request.url}"))
+        self.page.on(
+            "requestfailed", lambda request: self.errors.append(f"not loaded: {request.url}")
+        )
 
     def _take_message(self, message: Any) -> None:
         if message.type in ("error", "assert"):

@@ -18,8 +18,20 @@ from typing import Any
 PLUGINS = Path(__file__).parents[2] / "plugins"
 _BOTH = ["is_connected", "connect", "is_calibrated", "calibrate", "configure", "disconnect"]
 ABSTRACT = {
-    "Robot": [*_BOTH, "action_features", "observation_features", "get_observation", "send_action"],
-    "Teleoperator": [*_BOTH, "action_features", "feedback_features", "get_action", "send_feedback"],
+    "Robot": [
+        *_BOTH,
+        "action_features",
+        "observation_features",
+        "get_observation",
+        "send_action",
+    ],
+    "Teleoperator": [
+        *_BOTH,
+        "action_features",
+        "feedback_features",
+        "get_action",
+        "send_feedback",
+    ],
 }
 
 
@@ -59,10 +71,14 @@ def _device(name: str) -> type:
 
 
 def _modules() -> dict[str, ModuleType]:
-    made = {name: ModuleType(name) for name in ("lerobot", "lerobot.utils", "lerobot.utils.errors")}
+    made = {
+        name: ModuleType(name) for name in ("lerobot", "lerobot.utils", "lerobot.utils.errors")
+    }
     for room, name in (("robots", "Robot"), ("teleoperators", "Teleoperator")):
         made[f"lerobot.{room}"] = ModuleType(f"lerobot.{room}")
-        made[f"lerobot.{room}"].__dict__.update({name: _device(name), f"{name}Config": _config()})
+        made[f"lerobot.{room}"].__dict__.update(
+            {name: _device(name), f"{name}Config": _config()}
+        )
     made["lerobot.teleoperators.utils"] = ModuleType("lerobot.teleoperators.utils")
     made["lerobot.teleoperators.utils"].__dict__["TeleopEvents"] = TeleopEvents
     for error in ("DeviceNotConnectedError", "DeviceAlreadyConnectedError"):
@@ -84,11 +100,15 @@ def plugins() -> Iterator[dict[str, ModuleType]]:
         yield {name: importlib.import_module(name) for name in names}
     finally:
         del sys.path[: len(names)]
-        for name in [one for one in sys.modules if one not in before and one.startswith("lerobot")]:
+        for name in [
+            one for one in sys.modules if one not in before and one.startswith("lerobot")
+        ]:
             del sys.modules[name]
 
 
 def make_device(config: Any) -> Any:
     """Makes a device as LeRobot does: of its configuration's module, by its name without `Config`."""
     kind = type(config)
-    return getattr(importlib.import_module(kind.__module__), kind.__name__.removesuffix("Config"))(config)
+    return getattr(
+        importlib.import_module(kind.__module__), kind.__name__.removesuffix("Config")
+    )(config)

@@ -30,7 +30,9 @@ def found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str,
         yield modules
 
 
-def test_a_plugin_is_found_by_the_name_of_its_distribution(found: dict[str, ModuleType]) -> None:
+def test_a_plugin_is_found_by_the_name_of_its_distribution(
+    found: dict[str, ModuleType],
+) -> None:
     """LeRobot imports the module of that name, which registers its configuration."""
     assert sorted(found) == [ROBOT, TELEOPERATOR]
     for name, module in found.items():
@@ -43,19 +45,32 @@ def test_a_plugin_is_found_by_the_name_of_its_distribution(found: dict[str, Modu
 
 def test_plugins_import_the_interface_alone() -> None:
     for path in PLUGINS.rglob("*.py"):
-        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if "trilat_net" in line]
-        assert [line for line in lines if line.startswith(("import", "from"))] == ["import trilat_net as tn"]
+        lines = [
+            line
+            for line in path.read_text(encoding="utf-8").splitlines()
+            if "trilat_net" in line
+        ]
+        assert [line for line in lines if line.startswith(("import", "from"))] == [
+            "import trilat_net as tn"
+        ]
 
 
-def test_features_follow_from_the_scenario_before_any_connection(found: dict[str, ModuleType]) -> None:
+def test_features_follow_from_the_scenario_before_any_connection(
+    found: dict[str, ModuleType],
+) -> None:
     robot = make_device(found[ROBOT].TrilatRobotConfig())
     joints = [
-        f"{site}.{q}.{what}" for site in ("s", "m2") for what in ("pos", "vel", "tau_x") for q in ("q1", "q2")
+        f"{site}.{q}.{what}"
+        for site in ("s", "m2")
+        for what in ("pos", "vel", "tau_x")
+        for q in ("q1", "q2")
     ]
     assert list(robot.observation_features) == [*joints, "x.pos", "y.pos", "x.felt", "y.felt"]
     assert robot.action_features == {"x.pos": float, "y.pos": float}
     teleoperator = make_device(found[TELEOPERATOR].TrilatTeleoperatorConfig())
-    assert teleoperator.action_features == teleoperator.feedback_features == robot.action_features
+    assert (
+        teleoperator.action_features == teleoperator.feedback_features == robot.action_features
+    )
     assert not robot.is_connected
     with pytest.raises(ConnectionError, match="not connected"):
         robot.get_observation()
@@ -74,7 +89,9 @@ def test_a_dataset_has_the_actions_that_the_plugin_accepts(
     hands = {f"sites.{site}.hands": [{"kind": "live", "mode": mode}], "duration_s": 0.1}
     scenario = load_scenario(str(SPACE) if space else "play", hands)
     (tmp_path / "held.toml").write_text(scenario.text, encoding="utf-8")
-    config = found[ROBOT].TrilatRobotConfig(scenario=str(tmp_path / "held.toml"), site=site, slave=slave)
+    config = found[ROBOT].TrilatRobotConfig(
+        scenario=str(tmp_path / "held.toml"), site=site, slave=slave
+    )
     features = make_device(config).action_features
     log = trilat_net.simulate(scenario)
     trilat_net.export(log, "lerobot", tmp_path / "set", actions=actions, fps=100)
@@ -91,7 +108,9 @@ def test_a_dataset_has_the_actions_that_the_plugin_accepts(
 
 
 @pytest.mark.parametrize("config", ["TrilatRobotConfig", "TrilatTeleoperatorConfig"])
-def test_an_arm_that_nobody_can_hold_is_refused(config: str, found: dict[str, ModuleType]) -> None:
+def test_an_arm_that_nobody_can_hold_is_refused(
+    config: str, found: dict[str, ModuleType]
+) -> None:
     module = found[ROBOT if "Robot" in config else TELEOPERATOR]
     with pytest.raises(ValueError, match="no operator of kind 'live' at m1"):
         make_device(getattr(module, config)(session="paper", site="m1"))
@@ -114,7 +133,9 @@ def test_policy_and_person_share_a_slave_and_one_takes_over(
                 yield hand
 
         monkeypatch.setattr(trilat_net, "hand", hold, raising=False)
-        monkeypatch.setattr(trilat_net, "session", lambda *_, **__: reached(bus, clock), raising=False)
+        monkeypatch.setattr(
+            trilat_net, "session", lambda *_, **__: reached(bus, clock), raising=False
+        )
         relayed = SimpleNamespace(sleep=wait_s, monotonic=lambda: 1e-9 * clock.monotonic_ns())
         monkeypatch.setattr(found[ROBOT], "time", relayed)
         wait_s(1.0)

@@ -108,7 +108,10 @@ class Desk:
     """A recording into memory, with a clock that the test moves."""
 
     def __init__(
-        self, scenario: Scenario = SCENARIO, clock: ManualClock | None = None, epoch: Epoch = EPOCH
+        self,
+        scenario: Scenario = SCENARIO,
+        clock: ManualClock | None = None,
+        epoch: Epoch = EPOCH,
     ) -> None:
         self.clock = clock or ManualClock(MONO_NS)
         self.network = LocalNetwork()
@@ -120,10 +123,14 @@ class Desk:
         self.tap = InboundQueue(self.clock)
         own = topics.key(SESSION, topics.RECORDER, topics.EVENT)
         info = told(topics.RECORDER, scenario="", scenario_sha256="")
-        publisher = EventPublisher(self.bus, SESSION, info, lambda payload: self.tap.take(own, payload))
+        publisher = EventPublisher(
+            self.bus, SESSION, info, lambda payload: self.tap.take(own, payload)
+        )
         writer = LogWriter(self.stream, scenario, SESSION, "live", epoch.unix_ns)
         self.recording = Recording(writer, scenario, SESSION, epoch, self.bus, publisher)
-        self.report = RecorderReport(self.bus, self.clock, self.recording, self.tap, self.stream.tell)
+        self.report = RecorderReport(
+            self.bus, self.clock, self.recording, self.tap, self.stream.tell
+        )
 
     def wait(self, for_ns: int) -> None:
         self.clock.sleep_until(self.clock.monotonic_ns() + for_ns)

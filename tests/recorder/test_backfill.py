@@ -19,7 +19,19 @@ from trilat_net.net.requests import BACKFILL_MESSAGES, Backfill
 from trilat_net.net.wire import decode, encode
 from trilat_net.scenario import load_scenario
 
-from .desk import BOOTS, MONO_NS, MS, SESSION, UNIX_NS, Desk, Memory, S, happening, states, statistics
+from .desk import (
+    BOOTS,
+    MONO_NS,
+    MS,
+    SESSION,
+    UNIX_NS,
+    Desk,
+    Memory,
+    S,
+    happening,
+    states,
+    statistics,
+)
 
 SLOW = load_scenario("two_sites", {"duration_s": 2.0, "rate_hz": 100})
 TICKS = SLOW.ticks("m")
@@ -75,10 +87,16 @@ WRONG: dict[str, Callable[[Backfill], dict[str, Any]]] = {
     "wrong numbers": lambda past: {"payloads": past.payloads[::-1]},
     "too many": lambda past: {"payloads": past.payloads * 2},
     "undecodable": lambda past: {"payloads": [b"\xc1" for _ in past.payloads]},
-    "another's": lambda past: {"payloads": [p.replace(b"\xa1m", b"\xa1s") for p in past.payloads]},
-    "a hole": lambda past: {"payloads": [b"" if n == 1 else p for n, p in enumerate(past.payloads)]},
+    "another's": lambda past: {
+        "payloads": [p.replace(b"\xa1m", b"\xa1s") for p in past.payloads]
+    },
+    "a hole": lambda past: {
+        "payloads": [b"" if n == 1 else p for n, p in enumerate(past.payloads)]
+    },
     "more gone than made": lambda past: {"first": past.made + 70, "payloads": []},
-    "far too many made": lambda past: {"made": 2**39} if past.channel != "event" else {"boot": 0},
+    "far too many made": lambda past: (
+        {"made": 2**39} if past.channel != "event" else {"boot": 0}
+    ),
 }
 
 
@@ -178,7 +196,8 @@ def test_the_log_has_all_that_arrived_or_could_be_requested(way: Way) -> None:
         assert account.refilled == len(truth) - len(live)
         assert account.duplicate == len(came) - len(live)
         passed = [
-            number < max(n for _, n in came[: came.index((at_ns, number)) + 1]) for at_ns, number in live
+            number < max(n for _, n in came[: came.index((at_ns, number)) + 1])
+            for at_ns, number in live
         ]
         assert account.reordered == sum(passed)
         assert {n for first, last in account.gaps for n in range(first, last + 1)} == (
@@ -280,7 +299,9 @@ def test_a_late_message_that_was_given_up_is_welcome() -> None:
 
 def vanish(run: Run) -> None:
     for name in ("m", "s"):
-        run.desk.recording.presence(topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", False)
+        run.desk.recording.presence(
+            topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", False
+        )
 
 
 def test_a_departed_site_is_not_asked_and_delays_no_end() -> None:
@@ -325,7 +346,9 @@ def test_answers_that_are_too_large_for_way_are_made_smaller() -> None:
 
 def test_a_channel_that_is_never_answered_keeps_no_other_waiting() -> None:
     run = Run(Way(lost={n for n in range(20, 180) if n % 3}))
-    run.site.replies = lambda payload: [] if decode(payload, Backfill).channel == "state" else [payload]
+    run.site.replies = lambda payload: (
+        [] if decode(payload, Backfill).channel == "state" else [payload]
+    )
     run.live(2600 * MS)
     run.desk.rounds(700, run.site)
     accounts = run.desk.recording.accounts

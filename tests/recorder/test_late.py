@@ -27,7 +27,9 @@ def late_desk(*there: str) -> tuple[Desk, dict[str, Memory]]:
     desk.wait(40 * S)
     desk.recording.assume_gone()
     for name in there:
-        desk.recording.presence(topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", True)
+        desk.recording.presence(
+            topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", True
+        )
     desk.recording.join_late(desk.clock.monotonic_ns())
     return desk, sites
 
@@ -36,14 +38,22 @@ def test_it_asks_every_site_for_all_that_it_has() -> None:
     desk, sites = late_desk("m", "s")
     desk.rounds(30, *sites.values())
     said = desk.said()
-    assert [(event.kind, event.about) for event in said] == [("late", ""), ("stored", "m"), ("stored", "s")]
+    assert [(event.kind, event.about) for event in said] == [
+        ("late", ""),
+        ("stored", "m"),
+        ("stored", "s"),
+    ]
     assert said[0].t_ns == 40 * S
     assert "at t = 40.000 s" in said[0].text
     assert desk.over()
     assert desk.recording.problem() is None
     log = desk.log()
     assert [state.tick for state in log["m"].states] == list(range(TICKS))
-    assert [event.kind for event in log.events if event.member == "s"] == ["ready", "mode", "end"]
+    assert [event.kind for event in log.events if event.member == "s"] == [
+        "ready",
+        "mode",
+        "end",
+    ]
 
 
 def test_sites_that_are_gone_are_named_and_not_waited_for() -> None:
@@ -66,7 +76,10 @@ def test_what_the_sites_no_longer_have_is_missing_for_good() -> None:
         site.oldest["state"] = 20
     desk.rounds(30, *sites.values())
     stored = [event.text for event in desk.said() if event.kind == "stored"]
-    assert stored[0] == f"all that can be had of m is stored; missing for good: 20 of {TICKS} records (0-19)"
+    assert (
+        stored[0]
+        == f"all that can be had of m is stored; missing for good: 20 of {TICKS} records (0-19)"
+    )
     assert desk.recording.problem() == f"missing of m: 20 of {TICKS} records (0-19)"
 
 
@@ -86,7 +99,9 @@ def test_a_recorder_takes_over_from_one_that_ended(tmp_path: Path, ahead_ns: int
     def second(clock: RelayClock) -> str | None:
         own = session._own("later", clock)
         said = session.said.append
-        recorder = Recorder(session.network.join(), own, REAL, 99, LogStorage(later), lambda: False, said)
+        recorder = Recorder(
+            session.network.join(), own, REAL, 99, LogStorage(later), lambda: False, said
+        )
         epoch = recorder.join(30.0)
         assert epoch is not None
         return recorder.record(epoch).problem()

@@ -44,7 +44,9 @@ from .desk import (
 
 def after_the_end() -> bytes:
     site = Site(SCENARIO.setup("m"))
-    return encode_state("m", BOOTS["m"], site.peers, site.step(TickInput(0))._replace(tick=TICKS), [], 0, 0)
+    return encode_state(
+        "m", BOOTS["m"], site.peers, site.step(TickInput(0))._replace(tick=TICKS), [], 0, 0
+    )
 
 
 OTHERS_WORD = encode(Event(member=topics.RECORDER, boot=99, n=0, kind="stored", text=""))
@@ -56,7 +58,12 @@ REFUSED = {
     "an end of another start": ("stranger", "m", topics.EVENT, end("m", boot=99)),
     "an end in the recorder's name": ("stranger", topics.RECORDER, topics.EVENT, end("m")),
     "another site's statistics": ("stranger", "m", topics.LINK, statistics("s")),
-    "a word of another recorder": ("another recorder", topics.RECORDER, topics.EVENT, OTHERS_WORD),
+    "a word of another recorder": (
+        "another recorder",
+        topics.RECORDER,
+        topics.EVENT,
+        OTHERS_WORD,
+    ),
     "a record after the end": ("out of range", "m", topics.STATE, after_the_end()),
     "statistics after the end": ("out of range", "m", topics.LINK, statistics("m", 100)),
     "an end after the end": ("out of range", "m", topics.EVENT, end("m", TICKS + 1)),
@@ -68,7 +75,9 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize(("reason", "name", "channel", "payload"), REFUSED.values(), ids=REFUSED.keys())
+@pytest.mark.parametrize(
+    ("reason", "name", "channel", "payload"), REFUSED.values(), ids=REFUSED.keys()
+)
 def test_foreign_messages_are_dropped_the_rest_written_byte_for_byte(
     reason: str, name: str, channel: str, payload: bytes
 ) -> None:
@@ -88,7 +97,9 @@ def test_foreign_messages_are_dropped_the_rest_written_byte_for_byte(
     assert (log.complete, log.driver, log.session["session"]) == (True, "live", SESSION)
     assert log.accounts[f"dropped: {reason}"] == "1"
     assert [message.data for message in written] == states("m")
-    assert [message.publish_time - UNIX_NS for message in written] == [MS * k for k in range(TICKS)]
+    assert [message.publish_time - UNIX_NS for message in written] == [
+        MS * k for k in range(TICKS)
+    ]
 
 
 LONG = load_scenario("two_sites", {"duration_s": 60.0})
@@ -96,7 +107,9 @@ LONG = load_scenario("two_sites", {"duration_s": 60.0})
 
 def ahead(tick: int) -> bytes:
     site = Site(LONG.setup("m"))
-    return encode_state("m", BOOTS["m"], site.peers, site.step(TickInput(0))._replace(tick=tick), [], 0, 0)
+    return encode_state(
+        "m", BOOTS["m"], site.peers, site.step(TickInput(0))._replace(tick=tick), [], 0, 0
+    )
 
 
 @pytest.mark.parametrize(
@@ -109,7 +122,14 @@ def ahead(tick: int) -> bytes:
         ("m is ahead of the clock", topics.EVENT, happening("m", -1, "join", ticks=50_000)),
         ("out of range", topics.EVENT, happening("m", 100_000)),
     ],
-    ids=["a record", "just too early", "statistics", "an end", "a beginning", "the number of an event"],
+    ids=[
+        "a record",
+        "just too early",
+        "statistics",
+        "an end",
+        "a beginning",
+        "the number of an event",
+    ],
 )
 def test_member_that_says_more_than_clock_allows_is_not_believed(
     reason: str, channel: str, payload: bytes
@@ -175,7 +195,9 @@ def test_gaps_are_counted_named_and_a_problem() -> None:
     assert any("m: 44 of 50 records, 6 missing" in line for line in desk.recording.summary())
 
 
-def test_overflow_is_counted_in_the_file_and_in_the_summary(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_overflow_is_counted_in_the_file_and_in_the_summary(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(tap_module, "CAPACITY", 20)
     desk = Desk()
     for payload in states("m"):
@@ -183,7 +205,10 @@ def test_overflow_is_counted_in_the_file_and_in_the_summary(monkeypatch: pytest.
     log = desk.log()
     assert len(log["m"]) == 20
     assert f"overflowed {TICKS - 20}" in log.account("m")
-    assert any(str(TICKS - 20) in line and "the queue was full" in line for line in desk.recording.summary())
+    assert any(
+        str(TICKS - 20) in line and "the queue was full" in line
+        for line in desk.recording.summary()
+    )
 
 
 def test_flood_of_events_leaves_log_that_can_be_used() -> None:
@@ -231,7 +256,8 @@ def test_site_that_dies_without_word_ends_recording_and_is_named() -> None:
     desk.take("s", topics.STATE, *states("s")[:20])
     desk.recording.presence(alive("s", BOOTS["s"]), False)
     assert not desk.over()
-    desk.clock.sleep_until(MONO_NS + 50_000_000 + LAST_NS)  # a site stays no longer after its last tick
+    # a site stays no longer after its last tick
+    desk.clock.sleep_until(MONO_NS + 50_000_000 + LAST_NS)
     assert not desk.over()
     desk.clock.sleep_until(desk.clock.monotonic_ns() + 1)
     assert desk.over()
@@ -241,7 +267,9 @@ def test_site_that_dies_without_word_ends_recording_and_is_named() -> None:
     assert (len(log["m"]), len(log["s"])) == (TICKS, 20)
 
 
-@pytest.mark.parametrize(("said_its_end", "patience_ns"), [(True, RECONNECT_NS), (False, AWAY_NS)])
+@pytest.mark.parametrize(
+    ("said_its_end", "patience_ns"), [(True, RECONNECT_NS), (False, AWAY_NS)]
+)
 def test_a_site_cut_off_for_long_is_waited_for(said_its_end: bool, patience_ns: int) -> None:
     """Even if it is the recorder that is cut off: then all sites are gone at once."""
     desk = Desk(load_scenario("two_sites", {"duration_s": 100.0}))
@@ -262,7 +290,9 @@ def test_a_site_cut_off_for_long_is_waited_for(said_its_end: bool, patience_ns: 
     assert desk.over()
 
 
-@pytest.mark.parametrize("key", [alive("s", 99), alive("s", "x"), alive("nobody", 1), "trilat", "", "a/b"])
+@pytest.mark.parametrize(
+    "key", [alive("s", 99), alive("s", "x"), alive("nobody", 1), "trilat", "", "a/b"]
+)
 def test_tokens_of_others_end_nothing(key: str) -> None:
     desk = Desk()
     desk.whole("m")
@@ -301,7 +331,13 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
     network = LocalNetwork()
 
     def run(clock: RelayClock) -> None:
-        own = (network.join(), clock, SESSION, BOOTS[topics.RECORDER], LogStorage(folder / "run.mcap"))
+        own = (
+            network.join(),
+            clock,
+            SESSION,
+            BOOTS[topics.RECORDER],
+            LogStorage(folder / "run.mcap"),
+        )
         recorder = Recorder(*own, lambda: clock.monotonic_ns() > stop_ns, str)
         met = recorder._joining.membership.met
         met["x"] = msgspec.structs.replace(told("m"), member="x", boot=5, scenario="garbage")

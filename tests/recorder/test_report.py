@@ -47,7 +47,11 @@ def test_it_says_so_once_a_second_and_writes_it() -> None:
         desk.write()
         desk.report.poll()
     said = heard(desk)
-    assert [stats.t_ns for stats in said] == [REPORT_EVERY_NS, 2 * REPORT_EVERY_NS, 3 * REPORT_EVERY_NS]
+    assert [stats.t_ns for stats in said] == [
+        REPORT_EVERY_NS,
+        2 * REPORT_EVERY_NS,
+        3 * REPORT_EVERY_NS,
+    ]
     assert desk.written()["recorder/stats"] == [encode(stats) for stats in said]
 
 
@@ -67,7 +71,9 @@ def test_it_fits_a_message_however_much_is_missing() -> None:
             desk.recording.accounts[key].take(number + 2**39)
     for n in range(12):
         name = f"site-with-a-long-name-{n}"
-        desk.recording.accounts[topics.key(SESSION, name, "state")] = desk.recording.accounts[key]
+        desk.recording.accounts[topics.key(SESSION, name, "state")] = desk.recording.accounts[
+            key
+        ]
     desk.report.publish()
     (stats,) = heard(desk)
     assert sum(map(len, stats.gaps.values())) <= 600

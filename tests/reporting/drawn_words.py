@@ -41,11 +41,15 @@ def misplaced(figure: Figure) -> list[str]:
     cut_off = [
         f"{said!r} is cut off"
         for said, box in found
-        if box.x0 < -SLACK_PT or box.y0 < -SLACK_PT or box.x1 > width + SLACK_PT or box.y1 > height + SLACK_PT
+        if box.x0 < -SLACK_PT
+        or box.y0 < -SLACK_PT
+        or box.x1 > width + SLACK_PT
+        or box.y1 > height + SLACK_PT
     ]
     on_each_other = [
         f"{one!r} lies on {other!r}"
         for (one, a), (other, b) in combinations(found, 2)
-        if min(a.x1, b.x1) - max(a.x0, b.x0) > SLACK_PT and min(a.y1, b.y1) - max(a.y0, b.y0) > SLACK_PT
+        if min(a.x1, b.x1) - max(a.x0, b.x0) > SLACK_PT
+        and min(a.y1, b.y1) - max(a.y0, b.y0) > SLACK_PT
     ]
     return cut_off + on_each_other

@@ -17,7 +17,9 @@ LOGS = {
     "jitter": lambda: runs.run("free", {**runs.JITTER, "rate_hz": 100}).log,
     "rich": lambda: runs.run("rich").log,
     "four": lambda: logs.simulated("four"),
-    "p_d": lambda: runs.run("free", {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}).log,
+    "p_d": lambda: (
+        runs.run("free", {"control.law": "p_d", "duration_s": 1.0, "rate_hz": 200}).log
+    ),
     "empty": lambda: logs.rewritten(logs.simulated("paper"), lambda _: False),
     "diverged": logs.diverged,
     "busy": lambda: logs.busy().log,
@@ -70,7 +72,9 @@ def test_a_figure_is_a_function_of_the_log(name: str) -> None:
         ("diverged", "FAIL ok FAIL ok ok"),
     ],
 )
-def test_lines_give_the_judgement_and_then_verdict_end_and_balance(name: str, marks: str) -> None:
+def test_lines_give_the_judgement_and_then_verdict_end_and_balance(
+    name: str, marks: str
+) -> None:
     found = certify(LOGS[name]())
     said = describe_certificate(found)
     assert [line.mark for line in said] == marks.split()
@@ -89,7 +93,9 @@ def test_many_links_are_one_entry() -> None:
 def test_the_papers_weights_are_told_where_they_are_wrong() -> None:
     told = describe_certificate(runs.run("free", runs.LYAPUNOV).certificate)[-1]
     assert told.mark == "note"
-    assert told.text.startswith("with the paper's weights, ones, V would have risen by 12.3 J of 32.8")
+    assert told.text.startswith(
+        "with the paper's weights, ones, V would have risen by 12.3 J of 32.8"
+    )
     assert runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate.ones is None
 
 
@@ -98,7 +104,9 @@ def test_listed_energies_add_up_to_v_at_the_end(name: str) -> None:
     found = certify(LOGS[name]())
     assert found.balance is not None
     (_, first), *between, (_, last) = list_energies(found.balance)
-    assert first + sum(amount for _, amount in between) == pytest.approx(last, abs=1e-5 * found.balance.scale)
+    assert first + sum(amount for _, amount in between) == pytest.approx(
+        last, abs=1e-5 * found.balance.scale
+    )
 
 
 def test_no_energy_is_said() -> None:

@@ -33,7 +33,9 @@ def test_the_end_of_a_chain_is_where_pinocchio_has_it():
     arm = six().scenario.arms["m1"]
     states = chain_references()["arm6"].states
     points = arm_poses.joint_positions_m(arm, np.array([state.q for state in states]))
-    assert points[:, -1] == pytest.approx(np.array([state.tip_position for state in states]), abs=1e-12)
+    assert points[:, -1] == pytest.approx(
+        np.array([state.tip_position for state in states]), abs=1e-12
+    )
     lengths = np.linalg.norm(np.diff(points, axis=1), axis=2)
     assert lengths == pytest.approx(np.tile(lengths[0], (len(states), 1)), abs=1e-12)
     assert not points[:, 0].any()
@@ -41,7 +43,9 @@ def test_the_end_of_a_chain_is_where_pinocchio_has_it():
 
 def test_pictures_of_chain_have_up_on_top_and_shadows_below():
     arm = six().scenario.arms["m1"]
-    origin, above, aside = arm_poses.project_arm_m(arm, np.array([[0.0, 0, 0], [0, 0, 1], [0.3, 0.2, 0]]))
+    origin, above, aside = arm_poses.project_arm_m(
+        arm, np.array([[0.0, 0, 0], [0, 0, 1], [0.3, 0.2, 0]])
+    )
     assert not origin.any()
     assert above[0] == pytest.approx(0.0)
     assert 0.8 < above[1] < 1.0
@@ -79,7 +83,9 @@ def test_every_joint_has_its_panel(form, draw, panels):
     figure = draw(six(), form)
     assert panels in (None, len(figure.axes))
     assert misplaced(figure) == []
-    words = " ".join(axes.get_title() + axes.get_ylabel().replace("\n", "") for axes in figure.axes)
+    words = " ".join(
+        axes.get_title() + axes.get_ylabel().replace("\n", "") for axes in figure.axes
+    )
     if panels in (6, 7):
         assert all(f"{n}: {name}" in words for n, name in enumerate(JOINTS, 1))
 
@@ -100,9 +106,15 @@ def test_paths_are_those_of_the_end_effectors_in_three_planes():
 def test_the_force_of_a_wall_is_the_recorded_torque():
     """Its torque is the force times what the end effector moves along the normal, by differences of poses."""
     arm = six().scenario.arms["s"]
-    start = arm_poses.joint_positions_m(arm, np.array([[0.0, -1.1, 1.0, -0.4, 0.3, 0.1]]))[0, -1]
+    start = arm_poses.joint_positions_m(arm, np.array([[0.0, -1.1, 1.0, -0.4, 0.3, 0.1]]))[
+        0, -1
+    ]
     normal = np.array([0.6, -0.3, 0.74])
-    wall = {"kind": "wall", "point_m": (start + 0.01 * normal).tolist(), "normal": normal.tolist()}
+    wall = {
+        "kind": "wall",
+        "point_m": (start + 0.01 * normal).tolist(),
+        "normal": normal.tolist(),
+    }
     push = {"sites.s.environment": [{**wall, "stiffness_n_m": 800.0, "damping_n_s_m": 5.0}]}
     log = simulate_scenario(parse_scenario(SIX, overrides={"rate_hz": 200, **push}))
     part = log["s"]
@@ -113,7 +125,9 @@ def test_the_force_of_a_wall_is_the_recorded_torque():
     across = normal / np.linalg.norm(normal)
     lever = np.empty((len(rows), 6))
     for joint, off in enumerate(1e-6 * np.eye(6)):
-        ends = [arm_poses.joint_positions_m(arm, part.q[rows] + s * off)[:, -1] for s in (1, -1)]
+        ends = [
+            arm_poses.joint_positions_m(arm, part.q[rows] + s * off)[:, -1] for s in (1, -1)
+        ]
         lever[:, joint] = (ends[0] - ends[1]) @ across / 2e-6
     assert force[:, None] * lever == pytest.approx(-part.tau_x[rows], abs=1e-5)
     at = arm_poses.joint_positions_m(arm, part.q[rows])[:, -1]

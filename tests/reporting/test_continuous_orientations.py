@@ -99,14 +99,18 @@ def list_table_series(
     """The orientations in a table of states; `read` returns a column of a site."""
     for site, motion in motions.items():
         for field, truth in (("x", motion.turned), ("q_des", motion.reference)):
-            columns = [np.asarray(read(site, f"{field}_{axis}")) for axis in ("qw", "qx", "qy", "qz")]
+            columns = [
+                np.asarray(read(site, f"{field}_{axis}")) for axis in ("qw", "qx", "qy", "qz")
+            ]
             yield f"{site} {field}", np.stack(columns, axis=1)[:records], truth
 
 
 def list_csv(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Series]:
     tn.export(log, "csv", folder / "out")
     frames = {site: pl.read_csv(folder / "out" / f"{site}_state.csv") for site in motions}
-    about = json.loads((folder / "out" / "about.json").read_text())["tables"]["m_state.csv"]["columns"]
+    about = json.loads((folder / "out" / "about.json").read_text())["tables"]["m_state.csv"][
+        "columns"
+    ]
     assert "unit quaternion" in about["x_qw"]["meaning"]
     assert about["x_qw"]["source"] == "x[3:6]"
     assert not [name for name in about if "_rx_rad" in name and "rad_s" not in name]
@@ -115,7 +119,9 @@ def list_csv(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Ser
 
 def list_parquet(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Series]:
     tn.export(log, "parquet", folder / "out")
-    frames = {site: pl.read_parquet(folder / "out" / f"{site}_state.parquet") for site in motions}
+    frames = {
+        site: pl.read_parquet(folder / "out" / f"{site}_state.parquet") for site in motions
+    }
     return list_table_series(lambda site, name: frames[site][name], motions)
 
 
@@ -147,7 +153,10 @@ def list_lerobot(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator
         *(f"{axis}.pos" for axis in "xyz"),
         *(f"{entry}.rot" for entry in ("r11", "r21", "r31", "r12", "r22", "r32")),
     ]
-    assert "rotation matrix" in json.loads((folder / "out" / "about.json").read_text())["meanings"]["r11.rot"]
+    assert (
+        "rotation matrix"
+        in json.loads((folder / "out" / "about.json").read_text())["meanings"]["r11.rot"]
+    )
     for column in ("action", "action.m"):
         yield column, frames[column].to_numpy()[:, 3:].astype(np.float64), motions["m"].turned
 
@@ -157,7 +166,11 @@ def read_turn(found: Any) -> list[float]:
 
 
 def list_ros_series(
-    poses: dict[str, list[Any]], frames: list[Any], log: Log, motions: dict[str, Motion], prefix: str
+    poses: dict[str, list[Any]],
+    frames: list[Any],
+    log: Log,
+    motions: dict[str, Motion],
+    prefix: str,
 ) -> Iterator[Series]:
     """The orientations in messages of poses, by topic, and of frames."""
     for site, motion in motions.items():
@@ -168,7 +181,9 @@ def list_ros_series(
     links = defaultdict(list)
     for message in frames:
         for one in message.transforms:
-            links[one.header.frame_id, one.child_frame_id].append(read_turn(one.transform.rotation))
+            links[one.header.frame_id, one.child_frame_id].append(
+                read_turn(one.transform.rotation)
+            )
     for site, motion in motions.items():
         turned = [Rotation.identity(RECORDS), *place_links(log.scenario, site, motion.q)]
         moving = [
@@ -223,13 +238,24 @@ def list_live_topics(log: Log, motions: dict[str, Motion], _folder: Path) -> Ite
         for topic, messages in graph.published.items()
         if topic.endswith("_pose")
     }
-    frames = [ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.published["tf"]]
+    frames = [
+        ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.published["tf"]
+    ]
     return list_ros_series(poses, frames, log, motions, "t")
 
 
 @pytest.mark.parametrize(
     "list_series",
-    [list_csv, list_parquet, list_npz, list_mat, list_python, list_lerobot, list_bag, list_live_topics],
+    [
+        list_csv,
+        list_parquet,
+        list_npz,
+        list_mat,
+        list_python,
+        list_lerobot,
+        list_bag,
+        list_live_topics,
+    ],
 )
 @pytest.mark.parametrize("number", EVERY)
 def test_every_export_and_topic_turns_as_the_arm_does(
@@ -259,7 +285,9 @@ def test_bodies_on_the_page_turn_as_the_plant_says(number: int) -> None:
 
 def test_an_environment_observes_orientations_that_never_jump() -> None:
     """Arms whose tools point down, as the user and as its peer."""
-    env = tn.make_env(CASE.read_text(encoding="utf-8"), user="s", leads="m", rate_hz=100, duration_s=2.0)
+    env = tn.make_env(
+        CASE.read_text(encoding="utf-8"), user="s", leads="m", rate_hz=100, duration_s=2.0
+    )
     observed = [env.reset(seed=1)[0]]
     shared = []
     for _ in range(190):

@@ -27,12 +27,18 @@ from trilat_net.scenario import parse_scenario
 def log() -> Log:
     """A log with everything in it: links of all kinds, modes, changes, events, statistics."""
     text = 'says "no",\nand 1.5 °C'
-    awkward = Event(member="a", boot=2**64 - 1, kind="refused", text=text, t_ns=-1, clocks={"a": "x"}, n=0)
-    plain = Event(member="c", boot=7, kind="end", text="c made 5 ticks", t_ns=9_000_000, ticks=5, n=0)
+    awkward = Event(
+        member="a", boot=2**64 - 1, kind="refused", text=text, t_ns=-1, clocks={"a": "x"}, n=0
+    )
+    plain = Event(
+        member="c", boot=7, kind="end", text="c made 5 ticks", t_ns=9_000_000, ticks=5, n=0
+    )
     stats = opened(recorded("two_sites", {"duration_s": 0.4})).link_stats("m")
     new = {"site": "a", "dropped": {"not finite": 3}, "offset_us": {"b": -4}}
     told = [msgspec.structs.replace(one, **new) for one in stats]
-    return logs.rewritten(logs.busy().log, lambda s: s.tick % 400 < 40, others=[awkward, plain, *told])
+    return logs.rewritten(
+        logs.busy().log, lambda s: s.tick % 400 < 40, others=[awkward, plain, *told]
+    )
 
 
 @cache
@@ -77,7 +83,13 @@ def test_csv_read_by_the_standard_library_and_polars(tmp_path: Path) -> None:
         for place, values in enumerate(columns.values()):
             for row, wanted in zip(rows, values, strict=True):
                 text = row[place]
-                read = text if isinstance(wanted, str) else None if text == "" else type(wanted)(text)
+                read = (
+                    text
+                    if isinstance(wanted, str)
+                    else None
+                    if text == ""
+                    else type(wanted)(text)
+                )
                 assert same(read, wanted)
     frame = pl.read_csv(folder / "b_state.csv")
     assert frame.columns == list(expected()["b_state"])
@@ -128,14 +140,17 @@ def test_mat_read_by_scipy(tmp_path: Path) -> None:
             read = np.atleast_1d(struct_[column]).tolist()
             for value, wanted in zip(read, values, strict=True):
                 if isinstance(wanted, str):
-                    text = value if isinstance(value, str) else ""  # an empty cell is an empty array
+                    # an empty cell is an empty array
+                    text = value if isinstance(value, str) else ""
                     assert text.rstrip() == wanted
                 elif wanted is None:
                     assert np.isnan(value)
                 else:
                     assert value == wanted
                     assert bits(float(value)) == bits(float(wanted))
-            said = about["tables"][site if kind in ("", "state") else f"{site}.{kind}"]["columns"][column]
+            said = about["tables"][site if kind in ("", "state") else f"{site}.{kind}"][
+                "columns"
+            ][column]
             units = struct_["units"][column]
             assert (units if isinstance(units, str) else "") == said["unit"]
 
@@ -159,7 +174,15 @@ def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
         ):
             row = [*decoded.position, *decoded.velocity, *decoded.effort, message.publish_time]
             found.setdefault(channel.topic.split("/")[2], []).append(row)
-    names = ("q1_rad", "q2_rad", "qd1_rad_s", "qd2_rad_s", "tau1_nm", "tau2_nm", "publish_time_ns")
+    names = (
+        "q1_rad",
+        "q2_rad",
+        "qd1_rad_s",
+        "qd2_rad_s",
+        "tau1_nm",
+        "tau2_nm",
+        "publish_time_ns",
+    )
     for site in "abc":
         rows = zip(*(wanted[f"{site}_state"][name] for name in names), strict=True)
         assert found[site] == [list(row) for row in rows]
@@ -169,12 +192,19 @@ def test_ros2_read_by_mcap_ros2(tmp_path: Path) -> None:
 def test_a_folder_says_what_is_in_it(form: str, tmp_path: Path) -> None:
     folder = exported(form, tmp_path)
     about = json.loads((folder / "about.json").read_text())
-    assert set(about["tables"]) == {path.name for path in folder.iterdir()} - {"about.json", "scenario.toml"}
+    assert set(about["tables"]) == {path.name for path in folder.iterdir()} - {
+        "about.json",
+        "scenario.toml",
+    }
     assert about["session"] == log().session
     assert about["complete"] is True
     state = about["tables"][f"a_state.{form}"]
     assert state["rows"] == len(log()["a"])
-    assert state["columns"]["q1_rad"] == {"unit": "rad", "meaning": "joint angles, joint 1", "source": "q[0]"}
+    assert state["columns"]["q1_rad"] == {
+        "unit": "rad",
+        "meaning": "joint angles, joint 1",
+        "source": "q[0]",
+    }
     assert (folder / "scenario.toml").read_bytes().decode() == log().scenario_text
 
 
@@ -185,7 +215,8 @@ def test_an_export_has_no_stamp_of_its_own(form: str, tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         exported(form, tmp_path / name)
     one, two = (
-        {p.name: p.read_bytes() for p in (tmp_path / n).rglob("*") if p.is_file()} for n in ("one", "two")
+        {p.name: p.read_bytes() for p in (tmp_path / n).rglob("*") if p.is_file()}
+        for n in ("one", "two")
     )
     if form == "mat":  # its first 116 bytes are a text with the date
         one, two = ({name: data[128:] for name, data in files.items()} for files in (one, two))

@@ -29,7 +29,9 @@ BACKGROUND = 0.6
 def marked(figure):
     """What is drawn behind the lines of all panels: shades, and lines where something was changed."""
     shades = [p for axes in figure.axes for p in axes.patches if p.get_zorder() < BACKGROUND]
-    changes = [line for axes in figure.axes for line in axes.lines if line.get_zorder() == BACKGROUND]
+    changes = [
+        line for axes in figure.axes for line in axes.lines if line.get_zorder() == BACKGROUND
+    ]
     return shades, changes
 
 
@@ -56,7 +58,10 @@ def test_histograms_count_every_tick():
     edges = age_and_lateness.loop_time_bin_edges(log)
     for site in log.sites:
         assert age_and_lateness.bin_loop_times(log[site].late_us, edges).sum() == len(log[site])
-        assert age_and_lateness.bin_loop_times(log[site].busy_us, edges).sum() == len(log[site]) - 1
+        assert (
+            age_and_lateness.bin_loop_times(log[site].busy_us, edges).sum()
+            == len(log[site]) - 1
+        )
 
 
 @pytest.mark.long
@@ -74,9 +79,13 @@ def test_every_panel_of_a_site_shows_its_changes(monkeypatch):
     figure = joint_motion.draw_positions(log)
     for site, row in zip(log.sites, np.reshape(figure.axes, (3, 2)), strict=True):
         for axes in row:
-            at_s = [line.get_xdata()[0] for line in axes.lines if line.get_zorder() == BACKGROUND]
+            at_s = [
+                line.get_xdata()[0] for line in axes.lines if line.get_zorder() == BACKGROUND
+            ]
             assert at_s == {"a": [3.0], "b": [], "c": [1.0, 4.0]}[site]
-            drawn = [edge for p in axes.patches for edge in (p.get_x(), p.get_x() + p.get_width())]
+            drawn = [
+                edge for p in axes.patches for edge in (p.get_x(), p.get_x() + p.get_width())
+            ]
             assert drawn == pytest.approx(
                 [edge for span in find_mode_intervals(log[site]) for edge in span[1:]]
             )
@@ -96,17 +105,22 @@ def test_the_stated_mean_is_drawn_only_while_it_holds():
     t_s, mean_ms = lines(panel)[-1].get_data()
     assert list(t_s) == pytest.approx([0.0, 1.0, 1.0, 1.0, 6.0, 6.0])
     assert mean_ms == pytest.approx([50.0, 50.0, np.nan, 90.0, 90.0, np.nan], nan_ok=True)
-    measured = trilat_net.simulate("two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"})
+    measured = trilat_net.simulate(
+        "two_sites", {"duration_s": 0.5, "rate_hz": 200, "link.model": "measured"}
+    )
     figure = age_and_lateness.draw_sample_age(measured)
     assert all(np.isnan(lines(axes)[-1].get_ydata()).all() for axes in figure.axes)
-    assert "mean delay as stated" not in [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "mean delay as stated" not in [
+        text.get_text() for text in figure.legends[0].get_texts()
+    ]
 
 
 def test_estimates_have_a_line_per_site_and_the_truth():
     figure = joint_motion.draw_parameter_estimates(logs.simulated("paper"))
     assert [len(lines(axes)) for axes in figure.axes] == [3] * 5
     truths = [line for line in figure.axes[3].lines if line not in lines(figure.axes[3])]
-    assert [line.get_ydata()[0] for line in truths] == [2.0]  # m1 lc1 + m2 l1 of the paper's arm
+    # m1 lc1 + m2 l1 of the paper's arm
+    assert [line.get_ydata()[0] for line in truths] == [2.0]
 
 
 def test_distributions_reach_longest_age_and_rare_one_by_logarithm():
@@ -145,7 +159,9 @@ def test_the_axis_of_ages_is_logarithmic_after_an_outage():
 
 
 def test_shares_are_of_all_that_there_is():
-    percent = age_and_lateness.cumulative_percent(np.array([1.0, 2.0, 2.0, 4.0]), np.array([0.0, 2.0, 9.0]))
+    percent = age_and_lateness.cumulative_percent(
+        np.array([1.0, 2.0, 2.0, 4.0]), np.array([0.0, 2.0, 9.0])
+    )
     assert percent.tolist() == [0, 75, 100]
     assert np.isnan(age_and_lateness.cumulative_percent(np.zeros(0), np.zeros(2))).all()
 
@@ -153,7 +169,9 @@ def test_shares_are_of_all_that_there_is():
 def test_arms_stand_at_their_angles_in_panels_with_equal_axes():
     log = logs.simulated("four")
     arm = log.scenario.arms["c"]
-    base, elbow, end_effector = arm_poses.joint_positions_m(arm, np.array([[np.pi / 2, -np.pi / 2]]))[0]
+    base, elbow, end_effector = arm_poses.joint_positions_m(
+        arm, np.array([[np.pi / 2, -np.pi / 2]])
+    )[0]
     assert [*base, *elbow, *end_effector] == pytest.approx([0.0, 0.0, 0.0, 0.6, 1.0, 0.6])
     instants = arm_poses.choose_instants_s(log)
     figure = arm_poses.draw_arms(log)
@@ -186,7 +204,9 @@ def test_a_triangle_stands_where_a_site_settles():
     (axes,) = joint_motion.draw_settling(log).axes
     marks = [line.get_data() for line in axes.lines if line.get_marker() == "v"]
     settled = [site_signals.settling_time_s(log[site]) for site in log.sites]
-    assert [float(t) for (t,), _ in marks] == pytest.approx([t for t in settled if t is not None])
+    assert [float(t) for (t,), _ in marks] == pytest.approx(
+        [t for t in settled if t is not None]
+    )
     assert all(float(y) == site_signals.SETTLED_ERROR_RAD for _, (y,) in marks)
 
 
@@ -195,13 +215,17 @@ def test_a_phase_portrait_is_of_e_and_its_rate():
     line = joint_motion.draw_phase_portrait(log).axes[1].lines[0]
     part = log["m1"]
     both = np.stack([part.e[:, 1], (part.qd - part.qd_des)[:, 1]], axis=1)
-    assert {tuple(row) for row in np.transpose(line.get_data()).tolist()} <= {tuple(r) for r in both.tolist()}
+    assert {tuple(row) for row in np.transpose(line.get_data()).tolist()} <= {
+        tuple(r) for r in both.tolist()
+    }
 
 
 def test_limit_of_torque_is_drawn_where_it_was_reached():
     free = joint_motion.draw_control_torques(logs.simulated("paper"))
     assert [text.get_text() for text in free.legends[0].get_texts()][-1] != "limit"
-    held = trilat_net.simulate("paper", {"duration_s": 1, "rate_hz": 200, "limits.tau_limit_nm": 20})
+    held = trilat_net.simulate(
+        "paper", {"duration_s": 1, "rate_hz": 200, "limits.tau_limit_nm": 20}
+    )
     figure = joint_motion.draw_control_torques(held)
     assert [text.get_text() for text in figure.legends[0].get_texts()][-1] == "limit"
     axes = figure.axes[0]
@@ -221,7 +245,9 @@ def test_shares_are_drawn_as_they_change():
     figure = joint_motion.draw_authority(log)
     assert len(figure.axes) == 3
     m1, m2 = (line.get_data() for line in lines(figure.axes[0])[:2])
-    assert np.interp([0.4, 0.75, 1.0, 1.25, 1.6], *m1) == pytest.approx([0.5, 0.625, 0.75, 0.375, 0.0])
+    assert np.interp([0.4, 0.75, 1.0, 1.25, 1.6], *m1) == pytest.approx(
+        [0.5, 0.625, 0.75, 0.375, 0.0]
+    )
     assert m1[1] + m2[1] == pytest.approx(np.ones(len(m1[0])))
     assert joint_motion.sites_with_changing_dominance(logs.simulated("paper")) == []
 
@@ -237,10 +263,15 @@ def test_overview_has_extremes_of_every_site_and_verdict():
 
 
 def test_overlaid_runs_share_sites_and_kind():
-    paper, task = logs.simulated("paper"), trilat_net.simulate(parse_scenario(planar_task(0.02)))
+    paper, task = (
+        logs.simulated("paper"),
+        trilat_net.simulate(parse_scenario(planar_task(0.02))),
+    )
     made = run_overview.draw_overlay({"one": paper, "two": logs.simulated("four")})
     one, _ = lines(made.axes[2])
-    assert np.nanmax(one.get_ydata()) == max(np.abs(paper[site].tau).max() for site in paper.sites)
+    assert np.nanmax(one.get_ydata()) == max(
+        np.abs(paper[site].tau).max() for site in paper.sites
+    )
     assert [text.get_text() for text in made.legends[0].get_texts()] == ["one", "two"]
     with pytest.raises(UsageError, match="of one kind"):
         run_overview.draw_overlay({"a": paper, "b": task})

@@ -24,7 +24,15 @@ from trilat_net.reporting.export import Exporter
 from trilat_net.scenario import parse_scenario
 
 FILE = "chunk-000/file-000.parquet"
-USERS = {"action": 2, "action.a": 2, "action.b": 2, "tau_x": 2, "tau_x.a": 2, "tau_x.b": 2, "dominance": 2}
+USERS = {
+    "action": 2,
+    "action.a": 2,
+    "action.b": 2,
+    "tau_x": 2,
+    "tau_x.a": 2,
+    "tau_x.b": 2,
+    "dominance": 2,
+}
 PLACES = {"frame_index", "episode_index", "index", "task_index"}
 
 
@@ -94,8 +102,14 @@ def test_a_frame_has_the_newest_records_before_it(fps: int, tmp_path: Path) -> N
     """Of a run of 6 s, whose last ticks are at 5.995 s and, of b, at 5.9933 s."""
     frames = read(exported(tmp_path, log(), fps=fps))
     assert len(frames) == 6 * fps
-    for column, site, field in (("action.b", "b", "q"), ("action.a", "a", "q"), ("tau_x", "c", "tau_x")):
-        assert np.array_equal(frames[column].to_numpy(), newest(log(), site, field, 6 * fps, fps))
+    for column, site, field in (
+        ("action.b", "b", "q"),
+        ("action.a", "a", "q"),
+        ("tau_x", "c", "tau_x"),
+    ):
+        assert np.array_equal(
+            frames[column].to_numpy(), newest(log(), site, field, 6 * fps, fps)
+        )
     state = np.hstack([newest(log(), "c", field, 6 * fps, fps) for field in ("q", "qd")])
     assert np.array_equal(frames["observation.state"].to_numpy(), state)
     assert state.sum() == frames["observation.state"].to_numpy().sum() != 0.0
@@ -111,7 +125,9 @@ def test_whose_share_is_above_the_program_s_intervenes(tmp_path: Path) -> None:
     assert shares[135] == pytest.approx([0.7, 0.3])
     assert shares[-1] == pytest.approx([0.9, 0.1])
     assert frames["intervention"].to_list() == [n > 120 for n in range(180)]
-    led = np.where(frames["intervention"].to_numpy()[:, None], frames["action.a"], frames["action.b"])
+    led = np.where(
+        frames["intervention"].to_numpy()[:, None], frames["action.a"], frames["action.b"]
+    )
     assert np.array_equal(frames["action"].to_numpy(), led)
 
 
@@ -139,16 +155,26 @@ def test_an_episode_ends_before_a_gap_and_nothing_bridges_it(tmp_path: Path) -> 
 
 
 def test_logs_become_episodes_of_one_set(tmp_path: Path) -> None:
-    again = trilat_net.simulate(log().scenario.text.replace("seed = 5", "seed = 6").replace("busy", "other"))
+    again = trilat_net.simulate(
+        log().scenario.text.replace("seed = 5", "seed = 6").replace("busy", "other")
+    )
     folder = exported(tmp_path, log(), again)
     episodes = read(folder, "meta/episodes")
     assert episodes["dataset_from_index"].to_list() == [0, 180]
-    assert episodes["dataset_to_index"].to_list() == [180, 360] == np.cumsum(episodes["length"]).tolist()
+    assert (
+        episodes["dataset_to_index"].to_list()
+        == [180, 360]
+        == np.cumsum(episodes["length"]).tolist()
+    )
     assert episodes["tasks"].to_list() == [["busy"], ["other"]]
     frames = read(folder)
     assert frames["index"].to_list() == list(range(360))
     assert frames["frame_index"].to_list() == 2 * list(range(180))
-    assert frames["task_index"].to_list() == frames["episode_index"].to_list() == [0] * 180 + [1] * 180
+    assert (
+        frames["task_index"].to_list()
+        == frames["episode_index"].to_list()
+        == [0] * 180 + [1] * 180
+    )
     tasks = pd.read_parquet(folder / "meta" / "tasks.parquet")
     assert tasks.index.tolist() == ["busy", "other"]
     assert tasks["task_index"].tolist() == [0, 1]
@@ -159,7 +185,9 @@ def test_python_takes_paths_and_logs_together(tmp_path: Path) -> None:
     """The path of a run of 0.2 s, and the log of it with another seed: six frames each, one task."""
     first, second = (trilat_net.simulate("paper", duration_s=0.2, seed=seed) for seed in (1, 2))
     path = first.save(tmp_path / "first.mcap")
-    folder = trilat_net.export([second, path], "lerobot", tmp_path / "set", fps=30, program="m1")
+    folder = trilat_net.export(
+        [second, path], "lerobot", tmp_path / "set", fps=30, program="m1"
+    )
     assert info(folder)["total_episodes"] == 2
     assert info(folder)["total_tasks"] == 1
     assert info(folder, "about")["program"] == "m1"
@@ -175,7 +203,9 @@ def test_statistics_are_those_of_the_frames(tmp_path: Path) -> None:
     assert stats["q90"] == pytest.approx(np.quantile(frames, 0.9, axis=0))
     episodes = read(folder, "meta/episodes")
     for n, (first, end) in enumerate(pairwise([0, *episodes["dataset_to_index"]])):
-        assert episodes["stats/action.a/max"][n].to_list() == pytest.approx(frames[first:end].max(axis=0))
+        assert episodes["stats/action.a/max"][n].to_list() == pytest.approx(
+            frames[first:end].max(axis=0)
+        )
 
 
 def test_logs_of_other_arms_are_refused_and_leave_nothing(tmp_path: Path) -> None:
@@ -200,9 +230,15 @@ def test_in_task_space_a_command_is_a_place(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("settings", "said"),
-    [({"fps": "0"}, "not 0"), ({"fps": "x"}, "cannot be read"), ({"fps": 29.97}, "cannot be read")],
+    [
+        ({"fps": "0"}, "not 0"),
+        ({"fps": "x"}, "cannot be read"),
+        ({"fps": 29.97}, "cannot be read"),
+    ],
 )
-def test_settings_that_are_none_are_refused(settings: dict[str, Any], said: str, tmp_path: Path) -> None:
+def test_settings_that_are_none_are_refused(
+    settings: dict[str, Any], said: str, tmp_path: Path
+) -> None:
     with pytest.raises(UsageError, match=said):
         Exporter("lerobot", tmp_path / "set", settings=settings).export(log())
 
@@ -223,7 +259,9 @@ def test_other_actions_are_refused(tmp_path: Path) -> None:
 
 def test_users_with_other_joints_are_told_to_use_tips(tmp_path: Path) -> None:
     source = trilat_net.simulate(parse_scenario(posed_arms(0.1)))
-    with pytest.raises(LogError, match=r"joints of m2 are not those of m1, .*: use actions tip"):
+    with pytest.raises(
+        LogError, match=r"joints of m2 are not those of m1, .*: use actions tip"
+    ):
         exported(tmp_path, source, actions="joints")
     folder = exported(tmp_path, source, actions="tip")
     assert info(folder)["features"]["action"]["names"] == ["x.pos", "y.pos", "z.pos"]

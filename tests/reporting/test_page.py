@@ -15,11 +15,18 @@ from trilat_net.analysis import site_signals
 from trilat_net.analysis.certificate.stability_certificate import certify
 from trilat_net.analysis.file_overview import summarise_run
 from trilat_net.log.findings import Finding
-from trilat_net.reporting.figures.registry import FIGURES, list_drawable_figures, write_report_figures
+from trilat_net.reporting.figures.registry import (
+    FIGURES,
+    list_drawable_figures,
+    write_report_figures,
+)
 from trilat_net.reporting.page import render_report, write_report
 from trilat_net.reporting.result_text import TextTable
 
-VERDICTS = [Finding("records", "all <b>there</b>", True), Finding("executed again", "differs", False)]
+VERDICTS = [
+    Finding("records", "all <b>there</b>", True),
+    Finding("executed again", "differs", False),
+]
 
 
 class Page(HTMLParser):
@@ -40,7 +47,9 @@ class Page(HTMLParser):
 
 def read(html):
     """The page, and the data that its charts are drawn from."""
-    data = re.search(r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL)[1]
+    data = re.search(
+        r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL
+    )[1]
     return html, json.loads(data)
 
 
@@ -55,11 +64,15 @@ def column(table, n):
 def test_a_report_is_a_page_with_numbers_and_pictures(tmp_path):
     """With a certificate: of a run in which V rose."""
     log = runs.run("free", {**runs.JITTER, "rate_hz": 100}).log
-    paths = write_report(log, tmp_path / "new", twin=log, certificate=certify(log), verdicts=VERDICTS)
+    paths = write_report(
+        log, tmp_path / "new", twin=log, certificate=certify(log), verdicts=VERDICTS
+    )
     assert [path.name for path in paths] == ["report.html", "summary.json"]
     assert sorted(paths) == sorted((tmp_path / "new").iterdir())
     pictures = write_report_figures(log, tmp_path, log)
-    wanted = {name for name in list_drawable_figures(log) if FIGURES[name].in_report} | {"certificate"}
+    wanted = {name for name in list_drawable_figures(log) if FIGURES[name].in_report} | {
+        "certificate"
+    }
     assert {path.stem for path in pictures} == wanted | {"hands_moved"}
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
     facts = json.loads(paths[1].read_text())
@@ -87,7 +100,9 @@ def test_the_page_asks_nothing_of_any_network():
     # one in the licence comment of the library, one that names what SVG is
     assert addresses <= {"https://github.com/leeoniya/uPlot", "http://www.w3.org/2000/svg"}
     policy = next(
-        a["content"] for t, a in seen.elements if "Content-Security-Policy" in a.get("http-equiv", "")
+        a["content"]
+        for t, a in seen.elements
+        if "Content-Security-Policy" in a.get("http-equiv", "")
     )
     assert policy.startswith("default-src 'none'")
 
@@ -111,7 +126,9 @@ def test_texts_of_a_scenario_stay_texts():
 def test_page_holds_log_with_spike_of_one_tick():
     def spike(state):
         return (
-            msgspec.structs.replace(state, q=[9.5, 0.0]) if (state.site, state.tick) == ("s", 123) else state
+            msgspec.structs.replace(state, q=[9.5, 0.0])
+            if (state.site, state.tick) == ("s", 123)
+            else state
         )
 
     log = logs.rewritten(logs.simulated("paper"), change=spike)
@@ -126,21 +143,32 @@ def test_page_holds_log_with_spike_of_one_tick():
     chart = next(c for c in data["charts"] if c["title"] == "tracking error, joint 2")
     for site, series in zip(log.sites, chart["series"], strict=True):
         values = column(data["tables"][series["table"]], series["column"])
-        assert values == pytest.approx(site_signals.joint_errors(log[site])[:, 1], rel=1e-6, abs=1e-12)
+        assert values == pytest.approx(
+            site_signals.joint_errors(log[site])[:, 1], rel=1e-6, abs=1e-12
+        )
 
 
 def test_the_page_tells_what_the_links_did_and_what_happened():
     html, data = page(logs.busy().log)
-    assert "uniform 60 ± 23.1 ms, duplicates 20 %, in order<br>from 3 s: uniform 30 ± 17.3 ms" in html
+    assert (
+        "uniform 60 ± 23.1 ms, duplicates 20 %, in order<br>from 3 s: uniform 30 ± 17.3 ms"
+        in html
+    )
     assert "order, taken in at tick 500 of a" in html
     assert '<td class="words">brake</td>' in html
     assert [change["n"] for change in data["changes"]] == [1, 2, 3]
-    assert {span[1] for spans in data["spans"].values() for span in spans} == {"hold", "brake", "return"}
+    assert {span[1] for spans in data["spans"].values() for span in spans} == {
+        "hold",
+        "brake",
+        "return",
+    }
     (chart,) = (c for c in data["charts"] if c["section"] == "ages" and c["sites"] == ["c"])
     # a at 50 and then 90 ms, b at its mean throughout
     drawn = [(line["colour"], line["from"], round(line["to"], 9)) for line in chart["lines"]]
     assert drawn == [(0, 0.0, 1.0), (0, 1.0, 6.0), (1, 0.0, 6.0)]
-    curves = [series for c in data["charts"] if c["section"] == "delays" for series in c["series"]]
+    curves = [
+        series for c in data["charts"] if c["section"] == "delays" for series in c["series"]
+    ]
     assert len(curves) == 2 * 6
     for curve in curves:
         percent = np.frombuffer(base64.b64decode(curve["values"]), "<f4")
@@ -166,7 +194,9 @@ def test_the_page_of_a_plain_log_has_nothing_superfluous():
 def test_a_log_with_next_to_nothing_has_a_report(sites, tmp_path):
     """No record at all, and one of two sites and none of the third."""
     some = logs.timed(logs.simulated("paper"))
-    log = logs.rewritten(some, lambda r: r.tick < 1 and r.site in sites, finished=False, driver="live")
+    log = logs.rewritten(
+        some, lambda r: r.tick < 1 and r.site in sites, finished=False, driver="live"
+    )
     twin = logs.twin("paper")
     paths = write_report(log, tmp_path, certificate=certify(log), twin=twin, verdicts=VERDICTS)
     assert [path.name for path in paths] == ["report.html", "summary.json"]
@@ -181,7 +211,9 @@ def test_a_run_that_diverged_has_a_page():
 
 def test_no_line_breaks_within_a_hash() -> None:
     digits = "0123456789abcdef" * 4
-    table = TextTable(("name", "sha256"), [("a law with a name of many words", digits), ("b", "decade")])
+    table = TextTable(
+        ("name", "sha256"), [("a law with a name of many words", digits), ("b", "decade")]
+    )
     assert f'<span style="white-space:nowrap">{digits}</span>' in table.html()
     assert "<td style" in table.html()
     assert ">decade</td>" in table.html()  # a word of letters is no hash

@@ -39,7 +39,9 @@ def test_unstable_loop_is_said_to_be_that_and_nothing_else() -> None:
 
 
 def test_a_clamp_that_makes_it_unstable_leaves_nothing_to_feel() -> None:
-    lines = describe_ports(section_of("contact", (("sites.m.hands", ()), ("sites.s.environment", ()))))
+    lines = describe_ports(
+        section_of("contact", (("sites.m.hands", ()), ("sites.s.environment", ())))
+    )
     assert lines[-1] == "  with s clamped the loop is unstable: it has no steady impedance"
     assert any("ranges more" in line for line in lines)
 
@@ -51,13 +53,18 @@ def test_facts_are_json_with_the_numbers_of_the_lines() -> None:
         assert facts["passive_qd"]["holds"] is section.velocity.passive
         assert facts["passive_qd"]["least"] == section.velocity.minima.least
         assert facts["felt"][0]["ratio_db"] == section.transparency[0].ratio_db
-        assert facts["felt"][0]["difference_nm_s_rad"] == section.transparency[0].difference_nm_s_rad
+        assert (
+            facts["felt"][0]["difference_nm_s_rad"]
+            == section.transparency[0].difference_nm_s_rad
+        )
         assert (facts["passive_r"] is None) is (section.proof is None)
     assert facts["passive_qd"]["lacking_nm_s_rad"] is None
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("name", "form"), [("two_sites", make_print_size(3.5)), ("p_d_margin", REPORT_SIZE)])
+@pytest.mark.parametrize(
+    ("name", "form"), [("two_sites", make_print_size(3.5)), ("p_d_margin", REPORT_SIZE)]
+)
 def test_figures_are_drawn_at_the_width_that_is_asked_for(name: str, form: FigureSize) -> None:
     for draw in (draw_port_impedance, draw_port_passivity):
         figure = draw(section_of(name), form)

@@ -13,7 +13,12 @@ from tests.analysis import logs
 from trilat_net.errors import UsageError
 from trilat_net.reporting.appearance import COLUMN_IN, PAGE_IN, make_print_size
 from trilat_net.reporting.figures import age_and_lateness, joint_motion
-from trilat_net.reporting.figures.registry import FIGURES, figure, list_drawable_figures, write_figures
+from trilat_net.reporting.figures.registry import (
+    FIGURES,
+    figure,
+    list_drawable_figures,
+    write_figures,
+)
 from trilat_net.reporting.style import FIGURE_FORMATS, write_figure
 
 from .drawn_words import misplaced
@@ -61,7 +66,9 @@ def test_words_do_not_overlap_type_is_8_pt(name, width_in):
     made = drawn(name, width_in)
     assert made.get_figwidth() == width_in
     assert misplaced(made) == []
-    assert {text.get_fontsize() for text in made.findobj(Text) if text.get_text().strip()} == {8.0}
+    assert {text.get_fontsize() for text in made.findobj(Text) if text.get_text().strip()} == {
+        8.0
+    }
     for axes in made.axes:
         spec = axes.get_subplotspec()
         below_it_is_the_same = len(axes.get_shared_x_axes().get_siblings(axes)) > 1
@@ -104,7 +111,14 @@ def test_a_log_has_the_figures_that_it_has_something_for():
     have = set(list_drawable_figures(walled()))
     assert {"contact", "operation", "positions"} <= have
     assert (
-        not {"authority", "certificate", "parameter_estimates", "loop_timing", "delay_distributions"} & have
+        not {
+            "authority",
+            "certificate",
+            "parameter_estimates",
+            "loop_timing",
+            "delay_distributions",
+        }
+        & have
     )
     assert "contact" not in list_drawable_figures(logs.busy().log)
     reasons = {name: entry.absent(logs.simulated("free")) for name, entry in FIGURES.items()}
@@ -125,7 +139,9 @@ def test_force_of_wall_is_what_record_says_of_arm():
     outer = np.sin(q.sum(axis=1))
     into_x = np.stack([-np.sin(q[:, 0]) - outer, -outer], axis=1)  # d x_tip / d q, links of 1 m
     assert force.max() > 1.0
-    assert -part.tau_x[rows] == pytest.approx(into_x * (wall.normal[0] * force)[:, None], abs=1e-9)
+    assert -part.tau_x[rows] == pytest.approx(
+        into_x * (wall.normal[0] * force)[:, None], abs=1e-9
+    )
 
 
 @pytest.mark.parametrize(

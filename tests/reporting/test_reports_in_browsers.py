@@ -22,9 +22,18 @@ from .varied_runs import LAW_SETTINGS, VARIED
 
 pytestmark = needs_browser
 
-PUSHED = ("delay uniform", "planar task", "fault", "diverged", "one record a site", "single records")
+PUSHED = (
+    "delay uniform",
+    "planar task",
+    "fault",
+    "diverged",
+    "one record a site",
+    "single records",
+)
 """Runs whose reports are opened on every push; the long tests open all."""
-NAMES = [pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in VARIED]
+NAMES = [
+    pytest.param(name, marks=() if name in PUSHED else pytest.mark.long) for name in VARIED
+]
 SCREEN: dict[str, Any] = {"viewport": {"width": 1200, "height": 900}}
 
 
@@ -86,7 +95,9 @@ def test_report_draws_everything(name: str, browser: Browser, tmp_path: Path) ->
         strip = "document.querySelectorAll('.strip svg .arm').length"
         assert count(page, strip) >= recorded
         absent = [site for site in log.sites if not len(log[site])]
-        assert not absent or f"there is no record: {', '.join(absent)}." in page.inner_text("body")
+        assert not absent or f"there is no record: {', '.join(absent)}." in page.inner_text(
+            "body"
+        )
 
 
 def test_no_line_leads_through_a_gap(browser: Browser, tmp_path: Path) -> None:
@@ -99,9 +110,7 @@ def test_no_line_leads_through_a_gap(browser: Browser, tmp_path: Path) -> None:
         )
         known = [n for n, value in enumerate(values) if value is not None]
         assert [t_s[n] for n in known] == [0.0, 0.5, 1.0, 1.5]
-        bridged = (
-            f"(last) => {charts}[0].data[1].slice(0, last).filter((value) => value === undefined).length"
-        )
+        bridged = f"(last) => {charts}[0].data[1].slice(0, last).filter((value) => value === undefined).length"
         assert page.evaluate(bridged, known[-1]) == 0
 
 
@@ -110,7 +119,11 @@ USED = ("live change", "six joints", "fault", "four sites")
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "live change" else pytest.mark.long) for name in USED]
+    "name",
+    [
+        pytest.param(name, marks=() if name == "live change" else pytest.mark.long)
+        for name in USED
+    ],
 )
 def test_report_stays_whole_while_used(name: str, browser: Browser, tmp_path: Path) -> None:
     """Played, pointed at, zoomed, with lines hidden, narrow, in the dark and printed."""
@@ -163,7 +176,9 @@ def toggle_lines(page: Page) -> None:
     assert page.locator(hidden_names).count() == 1
     page.locator(names).first.click()
     for hidden in (page.locator(names).count(), 0):
-        page.evaluate("(names) => document.querySelectorAll(names).forEach((name) => name.click())", names)
+        page.evaluate(
+            "(names) => document.querySelectorAll(names).forEach((name) => name.click())", names
+        )
         assert page.locator(hidden_names).count() == hidden
 
 
@@ -173,7 +188,9 @@ CERTIFIED = ("live change", "diverged", "shipped paper", "shipped contact", "eve
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore:the run diverged")
 @pytest.mark.parametrize("name", CERTIFIED)
-def test_whole_report_with_its_certificate_is_drawn(name: str, browser: Browser, tmp_path: Path) -> None:
+def test_whole_report_with_its_certificate_is_drawn(
+    name: str, browser: Browser, tmp_path: Path
+) -> None:
     """As the command writes it: with the certificate, its pictures, and the twin without operators."""
     log = VARIED[name]()
     twin = logs.twin("paper") if name == "shipped paper" else None

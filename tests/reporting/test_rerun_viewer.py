@@ -78,7 +78,9 @@ def test_what_was_made_for_it_is_gone_when_viewer_is(files: dict[str, Path]) -> 
     assert files["live"].exists()
 
 
-def test_parts_are_shown_as_one_and_a_torn_log_too(files: dict[str, Path], tmp_path: Path) -> None:
+def test_parts_are_shown_as_one_and_a_torn_log_too(
+    files: dict[str, Path], tmp_path: Path
+) -> None:
     parts = sorted(files["first part"].parent.glob("parts-*.mcap"))
     torn = tmp_path / "run.mcap.active"
     torn.write_bytes(files["live"].read_bytes()[:150_000])
@@ -88,9 +90,16 @@ def test_parts_are_shown_as_one_and_a_torn_log_too(files: dict[str, Path], tmp_p
         assert {"/lab/m/joint_states", "/lab/s/error"} <= rerun.topics
 
 
-def test_a_name_that_rerun_does_not_take_is_replaced(files: dict[str, Path], tmp_path: Path) -> None:
+def test_a_name_that_rerun_does_not_take_is_replaced(
+    files: dict[str, Path], tmp_path: Path
+) -> None:
     """It would find another one for the log than for its layout, and complain."""
-    names = {"run.mcap": "run", "my run.2.mcap": "my-run-2", "-x.mcap.active": "x", "ü.mcap": "log"}
+    names = {
+        "run.mcap": "run",
+        "my run.2.mcap": "my-run-2",
+        "-x.mcap.active": "x",
+        "ü.mcap": "log",
+    }
     assert {name: make_application_id(Path(name)) for name in names} == names
     (tmp_path / "ü.mcap").write_bytes(files["live"].read_bytes())
     rerun, _ = shown([tmp_path / "ü.mcap"], ViewerOptions(save=Path("x.rrd")))
@@ -108,7 +117,9 @@ def test_a_browser_is_told_where_to_go(files: dict[str, Path]) -> None:
     )
 
 
-def test_a_window_needs_a_display(files: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_needs_a_display(
+    files: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setattr(rerun_viewer.sys, "platform", "linux")
@@ -120,7 +131,9 @@ def test_a_window_needs_a_display(files: dict[str, Path], monkeypatch: pytest.Mo
     assert "--save" not in rerun.command
 
 
-def test_what_fails_is_told(files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_fails_is_told(
+    files: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     web = ViewerOptions(web=True)
     with pytest.raises(RunFailed, match="Rerun ended with exit code 3"):
         shown([files["live"]], web, code=3)
@@ -131,7 +144,9 @@ def test_what_fails_is_told(files: dict[str, Path], tmp_path: Path, monkeypatch:
         shown([files["live"]], web)
 
 
-def test_rerun_takes_log_and_layout_into_one_recording(files: dict[str, Path], tmp_path: Path) -> None:
+def test_rerun_takes_log_and_layout_into_one_recording(
+    files: dict[str, Path], tmp_path: Path
+) -> None:
     """The program itself: the layout is of the log's own application, so that Rerun applies it."""
     recording = tmp_path / "run.rrd"
     open_rerun([files["live"]], never, ViewerOptions(save=recording), lambda _: None)
@@ -182,7 +197,10 @@ def test_a_bag_shows_the_reference_beside_the_joints(
         "/lab/m/reference/position",
     ]
     assert bag[0][0].curves[1].names == ("m_q1_ref", "m_q2_ref")
-    assert [c.entity for c in bag[2][0].curves] == ["/lab/m/joint_states/effort", "/lab/m/tau_x"]
+    assert [c.entity for c in bag[2][0].curves] == [
+        "/lab/m/joint_states/effort",
+        "/lab/m/tau_x",
+    ]
     assert views[2][0].curves[0].shown == (True, True, False, False)
     assert of["bag"][1].lines == "/lab/log"
 
@@ -191,7 +209,12 @@ def test_what_there_is_not_takes_no_room(files: dict[str, Path]) -> None:
     rows = boards(files)["virtual"][1].pages["Links, timing"]
     assert [row[0].title for row in rows] == ["m: age of samples in use, by peer (ms)"]
     assert build_plot_layout({}) == PlotLayout({}, "")
-    assert build_plot_layout({"/viz/a/joint_states": Ros2Channel(JOINT_STATE, {"names": "a_q1"})}).lines == ""
+    assert (
+        build_plot_layout(
+            {"/viz/a/joint_states": Ros2Channel(JOINT_STATE, {"names": "a_q1"})}
+        ).lines
+        == ""
+    )
 
 
 def test_a_number_of_two_dimensions_has_the_name_of_both(files: dict[str, Path]) -> None:
@@ -199,7 +222,9 @@ def test_a_number_of_two_dimensions_has_the_name_of_both(files: dict[str, Path])
     assert delays[0].curves[0].names == ("s median", "s max")
 
 
-def test_a_file_without_an_index_has_no_channels_to_show(files: dict[str, Path], tmp_path: Path) -> None:
+def test_a_file_without_an_index_has_no_channels_to_show(
+    files: dict[str, Path], tmp_path: Path
+) -> None:
     for content in (b"", b"nonsense" * 100, files["live"].read_bytes()[:50_000]):
         (tmp_path / "x.mcap").write_bytes(content)
         assert read_ros2_channels(tmp_path / "x.mcap") == {}

@@ -56,14 +56,21 @@ def test_what_happened_is_told_once():
 def test_arm_that_was_stopped_is_told_first_and_in_large():
     log = stopped_log()
     assert format_run_lines(log)[0] == "*** s STOPPED 2.000-3.500 s: it was ordered to stop"
-    assert "<strong>s STOPPED</strong>2.000 s to 3.500 s: it was ordered to stop" in render_alarms(log)
+    assert (
+        "<strong>s STOPPED</strong>2.000 s to 3.500 s: it was ordered to stop"
+        in render_alarms(log)
+    )
     assert render_alarms(logs.simulated("two_sites")) == ""
 
 
 @pytest.mark.parametrize(
     ("mode", "reason", "advice"),
     [
-        ("fault", LifeReason.LIMIT_Q, "back within its limits, then trilat reset --session x s"),
+        (
+            "fault",
+            LifeReason.LIMIT_Q,
+            "back within its limits, then trilat reset --session x s",
+        ),
         ("fault", LifeReason.OVERRUN, "trilat reset --session x s"),
         ("stopped", LifeReason.STOP, "trilat enable --session x s"),
         ("stopped", LifeReason.RELEASED, "hold the switch"),
@@ -106,14 +113,29 @@ def statistics(tick, **clock):
     none = {"m1": 0, "s": 0}
     counts = dict.fromkeys(("accepted", "late", "duplicate", "refused", "age_us"), none)
     zeros = dict.fromkeys(("late_max_us", "busy_max_us", "overruns"), 0)
-    place = {"v": 2, "site": "m2", "boot": 1, "tick": tick, "t_ns": tick * 5_000_000, "mode": "run"}
+    place = {
+        "v": 2,
+        "site": "m2",
+        "boot": 1,
+        "tick": tick,
+        "t_ns": tick * 5_000_000,
+        "mode": "run",
+    }
     return LinkStats(**place, **counts, **zeros, dropped={}, **clock)
 
 
 def clocked():
     """Two statistics and an estimate of m2: the clock of m1 is another one, that of s is its own."""
-    first = {"offset_us": {"m1": 3_000_000, "s": 0}, "bound_us": {"m1": 200, "s": 0}, "rtt_us": {"m1": -1}}
-    last = {"offset_us": {"m1": 3_000_100, "s": 0}, "bound_us": {"m1": 60, "s": 0}, "rtt_us": {"m1": 180}}
+    first = {
+        "offset_us": {"m1": 3_000_000, "s": 0},
+        "bound_us": {"m1": 200, "s": 0},
+        "rtt_us": {"m1": -1},
+    }
+    last = {
+        "offset_us": {"m1": 3_000_100, "s": 0},
+        "bound_us": {"m1": 60, "s": 0},
+        "rtt_us": {"m1": 180},
+    }
     faults = {"clock_faults": {"m1": 2}}
     drift = {"drift_ppb": 50_000, "drift_bound_ppb": 900}
     estimate = Event(member="m2", boot=1, kind="clock", text="", about="m1", ticks=20, **drift)
@@ -124,7 +146,12 @@ def clocked():
 def test_a_clock_is_told_as_it_stood_at_the_end():
     use = summarise_clock(clocked(), "m1", "m2")
     assert (use.offset_first_us, use.offset_us) == (3_000_000, 3_000_100)
-    assert (use.bound_p50_us, use.bound_max_us, use.rtt_min_us, use.faults) == (130.0, 200, 180, 2)
+    assert (use.bound_p50_us, use.bound_max_us, use.rtt_min_us, use.faults) == (
+        130.0,
+        200,
+        180,
+        2,
+    )
     assert (use.drift_ppm, use.drift_bound_ppm) == (50.0, 0.9)
     (line,) = format_clock_lines(clocked())
     assert line == (
@@ -145,7 +172,12 @@ def test_what_ended_the_run_is_a_line_without_controls() -> None:
     long = "the law a:B of s failed at tick 3: \x1b[31m" + "x" * 1000
     said = [
         SimpleNamespace(kind=kind, text=text)
-        for kind, text in (("ready", "s is ready"), ("failed", long), ("law", "slow"), ("arm", "off"))
+        for kind, text in (
+            ("ready", "s is ready"),
+            ("failed", long),
+            ("law", "slow"),
+            ("arm", "off"),
+        )
     ]
     failed, law, arm = format_outside_lines(SimpleNamespace(events=said))
     assert (law, arm) == ("slow", "off")
@@ -185,5 +217,6 @@ def test_a_terminal_gets_every_cell_and_no_control_characters() -> None:
     assert "\x1b" not in text
     assert "".join(text.split()).count("[red]") == 1
     console = Console(file=StringIO(), width=40)
-    console.print(TextTable(("", ""), [("a", "b")]).rich())  # without headers, without their line
+    # without headers, without their line
+    console.print(TextTable(("", ""), [("a", "b")]).rich())
     assert console.file.getvalue().split() == ["a", "b"]  # type: ignore[attr-defined]

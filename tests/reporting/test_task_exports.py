@@ -61,7 +61,9 @@ def test_csv_read_by_the_standard_library_and_polars(tmp_path: Path) -> None:
         assert np.array_equal([[float(row[head]) for head in heads] for row in rows], wanted)
         assert np.array_equal(frame.select(heads).to_numpy(), wanted)
     assert np.abs(log()["s"].wrench).max() > 1.0
-    columns = json.loads((folder / "about.json").read_text())["tables"]["s_state.csv"]["columns"]
+    columns = json.loads((folder / "about.json").read_text())["tables"]["s_state.csv"][
+        "columns"
+    ]
     assert columns["wrench_x_n"]["unit"] == "N"
     assert columns["x_z_m"]["source"] == "x[2]"
     assert "q_des1_rad" not in columns
@@ -91,10 +93,15 @@ def test_ros2_read_by_rosbags(tmp_path: Path) -> None:
     found: dict[str, list[list[float]]] = {}
     with AnyReader([path]) as bag:
         for connection, _, data in bag.messages():
-            if connection.topic.startswith("/planar/s/") and connection.msgtype.endswith("Float64MultiArray"):
+            if connection.topic.startswith("/planar/s/") and connection.msgtype.endswith(
+                "Float64MultiArray"
+            ):
                 message = bag.deserialize(data, connection.msgtype)
                 found.setdefault(connection.topic, []).append(message.data.tolist())
-            if connection.topic.startswith("/planar/s/") and "geometry_msgs" in connection.msgtype:
+            if (
+                connection.topic.startswith("/planar/s/")
+                and "geometry_msgs" in connection.msgtype
+            ):
                 message = bag.deserialize(data, connection.msgtype)
                 found.setdefault(connection.topic, []).append(list_numbers(message))
         types = {connection.topic: connection.msgtype for connection in bag.connections}
@@ -136,13 +143,19 @@ def test_messages_are_in_order_of_arrival(
     assert times == sorted(times)
     topics = [channel.topic for _, channel, _ in messages]
     assert sum(topic.endswith("/joint_states") for topic in topics) == sum(told) == 3 * 120
-    assert {"/paper/m1/link_age", "/paper/events", "/paper/log", "/tf", "/diagnostics"} <= set(topics)
-    assert not {f"/paper/m1/{name}" for name in ("link_delay", "link_offset", "timing")} & set(topics)
+    assert {"/paper/m1/link_age", "/paper/events", "/paper/log", "/tf", "/diagnostics"} <= set(
+        topics
+    )
+    assert not {f"/paper/m1/{name}" for name in ("link_delay", "link_offset", "timing")} & set(
+        topics
+    )
 
 
 def test_records_that_came_late_stand_where_they_came(tmp_path: Path) -> None:
     """A gap in the log is a gap in the bag."""
-    log = opened(edited(recorded("paper"), record=lambda r: None if 20 <= r["tick"] < 40 else r))
+    log = opened(
+        edited(recorded("paper"), record=lambda r: None if 20 <= r["tick"] < 40 else r)
+    )
     path = tmp_path / "bag.mcap"
     export_ros2(log, path)
     with path.open("rb") as stream:
@@ -151,6 +164,10 @@ def test_records_that_came_late_stand_where_they_came(tmp_path: Path) -> None:
 
 
 def test_a_record_that_cannot_be_read_is_told(tmp_path: Path) -> None:
-    log = opened(edited(recorded("paper"), record=lambda r: {**r, "q": r["q"][:1]} if r["tick"] == 7 else r))
+    log = opened(
+        edited(
+            recorded("paper"), record=lambda r: {**r, "q": r["q"][:1]} if r["tick"] == 7 else r
+        )
+    )
     with pytest.raises(LogError, match="a record of m1 cannot be read"):
         export_ros2(log, tmp_path / "bag.mcap")

@@ -29,7 +29,12 @@ LINKS: dict[str, dict[str, Any]] = {
     "normal": {"delay_ms": 80.0, "deviation_ms": 15.0},
     "gamma": {"delay_ms": 80.0, "deviation_ms": 30.0, "loss": 0.1, "loss_burst": 4.0},
     "lognormal": {"delay_ms": 80.0, "deviation_ms": 30.0, "order": "in_order"},
-    "hyperexponential": {"floor_ms": 30.0, "fast_ms": 5.0, "slow_ms": 200.0, "slow_share": 0.02},
+    "hyperexponential": {
+        "floor_ms": 30.0,
+        "fast_ms": 5.0,
+        "slow_ms": 200.0,
+        "slow_share": 0.02,
+    },
     "ar1": {"delay_ms": 80.0, "deviation_ms": 20.0, "correlation": 0.9, "playout_ms": 90.0},
     "sine": {"delay_ms": 60.0, "amplitude_ms": 30.0, "period_s": 0.7},
     "trace": {"trace": "0 20000, 400000 90000, 800000 lost, 1200000 40000", "at_end": "loop"},
@@ -117,11 +122,21 @@ VARIED: dict[str, MakeLog] = {
         load_scenario("two_sites", {**SHORT, "link": {"model": "measured"}})
     ),
     **{f"law {law}": partial(run_with_law, law) for law in LAW_SETTINGS},
-    "six joints": lambda: trilat_net.simulate(parse_scenario(six_joints(1.0), overrides={"rate_hz": 200})),
+    "six joints": lambda: trilat_net.simulate(
+        parse_scenario(six_joints(1.0), overrides={"rate_hz": 200})
+    ),
     "planar task": lambda: trilat_net.simulate(parse_scenario(planar_task(rate_hz=200))),
-    "posed task": lambda: trilat_net.simulate(parse_scenario(posed_arms(1.0), overrides={"rate_hz": 200})),
+    "posed task": lambda: trilat_net.simulate(
+        parse_scenario(posed_arms(1.0), overrides={"rate_hz": 200})
+    ),
     "carried bodies": lambda: simulate(
-        "paper", {"sites.s.plant": {"class": "tests.own_code:Carousel", "bodies": {"box": [0.2, 0.2, 0.1]}}}
+        "paper",
+        {
+            "sites.s.plant": {
+                "class": "tests.own_code:Carousel",
+                "bodies": {"box": [0.2, 0.2, 0.1]},
+            }
+        },
     ),
     "four sites": lambda: logs.timed(logs.simulated("four")),
     "live change": lambda: logs.busy().log,

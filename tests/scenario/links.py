@@ -31,7 +31,9 @@ def _besides(draw: st.DrawFn) -> dict[str, Any]:
             "duplicate": share,
             "order": st.sampled_from(["newest", "in_order"]),
             "playout_ms": st.floats(0, 500) | st.integers(0, 500),
-            "outages_s": st.lists(st.tuples(st.floats(0, 10), st.floats(10.5, 99)).map(list), max_size=3),
+            "outages_s": st.lists(
+                st.tuples(st.floats(0, 10), st.floats(10.5, 99)).map(list), max_size=3
+            ),
         },
     )
     return {**draw(_losses()), **draw(others)}
@@ -70,7 +72,9 @@ _models: dict[str, st.SearchStrategy[dict[str, Any]]] = {
     "hyperexponential": st.fixed_dictionaries(
         {"floor_ms": ms, "fast_ms": ms, "slow_ms": ms, "slow_share": share}
     ),
-    "ar1": st.tuples(_spread(), _correlation).map(lambda pair: {**pair[0], "correlation": pair[1]}),
+    "ar1": st.tuples(_spread(), _correlation).map(
+        lambda pair: {**pair[0], "correlation": pair[1]}
+    ),
     "sine": st.tuples(_bounded("amplitude_ms"), st.floats(0.01, 100), st.floats(-7, 7)).map(
         lambda parts: {**parts[0], "period_s": parts[1], "phase_rad": parts[2]}
     ),

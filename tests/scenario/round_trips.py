@@ -12,7 +12,11 @@ SENT_NS = (22211105, 1022856655, 2022029432, 3022256680, 4022643932)
 def trip(number: int, lost: str = "false") -> dict[str, Any]:
     """An entry of the file; `lost` is what irtt says of that."""
     times = {"client": {"send": {"wall": 1707277440772833721, "monotonic": SENT_NS[number]}}}
-    delay = {} if lost != "false" else {"rtt": RTT_NS[number], "send": 10486437967, "receive": -10470921269}
+    delay = (
+        {}
+        if lost != "false"
+        else {"rtt": RTT_NS[number], "send": 10486437967, "receive": -10470921269}
+    )
     return {"seqno": number, "lost": lost, "timestamps": times, "delay": delay}
 
 

@@ -24,7 +24,12 @@ from trilat_net.scenario.urdf import MAX_CHARACTERS, read_urdf
 
 ARM6, ARM7 = ((SHIPPED_FOLDER / f"arm{n}.urdf").read_text(encoding="utf-8") for n in (6, 7))
 UNIFORM = {"uniform": [0.1, 0.2]}
-WALL = {"kind": "wall", "point_m": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "stiffness_n_m": 100.0}
+WALL = {
+    "kind": "wall",
+    "point_m": [0.0, 0.0, 0.0],
+    "normal": [0.0, 0.0, 1.0],
+    "stiffness_n_m": 100.0,
+}
 PULSE = {"kind": "pulse", "start_s": 1.0, "end_s": 2.0, "peak_nm": 3.0}
 TIP_SPRING = {"kind": "tip_spring", "stiffness_n_m": 100.0}
 Overrides = dict[str, Any]
@@ -60,12 +65,17 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
     assert ur5.theta[::10].sum() == pytest.approx(17.05, abs=0.005)
     assert panda.theta[::10].sum() == pytest.approx(16.06, abs=0.005)
     straight = joint_positions_m(ur5, np.zeros((1, 6)))[0]
-    assert math.dist(straight[5], straight[2]) == pytest.approx(math.hypot(0.425 + 0.39225, 0.10915))
+    assert math.dist(straight[5], straight[2]) == pytest.approx(
+        math.hypot(0.425 + 0.39225, 0.10915)
+    )
     limits = [np.linspace(joint.lower, joint.upper, 40) for joint in panda.chain.joints[3:6]]
     poses = np.zeros((40**3, 7))
-    poses[:, 3:6] = np.stack(np.meshgrid(*limits), axis=-1).reshape(-1, 3)  # what the reach depends on
+    # what the reach depends on
+    poses[:, 3:6] = np.stack(np.meshgrid(*limits), axis=-1).reshape(-1, 3)
     points = joint_positions_m(panda, poses)
-    assert np.linalg.norm(points[:, -1] - points[:, 1], axis=1).max() == pytest.approx(0.855, abs=0.004)
+    assert np.linalg.norm(points[:, -1] - points[:, 1], axis=1).max() == pytest.approx(
+        0.855, abs=0.004
+    )
 
 
 # What is refused
@@ -74,7 +84,11 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
 @pytest.mark.parametrize(
     ("changes", "path", "words"),
     [
-        ({"arm.payload_inertia_kg_m2": [0.1, 0, 0.1, 0, 0, 0.1]}, "arm.payload_inertia_kg_m2", "payload_kg"),
+        (
+            {"arm.payload_inertia_kg_m2": [0.1, 0, 0.1, 0, 0, 0.1]},
+            "arm.payload_inertia_kg_m2",
+            "payload_kg",
+        ),
         ({"arm.payload_com_m": [0.1, 0, 0]}, "arm.payload_com_m", "payload_kg"),
         (
             {"arm.payload_kg": 1.0, "arm.payload_inertia_kg_m2": [0.1, 0, 0.1, 0, 0, 0.3]},
@@ -86,15 +100,27 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
         ({"arm.tip": "wrist"}, "arm.tip", "did you mean 'wrist_3_link'"),
         ({"arm.base": "bas"}, "arm.base", "did you mean 'base'"),
         ({"arm.tip": "forearm"}, "arm.armature_kg_m2", "6 numbers, and the arm has 3 joints"),
-        ({"arm.armature_kg_m2": [0.1, 0.2]}, "arm.armature_kg_m2", "2 numbers, and the arm has 6 joints"),
+        (
+            {"arm.armature_kg_m2": [0.1, 0.2]},
+            "arm.armature_kg_m2",
+            "2 numbers, and the arm has 6 joints",
+        ),
         ({"arm.down": [0.0, 0.0, 0.0]}, "arm.down", "point somewhere"),
         ({"arm.down": [0.0, 0.0]}, "arm.down", "length >= 3"),
         ({"arm.l1_m": 2.0}, "arm.l1_m", "planar"),
         ({"arm.urdf": ""}, "q0_rad", "2 joints"),
         ({"urdf": {"arm6.urdf": "<robot/>"}}, "arm.urdf", "arm6.urdf: has no links"),
         ({"control.Kp": [1.0, 2.0]}, "control.Kp", "2 numbers, and the arm has 6 joints"),
-        ({"control.Gamma": [1.0, 2.0]}, "control.Gamma", "2 numbers, and the arm has 60 parameters"),
-        ({"limits.tau_limit_nm": [1.0, 2.0]}, "limits.tau_limit_nm", "2 numbers, and the arm has 6"),
+        (
+            {"control.Gamma": [1.0, 2.0]},
+            "control.Gamma",
+            "2 numbers, and the arm has 60 parameters",
+        ),
+        (
+            {"limits.tau_limit_nm": [1.0, 2.0]},
+            "limits.tau_limit_nm",
+            "2 numbers, and the arm has 6",
+        ),
         ({"sites.m1.q0_rad": [0.0, 0.0]}, "q0_rad", "2 numbers, and the arm has 6 joints"),
         (
             {"sites.m1.q0_rad": [7.0, 0, 0, 0, 0, 0]},
@@ -106,10 +132,26 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
             "q0_rad[1]",
             "drawn with seed 1, beyond a stop of joint shoulder_lift",
         ),
-        ({"sites.m1.environment": [{**WALL, "point_m": [0.0, 0.0]}]}, "environment[0].point_m", "x, y and z"),
-        ({"sites.m1.environment": [{**WALL, "normal": [0, 0, 0]}]}, "environment[0].normal", "somewhere"),
-        ({"sites.m1.hands": [{**PULSE, "peak_nm": [1.0, 2.0]}]}, "hands[0].peak_nm", "one for each"),
-        ({"sites.m1.hands": [{**TIP_SPRING, "to_m": [0.0, 0.0]}]}, "hands[0].to_m", "x, y and z"),
+        (
+            {"sites.m1.environment": [{**WALL, "point_m": [0.0, 0.0]}]},
+            "environment[0].point_m",
+            "x, y and z",
+        ),
+        (
+            {"sites.m1.environment": [{**WALL, "normal": [0, 0, 0]}]},
+            "environment[0].normal",
+            "somewhere",
+        ),
+        (
+            {"sites.m1.hands": [{**PULSE, "peak_nm": [1.0, 2.0]}]},
+            "hands[0].peak_nm",
+            "one for each",
+        ),
+        (
+            {"sites.m1.hands": [{**TIP_SPRING, "to_m": [0.0, 0.0]}]},
+            "hands[0].to_m",
+            "x, y and z",
+        ),
         (
             {"sites.m1.hands": [{"kind": "recorded", "points": [[0, 1, 2]]}]},
             "hands[0].points[0]",
@@ -131,7 +173,11 @@ def test_a_mistake_is_refused_at_its_own_key(changes: Overrides, path: str, word
         ({"arm.urdf": "\0"}, "arm.urdf", "cannot be read"),
         ({"urdf": [1]}, "urdf", "table"),
         ({"urdf": {"arm6.urdf": 5}}, "urdf.arm6.urdf", "text of a URDF"),
-        ({"expect.end_pose_rad": {"s": [0, 0]}}, "expect.end_pose_rad.s", "length 6, one angle per joint"),
+        (
+            {"expect.end_pose_rad": {"s": [0, 0]}},
+            "expect.end_pose_rad.s",
+            "length 6, one angle per joint",
+        ),
     ],
 )
 def test_a_mistake_of_the_whole_scenario_too(changes: Overrides, path: str, words: str) -> None:
@@ -142,13 +188,19 @@ def test_a_mistake_of_the_whole_scenario_too(changes: Overrides, path: str, word
 @pytest.mark.parametrize("key", ["armature_kg_m2", "payload_kg", "stops", "down", "tip"])
 def test_a_planar_arm_has_no_keys_of_a_chain(key: str) -> None:
     value: Any = {"stops": False, "down": [0.0, -1.0, 0.0], "tip": "x"}.get(key, 1.0)
-    with pytest.raises(ScenarioError, match=f"sites.m1.arm.{key}: belongs to an arm with a urdf"):
+    with pytest.raises(
+        ScenarioError, match=f"sites.m1.arm.{key}: belongs to an arm with a urdf"
+    ):
         load_scenario("free", {f"arm.{key}": value})
 
 
 def test_arms_of_unlike_joints_are_refused_in_joint_space() -> None:
     error = refusal(
-        {"sites.s.arm.urdf": "arm7.urdf", "sites.s.q0_rad": [0, 0, 0, -1.5, 0, 1.5, 0], "control": {}}
+        {
+            "sites.s.arm.urdf": "arm7.urdf",
+            "sites.s.q0_rad": [0, 0, 0, -1.5, 0, 1.5, 0],
+            "control": {},
+        }
     )
     assert error.path == "sites.s.arm"
     assert "has 7 joints, and that of m1 has 6" in error.problem
@@ -161,11 +213,14 @@ def test_a_link_of_meshes_alone_is_refused_with_its_name() -> None:
     assert "link 'shoulder'" in error.problem
     assert "has no <inertial>" in error.problem
     whole = six(urdf={"arm6.urdf": ARM6.replace("<inertial>", f"{mesh}<inertial>", 1)})
-    assert whole.arms["m1"].theta.tolist() == six().arms["m1"].theta.tolist()  # and no file is opened
+    # and no file is opened
+    assert whole.arms["m1"].theta.tolist() == six().arms["m1"].theta.tolist()
 
 
 @pytest.mark.parametrize(("scheme", "most"), [("second_order", 1.0), ("digital", 2.0)])
-def test_damping_that_a_light_joint_cannot_take_names_the_joint(scheme: str, most: float) -> None:
+def test_damping_that_a_light_joint_cannot_take_names_the_joint(
+    scheme: str, most: float
+) -> None:
     """The largest eigenvalue of h D M^-1 by NumPy, from Pinocchio's M of a stored pose."""
     chain, states = chain_references()["arm6"]
     pose, armature = states[0].q, np.array([0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
@@ -227,7 +282,8 @@ def test_an_arm_may_start_a_little_beyond_a_stop() -> None:
     assert (m1.upper, s.upper) == (2.0 * math.pi, 6.34)
     assert m1.lower == s.lower == -2.0 * math.pi
     assert any(
-        "s starts 0.0568 rad beyond a stop of joint shoulder_pan" in x for x in list_arm_notes(scenario)
+        "s starts 0.0568 rad beyond a stop of joint shoulder_pan" in x
+        for x in list_arm_notes(scenario)
     )
     error = refusal({"sites.s.q0_rad": [-6.44, -0.3, 0.5, 0.0, 0.0, 0.0]})
     assert error.path == "sites.s.q0_rad[0]"
@@ -252,7 +308,10 @@ def test_limits_of_position_give_way_to_a_start_a_little_beyond() -> None:
     scenario = load_scenario("play", {**limits, "sites.m1.q0_rad": [2.1, 0.5]})
     assert scenario.setup("m1").limits.q_max == (2.15, 2.0)
     assert scenario.setup("s").limits.q_max == 2.0
-    assert any("q_max_rad of joint q1: the limit lies at 2.15 rad" in x for x in list_arm_notes(scenario))
+    assert any(
+        "q_max_rad of joint q1: the limit lies at 2.15 rad" in x
+        for x in list_arm_notes(scenario)
+    )
     with pytest.raises(ScenarioError, match=r"start at most 0\.15 rad"):
         load_scenario("play", {**limits, "sites.m1.q0_rad": [2.16, 0.5]})
 
@@ -268,19 +327,27 @@ def test_an_arm_of_its_own_begins_anew() -> None:
     """Nothing of [arm] holds for a site that names a file: tip and drives belong to the one of the group."""
     own = {"arm": {"urdf": "arm7.urdf", "tip": "link6"}, "control": {"Kp": 0.01, "Kd": 0.0}}
     start = [0, 0, 0, -1.5, 0, 1.5]
-    one = six(**{f"sites.s.{key}": value for key, value in own.items()}, **{"sites.s.q0_rad": start})
+    one = six(
+        **{f"sites.s.{key}": value for key, value in own.items()}, **{"sites.s.q0_rad": start}
+    )
     assert one.sites["s"].arm.armature_kg_m2 == (0.0,)
     assert one.arms["s"].joint_names == tuple(f"joint{n}" for n in range(1, 7))
     assert set(one.urdf) == {"arm6.urdf", "arm7.urdf"}
-    back = load_scenario(one, {"sites.s.arm.urdf": "arm6.urdf", "sites.s.arm.armature_kg_m2": 0.1})
+    back = load_scenario(
+        one, {"sites.s.arm.urdf": "arm6.urdf", "sites.s.arm.armature_kg_m2": 0.1}
+    )
     assert (back.sites["s"].arm.tip, set(back.urdf)) == ("", {"arm6.urdf"})
 
 
 def test_overrides_reach_every_arm_or_one() -> None:
-    heavy = load_scenario(six(), ["arm.payload_kg=1", "sites.s.arm.payload_kg=2", "control.Kp=[9,9,9,1,1,1]"])
+    heavy = load_scenario(
+        six(), ["arm.payload_kg=1", "sites.s.arm.payload_kg=2", "control.Kp=[9,9,9,1,1,1]"]
+    )
     assert [spec.arm.payload_kg for spec in heavy.sites.values()] == [1.0, 1.0, 2.0]
     assert heavy.sites["s"].control.Kp == (9.0, 9.0, 9.0, 1.0, 1.0, 1.0)
-    wrist = load_scenario(six(), {"sites.s.arm.tip": "wrist_3_link", "sites.s.arm.payload_kg": 0.5})
+    wrist = load_scenario(
+        six(), {"sites.s.arm.tip": "wrist_3_link", "sites.s.arm.payload_kg": 0.5}
+    )
     assert wrist.arms["s"].theta[50] == six().arms["s"].theta[50] + 0.5
 
 
@@ -314,8 +381,14 @@ def test_a_file_lies_beside_the_scenario(tmp_path: Path) -> None:
         load_scenario(file)
 
 
-comments = (st.sampled_from(['"""', "a\r\nb", "\\", "'''", "[\n    1.0,\n]"]) | st.text(max_size=30)).filter(
-    lambda text: "--" not in text and not text.endswith("-") and all(c in "\t\r\n" or c >= " " for c in text)
+comments = (
+    st.sampled_from(['"""', "a\r\nb", "\\", "'''", "[\n    1.0,\n]"]) | st.text(max_size=30)
+).filter(
+    lambda text: (
+        "--" not in text
+        and not text.endswith("-")
+        and all(c in "\t\r\n" or c >= " " for c in text)
+    )
 )
 pose = st.lists(st.floats(-3, 3), min_size=6, max_size=6)
 overrides = st.fixed_dictionaries(
@@ -323,7 +396,8 @@ overrides = st.fixed_dictionaries(
     optional={
         "arm.payload_kg": st.floats(0, 3) | st.just(UNIFORM),
         "arm.payload_com_m": st.lists(st.floats(-0.2, 0.2), min_size=3, max_size=3),
-        "arm.armature_kg_m2": st.floats(0.3, 1) | st.lists(st.floats(0.3, 1), min_size=6, max_size=6),
+        "arm.armature_kg_m2": st.floats(0.3, 1)
+        | st.lists(st.floats(0.3, 1), min_size=6, max_size=6),
         "arm.down": st.lists(st.integers(1, 3), min_size=3, max_size=3),
         "arm.g_m_s2": st.floats(0, 20),
         "sites.s.arm.stops": st.booleans(),
@@ -331,14 +405,17 @@ overrides = st.fixed_dictionaries(
         "sites.s.q0_rad": pose | st.floats(-1, 1),
         "sites.m2.hands": st.lists(st.sampled_from([PULSE, TIP_SPRING]), max_size=2),
         "sites.s.environment": st.sampled_from([[], [WALL]]),
-        "limits.tau_limit_nm": st.floats(1, 100) | st.lists(st.floats(1, 100), min_size=6, max_size=6),
+        "limits.tau_limit_nm": st.floats(1, 100)
+        | st.lists(st.floats(1, 100), min_size=6, max_size=6),
     },
 )
 
 
 @settings(max_examples=40)
 @given(changed=overrides, comment=comments)
-def test_the_canonical_text_loads_to_the_same_scenario(changed: Overrides, comment: str) -> None:
+def test_the_canonical_text_loads_to_the_same_scenario(
+    changed: Overrides, comment: str
+) -> None:
     if not changed.get("arm.payload_kg"):
         changed.pop("arm.payload_com_m", None)  # what has no mass has no centre
     urdf = {"arm6.urdf": ARM6.replace("</robot>", f"<!--{comment}--></robot>")}
@@ -369,7 +446,14 @@ def test_a_planar_arm_beside_a_chain_is_the_same_arm() -> None:
     mixed = six(
         control={},
         **{f"sites.{name}.arm": {"urdf": ""} for name in ("m1", "m2")},
-        **{"sites.s.arm": {"urdf": "arm7.urdf", "base": "link2", "tip": "link4", "armature_kg_m2": 1.0}},
+        **{
+            "sites.s.arm": {
+                "urdf": "arm7.urdf",
+                "base": "link2",
+                "tip": "link4",
+                "armature_kg_m2": 1.0,
+            }
+        },
         **{f"sites.{name}.q0_rad": [0.3, -1.0] for name in ("m1", "m2", "s")},
     )
     assert parse_embedded(mixed.text) == mixed
@@ -389,7 +473,9 @@ REACHES = {
         "six_joints",
         {
             "urdf": {
-                "arm6.urdf": ARM6.replace('name="elbow" type="revolute"', 'name="elbow" type="prismatic"')
+                "arm6.urdf": ARM6.replace(
+                    'name="elbow" type="revolute"', 'name="elbow" type="prismatic"'
+                )
             },
             "expect": {},
         },
@@ -411,7 +497,9 @@ def test_the_reach_of_two_links_is_exact() -> None:
     reach = REACHES["planar"].reach
     assert (reach.inner_m, reach.outer_m) == (pytest.approx(0.4), pytest.approx(1.6))
     for elbow, radius in ((0.0, reach.outer_m), (math.pi, reach.inner_m)):
-        assert math.hypot(*REACHES["planar"].end_effector([0.7, elbow])) == pytest.approx(radius)
+        assert math.hypot(*REACHES["planar"].end_effector([0.7, elbow])) == pytest.approx(
+            radius
+        )
 
 
 def test_a_hand_at_the_joints_stays_between_stops_and_limits() -> None:

@@ -16,7 +16,9 @@ NAMES = ("m1", "m2", "s")
 EVERY = [f"{j}->{i}" for i in NAMES for j in NAMES if i != j]
 pair = st.tuples(st.floats(0.01, 50), st.floats(0.01, 50)).map(list)
 vector = st.floats(0.01, 50) | pair
-texts = st.sampled_from(['a """ b', "end \\", "a\r\nb", "[\n    1.0,\n]", "\x00"]) | st.text(max_size=60)
+texts = st.sampled_from(['a """ b', "end \\", "a\r\nb", "[\n    1.0,\n]", "\x00"]) | st.text(
+    max_size=60
+)
 
 laws = st.fixed_dictionaries(
     {"law": st.just("adaptive")},
@@ -93,14 +95,20 @@ def test_the_canonical_text_loads_to_the_same_scenario(changed: dict[str, Any]) 
         one, other = scenario.setup(name), again.setup(name)
         assert [link.models for link in one.links] == [link.models for link in other.links]
         assert [link.key for link in one.links] == [link.key for link in other.links]
-        assert (one.ramps, one.on_stale, one.gains) == (other.ramps, other.on_stale, other.gains)
+        assert (one.ramps, one.on_stale, one.gains) == (
+            other.ramps,
+            other.on_stale,
+            other.gains,
+        )
 
 
 @pytest.mark.parametrize("name", list_shipped())
 def test_what_nobody_asked_for_is_not_in_the_text(name: str) -> None:
     """So the hash of an experiment does not change when another feature comes."""
     text = load_scenario("paper", {"expect": {}}).text
-    assert not any(word in text for word in ("on_stale", "timeline", "expect", "loss", "playout"))
+    assert not any(
+        word in text for word in ("on_stale", "timeline", "expect", "loss", "playout")
+    )
     assert ("timeline" in load_scenario(name).text) == bool(load_scenario(name).timeline)
 
 

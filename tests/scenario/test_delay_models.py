@@ -49,16 +49,31 @@ def test_the_chain_of_losses_is_one(keys: dict[str, Any]) -> None:
     """Probabilities, and the stationary loss that the author wrote."""
     made = link(keys)
     model = made.core()
-    assert all(0.0 <= p <= 1.0 + 1e-12 for p in (model.loss_good, model.loss_bad, model.enter, model.leave))
+    assert all(
+        0.0 <= p <= 1.0 + 1e-12
+        for p in (model.loss_good, model.loss_bad, model.enter, model.leave)
+    )
     bad = model.enter / (model.enter + model.leave)
-    assert bad * model.loss_bad + (1 - bad) * model.loss_good == pytest.approx(made.loss, abs=1e-12)
+    assert bad * model.loss_bad + (1 - bad) * model.loss_good == pytest.approx(
+        made.loss, abs=1e-12
+    )
     if made.loss_burst and made.loss:
-        assert 1 / (1 - (1 - model.leave) * model.loss_bad) == pytest.approx(made.loss_burst, rel=1e-9)
+        assert 1 / (1 - (1 - model.leave) * model.loss_bad) == pytest.approx(
+            made.loss_burst, rel=1e-9
+        )
 
 
 def test_it_says_in_a_few_words_what_a_link_does() -> None:
-    keys = {"loss": 0.05, "loss_burst": 8, "duplicate": 0.01, "outages_s": [[1, 2.5]], "order": "in_order"}
-    words = link({"model": "gamma", "delay_ms": 40, "deviation_ms": 10, "playout_ms": 80, **keys}).describe()
+    keys = {
+        "loss": 0.05,
+        "loss_burst": 8,
+        "duplicate": 0.01,
+        "outages_s": [[1, 2.5]],
+        "order": "in_order",
+    }
+    words = link(
+        {"model": "gamma", "delay_ms": 40, "deviation_ms": 10, "playout_ms": 80, **keys}
+    ).describe()
     assert words == (
         "gamma 40 +- 10 ms, loss 5 % in bursts of 8, duplicates 1 %, cut 1-2.5 s, in order, play-out 80 ms"
     )
@@ -113,9 +128,17 @@ def test_whether_anything_is_drawn_and_whether_the_network_decides(
         ({"model": "unifrom"}, "link.model", "did you mean 'uniform'"),
         ({"model": 3}, "link.model", "must be one of"),
         ({"preset": "5G"}, "link.preset", "did you mean '5g'"),
-        ({"preset": "4g", "model": "uniform"}, "link.model", "the preset '4g' is 'hyperexponential'"),
+        (
+            {"preset": "4g", "model": "uniform"},
+            "link.model",
+            "the preset '4g' is 'hyperexponential'",
+        ),
         ({"preset": "4g", "delay_ms": 5}, "link.delay_ms", "unknown key"),
-        ({"model": "uniform", "delay_ms": 5, "deviation_ms": 1}, "link.deviation_ms", "unknown key"),
+        (
+            {"model": "uniform", "delay_ms": 5, "deviation_ms": 1},
+            "link.deviation_ms",
+            "unknown key",
+        ),
         ({"model": "measured", "delay_ms": 5}, "link.delay_ms", "unknown key"),
         ({"delay_ms": 5, "los": 0.1}, "link.los", "did you mean 'loss'"),
         ({"model": "constant", "delay_ms": 5, "file": "x.csv"}, "link.file", "unknown key"),
@@ -176,7 +199,9 @@ def test_choices_are_named_where_one_is_wrong() -> None:
     assert refused({"delay_ms": 5, "order": "in order"}).problem == (
         "is 'in order', must be 'newest' or 'in_order'"
     )
-    assert "'hold' or 'loop'" in refused({"model": "trace", "trace": "0 5", "at_end": "x"}).problem
+    assert (
+        "'hold' or 'loop'" in refused({"model": "trace", "trace": "0 5", "at_end": "x"}).problem
+    )
 
 
 def test_the_longest_burst_that_holes_allow_is_named() -> None:

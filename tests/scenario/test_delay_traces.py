@@ -13,7 +13,12 @@ from trilat_net.core.channel import LOST
 from trilat_net.core.delay import MAX_DELAY_US, TraceEnd
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario, parse_scenario
-from trilat_net.scenario.delay_traces import MAX_TRACE_POINTS, format_trace, parse_trace, read_trace
+from trilat_net.scenario.delay_traces import (
+    MAX_TRACE_POINTS,
+    format_trace,
+    parse_trace,
+    read_trace,
+)
 from trilat_net.scenario.scenario_reader import read_shipped
 
 POINTS = [[0, 41_200], [1_000, LOST], [2_500, 0]]
@@ -40,7 +45,9 @@ def test_tables_as_people_have_them(tmp_path: Path, content: str) -> None:
 
 
 rows = st.lists(
-    st.tuples(st.integers(1, 10**8), st.integers(0, MAX_DELAY_US) | st.just(LOST)), min_size=1, max_size=30
+    st.tuples(st.integers(1, 10**8), st.integers(0, MAX_DELAY_US) | st.just(LOST)),
+    min_size=1,
+    max_size=30,
 )
 
 
@@ -49,10 +56,13 @@ def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]
     t_us = np.cumsum([gap for gap, _ in rows])
     delays = [delay for _, delay in rows]
     table = [
-        (t / 1e6, math.inf if us == LOST else us / 1e3) for t, us in zip(t_us.tolist(), delays, strict=True)
+        (t / 1e6, math.inf if us == LOST else us / 1e3)
+        for t, us in zip(t_us.tolist(), delays, strict=True)
     ]
     text = format_trace(table)
-    assert parse_trace(text).tolist() == [[t - t_us[0], us] for t, us in zip(t_us, delays, strict=True)]
+    assert parse_trace(text).tolist() == [
+        [t - t_us[0], us] for t, us in zip(t_us, delays, strict=True)
+    ]
 
 
 @pytest.mark.parametrize(
@@ -72,10 +82,14 @@ def test_a_trace_keeps_its_points_to_the_microsecond(rows: list[tuple[int, int]]
         ("O.0,41\n1,5\n", "line 1: a line is"),  # a broken first line is no head
     ],
 )
-def test_what_is_no_trace_is_refused_where_it_is_wrong(tmp_path: Path, content: str, words: str) -> None:
+def test_what_is_no_trace_is_refused_where_it_is_wrong(
+    tmp_path: Path, content: str, words: str
+) -> None:
     (tmp_path / "delays.csv").write_text(content, encoding="utf-8")
     with pytest.raises(ScenarioError) as error:
-        load_scenario("paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "delays.csv")}})
+        load_scenario(
+            "paper", {"links.m1->s": {"model": "trace", "file": str(tmp_path / "delays.csv")}}
+        )
     assert error.value.path == "links.m1->s.file"
     assert words in error.value.problem
     assert "delays.csv" in error.value.problem
@@ -137,7 +151,10 @@ def test_a_file_lies_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
     assert "delays.csv" not in made.text
     assert parse_scenario(made.text) == made
     (path := tmp_path / "mine.toml").write_text(
-        read_shipped("paper").replace("delay_ms = 200.0", 'model = "trace"\nfile = "delays.csv"'), "utf-8"
+        read_shipped("paper").replace(
+            "delay_ms = 200.0", 'model = "trace"\nfile = "delays.csv"'
+        ),
+        "utf-8",
     )
     assert load_scenario(path).links["m1->s"].trace == TEXT
     setup = made.setup("s").links[0]
@@ -149,11 +166,17 @@ def test_a_file_lies_beside_the_scenario_that_names_it(tmp_path: Path) -> None:
 def test_trace_written_out_replaces_file_and_file_trace(tmp_path: Path) -> None:
     (tmp_path / "delays.csv").write_text("0,41.2\n", encoding="utf-8")
     file = 'file = "delays.csv"'
-    made = scenario(tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\ntrace = "0 7"')
+    made = scenario(
+        tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\ntrace = "0 7"'
+    )
     assert (made.links["m1->s"].trace, made.links["m2->s"].trace) == ("0 7", "0 41200")
-    made = scenario(tmp_path, f'[link]\nmodel = "trace"\ntrace = "0 7"\n[links."m1->s"]\n{file}')
+    made = scenario(
+        tmp_path, f'[link]\nmodel = "trace"\ntrace = "0 7"\n[links."m1->s"]\n{file}'
+    )
     assert (made.links["m1->s"].trace, made.links["m2->s"].trace) == ("0 41200", "0 7")
-    made = scenario(tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\nat_end = "loop"')
+    made = scenario(
+        tmp_path, f'[link]\nmodel = "trace"\n{file}\n[links."m1->s"]\nat_end = "loop"'
+    )
     assert (made.links["m1->s"].at_end, made.links["m2->s"].at_end) == ("loop", "hold")
 
 
@@ -161,7 +184,11 @@ def test_trace_written_out_replaces_file_and_file_trace(tmp_path: Path) -> None:
     ("link", "path", "words"),
     [
         ('[link]\nmodel = "trace"', "links.m2->m1.file", "is missing"),
-        ('[link]\nmodel = "trace"\ntrace = "0 7"\nfile = "a.csv"', "link.file", "either trace or file"),
+        (
+            '[link]\nmodel = "trace"\ntrace = "0 7"\nfile = "a.csv"',
+            "link.file",
+            "either trace or file",
+        ),
         (
             '[link]\nmodel = "trace"\ntrace = "0 7"\nof = "m1->s"',
             "links.m2->m1.of",
@@ -170,7 +197,9 @@ def test_trace_written_out_replaces_file_and_file_trace(tmp_path: Path) -> None:
         ('[link]\nmodel = "trace"\nfile = 5', "link.file", "No such file"),
     ],
 )
-def test_where_a_trace_comes_from_is_said_once(tmp_path: Path, link: str, path: str, words: str) -> None:
+def test_where_a_trace_comes_from_is_said_once(
+    tmp_path: Path, link: str, path: str, words: str
+) -> None:
     with pytest.raises(ScenarioError) as error:
         scenario(tmp_path, link)
     assert error.value.path == path

@@ -22,7 +22,9 @@ def test_one_experiment_differs_in_nothing_whatever_it_is_called() -> None:
 
 
 def test_a_gain_of_all_sites_is_one_line() -> None:
-    assert told(("free", []), ("free", ["control.Kd=5"])) == {"control.Kd of m1, m2, s": ("3", "5")}
+    assert told(("free", []), ("free", ["control.Kd=5"])) == {
+        "control.Kd of m1, m2, s": ("3", "5")
+    }
     found = told(("free", []), ("free", ["sites.s.control.Kd=[5, 6]"]))
     assert found == {"control.Kd of s": ("3", "[5, 6]")}
 
@@ -38,7 +40,9 @@ def test_another_law_is_told_as_a_whole() -> None:
 
 
 def test_links_are_told_in_words() -> None:
-    found = told(("free", []), ("free", ["link.delay_ms=50"]), ("free", ["links.m1->s.delay_ms=9"]))
+    found = told(
+        ("free", []), ("free", ["link.delay_ms=50"]), ("free", ["links.m1->s.delay_ms=9"])
+    )
     assert found == {
         "link m1->s": ("200 ms", "50 ms", "9 ms"),
         "link m2->m1, s->m1, m1->m2, s->m2, m2->s": ("200 ms", "50 ms", "200 ms"),
@@ -54,14 +58,22 @@ def test_other_scenarios_other_sites_other_hands() -> None:
 
 
 def test_a_chain_is_told_joint_by_joint_with_notes() -> None:
-    unlimited = (SHIPPED_FOLDER / "arm6.urdf").read_text().replace('effort="28" velocity', "velocity", 1)
-    text = "\n".join(describe_scenario(six(urdf={"arm6.urdf": unlimited})))
-    first = (
-        "  shoulder_pan moves shoulder, 3.7 kg; -6.283 to 6.283 rad; 150 N m; 3.142 rad/s; drive 0.2 kg m^2"
+    unlimited = (
+        (SHIPPED_FOLDER / "arm6.urdf")
+        .read_text()
+        .replace('effort="28" velocity', "velocity", 1)
     )
-    assert f"arm of m1, m2, s: arm6.urdf, 6 joints from base to flange, 17.05 kg move\n{first}\n" in text
+    text = "\n".join(describe_scenario(six(urdf={"arm6.urdf": unlimited})))
+    first = "  shoulder_pan moves shoulder, 3.7 kg; -6.283 to 6.283 rad; 150 N m; 3.142 rad/s; drive 0.2 kg m^2"
+    assert (
+        f"arm of m1, m2, s: arm6.urdf, 6 joints from base to flange, 17.05 kg move\n{first}\n"
+        in text
+    )
     assert "  note: joint 'wrist_1' states no limit, or 0, of effort: none is kept" in text
-    assert "  wrist_1 moves wrist_1_link, 1.219 kg; -6.283 to 6.283 rad; 3.142 rad/s; drive" in text
+    assert (
+        "  wrist_1 moves wrist_1_link, 1.219 kg; -6.283 to 6.283 rad; 3.142 rad/s; drive"
+        in text
+    )
     assert "arm of" not in "\n".join(describe_scenario(load_scenario("free")))
 
 
@@ -88,7 +100,9 @@ def test_check_states_the_time_to_rest() -> None:
     scenario = load_scenario("free", {"on_stale.action": "glide"})
     bounds = find_rest_bounds(scenario, "s")
     lines = [line for line in describe_scenario(scenario) if line.startswith("arms of")]
-    stated = f"come to rest within {bounds.rest_s:.3g} s of a stop at limits.qd_limit_rad_s = 7.5"
+    stated = (
+        f"come to rest within {bounds.rest_s:.3g} s of a stop at limits.qd_limit_rad_s = 7.5"
+    )
     assert lines == [f"arms of m1, m2, s {stated}"]
     assert not [line for line in describe_scenario("free") if "come to rest" in line]
     fast = load_scenario("free", {"on_stale.action": "glide", "limits.qd_limit_rad_s": 40.0})
@@ -108,7 +122,11 @@ def test_motors_bear_the_speeds_of_shipped_scenarios(name: str) -> None:
         assert bounds.rest_s < 4.5
 
 
-REVERSIBLE = {"m1": {"m2": 0.25, "s": 0.75}, "m2": {"m1": 0.25, "s": 0.75}, "s": {"m1": 0.5, "m2": 0.5}}
+REVERSIBLE = {
+    "m1": {"m2": 0.25, "s": 0.75},
+    "m2": {"m1": 0.25, "s": 0.75},
+    "s": {"m1": 0.5, "m2": 0.5},
+}
 ONE_WAY = {**REVERSIBLE, "s": {"m1": 0.9, "m2": 0.1}}
 RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 0.5}]
 
@@ -125,7 +143,9 @@ RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 
         (
             {"law": "wave"},
             {"dominance": ONE_WAY},
-            ["m1, m2, s: lines share as b_ij / sum b_ik, as the shares of sites are not reversible"],
+            [
+                "m1, m2, s: lines share as b_ij / sum b_ik, as the shares of sites are not reversible"
+            ],
         ),
         (
             {"law": "wave"},
@@ -137,8 +157,14 @@ RAMP = [{"at_s": 1.0, "dominance": "s", "to": {"m1": 0.1, "m2": 0.9}, "ramp_s": 
 def test_a_check_says_which_shares_have_no_effect(
     law: dict[str, object], more: dict[str, object], expected: list[str]
 ) -> None:
-    scenario = unit_scenario({"m1": {}, "m2": {}, "s": {}}, law, **{"dominance": REVERSIBLE, **more})
-    found = [line for line in describe_scenario(scenario) if line.startswith("dominance without effect")]
+    scenario = unit_scenario(
+        {"m1": {}, "m2": {}, "s": {}}, law, **{"dominance": REVERSIBLE, **more}
+    )
+    found = [
+        line
+        for line in describe_scenario(scenario)
+        if line.startswith("dominance without effect")
+    ]
     assert found == [f"dominance without effect at {line}" for line in expected]
 
 
@@ -149,6 +175,8 @@ def test_lines_have_shares_of_their_sites_and_b_on_average() -> None:
     for name, one in zip(scenario.names, scenario.controls, strict=True):
         lines = np.array([one.find_impedances(name, peer) for peer in scenario.peers(name)])
         shares = [scenario.dominance[name][peer] for peer in scenario.peers(name)]
-        assert lines / lines.sum(axis=0) == pytest.approx(np.array([shares, shares]).T, rel=1e-9)
+        assert lines / lines.sum(axis=0) == pytest.approx(
+            np.array([shares, shares]).T, rel=1e-9
+        )
         total += lines.sum(axis=0)
     assert total / 6.0 == pytest.approx([6.0, 3.0])

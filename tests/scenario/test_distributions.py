@@ -19,7 +19,12 @@ EXAMPLE: dict[str, Any] = {
     "sites.m1.hands": [
         {"kind": "spring", "stiffness_nm_rad": {"uniform": [20.0, 30.0]}, "end_s": 5.0},
         {"kind": "tip_spring", "stiffness_n_m": [30.0, 30.0]},
-        {"kind": "pulse", "start_s": 1.0, "end_s": {"uniform": [3.0, 5.0]}, "peak_nm": [10.0, 0.0]},
+        {
+            "kind": "pulse",
+            "start_s": 1.0,
+            "end_s": {"uniform": [3.0, 5.0]},
+            "peak_nm": [10.0, 0.0],
+        },
     ],
 }
 
@@ -67,7 +72,10 @@ def test_the_text_is_canonical_and_holds_what_was_drawn() -> None:
 
 def test_another_seed_draws_again_wherever_the_scenario_came_from() -> None:
     """From a scenario, and from the text of a log: hands that hold the start pose too."""
-    for found in (reseed_scenario(drawn(1), 5), reseed_scenario(parse_scenario(drawn(2).text), 5)):
+    for found in (
+        reseed_scenario(drawn(1), 5),
+        reseed_scenario(parse_scenario(drawn(2).text), 5),
+    ):
         assert found == drawn(5)
         assert found.sha256 == drawn(5).sha256
     spring, tip, _ = found.sites["m1"].hands
@@ -98,9 +106,16 @@ def test_there_and_back_is_the_same_experiment(
     drawn_there: dict[str, list[float]], seeds: tuple[int, int]
 ) -> None:
     """Whatever is drawn: the text loads to itself, and the first seed again gives the first experiment."""
-    ranges = {key: {"uniform": two} for key, two in drawn_there.items() if key != "sites.m1.hands.1.to_m"}
+    ranges = {
+        key: {"uniform": two}
+        for key, two in drawn_there.items()
+        if key != "sites.m1.hands.1.to_m"
+    }
     if "sites.m1.hands.1.to_m" in drawn_there:
-        ranges["sites.m1.hands.1.to_m"] = [{"uniform": drawn_there["sites.m1.hands.1.to_m"]}, 0.5]
+        ranges["sites.m1.hands.1.to_m"] = [
+            {"uniform": drawn_there["sites.m1.hands.1.to_m"]},
+            0.5,
+        ]
     first = load_scenario("free", {**EXAMPLE, **ranges, "seed": seeds[0]})
     assert parse_scenario(first.text).text == first.text
     other = reseed_scenario(first, seeds[1])
@@ -127,15 +142,25 @@ def test_an_experiment_without_operators_is_still_itself() -> None:
 @pytest.mark.parametrize(
     ("key", "value", "problem"),
     [
-        ("sites.m1.q0_rad", {"normal": [0.1]}, "sites.m1.q0_rad[0]: must be { normal = [mean, deviation] }"),
+        (
+            "sites.m1.q0_rad",
+            {"normal": [0.1]},
+            "sites.m1.q0_rad[0]: must be { normal = [mean, deviation] }",
+        ),
         ("arm.m1_kg", {"normal": [1.0, -0.1]}, "sites.m1.arm.m1_kg: must be { normal"),
         ("arm.m1_kg", {"uniform": [2.0, 1.0]}, "sites.m1.arm.m1_kg: must be { normal"),
-        ("arm.m1_kg", {"normal": [1.0, 0.1], "uniform": [0.0, 1.0]}, "sites.m1.arm.m1_kg: must be { normal"),
+        (
+            "arm.m1_kg",
+            {"normal": [1.0, 0.1], "uniform": [0.0, 1.0]},
+            "sites.m1.arm.m1_kg: must be { normal",
+        ),
         ("sites.m1.arm.m1_kg", {"uniform": [-2.0, -1.0]}, "was drawn with seed 1"),
         ("drawn", {"sites.m1.q0_rad.0": 1.0}, "drawn: "),
     ],
 )
-def test_what_is_no_distribution_is_refused_at_its_key(key: str, value: Any, problem: str) -> None:
+def test_what_is_no_distribution_is_refused_at_its_key(
+    key: str, value: Any, problem: str
+) -> None:
     with pytest.raises(ScenarioError) as refused:
         load_scenario("free", {key: value})
     assert problem in str(refused.value)

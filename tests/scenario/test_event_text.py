@@ -10,7 +10,11 @@ from trilat_net.scenario.run_changes import describe_change, find_orderer
 from trilat_net.scenario.scenario_types import Change, SiteOrder
 
 CHANGES = {
-    "m2 was stopped by the experimenter at 58.2 s": {"site": "m2", "order": "stop", "at_s": 58.213},
+    "m2 was stopped by the experimenter at 58.2 s": {
+        "site": "m2",
+        "order": "stop",
+        "at_s": 58.213,
+    },
     "the link m1->s was set to 300 ms by the experimenter, from 58.213 s on": {
         "link": "m1->s",
         "to": {"model": "constant", "delay_ms": 300.0},
@@ -59,6 +63,8 @@ def test_who_ordered_a_stop_is_found_again() -> None:
     assert find_orderer("m2 follows its peers from t = 1.000 s") == ""
 
 
-@pytest.mark.parametrize("command", ["{", "{}", '{"at_s": "x"}', '{"at_s": 1.0, "link": "a->b"}', "[]", "3"])
+@pytest.mark.parametrize(
+    "command", ["{", "{}", '{"at_s": "x"}', '{"at_s": 1.0, "link": "a->b"}', "[]", "3"]
+)
 def test_a_strangers_command_keeps_its_text(command: str) -> None:
     assert describe_event("change", f"s takes in {command}", command)

@@ -44,11 +44,17 @@ def test_every_other_key_asks_something_whatever_its_value(keys: dict[str, Any])
         ("synchronised_rad", 0.0, ["expect.synchronised_rad"]),
         ("late_samples_max", 1.5, ["expect.late_samples_max"]),
         ("end_pose_rad", {"x": [0.0, 0.0]}, ["expect.end_pose_rad.x", "m1, m2, s"]),
-        ("end_pose_rad", {"m1": [0.0, 0.0], "s": [0.0]}, ["expect.end_pose_rad.s: expected list of length"]),
+        (
+            "end_pose_rad",
+            {"m1": [0.0, 0.0], "s": [0.0]},
+            ["expect.end_pose_rad.s: expected list of length"],
+        ),
         ("end_error_min_rad", 1.0, ["expect.end_error_min_rad", "end_error_max_rad"]),
     ],
 )
-def test_what_cannot_be_right_is_refused_with_its_key(key: str, value: Any, facts: list[str]) -> None:
+def test_what_cannot_be_right_is_refused_with_its_key(
+    key: str, value: Any, facts: list[str]
+) -> None:
     with pytest.raises(ScenarioError) as error:
         with_expect(**{"peak_error_max_rad": 2.0, key: value})
     for fact in facts:
@@ -56,12 +62,19 @@ def test_what_cannot_be_right_is_refused_with_its_key(key: str, value: Any, fact
 
 
 def test_a_pair_of_limits_must_leave_room() -> None:
-    assert find_expect_problem(Expect(mean_age_min_ms=5.0, mean_age_max_ms=5.0), {"m": 2}) is None
-    assert find_expect_problem(Expect(mean_age_min_ms=5.1, mean_age_max_ms=5.0), {"m": 2}) is not None
+    assert (
+        find_expect_problem(Expect(mean_age_min_ms=5.0, mean_age_max_ms=5.0), {"m": 2}) is None
+    )
+    assert (
+        find_expect_problem(Expect(mean_age_min_ms=5.1, mean_age_max_ms=5.0), {"m": 2})
+        is not None
+    )
 
 
 def test_it_survives_the_canonical_text_and_names_another_experiment() -> None:
-    scenario = load_scenario("free", {"expect.end_pose_rad": {"s": [0.1, -0.2]}, "expect.stable": False})
+    scenario = load_scenario(
+        "free", {"expect.end_pose_rad": {"s": [0.1, -0.2]}, "expect.stable": False}
+    )
     assert parse_scenario(scenario.text).expect == scenario.expect
     assert scenario.sha256 != load_scenario("free").sha256
 
@@ -79,7 +92,10 @@ def test_a_window_is_part_of_the_scenarios_text() -> None:
 @pytest.mark.parametrize(
     ("changes", "facts"),
     [
-        ({"wall_meen_n": [0, 1]}, ["expect.windows[0].wall_meen_n", "did you mean 'wall_mean_n'"]),
+        (
+            {"wall_meen_n": [0, 1]},
+            ["expect.windows[0].wall_meen_n", "did you mean 'wall_mean_n'"],
+        ),
         ({"to_s": 1.0}, ["expect.windows[0].to_s", "from_s = 1"]),
         ({"site": "m3"}, ["expect.windows[0].site", "m1, m2, s"]),
         ({"site": ""}, ["expect.windows[0].site", "wall_mean_n is of one site"]),
@@ -98,13 +114,19 @@ def test_window_that_cannot_be_right_is_refused_with_its_key(
 
 
 def test_a_window_that_asks_nothing_is_refused() -> None:
-    with pytest.raises(ScenarioError, match=r"expect.windows\[0\]: asks nothing; it may ask error_peak_rad"):
+    with pytest.raises(
+        ScenarioError, match=r"expect.windows\[0\]: asks nothing; it may ask error_peak_rad"
+    ):
         with_expect(windows=[{"from_s": 1.0, "to_s": 2.0}])
 
 
 def test_template_names_every_key_with_value_that_is_valid() -> None:
     commented = read_template().partition("# [expect]")[2].splitlines()[1:]
-    text = read_template() + "\n[expect]\n" + "\n".join(line.removeprefix("# ") for line in commented)
+    text = (
+        read_template()
+        + "\n[expect]\n"
+        + "\n".join(line.removeprefix("# ") for line in commented)
+    )
     written = parse_scenario(text).expect
     named = [line.removeprefix("# ").split(" = ")[0] for line in commented if " = " in line]
     window = ["from_s", "to_s", "site", *window_quantities(2)]
@@ -114,12 +136,22 @@ def test_template_names_every_key_with_value_that_is_valid() -> None:
 
 
 def test_window_has_quantities_of_as_many_joints_as_arm() -> None:
-    window = {"from_s": 1.0, "to_s": 2.0, "site": "s", "q6_rad": [0.0, 1.0], "push5_mean_nm": [0.0, 1.0]}
+    window = {
+        "from_s": 1.0,
+        "to_s": 2.0,
+        "site": "s",
+        "q6_rad": [0.0, 1.0],
+        "push5_mean_nm": [0.0, 1.0],
+    }
     asked = six(**{"expect.windows": [window]}).expect.windows[0].asked
     assert dict(asked) == {"q6_rad": (0.0, 1.0), "push5_mean_nm": (0.0, 1.0)}
-    with pytest.raises(ScenarioError, match=r"windows\[0\].q7_rad: there is no such joint: .* has 6"):
+    with pytest.raises(
+        ScenarioError, match=r"windows\[0\].q7_rad: there is no such joint: .* has 6"
+    ):
         six(**{"expect.windows": [window | {"q7_rad": [0.0, 1.0]}]})
-    with pytest.raises(ScenarioError, match=r"windows\[0\].q6_rad: there is no such joint: .* has 2"):
+    with pytest.raises(
+        ScenarioError, match=r"windows\[0\].q6_rad: there is no such joint: .* has 2"
+    ):
         with_expect(windows=[window])
 
 
@@ -127,7 +159,9 @@ def test_a_window_may_name_joints_as_their_file_does() -> None:
     """It is the same window as one with their numbers, so that nothing else knows the difference."""
 
     def windows(**keys: Any) -> tuple[ExpectWindow, ...]:
-        return six(**{"expect.windows": [{"from_s": 0.0, "to_s": 1.0, "site": "m1", **keys}]}).expect.windows
+        return six(
+            **{"expect.windows": [{"from_s": 0.0, "to_s": 1.0, "site": "m1", **keys}]}
+        ).expect.windows
 
     named = windows(q_elbow_rad=[0.0, 1.0], push_wrist_1_mean_nm=[-1.0, 1.0])
     assert named == windows(q3_rad=[0.0, 1.0], push4_mean_nm=[-1.0, 1.0])

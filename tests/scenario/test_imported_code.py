@@ -43,7 +43,9 @@ def test_naming_a_law_hashes_its_file_and_runs_nothing(module: str, folder: Path
 
 def test_a_named_law_is_imported_only_where_defined(folder: Path) -> None:
     """The hash is that of the file: a class from elsewhere would not be in it."""
-    (folder / "borrowed.py").write_text("raise RuntimeError('it ran')\nfrom tests.laws import Adaptive\n")
+    (folder / "borrowed.py").write_text(
+        "raise RuntimeError('it ran')\nfrom tests.laws import Adaptive\n"
+    )
     scenario = load_scenario("two_sites", {"control.law": "borrowed:Adaptive"})
     with pytest.raises(ScenarioError, match="defines no class Adaptive"):
         Site(scenario.setup("s"))
@@ -76,7 +78,9 @@ def test_name_that_is_none_is_refused_as_scenario_is_read(law: str, fact: str) -
         ({"control.law": "tests.laws:Odd"}, "sites must be as in 2 or (2, 4), is 'many'"),
     ],
 )
-def test_a_wrong_law_is_refused_as_the_site_is_built(overrides: dict[str, object], fact: str) -> None:
+def test_a_wrong_law_is_refused_as_the_site_is_built(
+    overrides: dict[str, object], fact: str
+) -> None:
     scenario = load_scenario("paper", overrides)
     with pytest.raises(ScenarioError) as caught:
         Site(scenario.setup("s"))
@@ -84,7 +88,9 @@ def test_a_wrong_law_is_refused_as_the_site_is_built(overrides: dict[str, object
     assert caught.value.path.startswith("sites.s.control")
 
 
-@pytest.mark.parametrize(("name", "law"), [("two_sites", "Pair"), ("two_sites", "Few"), ("paper", "Few")])
+@pytest.mark.parametrize(
+    ("name", "law"), [("two_sites", "Pair"), ("two_sites", "Few"), ("paper", "Few")]
+)
 def test_a_law_made_for_a_number_of_sites_gets_it(name: str, law: str) -> None:
     Site(load_scenario(name, {"control.law": f"tests.laws:{law}"}).setup("s"))
 
@@ -101,7 +107,9 @@ def test_a_law_is_not_told_what_nobody_knows() -> None:
     Site(load_scenario("two_sites", unknown).setup("s")._replace(own=Listening))
     Site(load_scenario("two_sites").setup("s")._replace(own=Listening))
     assert told == [(), (3.0, 1.0, 1.0, 2.0, 1.0)]
-    scenario = load_scenario("two_sites", {**unknown, "sites.s.control.law": "tests.laws:Knowing"})
+    scenario = load_scenario(
+        "two_sites", {**unknown, "sites.s.control.law": "tests.laws:Knowing"}
+    )
     with pytest.raises(ScenarioError, match=r"needs the arm's parameters, which are unknown"):
         Site(scenario.setup("s"))
 
@@ -117,13 +125,18 @@ def test_an_edited_law_file_is_taken_as_it_is_now(folder: Path) -> None:
     assert made == [1, 2.5]
 
 
-RESOLVED = load_scenario("paper", {"control.law": LAW, "control.Kd": 2.0, "sites.m1.control.law": "adaptive"})
+RESOLVED = load_scenario(
+    "paper", {"control.law": LAW, "control.Kd": 2.0, "sites.m1.control.law": "adaptive"}
+)
 
 
 @pytest.mark.parametrize(
     ("overrides", "settings"),
     [
-        (["control.Lambda=4"], ({"Kd": 2.0}, {"Kd": 2.0})),  # m1 has it by a law of ours: its own
+        (
+            ["control.Lambda=4"],
+            ({"Kd": 2.0}, {"Kd": 2.0}),
+        ),  # m1 has it by a law of ours: its own
         (["control.gain=4"], ({"Kd": 2.0, "gain": 4},) * 2),
         (["control.settings.Kd=4"], ({"Kd": 4},) * 2),
         (["sites.s.control.Kd=4"], ({"Kd": 2.0}, {"Kd": 4})),
@@ -147,9 +160,13 @@ def test_settings_stand_beside_the_name_of_the_law() -> None:
 
 
 def test_resolved_scenario_begins_with_no_other_file_than_it_names() -> None:
-    other = load_scenario(RESOLVED.text.replace(RESOLVED.sites["s"].control.source_sha256, "0" * 64))
+    other = load_scenario(
+        RESOLVED.text.replace(RESOLVED.sites["s"].control.source_sha256, "0" * 64)
+    )
     Site(RESOLVED.setup("s"))
-    with pytest.raises(ScenarioError, match=r"is not the one that the scenario names") as caught:
+    with pytest.raises(
+        ScenarioError, match=r"is not the one that the scenario names"
+    ) as caught:
         Site(other.setup("s"))
     assert caught.value.path == "sites.s.control.law"
 
@@ -170,7 +187,9 @@ def load_sending(folder: Path, sends: str) -> Scenario:
 
 
 def test_what_a_law_sends_stands_in_the_scenario(folder: Path) -> None:
-    sends = "{'u': {'unit': 'sqrt(W)', 'per_peer': True}, 'E': {'unit': 'J', 'length': 1}, 'w': {}}"
+    sends = (
+        "{'u': {'unit': 'sqrt(W)', 'per_peer': True}, 'E': {'unit': 'J', 'length': 1}, 'w': {}}"
+    )
     scenario = load_sending(folder, sends)
     assert parse_scenario(scenario.text) == scenario
     to_all = (SentVector("E", "J", 1), SentVector("w", "", 2))
@@ -205,7 +224,11 @@ def test_law_that_sends_nothing_leaves_its_scenario_as_it_was(folder: Path) -> N
         ("{'two words': {}}", "sends.two words", "is no name for a vector"),
         ("{'class': {}}", "sends.class", "is no name for a vector"),
         ("{'T': {}}", "sends.T", "is taken"),
-        ("{'u': {'length': 20}, 'v': {'length': 13, 'per_peer': True}}", "sends", "33 numbers to each peer"),
+        (
+            "{'u': {'length': 20}, 'v': {'length': 13, 'per_peer': True}}",
+            "sends",
+            "33 numbers to each peer",
+        ),
     ],
 )
 def test_what_cannot_be_sent_is_refused_as_scenario_is_read(
@@ -221,7 +244,11 @@ def test_what_cannot_be_sent_is_refused_as_scenario_is_read(
     ("sends", "overrides", "fact"),
     [
         ("{}", {}, "sends other vectors than the scenario names"),
-        ("{'u': {}}; schemes = ('digital',)", {}, "is for scheme = 'digital', and here it is 'second_order'"),
+        (
+            "{'u': {}}; schemes = ('digital',)",
+            {},
+            "is for scheme = 'digital', and here it is 'second_order'",
+        ),
         ("{'u': {}}; schemes = ('digital',)", {"scheme": "digital"}, ""),
     ],
 )

@@ -15,9 +15,24 @@ OUTSIDE = {"sites.s.plant": "external", "sites.s.arm.known": False}
     [
         ("paper", {"sites.s.arm.known": False}, "sites.s.arm.known", "plant = 'external'"),
         ("paper", {"control.law": "p_f"}, "sites.m1.control.law", "here are 3 sites"),
-        ("two_sites", {**OUTSIDE, "sites.s.control.law": "p_d"}, "sites.s.control.gravity", "p_d takes"),
-        ("two_sites", {**OUTSIDE, "sites.s.control.law": "pd_d"}, "sites.s.control.gravity", "pd_d takes"),
-        ("two_sites", {**OUTSIDE, "sites.s.control.law": "p_f"}, "sites.s.control.gravity", "p_f takes"),
+        (
+            "two_sites",
+            {**OUTSIDE, "sites.s.control.law": "p_d"},
+            "sites.s.control.gravity",
+            "p_d takes",
+        ),
+        (
+            "two_sites",
+            {**OUTSIDE, "sites.s.control.law": "pd_d"},
+            "sites.s.control.gravity",
+            "pd_d takes",
+        ),
+        (
+            "two_sites",
+            {**OUTSIDE, "sites.s.control.law": "p_f"},
+            "sites.s.control.gravity",
+            "p_f takes",
+        ),
         ("two_sites", {"sites.m.plant": "external"}, "sites.m.hands", "is pushed there"),
     ],
 )
@@ -41,7 +56,9 @@ def test_a_law_that_cannot_do_its_work_is_refused(
     ],
     ids=str,
 )
-def test_law_that_needs_no_masses_drives_arm_that_nobody_knows(overrides: dict[str, Any]) -> None:
+def test_law_that_needs_no_masses_drives_arm_that_nobody_knows(
+    overrides: dict[str, Any],
+) -> None:
     scenario = load_scenario("two_sites", {**OUTSIDE, **overrides})
     assert not scenario.setup("s").theta_known
     assert parse_scenario(scenario.text) == scenario
@@ -49,7 +66,10 @@ def test_law_that_needs_no_masses_drives_arm_that_nobody_knows(overrides: dict[s
 
 def test_a_known_arm_is_not_mentioned_for_the_hashes_sake() -> None:
     assert "known" not in load_scenario("two_sites").text
-    assert load_scenario("two_sites", {"arm.known": True}).sha256 == load_scenario("two_sites").sha256
+    assert (
+        load_scenario("two_sites", {"arm.known": True}).sha256
+        == load_scenario("two_sites").sha256
+    )
     assert load_scenario("two_sites", OUTSIDE).text.count("known = false") == 1
 
 

@@ -19,7 +19,9 @@ from trilat_net.scenario.link_inertia import LinkInertia, balance_tensor, fill_t
 from trilat_net.scenario.urdf import UrdfChain, read_urdf
 
 ROBOTS = Path(__file__).with_name("robots")
-FINGER, SHAPES = ((ROBOTS / f"{name}.urdf").read_text() for name in ("finger_inertia", "kinematics_only"))
+FINGER, SHAPES = (
+    (ROBOTS / f"{name}.urdf").read_text() for name in ("finger_inertia", "kinematics_only")
+)
 IMPOSSIBLE = '<inertia ixx="1e-7" ixy="0" ixz="0" iyy="1.4e-6" iyz="0" izz="4e-6"/>'
 TWO_SITES = {
     "name": "arm",
@@ -48,7 +50,8 @@ def finger(**inertial: Any) -> str:
     body = '<mass value="0.02"/>' + IMPOSSIBLE
     assert body in FINGER
     return FINGER.replace(body, inertial["body"]).replace(
-        'name="grip" type="prismatic"', f'name="grip" type="{inertial.get("kind", "prismatic")}"'
+        'name="grip" type="prismatic"',
+        f'name="grip" type="{inertial.get("kind", "prismatic")}"',
     )
 
 
@@ -61,7 +64,9 @@ def body_moments(chain: UrdfChain, joint: int) -> list[float]:
     m, *first = chain.joints[joint].inertia[:4]
     c = np.array(first) / m
     about = np.array(fill_tensor(chain.joints[joint].inertia[4:]))
-    return [float(x) for x in np.linalg.eigvalsh(about - m * (c @ c * np.eye(3) - np.outer(c, c)))]
+    return [
+        float(x) for x in np.linalg.eigvalsh(about - m * (c @ c * np.eye(3) - np.outer(c, c)))
+    ]
 
 
 # A link that does not lead to the end link
@@ -71,7 +76,9 @@ def test_a_finger_with_impossible_inertia_is_lumped_and_noted() -> None:
     chain = read_urdf(FINGER, tip="lower")
     assert [joint.name for joint in chain.joints] == ["shoulder", "elbow"]
     assert chain.joints[1].inertia[0] == 1.02
-    assert chain.joints[1].inertia[4] == pytest.approx(0.01 + 1.0 * 0.1**2 + 1e-7 + 0.02 * 0.3**2)
+    assert chain.joints[1].inertia[4] == pytest.approx(
+        0.01 + 1.0 * 0.1**2 + 1e-7 + 0.02 * 0.3**2
+    )
     lumped, counted = chain.notes
     assert "'grip' does not lead to the end link" in lumped
     assert "'finger' does not lead to the end link and counts as stated" in counted
@@ -85,22 +92,49 @@ def test_a_finger_with_impossible_inertia_is_lumped_and_noted() -> None:
         ('<mass value="0.02"/>' + IMPOSSIBLE, "floating", 1.02, "held at zero"),
         ('<mass value="0.02"/>' + IMPOSSIBLE, "planar", 1.02, "held at zero"),
         ('<mass value="0.02"/>' + IMPOSSIBLE, "fixed", 1.02, "counts as stated"),
-        ('<mass value="0.02"/>' + IMPOSSIBLE.replace('"4e-6', '"-4e-6'), "revolute", 1.02, "as stated"),
+        (
+            '<mass value="0.02"/>' + IMPOSSIBLE.replace('"4e-6', '"-4e-6'),
+            "revolute",
+            1.02,
+            "as stated",
+        ),
         (
             '<mass value="0.02"/>' + IMPOSSIBLE.replace('"4e-6', '"4e-1'),
             "revolute",
             1.02,
             "a point of 0.02 kg",
         ),
-        ('<mass value="0.02"/>' + IMPOSSIBLE.replace('"4e-6', '"-4e-1'), "revolute", 1.02, "as a point"),
-        ('<mass value="0.02"/>', "revolute", 1.02, "states a mass and no inertia: a point of 0.02 kg"),
-        ('<mass value="-0.02"/>' + IMPOSSIBLE, "revolute", 1.0, "left out: its mass is -0.02 kg"),
-        ('<mass value="0"/>' + IMPOSSIBLE, "revolute", 1.0, "left out: has moments of inertia and no mass"),
+        (
+            '<mass value="0.02"/>' + IMPOSSIBLE.replace('"4e-6', '"-4e-1'),
+            "revolute",
+            1.02,
+            "as a point",
+        ),
+        (
+            '<mass value="0.02"/>',
+            "revolute",
+            1.02,
+            "states a mass and no inertia: a point of 0.02 kg",
+        ),
+        (
+            '<mass value="-0.02"/>' + IMPOSSIBLE,
+            "revolute",
+            1.0,
+            "left out: its mass is -0.02 kg",
+        ),
+        (
+            '<mass value="0"/>' + IMPOSSIBLE,
+            "revolute",
+            1.0,
+            "left out: has moments of inertia and no mass",
+        ),
         (IMPOSSIBLE, "revolute", 1.0, "left out: its <inertial> has no <mass>"),
         ("", "revolute", 1.0, "left out"),
     ],
 )
-def test_no_link_off_the_way_makes_an_arm_unusable(body: str, kind: str, mass_kg: float, note: str) -> None:
+def test_no_link_off_the_way_makes_an_arm_unusable(
+    body: str, kind: str, mass_kg: float, note: str
+) -> None:
     chain = read_urdf(finger(body=body, kind=kind), tip="lower")
     assert chain.joints[1].inertia[0] == mass_kg
     assert any(note in one for one in chain.notes)
@@ -113,7 +147,12 @@ def test_a_finger_that_is_the_end_link_is_refused_with_three_remedies() -> None:
     with pytest.raises(ScenarioError) as refused:
         of_arm(FINGER, {})
     assert refused.value.path == "sites.m.arm.urdf"
-    for word in ("'finger'", "arm.balance_inertia = true", "[arm.links.finger]", "arm.tip = 'lower'"):
+    for word in (
+        "'finger'",
+        "arm.balance_inertia = true",
+        "[arm.links.finger]",
+        "arm.tip = 'lower'",
+    ):
         assert word in str(refused.value)
     assert len(of_arm(FINGER, {"balance_inertia": True}).arms["m"].joint_names) == 3
     given = {"links": {"finger": {"inertia_kg_m2": [1e-6, 0, 1e-6, 0, 0, 1e-6]}}}
@@ -155,7 +194,9 @@ def test_balancing_keeps_the_largest_moment_and_a_possible_tensor() -> None:
 
 
 def test_shapes_without_masses_become_an_arm_by_keys() -> None:
-    with pytest.raises(ScenarioError, match=r"'yaw'.*give mass_kg and inertia_kg_m2 in \[arm.links.yaw\]"):
+    with pytest.raises(
+        ScenarioError, match=r"'yaw'.*give mass_kg and inertia_kg_m2 in \[arm.links.yaw\]"
+    ):
         of_arm(SHAPES, {})
     with pytest.raises(ScenarioError, match=r"'yaw'.*give inertia_kg_m2 in \[arm.links.yaw\]"):
         of_arm(SHAPES, {"links": {"yaw": {"mass_kg": 0.5}}})
@@ -165,7 +206,9 @@ def test_shapes_without_masses_become_an_arm_by_keys() -> None:
     assert scenario.arms["m"].theta[10] == 0.3
 
 
-TURNED = FINGER.replace('<origin xyz="0 0 0.1"/><mass', '<origin xyz="0 0 0.1" rpy="0 0 1.5707963"/><mass')
+TURNED = FINGER.replace(
+    '<origin xyz="0 0 0.1"/><mass', '<origin xyz="0 0 0.1" rpy="0 0 1.5707963"/><mass'
+)
 TURNED = TURNED.replace('ixx="0.01"', 'ixx="0.005"')
 
 
@@ -173,7 +216,11 @@ def test_a_key_that_is_left_out_keeps_the_value_of_the_file() -> None:
     """The axes of the file's tensor stay turned; a tensor of the scenario stands in the link's axes."""
 
     def upper(**given: Any) -> list[float]:
-        return list(read_urdf(TURNED, tip="lower", links={"upper": LinkInertia(**given)}).joints[0].inertia)
+        return list(
+            read_urdf(TURNED, tip="lower", links={"upper": LinkInertia(**given)})
+            .joints[0]
+            .inertia
+        )
 
     m, c = 2.0, (0.1, 0.0, 0.2)
     about = [0.01, 0, 0.005, 0, 0, 0.01]  # turned by a right angle about z
@@ -187,8 +234,12 @@ def test_a_key_that_is_left_out_keeps_the_value_of_the_file() -> None:
     assert upper(mass_kg=m) == pytest.approx(shifted(m, (0, 0, 0.1), about), abs=1e-9)
     assert upper(com_m=c) == pytest.approx(shifted(1.0, c, about), abs=1e-9)
     own = (0.02, 0.0, 0.03, 0.0, 0.0, 0.04)
-    assert upper(inertia_kg_m2=own) == pytest.approx(shifted(1.0, (0, 0, 0.1), list(own)), abs=1e-9)
-    assert upper(mass_kg=m, com_m=c, inertia_kg_m2=own) == pytest.approx(shifted(m, c, list(own)))
+    assert upper(inertia_kg_m2=own) == pytest.approx(
+        shifted(1.0, (0, 0, 0.1), list(own)), abs=1e-9
+    )
+    assert upper(mass_kg=m, com_m=c, inertia_kg_m2=own) == pytest.approx(
+        shifted(m, c, list(own))
+    )
 
 
 def test_a_mass_of_zero_leaves_a_link_out() -> None:
@@ -221,7 +272,11 @@ def test_a_mass_of_zero_leaves_a_link_out() -> None:
             "links.upper.inertia_kg_m2",
             "must be positive",
         ),
-        ({"finger": {"mass_kg": 0.0, "com_m": [0.1, 0.0, 0.0]}}, "links.finger.com_m", "without mass"),
+        (
+            {"finger": {"mass_kg": 0.0, "com_m": [0.1, 0.0, 0.0]}},
+            "links.finger.com_m",
+            "without mass",
+        ),
         ({"finger": {"mass_kg": math.inf}}, "arm.links.finger.mass_kg", "finite"),
     ],
 )
@@ -280,7 +335,14 @@ def test_a_site_mends_a_link_further_than_all_sites() -> None:
     """Also a name that TOML quotes, and a number that is drawn."""
     text = SHAPES.replace('"tool"', '"tool.1"')
     shared = {"yaw": YAW, "tool.1": {"mass_kg": 0.4}}
-    own = {"arm": {"links": {"tool.1": {"com_m": [0.0, 0.0, 0.1]}, "yaw": {"mass_kg": {"normal": [1, 0.1]}}}}}
+    own = {
+        "arm": {
+            "links": {
+                "tool.1": {"com_m": [0.0, 0.0, 0.1]},
+                "yaw": {"mass_kg": {"normal": [1, 0.1]}},
+            }
+        }
+    }
     scenario = of_arm(text, {"links": shared}, s=own)
     m, s = (scenario.sites[name].arm.links for name in "ms")
     assert m["tool.1"] == LinkInertia(mass_kg=0.4)
@@ -292,7 +354,9 @@ def test_a_site_mends_a_link_further_than_all_sites() -> None:
 
 
 def test_what_differs_from_the_file_is_said() -> None:
-    scenario = of_arm(FINGER, {"tip": "lower", "links": {"upper": {"mass_kg": 2.0}}}, m={"q0_rad": [2.1, 0]})
+    scenario = of_arm(
+        FINGER, {"tip": "lower", "links": {"upper": {"mass_kg": 2.0}}}, m={"q0_rad": [2.1, 0]}
+    )
     notes = list_arm_notes(scenario)
     assert any("arm of m, s: link 'upper': mass_kg of the scenario" in note for note in notes)
     assert any("arm of m, s: link 'finger' does not lead" in note for note in notes)

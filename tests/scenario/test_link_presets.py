@@ -26,15 +26,21 @@ def test_a_preset_makes_a_scenario_in_every_place(name: str) -> None:
     for scenario in (
         load_scenario("paper", [f"link.preset={name}"]),
         load_scenario("paper", {"links": {"m1->s": {"preset": name}}}),
-        load_scenario("paper", {"timeline": [{"at_s": 1, "link": "m1->s", "to": {"preset": name}}]}),
+        load_scenario(
+            "paper", {"timeline": [{"at_s": 1, "link": "m1->s", "to": {"preset": name}}]}
+        ),
     ):
         assert repr(name) not in scenario.text.replace('"', "'")
         assert scenario.setup("s").links[0].models
 
 
 @pytest.mark.parametrize(("name", "round_trip"), ROUND_TRIPS_MS.items())
-def test_a_pair_of_cities_is_half_a_round_trip_away(name: str, round_trip: tuple[float, float]) -> None:
-    mean_ms, deviation_ms = load_scenario("paper", {"link": {"preset": name}}).links["m1->s"].moments()
+def test_a_pair_of_cities_is_half_a_round_trip_away(
+    name: str, round_trip: tuple[float, float]
+) -> None:
+    mean_ms, deviation_ms = (
+        load_scenario("paper", {"link": {"preset": name}}).links["m1->s"].moments()
+    )
     assert 2 * mean_ms == pytest.approx(round_trip[0], abs=0.011)
     assert math.sqrt(2) * deviation_ms == pytest.approx(round_trip[1], abs=0.01)
 
@@ -45,7 +51,9 @@ def test_wifi_has_half_of_the_percentiles_that_were_measured() -> None:
     parts = (stats.expon(link.floor_ms, link.fast_ms), stats.expon(link.floor_ms, link.slow_ms))
     for round_trip_ms, share in ((3, 0.5), (20, 0.9), (250, 0.99)):
         below = [part.cdf(round_trip_ms / 2) for part in parts]
-        assert (1 - link.slow_share) * below[0] + link.slow_share * below[1] == pytest.approx(share, abs=2e-3)
+        assert (1 - link.slow_share) * below[0] + link.slow_share * below[1] == pytest.approx(
+            share, abs=2e-3
+        )
 
 
 def test_lan_has_half_of_median_and_of_quartiles_distance() -> None:
@@ -64,7 +72,10 @@ def test_mobile_and_satellite_have_the_numbers_of_their_sources() -> None:
     assert described("4g") == "hyperexponential 53 +- 87.8 ms"
     assert PRESETS["5g"]["floor_ms"] + 0.8 * 5 + 0.2 * 50 == 21.5
     assert described("5g") == "hyperexponential 21.5 +- 29.1 ms"
-    assert (PRESETS["geo"]["floor_ms"], described("geo")) == (550 / 2, "hyperexponential 300 +- 25 ms")
+    assert (PRESETS["geo"]["floor_ms"], described("geo")) == (
+        550 / 2,
+        "hyperexponential 300 +- 25 ms",
+    )
 
 
 def test_the_grid_is_half_a_round_trip_and_single_losses() -> None:

@@ -29,7 +29,9 @@ CICV5G = """pub_time(ms) sub_time(ms) delay(ms) utmX(m) rsrp(db)
 
 
 @pytest.mark.parametrize("zipped", [False, True])
-def test_irtt_says_of_round_trips_what_trace_says_of_halves(tmp_path: Path, zipped: bool) -> None:
+def test_irtt_says_of_round_trips_what_trace_says_of_halves(
+    tmp_path: Path, zipped: bool
+) -> None:
     found = import_trace(irtt(tmp_path, zipped=zipped), "irtt")
     facts = found.to_dict()
     assert facts["mean_ms"] == pytest.approx(0.5e-6 * IRTT_MEAN_NS, rel=1e-7)
@@ -57,7 +59,9 @@ def test_a_ping_has_its_gaps_and_the_times_of_sending(tmp_path: Path) -> None:
     path.write_text(PING)
     found = import_trace(path, "ping")
     assert [ms for _, ms in found.points] == [30.3, 28.45, 31.0, math.inf, 32.55]
-    assert found.points[1][0] == pytest.approx(0.421290 - 0.0569 - (0.410606 - 0.0606), abs=1e-6)
+    assert found.points[1][0] == pytest.approx(
+        0.421290 - 0.0569 - (0.410606 - 0.0606), abs=1e-6
+    )
     path.write_text(PING.replace("[17001828", "x [17001828"))
     assert [t for t, _ in import_trace(path, "ping", every_s=0.2).points] == pytest.approx(
         [0.0, 0.2, 0.4, 0.6, 0.8]
@@ -66,7 +70,10 @@ def test_a_ping_has_its_gaps_and_the_times_of_sending(tmp_path: Path) -> None:
 
 def test_a_ping_that_counts_from_zero_again_goes_on(tmp_path: Path) -> None:
     path = tmp_path / "ping.txt"
-    lines = [f"64 bytes from 192.0.2.1: icmp_seq={n} ttl=63 time=2.0 ms" for n in (65534, 65535, 0, 2)]
+    lines = [
+        f"64 bytes from 192.0.2.1: icmp_seq={n} ttl=63 time=2.0 ms"
+        for n in (65534, 65535, 0, 2)
+    ]
     path.write_text("\n".join(lines))
     assert [ms for _, ms in import_trace(path, "ping").points] == [1.0, 1.0, 1.0, math.inf, 1.0]
 
@@ -82,7 +89,9 @@ def test_a_table_of_the_form_of_cicv5g_makes_a_link(tmp_path: Path) -> None:
     assert "1 took longer than 10 s and count as lost" in whole.summary()
     trace = tmp_path / "drive.csv"
     trace.write_text(whole.write_rows())
-    link = load_scenario("free", {"link": {"model": "trace", "file": str(trace)}}).links["m1->s"]
+    link = load_scenario("free", {"link": {"model": "trace", "file": str(trace)}}).links[
+        "m1->s"
+    ]
     assert isinstance(link, TraceDelay)
     assert link.points.tolist() == [[0, 22000], [54000, 33000], [109000, -1]]
 
@@ -91,7 +100,10 @@ def test_column_says_its_unit_and_whether_it_is_round_trip(tmp_path: Path) -> No
     path = tmp_path / "table.csv"
     path.write_text("timestamp_s,rtt_ms,uplink_ms\n0,20,12\n1,40,-1\n")
     assert [ms for _, ms in import_trace(path, "csv").points] == [10.0, 20.0]
-    assert [ms for _, ms in import_trace(path, "csv", column="uplink_ms").points] == [12.0, math.inf]
+    assert [ms for _, ms in import_trace(path, "csv", column="uplink_ms").points] == [
+        12.0,
+        math.inf,
+    ]
     path.write_text("timestamp,rtt\n0,20\n")
     with pytest.raises(ScenarioError, match="'timestamp' names no unit"):
         import_trace(path, "csv")
@@ -108,7 +120,9 @@ def test_column_says_its_unit_and_whether_it_is_round_trip(tmp_path: Path) -> No
         ("csv", "t_s,delay_ms\n", "it has no samples"),
     ],
 )
-def test_what_is_not_of_a_form_is_refused(tmp_path: Path, form: str, text: str, said: str) -> None:
+def test_what_is_not_of_a_form_is_refused(
+    tmp_path: Path, form: str, text: str, said: str
+) -> None:
     path = tmp_path / "file"
     path.write_text(text)
     with pytest.raises(ScenarioError, match=said):

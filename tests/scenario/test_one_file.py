@@ -90,7 +90,9 @@ print(json.dumps({
 """
 
 
-@pytest.mark.parametrize("scenario", ["two_sites", pytest.param("six_joints", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "scenario", ["two_sites", pytest.param("six_joints", marks=pytest.mark.long)]
+)
 def test_a_file_beside_the_others_acts_in_every_driver(tmp_path: Path, scenario: str) -> None:
     put_beside(tmp_path, "scenario/operators", "tremor.py", OPERATOR)
     put_beside(tmp_path, "scenario/delay_models", "two_paths.py", DELAY)
@@ -120,17 +122,23 @@ def force_of_kernel(body: HuntCrossley, q: tuple, qd: tuple) -> np.ndarray:
 
 def tip(q: tuple, qd: tuple) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     a, b = q[0], q[0] + q[1]
-    J = np.array([[-math.sin(a) - math.sin(b), -math.sin(b)], [math.cos(a) + math.cos(b), math.cos(b)]])
+    J = np.array(
+        [[-math.sin(a) - math.sin(b), -math.sin(b)], [math.cos(a) + math.cos(b), math.cos(b)]]
+    )
     return np.array([math.cos(a) + math.cos(b), math.sin(a) + math.sin(b)]), J @ qd, J
 
 
 @given(body=bodies, q=pairs, qd=pairs)
-def test_compiled_and_row_functions_of_a_body_agree(body: HuntCrossley, q: tuple, qd: tuple) -> None:
+def test_compiled_and_row_functions_of_a_body_agree(
+    body: HuntCrossley, q: tuple, qd: tuple
+) -> None:
     """F = K d^(3/2) (1 + lambda d'), Hunt and Crossley (1975)."""
     at, speed, J = tip(q, qd)
     effort = body.effort(np.array([1.0]), at[None], speed[None])[0]
     size = body.stiffness_n_m15 * (1.0 + body.damping_s_m)
-    assert force_of_kernel(body, q, qd) == pytest.approx(J.T @ effort, rel=1e-9, abs=1e-9 * (1.0 + size))
+    assert force_of_kernel(body, q, qd) == pytest.approx(
+        J.T @ effort, rel=1e-9, abs=1e-9 * (1.0 + size)
+    )
 
 
 @given(body=bodies, depth_mm=st.floats(1e-3, 50.0), speed_m_s=st.floats(0.0, 1.0))
@@ -151,7 +159,10 @@ def test_a_compliant_body_dissipates_whatever_its_depth(
 
 def test_paths_of_a_low_orbit_stay_for_their_slot() -> None:
     model = LowOrbit(floor_ms=20.0, path_ms=50.0, jitter_ms=0.0, slot_s=0.1)
-    fates = due(channel([model.core()._replace(trace_count=len(model.points))], points=model.points), 1000)
+    fates = due(
+        channel([model.core()._replace(trace_count=len(model.points))], points=model.points),
+        1000,
+    )
     delays = fates - np.arange(1000) * 1_000_000
     slots = delays.reshape(10, 100)
     assert (slots == slots[:, :1]).all()
@@ -160,6 +171,10 @@ def test_paths_of_a_low_orbit_stay_for_their_slot() -> None:
 
 
 def test_every_kind_of_a_file_of_its_own_is_found() -> None:
-    own = [kind for kind in (*OPERATORS.values(), *ENVIRONMENTS.values()) if issubclass(kind, OwnActor)]
+    own = [
+        kind
+        for kind in (*OPERATORS.values(), *ENVIRONMENTS.values())
+        if issubclass(kind, OwnActor)
+    ]
     assert HuntCrossley in own
     assert DELAY_MODELS["low_orbit"] is LowOrbit

@@ -17,7 +17,12 @@ VISCOUS = {"kind": "viscous", "damping_nm_s_rad": 1.0}
 WALL = {"kind": "wall", "point_m": [1.3, 0.0], "normal": [-1.0, 0.0], "stiffness_n_m": 2000.0}
 CHIRP = {"kind": "chirp", "peak_nm": 1.0, "from_hz": 0.5, "to_hz": 5.0, "sweep_s": 4.0}
 MULTISINE = {"kind": "multisine", "amplitude_nm": 1.0, "frequencies_hz": [0.5, 1.25]}
-BODY = {"kind": "hunt_crossley", "point_m": [1.3, 0.0], "normal": [-1.0, 0.0], "stiffness_n_m15": 2000.0}
+BODY = {
+    "kind": "hunt_crossley",
+    "point_m": [1.3, 0.0],
+    "normal": [-1.0, 0.0],
+    "stiffness_n_m15": 2000.0,
+}
 GROUPS = {
     "hands": [PULSE, SPRING, TIP, RECORDED, CHIRP, MULTISINE],
     "environment": [BODY, VISCOUS, WALL],
@@ -36,7 +41,9 @@ def test_every_kind_has_an_example_here_that_is_valid() -> None:
         shown = [kind for kind in kinds if kind not in ("live", "own")]
         assert [entry["kind"] for entry in GROUPS[group]] == shown
         assert len(
-            getattr(load_scenario("free", {f"sites.s.{group}": GROUPS[group]}).sites["s"], group)
+            getattr(
+                load_scenario("free", {f"sites.s.{group}": GROUPS[group]}).sites["s"], group
+            )
         ) == len(GROUPS[group])
 
 
@@ -66,7 +73,9 @@ def test_what_is_missing_is_named_with_what_it_wants(group: str, entry: Any, key
     ],
     ids=str,
 )
-def test_value_of_wrong_kind_is_told_what_its_key_wants(group: str, entry: Any, key: str) -> None:
+def test_value_of_wrong_kind_is_told_what_its_key_wants(
+    group: str, entry: Any, key: str
+) -> None:
     said = refused(group, entry)
     assert said.startswith(f".{key}: must be ")
     assert key == "points" or said.endswith("is 'x'")
@@ -75,28 +84,68 @@ def test_value_of_wrong_kind_is_told_what_its_key_wants(group: str, entry: Any, 
 @pytest.mark.parametrize(
     ("group", "entry", "said"),
     [
-        ("hands", {"kind": "pluse"}, ".kind: is 'pluse', must be one of 'pulse', .*; did you mean 'pulse'"),
+        (
+            "hands",
+            {"kind": "pluse"},
+            ".kind: is 'pluse', must be one of 'pulse', .*; did you mean 'pulse'",
+        ),
         ("hands", WALL, ".kind: is 'wall', which belongs in environment"),
         ("environment", PULSE, ".kind: is 'pulse', which belongs in hands"),
         ("hands", {**PULSE, "peak": 1.0}, ".peak: unknown key; did you mean 'peak_nm'"),
         ("hands", {**SPRING, "stiffness_n_m": 1.0}, ".*; did you mean 'stiffness_nm_rad'"),
         ("hands", {**PULSE, "end_s": 0.5}, ".end_s: must be later than start_s = 1, is 0.5"),
-        ("hands", {**SPRING, "move_start_s": 4.0}, ".move_end_s: must not be before move_start_s = 4, is 0"),
-        ("hands", {**CHIRP, "to_hz": 0.0}, ".to_hz: must be a frequency above 0 and up to 1000 Hz, is 0.0"),
+        (
+            "hands",
+            {**SPRING, "move_start_s": 4.0},
+            ".move_end_s: must not be before move_start_s = 4, is 0",
+        ),
+        (
+            "hands",
+            {**CHIRP, "to_hz": 0.0},
+            ".to_hz: must be a frequency above 0 and up to 1000 Hz, is 0.0",
+        ),
         (
             "hands",
             {**MULTISINE, "phases_rad": [1.0]},
             ".phases_rad: must be 2 angles, as many as frequencies",
         ),
-        ("hands", {**PULSE, "peak_nm": [1.0]}, ".peak_nm: must be one torque for both joints or two, ON"),
+        (
+            "hands",
+            {**PULSE, "peak_nm": [1.0]},
+            ".peak_nm: must be one torque for both joints or two, ON",
+        ),
         ("hands", {**SPRING, "stiffness_nm_rad": -5.0}, ".*at least 0, N m/rad, is -5.0"),
         ("hands", {**SPRING, "sampled": 1}, ".sampled: must be true or false, is 1"),
-        ("hands", {**RECORDED, "points": [[0.0, 1.0]]}, r".points\[0\]: must be a row \[time in s, torque"),
-        ("hands", {**RECORDED, "points": [[1.0, 0.0, 0.0]] * 2}, ".points: must be in the order of"),
-        ("environment", {**WALL, "normal": [0.0, 0.0]}, ".normal: must point somewhere, is zero"),
-        ("environment", {**WALL, "normal": "left"}, ".normal: .*to which side the wall is free, is 'left'"),
-        ("environment", {**WALL, "stiffness_n_m": [1.0, 2.0]}, ".stiffness_n_m: must be a number of"),
-        ("environment", {**WALL, "end_s": -1.0}, ".end_s: must be a time of at least 0 s, is -1.0"),
+        (
+            "hands",
+            {**RECORDED, "points": [[0.0, 1.0]]},
+            r".points\[0\]: must be a row \[time in s, torque",
+        ),
+        (
+            "hands",
+            {**RECORDED, "points": [[1.0, 0.0, 0.0]] * 2},
+            ".points: must be in the order of",
+        ),
+        (
+            "environment",
+            {**WALL, "normal": [0.0, 0.0]},
+            ".normal: must point somewhere, is zero",
+        ),
+        (
+            "environment",
+            {**WALL, "normal": "left"},
+            ".normal: .*to which side the wall is free, is 'left'",
+        ),
+        (
+            "environment",
+            {**WALL, "stiffness_n_m": [1.0, 2.0]},
+            ".stiffness_n_m: must be a number of",
+        ),
+        (
+            "environment",
+            {**WALL, "end_s": -1.0},
+            ".end_s: must be a time of at least 0 s, is -1.0",
+        ),
         ("environment", [WALL], ": must be a table"),
     ],
     ids=str,

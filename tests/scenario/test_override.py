@@ -32,10 +32,14 @@ def test_it_is_what_same_override_gives_as_scenario_is_loaded(
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_single_ones_key_counts_over_its_groups_in_any_order(order: int) -> None:
-    texts = ["control.Kd=5", "sites.s.control.Kd=7", "link.loss=0.1", "links.m1->s.loss=0.2"][::order]
+    texts = ["control.Kd=5", "sites.s.control.Kd=7", "link.loss=0.1", "links.m1->s.loss=0.2"][
+        ::order
+    ]
     scenario = load_scenario(PAPER, texts)
     assert [site.control.Kd[0] for site in scenario.sites.values()] == [5.0, 5.0, 7.0]
-    assert {name: link.loss for name, link in scenario.links.items() if link.loss != 0.1} == {"m1->s": 0.2}
+    assert {name: link.loss for name, link in scenario.links.items() if link.loss != 0.1} == {
+        "m1->s": 0.2
+    }
 
 
 @pytest.mark.parametrize(
@@ -51,7 +55,11 @@ def test_single_ones_key_counts_over_its_groups_in_any_order(order: int) -> None
 def test_key_of_one_joint_is_that_entry_of_its_vector(one: str, whole: str) -> None:
     """Also where the author wrote one number for all joints, or the vector of a group."""
     scenario = load_scenario("six_joints", [whole])
-    assert load_scenario("six_joints", [one]) == scenario == load_scenario(load_scenario("six_joints"), [one])
+    assert (
+        load_scenario("six_joints", [one])
+        == scenario
+        == load_scenario(load_scenario("six_joints"), [one])
+    )
 
 
 def test_another_law_has_its_own_gains_from_the_start() -> None:
@@ -73,7 +81,10 @@ def test_key_counts_for_those_whose_law_or_model_has_it() -> None:
     [
         (["control.Kdd=5"], ["control.Kdd", "did you mean 'Kd'"]),
         (["control.K=5"], ["control.K", "belongs to law", "p_d", "adaptive", "control.law"]),
-        (["link.half_width_ms=5"], ["link.half_width_ms", "belongs to model uniform", "link.model"]),
+        (
+            ["link.half_width_ms=5"],
+            ["link.half_width_ms", "belongs to model uniform", "link.model"],
+        ),
         (["link.preset=4h"], ["4h", "did you mean '4g'"]),
         (["control.law=pd"], ["pd", "did you mean 'p_d'"]),
         (["limits.tau_limit=5"], ["limits.tau_limit", "did you mean 'tau_limit_nm'"]),

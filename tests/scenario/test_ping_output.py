@@ -17,7 +17,9 @@ BSD = "PING host (192.0.2.5): 56 data bytes\n"
 LOST = math.inf
 
 
-def read(tmp_path: Path, text: str, encoding: str = "utf-8", every_s: float = 1.0) -> MeasuredTrace:
+def read(
+    tmp_path: Path, text: str, encoding: str = "utf-8", every_s: float = 1.0
+) -> MeasuredTrace:
     path = tmp_path / "ping.txt"
     path.write_bytes(text.encode(encoding))
     return import_trace(path, "ping", way="whole", every_s=every_s)
@@ -28,7 +30,9 @@ def delays(trace: MeasuredTrace) -> list[float]:
 
 
 def answers(*numbers: int, key: str = "icmp_seq") -> str:
-    return "".join(f"64 bytes from 192.0.2.5: {key}={n} ttl=64 time={n + 1}.0 ms\n" for n in numbers)
+    return "".join(
+        f"64 bytes from 192.0.2.5: {key}={n} ttl=64 time={n + 1}.0 ms\n" for n in numbers
+    )
 
 
 def summary(sent: int, received: int) -> str:
@@ -47,7 +51,12 @@ def summary(sent: int, received: int) -> str:
     ],
 )
 def test_every_probe_of_a_ping_counts(
-    name: str, samples: int, lost_percent: float, first_ms: float, last_ms: float, end_known: bool
+    name: str,
+    samples: int,
+    lost_percent: float,
+    first_ms: float,
+    last_ms: float,
+    end_known: bool,
 ) -> None:
     found = import_trace(PINGS / f"{name}.txt", "ping", way="whole")
     facts = found.to_dict()
@@ -71,7 +80,10 @@ def test_losses_without_lines_count_at_both_ends(tmp_path: Path, head: str) -> N
 
 
 def test_times_continue_beyond_the_answered_probes(tmp_path: Path) -> None:
-    lines = [f"[{100.005 + 0.2 * n:.6f}] 64 bytes: icmp_seq={n} ttl=64 time=5.0 ms" for n in (4, 5, 7)]
+    lines = [
+        f"[{100.005 + 0.2 * n:.6f}] 64 bytes: icmp_seq={n} ttl=64 time=5.0 ms"
+        for n in (4, 5, 7)
+    ]
     found = read(tmp_path, IPUTILS + "\n".join(lines) + "\n" + summary(9, 3))
     assert [t_s for t_s, _ in found.points] == pytest.approx(0.2 * np.arange(9), abs=1e-6)
 
@@ -81,10 +93,13 @@ def test_seeded_losses_are_counted_as_ping_counts_them(tmp_path: Path) -> None:
     for loss in (0.05, 0.3, 0.6, 0.95):
         sent = int(random.integers(5, 200))
         answered = [n for n in range(1, sent + 1) if random.uniform() > loss]
-        order = sorted(answered, key=lambda n: n + 3.0 * random.uniform())  # some overtake others
+        # some overtake others
+        order = sorted(answered, key=lambda n: n + 3.0 * random.uniform())
         text = IPUTILS + answers(*order) + answers(*order[:2]) + summary(sent, len(answered))
         found = read(tmp_path, text)
-        assert found.to_dict()["lost_percent"] == pytest.approx(100.0 * (sent - len(answered)) / sent)
+        assert found.to_dict()["lost_percent"] == pytest.approx(
+            100.0 * (sent - len(answered)) / sent
+        )
         assert delays(found) == [n + 1.0 if n in answered else LOST for n in range(1, sent + 1)]
 
 
@@ -120,7 +135,9 @@ WINDOWS = {
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "cp850", "cp1252"])
 @pytest.mark.parametrize("language", WINDOWS)
-def test_windows_speaks_any_language_and_encoding(tmp_path: Path, language: str, encoding: str) -> None:
+def test_windows_speaks_any_language_and_encoding(
+    tmp_path: Path, language: str, encoding: str
+) -> None:
     head, reply, lost, counts = WINDOWS[language]
     lines = [
         "",
@@ -192,15 +209,23 @@ def test_unfinished_output_says_that_its_end_is_unknown(
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (IPUTILS + answers(1, 9) + summary(3, 2), "counts 3 packets, but its lines reach number 9"),
+        (
+            IPUTILS + answers(1, 9) + summary(3, 2),
+            "counts 3 packets, but its lines reach number 9",
+        ),
         (IPUTILS + summary(9, 9), "counts 9 answers, but its lines have 0"),
         (IPUTILS + answers(1) + IPUTILS + answers(1), "several runs of ping"),
         ("a : [0], 64 bytes, 1.0 ms\nb : [0], 64 bytes, 1.0 ms", "it has 2 hosts, a, b"),
         (IPUTILS + summary(10**9, 0), "at most 16777216 are read"),
-        ("Reply from 192.0.2.7: bytes=32 time=1ms TTL=53\nsomething else\n", "line 2 is neither"),
+        (
+            "Reply from 192.0.2.7: bytes=32 time=1ms TTL=53\nsomething else\n",
+            "line 2 is neither",
+        ),
     ],
 )
-def test_output_that_contradicts_itself_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_output_that_contradicts_itself_is_refused(
+    tmp_path: Path, text: str, said: str
+) -> None:
     with pytest.raises(ScenarioError, match=said):
         read(tmp_path, text)
 
@@ -214,7 +239,9 @@ def test_output_that_contradicts_itself_is_refused(tmp_path: Path, text: str, sa
         ("zip", "a.txt"),
     ],
 )
-def test_a_spreadsheet_is_named_as_one(tmp_path: Path, form: str, ending: str, inside: str) -> None:
+def test_a_spreadsheet_is_named_as_one(
+    tmp_path: Path, form: str, ending: str, inside: str
+) -> None:
     path = tmp_path / f"table.{ending}"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mimetype" if ending == "ods" else inside, inside)

@@ -57,7 +57,13 @@ def test_a_change_of_shares_is_a_ramp() -> None:
 
 
 def test_a_change_keeps_unnamed_keys_unless_it_names_a_kind() -> None:
-    base = {"model": "gamma", "delay_ms": 50.0, "deviation_ms": 10.0, "loss": 0.1, "outages_s": [[1, 2]]}
+    base = {
+        "model": "gamma",
+        "delay_ms": 50.0,
+        "deviation_ms": 10.0,
+        "loss": 0.1,
+        "outages_s": [[1, 2]],
+    }
     first = {"at_s": 1, "link": "m1->s", "to": {"deviation_ms": 5}}
     then = {"at_s": 2, "link": "m1->s", "to": {"preset": "4g"}}
     last = {"at_s": 3, "link": "m1->s", "to": {"model": "measured", "loss": 0.2}}
@@ -93,10 +99,18 @@ def test_a_trace_may_be_left_but_no_other_begun() -> None:
 @pytest.mark.parametrize(
     ("change", "path", "words"),
     [
-        ({**LINK, "link": "m1->ss"}, "timeline[0].link", "there is no link 'm1->ss'; did you mean 'm1->s'"),
+        (
+            {**LINK, "link": "m1->ss"},
+            "timeline[0].link",
+            "there is no link 'm1->ss'; did you mean 'm1->s'",
+        ),
         ({**LINK, "link": "x"}, "timeline[0].link", "links are m2->m1"),
         ({**LINK, "link": 5}, "timeline[0].link", "must be a name"),
-        ({**ROW, "dominance": "ss"}, "timeline[0].dominance", "there is no site 'ss'; did you mean 's'"),
+        (
+            {**ROW, "dominance": "ss"},
+            "timeline[0].dominance",
+            "there is no site 'ss'; did you mean 's'",
+        ),
         ({**ROW, "dominance": {}}, "timeline[0].dominance", "must be a name"),
         ({**LINK, "dominance": "s"}, "timeline[0]", "either a link or, as dominance, a site"),
         ({**LINK, "att_s": 1}, "timeline[0].att_s", "did you mean 'at_s'"),
@@ -108,9 +122,17 @@ def test_a_trace_may_be_left_but_no_other_begun() -> None:
         ({**LINK, "ramp_s": 2.0}, "timeline[0].ramp_s", "only shares have a ramp"),
         ({**LINK, "to": {"delay_ms": -1}}, "timeline[0].to.delay_ms", ">= 0"),
         ({**LINK, "to": {"delay": 1}}, "timeline[0].to.delay", "did you mean 'delay_ms'"),
-        ({**LINK, "to": {"model": "gamma", "delay_ms": 5}}, "timeline[0].to", "deviation_ms is missing"),
+        (
+            {**LINK, "to": {"model": "gamma", "delay_ms": 5}},
+            "timeline[0].to",
+            "deviation_ms is missing",
+        ),
         ({**LINK, "to": {"order": "last"}}, "timeline[0].to.order", "'newest' or 'in_order'"),
-        ({**LINK, "to": {"loss": 1.0, "loss_burst": 3}}, "timeline[0].to.loss", "must be below"),
+        (
+            {**LINK, "to": {"loss": 1.0, "loss_burst": 3}},
+            "timeline[0].to.loss",
+            "must be below",
+        ),
         ({**LINK, "to": {"outages_s": [[1, 2]]}}, "timeline[0].to.outages_s", "cannot change"),
         ({**LINK, "to": 5}, "timeline[0].to", "must be a table"),
         ({**ROW, "to": {"m1": 0.9, "m2": 0.2}}, "timeline[0].to", "sum to 1.1"),
@@ -120,7 +142,9 @@ def test_a_trace_may_be_left_but_no_other_begun() -> None:
         (5, "timeline[0]", "must be a table"),
     ],
 )
-def test_a_change_that_cannot_be_is_refused_with_its_path(change: Any, path: str, words: str) -> None:
+def test_a_change_that_cannot_be_is_refused_with_its_path(
+    change: Any, path: str, words: str
+) -> None:
     error = refused(change)
     assert error.path == path
     assert words in error.problem
@@ -144,18 +168,27 @@ def ordered(scenario: Scenario, written: dict[str, Any], from_ns: int = S) -> An
 
 def test_command_holds_from_its_tick_and_belongs_to_receiver() -> None:
     scenario = load_scenario("paper")
-    change = ordered(scenario, {"link": "m1->s", "to": {"delay_ms": 350, "loss": 0.05}}, 123_456_789)
+    change = ordered(
+        scenario, {"link": "m1->s", "to": {"delay_ms": 350, "loss": 0.05}}, 123_456_789
+    )
     assert (find_owner(change), change.start_ns) == ("s", 123_456_789)
     made = to_core_change(scenario, change)
-    assert (made.peer, made.model) == (0, LinkModel(from_ns=123_456_789, location=350_000.0, loss_good=0.05))
+    assert (made.peer, made.model) == (
+        0,
+        LinkModel(from_ns=123_456_789, location=350_000.0, loss_good=0.05),
+    )
     change = ordered(scenario, {"dominance": "m2", "to": {"s": 1}, "ramp_s": 0.5}, 2 * S)
     assert find_owner(change) == "m2"
-    assert to_core_change(scenario, change).ramp == DominanceRamp(2 * S, 2_500_000_000, (0.0, 1.0))
+    assert to_core_change(scenario, change).ramp == DominanceRamp(
+        2 * S, 2_500_000_000, (0.0, 1.0)
+    )
 
 
 @settings(max_examples=60)
 @given(to=links(without=("trace",)), from_ns=st.integers(0, 10**14))
-def test_a_record_that_names_a_command_makes_the_same_command(to: dict[str, Any], from_ns: int) -> None:
+def test_a_record_that_names_a_command_makes_the_same_command(
+    to: dict[str, Any], from_ns: int
+) -> None:
     scenario = load_scenario("paper")
     to.pop("outages_s", None)
     made = to_core_change(scenario, ordered(scenario, {"link": "s->m1", "to": to}, from_ns))
@@ -168,17 +201,25 @@ def test_a_record_that_names_a_command_makes_the_same_command(to: dict[str, Any]
 def test_a_command_does_what_the_script_would_have_done(change: dict[str, Any]) -> None:
     """The same trajectories, bit for bit, and the record of its tick names it."""
     at_ns = 300_000_000
-    short = {"duration_s": 1.0, "link": {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0}}
+    short = {
+        "duration_s": 1.0,
+        "link": {"model": "uniform", "delay_ms": 20.0, "half_width_ms": 10.0},
+    }
     script = {**change, "at_s": at_ns / S, **({"ramp_s": 0.2} if "dominance" in change else {})}
     if "link" in change:
         script["to"] = {"model": "constant", "delay_ms": 60.0}
-    plain, planned = load_scenario("free", short), load_scenario("free", {**short, "timeline": [script]})
+    plain, planned = (
+        load_scenario("free", short),
+        load_scenario("free", {**short, "timeline": [script]}),
+    )
     written = {key: value for key, value in script.items() if key != "at_s"}
     made = to_core_change(plain, ordered(plain, written, at_ns))
     k = first_tick_at(at_ns, 1000) - 100
     commanded = list(virtual.execute_virtual(plain, commands={"s": {k: [made]}}))
     scripted_run = list(virtual.execute_virtual(planned))
-    assert [step.output._replace(cmd=[]) for step in commanded] == [step.output for step in scripted_run]
+    assert [step.output._replace(cmd=[]) for step in commanded] == [
+        step.output for step in scripted_run
+    ]
     named = [step.output for step in commanded if step.output.cmd]
     assert [(output.tick, output.cmd) for output in named] == [(k, [made.text])]
     assert commanded != list(virtual.execute_virtual(plain))
@@ -204,7 +245,9 @@ def test_a_link_with_a_trace_takes_no_unrecordable_orders() -> None:
     with pytest.raises(ScenarioError, match="can only be given another model"):
         ordered(scenario, {"link": "m1->s", "to": {"loss": 0.5}})
     assert (
-        to_core_change(scenario, ordered(scenario, {"link": "m1->s", "to": {"preset": "lan"}})).model
+        to_core_change(
+            scenario, ordered(scenario, {"link": "m1->s", "to": {"preset": "lan"}})
+        ).model
         is not None
     )
 
@@ -222,7 +265,9 @@ row = {"at_s": 1.0, "dominance": "s", "to": {"m1": 0.5, "m2": 0.5}}
         json.dumps({**good, "link": "m1->m2"}),
         json.dumps({**good, "dominance": "s"}),
         json.dumps({**good, "to": {"model": "constant", "delay_ms": -5}}),
-        json.dumps({**good, "to": {"model": "constant", "delay_ms": 5, "loss": 1, "loss_burst": 2}}),
+        json.dumps(
+            {**good, "to": {"model": "constant", "delay_ms": 5, "loss": 1, "loss_burst": 2}}
+        ),
         json.dumps({**good, "at_s": -1}),
         json.dumps({**row, "dominance": "m1"}),
         json.dumps({**row, "to": {"m1": "half"}}),
@@ -232,6 +277,9 @@ row = {"at_s": 1.0, "dominance": "s", "to": {"m1": 0.5, "m2": 0.5}}
 def test_record_that_names_no_command_of_its_site_is_refused(text: str) -> None:
     scenario = load_scenario("paper")
     for valid in (good, row):
-        assert parse_core_change(scenario, "s", json.dumps(valid)).text == msgspec.json.encode(valid).decode()
+        assert (
+            parse_core_change(scenario, "s", json.dumps(valid)).text
+            == msgspec.json.encode(valid).decode()
+        )
     with pytest.raises(ScenarioError):
         parse_core_change(scenario, "s", text)

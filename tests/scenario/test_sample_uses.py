@@ -13,8 +13,19 @@ from trilat_net.scenario.sample_uses import PictureDelay, draw_uses
 
 MODELS = {
     "constant": {"delay_ms": 130.0},
-    "lossy gamma": {"model": "gamma", "delay_ms": 90.0, "deviation_ms": 40.0, "loss": 0.3, "loss_burst": 5.0},
-    "in order": {"model": "uniform", "delay_ms": 90.0, "half_width_ms": 80.0, "order": "in_order"},
+    "lossy gamma": {
+        "model": "gamma",
+        "delay_ms": 90.0,
+        "deviation_ms": 40.0,
+        "loss": 0.3,
+        "loss_burst": 5.0,
+    },
+    "in order": {
+        "model": "uniform",
+        "delay_ms": 90.0,
+        "half_width_ms": 80.0,
+        "order": "in_order",
+    },
     "played out": {
         "model": "ar1",
         "delay_ms": 40.0,

@@ -59,7 +59,9 @@ def test_paper_is_section_iv() -> None:
 def test_template_is_valid_and_its_defaults_are_what_it_says() -> None:
     scenario = parse_scenario(read_template(), "template")
     assert scenario.name == "mine"
-    spelt_out = "\n".join(line.removeprefix("# ") for line in read_template().splitlines() if "=" in line)
+    spelt_out = "\n".join(
+        line.removeprefix("# ") for line in read_template().splitlines() if "=" in line
+    )
     assert "Kd = 3.0" in spelt_out
     control = scenario.sites["m1"].control
     assert (control.Kd, control.Gamma) == ((3.0, 3.0), (1.0,) * 5)
@@ -81,7 +83,13 @@ def test_the_hash_names_the_experiment() -> None:
 
 def test_an_override_reads_key_equals_value() -> None:
     tables: dict[str, Any] = {}
-    texts = ["control.Kd=5", "scheme=digital", "sites.m1.q0_rad=[0.1, 2]", 'title="a = b"', "seed = 7"]
+    texts = [
+        "control.Kd=5",
+        "scheme=digital",
+        "sites.m1.q0_rad=[0.1, 2]",
+        'title="a = b"',
+        "seed = 7",
+    ]
     apply_overrides(tables, texts)
     assert tables == {
         "control": {"Kd": 5},
@@ -101,9 +109,16 @@ def test_override_that_names_kind_replaces_what_file_says_of_another() -> None:
     """Whatever comes first; other overrides of the same table stay."""
     for texts in (["link.preset=4g", "link.loss=0.1"], ["link.loss=0.1", "link.preset=4g"]):
         links = load_scenario("paper", texts).links.values()
-        assert {link.describe() for link in links} == {"hyperexponential 53 +- 87.8 ms, loss 10 %"}
+        assert {link.describe() for link in links} == {
+            "hyperexponential 53 +- 87.8 ms, loss 10 %"
+        }
     assert load_scenario("paper", ["link.model=measured"]).measured
-    assert load_scenario("4g", ["link.delay_ms=5", "link.model=constant"]).links["m1->s"].describe() == "5 ms"
+    assert (
+        load_scenario("4g", ["link.delay_ms=5", "link.model=constant"])
+        .links["m1->s"]
+        .describe()
+        == "5 ms"
+    )
 
 
 def test_an_override_of_the_law_takes_that_laws_gains() -> None:
@@ -112,17 +127,28 @@ def test_an_override_of_the_law_takes_that_laws_gains() -> None:
     assert (gains.law, gains.K, gains.d) == (Law.KNOWN, (10.0, 10.0), (7.0, 7.0))
     assert refused(["control.law=p_d", "control.Kp=2"]).path == "control.Kp"
     mixed = load_scenario("paper", {"sites.s.control": {"law": "p_d"}})
-    assert [mixed.setup(name).gains.law for name in mixed.names] == [Law.ADAPTIVE, Law.ADAPTIVE, Law.KNOWN]
+    assert [mixed.setup(name).gains.law for name in mixed.names] == [
+        Law.ADAPTIVE,
+        Law.ADAPTIVE,
+        Law.KNOWN,
+    ]
 
 
 def test_what_to_do_about_a_stale_peer() -> None:
     assert load_scenario("paper").setup("s").on_stale == StaleRule(
         StaleAction.USE, 350_000_000, 1_000_000_000
     )
-    keys = {"on_stale": {"action": "hold", "age_ms": 120.5}, "sites.s.on_stale": {"action": "brake"}}
+    keys = {
+        "on_stale": {"action": "hold", "age_ms": 120.5},
+        "sites.s.on_stale": {"action": "brake"},
+    }
     scenario = load_scenario("paper", {**keys, "link.delay_ms": 100.0})
-    assert scenario.setup("m1").on_stale == StaleRule(StaleAction.HOLD, 120_500_000, 1_000_000_000)
-    assert scenario.setup("s").on_stale == StaleRule(StaleAction.BRAKE, 120_500_000, 1_000_000_000)
+    assert scenario.setup("m1").on_stale == StaleRule(
+        StaleAction.HOLD, 120_500_000, 1_000_000_000
+    )
+    assert scenario.setup("s").on_stale == StaleRule(
+        StaleAction.BRAKE, 120_500_000, 1_000_000_000
+    )
     for value in (0, -1, "soon"):
         assert "age_ms" in refused({"on_stale.age_ms": value}).path
     assert refused({"on_stale.return_s": 0}).problem
@@ -135,12 +161,15 @@ def test_an_override_below_a_value_is_refused() -> None:
 
 def test_an_override_reaches_into_lists_by_number() -> None:
     wall = load_scenario("contact").sites["s"].environment[0]
-    stiff = load_scenario("contact", ["sites.s.environment.0.stiffness_n_m=500", "sites.s.q0_rad.1=0.5"])
+    stiff = load_scenario(
+        "contact", ["sites.s.environment.0.stiffness_n_m=500", "sites.s.q0_rad.1=0.5"]
+    )
     assert stiff.sites["s"].environment == (msgspec.structs.replace(wall, stiffness_n_m=500.0),)
     assert stiff.sites["s"].q0_rad == (load_scenario("contact").sites["s"].q0_rad[0], 0.5)
     assert stiff.sites["m"].hands == load_scenario("contact").sites["m"].hands
     resolved = load_scenario(
-        load_scenario("contact"), {"sites.s.environment.0.stiffness_n_m": 500, "sites.s.q0_rad.1": 0.5}
+        load_scenario("contact"),
+        {"sites.s.environment.0.stiffness_n_m": 500, "sites.s.q0_rad.1": 0.5},
     )
     assert resolved == stiff
     given: dict[str, Any] = {"a": [{"b": [1, 2]}, {}]}
@@ -151,13 +180,29 @@ def test_an_override_reaches_into_lists_by_number() -> None:
 @pytest.mark.parametrize(
     ("key", "path", "problem"),
     [
-        ("sites.s.environment.1.stiffness_n_m", "sites.s.environment.1", "it has 1, counted from 0"),
-        ("sites.s.environment.-1.stiffness_n_m", "sites.s.environment.-1", "it has 1, counted from 0"),
-        ("sites.s.environment.wall.stiffness_n_m", "sites.s.environment.wall", "it has 1, counted from 0"),
+        (
+            "sites.s.environment.1.stiffness_n_m",
+            "sites.s.environment.1",
+            "it has 1, counted from 0",
+        ),
+        (
+            "sites.s.environment.-1.stiffness_n_m",
+            "sites.s.environment.-1",
+            "it has 1, counted from 0",
+        ),
+        (
+            "sites.s.environment.wall.stiffness_n_m",
+            "sites.s.environment.wall",
+            "it has 1, counted from 0",
+        ),
         ("sites.m.environment.0.stiffness_n_m", "sites.m.environment.0", "it has none"),
         ("sites.s.q0_rad.2", "sites.s.q0_rad.2", "it has 2, counted from 0"),
         ("sites.s.q0_rad.0.x", "sites.s.q0_rad.0", "is a value, not a table"),
-        ("sites.s.environment.0.stiffnes_n_m", "sites.s.environment[0].stiffnes_n_m", "'stiffness_n_m'"),
+        (
+            "sites.s.environment.0.stiffnes_n_m",
+            "sites.s.environment[0].stiffnes_n_m",
+            "'stiffness_n_m'",
+        ),
     ],
 )
 def test_an_entry_that_is_not_in_a_list_is_refused(key: str, path: str, problem: str) -> None:
@@ -178,11 +223,19 @@ def test_a_number_counts_for_every_joint_and_every_parameter() -> None:
 
 def test_a_site_overrides_its_arm_and_a_link_its_delay() -> None:
     scenario = load_scenario(
-        "paper", {"sites.s.arm.m1_kg": 2, "links": {"m1->s": {"delay_ms": 350.0}}, "sites.m2.rate_hz": 500}
+        "paper",
+        {
+            "sites.s.arm.m1_kg": 2,
+            "links": {"m1->s": {"delay_ms": 350.0}},
+            "sites.m2.rate_hz": 500,
+        },
     )
     assert scenario.sites["s"].arm.m1_kg == 2.0
     assert scenario.sites["m1"].arm.m1_kg == 1.0
-    assert [link.models[0].location for link in scenario.setup("s").links] == [350_000.0, 200_000.0]
+    assert [link.models[0].location for link in scenario.setup("s").links] == [
+        350_000.0,
+        200_000.0,
+    ]
     setup = scenario.setup("m1")
     assert [link.models[0].location for link in setup.links] == [200_000.0, 200_000.0]
     assert [link.rate_hz for link in setup.links] == [500, 1000]
@@ -191,7 +244,12 @@ def test_a_site_overrides_its_arm_and_a_link_its_delay() -> None:
 def test_a_delay_is_rounded_to_whole_microseconds() -> None:
     for delay_ms, us in ((0.0004, 0.0), (0.0006, 1.0), (199.0011, 199_001.0)):
         assert (
-            load_scenario("paper", {"link.delay_ms": delay_ms}).setup("m1").links[0].models[0].location == us
+            load_scenario("paper", {"link.delay_ms": delay_ms})
+            .setup("m1")
+            .links[0]
+            .models[0]
+            .location
+            == us
         )
 
 
@@ -270,7 +328,9 @@ def test_a_key_unlike_any_other_is_refused_with_all_valid() -> None:
         ({"sites.recorder": {}}, "sites.recorder"),
     ],
 )
-def test_a_value_that_cannot_be_is_refused_with_its_path(overrides: dict[str, Any], path: str) -> None:
+def test_a_value_that_cannot_be_is_refused_with_its_path(
+    overrides: dict[str, Any], path: str
+) -> None:
     error = refused(overrides)
     assert path in error.path
     assert error.problem
@@ -365,7 +425,10 @@ def test_name_that_is_not_shipped_is_refused_with_nearest() -> None:
 
 def test_a_stale_rule_below_the_delay_is_refused() -> None:
     rule = {"on_stale.action": "hold", "on_stale.age_ms": 350.0}
-    assert load_scenario("paper", {**rule, "link.delay_ms": 349.0}).sites["s"].on_stale.action == "hold"
+    assert (
+        load_scenario("paper", {**rule, "link.delay_ms": 349.0}).sites["s"].on_stale.action
+        == "hold"
+    )
     for link in ({"link.delay_ms": 350.0}, {"link.playout_ms": 400.0}):
         with pytest.raises(ScenarioError, match=r"sites\.m1\.on_stale\.age_ms.*never follow"):
             load_scenario("paper", {**rule, **link})
@@ -394,4 +457,9 @@ for _ in range(8):
 
 def test_threads_may_be_the_first_readers_together() -> None:
     """A program that opens two hands at once reads one scenario in two threads."""
-    assert subprocess.run([sys.executable, "-c", FIRST_READERS], check=False, timeout=60).returncode == 0
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", FIRST_READERS], check=False, timeout=60
+        ).returncode
+        == 0
+    )

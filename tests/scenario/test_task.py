@@ -21,23 +21,37 @@ TEXT = planar_task()
             "sites.s.q0_rad",
             "singular pose: its end effector cannot move along",
         ),
-        ({"task.axes": ["x", "y", "z"]}, "sites.m.task.axes", "has z, along which no joint moves"),
+        (
+            {"task.axes": ["x", "y", "z"]},
+            "sites.m.task.axes",
+            "has z, along which no joint moves",
+        ),
         ({"task.axes": []}, "sites.m.task.axes", "has z, along which no joint moves"),
         ({"task.axes": ["x", "rx"]}, "sites.m.task.axes", "rx, which belongs to a pose"),
         ({"task.axes": ["q"]}, "sites.m.task.axes[0]", "Invalid enum value 'q'"),
         ({"task.space": "place"}, "sites.m.task.space", "Invalid enum value 'place'"),
         ({"task.scale": 0}, "sites.m.task.scale", "> 0"),
-        ({"task.posture_rad": [0, 0]}, "sites.m.task.posture_rad", "while posture_rate_1_s is 0"),
+        (
+            {"task.posture_rad": [0, 0]},
+            "sites.m.task.posture_rad",
+            "while posture_rate_1_s is 0",
+        ),
         (
             {"task.posture_rad": [0, 0, 0], "task.posture_rate_1_s": 1},
             "sites.m.task.posture_rad",
             "has 3 numbers, and the arm has 2 joints",
         ),
-        ({"task.space": "joints"}, "sites.m.task.axes", "has no effect while sites share joint angles"),
+        (
+            {"task.space": "joints"},
+            "sites.m.task.axes",
+            "has no effect while sites share joint angles",
+        ),
         ({"sites.m.arm.base_xyz_m": [0, 0]}, "sites.m.arm.base_xyz_m", "length"),
     ],
 )
-def test_a_mistake_of_a_task_is_refused_at_its_key(changes: dict[str, Any], path: str, words: str) -> None:
+def test_a_mistake_of_a_task_is_refused_at_its_key(
+    changes: dict[str, Any], path: str, words: str
+) -> None:
     with pytest.raises(ScenarioError) as refused:
         parse_scenario(TEXT, overrides=changes)
     assert (refused.value.path, words in refused.value.problem) == (path, True), refused.value

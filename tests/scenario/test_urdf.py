@@ -27,7 +27,9 @@ def link(name: str, body: str = BODY) -> str:
     return f'<link name="{name}">{body}</link>'
 
 
-def joint(name: str, parent: str, child: str, kind: str = "revolute", inside: str = LIMIT) -> str:
+def joint(
+    name: str, parent: str, child: str, kind: str = "revolute", inside: str = LIMIT
+) -> str:
     return (
         f'<joint name="{name}" type="{kind}"><origin xyz="0 0 0.5"/><parent link="{parent}"/>'
         f'<child link="{child}"/><axis xyz="0 0 1"/>{inside}</joint>'
@@ -77,11 +79,18 @@ def test_the_shipped_arms_are_those_of_the_references(text: str, name: str, n: i
     chain = read_urdf(text)
     stored = chain_references()[name].chain
     assert (chain.tip, len(chain.joints), chain.notes) == ("flange", n, ())
-    geometry = [(j.name, j.link, j.kind, j.axis, j.rotation, j.origin_m, j.inertia) for j in chain.joints]
-    assert geometry == [
-        (j.name, j.link, j.kind, j.axis, j.rotation, j.origin_m, j.inertia) for j in stored.joints
+    geometry = [
+        (j.name, j.link, j.kind, j.axis, j.rotation, j.origin_m, j.inertia)
+        for j in chain.joints
     ]
-    assert (chain.tip_rotation, chain.tip_origin_m) == (stored.tip_rotation, stored.tip_origin_m)
+    assert geometry == [
+        (j.name, j.link, j.kind, j.axis, j.rotation, j.origin_m, j.inertia)
+        for j in stored.joints
+    ]
+    assert (chain.tip_rotation, chain.tip_origin_m) == (
+        stored.tip_rotation,
+        stored.tip_origin_m,
+    )
     assert all(math.isfinite(j.effort_limit) and j.lower < j.upper for j in chain.joints)
 
 
@@ -134,7 +143,9 @@ def points(random: np.random.Generator) -> tuple[Array, Array]:
 
 
 def tensor(masses: Array, places: Array) -> Array:
-    return sum(m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, places, strict=True))
+    return sum(
+        m * (p @ p * np.eye(3) - np.outer(p, p)) for m, p in zip(masses, places, strict=True)
+    )
 
 
 def six(I: Array) -> list[float]:  # noqa: E741 - the symbol of an inertia
@@ -145,9 +156,13 @@ def stated(masses: Array, places: Array, angles: Array) -> str:
     c, R = masses @ places / masses.sum(), rpy(angles)
     moments = six(R.T @ tensor(masses, places - c) @ R)
     keys = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
-    inertia = " ".join(f'{key}="{float(moment)!r}"' for key, moment in zip(keys, moments, strict=True))
+    inertia = " ".join(
+        f'{key}="{float(moment)!r}"' for key, moment in zip(keys, moments, strict=True)
+    )
     origin, mass = f'xyz="{words(c)}" rpy="{words(angles)}"', float(masses.sum())
-    return f'<inertial><origin {origin}/><mass value="{mass!r}"/><inertia {inertia}/></inertial>'
+    return (
+        f'<inertial><origin {origin}/><mass value="{mass!r}"/><inertia {inertia}/></inertial>'
+    )
 
 
 def words(vector: Array) -> str:
@@ -160,7 +175,10 @@ def test_fixed_links_and_payload_are_lumped_and_fixed_frames_composed(seed: int)
     """Every body is a cloud of masses: what is read must be the cloud's own sums in the joint's frame."""
     random = np.random.default_rng(seed)
     angles, offsets = random.uniform(-3, 3, (6, 3)), random.uniform(-1, 1, (6, 3))
-    origins = [f'<origin xyz="{words(x)}" rpy="{words(a)}"/>' for x, a in zip(offsets, angles, strict=True)]
+    origins = [
+        f'<origin xyz="{words(x)}" rpy="{words(a)}"/>'
+        for x, a in zip(offsets, angles, strict=True)
+    ]
 
     def edge(n: int, kind: str, parent: str, child: str) -> str:
         inside = f'{origins[n]}<parent link="{parent}"/><child link="{child}"/><axis xyz="0 3 4"/>{LIMIT}'
@@ -168,7 +186,10 @@ def test_fixed_links_and_payload_are_lumped_and_fixed_frames_composed(seed: int)
 
     clouds = [points(random) for _ in range(4)]
     text = robot(
-        *(link(f"l{n}", "" if n in (0, 1) else stated(*clouds[n - 2], angles[n])) for n in range(5)),
+        *(
+            link(f"l{n}", "" if n in (0, 1) else stated(*clouds[n - 2], angles[n]))
+            for n in range(5)
+        ),
         edge(0, "fixed", "l0", "l1"),
         edge(1, "revolute", "l1", "l2"),
         edge(2, "fixed", "l2", "l3"),
@@ -188,7 +209,10 @@ def test_fixed_links_and_payload_are_lumped_and_fixed_frames_composed(seed: int)
     assert np.abs(chain.tip_rotation - R[4]).max() < 1e-14
     assert chain.tip_origin_m == tuple(offsets[4])
     assert second.axis == (0.0, 0.6, 0.8)
-    for body, own, carried, n in ((first, clouds[0], clouds[1], 2), (second, clouds[2], clouds[3], 4)):
+    for body, own, carried, n in (
+        (first, clouds[0], clouds[1], 2),
+        (second, clouds[2], clouds[3], 4),
+    ):
         m = np.concatenate([own[0], carried[0]])
         p = np.concatenate([own[1], offsets[n] + carried[1] @ R[n].T])
         expected = [m.sum(), *(m @ p), *six(tensor(m, p))]
@@ -205,7 +229,12 @@ def test_limits_friction_and_kinds() -> None:
         link("b"),
         joint("three", "b", "c", inside='<limit effort="0" velocity="0"/>'),
         link("c"),
-        joint("four", "c", "d", inside='<limit lower="-1e16" upper="1e16" effort="1e16" velocity="2"/>'),
+        joint(
+            "four",
+            "c",
+            "d",
+            inside='<limit lower="-1e16" upper="1e16" effort="1e16" velocity="2"/>',
+        ),
         link("d"),
     ).replace('<axis xyz="0 0 1"/><limit lower="-1e16"', '<limit lower="-1e16"')
     one, two, three, four = read_urdf(text).joints
@@ -249,7 +278,9 @@ def test_a_base_or_a_tip_within_a_robot() -> None:
 
 def test_files_that_the_text_names_are_not_opened() -> None:
     mesh = '<visual><geometry><mesh filename="package://nowhere/a.dae"/></geometry></visual>'
-    assert read_urdf(TWO.replace('<link name="upper">', f'<link name="upper">{mesh}')) == read_urdf(TWO)
+    assert read_urdf(
+        TWO.replace('<link name="upper">', f'<link name="upper">{mesh}')
+    ) == read_urdf(TWO)
 
 
 # What is refused
@@ -282,7 +313,11 @@ def test_files_that_the_text_names_are_not_opened() -> None:
         (LIMIT, LIMIT + '<mimic joint="two"/>', ["joint 'one'", "mimic"]),
         (LIMIT, LIMIT + LIMIT, ["joint 'one'", "2 <limit>"]),
         ('type="revolute"', 'type="floating"', ["joint 'one'", "floating", "'upper'"]),
-        ('type="revolute"', 'type="revolut"', ["joint 'one'", "'revolut'", "did you mean 'revolute'"]),
+        (
+            'type="revolute"',
+            'type="revolut"',
+            ["joint 'one'", "'revolut'", "did you mean 'revolute'"],
+        ),
         ('<parent link="base"/>', "", ["joint 'one'", "<parent>"]),
         ('<parent link="base"/>', '<parent link="bas"/>', ["joint 'one'", "'bas'", "'base'"]),
         ('<child link="upper"/>', '<child link="lower"/>', ["link 'lower'", "'one'", "'two'"]),
@@ -295,10 +330,16 @@ def test_files_that_the_text_names_are_not_opened() -> None:
         ("</robot>", "", ["line 1", "XML"]),
         ("robot", "sdf", ["<sdf>", "<robot>"]),
         ('value="2"', 'value="${mass}"', ["xacro FILE.urdf.xacro > FILE.urdf"]),
-        ("<link", '<x:macro xmlns:x="http://www.ros.org/wiki/xacro"/><link', ["<macro>", "xacro FILE"]),
+        (
+            "<link",
+            '<x:macro xmlns:x="http://www.ros.org/wiki/xacro"/><link',
+            ["<macro>", "xacro FILE"],
+        ),
     ],
 )
-def test_a_mistake_is_refused_with_its_place_and_the_remedy(old: str, new: str, words: list[str]) -> None:
+def test_a_mistake_is_refused_with_its_place_and_the_remedy(
+    old: str, new: str, words: list[str]
+) -> None:
     assert old in TWO
     text = TWO.replace(old, new) if old == "robot" else TWO.replace(old, new, 1)
     message = refusal(text)
@@ -320,7 +361,9 @@ def test_a_mistake_is_refused_with_its_place_and_the_remedy(old: str, new: str, 
         (GRIPPER.replace("prismatic", "planar"), {"tip": "finger"}, ["joint 'left'", "planar"]),
     ],
 )
-def test_ends_that_make_no_arm_are_refused_by_name(text: str, ends: dict, words: list[str]) -> None:
+def test_ends_that_make_no_arm_are_refused_by_name(
+    text: str, ends: dict, words: list[str]
+) -> None:
     message = refusal(text, **ends)
     assert [word for word in words if word not in message] == []
 
@@ -380,13 +423,17 @@ def mutate(root: ElementTree.Element, data: st.DataObject) -> None:
     parents = [e for e in root.iter() if len(e)]
     parent = data.draw(st.sampled_from(parents))
     child = data.draw(st.sampled_from(list(parent)))
-    kind = data.draw(st.sampled_from(["drop", "double", "tag", "attribute", "attribute", "number", "number"]))
+    kind = data.draw(
+        st.sampled_from(["drop", "double", "tag", "attribute", "attribute", "number", "number"])
+    )
     if kind == "drop":
         parent.remove(child)
     elif kind == "double":
         parent.append(copy.deepcopy(child))
     elif kind == "tag":
-        child.tag = data.draw(st.sampled_from(["inertial", "joint", "link", "mass", "origin", "x"]))
+        child.tag = data.draw(
+            st.sampled_from(["inertial", "joint", "link", "mass", "origin", "x"])
+        )
     elif child.attrib:
         key = data.draw(st.sampled_from(sorted(child.attrib)))
         if kind == "number":
@@ -417,7 +464,8 @@ def check_physical(chain: UrdfChain) -> None:
         m, x, y, z, xx, xy, yy, xz, yz, zz = j.inertia
         c = np.array([x, y, z]) / m
         moments = np.linalg.eigvalsh(
-            np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - m * (c @ c * np.eye(3) - np.outer(c, c))
+            np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+            - m * (c @ c * np.eye(3) - np.outer(c, c))
         )
         assert m > 0.0
         assert moments[0] > 0.0
@@ -433,7 +481,9 @@ def check_physical(chain: UrdfChain) -> None:
 
 @given(data=st.data(), source=st.sampled_from([(ARM6, ""), (ARM7, ""), (GRIPPER, "tcp")]))
 @settings(max_examples=200)
-def test_a_mutated_file_is_refused_with_its_place_or_physical(data: st.DataObject, source: tuple) -> None:
+def test_a_mutated_file_is_refused_with_its_place_or_physical(
+    data: st.DataObject, source: tuple
+) -> None:
     text, tip = source
     if data.draw(st.booleans()):
         text = garble(text, data)

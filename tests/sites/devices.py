@@ -28,7 +28,10 @@ class ScriptedDevice:
     rate_hz: ClassVar[int] = 200
 
     def __init__(
-        self, clock: Clock, script: Callable[[float], DeviceState], hangs_s: tuple[float, float] = (1e9, 0.0)
+        self,
+        clock: Clock,
+        script: Callable[[float], DeviceState],
+        hangs_s: tuple[float, float] = (1e9, 0.0),
     ) -> None:
         self._clock, self._script, self._begun_ns = clock, script, 0
         self._hangs_s = hangs_s  # from when, for how long
@@ -75,7 +78,9 @@ class HaplyService:
         self.asked: list[tuple[float, dict[str, Any]]] = []
         self.silent, self.raw, self._key = threading.Event(), "", force_key
         self.devices, self.answered_s = ["049D"], 0.0
-        self._server = serve(self._attend, "127.0.0.1", port, compression=None, ping_interval=None)
+        self._server = serve(
+            self._attend, "127.0.0.1", port, compression=None, ping_interval=None
+        )
         self.port = self._server.socket.getsockname()[1]
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._open: list[ServerConnection] = []
@@ -111,7 +116,9 @@ class HaplyService:
     def _attend(self, connection: ServerConnection) -> None:
         self._open.append(connection)
         with suppress(ConnectionClosed, OSError):
-            connection.send(json.dumps({"session_id": 7} | self._state(config={"type": "inverse3"})))
+            connection.send(
+                json.dumps({"session_id": 7} | self._state(config={"type": "inverse3"}))
+            )
             for text in connection:
                 self.asked.append((time.perf_counter(), json.loads(text)))
                 while self.silent.is_set():
@@ -123,7 +130,9 @@ class HaplyService:
     def _state(self, **more: Any) -> dict[str, Any]:
         force = self._force(self.asked[-1][1]) if self.asked else ZERO
         vectors = {"position": self.place_m(), "velocity": ZERO}
-        state: dict[str, Any] = {f"cursor_{k}": dict(zip("xyz", v, strict=True)) for k, v in vectors.items()}
+        state: dict[str, Any] = {
+            f"cursor_{k}": dict(zip("xyz", v, strict=True)) for k, v in vectors.items()
+        }
         state["current_cursor_force"] = dict(zip("xyz", force, strict=True))
         up = self.presses_anew and time.perf_counter() % 0.5 < 0.02
         buttons = {name: name in self.pressed and not up for name in "abc"}
@@ -144,7 +153,10 @@ class CapReports:
     def push(self, right: int, near: int, down: int) -> None:
         """The cap is pushed, in counts of its axes."""
         numbers = (right, near, down, 0, 0, 0)
-        os.write(self._write, bytes([1]) + b"".join(n.to_bytes(2, "little", signed=True) for n in numbers))
+        os.write(
+            self._write,
+            bytes([1]) + b"".join(n.to_bytes(2, "little", signed=True) for n in numbers),
+        )
 
     def press(self, buttons: int) -> None:
         os.write(self._write, bytes([3, buttons, 0]))

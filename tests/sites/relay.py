@@ -17,7 +17,9 @@ LONGEST_NS = 3_600 * 10**9
 class Relay:
     """Time shared by runners, of which one at a time runs; between them things happen by themselves."""
 
-    def __init__(self, start_ns: int = 10**9, epoch_unix_ns: int = 1_700_000_000_000_000_000) -> None:
+    def __init__(
+        self, start_ns: int = 10**9, epoch_unix_ns: int = 1_700_000_000_000_000_000
+    ) -> None:
         self.now_ns = start_ns
         self._epoch_unix_ns = epoch_unix_ns
         self._deadlines: dict[int, int] = {}
@@ -27,7 +29,9 @@ class Relay:
         self._failed: list[BaseException] = []
         self.results: dict[str, object] = {}
 
-    def add(self, name: str, run: Callable[["RelayClock"], object], at_ns: int = 0) -> "RelayClock":
+    def add(
+        self, name: str, run: Callable[["RelayClock"], object], at_ns: int = 0
+    ) -> "RelayClock":
         """Adds a runner that begins at a time; `run` gets its clock."""
         seat = len(self._runners)
         clock = RelayClock(self, seat)

@@ -30,7 +30,12 @@ from .relay import Killed, Relay, RelayClock
 
 SESSION = "t"
 RECORDER_BOOT = 77
-GLIDE = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "link.delay_ms": 50, "rate_hz": 200}
+GLIDE = {
+    "on_stale.action": "glide",
+    "on_stale.align_limit_rad": 3.0,
+    "link.delay_ms": 50,
+    "rate_hz": 200,
+}
 Sink = Callable[[str, bytes], None]
 Stranger = Callable[[Bus, RelayClock], None]
 
@@ -97,13 +102,20 @@ class Session:
         timeout_s: float = 10.0,
     ) -> int:
         options = SiteOptions(
-            SESSION, Connection(), timeout_s, needs_recorder, stay_s=self.stay_s, **self.options.get(name, {})
+            SESSION,
+            Connection(),
+            timeout_s,
+            needs_recorder,
+            stay_s=self.stay_s,
+            **self.options.get(name, {}),
         )
         interrupt = interrupt or self.interrupts.get(name, Interrupt())
         own = self._own(name, clock)
         bus = self.join(name)
         try:
-            return take_part(SiteParts(self.scenario, name, options, bus, own, interrupt, self.said.append))
+            return take_part(
+                SiteParts(self.scenario, name, options, bus, own, interrupt, self.said.append)
+            )
         finally:
             bus.close()
             self.left_ns[name] = clock.monotonic_ns()
@@ -115,7 +127,10 @@ class Session:
         return SkewedClock(clock, *self.skews[name]) if name in self.skews else clock
 
     def recorder(
-        self, stopped: Callable[[], bool] = lambda: False, at_ns: int = 0, boot: int = RECORDER_BOOT
+        self,
+        stopped: Callable[[], bool] = lambda: False,
+        at_ns: int = 0,
+        boot: int = RECORDER_BOOT,
     ) -> None:
         def run(clock: RelayClock) -> Sequence[str]:
             bus = self.join("recorder")
@@ -154,7 +169,8 @@ class Session:
         def begin() -> None:
             for member in self.network.members:
                 member._sinks = [
-                    (expression, self._filter(sink, lost, to_ns)) for expression, sink in member._sinks
+                    (expression, self._filter(sink, lost, to_ns))
+                    for expression, sink in member._sinks
                 ]
 
         self.clocks[by].at(from_ns, begin)
@@ -173,7 +189,11 @@ class Session:
         return take
 
     def stranger(self, act: Stranger, at_ns: int = 0) -> None:
-        self.relay.add(f"stranger {len(self.clocks)}", lambda clock: act(self.join("stranger"), clock), at_ns)
+        self.relay.add(
+            f"stranger {len(self.clocks)}",
+            lambda clock: act(self.join("stranger"), clock),
+            at_ns,
+        )
 
     def play(self) -> None:
         """Runs it in this process, which is left as it is: no real-time priority, no locked memory."""
@@ -189,7 +209,16 @@ class Session:
 def computed(state: State) -> bytes:
     return msgpack.packb(
         [
-            *(state.site, state.tick, state.t_ns, state.mode, state.q, state.qd, state.q_des, state.qd_des),
+            *(
+                state.site,
+                state.tick,
+                state.t_ns,
+                state.mode,
+                state.q,
+                state.qd,
+                state.q_des,
+                state.qd_des,
+            ),
             *(state.tau, state.tau_x, state.theta_hat, state.used, state.ch),
         ]
     )

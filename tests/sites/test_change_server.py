@@ -27,7 +27,9 @@ STOP = topics.key(SESSION, "s", topics.STOP)
 class Asked:
     """A site `s` that listens, and somebody who asks it."""
 
-    def __init__(self, scenario: Scenario | None = None, mode: Callable[[], Mode] = lambda: Mode.RUN) -> None:
+    def __init__(
+        self, scenario: Scenario | None = None, mode: Callable[[], Mode] = lambda: Mode.RUN
+    ) -> None:
         network = LocalNetwork()
         self.scenario = scenario or load_scenario("paper")
         self._client: Bus = network.join()
@@ -91,9 +93,14 @@ def test_triangle_dragged_for_minute_is_obeyed_to_its_end() -> None:
     asked = Asked()
     site = Site(asked.scenario.setup("s"))
     for n in range(1800):
-        (taken,), _ = asked.ask(10 * n, dominance="s", to={"m1": 0.5 + n / 4000, "m2": 0.5 - n / 4000})
+        (taken,), _ = asked.ask(
+            10 * n, dominance="s", to={"m1": 0.5 + n / 4000, "m2": 0.5 - n / 4000}
+        )
         site.order(taken, 10 * n * 1_000_000)
-    replies = [asked.ask(19_000, dominance="s", to={"m1": 1.0, "m2": 0.0})[1] for _ in range(MAX_RAMPS + 1)]
+    replies = [
+        asked.ask(19_000, dominance="s", to={"m1": 1.0, "m2": 0.0})[1]
+        for _ in range(MAX_RAMPS + 1)
+    ]
     assert [reply.accepted for reply in replies] == [True] * MAX_RAMPS + [False]
 
 
@@ -149,7 +156,9 @@ def test_what_is_no_order_is_answered_and_harmless() -> None:
     asked = Asked()
     replies = [asked.send(payload) for payload in (b"", b"\xc1", b"x" * 70_000)]
     assert asked.changes.take(0) == []
-    assert all((answer := r.poll()) and not decode(answer[1], ChangeReply).accepted for r in replies)
+    assert all(
+        (answer := r.poll()) and not decode(answer[1], ChangeReply).accepted for r in replies
+    )
 
 
 def test_change_that_run_does_not_live_to_see_is_refused() -> None:

@@ -14,11 +14,18 @@ from .relay import Relay
 from .sessions import Session, in_log, in_virtual_time
 
 S = 1_000_000_000
-SKEWS = {"m2": (3 * S, 100_000), "s": (-500_000_000, -100_000), "recorder": (86_400 * S, 37_000)}
+SKEWS = {
+    "m2": (3 * S, 100_000),
+    "s": (-500_000_000, -100_000),
+    "recorder": (86_400 * S, 37_000),
+}
 
 
 def run(
-    folder: Path, skews: dict[str, tuple[int, int]], duration_s: float, relay: Relay | None = None
+    folder: Path,
+    skews: dict[str, tuple[int, int]],
+    duration_s: float,
+    relay: Relay | None = None,
 ) -> tuple[Session, Log]:
     scenario = load_scenario("asymmetric", {"duration_s": duration_s})
     session = Session.whole(scenario, folder, relay=relay or Relay(), skews=skews)
@@ -38,7 +45,9 @@ def test_clocks_that_differ_and_drift_change_no_bit(skewed: tuple[Session, Log])
     assert not compare_with_virtual(log).late
 
 
-@pytest.mark.parametrize("names", [("m2",), pytest.param(("m1", "recorder"), marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "names", [("m2",), pytest.param(("m1", "recorder"), marks=pytest.mark.long)]
+)
 def test_whoever_it_is_whose_clock_differs(names: tuple[str, ...], tmp_path: Path) -> None:
     skews = {**SKEWS, "m1": (7 * S, 60_000)}
     session, log = run(tmp_path, {name: skews[name] for name in names}, 0.3)
@@ -46,7 +55,8 @@ def test_whoever_it_is_whose_clock_differs(names: tuple[str, ...], tmp_path: Pat
     assert in_log(log) == in_virtual_time(session.scenario)
     clocks = members(log)
     begun_ns = {name: clock.true_ns(0) for name, clock in clocks.items()}
-    assert max(begun_ns.values()) - min(begun_ns.values()) <= 200_000  # one instant, but for drift since
+    # one instant, but for drift since
+    assert max(begun_ns.values()) - min(begun_ns.values()) <= 200_000
 
 
 def test_delays_and_offsets_in_log_are_true_within_bound(skewed: tuple[Session, Log]) -> None:
@@ -95,7 +105,9 @@ def test_on_one_clock_nothing_is_estimated_and_nothing_slewed(tmp_path: Path) ->
         for stats in log.link_stats(site):
             assert set(stats.offset_us.values()) == set(stats.bound_us.values()) == {0}
             assert (stats.grid_error_us, stats.slew_ppb) == (0, 0)
-    assert not any("another one" in text for text in session.said if not text.startswith("recorder"))
+    assert not any(
+        "another one" in text for text in session.said if not text.startswith("recorder")
+    )
 
 
 def test_sites_on_one_clock_wake_up_in_turn(tmp_path: Path) -> None:
@@ -127,13 +139,19 @@ def test_a_stepping_wall_clock_changes_only_labels(tmp_path: Path) -> None:
     assert session.relay.readings > 0
     assert in_log(log) == in_log(steady)
     for site in log.sites:
-        assert [state.rx for state in log[site].states] == [state.rx for state in steady[site].states]
-        assert [state.sent_ns for state in log[site].states] == [s.sent_ns for s in steady[site].states]
+        assert [state.rx for state in log[site].states] == [
+            state.rx for state in steady[site].states
+        ]
+        assert [state.sent_ns for state in log[site].states] == [
+            s.sent_ns for s in steady[site].states
+        ]
         assert log.link_stats(site)[-1].offset_us == steady.link_stats(site)[-1].offset_us
     assert log.session["epoch_unix_ns"] != steady.session["epoch_unix_ns"]
 
 
-@pytest.mark.parametrize("at_ns", [1_050_000_000, pytest.param(1_250_000_000, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "at_ns", [1_050_000_000, pytest.param(1_250_000_000, marks=pytest.mark.long)]
+)
 def test_a_hanging_member_on_another_clock_is_waited_for(at_ns: int, tmp_path: Path) -> None:
     session = Session.whole(
         load_scenario("two_sites", {"duration_s": 0.3}), tmp_path, skews={"s": (S, 50_000)}

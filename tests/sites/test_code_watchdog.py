@@ -5,7 +5,15 @@ from collections.abc import Callable
 
 import pytest
 
-from sites.code_watchdog import CHECKS, FIRST_CHECKS, HICCUP_NS, MOST_NS, SHARE, CodeWatchdog, WatchedCode
+from sites.code_watchdog import (
+    CHECKS,
+    FIRST_CHECKS,
+    HICCUP_NS,
+    MOST_NS,
+    SHARE,
+    CodeWatchdog,
+    WatchedCode,
+)
 from tests.core.sites import setup
 from tests.net.manual_clock import ManualClock
 from trilat_net.core.site_step import Site
@@ -22,7 +30,9 @@ class Steps:
 
     name, rate_hz = "s", 1000
 
-    def __init__(self, takes_ns: Callable[[int], int], computes: float = 1.0, evicts: int = 0) -> None:
+    def __init__(
+        self, takes_ns: Callable[[int], int], computes: float = 1.0, evicts: int = 0
+    ) -> None:
         self.clock = ManualClock()
         self.computed_ns = self.evicted = 0
         self._takes_ns, self._computes, self._evicts = takes_ns, computes, evicts
@@ -111,9 +121,13 @@ class Hanging:
 def test_a_law_that_does_not_come_back_is_stopped() -> None:
     site = Site(setup("s", "two_sites")._replace(own=Hanging))
     before = signal.getsignal(signal.SIGALRM)
-    watched = WatchedCode("the law laws:Hanging", 1000, fail_of("s", "laws:Hanging"), SystemClock())
+    watched = WatchedCode(
+        "the law laws:Hanging", 1000, fail_of("s", "laws:Hanging"), SystemClock()
+    )
     with CodeWatchdog(watched):
-        with pytest.raises(LawFailed, match=r"laws:Hanging of s failed at tick 0: it did not come back"):
+        with pytest.raises(
+            LawFailed, match=r"laws:Hanging of s failed at tick 0: it did not come back"
+        ):
             watched.run(0, lambda: site.step(TickInput(0)))
         signal.raise_signal(signal.SIGALRM)  # between two ticks: nobody hangs
     assert signal.getsignal(signal.SIGALRM) is before
@@ -122,7 +136,9 @@ def test_a_law_that_does_not_come_back_is_stopped() -> None:
 
 def test_every_call_of_a_first_tick_may_compile() -> None:
     """A plant is asked at its first tick where its bodies are, and then to move."""
-    watched = WatchedCode("the plant mine:Scene", 1000, fail_of("s", "mine:Scene"), SystemClock())
+    watched = WatchedCode(
+        "the plant mine:Scene", 1000, fail_of("s", "mine:Scene"), SystemClock()
+    )
     for _ in ("poses", "step"):
         watched.run(0, lambda: [watched.check() for _ in range(FIRST_CHECKS - 1)])
     with pytest.raises(LawFailed, match="failed at tick 1: it did not come back within 2 s"):

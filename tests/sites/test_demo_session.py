@@ -36,7 +36,12 @@ def ended(starter: ProcessStarter, process: SessionProcess) -> SessionProcess:
 
 def waiting(starter: ProcessStarter, name: str) -> SessionProcess:
     process = starter.start(name, WAITS)
-    until(lambda: starter.poll() or (process.output.exists() and "waiting for" in process.output.read_text()))
+    until(
+        lambda: (
+            starter.poll()
+            or (process.output.exists() and "waiting for" in process.output.read_text())
+        )
+    )
     return process
 
 
@@ -57,7 +62,11 @@ def test_a_process_does_what_its_words_do(starter: ProcessStarter, tmp_path: Pat
 def test_each_has_its_name_session_and_signals(starter: ProcessStarter) -> None:
     process = waiting(starter, "recorder")
     assert process.pid is not None
-    assert Path(f"/proc/{process.pid}/cmdline").read_text().startswith("trilat record --session nobody ")
+    assert (
+        Path(f"/proc/{process.pid}/cmdline")
+        .read_text()
+        .startswith("trilat record --session nobody ")
+    )
     assert os.getsid(process.pid) == process.pid
     process.end(signal.SIGINT)
     assert (ended(starter, process).code, process.problem()) == (130, None)
@@ -108,10 +117,14 @@ def test_a_starter_that_fails_says_why(tmp_path: Path) -> None:
     assert "absent.toml" in str(process.problem())
 
 
-def test_no_code_of_the_users_runs_in_the_starter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_code_of_the_users_runs_in_the_starter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whose threads or devices no copy would have."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
+    monkeypatch.setenv(
+        "PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    )
     trilat("new", "law", "mylaw.py", cwd=tmp_path)
     file = tmp_path / "mylaw.py"
     file.write_text(file.read_text() + "\nopen('imported', 'a').close()\n")

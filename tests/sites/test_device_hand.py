@@ -42,7 +42,8 @@ class Led:
     ) -> None:
         hands = [{"kind": "live", "mode": mode, **({"device": device} if device else {})}]
         scenario = load_scenario(
-            "play", {"duration_s": 3.0, "rate_hz": 200, "sites.m1.hands": hands, "link.delay_ms": 10}
+            "play",
+            {"duration_s": 3.0, "rate_hz": 200, "sites.m1.hands": hands, "link.delay_ms": 10},
         )
         session = Session.whole(scenario, folder)
         self.said: list[str] = []
@@ -116,7 +117,9 @@ def test_open_clutch_moves_nothing_and_closing_it_makes_no_jump(tmp_path: Path) 
 
 def test_button_lets_go(tmp_path: Path) -> None:
     def script(t_s: float) -> DeviceState:
-        return DeviceState(up(t_s), ZERO, {"a": t_s < 2.0, "b": 1.0 < t_s < 1.1} if t_s > 0.2 else FREE)
+        return DeviceState(
+            up(t_s), ZERO, {"a": t_s < 2.0, "b": 1.0 < t_s < 1.1} if t_s > 0.2 else FREE
+        )
 
     led = Led(tmp_path, script)
     assert led.changes == ["m1: ScriptedDevice takes hold", "m1: ScriptedDevice lets go"]
@@ -138,7 +141,10 @@ def jumping(wrong: DeviceState) -> Script:
         (DeviceState((1e300, -1e308, 0.0), ZERO, HELD), "dropped 2 jumps, 0 unreadable"),
         (DeviceState((math.nan, 0.0, 0.0), ZERO, HELD), "dropped 0 jumps, 3 unreadable"),
         (DeviceState((0.3, -0.12, math.inf), ZERO, HELD), "dropped 0 jumps, 3 unreadable"),
-        (DeviceState((0.3, -0.12, 0.15), (math.nan, 0.0, 0.0), HELD), "dropped 0 jumps, 3 unreadable"),
+        (
+            DeviceState((0.3, -0.12, 0.15), (math.nan, 0.0, 0.0), HELD),
+            "dropped 0 jumps, 3 unreadable",
+        ),
     ],
 )
 def test_jumps_and_numbers_that_are_none_move_nothing(
@@ -180,7 +186,11 @@ def test_force_stays_within_its_limit(scale: float, limit: float, tmp_path: Path
 
 def test_clutch_that_closes_lets_the_force_grow(tmp_path: Path) -> None:
     """The arm is pulled by a target 50 mm off all the time: nothing is felt at once."""
-    led = Led(tmp_path, moving(up, lambda t_s: 0.2 <= t_s < 1.0 or t_s > 1.2), {"force_limit_n": 1000.0})
+    led = Led(
+        tmp_path,
+        moving(up, lambda t_s: 0.2 <= t_s < 1.0 or t_s > 1.2),
+        {"force_limit_n": 1000.0},
+    )
     after = [math.hypot(*force) for t_s, force in led.device.rendered if 1.2 < t_s < 1.4]
     assert after[0] < 0.2 * max(after)
     assert max(np.diff(after)) < 0.2 * max(after)
@@ -199,7 +209,8 @@ def test_silent_device_lets_go_and_needs_its_button_anew(how: str, tmp_path: Pat
     gone = "lets go" if how == "raises" else "is silent: let go"
     assert (
         led.changes
-        == [f"m1: ScriptedDevice {what}" for what in ("takes hold", gone) * 2][:3] + led.changes[3:]
+        == [f"m1: ScriptedDevice {what}" for what in ("takes hold", gone) * 2][:3]
+        + led.changes[3:]
     )
     part = led.log["m1"]
     held = part.t_s[part.hand[:, 2] > 0.0]
@@ -244,15 +255,23 @@ def test_record_that_is_old_is_felt_no_more(tmp_path: Path) -> None:
 def test_device_of_the_page_leads_an_arm(tmp_path: Path) -> None:
     """The class of docs/devices.md, which moves to the right at 5 cm/s and presses its clutch after 1 cm."""
     names: dict[str, Any] = {}
-    (code,) = [block.text for block in find_blocks("docs/devices.md") if block.language == "python"]
+    (code,) = [
+        block.text for block in find_blocks("docs/devices.md") if block.language == "python"
+    ]
     exec(code, names)
     pushed, felt_n = names["Pushed"](), list[float]()
     pushed.render = lambda force_n: felt_n.append(force_n[0])
-    session = Session.whole(load_scenario("play", {"duration_s": 3.0, "rate_hz": 200}), tmp_path)
-    session.stranger(lambda bus, clock: reached(bus, clock).lead("m1", pushed, say=lambda _: None))
+    session = Session.whole(
+        load_scenario("play", {"duration_s": 3.0, "rate_hz": 200}), tmp_path
+    )
+    session.stranger(
+        lambda bus, clock: reached(bus, clock).lead("m1", pushed, say=lambda _: None)
+    )
     log = session.run()
     target = log["m1"].hand[log["m1"].hand[:, 2] > 0.0, 3:5]
-    assert target[-1, 0] - target[SETTLED, 0] == pytest.approx(0.05 * (len(target) - SETTLED) / 200, rel=0.1)
+    assert target[-1, 0] - target[SETTLED, 0] == pytest.approx(
+        0.05 * (len(target) - SETTLED) / 200, rel=0.1
+    )
     assert min(felt_n) < -0.1
 
 
@@ -288,7 +307,8 @@ def test_repeated_clutching_keeps_the_target_within_reach(tmp_path: Path) -> Non
     t_s = led.log["m1"].t_s[hand[:, 2] > 0.0]
     begun = int(np.argmax(radius_m > reach_m - 1e-3))
     back = held[-1, 3] - held[begun:, 3].max()
-    assert back < -0.3  # of 2 x 0.5 m/s for the rest of the session: no stroke has to be taken back
+    # of 2 x 0.5 m/s for the rest of the session: no stroke has to be taken back
+    assert back < -0.3
     assert t_s[begun] < 2.2
     assert verify(led.log).passed
 

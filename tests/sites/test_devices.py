@@ -46,7 +46,9 @@ def there(
     return open_device(f"{request.param}={address}"), lose
 
 
-def test_device_reads_renders_and_is_entered_again(there: tuple[Device, Callable[[], None]]) -> None:
+def test_device_reads_renders_and_is_entered_again(
+    there: tuple[Device, Callable[[], None]],
+) -> None:
     device, _ = there
     assert 50 <= device.rate_hz <= 1000
     for _ in range(2):
@@ -60,7 +62,9 @@ def test_device_reads_renders_and_is_entered_again(there: tuple[Device, Callable
                 device.render(FORCE)
 
 
-def test_device_that_is_lost_raises_an_error_of_the_system(there: tuple[Device, Callable[[], None]]) -> None:
+def test_device_that_is_lost_raises_an_error_of_the_system(
+    there: tuple[Device, Callable[[], None]],
+) -> None:
     """And again where it is entered, if it is not there."""
     device, lose = there
     with device:
@@ -140,7 +144,10 @@ def test_silent_service_is_given_up(service: HaplyService) -> None:
 
 def test_service_without_a_device_says_so(service: HaplyService) -> None:
     service.devices = []
-    with HaplyInverse3(service.address) as device, pytest.raises(ConnectionError, match="has no Inverse3"):
+    with (
+        HaplyInverse3(service.address) as device,
+        pytest.raises(ConnectionError, match="has no Inverse3"),
+    ):
         device.read()
 
 
@@ -159,7 +166,16 @@ def message(position: Any = ORIGIN, velocity: Any = ORIGIN, **more: Any) -> str:
 
 
 MALFORMED = [
-    *(" ", "[]", "7", '"x"', "{", '{"inverse3":7}', '{"inverse3":[[]]}', '{"inverse3":[{"device_id":"1"}]}'),
+    *(
+        " ",
+        "[]",
+        "7",
+        '"x"',
+        "{",
+        '{"inverse3":7}',
+        '{"inverse3":[[]]}',
+        '{"inverse3":[{"device_id":"1"}]}',
+    ),
     message(position={"x": 1.0}),
     message(position=ORIGIN | {"x": math.nan}),
     message(position=ORIGIN | {"x": 10**400}),
@@ -223,7 +239,9 @@ def test_buttons_and_reports_of_other_kinds(cap: CapReports) -> None:
 def test_a_spacemouse_is_found_by_its_maker(maker: str, tmp_path: Path) -> None:
     for name, made_by in {"hidraw0": "0003:0000046D:0000C52B", "hidraw1": maker}.items():
         (tmp_path / name / "device").mkdir(parents=True)
-        (tmp_path / name / "device" / "uevent").write_text(f"DRIVER=hid-generic\nHID_ID={made_by}\n")
+        (tmp_path / name / "device" / "uevent").write_text(
+            f"DRIVER=hid-generic\nHID_ID={made_by}\n"
+        )
     assert find_spacemouse(tmp_path) == "/dev/hidraw1"
     with pytest.raises(FileNotFoundError, match="no SpaceMouse"):
         find_spacemouse(tmp_path / "nothing")

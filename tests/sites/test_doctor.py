@@ -13,7 +13,13 @@ from types import SimpleNamespace
 import pytest
 
 from sites import doctor
-from sites.doctor import examine_clock, examine_keys, examine_links, examine_machine, examine_room
+from sites.doctor import (
+    examine_clock,
+    examine_keys,
+    examine_links,
+    examine_machine,
+    examine_room,
+)
 from tests.cli.running import trilat
 from tests.net.manual_clock import ManualClock
 from tests.other_systems import replace_os
@@ -42,7 +48,9 @@ class UnpunctualClock(ManualClock):
 
     def sleep_until(self, deadline_ns: int) -> None:
         self._sleeps += 1
-        super().sleep_until(deadline_ns + (self._late_ns if self._sleeps % self._every == 0 else 0))
+        super().sleep_until(
+            deadline_ns + (self._late_ns if self._sleeps % self._every == 0 else 0)
+        )
 
 
 def states(findings: Iterator[doctor.DoctorFinding]) -> list[str]:
@@ -61,14 +69,20 @@ def test_keys_that_end_soon_or_lie_open_are_told(tmp_path: Path) -> None:
     (tmp_path / "keys" / "m1").chmod(0o755)
     found = list(examine_keys(tmp_path / "keys" / "m1"))
     assert [one.state for one in found] == ["warn"] * 3
-    assert ["soon" in found[0].text, "chmod 700" in found[1].text, "authority" in found[2].text] == [True] * 3
+    assert [
+        "soon" in found[0].text,
+        "chmod 700" in found[1].text,
+        "authority" in found[2].text,
+    ] == [True] * 3
     (tmp_path / "keys" / "m1" / "private.key").chmod(0o640)
     (refused,) = examine_keys(tmp_path / "keys" / "m1")
     assert refused.state == "fail"
     assert "chmod 600" in refused.text
 
 
-def links(folder: Path | None, listen: list[str], connect: list[str], *, insecure: bool = False) -> list[str]:
+def links(
+    folder: Path | None, listen: list[str], connect: list[str], *, insecure: bool = False
+) -> list[str]:
     owned = None if folder is None else read_member_keys(folder)
     return states(examine_links(Connection(listen, connect), folder, owned, insecure=insecure))
 
@@ -82,7 +96,9 @@ def member(folder: Path, place: str) -> Iterator[None]:
         bus.close()
 
 
-def test_member_with_keys_answers_one_with_keys_of_same_authority(folder: Path, tmp_path: Path) -> None:
+def test_member_with_keys_answers_one_with_keys_of_same_authority(
+    folder: Path, tmp_path: Path
+) -> None:
     create_keys(tmp_path / "others", MEMBERS, [], 30)
     (place, nobody) = (one.replace("tcp", "tls") for one in find_free_endpoints(2))
     with member(folder / "m1", place):
@@ -131,12 +147,16 @@ class OddClock(ManualClock):
         return self._now + (self._step if self._reads > 9 else 0)
 
 
-@pytest.mark.parametrize(("clock", "state"), [((), "ok"), ((-5_000_000,), "fail"), ((0, 1 << 30), "warn")])
+@pytest.mark.parametrize(
+    ("clock", "state"), [((), "ok"), ((-5_000_000,), "fail"), ((0, 1 << 30), "warn")]
+)
 def test_a_clock_that_goes_back_or_steps_is_told(clock: tuple[int, ...], state: str) -> None:
     assert states(examine_clock(OddClock(*clock))) == [state]
 
 
-@pytest.mark.parametrize(("free", "state"), [(50 << 20, "fail"), (1 << 30, "warn"), (1 << 40, "ok")])
+@pytest.mark.parametrize(
+    ("free", "state"), [(50 << 20, "fail"), (1 << 30, "warn"), (1 << 40, "ok")]
+)
 def test_a_disk_that_is_nearly_full_is_told(
     free: int, state: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -146,7 +166,11 @@ def test_a_disk_that_is_nearly_full_is_told(
 
 
 def test_rights_that_are_not_obtained_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    obtained = {"scheduling": "normal (not permitted)", "memory": "locked", "timer_slack": "1 ns"}
+    obtained = {
+        "scheduling": "normal (not permitted)",
+        "memory": "locked",
+        "timer_slack": "1 ns",
+    }
     done = SimpleNamespace(returncode=0, stdout=json.dumps(obtained))
     monkeypatch.setattr(doctor.subprocess, "run", lambda *_, **__: done)
     assert states(doctor.examine_rights()) == ["warn", "ok", "ok"]
@@ -156,12 +180,18 @@ def test_rights_that_are_not_obtained_are_told(monkeypatch: pytest.MonkeyPatch) 
     ("late_ns", "every", "held"),
     [
         (400_000, 10, [True]),
-        (600_000, 10, [False, True]),  # more than half a period of 1000 Hz, and less than half of 500 Hz
+        (
+            600_000,
+            10,
+            [False, True],
+        ),  # more than half a period of 1000 Hz, and less than half of 500 Hz
         (10_000_000, 10, [False] * 4),
         (2_000_000, 400, [True]),
     ],
 )
-def test_a_rate_is_held_if_ticks_begin_in_time(late_ns: int, every: int, held: list[bool]) -> None:
+def test_a_rate_is_held_if_ticks_begin_in_time(
+    late_ns: int, every: int, held: list[bool]
+) -> None:
     """One tick in a hundred may begin in the second half of its period, or later."""
     found = doctor.rehearse_rates(UnpunctualClock(late_ns, every))
     assert [doctor.is_held(*one[:2]) for one in found] == held
@@ -172,7 +202,11 @@ def test_a_rate_is_held_if_ticks_begin_in_time(late_ns: int, every: int, held: l
 @pytest.mark.parametrize(
     ("rates", "state", "text"),
     [
-        ([(1000, 90, 4000)], "ok", "holds 1000 Hz: 99% of the ticks began within 0.09 ms of their time"),
+        (
+            [(1000, 90, 4000)],
+            "ok",
+            "holds 1000 Hz: 99% of the ticks began within 0.09 ms of their time",
+        ),
         ([(1000, 700, 900), (500, 700, 900)], "warn", "holds 500 Hz"),
         ([(100, 9000, 12000)], "fail", "holds not even 100 Hz"),
     ],
@@ -191,15 +225,21 @@ def test_a_real_loop_is_measured_in_its_own_process() -> None:
     assert doctor.examine_rate().text.startswith("a site alone ")
 
 
-@pytest.mark.parametrize(("kernel", "name"), [("Windows", "Windows"), ("Darwin", "macOS"), ("Linux", "")])
-def test_what_is_promised_here_is_told(kernel: str, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("kernel", "name"), [("Windows", "Windows"), ("Darwin", "macOS"), ("Linux", "")]
+)
+def test_what_is_promised_here_is_told(
+    kernel: str, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(platform, "system", lambda: kernel)
     found = doctor.examine_system()
     assert found.state == ("warn" if name else "ok")
     assert name in found.text
 
 
-def test_open_rights_are_no_finding_on_windows(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_rights_are_no_finding_on_windows(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Windows lets a mode tell nothing but whether a file can be written."""
     (folder / "m1" / "private.key").chmod(0o666)
     try:
@@ -210,20 +250,32 @@ def test_open_rights_are_no_finding_on_windows(folder: Path, monkeypatch: pytest
         (folder / "m1" / "private.key").chmod(0o600)
 
 
-def test_the_command_exits_with_1_if_something_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_exits_with_1_if_something_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(doctor, "examine_rights", lambda: iter(()))
     monkeypatch.setattr(doctor, "examine_rate", lambda: doctor.DoctorFinding("rate", "ok", ""))
     monkeypatch.setattr(os, "getloadavg", lambda: (0.0, 0.0, 0.0))
     done = trilat("doctor", "--json", cwd=tmp_path)
-    assert {one["check"] for one in json.loads(done.out)} >= {"keys", "links", "clock", "disk", "processors"}
+    assert {one["check"] for one in json.loads(done.out)} >= {
+        "keys",
+        "links",
+        "clock",
+        "disk",
+        "processors",
+    }
     done = trilat("doctor", "--listen", "tcp/0.0.0.0:7447", cwd=tmp_path)
     assert done.code == 1
     assert "fail links" in done.out
     assert "--insecure" in done.out
 
 
-def test_a_session_that_nobody_answers_for_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_that_nobody_answers_for_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(doctor, "CONNECT_S", 0.2)
     connection = Connection((), find_free_endpoints(1))
-    found = list(examine_machine(connection, None, tmp_path, "x", SystemClock(), insecure=False))
+    found = list(
+        examine_machine(connection, None, tmp_path, "x", SystemClock(), insecure=False)
+    )
     assert ("clock", "fail") in {(one.check, one.state) for one in found}

@@ -104,7 +104,9 @@ def driving(
     return drive
 
 
-def session_of(folder: Path, act: Act | None, **overrides: object) -> tuple[Session, dict[str, object]]:
+def session_of(
+    folder: Path, act: Act | None, **overrides: object
+) -> tuple[Session, dict[str, object]]:
     scenario = load_scenario("two_sites", {**OUTSIDE, **overrides})
     session = Session.whole(scenario, folder, ends={})
     if act is not None:
@@ -149,7 +151,9 @@ def test_arm_of_six_joints_sends_torque_that_it_measures(tmp_path: Path) -> None
     sent: list[list[float]] = []
     session = Session.whole(six(**changes), tmp_path, ends={})
     start = six().sites["s"].q0_rad
-    session.stranger(driving(sent, [], arm=Pendulum(start), senses=True), at_ns=A_SECOND + 200_250_000)
+    session.stranger(
+        driving(sent, [], arm=Pendulum(start), senses=True), at_ns=A_SECOND + 200_250_000
+    )
     log = session.run()
     assert set(session.ends.values()) == {0}
     records = [[*state.q, *state.qd, *state.tau_x] for state in log["s"].states]
@@ -161,7 +165,9 @@ def test_arm_of_six_joints_sends_torque_that_it_measures(tmp_path: Path) -> None
 def test_an_arm_with_another_number_of_joints_is_told_so(tmp_path: Path) -> None:
     scenario = six(**ARM)
     session = Session(scenario, tmp_path / "run.mcap")
-    session.stranger(driving([], [], until_ns=3 * A_SECOND, arm=Pendulum((0.0,) * 7)), at_ns=A_SECOND)
+    session.stranger(
+        driving([], [], until_ns=3 * A_SECOND, arm=Pendulum((0.0,) * 7)), at_ns=A_SECOND
+    )
 
     def alone(clock: RelayClock) -> None:
         with pytest.raises(SessionError, match=r"dropped: \d+ of 7 joints; the scenario has 6"):
@@ -170,7 +176,10 @@ def test_an_arm_with_another_number_of_joints_is_told_so(tmp_path: Path) -> None
     session.relay.add("s", alone)
     session.play()
     assert (
-        sum("its arm sends measurements of 7 joints; the scenario has 6" in line for line in session.said)
+        sum(
+            "its arm sends measurements of 7 joints; the scenario has 6" in line
+            for line in session.said
+        )
         == 1
     )
 
@@ -185,14 +194,19 @@ def test_a_silent_arm_is_held_then_in_fault(tmp_path: Path) -> None:
     assert set(modes[last + 32 : last + 199]) == {"hold"}
     assert set(modes[last + 202 :]) == {"fault"}
     assert len(log["s"]) == 1000
-    assert any(re.search("s is in FAULT from .*: its arm is silent", event.text) for event in log.events)
+    assert any(
+        re.search("s is in FAULT from .*: its arm is silent", event.text)
+        for event in log.events
+    )
     whole(log)
 
 
 @pytest.mark.parametrize(
     "frozen_s", [0.3, *(pytest.param(s, marks=pytest.mark.long) for s in (1.0, 3.0, 10.0))]
 )
-def test_a_frozen_site_makes_up_for_nothing_its_arm_stays(frozen_s: float, tmp_path: Path) -> None:
+def test_a_frozen_site_makes_up_for_nothing_its_arm_stays(
+    frozen_s: float, tmp_path: Path
+) -> None:
     poses: list[tuple[int, list[float]]] = []
     at_ns = 4 * A_SECOND
     scenario = load_scenario("two_sites", {**OUTSIDE, "duration_s": 3.5 + frozen_s})
@@ -208,7 +222,13 @@ def test_a_frozen_site_makes_up_for_nothing_its_arm_stays(frozen_s: float, tmp_p
     assert set(part.mode[jump + 1 :]) == {"fault"}
     held = next(q for now_ns, q in poses if now_ns >= at_ns)
     assert (
-        max(abs(a - b) for now_ns, q in poses if now_ns >= at_ns for a, b in zip(q, held, strict=True)) < 0.05
+        max(
+            abs(a - b)
+            for now_ns, q in poses
+            if now_ns >= at_ns
+            for a, b in zip(q, held, strict=True)
+        )
+        < 0.05
     )
     before, after = part.theta_hat[jump], part.theta_hat[-1]
     assert np.abs(after - before).max() <= 0.01 * np.abs(before).max()
@@ -219,7 +239,9 @@ def test_a_frozen_site_makes_up_for_nothing_its_arm_stays(frozen_s: float, tmp_p
 
 def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
     """Held from 0.2 s to 0.5 s, then silent; again from 0.8 s, and let go at 1.1 s."""
-    session, ends = session_of(tmp_path, driving([], []), **{"sites.s.arm.dead_man": True, "duration_s": 1.5})
+    session, ends = session_of(
+        tmp_path, driving([], []), **{"sites.s.arm.dead_man": True, "duration_s": 1.5}
+    )
     told: list[tuple[bool, str]] = []
 
     def hold(bus: Bus, clock: RelayClock) -> None:
@@ -234,7 +256,9 @@ def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
                     clock.sleep_until(clock.monotonic_ns() + 20_000_000)
             switch.send(held=False)
             clock.sleep_until(clock.monotonic_ns() + 20_000_000)
-            told.extend((one.accepted, one.text) for one in reached(bus, clock).order(["s"], "enable"))
+            told.extend(
+                (one.accepted, one.text) for one in reached(bus, clock).order(["s"], "enable")
+            )
 
     session.stranger(hold, at_ns=A_SECOND)
     log = session.run()
@@ -242,9 +266,13 @@ def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
     changes = [int(k) + 1 for k in np.flatnonzero(np.diff(log["s"].mode == "stopped"))]
     starts = np.array([0, *changes])
     assert log["s"].mode[0] == "stopped"
-    assert np.abs(starts - [0, 200, 580, 800, 1100]).max() <= 5  # 480 ms and a silence of 100 ms
+    # 480 ms and a silence of 100 ms
+    assert np.abs(starts - [0, 200, 580, 800, 1100]).max() <= 5
     assert {log["s"].mode[k] for k in changes} == {"stopped", "return"}
-    said = [re.search("STOPPED from .*: its dead-man switch is not held", event.text) for event in log.events]
+    said = [
+        re.search("STOPPED from .*: its dead-man switch is not held", event.text)
+        for event in log.events
+    ]
     assert len([text for text in said if text]) == 3
     assert told == [(False, "the dead-man switch of s is not held; enable it while it is")]
     assert np.abs(np.diff(log["s"].tau, axis=0)).max() <= 2.0 * (1.0 + 1e-9)  # 2000 N m/s
@@ -264,7 +292,9 @@ class Switch:
         self.ring = StampingRing(self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
         self.switch = DeadManSwitch("s", self.ring, self.clock, self.dropped)
 
-    def hear(self, boot: int, n: int, site: str = "s", *, held: bool = True, after_ns: int = 0) -> bool:
+    def hear(
+        self, boot: int, n: int, site: str = "s", *, held: bool = True, after_ns: int = 0
+    ) -> bool:
         """Hears of one program; returns whether it is held then."""
         self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
         self.ring.take(encode(ArmEnable(site=site, boot=boot, n=n, held=held, sent_ns=0)))
@@ -340,7 +370,9 @@ def test_many_idle_switch_programs_forget_nobody_who_holds() -> None:
 def test_a_site_that_is_killed_comes_back_with_its_arm(tmp_path: Path) -> None:
     """Both programs are started again by hand; meanwhile brakes hold the arm, and its peer holds."""
     glide = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0}
-    scenario = load_scenario("two_sites", {**OUTSIDE, **glide, "duration_s": 6.0, "link.delay_ms": 50.0})
+    scenario = load_scenario(
+        "two_sites", {**OUTSIDE, **glide, "duration_s": 6.0, "link.delay_ms": 50.0}
+    )
     session = Session.whole(scenario, tmp_path, ends={})
     poses: list[tuple[int, list[float]]] = []
     drive = driving([], [], poses=poses)
@@ -370,7 +402,9 @@ def test_without_an_arm_nothing_begins_and_that_is_said(tmp_path: Path) -> None:
     session = Session(load_scenario("two_sites", OUTSIDE), tmp_path / "run.mcap")
 
     def alone(clock: RelayClock) -> None:
-        with pytest.raises(SessionError, match=r"s waited in vain for its arm: .* trilat/t/s/measured"):
+        with pytest.raises(
+            SessionError, match=r"s waited in vain for its arm: .* trilat/t/s/measured"
+        ):
             session.live("s", clock)
 
     session.relay.add("s", alone)
@@ -398,7 +432,15 @@ def test_a_second_program_and_garbage_are_counted_and_change_nothing(tmp_path: P
 
 
 def measurement(**changed: object) -> bytes:
-    fields = {"v": VERSION, "site": "s", "boot": 7, "n": 0, "q": [0.5, 0.25], "qd": [1.0, 2.0], "sent_ns": 5}
+    fields = {
+        "v": VERSION,
+        "site": "s",
+        "boot": 7,
+        "n": 0,
+        "q": [0.5, 0.25],
+        "qd": [1.0, 2.0],
+        "sent_ns": 5,
+    }
     return msgpack.packb({**fields, **changed})
 
 
@@ -541,7 +583,15 @@ def test_torque_counts_while_it_is_fresh_and_run_goes_on() -> None:
     def at(tick: int, **changed: object) -> bytes:
         return msgpack.packb({**state, "tick": tick, "t_ns": tick * PERIOD_NS, **changed})
 
-    state = {"v": VERSION, "site": "s", "boot": 5, "mode": "run", **zeros, **vectors, "tau": [1.5, -2.5]}
+    state = {
+        "v": VERSION,
+        "site": "s",
+        "boot": 5,
+        "mode": "run",
+        **zeros,
+        **vectors,
+        "tau": [1.5, -2.5],
+    }
     state |= {"theta_hat": [0.0] * 5, "used": {}, "rx": [], "cmd": [], "mem": []}
     say = site.publisher("trilat/t/s/state")
     say(msgpack.packb(state))
@@ -562,7 +612,10 @@ def test_torque_counts_while_it_is_fresh_and_run_goes_on() -> None:
     assert port.torque() is None
     say(at(103))
     assert port.torque() == (1.5, -2.5)
-    for tick, reason, torque in ((110, LifeReason.RELEASED, None), (120, LifeReason.STOP, (1.5, -2.5))):
+    for tick, reason, torque in (
+        (110, LifeReason.RELEASED, None),
+        (120, LifeReason.STOP, (1.5, -2.5)),
+    ):
         say(at(tick, mode="stopped", mem=[0.0, 0.0, 1e6, 0.0, 0.0, float(reason)]))
         assert port.torque() == torque
     say(at(125, mode="fault", mem=[]))  # since when, it does not say
@@ -570,7 +623,9 @@ def test_torque_counts_while_it_is_fresh_and_run_goes_on() -> None:
     say(at(130, mode="diverged"))
     assert port.torque() is None
     assert not port.over
-    site.publisher("trilat/t/s/event")(encode(Event(member="s", boot=5, kind="end", text="made 3 ticks")))
+    site.publisher("trilat/t/s/event")(
+        encode(Event(member="s", boot=5, kind="end", text="made 3 ticks"))
+    )
     assert port.over
 
 

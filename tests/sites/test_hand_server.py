@@ -63,7 +63,9 @@ def holding(site: str, say: Say, felt: Felt, first: int = 12, last: int = 60) ->
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> tuple[Log, Felt]:
     made, felt = Session.whole(SCENARIO, tmp_path_factory.mktemp("held")), Felt()
-    made.stranger(holding("m1", lambda hand, n: hand.move(1.6 + 0.1 * math.sin(0.2 * n), 0.6), felt))
+    made.stranger(
+        holding("m1", lambda hand, n: hand.move(1.6 + 0.1 * math.sin(0.2 * n), 0.6), felt)
+    )
     made.stranger(holding("m2", lambda hand, n: hand.move(1.5, 0.3 + 0.005 * n), Felt()))
     made.stranger(holding("m1", lambda hand, _: hand.move(0.0, 0.0), Felt(), first=30, last=50))
     return made.run(), felt
@@ -136,7 +138,9 @@ class Served:
 
 def message(**fields: Any) -> bytes:
     return encode(
-        HandMessage(**{"site": "m1", "boot": 5, "n": 0, "target": [1.5, 0.5], "sent_ns": 0, **fields})
+        HandMessage(
+            **{"site": "m1", "boot": 5, "n": 0, "target": [1.5, 0.5], "sent_ns": 0, **fields}
+        )
     )
 
 
@@ -170,4 +174,6 @@ def test_flood_is_read_little_at_time_and_moves_nobody() -> None:
     assert hand.source == 5
     assert hand.number == 99
     assert served.dropped == {ANOTHER_HOLDS: 99 * (MESSAGES_KEPT - 1)}
-    assert [text for _, text in served.server.news] == ["m1: hand 00000005 takes hold at t = 0.000 s"]
+    assert [text for _, text in served.server.news] == [
+        "m1: hand 00000005 takes hold at t = 0.000 s"
+    ]

@@ -32,7 +32,9 @@ def test_a_copy_of_the_papers_law_has_its_bits_live(tmp_path: Path) -> None:
 
 
 def test_what_laws_send_each_other_is_that_of_virtual_time(tmp_path: Path) -> None:
-    log, _ = lived(tmp_path, "paper", control={"law": "tests.channel_law:Talking"}, duration_s=0.3)
+    log, _ = lived(
+        tmp_path, "paper", control={"law": "tests.channel_law:Talking"}, duration_s=0.3
+    )
     assert in_log(log) == in_virtual_time(log.scenario)
     assert verify(log).identical == 900
     assert log["m1"].sent["target[s]"].any()

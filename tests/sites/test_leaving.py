@@ -51,7 +51,9 @@ def test_site_that_is_killed_comes_back_and_log_is_whole(tmp_path: Path) -> None
 
 
 def kinds_about(log: Log, member: str, about: str) -> list[str]:
-    return [event.kind for event in log.events if event.member == member and event.about == about]
+    return [
+        event.kind for event in log.events if event.member == member and event.about == about
+    ]
 
 
 def test_whose_end_it_was_is_told_to_the_others(tmp_path: Path) -> None:
@@ -76,7 +78,9 @@ def test_whose_end_it_was_is_told_to_the_others(tmp_path: Path) -> None:
 
 
 def test_a_site_waits_for_a_departed_one_only_as_told(tmp_path: Path) -> None:
-    session = Session.whole(gliding(30.0), tmp_path, ends={}, options={"m": {"leave_timeout_s": 1.0}})
+    session = Session.whole(
+        gliding(30.0), tmp_path, ends={}, options={"m": {"leave_timeout_s": 1.0}}
+    )
     session.clocks["s"].dies_ns = 3 * S
     log = session.run()
     assert session.ends is not None
@@ -109,7 +113,10 @@ def test_a_departed_site_may_return_and_leave_again(tmp_path: Path) -> None:
 def test_site_may_come_late_where_first_one_begins_without_it(tmp_path: Path) -> None:
     scenario = gliding(5.0, "asymmetric")
     session = Session(
-        scenario, tmp_path / "run.mcap", ends={}, options={"m1": {"without": (scenario.names[2],)}}
+        scenario,
+        tmp_path / "run.mcap",
+        ends={},
+        options={"m1": {"without": (scenario.names[2],)}},
     )
     session.recorder()
     for n, name in enumerate(scenario.names):
@@ -139,7 +146,9 @@ def test_sites_on_clocks_of_their_own_find_the_grid_again(dies: str, tmp_path: P
     assert (result.differing, result.unjudged, result.gaps) == (0, 0, [])
     for name in log.sites:
         dropped = {
-            reason: n for reason, n in log.link_stats(name)[-1].dropped.items() if reason != "stranger"
+            reason: n
+            for reason, n in log.link_stats(name)[-1].dropped.items()
+            if reason != "stranger"
         }
         assert dropped == {}
     assert "clock fault" not in {event.kind for event in log.events}
@@ -175,10 +184,13 @@ def test_recorder_that_comes_after_return_knows_what_was_not_made(tmp_path: Path
     ((first, _),) = log.starts["m"]
     ((away, last),) = log.absences["m"]
     assert (away, last) == (log["s"].used["m"][log["s"].tick < first].max() + 1, first - 1)
-    assert log.missing("m") == away  # the memory of the first start went with it; the other site heard all
+    # the memory of the first start went with it; the other site heard all
+    assert log.missing("m") == away
     assert len(log["s"]) == 1600
     assert log.missing("s") == 0
-    assert "agree with what is there" in [finding.text for finding in check_file(session.path).findings]
+    assert "agree with what is there" in [
+        finding.text for finding in check_file(session.path).findings
+    ]
 
 
 def test_a_sample_whose_record_died_leaves_few_ticks_open(tmp_path: Path) -> None:
@@ -200,7 +212,10 @@ def test_a_one_way_cut_is_in_the_last_words(tmp_path: Path) -> None:
     session.lose("m", "trilat/t/m/sample", 3 * S, 60 * S)
     log = session.run()
     ends = {event.member: event.text for event in log.events if event.kind == "end"}
-    assert ends == {"m": "m made 600 ticks; s did not hear it at the end", "s": "s made 600 ticks"}
+    assert ends == {
+        "m": "m made 600 ticks; s did not hear it at the end",
+        "s": "s made 600 ticks",
+    }
 
 
 def test_a_site_that_some_do_not_admit_names_them(tmp_path: Path) -> None:
@@ -227,7 +242,9 @@ def test_a_site_says_that_a_peer_does_not_hear_it(tmp_path: Path) -> None:
     session.lose("m", "trilat/t/m/sample", 3 * S, 3 * S + 600_000_000)
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
-    told = [(event.kind, event.about, event.t_ns) for event in log.events if "hear" in event.kind]
+    told = [
+        (event.kind, event.about, event.t_ns) for event in log.events if "hear" in event.kind
+    ]
     assert [kind for kind, _, _ in told] == ["unheard", "heard"]
     assert {about for _, about, _ in told} == {"s"}
     cut_s = 3.0 - log.events[0].epoch_mono_ns / S if log.events[0].epoch_mono_ns else 0.0
@@ -247,7 +264,9 @@ def test_certificate_says_what_theorem_covers_and_judges_rest(tmp_path: Path) ->
     premises = {premise.name: premise for premise in found.premises}
     assert premises["presence"].holds is False
     (first, last), rate_hz = log.absences["m1"][0], 200
-    assert f"m1 {first / rate_hz:.4g} to {(last + 1) / rate_hz:.4g} s" in premises["presence"].text
+    assert (
+        f"m1 {first / rate_hz:.4g} to {(last + 1) / rate_hz:.4g} s" in premises["presence"].text
+    )
     assert premises["presence"].text.count("all follow from") == 2
     assert premises["presence"].text.count("delays are constant") == 2
     assert premises["records"].holds
@@ -260,7 +279,9 @@ def test_certificate_says_what_theorem_covers_and_judges_rest(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("dies_ms", "again_ms"), [pytest.param(4300, 5000, marks=pytest.mark.long), (4050, 4060)]
 )
-def test_a_start_dead_before_tick_0_leaves_its_place(dies_ms: int, again_ms: int, tmp_path: Path) -> None:
+def test_a_start_dead_before_tick_0_leaves_its_place(
+    dies_ms: int, again_ms: int, tmp_path: Path
+) -> None:
     """Also if the other site admits it only when the next one is there already."""
     session = Session.whole(gliding(7.0), tmp_path, ends={})
     session.clocks["m"].dies_ns = 3 * S
@@ -280,11 +301,14 @@ def test_a_returning_site_does_not_wait_for_a_leaving_one(tmp_path: Path) -> Non
     session = Session.whole(gliding(6.0, "asymmetric"), tmp_path, ends={})
     session.clocks["m1"].dies_ns = 3 * S
     session.site("m1", at_ns=4 * S)
-    session.clocks["s"].dies_ns = 4 * S + 2_000_000  # its token was seen, and it has answered nothing
+    # its token was seen, and it has answered nothing
+    session.clocks["s"].dies_ns = 4 * S + 2_000_000
     log = session.run()
     (coming,) = (event for event in log.events if event.kind == "coming")
     (gone_ns,) = (
-        event.t_ns for event in log.events if (event.member, event.kind, event.about) == ("m2", "lost", "s")
+        event.t_ns
+        for event in log.events
+        if (event.member, event.kind, event.about) == ("m2", "lost", "s")
     )
     assert coming.t_ns - gone_ns < 200_000_000
     assert log.starts.keys() == {"m1"}
@@ -298,7 +322,9 @@ def test_two_sites_returning_together_admit_each_other(later_ms: int, tmp_path: 
         session.interrupt(name, 3 * S + wait_ms * 1_000_000, 15)
         session.site(name, at_ns=3 * S + (140 + wait_ms) * 1_000_000)
     log = session.run()
-    assert {name: log[name].mode[-1] for name in log.sites} == dict.fromkeys(("m1", "m2", "s"), "run")
+    assert {name: log[name].mode[-1] for name in log.sites} == dict.fromkeys(
+        ("m1", "m2", "s"), "run"
+    )
     assert verify(log).passed
 
 
@@ -344,7 +370,9 @@ def test_successive_recorders_agree_on_ticks_not_made(tmp_path: Path) -> None:
 
 def test_a_site_whose_token_goes_for_nothing_is_not_away(tmp_path: Path) -> None:
     """As a reconnection may report the end of a connection after its return."""
-    session = Session.whole(gliding(5.0), tmp_path, ends={}, options={"s": {"leave_timeout_s": 2.0}})
+    session = Session.whole(
+        gliding(5.0), tmp_path, ends={}, options={"s": {"leave_timeout_s": 2.0}}
+    )
     session.clocks["s"].at(3 * S, lambda: session.lose_token("m"))
     log = session.run()
     assert kinds_about(log, "s", "m") == ["lost"]

@@ -89,7 +89,9 @@ class Alone:
 def test_ticks_lie_on_an_absolute_grid_at_any_rate(rate_hz: int) -> None:
     clock = LateClock()
     Alone(clock, {"rate_hz": rate_hz}).run()
-    assert clock.deadlines == [EPOCH_NS + k * 1_000_000_000 // rate_hz for k in range(2 * rate_hz)]
+    assert clock.deadlines == [
+        EPOCH_NS + k * 1_000_000_000 // rate_hz for k in range(2 * rate_hz)
+    ]
 
 
 def test_missed_ticks_run_back_to_back_and_are_counted() -> None:
@@ -107,7 +109,9 @@ def test_lateness_enters_no_formula() -> None:
     prompt, late = Alone(LateClock()), Alone(LateClock({5: 7_300_000, 900: 400_000_000}))
     prompt.run()
     late.run()
-    on_time = [msgspec.structs.replace(state, late_us=0, sent_ns=state.t_ns) for state in late.states]
+    on_time = [
+        msgspec.structs.replace(state, late_us=0, sent_ns=state.t_ns) for state in late.states
+    ]
     assert on_time == prompt.states
     assert max(state.late_us for state in late.states) == 400_000
 
@@ -118,7 +122,9 @@ def test_a_turn_shifts_wake_ups_and_nothing_else() -> None:
     prompt.run()
     in_turn.run(turn_ns=333_000)
     assert clock.deadlines == [EPOCH_NS + k * 1_000_000 + 333_000 for k in range(2000)]
-    assert [msgspec.structs.replace(state, sent_ns=state.t_ns) for state in in_turn.states] == prompt.states
+    assert [
+        msgspec.structs.replace(state, sent_ns=state.t_ns) for state in in_turn.states
+    ] == prompt.states
 
 
 def test_statistics_and_slack_come_ten_times_second_after_tick() -> None:
@@ -144,7 +150,9 @@ def test_a_run_beyond_its_limits_ends_with_a_diverged_record() -> None:
     alone = Alone(LateClock(), {"limits.qd_limit_rad_s": 0.05, "sites.m.q0_rad": [0.4, -0.2]})
     output = alone.run()
     assert output.mode is Mode.DIVERGED
-    assert [state.mode for state in alone.states] == ["run"] * (len(alone.states) - 1) + ["diverged"]
+    assert [state.mode for state in alone.states] == ["run"] * (len(alone.states) - 1) + [
+        "diverged"
+    ]
     assert 0 < len(alone.states) < 2000
 
 
@@ -158,11 +166,15 @@ SCENARIOS = {
 
 @pytest.mark.parametrize("name", SCENARIOS)
 @pytest.mark.push
-def test_session_of_live_loops_equals_virtual_time_bit_for_bit(name: str, tmp_path: Path) -> None:
+def test_session_of_live_loops_equals_virtual_time_bit_for_bit(
+    name: str, tmp_path: Path
+) -> None:
     scenario = load_scenario(name, SCENARIOS[name])
     log = Session.whole(scenario, tmp_path).run()
     assert log.complete
-    assert [len(log[site]) for site in log.sites] == [scenario.ticks(site) for site in scenario.names]
+    assert [len(log[site]) for site in log.sites] == [
+        scenario.ticks(site) for site in scenario.names
+    ]
     assert in_log(log) == in_virtual_time(scenario)
     assert verify(log).passed
 
@@ -251,7 +263,9 @@ def test_who_comes_late_is_told_how_far_the_session_is(tmp_path: Path) -> None:
     refused: list[str] = []
 
     def come_late(_bus: Bus, clock: RelayClock) -> None:
-        member = Session(session.scenario, tmp_path / "other.mcap", session.relay, session.network)
+        member = Session(
+            session.scenario, tmp_path / "other.mcap", session.relay, session.network
+        )
         with pytest.raises(SessionError) as caught:
             member.live("m", clock)
         refused.append(str(caught.value))

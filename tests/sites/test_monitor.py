@@ -44,7 +44,11 @@ def test_whatever_strangers_say_is_shown_or_passed_over(terminal: bool) -> None:
     record = msgspec.structs.replace(moved.states[-1], mode="[/red]\x1b[7mX")
     say("m1", topics.STATE, b"".join([*moved.payloads[:-1], msgspec.msgpack.encode(record)]))
     say("nobody", topics.LINK, encode(msgspec.structs.replace(STATISTICS, site="nobody")))
-    say("m1", topics.EVENT, encode(Event(member="m1", boot=1, kind="lost", text="[/red] s is gone [x]")))
+    say(
+        "m1",
+        topics.EVENT,
+        encode(Event(member="m1", boot=1, kind="lost", text="[/red] s is gone [x]")),
+    )
     with display:
         watch.poll()
         assert list(watch.latest) == ["m1"]

@@ -30,12 +30,17 @@ MS = 1_000_000
 class SlowFarEnd:
     """Sends back every sample but some, a time after it came."""
 
-    def __init__(self, relay: Relay, network: LocalNetwork, trip_ns: int, lost_every: int = 0) -> None:
+    def __init__(
+        self, relay: Relay, network: LocalNetwork, trip_ns: int, lost_every: int = 0
+    ) -> None:
         relayed, self.came = LocalNetwork(), 0
         answer_benchmarks(relayed.join(), "far")
         forward = relayed.join()
         to_near = network.join().publisher(topics.key(SESSION, "far", topics.SAMPLE))
-        forward.tap("**", lambda _, payload: relay.happens(relay.now_ns + trip_ns, lambda: to_near(payload)))
+        forward.tap(
+            "**",
+            lambda _, payload: relay.happens(relay.now_ns + trip_ns, lambda: to_near(payload)),
+        )
         ask = forward.publisher(topics.key(SESSION, "near", topics.SAMPLE))
 
         def take(_: str, payload: bytes) -> None:
@@ -101,7 +106,9 @@ def test_a_network_is_judged_by_the_delay_margin_of_linear() -> None:
 
 
 def test_a_play_out_is_what_a_measured_link_adds() -> None:
-    needs = find_needs(tn.load_scenario("p_d_margin", {"link.model": "measured", "link.playout_ms": 40}))
+    needs = find_needs(
+        tn.load_scenario("p_d_margin", {"link.model": "measured", "link.playout_ms": 40})
+    )
     assert (needs.playout_ms, needs.held_ms, needs.in_use_ms) == (40.0, 40.0, None)
     assert judge_network(needs, row(needs, 12.3))["age_ms"] == 40.0
     assert judge_network(needs, row(needs, 41.3))["age_ms"] == 42.0
@@ -130,9 +137,13 @@ def check_result(found: Result, transports: list[str]) -> None:
     assert [one["transport"] for one in facts["transports"]] == transports
     assert len(facts["rows"]) == 6 * len(transports)
     assert all(0 <= one["lost"] <= one["sent"] for one in facts["rows"])
-    for one in facts["rows"]:  # a machine that stands still for half a second loses all of a row
+    # a machine that stands still for half a second loses all of a row
+    for one in facts["rows"]:
         assert (one["one_way_us"] is None) == (one["lost"] == one["sent"])
-        assert one["one_way_us"] is None or 0 < one["one_way_us"]["p50"] <= one["one_way_us"]["max"]
+        assert (
+            one["one_way_us"] is None
+            or 0 < one["one_way_us"]["p50"] <= one["one_way_us"]["max"]
+        )
     assert is_documented("ping --benchmark", facts)
     assert len(found.to_frame()) == len(facts["rows"])
 

@@ -29,7 +29,9 @@ MS_NS = 1_000_000
 
 def at_m2(kind: str, **keys: Any) -> Scenario:
     hand = {"kind": "own", "class": f"tests.own_code:{kind}", **keys}
-    return load_scenario("paper", {"sites.m2.hands": [hand], "link.delay_ms": 50, "duration_s": 1.0})
+    return load_scenario(
+        "paper", {"sites.m2.hands": [hand], "link.delay_ms": 50, "duration_s": 1.0}
+    )
 
 
 def begin(scenario: Scenario, folder: Path) -> tuple[HandSite, Session]:
@@ -70,7 +72,10 @@ def add_program(
 def assert_same(log: Log, other: Log) -> None:
     for name in log.scenario.names:
         for signal in SIGNALS:
-            assert np.array_equal(getattr(log[name], signal), getattr(other[name], signal)), (name, signal)
+            assert np.array_equal(getattr(log[name], signal), getattr(other[name], signal)), (
+                name,
+                signal,
+            )
 
 
 @pytest.mark.parametrize("kind", [Circle, Follower])
@@ -154,7 +159,12 @@ def test_a_stranger_moves_no_hand_of_ones_own(tmp_path: Path) -> None:
         publish = bus.publisher(key(SESSION, "m2", HAND))
         for n in range(400):
             moved = HandMessage(
-                site="m2", boot=7, source="page", n=n, target=[9.0, 9.0], sent_ns=clock.monotonic_ns()
+                site="m2",
+                boot=7,
+                source="page",
+                n=n,
+                target=[9.0, 9.0],
+                sent_ns=clock.monotonic_ns(),
             )
             publish(encode(moved))
             publish(b"\x00 nothing")
@@ -174,7 +184,11 @@ def test_saying_that_it_is_here_decides_nothing(tmp_path: Path) -> None:
     def say(clock: RelayClock) -> None:
         publish = session.network.join().publisher(key(SESSION, "m2", HAND))
         for _ in range(2_000):
-            publish(encode(HandMessage(site="m2", boot=9, source=at.source, n=0, grip=False, sent_ns=1)))
+            publish(
+                encode(
+                    HandMessage(site="m2", boot=9, source=at.source, n=0, grip=False, sent_ns=1)
+                )
+            )
             clock.sleep_until(clock.monotonic_ns() + MS_NS)
 
     session.relay.add("here", say)
@@ -186,22 +200,32 @@ def test_a_hand_that_fails_within_its_site_lets_go(how: str, tmp_path: Path) -> 
     scenario = at_m2("Failing", settings={"how": how})
     log = Session.whole(scenario, tmp_path).run()
     assert_same(log, simulate_scenario(scenario))
-    assert [event.text for event in log.events if event.kind == "hand" and "failed at tick 300" in event.text]
+    assert [
+        event.text
+        for event in log.events
+        if event.kind == "hand" and "failed at tick 300" in event.text
+    ]
     assert log.complete
 
 
 def test_a_plant_moves_alike_live_and_in_virtual_time(tmp_path: Path) -> None:
-    scenario = load_scenario("paper", {"sites.s.plant": "tests.own_code:Arm", "duration_s": 1.0})
+    scenario = load_scenario(
+        "paper", {"sites.s.plant": "tests.own_code:Arm", "duration_s": 1.0}
+    )
     log = Session.whole(scenario, tmp_path).run()
     assert_same(log, simulate_scenario(scenario))
     assert verify(log).passed
 
 
 def test_a_plant_that_fails_ends_the_run_named(tmp_path: Path) -> None:
-    scenario = load_scenario("paper", {"sites.s.plant": "tests.own_code:Torn", "duration_s": 1.0})
+    scenario = load_scenario(
+        "paper", {"sites.s.plant": "tests.own_code:Torn", "duration_s": 1.0}
+    )
     ends: dict[str, object] = {}
     log = Session.whole(scenario, tmp_path, ends=ends).run()
     assert isinstance(ends["s"], PlantFailed)
     assert "the belt is torn" in str(ends["s"])
-    assert [event.text for event in log.events if event.kind == "failed" and event.member == "s"]
+    assert [
+        event.text for event in log.events if event.kind == "failed" and event.member == "s"
+    ]
     assert verify(log).passed

@@ -59,7 +59,9 @@ class Desk:
             LinkTimingMonitor(PeerClock(name, EPOCH_NS, 0, exact_offset(0), None), SentStamps())
             for name in PEERS
         ]
-        paced = [link._replace(rate_hz=rate_hz) for link, rate_hz in zip(links, rates, strict=True)]
+        paced = [
+            link._replace(rate_hz=rate_hz) for link, rate_hz in zip(links, rates, strict=True)
+        ]
         self.intake = PeerInbox(paced, rings, BOOTS, self.meters, self.dropped)
 
     def wait(self, until_ns: int) -> None:
@@ -72,7 +74,9 @@ def test_samples_come_peer_by_peer_each_in_its_order() -> None:
         desk.send[1](payload(tick, 1))
         desk.send[0](payload(tick, 0))
     arrivals = desk.intake.drain(5_000_000)
-    assert [(a.peer, a.tick) for a in arrivals] == [(p, t) for p in (0, 1) for t in (0, 1, 3, 2)]
+    assert [(a.peer, a.tick) for a in arrivals] == [
+        (p, t) for p in (0, 1) for t in (0, 1, 3, 2)
+    ]
     assert [a.q for a in arrivals[:2]] == [[0.0, 0.2], [0.1, 0.2]]
     assert desk.intake.drain(6_000_000) == []
 
@@ -91,7 +95,10 @@ def test_what_comes_before_it_was_sent_is_counted_and_used() -> None:
     desk.wait(5_000_000)
     desk.send[0](payload(0, 0, sent_ns=5_000_001))
     desk.send[0](payload(1, 0, sent_ns=4_000_000))
-    assert [(a.tick, a.latency_us) for a in desk.intake.drain(5_000_000)] == [(0, -1), (1, 1000)]
+    assert [(a.tick, a.latency_us) for a in desk.intake.drain(5_000_000)] == [
+        (0, -1),
+        (1, 1000),
+    ]
     assert [meter.faults for meter in desk.meters] == [1, 0]
     assert desk.meters[0].worst_ns == 1
     assert not desk.dropped
@@ -115,14 +122,22 @@ REFUSED = {
     "version": [payload(v=VERSION + 1), payload(v=0)],
     "not finite": [payload(q=[float("nan"), 0.0]), payload(qd=[0.0, float("-inf")])],
     "stranger": [payload(boot=99), payload(site="s"), payload(site="nobody")],
-    "ahead": [payload(tick=AHEAD_LIMIT_NS // 1_000_000 + 1), payload(tick=2**40 - 1, sent_ns=0)],
+    "ahead": [
+        payload(tick=AHEAD_LIMIT_NS // 1_000_000 + 1),
+        payload(tick=2**40 - 1, sent_ns=0),
+    ],
 }
 
 
 @pytest.mark.parametrize(("reason", "sent"), [(r, p) for r, ps in REFUSED.items() for p in ps])
 def test_what_is_no_sample_is_counted_by_reason_and_dropped(reason: str, sent: bytes) -> None:
     desk = Desk()
-    for message in (payload(0), sent, payload(AHEAD_LIMIT_NS // 1_000_000)):  # the last that is taken
+    # the last that is taken
+    for message in (
+        payload(0),
+        sent,
+        payload(AHEAD_LIMIT_NS // 1_000_000),
+    ):
         desk.send[0](message)
     assert [a.tick for a in desk.intake.drain(0)] == [0, 10_000]
     del desk.dropped["missing"]
@@ -131,11 +146,18 @@ def test_what_is_no_sample_is_counted_by_reason_and_dropped(reason: str, sent: b
 
 @given(
     st.dictionaries(
-        st.sampled_from(["v", "site", "boot", "tick", "q", "qd", "tau_x", "sent_ns", "echo", "more"]),
+        st.sampled_from(
+            ["v", "site", "boot", "tick", "q", "qd", "tau_x", "sent_ns", "echo", "more"]
+        ),
         st.recursive(
-            st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5),
+            st.none()
+            | st.booleans()
+            | st.integers(-(2**63), 2**64 - 1)
+            | st.floats()
+            | st.text(max_size=5),
             lambda inner: (
-                st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
+                st.lists(inner, max_size=3)
+                | st.dictionaries(st.text(max_size=3), inner, max_size=3)
             ),
             max_leaves=6,
         ),
@@ -179,7 +201,11 @@ def test_duplicates_are_handed_on_because_the_record_lists_them() -> None:
     assert not desk.dropped
 
 
-GUARDED = load_scenario("paper", {"on_stale.action": "glide", "limits.qd_limit_rad_s": 5.0}).setup("m1").links
+GUARDED = (
+    load_scenario("paper", {"on_stale.action": "glide", "limits.qd_limit_rad_s": 5.0})
+    .setup("m1")
+    .links
+)
 """At 5 rad/s, 5 mrad in a period, and 20 mrad besides."""
 
 

@@ -32,7 +32,14 @@ class Desk:
         return bus
 
     def says(self, member: str, boot: int, kind: str, about: str = "", ticks: int = 0) -> None:
-        event = Event(member=member, boot=boot, kind=kind, text=f"{member} {kind}", about=about, ticks=ticks)
+        event = Event(
+            member=member,
+            boot=boot,
+            kind=kind,
+            text=f"{member} {kind}",
+            about=about,
+            ticks=ticks,
+        )
         self.network.join().publisher(topics.key("t", member, topics.EVENT))(encode(event))
 
     def told(self) -> Sequence[tuple[str, str]]:

@@ -22,7 +22,9 @@ print(json.dumps([obtained, gc.isenabled(), sorted(os.sched_getaffinity(0))]))
 
 def prepared(cpu: object = None, before: str = "") -> tuple[dict[str, str], bool, list[int]]:
     program = PROGRAM.format(before=before, cpu=cpu)
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
+    )
     assert done.returncode == 0, done.stderr
     return tuple(json.loads(done.stdout))
 
@@ -39,7 +41,9 @@ def test_every_step_says_what_it_obtained_and_pins_its_process() -> None:
 
 
 @pytest.mark.parametrize("cpu", [-1, 1023, 2**80])
-def test_a_processor_that_is_not_there_is_a_warning(cpu: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_processor_that_is_not_there_is_a_warning(
+    cpu: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for step in ("_call_libc", "_set_scheduling", "_stop_collector"):
         monkeypatch.setattr(realtime, step, lambda *_: "")
     assert realtime.prepare(cpu)["affinity"].startswith("not obtained (")
@@ -52,7 +56,11 @@ def test_without_any_privilege_the_loop_runs_as_it_can() -> None:
     refuse = f"{REFUSE}os.sched_setscheduler = os.setpriority = realtime._call_libc = refuse"
     obtained, collecting, _ = prepared(before=refuse)
     assert obtained["scheduling"].startswith("normal (")
-    assert obtained["memory"] == obtained["timer_slack"] == "not obtained (Operation not permitted)"
+    assert (
+        obtained["memory"]
+        == obtained["timer_slack"]
+        == "not obtained (Operation not permitted)"
+    )
     assert not collecting
 
 
@@ -88,7 +96,9 @@ print(json.dumps([policy(0), [policy(thread) for thread in beside]]))
 def test_threads_beside_a_loop_give_back_the_interpreter_at_once() -> None:
     """Of all that is not a loop nothing comes before it; else it keeps what the loop waits for."""
     program = f"{PROGRAM.format(before=BESIDE, cpu=None)}{POLICIES}"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60
+    )
     obtained, policies = map(json.loads, done.stdout.splitlines())
     if obtained[0]["scheduling"] != "SCHED_FIFO 50":
         pytest.skip("needs the right to use SCHED_FIFO")

@@ -6,7 +6,13 @@ from typing import Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sites.retransmit_buffer import EVENTS_KEPT, KEPT_S, RECORDS_KEPT, ChannelBuffer, RetransmitBuffer
+from sites.retransmit_buffer import (
+    EVENTS_KEPT,
+    KEPT_S,
+    RECORDS_KEPT,
+    ChannelBuffer,
+    RetransmitBuffer,
+)
 from tests.net.local_bus import LocalNetwork
 from trilat_net.core.site_setup import Layout
 from trilat_net.net import topics
@@ -33,7 +39,9 @@ class Desk:
         return replies
 
     def told(self, channel: str, first: int, last: int) -> Backfill:
-        reply = self.ask(encode(BackfillRequest(channel=channel, first=first, last=last))).poll()  # type: ignore[arg-type]
+        reply = self.ask(
+            encode(BackfillRequest(channel=channel, first=first, last=last))
+        ).poll()  # type: ignore[arg-type]
         assert reply is not None
         return decode(reply[1], Backfill)
 
@@ -69,7 +77,9 @@ def test_a_ring_tells_what_it_still_has_in_chunks(
 
 
 @given(**memories)
-def test_a_ring_forgets_no_more_than_it_must(capacity: int, size_bytes: int, sizes: list[int]) -> None:
+def test_a_ring_forgets_no_more_than_it_must(
+    capacity: int, size_bytes: int, sizes: list[int]
+) -> None:
     """What is left fills the memory, but for the piece of a message at its end, or the places."""
     ring = ChannelBuffer(capacity, size_bytes)
     for size in sizes:

@@ -91,7 +91,9 @@ class Desk:
         )
         self.take = self.refusals.guard("play/m1/target_pose", self.topic.take)
 
-    def hears(self, x: float, sender: Attachment = FIRST, after_ns: int = 0, frame: str = "m1/base") -> None:
+    def hears(
+        self, x: float, sender: Attachment = FIRST, after_ns: int = 0, frame: str = "m1/base"
+    ) -> None:
         self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
         self.topic.watch()
         self.take(cdr.pack_frame_vectors(7, frame, x, 0.5, 0, 0, 0, 0, 1), sender)
@@ -154,12 +156,17 @@ def test_a_pose_in_another_frame_moves_nothing() -> None:
     desk.hears(0.1, frame="")
     desk.hears(0.2, frame="camera")
     assert desk.arm.goals == [(0.1, 0.5)]
-    assert desk.said == ["refused: play/m1/target_pose is in the frame 'camera', and here it is 'm1/base'"]
+    assert desk.said == [
+        "refused: play/m1/target_pose is in the frame 'camera', and here it is 'm1/base'"
+    ]
 
 
 def test_joints_are_found_by_their_names_in_any_order() -> None:
     assert read_joint_target(NAMES, joints(["m1_q2", "m1_q1"], [2.0, 1.0])) == [1.0, 2.0]
-    assert read_joint_target(NAMES, joints(["other", "q2", "q1"], [9.0, 2.0, 1.0])) == [1.0, 2.0]
+    assert read_joint_target(NAMES, joints(["other", "q2", "q1"], [9.0, 2.0, 1.0])) == [
+        1.0,
+        2.0,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -214,7 +221,9 @@ def test_topics_are_called_as_a_file_says(tmp_path: Path) -> None:
         (None, "--names is crisp, crtk or a file, and .* cannot be read: No such file"),
     ],
 )
-def test_names_that_cannot_be_right_are_refused(tmp_path: Path, text: str | None, said: str) -> None:
+def test_names_that_cannot_be_right_are_refused(
+    tmp_path: Path, text: str | None, said: str
+) -> None:
     file = tmp_path / "names.toml"
     if text is not None:
         file.write_text(text)
@@ -228,7 +237,9 @@ def test_a_robot_of_a_site_without_external_arm_is_refused(tmp_path: Path, site:
         FILE.replace("sites.s", f"sites.{site}").replace("sites.m1", "sites.s")
     )
     scenario = load_scenario(str(Path(__file__).parents[2] / "examples" / "external_arm.toml"))
-    with pytest.raises(UsageError, match=rf"sites\.{site}: there is no external arm; sites with one: s"):
+    with pytest.raises(
+        UsageError, match=rf"sites\.{site}: there is no external arm; sites with one: s"
+    ):
         refuse_other_robots(read_topic_table(str(tmp_path / "names.toml")), scenario)
 
 
@@ -278,12 +289,24 @@ def compose(frames: Any, site: str) -> list[tuple[Any, Any]]:
             one.transform.rotation,
         )
         place = at + turned.apply([move.x, move.y, move.z])
-        found[one.child_frame_id] = place, turned * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
-    return [where for name, where in found.items() if name.startswith(f"{site}/")] + [found["world"]]
+        found[one.child_frame_id] = (
+            place,
+            turned * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]),
+        )
+    return [where for name, where in found.items() if name.startswith(f"{site}/")] + [
+        found["world"]
+    ]
 
 
 @pytest.mark.parametrize(
-    "name", ["paper", "six_joints", "unlike_arms", "wall_in_space", pytest.param(posed_arms(), id="posed")]
+    "name",
+    [
+        "paper",
+        "six_joints",
+        "unlike_arms",
+        "wall_in_space",
+        pytest.param(posed_arms(), id="posed"),
+    ],
 )
 def test_the_pose_of_the_tip_is_in_the_transforms(name: str) -> None:
     log = trilat_net.simulate(name, {"duration_s": 0.3})
@@ -292,12 +315,20 @@ def test_the_pose_of_the_tip_is_in_the_transforms(name: str) -> None:
         ends: Any = Ends(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
         shown = SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
         shown.show(log[site].states[-1], 1000.0)
-        messages = [ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.came["tf"]]
+        messages = [
+            ROS.deserialize_cdr(data, "tf2_msgs/msg/TFMessage") for data in graph.came["tf"]
+        ]
         frames = [one for message in messages for one in message.transforms]
-        tip = ROS.deserialize_cdr(graph.came[f"t/{site}/tip_pose"][-1], "geometry_msgs/msg/PoseStamped")
+        tip = ROS.deserialize_cdr(
+            graph.came[f"t/{site}/tip_pose"][-1], "geometry_msgs/msg/PoseStamped"
+        )
         where, turn = tip.pose.position, tip.pose.orientation
-        held = next(one for one in frames if one.child_frame_id == tip.header.frame_id).transform
-        base = Rotation.from_quat([held.rotation.x, held.rotation.y, held.rotation.z, held.rotation.w])
+        held = next(
+            one for one in frames if one.child_frame_id == tip.header.frame_id
+        ).transform
+        base = Rotation.from_quat(
+            [held.rotation.x, held.rotation.y, held.rotation.z, held.rotation.w]
+        )
         place = base.apply([where.x, where.y, where.z])
         place += [held.translation.x, held.translation.y, held.translation.z]
         turned = base * Rotation.from_quat([turn.x, turn.y, turn.z, turn.w])
@@ -312,7 +343,9 @@ def shares(*numbers: float) -> bytes:
     array = ROS.types["std_msgs/msg/Float64MultiArray"]
     layout = ROS.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
     return bytes(
-        ROS.serialize_cdr(array(layout=layout, data=np.array(numbers)), "std_msgs/msg/Float64MultiArray")
+        ROS.serialize_cdr(
+            array(layout=layout, data=np.array(numbers)), "std_msgs/msg/Float64MultiArray"
+        )
     )
 
 
@@ -346,14 +379,19 @@ def test_shares_are_asked_for_once_and_refusals_are_said() -> None:
         "refused: t/s/set_dominance has a number that is not finite",
         "refused: t/s/set_dominance is not plain CDR, little-endian",
     ]
-    clock.sleep_until(2 * RIVAL_NS)  # whoever asks for the same later may have been overruled meanwhile
+    # whoever asks for the same later may have been overruled meanwhile
+    clock.sleep_until(2 * RIVAL_NS)
     take(shares(0.5, 0.1), FIRST)
     ask()
     assert asked[2:] == [{"m1": 0.5, "m2": 0.1}]
 
 
-@given(st.lists(st.tuples(st.integers(0, 60), st.integers(0, 30), st.floats(0.0, 1.0)), max_size=5))
-def test_shares_are_those_that_the_certificate_sees(changes: list[tuple[int, int, float]]) -> None:
+@given(
+    st.lists(st.tuples(st.integers(0, 60), st.integers(0, 30), st.floats(0.0, 1.0)), max_size=5)
+)
+def test_shares_are_those_that_the_certificate_sees(
+    changes: list[tuple[int, int, float]],
+) -> None:
     scenario = load_scenario("paper")
     history, ramps = ShareHistory(scenario, "s"), []
     for start, lasts, share in changes:
@@ -365,7 +403,9 @@ def test_shares_are_those_that_the_certificate_sees(changes: list[tuple[int, int
         t_s = np.arange(100) / 10.0
         first, scripted = list_scripted_ramps(scenario, "s")
         planned = evaluate_ramps(first, [*scripted, *ramps], t_s, 0.0).alpha
-        np.testing.assert_allclose([history.at(round(t * 1e9)) for t in t_s], planned, atol=1e-9)
+        np.testing.assert_allclose(
+            [history.at(round(t * 1e9)) for t in t_s], planned, atol=1e-9
+        )
 
 
 def test_shares_that_change_ten_times_a_second_are_shown() -> None:
@@ -405,7 +445,10 @@ class Robot:
         sender: Attachment = FIRST,
         stamp_ns: int = 7,
     ) -> None:
-        self.take(cdr.JointStatePacker(names, velocity=bool(qd), effort=False).pack(stamp_ns, q, qd), sender)
+        self.take(
+            cdr.JointStatePacker(names, velocity=bool(qd), effort=False).pack(stamp_ns, q, qd),
+            sender,
+        )
 
     def measured(self) -> list[ArmMeasurement]:
         return [decode(payload, ArmMeasurement) for _, payload in drained(self._measured)]
@@ -420,13 +463,21 @@ class Robot:
         self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
         self.commands.clear()
         self.arm.drive()
-        got = [ROS.deserialize_cdr(data, "std_msgs/msg/Float64MultiArray") for data in self.commands]
+        got = [
+            ROS.deserialize_cdr(data, "std_msgs/msg/Float64MultiArray")
+            for data in self.commands
+        ]
         return [message.data.tolist() for message in got]
 
 
 def test_joint_states_of_a_robot_are_its_sites_measurements() -> None:
     robot, of_another_clock = Robot(), 1_790_000_000 * 10**9
-    robot.says(["gripper", "elbow", "shoulder"], [9.0, 2.0, 1.0], [8.0, 4.0, 3.0], stamp_ns=of_another_clock)
+    robot.says(
+        ["gripper", "elbow", "shoulder"],
+        [9.0, 2.0, 1.0],
+        [8.0, 4.0, 3.0],
+        stamp_ns=of_another_clock,
+    )
     robot.says(["shoulder", "elbow"], [1.5, 2.5], [0.0, 0.0], stamp_ns=0)
     robot.says(["wheel"], [7.0], [7.0])  # another robot on the same topic
     first, second = robot.measured()
@@ -471,14 +522,21 @@ def test_two_robots_on_one_topic_measure_nothing() -> None:
 
 @given(st.binary(max_size=120) | st.binary(max_size=120).map(lambda rest: b"\0\1\0\0" + rest))
 def test_whatever_asks_for_shares_or_angles_is_taken_or_counted(data: bytes) -> None:
-    refusals, asked, turned = Refusals(list[str]().append), list[dict[str, float]](), list[list[float]]()
+    refusals, asked, turned = (
+        Refusals(list[str]().append),
+        list[dict[str, float]](),
+        list[list[float]](),
+    )
     shares_ = DominanceTopic(["m1"], asked.append, ManualClock())
     refusals.guard("a", shares_.take)(data, FIRST)
     shares_.ask()
     refusals.guard("b", lambda: turned.append(read_joint_target(NAMES, data)))()
     assert len(asked) + len(turned) + refusals.counts.total() == 2
     assert all(
-        map(math.isfinite, [x for one in asked for x in one.values()] + [x for q in turned for x in q])
+        map(
+            math.isfinite,
+            [x for one in asked for x in one.values()] + [x for q in turned for x in q],
+        )
     )
 
 
@@ -513,7 +571,9 @@ def test_a_robot_without_a_torque_gets_the_safe_command() -> None:
     assert robot.driven(SAFE_NS) == safe
 
 
-@pytest.mark.parametrize("controller", [["elbow"], ["elbow", "wrist"], ["elbow", "shoulder", "wrist"]])
+@pytest.mark.parametrize(
+    "controller", [["elbow"], ["elbow", "wrist"], ["elbow", "shoulder", "wrist"]]
+)
 def test_a_controller_of_other_joints_is_refused(controller: list[str]) -> None:
     with pytest.raises(UsageError, match="have one of each joint: shoulder, elbow"):
         Robot(controller)
@@ -522,24 +582,36 @@ def test_a_controller_of_other_joints_is_refused(controller: list[str]) -> None:
 class Sites:
     """The sites of a session: who they are, what they have noted, and records; a bridge that shows them."""
 
-    def __init__(self, noted: Sequence[Event], scenario: str = "paper", session: str = "t") -> None:
+    def __init__(
+        self, noted: Sequence[Event], scenario: str = "paper", session: str = "t"
+    ) -> None:
         network, self._scenario, self.session = LocalNetwork(), load_scenario(scenario), session
         bus, self._info = network.join(), b""
-        past = {"channel": "event", "first": 0, "payloads": [*map(encode, noted)], "made": len(noted)}
+        past = {
+            "channel": "event",
+            "first": 0,
+            "payloads": [*map(encode, noted)],
+            "made": len(noted),
+        }
         for site in self._scenario.names:
             bus.announce(liveliness_token(session, site, 1))
             bus.respond(topics.key(session, site, topics.INFO), lambda _: self._info)
             kept = encode(Backfill(member=site, boot=1, **past))
             bus.respond(topics.key(session, site, topics.PAST), lambda _, kept=kept: kept)
         self._state, self._event = (
-            bus.publisher(topics.key(session, "s", channel)) for channel in (topics.STATE, topics.EVENT)
+            bus.publisher(topics.key(session, "s", channel))
+            for channel in (topics.STATE, topics.EVENT)
         )
         self.graph, self.anew, self.said = Listener(), list[bool](), list[str]()
-        self._ends: Any = Ends(self.graph, network.join(), SystemClock(), session, read_topic_table("crisp"))  # type: ignore[arg-type]
+        self._ends: Any = Ends(
+            self.graph, network.join(), SystemClock(), session, read_topic_table("crisp")
+        )  # type: ignore[arg-type]
 
     def begin(self, epoch_unix_ns: int) -> None:
         about = {"running": True, "epoch_unix_ns": epoch_unix_ns}
-        self._info = encode(describe_member("s", 1, SystemClock(), self._scenario.text, **about))
+        self._info = encode(
+            describe_member("s", 1, SystemClock(), self._scenario.text, **about)
+        )
         self._event(encode(event("epoch", epoch_unix_ns=epoch_unix_ns)))
 
     def ticks(self, k: int) -> None:
@@ -595,11 +667,16 @@ def test_a_session_begun_anew_is_shown_with_its_epoch() -> None:
 
 def test_shares_that_were_changed_before_are_shown() -> None:
     change = '{"at_s": 0.001, "dominance": "s", "to": {"m1": 0.75, "m2": 0.25}}'
-    sites = Sites([event("setup"), event("change", command="none"), event("change", command=change)])
+    sites = Sites(
+        [event("setup"), event("change", command="none"), event("change", command=change)]
+    )
     sites.begin(10**18)
     with sites.shown():
         (told,) = until(lambda: sites.graph.came["t/s/dominance"])
-        assert ROS.deserialize_cdr(told, "std_msgs/msg/Float64MultiArray").data.tolist() == [0.75, 0.25]
+        assert ROS.deserialize_cdr(told, "std_msgs/msg/Float64MultiArray").data.tolist() == [
+            0.75,
+            0.25,
+        ]
         assert {"t/stop", "t/s/stop", "t/m1/reset", "t/end"} <= set(sites.graph.served)
 
 
@@ -622,12 +699,20 @@ def test_a_bag_has_the_topics_of_the_live_bridge(tmp_path: Path) -> None:
     with sites.shown():
         live = dict(sites.graph.offered)
     assert bag == live
-    assert {"tf", "diagnostics", "lab/s/robot_description", "lab/m/tip_pose", "lab/log"} <= bag.keys()
+    assert {
+        "tf",
+        "diagnostics",
+        "lab/s/robot_description",
+        "lab/m/tip_pose",
+        "lab/log",
+    } <= bag.keys()
 
 
 @pytest.mark.parametrize("name", ["six_joints", "wall_in_space", "box", "handover"])
 @pytest.mark.parametrize("naming", ["crisp", "crtk"])
-def test_bags_of_other_scenarios_have_no_topic_of_their_own(tmp_path: Path, name: str, naming: str) -> None:
+def test_bags_of_other_scenarios_have_no_topic_of_their_own(
+    tmp_path: Path, name: str, naming: str
+) -> None:
     log = trilat_net.simulate(name, {"duration_s": 0.02})
     trilat_net.export(log, "ros2", tmp_path / "bag.mcap", names=naming)
     graph, table = Listener(), read_topic_table(naming)
@@ -635,9 +720,21 @@ def test_bags_of_other_scenarios_have_no_topic_of_their_own(tmp_path: Path, name
     for site in log.sites:
         SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
     planned = list_topics(log.scenario, name, table)
-    assert {topic: offer for topic, offer in graph.offered.items() if topic in planned} == graph.offered
+    assert {
+        topic: offer for topic, offer in graph.offered.items() if topic in planned
+    } == graph.offered
     bag = list_bag(tmp_path / "bag.mcap")
     assert bag == {topic: (planned[topic].kind, planned[topic].latched) for topic in bag}
-    assert graph.offered.items() >= {topic: bag[topic] for topic in bag if topic in graph.offered}.items()
+    assert (
+        graph.offered.items()
+        >= {topic: bag[topic] for topic in bag if topic in graph.offered}.items()
+    )
     missing = {topic.rpartition("/")[2] for topic in planned.keys() - bag.keys()}
-    assert missing <= {"link_delay", "link_offset", "timing", "events", "log"}  # of live sessions alone
+    # of live sessions alone
+    assert missing <= {
+        "link_delay",
+        "link_offset",
+        "timing",
+        "events",
+        "log",
+    }

@@ -21,7 +21,8 @@ def test_everybody_is_seen_and_nobody_waits_for_the_visitor() -> None:
     assert [facts["member"] for facts in found] == ["m", "recorder"]
     assert all(facts["answers"] >= 10 for facts in found)
     assert all(
-        (facts["same_clock"], facts["offset_ns"], facts["bound_us"]) == (True, 0, 0.0) for facts in found
+        (facts["same_clock"], facts["offset_ns"], facts["bound_us"]) == (True, 0, 0.0)
+        for facts in found
     )
     assert party.members["m"].joining.membership.missing() == ["s"]
     party.start("s")

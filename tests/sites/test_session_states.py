@@ -17,7 +17,9 @@ from .sessions import SESSION, Session
 MS_NS = 1_000_000
 
 
-def watch(session: Session, what: Any, first_ms: int = 2_200, every_ms: int = 33, times: int = 20) -> None:
+def watch(
+    session: Session, what: Any, first_ms: int = 2_200, every_ms: int = 33, times: int = 20
+) -> None:
     def run(clock: RelayClock) -> None:
         clock.sleep_until(first_ms * MS_NS)
         bus = session.network.join()
@@ -50,7 +52,8 @@ def test_states_as_one_site_knows_them(tmp_path: Path) -> None:
     watch(session, Both)
     session.play()
     log = open_log(session.path)
-    for one, true in list(zip(seen, newest, strict=True))[5:]:  # it listens for longer than the delay
+    # it listens for longer than the delay
+    for one, true in list(zip(seen, newest, strict=True))[5:]:
         own = one["m1"]
         for peer in ("m2", "s"):
             assert one[peer].tick == own.used[peer] == log["m1"].states[own.tick].used[peer]

@@ -26,7 +26,9 @@ LIVE = {"sites.m1.hands": [{"kind": "live"}]}
 
 
 def test_stop_ends_all_sites_at_one_time(tmp_path: Path) -> None:
-    session = Session.whole(load_scenario("paper", {"duration_s": 30.0, **LIVE}), tmp_path, ends={})
+    session = Session.whole(
+        load_scenario("paper", {"duration_s": 30.0, **LIVE}), tmp_path, ends={}
+    )
     said: list[str] = []
     shown: list[list[SiteRow]] = []
     titles: list[str] = []
@@ -65,13 +67,17 @@ GLIDES = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "link.del
 
 
 def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> None:
-    session = Session.whole(load_scenario("two_sites", {"duration_s": 4.0, **GLIDES}), tmp_path, ends={})
+    session = Session.whole(
+        load_scenario("two_sites", {"duration_s": 4.0, **GLIDES}), tmp_path, ends={}
+    )
     said: list[tuple[bool, str]] = []
 
     def order(bus: Bus, clock: RelayClock) -> None:
         for name, sites in (("stop", ["s"]), ("reset", ["s"]), ("enable", [])):
             clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
-            said.extend((one.accepted, one.text) for one in reached(bus, clock).order(sites, name))
+            said.extend(
+                (one.accepted, one.text) for one in reached(bus, clock).order(sites, name)
+            )
 
     raised: list[tuple[str, LifeAlarm]] = []
     frames: list[dict[str, Any]] = []
@@ -88,16 +94,30 @@ def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> Non
                 console.print(*frame_alarms(watch.alarms))
             clock.sleep_until(clock.monotonic_ns() + 50_000_000)
         shown = [show_event(event) for event in watch.view.events.since(0, 400)]
-        told = [re.sub(r"[\d.]+ s$", "", event["text"]) for event in shown if event["kind"] == "change"]
-        assert told == ["s was stopped by the operator at ", "s was enabled by the operator at "]
+        told = [
+            re.sub(r"[\d.]+ s$", "", event["text"])
+            for event in shown
+            if event["kind"] == "change"
+        ]
+        assert told == [
+            "s was stopped by the operator at ",
+            "s was enabled by the operator at ",
+        ]
 
     session.stranger(order)
     session.stranger(look)
     log = session.run()
     assert session.ends == {"m": 0, "s": 0}
-    stop = LifeAlarm("STOPPED", "ordered by the operator", f"trilat enable --session {SESSION} s", "enable")
+    stop = LifeAlarm(
+        "STOPPED", "ordered by the operator", f"trilat enable --session {SESSION} s", "enable"
+    )
     assert ("s", stop) in raised
-    on_page = {"word": "STOPPED", "reason": "ordered by the operator", "advice": "", "order": "enable"}
+    on_page = {
+        "word": "STOPPED",
+        "reason": "ordered by the operator",
+        "advice": "",
+        "order": "enable",
+    }
     assert on_page in [frame["sites"]["s"]["alarm"] for frame in frames]
     assert frames[-1]["sites"]["s"]["alarm"] is None
     assert "s STOPPED" in screen.getvalue()
@@ -133,7 +153,9 @@ def test_an_arm_without_glide_is_told_how_it_ends(tmp_path: Path) -> None:
 
     def order(bus: Bus, clock: RelayClock) -> None:
         clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
-        said.extend(one.text for one in reached(bus, clock).order(["s"], "stop") if not one.accepted)
+        said.extend(
+            one.text for one in reached(bus, clock).order(["s"], "stop") if not one.accepted
+        )
 
     session.stranger(order)
     session.run()
@@ -148,7 +170,9 @@ def test_a_session_that_is_not_there_is_not_stopped() -> None:
 @pytest.mark.long
 def test_watching_sees_a_site_return_and_stop_reaches_all(tmp_path: Path) -> None:
     glide = {"on_stale.action": "glide", "on_stale.align_limit_rad": 3.0, "rate_hz": 200}
-    session = Session.whole(load_scenario("paper", {"duration_s": 60.0, **glide}), tmp_path, ends={})
+    session = Session.whole(
+        load_scenario("paper", {"duration_s": 60.0, **glide}), tmp_path, ends={}
+    )
     session.clocks["m1"].dies_ns = 4_000_000_000
     session.site("m1", at_ns=5_000_000_000)
     session.clocks["s"].dies_ns = 9_000_000_000
@@ -163,7 +187,9 @@ def test_watching_sees_a_site_return_and_stop_reaches_all(tmp_path: Path) -> Non
         while clock.monotonic_ns() < 9_000_000_000:
             watch.update()
             clock.sleep_until(clock.monotonic_ns() + 20_000_000)
-        seen.update({name: site.record.tick for name, site in watch.view.sites.items() if site.record})
+        seen.update(
+            {name: site.record.tick for name, site in watch.view.sites.items() if site.record}
+        )
 
     session.stranger(look)
     session.stranger(stop, at_ns=10_000_000_000)

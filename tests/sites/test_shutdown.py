@@ -26,13 +26,24 @@ def ending(folder: Path, stay_s: float) -> Session:
 @pytest.mark.parametrize(
     ("stay_s", "after", "least_s", "most_s"),
     [
-        (120.0, "recorder", 1, 3),  # a process needs a moment to end: the recorder's shall be the first
+        (
+            120.0,
+            "recorder",
+            1,
+            3,
+        ),  # a process needs a moment to end: the recorder's shall be the first
         (0.0, "log", -1, 1),
         (4.0, "log", 3, 5),
     ],
-    ids=["it stays until the recorder has left", "until its records are stored", "no longer than it shall"],
+    ids=[
+        "it stays until the recorder has left",
+        "until its records are stored",
+        "no longer than it shall",
+    ],
 )
-def test_how_long_a_site_stays(stay_s: float, after: str, least_s: int, most_s: int, tmp_path: Path) -> None:
+def test_how_long_a_site_stays(
+    stay_s: float, after: str, least_s: int, most_s: int, tmp_path: Path
+) -> None:
     session = ending(tmp_path, stay_s)
     session.run()
     assert session.ends == {"m": 0, "s": 0}
@@ -69,7 +80,14 @@ def test_a_site_that_is_interrupted_waits_for_every_recorder(tmp_path: Path) -> 
         say = bus.publisher(topics.key(SESSION, topics.RECORDER, topics.EVENT))
         for n, name in enumerate(("m", "s")):
             event = Event(
-                member=topics.RECORDER, boot=78, t_ns=0, n=n, kind="stored", text="", about=name, ticks=9000
+                member=topics.RECORDER,
+                boot=78,
+                t_ns=0,
+                n=n,
+                kind="stored",
+                text="",
+                about=name,
+                ticks=9000,
             )
             say(encode(event))
 

@@ -26,7 +26,9 @@ def taken(inbox: Inbox) -> list[bytes]:
     return [message[1] for message in iter(inbox.poll, None)]
 
 
-def heard(session: Session, sites: Sequence[str]) -> tuple[dict[str, list[bytes]], dict[str, list[bytes]]]:
+def heard(
+    session: Session, sites: Sequence[str]
+) -> tuple[dict[str, list[bytes]], dict[str, list[bytes]]]:
     """What others hear of every site until the session is over: its samples, its blocks."""
     samples: dict[str, list[bytes]] = {}
     blocks: dict[str, list[bytes]] = {}
@@ -51,19 +53,26 @@ def heard(session: Session, sites: Sequence[str]) -> tuple[dict[str, list[bytes]
     ],
     ids=["two joints", "four ticks a millisecond", "six joints"],
 )
-def test_samples_are_records_and_blocks_hold_ten_milliseconds(scenario: Scenario, tmp_path: Path) -> None:
+def test_samples_are_records_and_blocks_hold_ten_milliseconds(
+    scenario: Scenario, tmp_path: Path
+) -> None:
     session = Session.whole(scenario, tmp_path)
     samples, blocks = heard(session, scenario.names)
     log = session.run()
     assert verify(log).passed
     assert in_log(log) == in_virtual_time(scenario)
     for name in scenario.names:
-        small = [decode(payload, PeerSample, layout=scenario.layout(name)) for payload in samples[name]]
+        small = [
+            decode(payload, PeerSample, layout=scenario.layout(name))
+            for payload in samples[name]
+        ]
         split = [[*split_states(block)] for block in blocks[name]]
         assert [payload for block in split for payload in block] == log[name].payloads
         assert [one.tick for one in small] == list(range(scenario.ticks(name)))
         for one, state in zip(small, log[name].states, strict=True):
-            assert all(getattr(one, f) == getattr(state, f) for f in PeerSample.__struct_fields__)
+            assert all(
+                getattr(one, f) == getattr(state, f) for f in PeerSample.__struct_fields__
+            )
         stamps = [[decode(payload, State).t_ns for payload in block] for block in split]
         assert max(last[-1] - last[0] for last in stamps) < 10_000_000
         assert len(blocks[name]) < 0.4 * len(small)
@@ -110,7 +119,9 @@ def ticks_that_hear(log: Log, name: str) -> list[int]:
 
 
 @pytest.mark.parametrize(("delay_ms", "together"), [(99, 1), (100, 5)])
-def test_samples_of_long_delays_come_together(delay_ms: int, together: int, tmp_path: Path) -> None:
+def test_samples_of_long_delays_come_together(
+    delay_ms: int, together: int, tmp_path: Path
+) -> None:
     scenario = load_scenario("two_sites", {"duration_s": 0.5, "link.delay_ms": delay_ms})
     log = Session.whole(scenario, tmp_path).run()
     assert in_log(log) == in_virtual_time(scenario)
@@ -124,7 +135,9 @@ def test_samples_of_another_clock_are_not_held(tmp_path: Path) -> None:
     scenario = load_scenario("two_sites", {"duration_s": 0.3})
     session = Session.whole(scenario, tmp_path, skews={"s": (1_000_000, 0)})
     log = session.run()
-    assert all(len(ticks_that_hear(log, name)) > 0.9 * scenario.ticks(name) for name in scenario.names)
+    assert all(
+        len(ticks_that_hear(log, name)) > 0.9 * scenario.ticks(name) for name in scenario.names
+    )
 
 
 @pytest.mark.parametrize("at_ns", [3_000_000, 41_000_000, 99_000_000])
@@ -147,5 +160,7 @@ def test_a_delay_made_short_finds_no_sample_held(at_ns: int, tmp_path: Path) -> 
     (taken,) = (state for state in log["s"].states if state.cmd)
     assert log.link_stats("s")[-1].late == {"m": 0}
     assert log["s"].states[-1].used["m"] == scenario.ticks("m") - 2
-    assert ticks_that_hear(log, "s")[-50:] == list(range(scenario.ticks("s") - 50, scenario.ticks("s")))
+    assert ticks_that_hear(log, "s")[-50:] == list(
+        range(scenario.ticks("s") - 50, scenario.ticks("s"))
+    )
     assert taken.tick < 320 + at_ns // 1_000_000

@@ -25,7 +25,9 @@ SITES = ("m", "s")
 
 
 def session_of(folder: Path, duration_s: float, storage: LogStorage | None = None) -> Session:
-    return Session.whole(load_scenario("two_sites", {"duration_s": duration_s}), folder, storage=storage)
+    return Session.whole(
+        load_scenario("two_sites", {"duration_s": duration_s}), folder, storage=storage
+    )
 
 
 def records(path: Path) -> dict[str, int]:
@@ -64,7 +66,9 @@ def test_on_a_full_disk_accounts_match_the_file(
     path = tmp_path / "run.mcap"
     monkeypatch.setattr(log_writer, "LogFile", lambda path, **_: file_on(SmallDisk(room), path))
     session = session_of(tmp_path, 2.0)
-    with pytest.raises(LogRefused, match="the disk is full; the log ends there, finished") as refusal:
+    with pytest.raises(
+        LogRefused, match="the disk is full; the log ends there, finished"
+    ) as refusal:
         session.run()
     assert refusal.value.exit_code == 5
     log = open_log(path)

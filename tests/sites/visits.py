@@ -34,7 +34,9 @@ class Visit:
 
 
 def link_stats() -> LinkStats:
-    counts = {name: {} for name in ("age_us", "accepted", "late", "duplicate", "refused", "dropped")}
+    counts = {
+        name: {} for name in ("age_us", "accepted", "late", "duplicate", "refused", "dropped")
+    }
     zeros = dict.fromkeys(("overruns", "late_max_us", "busy_max_us"), 0)
     own = {"v": VERSION, "site": "m", "boot": 1, "tick": 5, "t_ns": 5, "mode": "run"}
     return LinkStats(**own, **counts, **zeros, delay_us={"s": 120})

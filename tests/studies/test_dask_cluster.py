@@ -39,14 +39,28 @@ class Cluster:
         file = folder / "scheduler.json"
         self._start("scheduler", "--port", "0", "--no-show", "--scheduler-file", str(file))
         self.address: str = (
-            until(lambda: file.exists() and file.read_text(), 60) and json.loads(file.read_text())["address"]
+            until(lambda: file.exists() and file.read_text(), 60)
+            and json.loads(file.read_text())["address"]
         )
 
     def _start(self, *words: str, path: Path = ROOT) -> "subprocess.Popen[bytes]":
         log = (self.folder / f"{len(self.processes)}.log").open("wb")
-        command = [sys.executable, "-P", "-m", "dask", *words, "--host", "127.0.0.1", "--no-dashboard"]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "dask",
+            *words,
+            "--host",
+            "127.0.0.1",
+            "--no-dashboard",
+        ]
         process = subprocess.Popen(
-            command, cwd=self.folder, stdout=log, stderr=log, env={**os.environ, "PYTHONPATH": str(path)}
+            command,
+            cwd=self.folder,
+            stdout=log,
+            stderr=log,
+            env={**os.environ, "PYTHONPATH": str(path)},
         )
         log.close()
         self.processes.append(process)
@@ -85,12 +99,16 @@ def run_on_cluster(cluster: Cluster, folder: Path, count: int) -> None:
 
     until(lambda: workers_of(cluster) == 2, 60)
     shared = run_sweep(
-        prepare_sweep_folder(sweep, folder / "shared"), progress=kill_half_way, on=cluster.address
+        prepare_sweep_folder(sweep, folder / "shared"),
+        progress=kill_half_way,
+        on=cluster.address,
     )
     assert killed.wait(10) == -signal.SIGKILL
     assert alive_at[0] < count
     assert (shared.runs, shared.jobs) == (count, 2)
-    assert (shared.folder.path / RESULTS_FILE).read_bytes() == (alone.folder.path / RESULTS_FILE).read_bytes()
+    assert (shared.folder.path / RESULTS_FILE).read_bytes() == (
+        alone.folder.path / RESULTS_FILE
+    ).read_bytes()
 
 
 def workers_of(cluster: Cluster) -> int:
@@ -100,7 +118,9 @@ def workers_of(cluster: Cluster) -> int:
 
 @pytest.mark.long
 @pytest.mark.timeout(120)
-def test_a_sweep_with_a_killed_worker_gives_the_same_bytes(cluster: Cluster, tmp_path: Path) -> None:
+def test_a_sweep_with_a_killed_worker_gives_the_same_bytes(
+    cluster: Cluster, tmp_path: Path
+) -> None:
     run_on_cluster(cluster, tmp_path, 300)
 
 
@@ -117,24 +137,42 @@ def test_trials_margins_and_tuning_run_there_too(cluster: Cluster, tmp_path: Pat
     on = ("--on", cluster.address)
     for n, words in enumerate(
         [
-            ("sweep", "trio.toml", "--margin", "control.d=0.2:3", "--set", "control.law=p_d", "-o"),
+            (
+                "sweep",
+                "trio.toml",
+                "--margin",
+                "control.d=0.2:3",
+                "--set",
+                "control.law=p_d",
+                "-o",
+            ),
             ("compare", "--tune", "trio.toml", "--law", "p_d", "--budget", "4", "--out"),
         ]
     ):
         for name, more in (("here", ("--jobs", "1")), ("there", on)):
             trilat(*words, f"{name}{n}", *more, cwd=tmp_path).succeeds()
     for file in ("0/margin.json", "1/front.json"):
-        assert (tmp_path / f"here{file}").read_bytes() == (tmp_path / f"there{file}").read_bytes()
+        assert (tmp_path / f"here{file}").read_bytes() == (
+            tmp_path / f"there{file}"
+        ).read_bytes()
     batch = trilat_net.trials(quick(), [5, 2, 9])
-    here, there = (trilat_net.check(quick(), [5, 2, 9], **how) for how in ({"jobs": 1}, {"on": on[1]}))
-    assert [result.outcomes for result in here.results] == [result.outcomes for result in there.results]
+    here, there = (
+        trilat_net.check(quick(), [5, 2, 9], **how) for how in ({"jobs": 1}, {"on": on[1]})
+    )
+    assert [result.outcomes for result in here.results] == [
+        result.outcomes for result in there.results
+    ]
     assert len(batch) == len(there.results)
 
 
 @pytest.mark.long
-def test_a_worker_with_another_program_is_refused_even_later(cluster: Cluster, tmp_path: Path) -> None:
+def test_a_worker_with_another_program_is_refused_even_later(
+    cluster: Cluster, tmp_path: Path
+) -> None:
     shutil.copytree(
-        ROOT / "trilat_net", tmp_path / "trilat_net", ignore=shutil.ignore_patterns("__pycache__")
+        ROOT / "trilat_net",
+        tmp_path / "trilat_net",
+        ignore=shutil.ignore_patterns("__pycache__"),
     )
     with (tmp_path / "trilat_net" / "errors.py").open("a") as file:
         file.write("# another one\n")
@@ -149,7 +187,10 @@ def test_a_worker_with_another_program_is_refused_even_later(cluster: Cluster, t
             UsageError, match=rf"the worker tcp://\S+ has source files \w+, .*here is.* {here}"
         ):
             pool.map(abs, range(-99, 0))
-    with pytest.raises(UsageError, match=f"source files .* {here}"), open_worker_pool(None, cluster.address):
+    with (
+        pytest.raises(UsageError, match=f"source files .* {here}"),
+        open_worker_pool(None, cluster.address),
+    ):
         pass
 
 
@@ -161,7 +202,9 @@ def test_a_worker_without_the_file_of_a_law_is_refused(
     monkeypatch.chdir(tmp_path)
     cluster.add_worker()
     scenario = quick(**{"control.law": "lonely_law:Spring"})
-    with pytest.raises(UsageError, match=r"the worker tcp://\S+ lacks the control law lonely_law:Spring"):
+    with pytest.raises(
+        UsageError, match=r"the worker tcp://\S+ lacks the control law lonely_law:Spring"
+    ):
         trilat_net.check(scenario, on=cluster.address)
 
 
@@ -176,12 +219,18 @@ def test_what_differs_is_named_on_both_sides() -> None:
 
 
 @pytest.mark.long
-def test_a_scheduler_that_does_not_answer_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_that_does_not_answer_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(dask_cluster, "CONNECT_S", 0.3)
     sweep = ("sweep", "free", "--over", "control.Kd=1,2", "--on")
-    trilat(*sweep, "tcp://127.0.0.1:1", cwd=tmp_path).refuses("tcp://127.0.0.1:1", "no Dask scheduler")
+    trilat(*sweep, "tcp://127.0.0.1:1", cwd=tmp_path).refuses(
+        "tcp://127.0.0.1:1", "no Dask scheduler"
+    )
     trilat(*sweep, "nowhere", cwd=tmp_path).refuses("nowhere")
-    trilat("test", "free", "--on", "tcp://127.0.0.1:1", cwd=tmp_path).refuses("tcp://127.0.0.1:1")
+    trilat("test", "free", "--on", "tcp://127.0.0.1:1", cwd=tmp_path).refuses(
+        "tcp://127.0.0.1:1"
+    )
     assert list(tmp_path.iterdir()) == []
 
 

@@ -11,13 +11,21 @@ from typing import Any
 import pytest
 
 from trilat_net.errors import RunFailed, UsageError
-from trilat_net.studies.executor import MAX_LOSSES, WorkerPool, _Feed, count_workers, open_worker_pool
+from trilat_net.studies.executor import (
+    MAX_LOSSES,
+    WorkerPool,
+    _Feed,
+    count_workers,
+    open_worker_pool,
+)
 
 
 def test_any_executor_gives_the_results_of_this_process() -> None:
     shown: list[tuple[int, int]] = []
     with ThreadPoolExecutor(3) as threads, open_worker_pool(None, threads) as pool:
-        assert pool.map(abs, range(-50, 0), lambda *one: shown.append(one)) == list(range(50, 0, -1))
+        assert pool.map(abs, range(-50, 0), lambda *one: shown.append(one)) == list(
+            range(50, 0, -1)
+        )
     assert shown == [(n, 50) for n in range(1, 51)]
     with open_worker_pool(1) as pool:
         assert list(pool.each(abs, [-3, 2])) == [(0, 3), (1, 2)]
@@ -96,7 +104,9 @@ class FragileExecutor(Executor):
 
 def test_items_of_a_lost_worker_run_again(tmp_path: Path) -> None:
     with open_worker_pool(2) as pool:
-        assert pool.map(partial(killed_once, tmp_path / "flag"), range(30)) == [n * n for n in range(30)]
+        assert pool.map(partial(killed_once, tmp_path / "flag"), range(30)) == [
+            n * n for n in range(30)
+        ]
         assert pool.map(abs, [-1, -2]) == [1, 2]
 
 

@@ -10,7 +10,13 @@ from gymnasium.utils.env_checker import check_env
 
 import trilat_net as tn
 from trilat_net.errors import ScenarioError, UsageError
-from trilat_net.studies.gym_environment import ENV_ID, Judgement, ReachTask, Scene, TeleoperationEnv
+from trilat_net.studies.gym_environment import (
+    ENV_ID,
+    Judgement,
+    ReachTask,
+    Scene,
+    TeleoperationEnv,
+)
 
 VARY = {"link.delay_ms": (0.0, 300.0)}
 BENT = {f"sites.{name}.q0_rad": [0.4, 1.2] for name in ("m1", "m2", "s")}
@@ -140,7 +146,9 @@ def test_reach_draws_places_evenly_and_sees_who_stays() -> None:
     apart = np.linalg.norm(goals, axis=1)
     assert apart.max() <= 0.3
     assert np.mean(apart < 0.15) == pytest.approx(0.25, abs=0.03)
-    there = [scene._replace(t_s=t_s, end_effector_m={"s": task.goal}) for t_s in (0.1, 0.2, 0.3)]
+    there = [
+        scene._replace(t_s=t_s, end_effector_m={"s": task.goal}) for t_s in (0.1, 0.2, 0.3)
+    ]
     assert [task.judge(one).succeeded for one in there] == [False, False, True]
 
 
@@ -171,7 +179,16 @@ def test_a_valid_action_works_after_refused_ones() -> None:
     env, other = (tn.make_env("paper", BENT, user="m2", duration_s=1) for _ in range(2))
     env.reset(seed=1)
     other.reset(seed=1)
-    refused = ([np.nan, 0.0], [np.inf, 0.0], [1.0], [[1.0, 2.0]], "left", None, [0.1, 0.2, 0.3], 5.0)
+    refused = (
+        [np.nan, 0.0],
+        [np.inf, 0.0],
+        [1.0],
+        [[1.0, 2.0]],
+        "left",
+        None,
+        [0.1, 0.2, 0.3],
+        5.0,
+    )
     for n in range(6):
         for action in refused:
             with pytest.raises(UsageError, match="an action"):
@@ -263,7 +280,9 @@ def test_pictures_show_the_motion() -> None:
 
 
 def test_flat_observations_are_the_same_numbers() -> None:
-    env, parts = (tn.make_env("paper", BENT, duration_s=1, vary=VARY, flat=flat) for flat in (True, False))
+    env, parts = (
+        tn.make_env("paper", BENT, duration_s=1, vary=VARY, flat=flat) for flat in (True, False)
+    )
     flat, seen = env.reset(seed=3)[0], parts.reset(seed=3)[0]
     for _ in range(5):
         assert flat.dtype == np.float32
@@ -292,7 +311,10 @@ class BufferedEnvs:
         return self.seen.copy()
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        rewards, done = np.zeros(len(self.envs), dtype=np.float32), np.zeros(len(self.envs), dtype=bool)
+        rewards, done = (
+            np.zeros(len(self.envs), dtype=np.float32),
+            np.zeros(len(self.envs), dtype=bool),
+        )
         for n, env in enumerate(self.envs):
             self.seen[n], rewards[n], ended, truncated, _ = env.step(actions[n])
             done[n] = ended or truncated

@@ -14,7 +14,10 @@ from trilat_net.errors import UsageError
 from trilat_net.studies.hand_impedance import HandImpedance, identify_hand, read_hands
 from trilat_net.theory.port_passivity import HandMatrices
 
-ALONG_X, ALONG_Y = ((0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 6.5), (0.75, 1.25, 1.75, 2.25, 3.25, 4.75, 6.75))
+ALONG_X, ALONG_Y = (
+    (0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 6.5),
+    (0.75, 1.25, 1.75, 2.25, 3.25, 4.75, 6.75),
+)
 """Frequencies of the sines on the first and on the second joint, Hz: 8 s tell them apart."""
 ARMS = {f"sites.{site}.q0_rad": [0.6, 1.2] for site in ("m1", "m2", "s")}
 
@@ -41,15 +44,27 @@ def drawn(random: np.random.Generator, low: float, high: float) -> Array:
 def held(seed: int, duration_s: float) -> tuple[HandMatrices, HandImpedance]:
     """A hand that is drawn at m1, moved from the slave over a link that delays, jitters and loses."""
     random = np.random.default_rng(seed)
-    true = HandMatrices(drawn(random, 0.5, 2.0), drawn(random, 5.0, 25.0), drawn(random, 80.0, 400.0))
-    plant = {"class": "tests.own_code:HeldArm", **{k: v.ravel().tolist() for k, v in true._asdict().items()}}
+    true = HandMatrices(
+        drawn(random, 0.5, 2.0), drawn(random, 5.0, 25.0), drawn(random, 80.0, 400.0)
+    )
+    plant = {
+        "class": "tests.own_code:HeldArm",
+        **{k: v.ravel().tolist() for k, v in true._asdict().items()},
+    }
     link = {"model": "gamma", "delay_ms": 60.0, "deviation_ms": 10.0, "loss": 0.1}
-    changes = {**moved_from("s", 15.0, duration_s), "sites.m1.plant": plant, "link": link, "seed": seed}
+    changes = {
+        **moved_from("s", 15.0, duration_s),
+        "sites.m1.plant": plant,
+        "link": link,
+        "seed": seed,
+    }
     return true, identify_hand(tn.simulate("free", changes), "m1")
 
 
 def covered(true: HandMatrices, found: HandImpedance) -> Array:
-    rows = [np.abs(getattr(found, k) - one) <= found.halves[k] for k, one in true._asdict().items()]
+    rows = [
+        np.abs(getattr(found, k) - one) <= found.halves[k] for k, one in true._asdict().items()
+    ]
     return np.array(rows)
 
 
@@ -71,7 +86,10 @@ def test_spring_and_damper_of_the_kernel_are_found(spring: HandImpedance) -> Non
 def test_only_segments_count_in_which_sines_act(spring: HandImpedance) -> None:
     """A run that goes on for 12 s after its sines, with the same spring at the same arm."""
     changes = moved_from("m1", 2.0, 40.0)
-    changes["sites.m1.hands"] = [SPRING, *({**one, "end_s": 28.0} for one in changes["sites.m1.hands"])]
+    changes["sites.m1.hands"] = [
+        SPRING,
+        *({**one, "end_s": 28.0} for one in changes["sites.m1.hands"]),
+    ]
     found = identify_hand(tn.simulate("free", changes))
     assert found.segments == spring.segments
     assert np.allclose(found.K, spring.K, atol=1e-6)

@@ -80,7 +80,10 @@ def test_trial_of_distribution_names_command_that_repeats_it(file: Path) -> None
     trial = trials(file, [3], {"control.d": {"normal": [15.0, 1.0]}})[0]
     words = shlex.split(trial.look)
     settings = [words[n + 1] for n, word in enumerate(words) if word == "--set"]
-    assert load_scenario(words[2], [*settings, f"seed={words[words.index('--seed') + 1]}"]) == trial.scenario
+    assert (
+        load_scenario(words[2], [*settings, f"seed={words[words.index('--seed') + 1]}"])
+        == trial.scenario
+    )
     assert len(set(trial.scenario.sites["m"].control.d)) == 2
 
 
@@ -105,7 +108,9 @@ def test_a_candidate_is_the_mean_of_its_seeds(file: Path) -> None:
     assert plan.runs == (4 + 2) * 3
     for gains, score in zip(law.tried, law.scores, strict=True):
         bases = (plan.base, *plan.others)
-        texts = [base.with_gains(law.space, plan.knowledge, gains).scenario.text for base in bases]
+        texts = [
+            base.with_gains(law.space, plan.knowledge, gains).scenario.text for base in bases
+        ]
         alone = [measure_candidate(text, None) for text in texts]
         assert score == average_scores(alone)
         assert score.error_rad == pytest.approx(np.mean([one.error_rad for one in alone]))
@@ -118,14 +123,22 @@ def test_the_outcome_of_a_candidate_is_its_worst() -> None:
         settled, outcome=CandidateClass.DIVERGED, error_rad=None, diverged_s=1.0
     )
     found = average_scores([settled, diverged])
-    assert (found.outcome, found.error_rad, found.diverged_s) == (CandidateClass.DIVERGED, None, 1.0)
+    assert (found.outcome, found.error_rad, found.diverged_s) == (
+        CandidateClass.DIVERGED,
+        None,
+        1.0,
+    )
     assert found.effort_nm == 2.0
 
 
 def test_logs_that_differ_in_their_seeds_are_averaged(file: Path) -> None:
     for seed in (1, 2, 3):
-        trilat("sim", file.name, "--seed", str(seed), "-o", f"{seed}.mcap", cwd=file.parent).succeeds()
-    trilat("sim", file.name, "--set", "link.delay_ms=60", "-o", "4.mcap", cwd=file.parent).succeeds()
+        trilat(
+            "sim", file.name, "--seed", str(seed), "-o", f"{seed}.mcap", cwd=file.parent
+        ).succeeds()
+    trilat(
+        "sim", file.name, "--set", "link.delay_ms=60", "-o", "4.mcap", cwd=file.parent
+    ).succeeds()
     text = trilat("compare", "1.mcap", "2.mcap", "3.mcap", "--json", cwd=file.parent).succeeds()
     found = json.loads(text)
     row = next(row for row in found["rows"] if row["key"] == "rms_error_rad")

@@ -33,11 +33,20 @@ def test_studies_take_tables_or_a_scenario() -> None:
         swept = plan_sweep(source, ["control.d=4"], over=["control.K=10,30"], laws=[PD, "p_d"])
         cells = [swept.scenario(*swept.cell(n).overrides) for n in range(4)]
         controls = [cell.sites["s"].control for cell in cells]
-        assert [control.settings for control in controls[:2]] == [{"K": K, "d": 4} for K in (10, 30)]
-        assert [(control.K[0], control.d[0]) for control in controls[2:]] == [(10.0, 4.0), (30.0, 4.0)]
+        assert [control.settings for control in controls[:2]] == [
+            {"K": K, "d": 4} for K in (10, 30)
+        ]
+        assert [(control.K[0], control.d[0]) for control in controls[2:]] == [
+            (10.0, 4.0),
+            (30.0, 4.0),
+        ]
         tuned = plan_tuning(source, laws=[PD], budget=2)
-        candidate = tuned.base.with_gains(tuned.spaces[0], tuned.knowledge, {"K": 11.0, "d": 2.0})
-        assert {site.control.settings["K"] for site in candidate.scenario.sites.values()} == {11.0}
+        candidate = tuned.base.with_gains(
+            tuned.spaces[0], tuned.knowledge, {"K": 11.0, "d": 2.0}
+        )
+        assert {site.control.settings["K"] for site in candidate.scenario.sites.values()} == {
+            11.0
+        }
         assert candidate.scenario.duration_s == 1.0
 
 
@@ -53,7 +62,9 @@ def test_ranges_come_from_the_class() -> None:
         ("K", "N m/rad", 5.0, 50.0, ""),
         ("d", "N m s/rad", 1.0, 20.0, ""),
     ]
-    told = space.controls(tn.load_scenario("free"), build_model_information(90.0), {"K": 7.0, "d": 2.0})
+    told = space.controls(
+        tn.load_scenario("free"), build_model_information(90.0), {"K": 7.0, "d": 2.0}
+    )
     assert told["s"] == {"law": "tests.own_laws:PD", "K": 7.0, "d": 2.0, "gravity": 0.9}
 
 

@@ -79,7 +79,9 @@ def assert_page_of_study_is_whole(
             assert image.evaluate(COLOURED) > 100, image.get_attribute("src")
 
 
-def assert_markdown_is_whole(browser: Browser, page: Path, pictures: int, tables: int = 1) -> None:
+def assert_markdown_is_whole(
+    browser: Browser, page: Path, pictures: int, tables: int = 1
+) -> None:
     """The same of a page in Markdown, as viewers of Markdown show it."""
     html = MarkdownIt("commonmark").enable("table").render(page.read_text(encoding="utf-8"))
     assert_page_of_study_is_whole(browser, page.parent, html, pictures, tables)
@@ -97,12 +99,15 @@ PLANES: dict[str, MapPlane] = {
     "all diverged": drawn(lambda *_: CellClass.DIVERGED),
     "uneven axis": UNEVEN._replace(x=UNEVEN.x._replace(values=(8, 68, 136, 272, 1088))),
     "missing cell": build_plane([row for row in rows() if row["cell"] != 12], KEYS, P_D),
-    "exponents": build_plane([row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()], KEYS, P_D),
+    "exponents": build_plane(
+        [row | {"exponent_per_s": row[KEYS[1]] - 1.2} for row in rows()], KEYS, P_D
+    ),
 }
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "panels" else pytest.mark.long) for name in PLANES]
+    "name",
+    [pytest.param(name, marks=() if name == "panels" else pytest.mark.long) for name in PLANES],
 )
 def test_page_of_a_map_is_whole(name: str, browser: Browser, tmp_path: Path) -> None:
     plane = PLANES[name]

@@ -15,9 +15,13 @@ POSE = (-0.6, 1.8)
 
 
 @cache
-def section_of(name: str, overrides: tuple[tuple[str, Any], ...] = (), of: str | None = None) -> PortAnalysis:
+def section_of(
+    name: str, overrides: tuple[tuple[str, Any], ...] = (), of: str | None = None
+) -> PortAnalysis:
     """The analysis of the ports of a shipped scenario about POSE; () is an empty list."""
-    scenario = load_scenario(name, {key: [] if value == () else value for key, value in overrides})
+    scenario = load_scenario(
+        name, {key: [] if value == () else value for key, value in overrides}
+    )
     return analyse_ports(scenario, find_equilibrium(scenario, POSE), of)
 
 

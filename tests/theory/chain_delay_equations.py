@@ -32,7 +32,13 @@ class ChainEquations(DelayEquations):
         v, a = -self.Lambda * e, -self.Lambda * ed
         for i in range(len(q)):
             Y = regressor(self.model, q[i], qd[i], v[i], a[i])
-            tau = Y @ estimate[i] + self.armature * a[i] - self.Kp * r[i] - self.Kd * ed[i] + pushed[i]
+            tau = (
+                Y @ estimate[i]
+                + self.armature * a[i]
+                - self.Kp * r[i]
+                - self.Kd * ed[i]
+                + pushed[i]
+            )
             data = self.model.createData()
             bias = pin.rnea(self.model, data, q[i], qd[i], np.zeros(self.joints))
             M = np.triu(pin.crba(self.model, data, q[i]))
@@ -58,7 +64,9 @@ def main() -> None:
     """Writes the motion that `chain_motion` reads."""
     exact = chain_equations(pushed_chains()).solve(float(TIMES_S[-1]))
     q = exact.at(TIMES_S)[..., : exact.joints]
-    PATH.write_text(json.dumps({"source": f"Pinocchio {pin.__version__}, DOP853", "q": q.tolist()}) + "\n")
+    PATH.write_text(
+        json.dumps({"source": f"Pinocchio {pin.__version__}, DOP853", "q": q.tolist()}) + "\n"
+    )
 
 
 if __name__ == "__main__":

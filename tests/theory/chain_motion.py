@@ -16,7 +16,12 @@ TIMES_S = np.arange(1, 21) / 10.0
 
 def pushed_chains(**changes: Any) -> Scenario:
     """From rest in three poses; the first arm is pushed at every joint."""
-    push = {"kind": "pulse", "start_s": 0.5, "end_s": 1.5, "peak_nm": [10.0, 10.0, 8.0, 2.0, 2.0, 1.0]}
+    push = {
+        "kind": "pulse",
+        "start_s": 0.5,
+        "end_s": 1.5,
+        "peak_nm": [10.0, 10.0, 8.0, 2.0, 2.0, 1.0],
+    }
     return six(**{"sites.m1.hands": [push], **changes})
 
 

@@ -27,7 +27,13 @@ def theta_of(arm) -> Array:
     m1, m2, l1, lc1, lc2 = arm.m1_kg, arm.m2_kg, arm.l1_m, arm.lc1_m, arm.lc2_m
     outer = m2 * lc2**2 + arm.I2_kg_m2
     return np.array(
-        [m1 * lc1**2 + m2 * l1**2 + arm.I1_kg_m2 + outer, m2 * l1 * lc2, outer, m1 * lc1 + m2 * l1, m2 * lc2]
+        [
+            m1 * lc1**2 + m2 * l1**2 + arm.I1_kg_m2 + outer,
+            m2 * l1 * lc2,
+            outer,
+            m1 * lc1 + m2 * l1,
+            m2 * lc2,
+        ]
     )
 
 
@@ -102,7 +108,8 @@ class DelayEquations:
         """The accelerations under the law's torque and the operators', and Y'r: of the planar arm."""
         Y = regressor(self.g, q, qd, -self.Lambda * e, -self.Lambda * ed)
         tau = (Y @ estimate[..., None])[..., 0] - self.Kp * r - self.Kd * ed
-        forces = regressor(self.g, q, qd, qd, np.zeros_like(qd)) @ self.theta  # C qd + G, Eq. (5)
+        # C qd + G, Eq. (5)
+        forces = regressor(self.g, q, qd, qd, np.zeros_like(qd)) @ self.theta
         left = tau + pushed - forces
         qdd = np.linalg.solve(inertia(self.theta, q), left[..., None])[..., 0]
         return qdd, (Y.swapaxes(1, 2) @ r[..., None])[..., 0]
@@ -111,7 +118,9 @@ class DelayEquations:
         """Method of steps: one piece per delay, and no piece across an edge of a pulse."""
         step = self.delay_s or 0.2
         steps = np.arange(1, round(end_s / step) + 1) * step
-        cuts = sorted({round(float(t), 9) for t in [*steps, *self.edges_s, end_s] if 0 < t <= end_s})
+        cuts = sorted(
+            {round(float(t), 9) for t in [*steps, *self.edges_s, end_s] if 0 < t <= end_s}
+        )
         x, t = self.past(-1.0).ravel(), 0.0
         for cut in cuts:
             accuracy = {"rtol": self.tolerance, "atol": 0.1 * self.tolerance}
@@ -154,7 +163,10 @@ def common_terms(scenario) -> dict[str, Any]:
 
     return {
         "alpha": np.array(
-            [[scenario.dominance[i].get(j, 0.0) for j in scenario.sites] for i in scenario.sites]
+            [
+                [scenario.dominance[i].get(j, 0.0) for j in scenario.sites]
+                for i in scenario.sites
+            ]
         ),
         "delay_s": delay_ms * 1e-3,
         "Lambda": np.array(control.Lambda),

@@ -92,5 +92,7 @@ def booked(name: str, scheme: str = "second_order", rate_hz: int = 1000) -> Bala
 def order(name: str, scheme: str, rate_hz: int) -> float:
     """Of the balance's error from half of a rate to that rate."""
     return float(
-        np.log2(booked(name, scheme, rate_hz // 2).residual / booked(name, scheme, rate_hz).residual)
+        np.log2(
+            booked(name, scheme, rate_hz // 2).residual / booked(name, scheme, rate_hz).residual
+        )
     )

@@ -14,7 +14,9 @@ from trilat_net.studies.measure_run import RunMetrics, measure_virtual_run
 Overrides = dict[str, Any]
 
 
-def measured(name: str, overrides: Overrides | None = None, *windows: tuple[float, float, str]) -> RunMetrics:
+def measured(
+    name: str, overrides: Overrides | None = None, *windows: tuple[float, float, str]
+) -> RunMetrics:
     """A shipped scenario, changed, in virtual time; its windows are (from, to, site), "" for all sites."""
     asked = [
         {
@@ -25,7 +27,9 @@ def measured(name: str, overrides: Overrides | None = None, *windows: tuple[floa
         }
         for from_s, to_s, site in windows
     ]
-    return measure_virtual_run(load_scenario(name, {**(overrides or {}), "expect": {"windows": asked}}))
+    return measure_virtual_run(
+        load_scenario(name, {**(overrides or {}), "expect": {"windows": asked}})
+    )
 
 
 def peak(figures: RunMetrics, n: int = 0) -> float:

@@ -22,7 +22,8 @@ def loop(A: Any, *delayed: tuple[float, Any]) -> LinearLoop:
     own = np.atleast_2d(np.asarray(A, dtype=float))
     n = len(own)
     entries = [
-        DelayedTerm(T, np.atleast_2d(np.asarray(Ad, dtype=float)), np.zeros((n, 0))) for T, Ad in delayed
+        DelayedTerm(T, np.atleast_2d(np.asarray(Ad, dtype=float)), np.zeros((n, 0)))
+        for T, Ad in delayed
     ]
     names = tuple(f"x.q{i}" for i in range(n))
     return LinearLoop(names, (), (), own, np.zeros((n, 0)), np.zeros((0, n)), tuple(entries))
@@ -42,7 +43,10 @@ def roots_within(system: LinearLoop, low: complex, high: complex, points: int = 
     """How many roots a rectangle has: by how often det Delta turns about 0 along its sides."""
     corners = [low, complex(high.real, low.imag), high, complex(low.real, high.imag), low]
     path = np.concatenate(
-        [a + (b - a) * np.linspace(0, 1, points, endpoint=False) for a, b in itertools.pairwise(corners)]
+        [
+            a + (b - a) * np.linspace(0, 1, points, endpoint=False)
+            for a, b in itertools.pairwise(corners)
+        ]
     )
     delta = path[:, None, None] * np.eye(len(system.A)) - system.A
     for delayed in system.delayed:
@@ -53,7 +57,10 @@ def roots_within(system: LinearLoop, low: complex, high: complex, points: int = 
 
 GAINS = {
     "adaptive": lambda rng: Gains(
-        Law.ADAPTIVE, *rng.uniform(0.5, 5, (3, 2)), Gamma=rng.uniform(0.1, 2, 5), theta_hat0=np.zeros(5)
+        Law.ADAPTIVE,
+        *rng.uniform(0.5, 5, (3, 2)),
+        Gamma=rng.uniform(0.1, 2, 5),
+        theta_hat0=np.zeros(5),
     ),
     "known": lambda rng: Gains(
         Law.KNOWN,
@@ -99,8 +106,12 @@ def actors(rng: np.random.Generator) -> list[TorqueSource]:
     }
     return [
         TorqueSource(TorqueKind.HAND, b=tuple(rng.uniform(-1, 1, 2)), K=pairs[0], B=pairs[1]),
-        TorqueSource(TorqueKind.TASK_HAND, b=tuple(rng.uniform(-1, 1, 2)), K=pairs[2], B=pairs[3]),
+        TorqueSource(
+            TorqueKind.TASK_HAND, b=tuple(rng.uniform(-1, 1, 2)), K=pairs[2], B=pairs[3]
+        ),
         TorqueSource(TorqueKind.VISCOUS, B=pairs[4], sampled=True),
         TorqueSource(TorqueKind.WALL, **wall),
-        TorqueSource(TorqueKind.WALL, **{**wall, "b": (-wall["b"][0], -wall["b"][1])}, sampled=True),
+        TorqueSource(
+            TorqueKind.WALL, **{**wall, "b": (-wall["b"][0], -wall["b"][1])}, sampled=True
+        ),
     ]

@@ -34,12 +34,20 @@ class Network(NamedTuple):
     def loop(self) -> LinearLoop:
         count = len(self.m)
         names = tuple(f"{site}.{x}1" for site in "abcd"[:count] for x in ("q", "qd"))
-        A, B, C = np.zeros((2 * count, 2 * count)), np.zeros((2 * count, count)), np.zeros((count, 2 * count))
+        A, B, C = (
+            np.zeros((2 * count, 2 * count)),
+            np.zeros((2 * count, count)),
+            np.zeros((count, 2 * count)),
+        )
         late: dict[float, DelayedTerm] = {}
         for i in range(count):
             q, qd = 2 * i, 2 * i + 1
             A[q, qd] = C[i, qd] = 1.0
-            A[qd, q], A[qd, qd], B[qd, i] = -self.k[i] / self.m[i], -self.d[i] / self.m[i], 1.0 / self.m[i]
+            A[qd, q], A[qd, qd], B[qd, i] = (
+                -self.k[i] / self.m[i],
+                -self.d[i] / self.m[i],
+                1.0 / self.m[i],
+            )
         for wire in self.wires:
             at, of, m = 2 * wire.at + 1, 2 * wire.of, self.m[wire.at]
             A[at, at - 1 : at + 1] -= np.array([wire.K, wire.B]) / m
@@ -52,7 +60,9 @@ class Network(NamedTuple):
             now = late.pop(0.0)
             A, B = A + now.A, B + now.B
         ports = [tuple(f"{site}.{x}1" for site in "abcd"[:count]) for x in ("tau", "qd")]
-        return LinearLoop(names, ports[0], ports[1], A, B, C, tuple(late[T] for T in sorted(late)))
+        return LinearLoop(
+            names, ports[0], ports[1], A, B, C, tuple(late[T] for T in sorted(late))
+        )
 
     def impedance(self, w_rad_s: Sequence[float] | Array) -> Complex:
         """Z with Z qd = (1 + reflection) u, from the equations of motion as they stand on paper."""
@@ -74,7 +84,9 @@ def hold_by_spring(loop: LinearLoop, site: str, K: float, B: float = 0.0) -> Lin
     ports = find_site_ports(loop, site)
     back = np.zeros((len(loop.inputs), len(loop.names)))
     back[ports] = B * loop.C[ports]
-    back[ports, [loop.names.index(loop.inputs[port].replace(".tau", ".q")) for port in ports]] += K
+    back[
+        ports, [loop.names.index(loop.inputs[port].replace(".tau", ".q")) for port in ports]
+    ] += K
     delayed = tuple(term._replace(A=term.A - term.B @ back) for term in loop.delayed)
     return loop._replace(A=loop.A - loop.B @ back, delayed=delayed)
 

@@ -25,19 +25,30 @@ def position_network(
     """Uniform rods of such masses, kg (1 m long, two to an arm), all from one pose, under P+d."""
     count = len(alpha)
     names = [f"s{n}" for n in range(count)]
-    lines = ['name = "network"', "rate_hz = 1000", "duration_s = 1.0", 'scheme = "second_order"']
+    lines = [
+        'name = "network"',
+        "rate_hz = 1000",
+        "duration_s = 1.0",
+        'scheme = "second_order"',
+    ]
     lines += ["[link]", f"delay_ms = {float(delay_ms)!r}", "[control]", 'law = "p_d"']
     for n, name in enumerate(names):
         mass = 1.0 if masses is None else float(masses[n])
         gains = [float(np.broadcast_to(gain, count)[n]) for gain in (K, d)]
-        lines += [f"[sites.{name}]", f'role = "{"master" if n else "slave"}"', "q0_rad = [-0.1, 0.4]"]
+        lines += [
+            f"[sites.{name}]",
+            f'role = "{"master" if n else "slave"}"',
+            "q0_rad = [-0.1, 0.4]",
+        ]
         lines += [f"control = {{ K = {gains[0]!r}, d = {gains[1]!r} }}", f"[sites.{name}.arm]"]
         for link in "12":
             lines += [f"l{link}_m = 1.0", f"m{link}_kg = {mass!r}", f"lc{link}_m = 0.5"]
             lines += [f"I{link}_kg_m2 = {mass / 12.0!r}"]
     lines += ["[dominance]"]
     for n, name in enumerate(names):
-        shares = ", ".join(f"{names[j]} = {float(alpha[n][j])!r}" for j in range(count) if alpha[n][j])
+        shares = ", ".join(
+            f"{names[j]} = {float(alpha[n][j])!r}" for j in range(count) if alpha[n][j]
+        )
         lines += [f"{name} = {{ {shares} }}"]
     scenario = parse_scenario("\n".join(lines))
     return load_scenario(scenario, changes) if changes else scenario
@@ -50,7 +61,12 @@ def rods(mass_kg: float, q2_rad: float) -> Array:
 
 
 def count_growing(
-    alpha: Any, inertias: Sequence[Array], K: Any, d: Any, ticks: Any, growth_per_s: float = 1e-6
+    alpha: Any,
+    inertias: Sequence[Array],
+    K: Any,
+    d: Any,
+    ticks: Any,
+    growth_per_s: float = 1e-6,
 ) -> int:
     """Counts roots z of the sampled loop outside of abs(z) = exp(growth h): by the turns of its determinant.
 
@@ -70,7 +86,9 @@ def count_growing(
         z, less = np.exp(s)[:, None, None], np.expm1(s)[:, None, None]
         seen = np.eye(size) - shares * np.exp(-s[:, None, None] * late)
         control = 2.0 / H_S * less * np.diag(damping) + (z + 1.0) * stiffness[:, None] * seen
-        sign, _ = np.linalg.slogdet(2.0 / H_S**2 * less**2 * z * mass + (1.5 * z - 0.5) * control)
+        sign, _ = np.linalg.slogdet(
+            2.0 / H_S**2 * less**2 * z * mass + (1.5 * z - 0.5) * control
+        )
         return np.asarray(np.angle(sign))
 
     phi = np.concatenate([np.geomspace(1e-12, 1e-6, 60)[:-1], np.geomspace(1e-6, np.pi, 1500)])
@@ -82,7 +100,10 @@ def count_growing(
         if not len(wide):
             break
         between = 0.5 * (phi[wide] + phi[wide + 1])
-        phi, turned = np.insert(phi, wide + 1, between), np.insert(turned, wide + 1, angle(between))
+        phi, turned = (
+            np.insert(phi, wide + 1, between),
+            np.insert(turned, wide + 1, angle(between)),
+        )
     growing = 3 * size - steps.sum() / np.pi
     assert abs(growing - round(growing)) < 1e-6
     return round(growing)

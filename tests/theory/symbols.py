@@ -31,7 +31,11 @@ def plain(expression: Any) -> Any:
     angles = {sp.sin(x): sp.Symbol(f"sin_{x}") for x in Q}
     written = sp.expand(sp.expand_trig(expression)).subs(angles)
     for x, sine in zip(Q, angles.values(), strict=True):
-        written = sp.rem(written, sine**2 + sp.cos(x) ** 2 - 1, sine) if written.has(sine) else written
+        written = (
+            sp.rem(written, sine**2 + sp.cos(x) ** 2 - 1, sine)
+            if written.has(sine)
+            else written
+        )
     return sp.expand(written)
 
 

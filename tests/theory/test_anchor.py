@@ -73,12 +73,18 @@ def test_what_the_derivation_integrates_is_conserved(name: str) -> None:
 def test_hand_sees_spring_of_115_nm_per_rad_and_arm() -> None:
     """Gamma g^2 cos^2 (1 + Lambda T), 115.5 N m/rad level; a push at one site moves all three by a third."""
     push_nm = 15.0
-    hands = [{"kind": "recorded", "points": [[0.0, push_nm, push_nm], [60.0, push_nm, push_nm]]}]
+    hands = [
+        {"kind": "recorded", "points": [[0.0, push_nm, push_nm], [60.0, push_nm, push_nm]]}
+    ]
     rest = sampled(load_scenario("paper_rods").without_hands(), (20.0,))
-    pushed = sampled(load_scenario("paper_rods", {"sites.m1.hands": hands, "sites.m2.hands": []}), (20.0,))
+    pushed = sampled(
+        load_scenario("paper_rods", {"sites.m1.hands": hands, "sites.m2.hands": []}), (20.0,)
+    )
     there, from_where = angles(pushed), angles(rest)
-    assert there[0] == pytest.approx(from_where[0], abs=2e-3)  # equal torques act on q1 + q2 alone
-    assert np.abs(pushed[:, -1, :2] - pushed[:, -1, 4:6]).max() < 1e-4  # no error: nothing is felt
+    # equal torques act on q1 + q2 alone
+    assert there[0] == pytest.approx(from_where[0], abs=2e-3)
+    # no error: nothing is felt
+    assert np.abs(pushed[:, -1, :2] - pushed[:, -1, 4:6]).max() < 1e-4
     middle = 0.5 * (there[1] + from_where[1])
     stiffness = push_nm / 3.0 / (there[1] - from_where[1])
     level = G**2 * 1.2
@@ -90,7 +96,9 @@ def test_small_gain_has_no_such_pose_and_arms_hang() -> None:
     """Gamma = 0.1: |sin q1(inf)| would have to be 1.7."""
     hanging = load_scenario("paper", {"control.Gamma": 0.1}).without_hands()
     assert predicted("paper", 0.2)[0] / 0.1 < -1.0
-    assert sampled(hanging, np.arange(20.0, 30.0, 0.01))[2, :, 0].mean() == pytest.approx(-np.pi / 2, abs=0.1)
+    assert sampled(hanging, np.arange(20.0, 30.0, 0.01))[2, :, 0].mean() == pytest.approx(
+        -np.pi / 2, abs=0.1
+    )
 
 
 LOAD_NM = 5.0

@@ -23,14 +23,19 @@ def motion(rate_hz: int, times_s: Array) -> Array:
 
 @pytest.mark.long
 def test_second_order_follows_the_stored_motion() -> None:
-    errors = [float(np.abs(motion(rate_hz, TIMES_S) - exact_motion()).max()) for rate_hz in (500, 1000)]
+    errors = [
+        float(np.abs(motion(rate_hz, TIMES_S) - exact_motion()).max())
+        for rate_hz in (500, 1000)
+    ]
     assert errors[1] <= 5e-5
     assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.1)
 
 
 @pytest.mark.long
 def test_second_order_of_chains_has_order_two_over_ten_seconds() -> None:
-    pytest.importorskip("pinocchio", reason="requirements/robots.lock is not installed: make test-long")
+    pytest.importorskip(
+        "pinocchio", reason="requirements/robots.lock is not installed: make test-long"
+    )
     from tests.theory.chain_delay_equations import chain_equations
 
     equations = chain_equations(pushed_chains()).solve(float(LONG_TIMES_S[-1]))

@@ -48,7 +48,9 @@ def test_a_guess_beyond_the_range_of_exp_is_dropped(E: np.ndarray | None) -> Non
     A, late = np.array([[-1.0, 0.0], [1.0, -2.0]]), np.array([[[0.0, 0.0], [1e-3, 0.0]]])
     pencil = characteristic_roots.Pencil(A, np.array([0.5]), late, E)
     with np.errstate(all="ignore"):
-        roots, dropped = characteristic_roots.refine_roots(pencil, np.array([-1.1 + 0j, -1e4 + 0j]), "ab", 4)
+        roots, dropped = characteristic_roots.refine_roots(
+            pencil, np.array([-1.1 + 0j, -1e4 + 0j]), "ab", 4
+        )
     assert dropped == 1
     assert roots[0].s == pytest.approx(-1.0, abs=1e-6)
 
@@ -61,7 +63,8 @@ def test_one_delay_is_lamberts_function(a: float, T: float) -> None:
     exact = exact[exact.imag >= -1e-9]
     exact = exact[np.argsort(-exact.real)]
     assert len(found) == 3
-    if abs(a * T - 1 / math.e) < 1e-3:  # two roots meet: they are known to the root of rounding only
+    # two roots meet: they are known to the root of rounding only
+    if abs(a * T - 1 / math.e) < 1e-3:
         return
     for root, wanted in zip(found, exact, strict=False):
         assert abs(root.s - wanted) <= 1e-9 * (1 + abs(wanted))
@@ -87,7 +90,9 @@ def test_no_root_is_missed(seed: int) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 5))
     delays = np.sort(rng.uniform(0.05, 1.5, 2))
-    system = loop(rng.normal(size=(n, n)), *((float(T), rng.normal(size=(n, n))) for T in delays))
+    system = loop(
+        rng.normal(size=(n, n)), *((float(T), rng.normal(size=(n, n))) for T in delays)
+    )
     found = compute_delay_spectrum(system, 5)
     assert all(residual(system, root.s) <= 1e-12 for root in found.roots)
     reals = [root.s.real for root in found.roots]
@@ -98,9 +103,14 @@ def test_no_root_is_missed(seed: int) -> None:
             left = before.s.real - 0.5 * gap
             right = [root for root in found.roots if root.s.real > left]
             count = sum(root.multiplicity * (2 if root.s.imag else 1) for root in right)
-            far = sum(np.linalg.norm(d.A) * math.exp(max(0.0, -left) * d.delay_s) for d in system.delayed)
+            far = sum(
+                np.linalg.norm(d.A) * math.exp(max(0.0, -left) * d.delay_s)
+                for d in system.delayed
+            )
             size = 1.0 + np.linalg.norm(system.A) + far
-            assert roots_within(system, complex(left, -size), complex(size, size), 6000) == count
+            assert (
+                roots_within(system, complex(left, -size), complex(size, size), 6000) == count
+            )
 
 
 def test_several_modes_that_share_a_root_are_one_root() -> None:
@@ -140,4 +150,6 @@ def test_a_mass_that_nothing_holds_drifts() -> None:
 def test_polynomials_are_differentiated_and_interpolated_exactly(order: int, at: float) -> None:
     nodes = chebyshev_nodes(order)
     assert chebyshev_differentiation(order) @ nodes**3 == pytest.approx(3 * nodes**2, abs=1e-10)
-    assert chebyshev_interpolation(order, np.array([at])) @ nodes**3 == pytest.approx(at**3, abs=1e-12)
+    assert chebyshev_interpolation(order, np.array([at])) @ nodes**3 == pytest.approx(
+        at**3, abs=1e-12
+    )

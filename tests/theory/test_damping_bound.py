@@ -49,10 +49,13 @@ def test_what_is_balanced_is_reversible() -> None:
         assert D is not None
         np.testing.assert_allclose(D[:, None] * alpha, (D[:, None] * alpha).T, rtol=1e-12)
         assert np.abs(np.linalg.eigvals(alpha).imag).max() < 1e-9
-        assert count == 2 or find_balancing_weights(shares(rng, count, reversible=False)) is None
+        assert (
+            count == 2 or find_balancing_weights(shares(rng, count, reversible=False)) is None
+        )
     assert find_balancing_weights(np.array(LAB)) is None
     assert find_balancing_weights(np.array(RING)) is None
-    follower = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.3, 0.7, 0.0]])  # nobody follows the third
+    # nobody follows the third
+    follower = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.3, 0.7, 0.0]])
     assert find_balancing_weights(follower) is not None
 
 
@@ -60,7 +63,10 @@ def test_the_common_motion_asks_for_its_share_at_one_mass() -> None:
     """-min sin x / x is at tan x = x; there m w^2 = K (1 - cos x): m = 1.2172 K T^2 / 20.19."""
     x = float(sp.nsolve(sp.tan(sp.Symbol("x")) - sp.Symbol("x"), 4.5))
     assert pytest.approx(-np.sin(x) / x, abs=1e-10) == COMMON_MOTION_SHARE
-    assert (1.0 - np.cos(x), x * x) == (pytest.approx(1.2172, abs=1e-4), pytest.approx(20.19, abs=0.005))
+    assert (1.0 - np.cos(x), x * x) == (
+        pytest.approx(1.2172, abs=1e-4),
+        pytest.approx(20.19, abs=0.005),
+    )
 
 
 @pytest.mark.parametrize(
@@ -78,12 +84,16 @@ def test_irreversible_shares_have_no_bound(
     found = analyse_linear_loop(scenario, pose=POSE).decisive.rightmost
     assert found is not None
     assert found.s.real == pytest.approx(growth_per_s, abs=1e-3)
-    assert count_growing(alpha, [rods(m, POSE[1]) for m in masses], 10.0, d, round(delay_ms)) > 0
+    assert (
+        count_growing(alpha, [rods(m, POSE[1]) for m in masses], 10.0, d, round(delay_ms)) > 0
+    )
 
 
 def test_seven_equal_shares_ask_more_than_their_least_eigenvalue() -> None:
     """K T = 2, d = 0.36: 1/6 of it is 0.333, 0.2172 of it 0.434."""
-    lacking, enough = (evaluate_criterion(position_network(equal(7), d=d)) for d in (0.36, 0.44))
+    lacking, enough = (
+        evaluate_criterion(position_network(equal(7), d=d)) for d in (0.36, 0.44)
+    )
     assert lacking is not None
     assert enough is not None
     assert lacking.excess < 0.0 < enough.excess
@@ -99,14 +109,16 @@ def check_sharpness(alpha: Any, K: float, ticks: int) -> None:
     """
     criterion = evaluate_criterion(position_network(alpha, K=K, d=0.0, delay_ms=float(ticks)))
     assert criterion is not None
-    line = -criterion.excess / (2.0 if len(alpha) == 2 else 1.0)  # of two sites 2 sqrt(d1 d2) - ...
+    # of two sites 2 sqrt(d1 d2) - ...
+    line = -criterion.excess / (2.0 if len(alpha) == 2 else 1.0)
     modes = np.linalg.eigvals(alpha).real  # of equal arms each is a loop of its own
     least = -modes.min()
     mass = 60.0 if least >= COMMON_MOTION_SHARE else 1.2172 / 20.19
     worst = [np.eye(1) * mass * K * (ticks * 1e-3) ** 2]
     assert line == pytest.approx(max(least, COMMON_MOTION_SHARE) * K * ticks * 1e-3, rel=1e-3)
     below, above = (
-        sum(count_growing([[a]], worst, K, share * line, ticks) for a in modes) for share in (0.98, 1.02)
+        sum(count_growing([[a]], worst, K, share * line, ticks) for a in modes)
+        for share in (0.98, 1.02)
     )
     assert below > 0 == above
 
@@ -129,7 +141,9 @@ def test_of_few_ticks_it_is_edge_of_loop_as_computed(ticks: int) -> None:
     def growing(d: float) -> int:
         masses = np.geomspace(1.0001 * d * 1e-3, 3e-3 * ticks**2, 40)
         modes = [(m, a) for m in masses for a in (-0.5, 1.0)]
-        return sum(count_growing([[a]], [np.eye(1) * m], 10.0, d, ticks, 1e-4) for m, a in modes)
+        return sum(
+            count_growing([[a]], [np.eye(1) * m], 10.0, d, ticks, 1e-4) for m, a in modes
+        )
 
     assert growing(-0.98 * criterion.excess) > 0 == growing(-1.02 * criterion.excess)
 
@@ -137,7 +151,9 @@ def test_of_few_ticks_it_is_edge_of_loop_as_computed(ticks: int) -> None:
 def pair_with_error_damping(d: Any, Kd: Any, masses: Any, K: Any = (10.0, 10.0)) -> Any:
     """The rightmost root of two sites under PD+d, 200 ms apart."""
     wires = (Wire(0, 1, K[0], Kd[0], 0.2), Wire(1, 0, K[1], Kd[1], 0.2))
-    spectrum = compute_delay_spectrum(Network(tuple(masses), tuple(d), (0.0, 0.0), wires).loop, 1)
+    spectrum = compute_delay_spectrum(
+        Network(tuple(masses), tuple(d), (0.0, 0.0), wires).loop, 1
+    )
     return spectrum.rightmost
 
 
@@ -167,7 +183,12 @@ def check_network(rng: np.random.Generator, *, sharp: bool) -> bool | None:
     count = int(rng.integers(2, 9))
     alpha = shares(rng, count, reversible=bool(rng.integers(2)))
     ticks, K = int(rng.integers(0, 1001)), float(10.0 ** rng.uniform(0.0, 1.5))
-    need = K * max(ticks, 1) * 1e-3 * max(-np.linalg.eigvals(alpha).real.min(), COMMON_MOTION_SHARE)
+    need = (
+        K
+        * max(ticks, 1)
+        * 1e-3
+        * max(-np.linalg.eigvals(alpha).real.min(), COMMON_MOTION_SHARE)
+    )
     d: Any = need * rng.uniform(0.8, 1.3)
     K_all: Any = K
     if count == 2:  # of two sites gains may differ
@@ -178,7 +199,9 @@ def check_network(rng: np.random.Generator, *, sharp: bool) -> bool | None:
         return None
     if sharp and ticks >= MANY_TICKS:
         check_sharpness(alpha, K, ticks)
-    inertias = [rods(mass, q2) for mass, q2 in zip(masses, rng.uniform(-3.1, 3.1, count), strict=True)]
+    inertias = [
+        rods(mass, q2) for mass, q2 in zip(masses, rng.uniform(-3.1, 3.1, count), strict=True)
+    ]
     if criterion.excess > 0.0:
         assert count_growing(alpha, inertias, K_all, d, max(ticks, 1)) == 0
     return criterion.excess > 0.0
@@ -186,7 +209,8 @@ def check_network(rng: np.random.Generator, *, sharp: bool) -> bool | None:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("seed", "sharp"), [(0, False), *(pytest.param(n, True, marks=pytest.mark.long) for n in range(8))]
+    ("seed", "sharp"),
+    [(0, False), *(pytest.param(n, True, marks=pytest.mark.long) for n in range(8))],
 )
 def test_it_never_calls_enough_what_grows(seed: int, *, sharp: bool) -> None:
     """250 networks a seed: 2 to 8 sites, any shares, masses over a decade, delays to 1 s."""
@@ -237,9 +261,13 @@ def test_held_torques_ask_for_more_than_bound_of_continuous_time() -> None:
 def test_bound_of_held_torques_is_that_of_worst_mass(count: int, ticks: int) -> None:
     """Above it no arm heavier than d h / 2 grows; 3 % below it some arm does."""
     text = judged(count, ticks, 1e3).text
-    sides = K_PAIR * TICK_S * (ticks + 1) if count == 2 else float(text.split(" = ")[1].split()[0])
+    sides = (
+        K_PAIR * TICK_S * (ticks + 1) if count == 2 else float(text.split(" = ")[1].split()[0])
+    )
     for d, grows in ((0.97 * sides, True), (1.01 * sides, False)):
         assert judged(count, ticks, d).holds is not grows
-        masses = np.concatenate([0.5 * d * TICK_S * (1.0 + np.logspace(-4, 1, 300)), np.logspace(-1, 4, 300)])
+        masses = np.concatenate(
+            [0.5 * d * TICK_S * (1.0 + np.logspace(-4, 1, 300)), np.logspace(-1, 4, 300)]
+        )
         most = max(growth(count, ticks, d, float(m)) for m in masses if m > 0.5 * d * TICK_S)
         assert (most > 0.0) is grows

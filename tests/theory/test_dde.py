@@ -27,7 +27,10 @@ def test_reference_solution_holds_more_digits_than_it_is_asked_for() -> None:
     ("name", "bound"),
     [
         ("paper", 1e-5),
-        *(pytest.param(*one, marks=pytest.mark.long) for one in (("paper_rods", 1e-5), ("free", 1.1e-5))),
+        *(
+            pytest.param(*one, marks=pytest.mark.long)
+            for one in (("paper_rods", 1e-5), ("free", 1.1e-5))
+        ),
     ],
 )
 def test_second_order_is_within_1e_5_rad_of_exact_solution(name: str, bound: float) -> None:

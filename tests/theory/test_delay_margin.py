@@ -11,7 +11,11 @@ from tests.theory.loops import loop
 from trilat_net.scenario import load_scenario
 from trilat_net.theory import find_equilibrium
 from trilat_net.theory.characteristic_roots import compute_delay_spectrum
-from trilat_net.theory.delay_margin import MAX_COMMON_DELAY_S, find_delay_margin, set_common_delay
+from trilat_net.theory.delay_margin import (
+    MAX_COMMON_DELAY_S,
+    find_delay_margin,
+    set_common_delay,
+)
 from trilat_net.theory.linear_loop import linearise_loop
 from trilat_net.theory.operating_point import derive_operating_conditions
 
@@ -31,7 +35,10 @@ def test_what_damps_itself_enough_is_stable_for_every_delay() -> None:
     """x' = -2 x + x(t - T)."""
     found = find_delay_margin(loop(-2.0, (1.0, 1.0)))
     assert found.words == "stable for every common delay up to 10 s"
-    assert find_delay_margin(loop(1.0, (1.0, 0.5))).words == "unstable for every common delay up to 10 s"
+    assert (
+        find_delay_margin(loop(1.0, (1.0, 0.5))).words
+        == "unstable for every common delay up to 10 s"
+    )
 
 
 def test_an_oscillator_is_stable_between_delays_again_and_again() -> None:
@@ -47,7 +54,8 @@ def test_an_oscillator_is_stable_between_delays_again_and_again() -> None:
             root = compute_delay_spectrum(set_common_delay(system, span.high_s), 1).roots[0]
             assert abs(root.s - 1j * span.high.omega_rad_s) < 1e-8
             assert (
-                compute_delay_spectrum(set_common_delay(system, 1.001 * span.high_s), 1).verdict == "unstable"
+                compute_delay_spectrum(set_common_delay(system, 1.001 * span.high_s), 1).verdict
+                == "unstable"
             )
 
 
@@ -61,13 +69,17 @@ def test_the_verdict_over_delay_is_that_of_the_roots(seed: int) -> None:
     for T in (0.0, 0.1, 0.4, 1.0, 2.5):
         if all(abs(T - end) > 0.01 for end in ends if 0 < end < MAX_COMMON_DELAY_S):
             inside = any(span.low_s <= T <= span.high_s for span in found.intervals)
-            assert (compute_delay_spectrum(set_common_delay(system, T), 1).verdict == "stable") == inside
+            assert (
+                compute_delay_spectrum(set_common_delay(system, T), 1).verdict == "stable"
+            ) == inside
 
 
 def test_roots_at_zero_cross_nothing() -> None:
     scenario = load_scenario("free")
     found = find_delay_margin(
-        linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.1236, 0.3373)))
+        linearise_loop(
+            derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.1236, 0.3373))
+        )
     )
     assert found.words == "stable for every common delay up to 10 s"
 

@@ -17,7 +17,9 @@ from trilat_net.theory.operating_point import derive_operating_conditions
 TRIO = {"rate_hz": 200}
 
 
-@pytest.mark.parametrize("name", ["free", "p_d_margin_two", "contact", "windup", "force_sharing"])
+@pytest.mark.parametrize(
+    "name", ["free", "p_d_margin_two", "contact", "windup", "force_sharing"]
+)
 def test_a_rest_is_an_equilibrium(name: str) -> None:
     scenario = load_scenario(name, TRIO)
     found = find_equilibrium(scenario)
@@ -49,9 +51,12 @@ def test_a_diverging_run_rests_where_its_linear_loop_goes() -> None:
 def test_what_is_kept_weighs_sites_by_their_damping_and_delay() -> None:
     """The pose that the linear loop foretells is that in which a run ends."""
     scenario = load_scenario(
-        "p_d_margin_two", {**TRIO, "sites.m.control.d": 9.0, "sites.s.control.d": 4.0, "duration_s": 60.0}
+        "p_d_margin_two",
+        {**TRIO, "sites.m.control.d": 9.0, "sites.s.control.d": 4.0, "duration_s": 60.0},
     )
-    assert predict_equilibrium(scenario).q == pytest.approx(find_equilibrium(scenario).q, abs=5e-3)
+    assert predict_equilibrium(scenario).q == pytest.approx(
+        find_equilibrium(scenario).q, abs=5e-3
+    )
 
 
 def test_a_run_that_hammers_has_an_equilibrium_in_contact() -> None:
@@ -59,9 +64,8 @@ def test_a_run_that_hammers_has_an_equilibrium_in_contact() -> None:
     found = find_equilibrium(scenario)
     assert "still moves" in found.how
     now = derive_operating_conditions(scenario)
-    calm = find_equilibrium(
-        load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0})
-    )  # settles at the same pose
+    # settles at the same pose
+    calm = find_equilibrium(load_scenario("contact", {"rate_hz": 500, "link.delay_ms": 20.0}))
     assert "at rest" in calm.how
     assert found.q == pytest.approx(calm.q, abs=1e-9)
     assert np.abs(compute_equilibrium_residual(now, calm)).max() <= MAX_EQUILIBRIUM_RESIDUAL
@@ -76,12 +80,16 @@ def test_a_pose_of_ones_own_is_taken_as_it_is() -> None:
 
 
 def test_pose_that_is_no_rest_is_said_to_be_none() -> None:
-    (note,) = find_equilibrium(load_scenario("p_d_margin_two", {"control.gravity": 0.5}), (0.1, 0.3)).notes
+    (note,) = find_equilibrium(
+        load_scenario("p_d_margin_two", {"control.gravity": 0.5}), (0.1, 0.3)
+    ).notes
     assert "the pose is no equilibrium" in note
 
 
 def test_a_torque_beyond_the_clamp_is_said() -> None:
-    notes = find_equilibrium(load_scenario("free", {"limits.tau_limit_nm": 5.0}), (0.1, 0.3)).notes
+    notes = find_equilibrium(
+        load_scenario("free", {"limits.tau_limit_nm": 5.0}), (0.1, 0.3)
+    ).notes
     assert [note.split()[0] for note in notes] == ["m1", "m2", "s"]
     assert all("its clamp is 5" in note for note in notes)
 
@@ -89,7 +97,10 @@ def test_a_torque_beyond_the_clamp_is_said() -> None:
 def test_a_rest_moves_along_with_a_key_that_moves_it() -> None:
     scenario = load_scenario("p_d_margin_two")
     rest = find_equilibrium(scenario, (0.3, 0.0))
-    assert follow_equilibrium(load_scenario(scenario, {"control.d": 1.0}), rest).q.tolist() == rest.q.tolist()
+    assert (
+        follow_equilibrium(load_scenario(scenario, {"control.d": 1.0}), rest).q.tolist()
+        == rest.q.tolist()
+    )
     hand = {"kind": "spring", "to_rad": [0.3, 0.0], "stiffness_nm_rad": 20.0}
     sagged = follow_equilibrium(
         load_scenario(scenario, {"sites.m.hands": [hand], "sites.s.control.gravity": 0.9}), rest
@@ -101,7 +112,9 @@ def test_a_rest_moves_along_with_a_key_that_moves_it() -> None:
 def test_a_loop_that_rests_nowhere_is_refused() -> None:
     """A torque that the arms cannot bear anywhere."""
     push = {"kind": "recorded", "points": [[0.0, 500.0, 0.0], [1000.0, 500.0, 0.0]]}
-    scenario = load_scenario("p_d_margin_two", {**TRIO, "sites.m.hands": [push], "duration_s": 2.0})
+    scenario = load_scenario(
+        "p_d_margin_two", {**TRIO, "sites.m.hands": [push], "duration_s": 2.0}
+    )
     with pytest.raises(ScenarioError, match="has no equilibrium near"):
         find_equilibrium(scenario)
 

@@ -49,14 +49,24 @@ class Rates(NamedTuple):
 
     @property
     def disagreement(self) -> Any:
-        return sum(a * norm(QD - then, self.Kd) for a, then in zip(self.alpha, self.seen, strict=True))
+        return sum(
+            a * norm(QD - then, self.Kd) for a, then in zip(self.alpha, self.seen, strict=True)
+        )
 
 
 @cache
 def rates() -> Rates:
     """Eq. (8), (13), (15) put into the derivative of Eq. (16), for delays T(t) that may grow."""
-    Lambda, Kp, Kd, Gamma = diagonal("L"), diagonal("P"), diagonal("D"), sp.diag(*sp.symbols("gamma1:6"))
-    share, growth = sp.Symbol("alpha12", positive=True), list(sp.symbols("Tdot2 Tdot3", real=True))
+    Lambda, Kp, Kd, Gamma = (
+        diagonal("L"),
+        diagonal("P"),
+        diagonal("D"),
+        sp.diag(*sp.symbols("gamma1:6")),
+    )
+    share, growth = (
+        sp.Symbol("alpha12", positive=True),
+        list(sp.symbols("Tdot2 Tdot3", real=True)),
+    )
     alpha = [share, 1 - share]  # Eq. (7)
     e, qd_j, seen, hand = pair("e"), [pair("u"), pair("w")], [pair("us"), pair("ws")], pair("h")
     estimate = sp.Matrix(sp.symbols("hat1:6", real=True))
@@ -92,15 +102,19 @@ def test_eq_17_has_other_sign_and_half_of_last_term() -> None:
     free = chain(True).subs(dict.fromkeys(x.hand, 0))
     printed = -norm(x.r, x.Kp) + dot(QD, x.Kd * x.ed) + x.passed
     assert not zero(free - printed)
-    assert not zero(free - (-norm(x.r, x.Kp) - dot(QD, x.Kd * x.ed) + x.passed))  # the sign alone
-    assert not zero(free - (-norm(x.r, x.Kp) + dot(QD, x.Kd * x.ed) + x.passed / 2))  # the factor alone
+    # the sign alone
+    assert not zero(free - (-norm(x.r, x.Kp) - dot(QD, x.Kd * x.ed) + x.passed))
+    # the factor alone
+    assert not zero(free - (-norm(x.r, x.Kp) + dot(QD, x.Kd * x.ed) + x.passed / 2))
     assert not zero(chain(True) - right - dot(QD, x.hand))
 
 
 def test_eq_19_does_not_follow_from_eq_17() -> None:
     """Errata 5, Eq. (19): halves, and the other sign of the last two norms."""
     x = rates()
-    stored = norm(QD, x.Kd) - sum(a * norm(u, x.Kd) for a, u in zip(x.alpha, x.qd_j, strict=True))
+    stored = norm(QD, x.Kd) - sum(
+        a * norm(u, x.Kd) for a, u in zip(x.alpha, x.qd_j, strict=True)
+    )
     printed_17 = -norm(x.r, x.Kp) + dot(QD, x.Kd * x.ed) + x.passed
     printed_19 = -norm(x.r, x.Kp) - x.disagreement + stored
     assert not zero(printed_17 - printed_19)
@@ -118,7 +132,9 @@ def test_a_delay_that_varies_adds_exactly_this() -> None:
     x = rates()
     push = x.Lambda * x.Kd * x.e + x.Lambda * inertia() * x.r
     terms = zip(x.alpha, x.growth, x.seen, strict=True)
-    added = sum(a * grows * (norm(then, x.Kd) / 2 + dot(push, then)) for a, grows, then in terms)
+    added = sum(
+        a * grows * (norm(then, x.Kd) / 2 + dot(push, then)) for a, grows, then in terms
+    )
     assert zero(chain(False) - chain(True) - added)
 
 
@@ -142,8 +158,12 @@ def test_a_delay_that_shrinks_lets_v_rise_however_slowly(grows: float) -> None:
     assert np.linalg.eigvalsh(form)[-1] > 0.0
 
 
-@pytest.mark.parametrize("gains", [(1.0, 3.0, 1.0, 5.83), (20.0, 5.0, 2.0, 0.17), (0.1, 10.0, 1.0, 1.0)])
-def test_a_delay_that_grows_slowly_enough_does_not(gains: tuple[float, float, float, float]) -> None:
+@pytest.mark.parametrize(
+    "gains", [(1.0, 3.0, 1.0, 5.83), (20.0, 5.0, 2.0, 0.17), (0.1, 10.0, 1.0, 1.0)]
+)
+def test_a_delay_that_grows_slowly_enough_does_not(
+    gains: tuple[float, float, float, float],
+) -> None:
     """Errata 8: T' (Kd + Lambda M)^2 <= 2 Kp Kd (1 - T') is where V' <= 0 ends."""
     Kp, Kd, Lambda, M = gains
     limit = 2 * Kp * Kd / ((Kd + Lambda * M) ** 2 + 2 * Kp * Kd)

@@ -6,7 +6,19 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from tests.theory.symbols import QD, THETA, G, Q, columns, dot, forces, gravity, inertia, pair, plain
+from tests.theory.symbols import (
+    QD,
+    THETA,
+    G,
+    Q,
+    columns,
+    dot,
+    forces,
+    gravity,
+    inertia,
+    pair,
+    plain,
+)
 from trilat_net.core.two_link_arm import ArmLinks, regressor, theta_from_links
 
 
@@ -17,7 +29,9 @@ def lagrange() -> tuple[sp.Matrix, dict[str, Any]]:
     f = [sp.Function("a")(t), sp.Function("b")(t)]
     both = f[0] + f[1]
     first = c1 * sp.Matrix([sp.cos(f[0]), sp.sin(f[0])])
-    second = l1 * sp.Matrix([sp.cos(f[0]), sp.sin(f[0])]) + c2 * sp.Matrix([sp.cos(both), sp.sin(both)])
+    second = l1 * sp.Matrix([sp.cos(f[0]), sp.sin(f[0])]) + c2 * sp.Matrix(
+        [sp.cos(both), sp.sin(both)]
+    )
     speeds = [first.diff(t), second.diff(t)]
     kinetic = sum(m * dot(v, v) for m, v in zip((m1, m2), speeds, strict=True)) / 2
     kinetic += (i1 * f[0].diff(t) ** 2 + i2 * both.diff(t) ** 2) / 2
@@ -45,7 +59,9 @@ def test_theta_5_is_m2_lc2_unlike_eq_24() -> None:
     ours = forces(QD, pair("a"))
 
     def off(last: Any) -> sp.Matrix:
-        return (torque - ours.subs(dict(zip(THETA, theta_24(n, last), strict=True)))).applyfunc(plain)
+        return (torque - ours.subs(dict(zip(THETA, theta_24(n, last), strict=True)))).applyfunc(
+            plain
+        )
 
     assert off(n["m2"] * n["lc2"]) == sp.zeros(2, 1)
     l2 = sp.Symbol("l2", positive=True)
@@ -58,7 +74,8 @@ def test_the_regressor_of_eq_12_needs_two_velocities() -> None:
     """Errata 2, Eq. (12): with one, it is right where v = qd and nowhere else."""
     v, a = pair("v"), pair("a")
     assert sp.expand(columns(v, a) * THETA - forces(v, a)) == sp.zeros(2, 1)
-    printed = columns(QD, a).subs(dict(zip(QD, v, strict=True)), simultaneous=True)  # Section IV's, at v
+    # Section IV's, at v
+    printed = columns(QD, a).subs(dict(zip(QD, v, strict=True)), simultaneous=True)
     off = (printed * THETA - forces(v, a)).applyfunc(sp.expand)
     assert off != sp.zeros(2, 1)
     assert off.subs(dict(zip(v, QD, strict=True))).applyfunc(sp.expand) == sp.zeros(2, 1)
@@ -70,12 +87,16 @@ def test_the_programs_regressor_is_that_of_the_energies() -> None:
     links = ArmLinks(0.7, 1.3, 0.4, 0.11, 0.9, 0.8, 0.35, 0.07)
     values = {"m1": 1.3, "m2": 0.8, "l1": 0.7, "lc1": 0.4, "lc2": 0.35, "I1": 0.11, "I2": 0.07}
     a = pair("a")
-    exact = sp.lambdify([Q, QD, a], torque.subs({n[k]: x for k, x in values.items()} | {G: 9.81}), "numpy")
+    exact = sp.lambdify(
+        [Q, QD, a], torque.subs({n[k]: x for k, x in values.items()} | {G: 9.81}), "numpy"
+    )
     rng = np.random.default_rng(1)
     for _ in range(20):
         q, qd, qdd = rng.normal(size=(3, 2))
         Y = np.array(regressor(9.81, q, qd, qd, qdd))
-        assert Y @ theta_from_links(links) == pytest.approx(exact(q, qd, qdd).ravel(), abs=1e-12)
+        assert Y @ theta_from_links(links) == pytest.approx(
+            exact(q, qd, qdd).ravel(), abs=1e-12
+        )
 
 
 def test_five_parameters_are_four_where_the_length_is_known() -> None:
@@ -98,5 +119,8 @@ def test_no_acceleration_at_the_start_contradicts_an_estimate_of_zero() -> None:
     """Errata 4: level and at rest, tau = G_hat, so that qdd(0) = M^-1 (G_hat - G) = (-g, g)."""
     level = dict.fromkeys([*Q, *QD], 0)
     point_masses = dict(zip(THETA, (3, 1, 1, 2, 1), strict=True))
-    M, force = inertia().subs(level).subs(point_masses), gravity().subs(level).subs(point_masses)
+    M, force = (
+        inertia().subs(level).subs(point_masses),
+        gravity().subs(level).subs(point_masses),
+    )
     assert list(M.inv() * -force) == [-G, G]

@@ -14,7 +14,12 @@ from trilat_net.analysis.dominance_history import (
     find_closed_groups,
     left_perron_vector,
 )
-from trilat_net.core.exogenous import TorqueKind, TorqueSource, torque_on_arm, torque_source_rows
+from trilat_net.core.exogenous import (
+    TorqueKind,
+    TorqueSource,
+    torque_on_arm,
+    torque_source_rows,
+)
 
 A12, A21, A31 = sp.symbols("alpha12 alpha21 alpha31", positive=True)
 ALPHA = sp.Matrix([[0, A12, 1 - A12], [A21, 0, 1 - A21], [A31, 1 - A31, 0]])  # Eq. (7)
@@ -67,10 +72,15 @@ def test_with_ones_v_can_rise() -> None:
     """Errata 6: one arm moves, its peers saw it move before; r = 0, and its column sums to more than one."""
     alpha = np.array([[0.0, 0.9, 0.1], [0.5, 0.0, 0.5], [0.2, 0.8, 0.0]])
     qd = np.array([0.0, 1.0, 0.0])
-    seen = np.repeat(qd[:, np.newaxis], 3, axis=1)  # of every peer what makes the disagreement zero
+    # of every peer what makes the disagreement zero
+    seen = np.repeat(qd[:, np.newaxis], 3, axis=1)
 
     def rate(beta: Any) -> float:
-        each = -0.5 * (alpha * (qd[:, np.newaxis] - seen) ** 2).sum(1) - 0.5 * qd**2 + 0.5 * alpha @ qd**2
+        each = (
+            -0.5 * (alpha * (qd[:, np.newaxis] - seen) ** 2).sum(1)
+            - 0.5 * qd**2
+            + 0.5 * alpha @ qd**2
+        )
         return float(beta @ each)
 
     assert rate(np.ones(3)) == pytest.approx(0.5 * (0.9 + 0.8 - 1))
@@ -108,7 +118,9 @@ def test_kd_may_differ_by_a_scalar_per_site_only() -> None:
     """Errata 7: beta_i = pi_i / c_i; of another shape there is no beta, not even for V' <= 0."""
     alpha, c = shares(np.random.default_rng(3), 3), np.array([10.0, 3.0, 0.3])
     common = c[:, np.newaxis] * [2.0, 5.0]
-    assert passed_on(alpha, common) @ (perron(alpha) / c) == pytest.approx(np.zeros(6), abs=1e-14)
+    assert passed_on(alpha, common) @ (perron(alpha) / c) == pytest.approx(
+        np.zeros(6), abs=1e-14
+    )
     assert np.abs(passed_on(alpha, common) @ perron(alpha)).max() > 0.1
     assert feasible(alpha, common)
     assert not feasible(alpha, np.array([[0.1, 30.0], [30.0, 0.1], [3.0, 3.0]]))
@@ -119,7 +131,8 @@ def test_no_weights_of_the_integrals_leave_slack() -> None:
     k, w = sp.symbols("k w", positive=True)
     own, seen = sp.symbols("own seen", real=True)
     (best,) = sp.solve(sp.diff(k * own * seen - w * seen**2 / 2, seen), seen)
-    most = (k * own * seen - w * seen**2 / 2).subs(seen, best)  # over what the peer may have done
+    # over what the peer may have done
+    most = (k * own * seen - w * seen**2 / 2).subs(seen, best)
     assert sp.simplify(most - k**2 * own**2 / (2 * w)) == 0
     assert sp.simplify(-k + k**2 / (2 * w) + w / 2 - (k - w) ** 2 / (2 * w)) == 0
 
@@ -141,8 +154,13 @@ def test_a_passive_wall_gives_energy_to_v() -> None:
     work_done = np.array([step @ push(q) for step, q in zip(steps, middles, strict=True)])
     assert np.abs(work_done).sum() > 10.0
     assert (work_done == 0.0).any()  # part of the way is free
-    assert work_done.sum() == pytest.approx(0.0, abs=0.01)  # once around: the wall gives back what it took
-    rests, desired = np.array([-0.5, 1.75]), np.array([-0.45, 1.6])  # its peers are deeper in the wall
+    # once around: the wall gives back what it took
+    assert work_done.sum() == pytest.approx(0.0, abs=0.01)
+    # its peers are deeper in the wall
+    rests, desired = (
+        np.array([-0.5, 1.75]),
+        np.array([-0.45, 1.6]),
+    )
     assert push(rests) @ (rests - desired) > 10.0
 
 
@@ -155,7 +173,8 @@ def test_a_rate_that_vanishes_does_not_make_a_limit() -> None:
     e = sp.sin(sp.log(1 + t))
     rate = sp.diff(e, t)
     assert sp.limit(sp.Abs(rate), t, sp.oo) == 0
-    assert sp.simplify(rate**2 * (1 + t) ** 2 - sp.cos(sp.log(1 + t)) ** 2) == 0  # at most 1 / (1 + t)^2
+    # at most 1 / (1 + t)^2
+    assert sp.simplify(rate**2 * (1 + t) ** 2 - sp.cos(sp.log(1 + t)) ** 2) == 0
     late = [sp.exp(sp.pi * (n + sp.Rational(1, 2))) - 1 for n in (10, 11)]
     assert [e.subs(t, when) for when in late] == [1, -1]
 
@@ -169,8 +188,12 @@ def test_weighted_errors_are_what_moved_while_samples_were_under_way() -> None:
     assert sp.expand(sum(PI[i] * e[i] for i in range(3)) - moved) == 0
     assert sp.expand(sum(PI[i] * e[i] for i in range(3))) != 0
     c, t, T = sp.symbols("c t T")
-    steady = {q[j]: c * t for j in range(3)} | {seen[i, j]: c * (t - T) for i in range(3) for j in range(3)}
-    assert [sp.expand(x.subs(steady)) for x in e] == [c * T] * 3  # arms that drift together have e = c T
+    steady = {q[j]: c * t for j in range(3)} | {
+        seen[i, j]: c * (t - T) for i in range(3) for j in range(3)
+    }
+    assert [sp.expand(x.subs(steady)) for x in e] == [
+        c * T
+    ] * 3  # arms that drift together have e = c T
 
 
 def test_nothing_but_rest_is_left() -> None:
@@ -179,7 +202,11 @@ def test_nothing_but_rest_is_left() -> None:
     for _ in range(50):
         alpha = shares(rng, 4)
         pi, Lambda, T = perron(alpha), rng.uniform(0.1, 5.0, 4), rng.uniform(0.0, 2.0, (4, 4))
-        assert (pi / Lambda).sum() + (pi[:, np.newaxis] * alpha * T).sum() >= (pi / Lambda).sum() > 0.0
+        assert (
+            (pi / Lambda).sum() + (pi[:, np.newaxis] * alpha * T).sum()
+            >= (pi / Lambda).sum()
+            > 0.0
+        )
 
 
 # --- 11: reducible matrices -----------------------------------------------------------------------------
@@ -197,7 +224,9 @@ def test_a_weight_is_zero_where_the_other_two_are_locked() -> None:
 
 def test_a_site_that_nobody_follows_settles_all_the_same() -> None:
     """Errata 11: V with beta = (1, 0, 1) never rises; V_2 alone may; e goes to zero at every site."""
-    rows = {f"dominance.{i}.{j}": share for i, row in LOCKED.items() for j, share in row.items()}
+    rows = {
+        f"dominance.{i}.{j}": share for i, row in LOCKED.items() for j, share in row.items()
+    }
     made = run("free", {**rows, "rate_hz": 200, "duration_s": 25.0})
     locked = balance(made, np.array([0.5, 0.0, 0.5])).V
     assert np.diff(locked).max() <= 1e-6 * locked.max()
@@ -222,7 +251,10 @@ def test_learning_gravity_is_a_spring() -> None:
     t, gain, g, Lambda = sp.symbols("t Gamma g Lambda", positive=True)
     q, e = sp.Function("q")(t), sp.Function("e")(t)
     learnt = -gain * g * sp.cos(q) * (q.diff(t) + Lambda * e)  # Eq. (15), fourth column of Y
-    assert sp.simplify(learnt + (gain * g * sp.sin(q)).diff(t) + gain * g * sp.cos(q) * Lambda * e) == 0
+    assert (
+        sp.simplify(learnt + (gain * g * sp.sin(q)).diff(t) + gain * g * sp.cos(q) * Lambda * e)
+        == 0
+    )
 
 
 def test_dominance_is_who_feels_whom() -> None:
@@ -232,7 +264,8 @@ def test_dominance_is_who_feels_whom() -> None:
     for holding, felt in ((0, 4.79), (1, 16.4)):
         free = np.array([i for i in range(3) if i != holding])
         load = np.array([0.0, 0.0, 5.0])
-        stiff = stiffness * (np.eye(3) - alpha)  # Kp Lambda e = tau_h, with the holding site's q = 0
+        # Kp Lambda e = tau_h, with the holding site's q = 0
+        stiff = stiffness * (np.eye(3) - alpha)
         q = np.zeros(3)
         q[free] = np.linalg.solve(stiff[np.ix_(free, free)], load[free])
         hand = (stiff @ q - load)[holding]

@@ -15,7 +15,11 @@ from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.sample_uses import draw_uses
 from trilat_net.theory import find_equilibrium, floquet
 from trilat_net.theory.characteristic_roots import Spectrum
-from trilat_net.theory.floquet import CoupledTicks, compute_sampled_spectrum, find_samples_in_use
+from trilat_net.theory.floquet import (
+    CoupledTicks,
+    compute_sampled_spectrum,
+    find_samples_in_use,
+)
 from trilat_net.theory.operating_point import derive_operating_conditions
 
 POSE = (0.1, 0.4)
@@ -34,11 +38,15 @@ class Loop(NamedTuple):
         return self.found.rightmost.s.real
 
 
-def at_rest(name: str, changes: Mapping[str, Any], wanted: int = 4, pose: tuple[float, ...] = POSE) -> Loop:
+def at_rest(
+    name: str, changes: Mapping[str, Any], wanted: int = 4, pose: tuple[float, ...] = POSE
+) -> Loop:
     """A scenario with all sites at rest at a pose, and its roots there."""
     scenario = load_scenario(name, changes)
     here = {f"sites.{site}.q0_rad": list(pose) for site in scenario.names}
-    scenario = load_scenario(scenario, here | {f"sites.{site}.hands": [] for site in scenario.names})
+    scenario = load_scenario(
+        scenario, here | {f"sites.{site}.hands": [] for site in scenario.names}
+    )
     found = compute_sampled_spectrum(
         derive_operating_conditions(scenario), find_equilibrium(scenario, pose), wanted
     )
@@ -59,7 +67,9 @@ def measure_growth(loop: Loop, push_rad: float, from_s: float, to_s: float) -> f
         {
             f"sites.{name}.{key}": (np.array(start) + push).tolist()
             for name, both in zip(whole.names, pushes, strict=True)
-            for key, start, push in zip(("q0_rad", "qd0_rad_s"), (POSE, (0.0, 0.0)), both, strict=True)
+            for key, start, push in zip(
+                ("q0_rad", "qd0_rad_s"), (POSE, (0.0, 0.0)), both, strict=True
+            )
         },
     )
     step_s = (loop.found.span_s or 0.05) * math.ceil(0.2 / (loop.found.span_s or 0.05))
@@ -67,7 +77,9 @@ def measure_growth(loop: Loop, push_rad: float, from_s: float, to_s: float) -> f
     seen = []
     for name, one, other in zip(whole.names, speeds(whole), speeds(beside), strict=True):
         ticks = np.rint(k * step_s * whole.sites[name].rate_hz).astype(int)
-        seen.append((one - other)[ticks] * np.exp(-loop.growth_per_s * k * step_s)[:, np.newaxis])
+        seen.append(
+            (one - other)[ticks] * np.exp(-loop.growth_per_s * k * step_s)[:, np.newaxis]
+        )
     rows = np.concatenate(seen, axis=1)  # of one size, to weigh alike
     before = np.concatenate(
         [
@@ -125,7 +137,11 @@ def draw_loop(seed: int) -> tuple[Loop, float, float, float] | None:
             if rng.random() < 0.5
             else {"order": "in_order"}
         )
-    changes = {"scheme": str(rng.choice(["second_order", "digital"])), "control": control, "link": link}
+    changes = {
+        "scheme": str(rng.choice(["second_order", "digital"])),
+        "control": control,
+        "link": link,
+    }
     for n, site in enumerate(sites):
         changes[f"sites.{site}.rate_hz"] = int(rates[n if seed % 5 < 3 else 0])
     loop = at_rest(name, changes, 6)
@@ -164,9 +180,13 @@ def test_twins_of_sixty_loops_grow_as_the_roots_say() -> None:
 
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law["law"])
 @pytest.mark.parametrize("delay_ms", [0.0, 30.0, 200.0])
-def test_at_one_rate_they_are_eigenvalues_of_companion_matrix(law: dict[str, Any], delay_ms: float) -> None:
+def test_at_one_rate_they_are_eigenvalues_of_companion_matrix(
+    law: dict[str, Any], delay_ms: float
+) -> None:
     damped = {} if law["law"] == "adaptive" else {"d": 1.3}
-    loop = at_rest("two_sites", {"rate_hz": 100, "control": {**law, **damped}, "link.delay_ms": delay_ms})
+    loop = at_rest(
+        "two_sites", {"rate_hz": 100, "control": {**law, **damped}, "link.delay_ms": delay_ms}
+    )
     recursion = build_recursion(
         derive_operating_conditions(loop.scenario), find_equilibrium(loop.scenario, POSE)
     )
@@ -214,7 +234,11 @@ def test_sine_pumps_loop_that_its_mean_delay_leaves_stable() -> None:
 @pytest.mark.parametrize("period_s", [1.4, 1.2517, 0.58317])
 def test_the_period_is_that_of_the_draws(period_s: float) -> None:
     """Or, where it is no multiple of the tick, all but a few of a hundred samples are the same again."""
-    changes = {"sites.m.rate_hz": 200, "sites.s.rate_hz": 150, "link": {**SINE, "period_s": period_s}}
+    changes = {
+        "sites.m.rate_hz": 200,
+        "sites.s.rate_hz": 150,
+        "link": {**SINE, "period_s": period_s},
+    }
     conditions = derive_operating_conditions(load_scenario("two_sites", changes))
     uses = find_samples_in_use(conditions)
     assert uses.period_s is not None
@@ -234,14 +258,18 @@ def test_drawn_delays_grow_like_twins_of_the_same_draws() -> None:
     assert loop.found.deviation_per_s is not None
     assert 1e-3 < loop.found.deviation_per_s < 0.02
     beside = load_scenario(loop.scenario, {"sites.s.q0_rad": [POSE[0] + 1e-7, 0.0]})
-    apart = np.hstack([a - b for a, b in zip(speeds(loop.scenario), speeds(beside), strict=True)])
+    apart = np.hstack(
+        [a - b for a, b in zip(speeds(loop.scenario), speeds(beside), strict=True)]
+    )
     first, last = (np.linalg.norm(apart[from_s * 100 :][:300]) for from_s in (2, 27))
     assert math.log(last / first) / 25.0 == pytest.approx(
         loop.growth_per_s, abs=3.0 * loop.found.deviation_per_s
     )
 
 
-def test_what_drifts_at_any_delays_is_told_from_what_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_drifts_at_any_delays_is_told_from_what_stays(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A free mass, and one that follows it: a shared place stays, and both may go on at one speed."""
     h, K, d = 0.01, 4.0, 3.0
     S = np.eye(4)
@@ -263,7 +291,9 @@ def test_what_drifts_at_any_delays_is_told_from_what_stays(monkeypatch: pytest.M
 def test_loop_that_grows_thousandfold_in_tick_has_its_root() -> None:
     control = {"law": "p_d", "K": 1.0, "d": 1e5}
     loop = at_rest(
-        "two_sites", {"rate_hz": 1000, "scheme": "digital", "control": control, "link.delay_ms": 20.0}, 1
+        "two_sites",
+        {"rate_hz": 1000, "scheme": "digital", "control": control, "link.delay_ms": 20.0},
+        1,
     )
     recursion = build_recursion(
         derive_operating_conditions(loop.scenario), find_equilibrium(loop.scenario, POSE)

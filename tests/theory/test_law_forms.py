@@ -31,7 +31,9 @@ HELD = {**CLAMP, "stiffness_nm_rad": 50.0, "damping_nm_s_rad": 10.0}
 
 
 def loop_of(scenario: Scenario) -> LinearLoop:
-    return linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, (0.0, 0.0)))
+    return linearise_loop(
+        derive_operating_conditions(scenario), find_equilibrium(scenario, (0.0, 0.0))
+    )
 
 
 def felt(loop: LinearLoop, s: complex, site: int = 0) -> complex:
@@ -73,7 +75,9 @@ def wave_pair(wall: float = 0.0, held: bool = True) -> Scenario:
     slave = {"law": "wave", "b": b, "K": K, "B": b}
     env = [{**CLAMP, "stiffness_nm_rad": wall}] if wall else []
     sites = {"m": {"hands": [HELD] if held else []}, "s": {"hands": env, "control": slave}}
-    return unit_scenario(sites, {"law": "wave", "b": b}, link={"model": "constant", "delay_ms": 1e3 * T})
+    return unit_scenario(
+        sites, {"law": "wave", "b": b}, link={"model": "constant", "delay_ms": 1e3 * T}
+    )
 
 
 @pytest.mark.parametrize("wall", [pytest.param(0.0, marks=pytest.mark.long), 1000.0])
@@ -84,11 +88,18 @@ def test_roots_of_a_wave_line_are_those_of_its_delays(wall: float) -> None:
         ours = []
         for root in spectrum.roots:
             step = wave_equation(root.s, mass, wall) / (
-                (wave_equation(root.s + 1e-6, mass, wall) - wave_equation(root.s - 1e-6, mass, wall)) / 2e-6
+                (
+                    wave_equation(root.s + 1e-6, mass, wall)
+                    - wave_equation(root.s - 1e-6, mass, wall)
+                )
+                / 2e-6
             )
             if abs(step) < 1e-7 * (1.0 + abs(root.s)):
                 ours.append(root.s)
-        low, high = complex(max(-4.0, spectrum.roots[-1].s.real + 1e-3), -1e-2), complex(1.0, 30.0)
+        low, high = (
+            complex(max(-4.0, spectrum.roots[-1].s.real + 1e-3), -1e-2),
+            complex(1.0, 30.0),
+        )
         inside = [s for s in ours if s.real > low.real and s.imag < 30.0 and abs(s) > 1e-6]
         equation = partial(wave_equation, mass=mass, wall=wall)
         zeros = count_inside(equation, -1e-3 - 1e-3j, 1e-3 + 1e-3j)
@@ -116,7 +127,9 @@ def test_four_channels_transmit_as_published(variant: str, delay_s: float) -> No
         for hz in (0.1, 0.5, 1.0, 2.0, 5.0)
     ]
     assert found == [printed(value) for value in TABLE[variant, delay_s]]
-    exact = [transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant]) for hz in (0.1, 5.0)]
+    exact = [
+        transmitted(hz, PAIR, 0, delay_s=delay_s, **VARIANTS[variant]) for hz in (0.1, 5.0)
+    ]
     assert [found[0], found[-1]] == pytest.approx(exact, rel=1e-9)
 
 
@@ -131,14 +144,22 @@ def test_roots_of_four_channels_with_delay_solve_their_equation(acceleration: fl
         return complex(np.linalg.det(balance(s, PAIR, delay_s=0.02, loads=loads, **law)[0]))
 
     roots = [root.s for root in compute_delay_spectrum(loop_of(scenario), 12).roots]
-    on_line = [s for s in roots if abs(f(s) / ((f(s + 1e-6) - f(s - 1e-6)) / 2e-6)) < 1e-7 * (1.0 + abs(s))]
+    on_line = [
+        s
+        for s in roots
+        if abs(f(s) / ((f(s + 1e-6) - f(s - 1e-6)) / 2e-6)) < 1e-7 * (1.0 + abs(s))
+    ]
     assert len(on_line) >= 3
     edge = max(s.real for s in on_line)
     low, high = complex(edge - 1.0, -0.01), complex(edge + 50.0, 400.0)
-    assert sum(s.real > edge - 1.0 and s.imag < 400.0 for s in on_line) == count_inside(f, low, high)
+    assert sum(s.real > edge - 1.0 and s.imag < 400.0 for s in on_line) == count_inside(
+        f, low, high
+    )
 
 
-@pytest.mark.parametrize(("a", "user", "values"), [(0.25, 0, (0.195, 0.277)), (0.25, 1, (0.373, 0.513))])
+@pytest.mark.parametrize(
+    ("a", "user", "values"), [(0.25, 0, (0.195, 0.277)), (0.25, 1, (0.373, 0.513))]
+)
 def test_six_channels_with_accelerations_share_as_published(
     a: float, user: int, values: tuple[float, float]
 ) -> None:
@@ -151,7 +172,8 @@ def test_six_channels_with_accelerations_share_as_published(
     law = {"law": "six_channel", "K": 100.0, "B": 20.0, "acceleration": 1.0}
     loop = set_common_delay(loop_of(unit_scenario(sites, law, dominance=shares)), 0.0)
     found = [
-        abs(felt(loop, 2j * np.pi * hz, user)) / abs(500.0 / (2j * np.pi * hz) + 5.0) for hz in (0.1, 1.0)
+        abs(felt(loop, 2j * np.pi * hz, user)) / abs(500.0 / (2j * np.pi * hz) + 5.0)
+        for hz in (0.1, 1.0)
     ]
     assert found == [printed(value) for value in values]
 
@@ -164,7 +186,9 @@ def test_predictor_of_true_model_has_roots_of_no_delay() -> None:
     """s^2 + d s + 2 K, and of the slave s^2 + d s + K, along the mass that the model has."""
     law = {"law": "smith", "K": 100.0, "d": 5.0, "inertia": 1.0}
     sites = {"m": {"control": {**law, "predicts": True}}, "s": {}}
-    roots = [root.s for root in compute_delay_spectrum(loop_of(unit_scenario(sites, law)), 16).roots]
+    roots = [
+        root.s for root in compute_delay_spectrum(loop_of(unit_scenario(sites, law)), 16).roots
+    ]
     for stiffness in (100.0, 200.0):
         wanted = np.roots([1.0, 5.0, stiffness]).astype(complex)[0]
         assert min(abs(root - complex(wanted.real, abs(wanted.imag))) for root in roots) < 1e-6
@@ -181,13 +205,17 @@ def test_users_who_share_authority_have_the_roots_of_their_springs() -> None:
     sites = {"u1": {}, "u2": {}, "s": {"control": {**law, "leads": False}}}
     roots = [
         root.s
-        for root in compute_delay_spectrum(loop_of(unit_scenario(sites, law, dominance=shares)), 12).roots
+        for root in compute_delay_spectrum(
+            loop_of(unit_scenario(sites, law, dominance=shares)), 12
+        ).roots
     ]
 
     def users(s: complex) -> complex:
         own = s * s + d * s
         pulls = K_a * alpha[0, 1], K_a * alpha[1, 0]
-        return complex((own + pulls[0]) * (own + pulls[1]) - pulls[0] * pulls[1] * np.exp(-2.0 * s * T))
+        return complex(
+            (own + pulls[0]) * (own + pulls[1]) - pulls[0] * pulls[1] * np.exp(-2.0 * s * T)
+        )
 
     assert sum(solves(users, s) for s in roots) >= 3
     assert any(solves(lambda s: s * s + d * s + K_a, s) for s in roots)
@@ -198,7 +226,9 @@ def test_impedances_have_the_roots_of_their_masses() -> None:
     """Free, with known dynamics, nothing comes back: M s^2 + B s + K at every site."""
     law = {"law": "impedance", "M": 2.0, "B": 10.0, "K": 50.0}
     sites = {"m": {}, "s": {"control": {**law, "follows": True}}}
-    roots = [root.s for root in compute_delay_spectrum(loop_of(unit_scenario(sites, law)), 4).roots]
+    roots = [
+        root.s for root in compute_delay_spectrum(loop_of(unit_scenario(sites, law)), 4).roots
+    ]
     wanted = np.roots([2.0, 10.0, 50.0])[0]
     assert roots
     for root in roots:  # of higher order: slave and master are alike
@@ -214,7 +244,10 @@ def test_synchronised_outputs_have_the_roots_of_their_consensus() -> None:
 
     def consensus(s: complex) -> complex:
         late = np.exp(-s * T)
-        pairs = [(m * s + 3.0 * (1.0 + late)) * (m * s + 3.0 * (1.0 - late)) for m in (1.0, 1.0 / 6.0)]
+        pairs = [
+            (m * s + 3.0 * (1.0 + late)) * (m * s + 3.0 * (1.0 - late))
+            for m in (1.0, 1.0 / 6.0)
+        ]
         return complex(pairs[0] * pairs[1])
 
     others = [root for root in roots if abs(root + 1.0) > 1e-5]
@@ -239,8 +272,12 @@ def test_the_analysis_of_waves_is_whole() -> None:
 def test_arms_that_line_holds_against_hands_are_at_rest_there() -> None:
     """A line between passive ends has no root to the right: its torque balances that of the operator."""
     follows = {"sites.s.control.K": 100.0, "sites.s.control.B": 10.0, "duration_s": 6.0}
-    scenario = load_scenario("two_sites", {"control.law": "wave", "scheme": "digital", **follows})
-    loop = linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, (0.4, 1.2)))
+    scenario = load_scenario(
+        "two_sites", {"control.law": "wave", "scheme": "digital", **follows}
+    )
+    loop = linearise_loop(
+        derive_operating_conditions(scenario), find_equilibrium(scenario, (0.4, 1.2))
+    )
     assert compute_delay_spectrum(loop, 4).roots[0].s.real < -0.1
 
 
@@ -248,8 +285,12 @@ def test_a_pull_that_saturates_is_linearised_where_it_does_not() -> None:
     """Its loop is that of P+d with the same K and d, and the analysis says so."""
     loops = []
     for law in ({"law": "saturated_pd", "P": 5.0}, {"law": "p_d"}):
-        scenario = unit_scenario({"m": {"hands": [HELD]}, "s": {}}, {**law, "K": 10.0, "d": 3.0})
+        scenario = unit_scenario(
+            {"m": {"hands": [HELD]}, "s": {}}, {**law, "K": 10.0, "d": 3.0}
+        )
         found = analyse_linear_loop(scenario, pose=(0.0, 0.0))
         loops.append([root.s for root in found.decisive.roots])
-        assert any("small errors" in note for note in found.notes) == (law["law"] == "saturated_pd")
+        assert any("small errors" in note for note in found.notes) == (
+            law["law"] == "saturated_pd"
+        )
     assert loops[0] == loops[1]

@@ -45,7 +45,9 @@ def test_above_the_edge_it_is_stable_with_a_margin(calm: LinearAnalysis) -> None
 def test_less_damping_than_the_edge_is_unstable() -> None:
     found = analyse_linear_loop("p_d_margin", ["control.d=0.9"], pose=(0.07, 0.23))
     assert found.verdict == "unstable"
-    assert describe_linear_verdict(found).startswith("unstable: the slowest motion goes as exp(0.01")
+    assert describe_linear_verdict(found).startswith(
+        "unstable: the slowest motion goes as exp(0.01"
+    )
 
 
 def test_verdict_is_that_of_loop_as_it_is_computed(digital: LinearAnalysis) -> None:
@@ -54,7 +56,9 @@ def test_verdict_is_that_of_loop_as_it_is_computed(digital: LinearAnalysis) -> N
     assert any("the tick rate decides" in note for note in digital.notes)
 
 
-def test_sampled_roots_stand_beside_where_they_differ(calm: LinearAnalysis, digital: LinearAnalysis) -> None:
+def test_sampled_roots_stand_beside_where_they_differ(
+    calm: LinearAnalysis, digital: LinearAnalysis
+) -> None:
     assert "re as computed" not in tabulate_roots(calm).headers
     cells = tabulate_roots(digital)
     assert cells.headers[5:7] == ("re as computed", "im as computed")
@@ -66,7 +70,10 @@ def test_every_word_has_its_number(calm: LinearAnalysis) -> None:
     told = calm.to_dict()
     assert told["verdict"] == "stable"
     first, *_ = told["continuous"]["roots"]
-    assert tabulate_roots(calm).rows[0][:2] == (f"{first['re_per_s']:.4g}", f"{first['im_rad_s']:.4g}")
+    assert tabulate_roots(calm).rows[0][:2] == (
+        f"{first['re_per_s']:.4g}",
+        f"{first['im_rad_s']:.4g}",
+    )
     assert told["margin"]["words"] in str(calm)
     assert str(told["continuous"]["zeros_by_structure"]) in describe_zero_roots(calm)
     assert list(describe_equilibrium(calm))[1].strip() == "all sites at (0.0700, 0.2300) rad"
@@ -111,7 +118,9 @@ def test_drawn_delays_tell_how_well_their_roots_are_known() -> None:
 def test_what_keeps_its_speed_is_told_from_what_decays() -> None:
     """Over wave lines with springs, the common speed of two joints; the others decay."""
     control = {"law": "wave", "b": 60.0, "K": 50.0, "B": 5.0}
-    found = analyse_linear_loop("two_sites", {"scheme": "digital", "control": control}, pose=POSE)
+    found = analyse_linear_loop(
+        "two_sites", {"scheme": "digital", "control": control}, pose=POSE
+    )
     text = describe_linear_verdict(found)
     assert text.startswith(
         "at the edge: 2 motions keep their speed, and the slowest of the others goes as exp(-0."
@@ -124,7 +133,11 @@ def test_a_line_without_losses_has_no_margin() -> None:
     control = {"law": "wave", "b": 60.0, "K": 0.0}
     given = {"scheme": "digital", "control": control}
     found = analyse_linear_loop("two_sites", given, pose=POSE, ports=True)
-    assert (found.verdict, found.margin.lossless, found.margin.crossings) == ("at the edge", True, ())
+    assert (found.verdict, found.margin.lossless, found.margin.crossings) == (
+        "at the edge",
+        True,
+        (),
+    )
     assert found.margin.words.startswith("none: waves run along lines without losses")
     assert found.ports is not None
 
@@ -156,7 +169,10 @@ def test_of_several_rates_roots_are_exact_and_those_of_scenario() -> None:
 def test_drawn_delays_have_the_roots_of_samples_in_use() -> None:
     """Its last quarter begins 15 s later than the draws of the linear analysis: they are others."""
     run = {"rate_hz": 200, "duration_s": 40.0}
-    found, whole = find_end_pose_roots(tn.simulate("jitter", run)), tn.linear("jitter", run, ports=False)
+    found, whole = (
+        find_end_pose_roots(tn.simulate("jitter", run)),
+        tn.linear("jitter", run, ports=False),
+    )
     assert whole.sampled is not None
     assert whole.sampled.rightmost is not None
     assert (found.verdict, found.exact) == ("stable", False)
@@ -169,5 +185,7 @@ def test_waves_are_told_in_continuous_time() -> None:
     found = find_end_pose_roots(
         tn.simulate("two_sites", {"scheme": "digital", "control": control, "duration_s": 2.0})
     )
-    assert found.text.startswith("this rest: at the edge, 2 of its motions keep their speed, the others -0.")
+    assert found.text.startswith(
+        "this rest: at the edge, 2 of its motions keep their speed, the others -0."
+    )
     assert found.text.endswith(", in continuous time")

@@ -21,7 +21,12 @@ from trilat_net.core.chain import (
     place_joints,
     propagate_motion,
 )
-from trilat_net.core.exogenous import TorqueKind, TorqueSource, put_torque_on_chain, torque_source_rows
+from trilat_net.core.exogenous import (
+    TorqueKind,
+    TorqueSource,
+    put_torque_on_chain,
+    torque_source_rows,
+)
 from trilat_net.core.site_setup import SiteSetup
 from trilat_net.errors import UsageError
 from trilat_net.execution.fused import FusedRun
@@ -35,7 +40,11 @@ from trilat_net.theory.delay_margin import set_common_delay
 from trilat_net.theory.equilibrium import predict_equilibrium
 from trilat_net.theory.floquet import compute_sampled_spectrum
 from trilat_net.theory.linear_loop import LinearLoop, linearise_loop
-from trilat_net.theory.operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from trilat_net.theory.operating_point import (
+    Equilibrium,
+    OperatingConditions,
+    derive_operating_conditions,
+)
 from trilat_net.theory.port_analysis import analyse_ports, linearise_teleoperator
 from trilat_net.theory.port_response import build_admittance
 from trilat_net.theory.site_dynamics import (
@@ -49,8 +58,18 @@ LOADED = [2, 3, 4, 5, 6]
 """Joints of arm6 that gravity loads: not the first, whose axis is upright."""
 TEXT = two_arms("arm6.urdf", POSE, 20.0, 50.0, [0.2, 0.2, 0.2, 0.05, 0.05, 0.05])
 LAWS: dict[str, dict[str, Any]] = {
-    "adaptive": {"law": "adaptive", "Gamma": 3.0, "Lambda": 2.0, "Kp": [8, 0.5, 3, 1, 1, 1], "Kd": 1.0},
-    "p_d": {"law": "p_d", "K": [60.0, 60.0, 60.0, 12.0, 12.0, 12.0], "d": [6.0, 6.0, 6.0, 0.7, 0.7, 0.7]},
+    "adaptive": {
+        "law": "adaptive",
+        "Gamma": 3.0,
+        "Lambda": 2.0,
+        "Kp": [8, 0.5, 3, 1, 1, 1],
+        "Kd": 1.0,
+    },
+    "p_d": {
+        "law": "p_d",
+        "K": [60.0, 60.0, 60.0, 12.0, 12.0, 12.0],
+        "d": [6.0, 6.0, 6.0, 0.7, 0.7, 0.7],
+    },
 }
 """Laws in which something swings: learnt gravity, or a spring with little damping."""
 
@@ -69,12 +88,18 @@ class Linear(NamedTuple):
 def six(law: str, off: Array | None = None, **overrides: Any) -> Linear:
     """Sites that start at the pose, or off it by (2, 6) rad."""
     start = POSE + (np.zeros((2, 6)) if off is None else off)
-    given = {"control": LAWS[law], "sites.m.q0_rad": start[0].tolist(), "sites.s.q0_rad": start[1].tolist()}
+    given = {
+        "control": LAWS[law],
+        "sites.m.q0_rad": start[0].tolist(),
+        "sites.s.q0_rad": start[1].tolist(),
+    }
     plain = parse_scenario(TEXT, "six", given | overrides, ARMS)
     theta = plain.arms["m"].theta.tolist()
     learns = {"control": {**LAWS[law], "theta_hat0": theta}} if law == "adaptive" else {}
     scenario = parse_scenario(TEXT, "six", given | overrides | learns, ARMS)
-    return Linear(scenario, derive_operating_conditions(scenario), find_equilibrium(scenario, POSE))
+    return Linear(
+        scenario, derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+    )
 
 
 def follow(scenario: Scenario, ticks: int) -> Array:
@@ -118,12 +143,17 @@ def test_rates_and_their_derivatives_are_those_of_the_compiled_leaves() -> None:
     wall = {"a": (0.0, 0.0, 0.5), "K": (300.0,), "B": (5.0,)}
     actors = (
         TorqueSource(TorqueKind.HAND, b=tuple(rng.normal(size=6)), K=(20.0,) * 6, B=(2.0,) * 6),
-        TorqueSource(TorqueKind.TASK_HAND, b=(0.3, 0.2, 0.4), K=(90.0, 60.0, 30.0), B=(9.0, 6.0, 3.0)),
+        TorqueSource(
+            TorqueKind.TASK_HAND, b=(0.3, 0.2, 0.4), K=(90.0, 60.0, 30.0), B=(9.0, 6.0, 3.0)
+        ),
         TorqueSource(TorqueKind.VISCOUS, B=(0.5,) * 6, sampled=True),
         TorqueSource(TorqueKind.WALL, b=tuple(normal), **wall),
         TorqueSource(TorqueKind.WALL, b=tuple(-normal), **wall, sampled=True),
     )
-    site, at = six("adaptive").scenario.setup("m")._replace(actors=actors), ArgumentLayout(6, 60)
+    site, at = (
+        six("adaptive").scenario.setup("m")._replace(actors=actors),
+        ArgumentLayout(6, 60),
+    )
     for _ in range(3):
         x = rng.uniform(-1.0, 1.0, at.arguments)
         rates, exact = evaluate_site_rates(site, x), differentiate_site_rates(site, x)
@@ -133,7 +163,9 @@ def test_rates_and_their_derivatives_are_those_of_the_compiled_leaves() -> None:
         for k in range(at.arguments):
             off = 1e-5 * np.eye(at.arguments)[k]
             difference = (by_leaves(site, x + off, at) - by_leaves(site, x - off, at)) / 2e-5
-            assert np.abs(difference - jacobian[:, k]).max() <= 1e-6 * (1.0 + np.abs(wanted).max())
+            assert np.abs(difference - jacobian[:, k]).max() <= 1e-6 * (
+                1.0 + np.abs(wanted).max()
+            )
 
 
 def test_learnt_gravity_stands_for_all_estimates() -> None:
@@ -160,7 +192,9 @@ def test_no_root_at_zero_hides_the_rightmost_one() -> None:
     loop = case.loop()
     found = compute_delay_spectrum(loop, 3)
     assert (found.zeros, found.drifting) == (loop.left_out + 6, 0)
-    assert all(residual(case.loop(every_estimate=True), root.s) <= 1e-12 for root in found.roots)
+    assert all(
+        residual(case.loop(every_estimate=True), root.s) <= 1e-12 for root in found.roots
+    )
     # no other root is to the right of the third
     edge = found.roots[2].s.real - 0.05
     right = sum(2 if root.s.imag else 1 for root in found.roots)
@@ -209,7 +243,10 @@ def test_a_run_moves_as_the_delay_equation_says(law: str) -> None:
 @pytest.mark.parametrize("law", LAWS)
 def test_a_run_decays_as_its_rightmost_root_says(law: str) -> None:
     """Late in a run of 200 Hz one mode is left: its root is fitted to joint 2, a recurrence of two steps."""
-    pushed = {"sites.m.qd0_rad_s": (1e-3 * OFF[0]).tolist(), "sites.s.qd0_rad_s": (5e-4 * OFF[0]).tolist()}
+    pushed = {
+        "sites.m.qd0_rad_s": (1e-3 * OFF[0]).tolist(),
+        "sites.s.qd0_rad_s": (5e-4 * OFF[0]).tolist(),
+    }
     case = six(law, rate_hz=200, **pushed)
     found = compute_sampled_spectrum(case.conditions, case.rest, 2)
     assert found is not None
@@ -228,12 +265,16 @@ def test_a_joint_answers_a_sinusoid_as_its_admittance_says() -> None:
     """A torque on joint 3 of m in a run of P+d: the motion of all twelve joints."""
     w_rad_s, amplitude_nm, rate_hz, settled_s = 2.0 * np.pi, 0.05, 500, 14.0
     case = six("p_d", rate_hz=rate_hz)
-    Y = build_admittance(linearise_teleoperator(case.conditions, case.rest))(np.array([w_rad_s]))[0, :, 2]
+    Y = build_admittance(linearise_teleoperator(case.conditions, case.rest))(
+        np.array([w_rad_s])
+    )[0, :, 2]
     t_s = np.arange(0.0, 21.0, 0.002)
     points = np.zeros((len(t_s), 7))
     points[:, 0], points[:, 3] = t_s, amplitude_nm * np.sin(w_rad_s * t_s)
     hands = [{"kind": "recorded", "points": points.tolist()}]
-    made = follow(six("p_d", rate_hz=rate_hz, **{"sites.m.hands": hands}).scenario, 18 * rate_hz)
+    made = follow(
+        six("p_d", rate_hz=rate_hz, **{"sites.m.hands": hands}).scenario, 18 * rate_hz
+    )
     late = np.arange(round(settled_s * rate_hz), len(made))
     turned = w_rad_s * (late + 1) / rate_hz
     columns = np.column_stack([np.sin(turned), np.cos(turned), np.ones_like(turned), turned])
@@ -252,7 +293,9 @@ def test_the_law_is_passive_in_r_for_six_joints() -> None:
     assert [joint for joint, one in ports.joints.items() if not one.passive] == LOADED
     assert [one.joint for one in ports.transparency] == [1, 2, 3, 4, 5, 6]
     assert len(ports.two_ports) == 6
-    assert sum("joint 2, 3, 4, 5, 6: fails within" in line for line in describe_ports(ports)) == 1
+    assert (
+        sum("joint 2, 3, 4, 5, 6: fails within" in line for line in describe_ports(ports)) == 1
+    )
 
 
 def test_a_pose_has_an_angle_for_each_joint() -> None:
@@ -272,7 +315,10 @@ def test_bound_of_p_d_holds_for_arms_of_six_joints() -> None:
     assert found.excess == pytest.approx(0.1)
     assert compute_delay_spectrum(damped(1.05).loop(), 1).verdict == "stable"
     edge = next(
-        iterate_linear_edges(damped(1.0).scenario, "control.d", 0.3, 1.2, damped(1.0).rest, points=4), None
+        iterate_linear_edges(
+            damped(1.0).scenario, "control.d", 0.3, 1.2, damped(1.0).rest, points=4
+        ),
+        None,
     )
     assert edge is not None
     assert 0.8 < edge.value < 1.0

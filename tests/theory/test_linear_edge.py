@@ -48,18 +48,24 @@ def least_damping(scenario: Scenario, K: float, T: float, share: float) -> float
 @pytest.mark.parametrize(
     "delay_ms", [200.0, *(pytest.param(ms, marks=pytest.mark.long) for ms in (20.0, 400.0))]
 )
-def test_p_d_turns_stable_where_its_mode_stands(name: str, share: float, delay_ms: float) -> None:
+def test_p_d_turns_stable_where_its_mode_stands(
+    name: str, share: float, delay_ms: float
+) -> None:
     scenario = load_scenario(name, {"link.delay_ms": delay_ms})
     T = delay_ms / 1e3
     line = share * 10.0 * T
-    found = next(iterate_linear_edges(scenario, "control.d", 0.3 * line, 1.5 * line, points=8), None)
+    found = next(
+        iterate_linear_edges(scenario, "control.d", 0.3 * line, 1.5 * line, points=8), None
+    )
     assert found is not None
     assert found.stable_above
     assert found.value == pytest.approx(least_damping(scenario, 10.0, T, share), rel=1e-4)
     assert found.value < line  # the line leaves the inertia out: it is on the safe side
 
 
-def heavy_pair(seed: int, ratio: Callable[[float, float, float, float], float]) -> tuple[Scenario, Array]:
+def heavy_pair(
+    seed: int, ratio: Callable[[float, float, float, float], float]
+) -> tuple[Scenario, Array]:
     """Two sites with random gains and delays whose arms are so heavy that K T^2 << M, and these.
 
     These: K1, K2, T1 + T2, d1, d2. d2 is that of the line 4 d1 d2 = (T1 + T2)^2 K1 K2; `ratio` says how
@@ -77,10 +83,14 @@ def heavy_pair(seed: int, ratio: Callable[[float, float, float, float], float]) 
         arms |= {f"sites.{site}.arm.{key}": kg / 12.0 for key in ("I1_kg_m2", "I2_kg_m2")}
     links = {"links.m->s.delay_ms": T1_ms, "links.s->m.delay_ms": T2_ms}
     gains = {"sites.m.control.K": K1, "sites.s.control.K": K2, "sites.m.control.d": d1}
-    return load_scenario("p_d_margin_two", {**arms, **links, **gains}), np.array([K1, K2, T, d1, d2])
+    return load_scenario("p_d_margin_two", {**arms, **links, **gains}), np.array(
+        [K1, K2, T, d1, d2]
+    )
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 2, 3))])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 2, 3))]
+)
 def test_two_sites_turn_stable_at_4_d_d(seed: int) -> None:
     """4 d1 d2 = (T1 + T2)^2 K1 K2, where M2/M1 is the ratio that needs the most damping."""
 
@@ -89,18 +99,23 @@ def test_two_sites_turn_stable_at_4_d_d(seed: int) -> None:
         return (K2 + both * math.sqrt(d2 / d1)) / (K1 + both * math.sqrt(d1 / d2))
 
     scenario, (*_, d2) = heavy_pair(seed, worst)
-    found = next(iterate_linear_edges(scenario, "sites.s.control.d", 0.8 * d2, 1.3 * d2, points=3), None)
+    found = next(
+        iterate_linear_edges(scenario, "sites.s.control.d", 0.8 * d2, 1.3 * d2, points=3), None
+    )
     assert found is not None
     assert found.value == pytest.approx(d2, rel=1e-3)
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 2, 3))])
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(n, marks=pytest.mark.long) for n in (1, 2, 3))]
+)
 def test_two_like_arms_turn_stable_at_their_round_trip(seed: int) -> None:
     """d1/K2 + d2/K1 = T1 + T2: no more than 4 d1 d2 asks for, by two means of the terms."""
     scenario, (K1, K2, T, d1, d2) = heavy_pair(seed, lambda *_: 1.0)
     exact = K1 * (T - d1 / K2)
     found = next(
-        iterate_linear_edges(scenario, "sites.s.control.d", 0.7 * exact, 1.4 * exact, points=3), None
+        iterate_linear_edges(scenario, "sites.s.control.d", 0.7 * exact, 1.4 * exact, points=3),
+        None,
     )
     assert found is not None
     assert found.value == pytest.approx(exact, rel=1e-3)
@@ -117,7 +132,11 @@ def test_digital_controller_has_least_rate_where_continuous_loop_has_none() -> N
     assert 100 < found.value < 125
     assert found.stable_above
     assert (
-        next(iterate_linear_edges(scenario, "rate_hz", 60, 400, rest, points=6, sampled=False), None) is None
+        next(
+            iterate_linear_edges(scenario, "rate_hz", 60, 400, rest, points=6, sampled=False),
+            None,
+        )
+        is None
     )
 
 
@@ -131,7 +150,9 @@ def test_every_edge_is_found_and_none_where_nothing_changes() -> None:
     assert 200 < found[0].value < 230
 
 
-@pytest.mark.parametrize(("low", "high"), [(2.0, 1.0), (1.0, 1.0), (float("nan"), 1.0), (0.0, float("inf"))])
+@pytest.mark.parametrize(
+    ("low", "high"), [(2.0, 1.0), (1.0, 1.0), (float("nan"), 1.0), (0.0, float("inf"))]
+)
 def test_a_range_that_is_none_is_refused(low: float, high: float) -> None:
     with pytest.raises(UsageError, match=r"control\.d is scanned from a value to a larger one"):
         next(iterate_linear_edges(load_scenario("p_d_margin"), "control.d", low, high), None)
@@ -153,7 +174,9 @@ def test_the_real_part_is_that_of_the_analysis() -> None:
     found, _, remarks = compute_growth_column([damped(d) for d in D], "control.d", D)
     assert remarks == []
     for d, growth in zip(D, found, strict=True):
-        root = analyse_linear_loop(damped(d), pose=(1.0 / 15.0, 7.0 / 30.0)).continuous.rightmost
+        root = analyse_linear_loop(
+            damped(d), pose=(1.0 / 15.0, 7.0 / 30.0)
+        ).continuous.rightmost
         assert root is not None
         assert growth == pytest.approx(root.s.real, abs=1e-9)
 
@@ -163,7 +186,9 @@ def test_an_edge_is_where_the_sign_changes() -> None:
     (found,), remark = find_root_crossings(damped(3.0), "control.d", 0.3, 3.0)
     assert remark == ""
     places = (found - 1e-4, found + 1e-4)
-    (below, above), edges, _ = compute_growth_column([*map(damped, places)], "control.d", places)
+    (below, above), edges, _ = compute_growth_column(
+        [*map(damped, places)], "control.d", places
+    )
     assert below > 0.0 > above
     assert edges == {0: pytest.approx(found, rel=1e-6)}
     alone = next(iterate_linear_edges(damped(3.0), "control.d", 0.3, 3.0), None)
@@ -174,7 +199,10 @@ def test_an_edge_is_where_the_sign_changes() -> None:
 def test_the_scheme_decides_which_loop_counts() -> None:
     """Without delay the continuous loop of the paper's law is stable at any rate; as computed it is not."""
     slow: dict[str, Any] = {"link.delay_ms": 0.0, "rate_hz": 50}
-    schemes = [load_scenario("free", {**slow, "scheme": scheme}) for scheme in ("second_order", "digital")]
+    schemes = [
+        load_scenario("free", {**slow, "scheme": scheme})
+        for scheme in ("second_order", "digital")
+    ]
     found = [compute_growth_column([one], "link.delay_ms", (0.0,)) for one in schemes]
     (continuous,), (digital,) = (one.growth_per_s for one in found)
     assert continuous < 0.0 < digital
@@ -183,7 +211,9 @@ def test_the_scheme_decides_which_loop_counts() -> None:
 
 def test_what_has_no_linear_loop_is_told_and_not_known() -> None:
     unknown = load_scenario("p_d_margin", {"link.model": "measured"})
-    found, edges, remarks = compute_growth_column([unknown, damped(3.0)], "control.d", (2.9, 3.0))
+    found, edges, remarks = compute_growth_column(
+        [unknown, damped(3.0)], "control.d", (2.9, 3.0)
+    )
     assert edges == {}
     assert np.isnan(found[0])
     assert found[1] < 0.0

@@ -33,14 +33,17 @@ def rightmost(overrides: dict[str, float]) -> complex:
 
 def test_states_inputs_and_outputs_are_in_order_of_scenario() -> None:
     scenario = load_scenario("contact")
-    found = linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.6, 1.8)))
+    found = linearise_loop(
+        derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.6, 1.8))
+    )
     assert found.names == ("m.q1", "m.q2", "m.qd1", "m.qd2", "s.q1", "s.q2", "s.qd1", "s.qd2")
     assert found.inputs == ("m.tau1", "m.tau2", "s.tau1", "s.tau2")
     assert found.outputs == ("m.qd1", "m.qd2", "s.qd1", "s.qd2")
     assert found.C @ np.arange(8.0) == pytest.approx([2.0, 3.0, 6.0, 7.0])
     (delayed,) = found.delayed
     assert delayed.delay_s == 0.2
-    assert delayed.B[2:4, 2:4] == pytest.approx(found.B[2:4, :2])  # k_f = 1: felt as if it were at the hand
+    # k_f = 1: felt as if it were at the hand
+    assert delayed.B[2:4, 2:4] == pytest.approx(found.B[2:4, :2])
     assert not delayed.B[4:].any()
 
 
@@ -49,16 +52,25 @@ def test_an_adaptive_site_has_its_estimate_among_its_states() -> None:
     names = linearise_loop(
         derive_operating_conditions(scenario), find_equilibrium(scenario, (0.1, 0.2))
     ).names
-    assert names[:9] == ("m.q1", "m.q2", "m.qd1", "m.qd2", *(f"m.theta{p}" for p in range(1, 6)))
+    assert names[:9] == (
+        "m.q1",
+        "m.q2",
+        "m.qd1",
+        "m.qd2",
+        *(f"m.theta{p}" for p in range(1, 6)),
+    )
 
 
 def test_links_of_different_delays_have_an_entry_each() -> None:
     scenario = load_scenario("free", {"links.m1->s.delay_ms": 50.0})
-    found = linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, POSE))
+    found = linearise_loop(
+        derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+    )
     assert [delayed.delay_s for delayed in found.delayed] == [0.05, 0.2]
     both = found.delayed[0].A + found.delayed[1].A
     alike = linearise_loop(
-        derive_operating_conditions(load_scenario("free")), find_equilibrium(load_scenario("free"), POSE)
+        derive_operating_conditions(load_scenario("free")),
+        find_equilibrium(load_scenario("free"), POSE),
     )
     assert both == pytest.approx(alike.delayed[0].A)
 
@@ -77,8 +89,12 @@ def test_the_rightmost_root_of_rods(delay_ms: float, re: float) -> None:
 
 def test_no_delay_at_all_is_the_limit_of_one_tick() -> None:
     scenario = load_scenario("free", {"link.delay_ms": 0.0})
-    found = linearise_loop(derive_operating_conditions(scenario), find_equilibrium(scenario, POSE))
-    tick, none = (compute_delay_spectrum(set_common_delay(found, T), 1).roots[0].s for T in (1e-3, 0.0))
+    found = linearise_loop(
+        derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+    )
+    tick, none = (
+        compute_delay_spectrum(set_common_delay(found, T), 1).roots[0].s for T in (1e-3, 0.0)
+    )
     tenth = compute_delay_spectrum(set_common_delay(found, 1e-4), 1).roots[0].s
     assert abs(tick - none) < 0.05
     assert abs(tenth - none) == pytest.approx(0.1 * abs(tick - none), rel=0.1)
@@ -128,7 +144,10 @@ def test_an_unstable_rest_with_wrong_estimates_is_left_for_another() -> None:
     run = FusedRun(late)
     run.advance(late.duration_s)
     speeds = np.max([site[:, 1] for site in run.maxima], axis=0)
-    at = {t_s: speeds[(t_s - 1) * BUCKETS_PER_S : t_s * BUCKETS_PER_S].max() for t_s in (60, 100, 200, 400)}
+    at = {
+        t_s: speeds[(t_s - 1) * BUCKETS_PER_S : t_s * BUCKETS_PER_S].max()
+        for t_s in (60, 100, 200, 400)
+    }
     assert root.real > 0.02
     assert math.log(at[100] / at[60]) / 40.0 == pytest.approx(root.real, rel=0.05)
     assert at[400] < 0.2 * at[200]

@@ -53,10 +53,25 @@ LAWS: dict[str, dict[str, Any]] = {
         "Kd": [4, 3, 6],
         "Gamma": 2.0,
     },
-    "pd_d": {"law": "pd_d", "K": [60.0, 40.0, 50.0], "Kd": [3.0, 5.0, 4.0], "d": [9.0, 8.0, 7.0]},
-    "p_f": {"law": "p_f", "K": [60.0, 40.0, 50.0], "d": [9.0, 8.0, 7.0], "k_f": [0.2, 0.3, 0.1]},
+    "pd_d": {
+        "law": "pd_d",
+        "K": [60.0, 40.0, 50.0],
+        "Kd": [3.0, 5.0, 4.0],
+        "d": [9.0, 8.0, 7.0],
+    },
+    "p_f": {
+        "law": "p_f",
+        "K": [60.0, 40.0, 50.0],
+        "d": [9.0, 8.0, 7.0],
+        "k_f": [0.2, 0.3, 0.1],
+    },
 }
-HAND = {"kind": "spring", "stiffness_nm_rad": [20.0, 30.0, 10.0], "damping_nm_s_rad": 2.0, "to_rad": 0.0}
+HAND = {
+    "kind": "spring",
+    "stiffness_nm_rad": [20.0, 30.0, 10.0],
+    "damping_nm_s_rad": 2.0,
+    "to_rad": 0.0,
+}
 
 
 def cartesian(law: str, space: str) -> Scenario:
@@ -84,7 +99,9 @@ def test_where_task_space_is_joint_space_all_answers_are_one(law: str) -> None:
         loop = linearise_loop(conditions, rest)
         spectrum = compute_delay_spectrum(loop, 12)
         sampled = compute_sampled_spectrum(conditions, rest, 12)
-        Y = build_admittance(linearise_teleoperator(conditions, rest))(np.array([0.1, 3.0, 40.0]))
+        Y = build_admittance(linearise_teleoperator(conditions, rest))(
+            np.array([0.1, 3.0, 40.0])
+        )
         found.append((rest.q, loop, spectrum, sampled, Y))
     (q, loop, one, sampled, Y), (q_task, loop_task, other, sampled_task, Y_task) = found
     assert q_task == pytest.approx(q, abs=1e-12)
@@ -106,11 +123,16 @@ def start_near(scenario: Scenario, rest: Equilibrium, off: dict[str, float]) -> 
         counts = scenario.arms[name].counts
 
         def put(kind: str, values: Array, name: str = name) -> list[float]:
-            return [value + off.get(f"{name}.{kind}{n}", 0.0) for n, value in enumerate(values.tolist(), 1)]
+            return [
+                value + off.get(f"{name}.{kind}{n}", 0.0)
+                for n, value in enumerate(values.tolist(), 1)
+            ]
 
         changes[f"sites.{name}.q0_rad"] = put("q", q[: counts.joints])
         changes[f"sites.{name}.qd0_rad_s"] = put("qd", 0.0 * q[: counts.joints])
-        changes[f"sites.{name}.control.theta_hat0"] = put("theta", theta_hat[: counts.parameters])
+        changes[f"sites.{name}.control.theta_hat0"] = put(
+            "theta", theta_hat[: counts.parameters]
+        )
         if scenario.sites[name].task.posture_rate_1_s:
             changes[f"sites.{name}.task.posture_rad"] = q[: counts.joints].tolist()
     return load_scenario(scenario, changes)
@@ -140,13 +162,19 @@ def settled(name: str) -> tuple[Scenario, Equilibrium]:
     """A scenario at the mean of its start poses, with estimates that are true."""
     texts = {"planar": planar_task(), "posed": posed_arms()}
     light = {"control.Kp": 2.0, "control.Gamma": 5.0} if name == "posed" else {}
-    scenario = parse_scenario(texts[name], name, light, ARMS) if name in texts else load_scenario(name)
+    scenario = (
+        parse_scenario(texts[name], name, light, ARMS) if name in texts else load_scenario(name)
+    )
     rest = find_equilibrium(scenario, find_mean_pose(scenario))
     return start_near(scenario, rest, {}), rest
 
 
 cases = pytest.mark.parametrize(
-    "name", ["planar", *(pytest.param(name, marks=pytest.mark.long) for name in ("unlike_arms", "posed"))]
+    "name",
+    [
+        "planar",
+        *(pytest.param(name, marks=pytest.mark.long) for name in ("unlike_arms", "posed")),
+    ],
 )
 
 
@@ -155,12 +183,18 @@ def test_small_deviation_goes_tick_by_tick_as_run_does(name: str) -> None:
     """The companion matrix carries it on; theta_0 = eta_0 + h/2 f_0, and tau_-1 = tau_0."""
     (scenario, rest), rng, size = settled(name), np.random.default_rng(1), 1e-6
     counts = [scenario.arms[site].counts.joints for site in scenario.names]
-    angles = [f"{site}.q{n + 1}" for site, n in zip(scenario.names, counts, strict=True) for n in range(n)]
+    angles = [
+        f"{site}.q{n + 1}"
+        for site, n in zip(scenario.names, counts, strict=True)
+        for n in range(n)
+    ]
     off = {angle: size * rng.normal() for angle in angles}
     whole, names, late, _ = build_recursion(derive_operating_conditions(scenario), rest)
     start = np.array([off.get(name, 0.0) for name in names])
     X = np.concatenate([start, np.tile(start[late], (len(whole) - len(names)) // len(late))])
-    learnt, torques = ([n for n, one in enumerate(names) if kind in one] for kind in (".gravity", ".tau"))
+    learnt, torques = (
+        [n for n, one in enumerate(names) if kind in one] for kind in (".gravity", ".tau")
+    )
     X[learnt] -= 0.5 * ((whole @ X)[learnt] - X[learnt])
     X[torques] = (whole @ X)[torques]
     made = follow(start_near(scenario, rest, off), rest, 1e-3, 300)
@@ -188,7 +222,9 @@ def test_a_run_decays_and_swings_as_its_roots_say(name: str) -> None:
         vector *= 1e-5 / vector[np.abs(vector).argmax()]
         off = dict(zip(names, vector.real.tolist(), strict=True))
         step_s = 0.3 / abs(s)
-        measured = realise(follow(start_near(scenario, rest, off), rest, step_s, 60), step_s, 16)
+        measured = realise(
+            follow(start_near(scenario, rest, off), rest, step_s, 60), step_s, 16
+        )
         assert np.abs(measured - s).min() <= 0.01 * abs(s), (s, measured)
 
 
@@ -218,7 +254,9 @@ def test_edges_margins_and_verdict_are_those_of_one_loop() -> None:
     there = compute_delay_spectrum(set_common_delay(found.loop, end.delay_s), 1).rightmost
     assert there is not None
     assert there.s == pytest.approx(1j * end.omega_rad_s, abs=1e-6 * end.omega_rad_s)
-    edge = next(iterate_linear_edges(scenario, "control.d", 2.0, 20.0, found.rest, points=5), None)
+    edge = next(
+        iterate_linear_edges(scenario, "control.d", 2.0, 20.0, found.rest, points=5), None
+    )
     assert edge is not None
     for d, verdict in ((0.99 * edge.value, "unstable"), (1.01 * edge.value, "stable")):
         beside = load_scenario(scenario, {"control.d": d})
@@ -230,7 +268,9 @@ def test_poses_that_have_no_loop_are_refused_by_name() -> None:
     with pytest.raises(ScenarioError, match="rests in a singular pose") as refused:
         find_equilibrium(scenario, (2.0, 0.0, 0.0))
     assert refused.value.path == "sites.m.task.axes"
-    with pytest.raises(ScenarioError, match=r"sites\.m\.q0_rad: its end effector does not reach the pose"):
+    with pytest.raises(
+        ScenarioError, match=r"sites\.m\.q0_rad: its end effector does not reach the pose"
+    ):
         find_equilibrium(scenario, (2.5, 0.0, 0.0))
     with pytest.raises(UsageError, match="pose is a place in m of the end effectors"):
         find_equilibrium(scenario, (2.5, 0.0))

@@ -22,7 +22,9 @@ POSE = (0.3, 0.2)
 
 
 def linear(law: Any, name: str = "p_d_margin", **more: Any) -> LinearAnalysis:
-    return tn.linear(name, {"control": {"law": law, **more.pop("gains", {})}, **more}, pose=POSE, ports=False)
+    return tn.linear(
+        name, {"control": {"law": law, **more.pop("gains", {})}, **more}, pose=POSE, ports=False
+    )
 
 
 def roots(found: Spectrum) -> Array:
@@ -37,8 +39,13 @@ def test_p_d_of_ones_own_has_roots_of_p_d(law: type, scheme: str) -> None:
     assert theirs.sampled is not None
     assert np.allclose(roots(theirs.sampled), roots(ours.sampled), rtol=0.0, atol=1e-8)
     assert np.allclose(roots(theirs.continuous), roots(ours.continuous), rtol=0.0, atol=1e-8)
-    assert theirs.margin.intervals[0].high_s == pytest.approx(ours.margin.intervals[0].high_s, rel=1e-8)
-    assert f"tests.own_laws:{law.__name__} of m1, m2, s is differentiated numerically" in theirs.notes[0]
+    assert theirs.margin.intervals[0].high_s == pytest.approx(
+        ours.margin.intervals[0].high_s, rel=1e-8
+    )
+    assert (
+        f"tests.own_laws:{law.__name__} of m1, m2, s is differentiated numerically"
+        in theirs.notes[0]
+    )
 
 
 def test_forces_are_those_of_the_four_channel_law() -> None:
@@ -48,7 +55,9 @@ def test_forces_are_those_of_the_four_channel_law() -> None:
     ours = linear("four_channel", gains={"K": 100.0, "B": 20.0, "force_own": 0.5}, **held)
     for alone in (False, True):
         theirs = linear(Forces, gains={"alone": alone}, **held)
-        assert np.allclose(roots(theirs.continuous), roots(ours.continuous), rtol=1e-7, atol=1e-7)
+        assert np.allclose(
+            roots(theirs.continuous), roots(ours.continuous), rtol=1e-7, atol=1e-7
+        )
 
 
 def test_the_tick_before_is_memory_like_any_other() -> None:
@@ -64,7 +73,9 @@ def test_the_tick_before_is_memory_like_any_other() -> None:
 def test_memory_is_linearised_as_it_is_sampled(scheme: str) -> None:
     """The adaptive law that users write keeps Y'r and the estimates, by the trapezoid rule."""
     more = {"scheme": scheme, "link.delay_ms": 0.0}
-    ours, theirs = (tn.load_scenario("free", {**more, "control.law": law}) for law in ("adaptive", Adaptive))
+    ours, theirs = (
+        tn.load_scenario("free", {**more, "control.law": law}) for law in ("adaptive", Adaptive)
+    )
     rest = find_equilibrium(ours, POSE)
     memory = np.hstack([np.zeros_like(rest.theta_hat), rest.theta_hat])
     same = follow_equilibrium(theirs, rest._replace(theta_hat=memory))
@@ -90,10 +101,15 @@ def test_a_certificate_runs_no_code_from_outside() -> None:
 def test_a_run_decays_as_its_roots_say() -> None:
     """From the poses of its sites to rest, and its edge lies where that of p_d does."""
     own = tn.linear(
-        "p_d_margin", {"control.law": CompiledPD, "control.d": 1.5}, over=["control.d=0.3:3"], ports=True
+        "p_d_margin",
+        {"control.law": CompiledPD, "control.d": 1.5},
+        over=["control.d=0.3:3"],
+        ports=True,
     )
     built_in = tn.linear("p_d_margin", {"control.d": 1.5}, over=["control.d=0.3:3"], ports=True)
-    assert own.scans[0].edges[0].value == pytest.approx(built_in.scans[0].edges[0].value, rel=1e-5)
+    assert own.scans[0].edges[0].value == pytest.approx(
+        built_in.scans[0].edges[0].value, rel=1e-5
+    )
     assert np.allclose(own.rest.q, built_in.rest.q, atol=1e-5)
     assert own.ports is not None
     assert own.ports.verdict == "stable"

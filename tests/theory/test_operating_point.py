@@ -12,7 +12,10 @@ from tests.virtual_runs import trajectories
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.theory.equilibrium import prolong_scenario
-from trilat_net.theory.operating_point import compute_effective_delay, derive_operating_conditions
+from trilat_net.theory.operating_point import (
+    compute_effective_delay,
+    derive_operating_conditions,
+)
 
 
 def test_shares_and_links_are_those_at_the_end() -> None:
@@ -20,13 +23,17 @@ def test_shares_and_links_are_those_at_the_end() -> None:
     assert found.alpha.sum(axis=1) == pytest.approx(1.0)
     row = dict(zip(found.names, found.alpha[found.names.index("s")], strict=True))
     assert row["m1"] == pytest.approx(0.1)
-    assert any("the dominance factors of s change during the run" in note for note in found.notes)
+    assert any(
+        "the dominance factors of s change during the run" in note for note in found.notes
+    )
     half = derive_operating_conditions(load_scenario("training", {"duration_s": 11.0}))
     assert half.alpha[half.names.index("s"), 0] == pytest.approx(0.5)
 
 
 def test_only_hands_that_hold_are_in_the_operating_point() -> None:
-    assert not any(site.actors for site in derive_operating_conditions(load_scenario("paper")).sites)
+    assert not any(
+        site.actors for site in derive_operating_conditions(load_scenario("paper")).sites
+    )
     pushed = derive_operating_conditions(load_scenario("paper", {"duration_s": 3.5}))
     (pulse,) = pushed.sites[0].actors
     assert pulse.a == pytest.approx((10.0, 10.0))  # its peak, at 3.5 s
@@ -37,7 +44,10 @@ def test_only_hands_that_hold_are_in_the_operating_point() -> None:
 
 
 def test_two_recorded_torques_stay_and_a_swinging_one_is_omitted() -> None:
-    recorded = [{"kind": "recorded", "points": [[0.0, push, 0.0], [60.0, push, 0.0]]} for push in (1.0, 2.0)]
+    recorded = [
+        {"kind": "recorded", "points": [[0.0, push, 0.0], [60.0, push, 0.0]]}
+        for push in (1.0, 2.0)
+    ]
     swings = {"kind": "multisine", "amplitude_nm": [1.0, 0.0], "frequencies_hz": [1.0]}
     scenario = load_scenario("free", {"sites.m1.hands": [*recorded, swings]})
     found = derive_operating_conditions(scenario)
@@ -57,10 +67,15 @@ def test_what_varies_is_said_with_its_mean() -> None:
     [
         ({"link.model": "measured"}, ["links.", ".model", "its delay is not known"]),
         ({"sites.s.plant": "external"}, ["sites.s.plant", "plant = 'simulated'"]),
-        ({"control.law": "tests.plugged_laws:Line"}, [".control.law", "sends vectors of its own"]),
+        (
+            {"control.law": "tests.plugged_laws:Line"},
+            [".control.law", "sends vectors of its own"],
+        ),
     ],
 )
-def test_what_has_no_linear_loop_is_refused(overrides: dict[str, object], facts: list[str]) -> None:
+def test_what_has_no_linear_loop_is_refused(
+    overrides: dict[str, object], facts: list[str]
+) -> None:
     with pytest.raises(ScenarioError) as refused:
         derive_operating_conditions(load_scenario("two_sites", overrides))
     assert all(fact in str(refused.value) for fact in ["two_sites", *facts])
@@ -73,13 +88,15 @@ def test_a_run_that_goes_on_has_nothing_new_in_it() -> None:
     held = derive_operating_conditions(longer)
     assert [len(site.actors) for site in held.sites] == [1, 1, 0]
     assert np.array_equal(
-        held.alpha, derive_operating_conditions(load_scenario("training", {"duration_s": 5.0})).alpha
+        held.alpha,
+        derive_operating_conditions(load_scenario("training", {"duration_s": 5.0})).alpha,
     )
 
 
 def scenario(**link: object) -> Scenario:
     return load_scenario(
-        "two_sites", {"duration_s": 3.0, **{f"link.{key}": value for key, value in link.items()}}
+        "two_sites",
+        {"duration_s": 3.0, **{f"link.{key}": value for key, value in link.items()}},
     )
 
 
@@ -100,7 +117,12 @@ def test_constant_delay_is_in_use_from_next_tick_on(delay_ms: float, rate_hz: in
         {"link.model": "uniform", "link.delay_ms": 60.0, "link.half_width_ms": 50.0},
         {"link.delay_ms": 40.0, "link.loss": 0.3},
         {"link.delay_ms": 40.0, "sites.m.rate_hz": 110},
-        {"link.model": "sine", "link.delay_ms": 60.0, "link.amplitude_ms": 40.0, "link.period_s": 1.0},
+        {
+            "link.model": "sine",
+            "link.delay_ms": 60.0,
+            "link.amplitude_ms": 40.0,
+            "link.period_s": 1.0,
+        },
     ],
     ids=["jitter", "loss", "rates", "sine"],
 )

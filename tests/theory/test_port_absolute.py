@@ -28,13 +28,17 @@ def drawn(seed: int, ports: int, count: int = 40) -> Complex:
     Y = rng.normal(size=(count, ports, ports)) + 1j * rng.normal(size=(count, ports, ports))
     Y *= 10.0 ** rng.uniform(-1.0, 1.0, size=(count, 1, ports)) * rng.uniform(0.1, 0.6)
     own = np.arange(ports)
-    Y[:, own, own] = rng.uniform(0.1, 1.0, (count, ports)) + 1j * rng.normal(size=(count, ports))
+    Y[:, own, own] = rng.uniform(0.1, 1.0, (count, ports)) + 1j * rng.normal(
+        size=(count, ports)
+    )
     return np.asarray(Y, dtype=np.complex128)
 
 
 @settings(max_examples=20, deadline=None)
 @given(K=POSITIVE, B=POSITIVE, d=st.just(0.0) | POSITIVE)
-def test_springs_and_dampers_between_two_sites_hold_without_a_delay(K: float, B: float, d: float) -> None:
+def test_springs_and_dampers_between_two_sites_hold_without_a_delay(
+    K: float, B: float, d: float
+) -> None:
     assert not criterion(pair((K, K), (d, d), (0.0, 0.0), B)).below
 
 
@@ -77,7 +81,8 @@ def test_for_two_ports_the_best_weights_decide_as_llewellyn_does(seed: int) -> N
     parameter = llewellyn_parameter(Y)
     clear = np.abs(found.margin) > 1e-4
     np.testing.assert_array_equal(found.margin[clear] > 0.0, parameter[clear] > 1.0)
-    ratio = np.abs(Y[:, 0, 1]) / np.abs(Y[:, 1, 0])  # where both parts are alike: y12 beta_1 ~ y21 beta_2
+    # where both parts are alike: y12 beta_1 ~ y21 beta_2
+    ratio = np.abs(Y[:, 0, 1]) / np.abs(Y[:, 1, 0])
     np.testing.assert_allclose(found.weights[:, 0], 1.0)
     plain = find_least_eigenvalue(weight_response(Y, found.weights))
     np.testing.assert_array_equal(plain[clear] > 0.0, found.margin[clear] > 0.0)
@@ -126,7 +131,9 @@ def test_no_weights_of_a_fine_grid_do_better(seed: int) -> None:
     logs = np.linspace(-8.0, 8.0, 41)
     best = np.max(
         [
-            find_least_eigenvalue(weight_response(scaled, np.exp(np.array([0.0, first, second]))[owner]))
+            find_least_eigenvalue(
+                weight_response(scaled, np.exp(np.array([0.0, first, second]))[owner])
+            )
             for first in logs
             for second in logs
         ],
@@ -156,5 +163,7 @@ def test_three_p_d_sites_hold_once_stable_alone() -> None:
     wires = tuple(Wire(i, j, 5.0, 0.0, 0.2) for i in range(3) for j in range(3) if i != j)
     for d, holds in ((0.98, False), (1.02, True)):
         Y = build_admittance(Network((1.0,) * 3, (d,) * 3, (0.0,) * 3, wires).loop)
-        margin = find_best_weights(Y(build_frequency_grid(1e-3, 10.0, 0.2)), np.arange(3)).margin
+        margin = find_best_weights(
+            Y(build_frequency_grid(1e-3, 10.0, 0.2)), np.arange(3)
+        ).margin
         assert bool((margin > -1e-8).all()) is holds

@@ -91,7 +91,9 @@ def test_wrong_estimates_let_the_linear_loop_return_stored_energy() -> None:
     scenario = load_scenario("free")
     rest = find_equilibrium(scenario, POSE)
     learnt = np.tile([0.5, 0.45, -0.29, 2.0, 1.0], (3, 1))  # as a run of it ends
-    section = analyse_ports(scenario, rest._replace(q=np.tile([-0.124, 0.337], (3, 1)), theta_hat=learnt))
+    section = analyse_ports(
+        scenario, rest._replace(q=np.tile([-0.124, 0.337], (3, 1)), theta_hat=learnt)
+    )
     assert not section.estimates_true
     assert section.proof is not None
     assert not section.proof.passive

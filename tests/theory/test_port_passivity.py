@@ -24,7 +24,9 @@ OR_NONE = st.just(0.0) | POSITIVE
 
 def judged(network: Network, weights: tuple[float, ...] | None = None) -> Passivity:
     Y = build_admittance(network.loop)
-    w = refine_frequencies(Y, build_frequency_grid(1e-3, 10.0, find_longest_delay_s(network.loop)))
+    w = refine_frequencies(
+        Y, build_frequency_grid(1e-3, 10.0, find_longest_delay_s(network.loop))
+    )
     return check_passivity(Y, w, None if weights is None else np.array(weights))
 
 
@@ -36,9 +38,14 @@ def judged(network: Network, weights: tuple[float, ...] | None = None) -> Passiv
     links=st.lists(st.tuples(OR_NONE, OR_NONE), min_size=2, max_size=2),
 )
 def test_masses_springs_and_dampers_are_passive(
-    m: tuple[float, ...], d: tuple[float, ...], k: tuple[float, ...], links: list[tuple[float, float]]
+    m: tuple[float, ...],
+    d: tuple[float, ...],
+    k: tuple[float, ...],
+    links: list[tuple[float, float]],
 ) -> None:
-    wires = [Wire(a, b, K, B) for n, (K, B) in enumerate(links) for a, b in ((n, n + 1), (n + 1, n))]
+    wires = [
+        Wire(a, b, K, B) for n, (K, B) in enumerate(links) for a, b in ((n, n + 1), (n + 1, n))
+    ]
     found = judged(Network(m, d, k, tuple(wires)))
     assert found.passive
     assert found.lacking_nm_s_rad == 0.0
@@ -93,10 +100,18 @@ def test_law_that_winds_up_lacks_more_than_any_damper_gives() -> None:
     """Z = m s + d + c / s^2: at low frequency a negative damping c / w^2."""
     loop = Network((1.0, 1.0), (2.0, 1.0), (0.0, 0.0)).loop
     A = loop.A.copy()
-    A[2] = [1.0, 0.0, -1.0, 0.0]  # b's angle is a filter of a's now: an integral that leaks slowly
+    # b's angle is a filter of a's now: an integral that leaks slowly
+    A[2] = [
+        1.0,
+        0.0,
+        -1.0,
+        0.0,
+    ]
     A[2, 2] = 0.0
     A[1, 2] = -0.1
-    wound = loop._replace(A=A, B=loop.B[:, :1], C=loop.C[:1], inputs=("a.tau1",), outputs=("a.qd1",))
+    wound = loop._replace(
+        A=A, B=loop.B[:, :1], C=loop.C[:1], inputs=("a.tau1",), outputs=("a.qd1",)
+    )
     Y = build_admittance(wound)
     found = check_passivity(Y, build_frequency_grid(1e-3, 100.0, 0.0))
     assert not found.passive
@@ -114,12 +129,16 @@ def test_ratios_of_weights_decide_the_sign_of_power(
     Y = np.array(numbers).reshape(1, 3, 3)
     D = np.array(weights)
     least = find_least_eigenvalue(weight_response(Y, D))[0]
-    assert find_least_eigenvalue(weight_response(Y, scale * D))[0] == pytest.approx(least, rel=1e-9, abs=1e-9)
+    assert find_least_eigenvalue(weight_response(Y, scale * D))[0] == pytest.approx(
+        least, rel=1e-9, abs=1e-9
+    )
     power = np.diag(D) @ Y[0]
     plain = np.linalg.eigvalsh(power + power.conj().T)[0]
     if abs(least) > 1e-6:
         assert np.sign(plain) == np.sign(least)
-    assert least == pytest.approx(find_least_eigenvalue(weight_response(Y, np.tile(D, (1, 1))))[0])
+    assert least == pytest.approx(
+        find_least_eigenvalue(weight_response(Y, np.tile(D, (1, 1))))[0]
+    )
 
 
 W = np.geomspace(1e-2, 1e2, 41)
@@ -172,7 +191,9 @@ def test_a_clamp_leaves_the_rest_of_the_impedance(site: str) -> None:
 
 
 def test_a_very_stiff_spring_is_nearly_a_clamp() -> None:
-    stiff = build_admittance(hold_by_spring(REFLECTING.loop, "b", 1e9))(W)[:, [0, 2]][:, :, [0, 2]]
+    stiff = build_admittance(hold_by_spring(REFLECTING.loop, "b", 1e9))(W)[:, [0, 2]][
+        :, :, [0, 2]
+    ]
     np.testing.assert_allclose(
         stiff, build_admittance(clamp_site(REFLECTING.loop, "b"))(W), rtol=1e-5, atol=1e-7
     )
@@ -221,4 +242,5 @@ def test_mass_and_stiffness_of_a_hand_dissipate_nothing() -> None:
     assert np.allclose(scalar_hand(3.0).dissipate(w), 3.0)
     swirl = HandMatrices(np.zeros((2, 2)), np.eye(2), np.array([[0.0, 5.0], [-5.0, 0.0]]))
     least = np.linalg.eigvalsh(swirl.dissipate(w))[:, 0]
-    assert np.allclose(least, 1.0 - 5.0 / w)  # a field of force that turns gives energy, the slower the more
+    # a field of force that turns gives energy, the slower the more
+    assert np.allclose(least, 1.0 - 5.0 / w)

@@ -37,7 +37,13 @@ def test_a_mass_alone_answers_with_one_over_j_w_m(m: float) -> None:
     k=st.tuples(POSITIVE, POSITIVE, POSITIVE),
     wires=st.lists(
         st.builds(
-            Wire, st.integers(0, 2), st.integers(0, 2), POSITIVE, POSITIVE, DELAYS, st.floats(0.0, 1.0)
+            Wire,
+            st.integers(0, 2),
+            st.integers(0, 2),
+            POSITIVE,
+            POSITIVE,
+            DELAYS,
+            st.floats(0.0, 1.0),
         ).filter(lambda wire: wire.at < wire.of),
         max_size=4,
     ),
@@ -48,11 +54,15 @@ def test_the_answer_is_the_inverse_of_the_impedance_on_paper(
     """Springs, dampers, delays and reflected torque of any size."""
     network = Network(m, d, k, tuple(wires))
     Y = build_admittance(network.loop)(W)
-    np.testing.assert_allclose(Y @ network.impedance(W), np.zeros_like(Y) + np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(
+        Y @ network.impedance(W), np.zeros_like(Y) + np.eye(3), atol=1e-9
+    )
 
 
 @given(K=POSITIVE, B=POSITIVE)
-def test_springs_and_dampers_between_sites_are_reciprocal_without_delay_only(K: float, B: float) -> None:
+def test_springs_and_dampers_between_sites_are_reciprocal_without_delay_only(
+    K: float, B: float
+) -> None:
     at_once = build_admittance(pair((K, K), B=B, T=(0.0, 0.0)).loop)(W)
     np.testing.assert_allclose(at_once[:, 0, 1], at_once[:, 1, 0], rtol=1e-9)
     late = build_admittance(pair((K, K), B=B, T=(0.1, 0.3)).loop)(W)
@@ -64,7 +74,9 @@ def test_what_is_read_may_be_past() -> None:
     """Velocity minus what it was 0.3 s before."""
     loop = Network((2.0,), (1.0,), (0.0,)).loop
     Y = evaluate_transfer(loop, to_imaginary_axis(W), LoopOutput(loop.C, ((0.3, -loop.C),)))
-    np.testing.assert_allclose(Y[:, 0, 0], (1.0 - np.exp(-0.3j * W)) / (2j * W + 1.0), rtol=1e-12)
+    np.testing.assert_allclose(
+        Y[:, 0, 0], (1.0 - np.exp(-0.3j * W)) / (2j * W + 1.0), rtol=1e-12
+    )
 
 
 def test_no_frequencies_no_answers() -> None:
@@ -90,7 +102,9 @@ def test_floating_masses_that_push_unevenly_have_an_active_pole() -> None:
         Network((1.0, 3.0), (0.0, 0.0), (0.0, 0.0), (Wire(0, 1, 7.0), Wire(1, 0, 3.0))).loop
     )
     assert found.order == 1
-    np.testing.assert_allclose(found.residue, [[1.0 / 8.0, 7.0 / 24.0], [1.0 / 8.0, 7.0 / 24.0]], rtol=1e-9)
+    np.testing.assert_allclose(
+        found.residue, [[1.0 / 8.0, 7.0 / 24.0], [1.0 / 8.0, 7.0 / 24.0]], rtol=1e-9
+    )
     assert not found.passive
 
 
@@ -122,8 +136,14 @@ def test_ports_need_a_velocity_for_each_torque() -> None:
         build_admittance(loop._replace(C=loop.C[:1]))
 
 
-@given(K=POSITIVE, d=st.tuples(POSITIVE, POSITIVE), T=st.tuples(st.floats(0.0, 0.5), st.floats(0.0, 0.5)))
-def test_what_is_felt_of_p_d_is_as_on_paper(K: float, d: tuple[float, float], T: tuple[float, float]) -> None:
+@given(
+    K=POSITIVE,
+    d=st.tuples(POSITIVE, POSITIVE),
+    T=st.tuples(st.floats(0.0, 0.5), st.floats(0.0, 0.5)),
+)
+def test_what_is_felt_of_p_d_is_as_on_paper(
+    K: float, d: tuple[float, float], T: tuple[float, float]
+) -> None:
     """Clamped: m s + d + K / s. Free: that less K^2 e^{-s (T1 + T2)} / s^2 over the other's own impedance."""
     network = pair((K, K), d, T)
     (found,) = measure_transparency(network.loop, "a", "b")
@@ -132,7 +152,8 @@ def test_what_is_felt_of_p_d_is_as_on_paper(K: float, d: tuple[float, float], T:
     through = (K / S) ** 2 * np.exp(-S * sum(T))
     np.testing.assert_allclose(found.clamped, own, rtol=1e-8)
     np.testing.assert_allclose(found.free, own - through / other, rtol=1e-8)
-    inside = (found.w_rad_s >= 0.2 * np.pi) & (found.w_rad_s <= 20.0 * np.pi)  # the Z-width -h12 h21 / h22
+    # the Z-width -h12 h21 / h22
+    inside = (found.w_rad_s >= 0.2 * np.pi) & (found.w_rad_s <= 20.0 * np.pi)
     sizes = np.abs(through / other)[inside]
     assert sizes.min() * (1.0 - 1e-6) <= found.difference_nm_s_rad <= sizes.max() * (1.0 + 1e-6)
 
@@ -142,21 +163,28 @@ def test_who_holds_the_third_site_counts() -> None:
     loop = Network((1.0,) * 3, (1.0,) * 3, (0.0,) * 3, wires).loop
     (alone,) = measure_transparency(loop, "a", "c")
     (held,) = measure_transparency(hold_by_spring(loop, "b", 1e3, 10.0), "a", "c")
-    assert held.size_at(0.1)[0] > 1.5 * alone.size_at(0.1)[0]  # a tenth of a hertz: springs count
+    # a tenth of a hertz: springs count
+    assert held.size_at(0.1)[0] > 1.5 * alone.size_at(0.1)[0]
     assert held.size_at(0.1)[1] == pytest.approx(10.0 / (0.2 * np.pi), rel=0.05)
 
 
-@given(free=POSITIVE, clamped=POSITIVE, band=st.tuples(st.floats(0.02, 1.0), st.floats(2.0, 50.0)))
+@given(
+    free=POSITIVE, clamped=POSITIVE, band=st.tuples(st.floats(0.02, 1.0), st.floats(2.0, 50.0))
+)
 def test_the_width_is_the_ratio_in_db_whatever_the_band(
     free: float, clamped: float, band: tuple[float, float]
 ) -> None:
     w = 2.0 * np.pi * np.union1d(np.geomspace(0.01, 100.0, 401), band)
-    one = Transparency("a", "b", 1, w, to_imaginary_axis(free * w), to_imaginary_axis(clamped * w), band)
+    one = Transparency(
+        "a", "b", 1, w, to_imaginary_axis(free * w), to_imaginary_axis(clamped * w), band
+    )
     assert one.ratio_db == pytest.approx(20.0 * np.log10(clamped / free), abs=1e-9)
     middle_rad_s = 2.0 * np.pi * np.sqrt(band[0] * band[1])
     assert one.softest_nm_s_rad == pytest.approx(free * middle_rad_s, rel=1e-6)
     assert one.stiffest_nm_s_rad == pytest.approx(clamped * middle_rad_s, rel=1e-6)
-    assert one.size_at(1.0) == pytest.approx((2.0 * np.pi * free, 2.0 * np.pi * clamped), rel=1e-6)
+    assert one.size_at(1.0) == pytest.approx(
+        (2.0 * np.pi * free, 2.0 * np.pi * clamped), rel=1e-6
+    )
 
 
 def test_the_width_grows_with_the_stiffness_of_the_coupling() -> None:
@@ -175,7 +203,11 @@ def test_two_sites_that_do_not_couple_feel_nothing() -> None:
 
 @pytest.mark.parametrize(
     ("at", "of", "said"),
-    [("z", "b", "no site 'z'"), ("a", "z", "no site 'z'"), ("a", "a", "the operator's own site")],
+    [
+        ("z", "b", "no site 'z'"),
+        ("a", "z", "no site 'z'"),
+        ("a", "a", "the operator's own site"),
+    ],
 )
 def test_what_cannot_be_felt_is_refused(at: str, of: str, said: str) -> None:
     with pytest.raises(UsageError, match=said):

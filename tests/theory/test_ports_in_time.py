@@ -22,13 +22,20 @@ ROD = {"lc1_m": 0.5, "I1_kg_m2": 1 / 12, "lc2_m": 0.5, "I2_kg_m2": 1 / 12}
 
 def fitted(t_s: Array, values: Array, w_rad_s: float) -> Complex:
     """The complex amplitude of sin(w t) in columns, beside a straight line."""
-    columns = np.column_stack([np.sin(w_rad_s * t_s), np.cos(w_rad_s * t_s), np.ones_like(t_s), t_s])
+    columns = np.column_stack(
+        [np.sin(w_rad_s * t_s), np.cos(w_rad_s * t_s), np.ones_like(t_s), t_s]
+    )
     found = np.linalg.lstsq(columns, values, rcond=None)[0]
     return np.asarray(found[0] + 1j * found[1], dtype=np.complex128)
 
 
 def answered(
-    name: str, overrides: dict[str, Any], joint: int, hz: float, settled_s: float, duration_s: float
+    name: str,
+    overrides: dict[str, Any],
+    joint: int,
+    hz: float,
+    settled_s: float,
+    duration_s: float,
 ) -> Complex:
     """Velocities of all joints per torque on one joint of m, by a run."""
     t_s = np.arange(0.0, duration_s + 1.0, 1e-3)
@@ -36,7 +43,9 @@ def answered(
     push[:, 0], push[:, joint] = t_s, AMPLITUDE_NM * np.sin(2.0 * np.pi * hz * t_s)
     torque = {"kind": "recorded", "points": push.tolist()}
     hands = [*overrides.get("sites.m.hands", []), torque]
-    run = trajectories(load_scenario(name, {**overrides, "sites.m.hands": hands, "duration_s": duration_s}))
+    run = trajectories(
+        load_scenario(name, {**overrides, "sites.m.hands": hands, "duration_s": duration_s})
+    )
     late = run.sites["m"].t_s >= settled_s
     velocities = np.hstack([site.qd[late] for site in run.sites.values()])
     return fitted(run.sites["m"].t_s[late], velocities, 2.0 * np.pi * hz) / AMPLITUDE_NM
@@ -48,7 +57,9 @@ def test_p_d_answers_a_sinusoid_as_its_admittance_says(hz: float, joint: int) ->
     overrides = {"control.d": 4.0, "sites.m.q0_rad": POSE, "sites.s.q0_rad": POSE}
     scenario = load_scenario("p_d_margin_two", overrides)
     Y = build_admittance(
-        linearise_teleoperator(derive_operating_conditions(scenario), find_equilibrium(scenario, POSE))
+        linearise_teleoperator(
+            derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+        )
     )(np.array([2.0 * np.pi * hz]))[0]
     found = answered("p_d_margin_two", overrides, joint, hz, 12.0, 16.0)
     assert np.abs(found - Y[:, joint - 1]).max() < 0.01 * np.abs(Y[:, joint - 1]).max()
@@ -58,7 +69,12 @@ def test_p_d_answers_a_sinusoid_as_its_admittance_says(hz: float, joint: int) ->
 @pytest.mark.parametrize("hz", [pytest.param(0.5, marks=pytest.mark.long), 2.0])
 def test_paper_s_law_answers_sinusoid_as_its_admittance_says(hz: float) -> None:
     """Rods that know themselves, a hand that holds m: learning, delay and the hand's spring are in it."""
-    hand = {"kind": "spring", "from_rad": POSE, "stiffness_nm_rad": 20.0, "damping_nm_s_rad": 3.0}
+    hand = {
+        "kind": "spring",
+        "from_rad": POSE,
+        "stiffness_nm_rad": 20.0,
+        "damping_nm_s_rad": 3.0,
+    }
     overrides: dict[str, Any] = {f"arm.{key}": value for key, value in ROD.items()}
     overrides |= {
         "control.theta_hat0": THETA,
@@ -66,8 +82,12 @@ def test_paper_s_law_answers_sinusoid_as_its_admittance_says(hz: float) -> None:
         "sites.m.q0_rad": POSE,
         "sites.s.q0_rad": POSE,
     }
-    scenario = load_scenario("two_sites", {**overrides, "sites.m.hands": [], "sites.s.hands": []})
-    bare = linearise_teleoperator(derive_operating_conditions(scenario), find_equilibrium(scenario, POSE))
+    scenario = load_scenario(
+        "two_sites", {**overrides, "sites.m.hands": [], "sites.s.hands": []}
+    )
+    bare = linearise_teleoperator(
+        derive_operating_conditions(scenario), find_equilibrium(scenario, POSE)
+    )
     Y = build_admittance(hold_by_spring(bare, "m", 20.0, 3.0))(np.array([2.0 * np.pi * hz]))[0]
     found = answered("two_sites", {**overrides, "sites.m.hands": [hand]}, 1, hz, 20.0, 26.0)
     assert (np.abs(found - Y[:, 0]) < 0.01 * np.abs(Y[:, 0])).all()

@@ -17,7 +17,12 @@ from trilat_net.theory.linear_edge import LinearEdge, find_contact_growth
 
 ENVIRONMENT = "sites.s.environment"
 STIFFNESS = f"{ENVIRONMENT}.0.stiffness_n_m"
-WALL = {"kind": "wall", "point_m": [1.3376933693863516, 0.0], "normal": [-1.0, 0.0], "sampled": True}
+WALL = {
+    "kind": "wall",
+    "point_m": [1.3376933693863516, 0.0],
+    "normal": [-1.0, 0.0],
+    "sampled": True,
+}
 
 
 def windup(K: float, B: float = 0.0, b: float = 0.0) -> Scenario:
@@ -112,15 +117,29 @@ def press(state: ChainState, K: float) -> Scenario:
         {
             "scheme": "digital",
             "expect": {},
-            "arm": {"urdf": "arm6.urdf", "g_m_s2": 0.0, "stops": False, "armature_kg_m2": DRIVES.tolist()},
-            "control": {"law": "p_d", "K": STIFF.tolist(), "d": DAMPING.tolist(), "gravity": 0.0},
+            "arm": {
+                "urdf": "arm6.urdf",
+                "g_m_s2": 0.0,
+                "stops": False,
+                "armature_kg_m2": DRIVES.tolist(),
+            },
+            "control": {
+                "law": "p_d",
+                "K": STIFF.tolist(),
+                "d": DAMPING.tolist(),
+                "gravity": 0.0,
+            },
             "link": {"model": "constant", "delay_ms": 1e3 * H_S * DELAY_TICKS},
             "sites.m": {"role": "master", "q0_rad": q},
             "sites.s": {
                 "role": "slave",
                 "q0_rad": q,
-                "hands": [{"kind": "spring", "to_rad": to.tolist(), "stiffness_nm_rad": HAND_NM_RAD}],
-                "environment": [{**wall, "point_m": (state.tip_position + FORCE_N / K * NORMAL).tolist()}],
+                "hands": [
+                    {"kind": "spring", "to_rad": to.tolist(), "stiffness_nm_rad": HAND_NM_RAD}
+                ],
+                "environment": [
+                    {**wall, "point_m": (state.tip_position + FORCE_N / K * NORMAL).tolist()}
+                ],
             },
         },
     )
@@ -148,7 +167,9 @@ def growth_of_ticks(state: ChainState, K: float) -> float:
     inverse = np.linalg.inv(state.inertia + np.diag(DRIVES))
     step: dict[str, tuple[Array, Array]] = {}
     for site, hand in (("m", 0.0), ("s", HAND_NM_RAD)):
-        rates = np.block([[none, one, none], [-hand * inverse, none, inverse], [none, none, none]])
+        rates = np.block(
+            [[none, one, none], [-hand * inverse, none, inverse], [none, none, none]]
+        )
         made = expm(H_S * rates)
         step[site] = made[:12, :12], made[:12, 12:]
     size = 24 + 12 * DELAY_TICKS  # m, s, then (q_m, q_s) of the ticks before, latest first
@@ -177,9 +198,9 @@ def test_six_joints_in_contact_grow_like_pinocchios_arm(n: int) -> None:
         theta = np.zeros((3, 2, 60))
         away = at + np.linalg.pinv(state.jacobian[:3]) @ (2.0 * FORCE_N / K * NORMAL)
         wanted = growth_of_ticks(state, K)
-        assert find_contact_growth(scenario, np.stack([away, at, away]), theta) == pytest.approx(
-            wanted, rel=1e-5
-        )
+        assert find_contact_growth(
+            scenario, np.stack([away, at, away]), theta
+        ) == pytest.approx(wanted, rel=1e-5)
         assert np.isnan(find_contact_growth(scenario, away[None], theta[:1]))
         signs.add(wanted > 0.0)
     assert signs == {True, False}

@@ -29,14 +29,27 @@ EDGE = {
 }
 
 
-SETTLED_S = {0.0: 22.2, 20.0: 23.3, 50.0: 24.3, 100.0: 17.8, 200.0: 11.9, 400.0: 5.5, 800.0: 11.4}
+SETTLED_S = {
+    0.0: 22.2,
+    20.0: 23.3,
+    50.0: 24.3,
+    100.0: 17.8,
+    200.0: 11.9,
+    400.0: 5.5,
+    800.0: 11.4,
+}
 
 
 @pytest.mark.parametrize(
     ("delay_ms", "settled_s"),
-    [pytest.param(*one, marks=pytest.mark.long if n % 3 else ()) for n, one in enumerate(SETTLED_S.items())],
+    [
+        pytest.param(*one, marks=pytest.mark.long if n % 3 else ())
+        for n, one in enumerate(SETTLED_S.items())
+    ],
 )
-def test_settling_of_free_motion_is_no_monotone_function_of_delay(delay_ms: float, settled_s: float) -> None:
+def test_settling_of_free_motion_is_no_monotone_function_of_delay(
+    delay_ms: float, settled_s: float
+) -> None:
     made = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
     made.advance(30.0)
     assert made.settled_s == printed(settled_s, 0.1)
@@ -45,7 +58,10 @@ def test_settling_of_free_motion_is_no_monotone_function_of_delay(delay_ms: floa
 @pytest.mark.long
 def test_the_error_of_free_motion_grows_with_every_delay() -> None:
     times_s = np.arange(0.02, 20.01, 0.02)
-    runs = [sampled(load_scenario("free", {"link.delay_ms": delay_ms}), times_s) for delay_ms in SETTLED_S]
+    runs = [
+        sampled(load_scenario("free", {"link.delay_ms": delay_ms}), times_s)
+        for delay_ms in SETTLED_S
+    ]
     rms = [float(np.sqrt(((run[..., :2] - run[..., 4:6]) ** 2).mean())) for run in runs]
     assert rms == sorted(rms)
     assert (rms[0], rms[-1]) == (printed(0.1064, 1e-4), printed(0.1259, 1e-4))
@@ -57,14 +73,20 @@ def test_the_error_of_free_motion_grows_with_every_delay() -> None:
     ("delay_ms", "rate_per_s"),
     [(0.0, -0.159), (200.0, -0.499), pytest.param(1600.0, -0.171, marks=pytest.mark.long)],
 )
-def test_about_one_rest_some_delay_damps_common_motion(delay_ms: float, rate_per_s: float) -> None:
+def test_about_one_rest_some_delay_damps_common_motion(
+    delay_ms: float, rate_per_s: float
+) -> None:
     found = analyse_linear_loop("free", [f"link.delay_ms={delay_ms}"], pose=(-0.124, 0.337))
     assert found.decisive.rightmost is not None
     assert found.decisive.rightmost.s.real == printed(rate_per_s, 0.001)
 
 
-@pytest.mark.parametrize(("name", "error", "speed"), [("paper", 6.0e-5, 3.0e-4), ("free", 1.3e-3, 1.1e-2)])
-def test_errors_and_speeds_decay_as_the_theorem_says(name: str, error: float, speed: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "error", "speed"), [("paper", 6.0e-5, 3.0e-4), ("free", 1.3e-3, 1.1e-2)]
+)
+def test_errors_and_speeds_decay_as_the_theorem_says(
+    name: str, error: float, speed: float
+) -> None:
     last = sampled(load_scenario(name), (20.0,))[:, -1]
     assert np.abs(last[:, :2] - last[:, 4:6]).max() == pytest.approx(error, rel=0.15)
     assert np.abs(last[:, 2:4]).max() == pytest.approx(speed, rel=0.15)
@@ -73,7 +95,8 @@ def test_errors_and_speeds_decay_as_the_theorem_says(name: str, error: float, sp
 def test_the_papers_hands_hardly_move_joint_1() -> None:
     paper = load_scenario("paper")
     pushed, alone = (
-        sampled(made, np.arange(0.01, 20.01, 0.01))[..., :2] for made in (paper, paper.without_hands())
+        sampled(made, np.arange(0.01, 20.01, 0.01))[..., :2]
+        for made in (paper, paper.without_hands())
     )
     assert pushed[:, -1] == pytest.approx(np.array([[-0.1729, 0.0874]] * 3), abs=1e-4)
     assert np.abs(pushed - alone)[..., 0].max() <= 0.003
@@ -157,7 +180,10 @@ def test_free_motion_is_calm_at_200_ms() -> None:
 
 @pytest.mark.parametrize(
     "law",
-    [{"law": "pd_d"}, pytest.param({"law": "p_d", "K": 100.0, "d": 40.0}, marks=pytest.mark.long)],
+    [
+        {"law": "pd_d"},
+        pytest.param({"law": "p_d", "K": 100.0, "d": 40.0}, marks=pytest.mark.long),
+    ],
     ids=str,
 )
 def test_laws_that_exchange_positions_pass_the_same_wall(law: dict[str, object]) -> None:
@@ -179,7 +205,9 @@ def test_without_learning_gravity_nothing_winds_up() -> None:
         (10.0, 10.2, "s"),
         (19.8, 20.0, "s"),
     )
-    assert value(made, "wall_mean_n", 1) == pytest.approx(value(made, "wall_mean_n", 0), abs=0.02)
+    assert value(made, "wall_mean_n", 1) == pytest.approx(
+        value(made, "wall_mean_n", 0), abs=0.02
+    )
 
 
 FIGURES = [
@@ -240,8 +268,12 @@ def test_margin_is_smallest_eigenvalue_of_alpha_times_k_t(name: str, margin: flo
     """d = abs(lambda_min(alpha)) K T."""
     scenario = load_scenario(name)
     (delay_ms,) = {link.delay_ms for link in scenario.links.values()}
-    alpha = np.array([[scenario.dominance[i].get(j, 0.0) for j in scenario.sites] for i in scenario.sites])
-    assert -np.linalg.eigvals(alpha).real.min() * 10.0 * delay_ms * 1e-3 == pytest.approx(margin)
+    alpha = np.array(
+        [[scenario.dominance[i].get(j, 0.0) for j in scenario.sites] for i in scenario.sites]
+    )
+    assert -np.linalg.eigvals(alpha).real.min() * 10.0 * delay_ms * 1e-3 == pytest.approx(
+        margin
+    )
 
 
 @pytest.mark.long
@@ -250,23 +282,38 @@ def test_below_its_margin_p_d_grows(name: str, d: float) -> None:
     """Above it, at 1.1 and 2.1, it decays: that is what both scenarios expect as they are shipped."""
     shipped = load_scenario(name)
     assert {site.control.d[0] for site in shipped.sites.values()} <= {1.1, 2.1}  # type: ignore[union-attr]
-    assert measured(name, {"control.d": d, "duration_s": 40.0}).end.error.trend is EnvelopeTrend.GROWS
+    assert (
+        measured(name, {"control.d": d, "duration_s": 40.0}).end.error.trend
+        is EnvelopeTrend.GROWS
+    )
 
 
 @pytest.mark.long
 def test_margin_with_unequal_shares_is_that_of_their_smallest_eigenvalue() -> None:
     """-0.8, so 1.6: as `docs/lab.md` asks."""
-    row = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.8, "s": 0.2}, "s": {"m1": 0.8, "m2": 0.2}}
+    row = {
+        "m1": {"m2": 0.1, "s": 0.9},
+        "m2": {"m1": 0.8, "s": 0.2},
+        "s": {"m1": 0.8, "m2": 0.2},
+    }
     alpha = np.array([[row[i].get(j, 0.0) for j in row] for i in row])
     assert np.linalg.eigvals(alpha).real.min() == pytest.approx(-0.8)
     changes = {"dominance": row, "duration_s": 40.0}
-    assert measured("p_d_margin", {**changes, "control.d": 1.4}).end.error.trend is EnvelopeTrend.GROWS
-    assert measured("p_d_margin", {**changes, "control.d": 1.8}).end.error.trend is EnvelopeTrend.DECAYS
+    assert (
+        measured("p_d_margin", {**changes, "control.d": 1.4}).end.error.trend
+        is EnvelopeTrend.GROWS
+    )
+    assert (
+        measured("p_d_margin", {**changes, "control.d": 1.8}).end.error.trend
+        is EnvelopeTrend.DECAYS
+    )
 
 
 @pytest.mark.long
 def test_half_of_the_margin_grows_to_10_rad() -> None:
-    made = measured("p_d_margin", {"control.d": 0.5, "duration_s": 40.0}, (10.0, 12.0, ""), (38.0, 40.0, ""))
+    made = measured(
+        "p_d_margin", {"control.d": 0.5, "duration_s": 40.0}, (10.0, 12.0, ""), (38.0, 40.0, "")
+    )
     assert [peak(made, 0), peak(made, 1)] == [printed(1.6, 0.1), printed(10.0, 1.0)]
 
 
@@ -280,7 +327,10 @@ def test_two_and_a_half_times_the_margin_decays_to_milliradians() -> None:
 def test_jitter_of_the_same_mean_delay_turns_the_verdict() -> None:
     jitter = measured("jitter", {}, (38.0, 40.0, ""))
     constant = measured("jitter", CONSTANT, (38.0, 40.0, ""))
-    assert (jitter.end.error.trend, constant.end.error.trend) == (EnvelopeTrend.DECAYS, EnvelopeTrend.GROWS)
+    assert (jitter.end.error.trend, constant.end.error.trend) == (
+        EnvelopeTrend.DECAYS,
+        EnvelopeTrend.GROWS,
+    )
     assert peak(jitter) == printed(0.022, 0.001)
     assert peak(constant) == printed(5.3, 0.1)
     ages = [age.mean_ms for age in jitter.ages.values()]

@@ -7,7 +7,12 @@ from hypothesis import strategies as st
 
 from tests.theory.loops import Array, actors, site
 from trilat_net.core import control
-from trilat_net.core.exogenous import TorqueKind, TorqueSource, torque_on_arm, torque_source_rows
+from trilat_net.core.exogenous import (
+    TorqueKind,
+    TorqueSource,
+    torque_on_arm,
+    torque_source_rows,
+)
 from trilat_net.core.site_setup import SiteSetup
 from trilat_net.core.two_link_arm import forward_dynamics, regressor
 from trilat_net.theory.site_dynamics import (
@@ -31,17 +36,23 @@ def by_leaves(one: SiteSetup, x: Array) -> dict[str, Array]:
     e, ed, r = control.control_errors(q, qd, x[AT.q_des], x[AT.qd_des], Lambda)
     Y = regressor(one.g_m_s2, q, qd, -Lambda * e, -Lambda * ed)
     wide = np.inf
-    Kp, Kd, K, d, k_f = (np.zeros(2) + gain for gain in (gains.Kp, gains.Kd, gains.K, gains.d, gains.k_f))
+    Kp, Kd, K, d, k_f = (
+        np.zeros(2) + gain for gain in (gains.Kp, gains.Kd, gains.K, gains.d, gains.k_f)
+    )
     known = np.zeros(5) + gains.known
     if gains.law.name == "ADAPTIVE":
         tau = control.adaptive_torque(Y, x[AT.estimate], Kp, Kd, r, ed, wide)
         estimate = -np.asarray(gains.Gamma) * control.regressor_transpose_times(Y, r)
     else:
-        tau = control.damped_torque(known, one.g_m_s2, K, d, Kd, k_f, q, qd, e, ed, x[AT.peer_torque], wide)
+        tau = control.damped_torque(
+            known, one.g_m_s2, K, d, Kd, k_f, q, qd, e, ed, x[AT.peer_torque], wide
+        )
         estimate = np.zeros(5)
     rows, table = torque_source_rows(one.actors)
     acted, held = (
-        np.array(torque_on_arm(LATE_S, q, qd, np.array(one.lengths_m), rows, table, sampled)[:2])
+        np.array(
+            torque_on_arm(LATE_S, q, qd, np.array(one.lengths_m), rows, table, sampled)[:2]
+        )
         for sampled in (0, 1)
     )
     total = np.array(tau) + acted + held + x[AT.external_torque]
@@ -62,13 +73,17 @@ def test_the_field_is_what_a_tick_computes(seed: int, law: str) -> None:
     x = rng.uniform(-2, 2, AT.arguments)
     found, wanted = evaluate_site_rates(one, x), by_leaves(one, x)
     for name, value in wanted.items():
-        scale = 1.0 + max(np.abs(value).max(), np.abs(wanted["external"]).max(), np.abs(wanted["tau"]).max())
+        scale = 1.0 + max(
+            np.abs(value).max(), np.abs(wanted["external"]).max(), np.abs(wanted["tau"]).max()
+        )
         inverse = (
             np.abs(differentiate_site_rates(one, x).qdd[:, AT.external_torque]).max()
             if name == "qdd"
             else 1.0
         )
-        assert np.abs(getattr(found, name) - value).max() <= 1e-12 * scale * max(1.0, inverse), name
+        assert np.abs(getattr(found, name) - value).max() <= 1e-12 * scale * max(
+            1.0, inverse
+        ), name
 
 
 @given(seed=seeds, law=laws)
@@ -82,29 +97,40 @@ def test_its_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
     found = differentiate_site_rates(one, x)
     for k in range(AT.arguments):
         ahead, behind = (
-            evaluate_site_rates(one, x + sign * step * np.eye(AT.arguments)[k]) for sign in (1, -1)
+            evaluate_site_rates(one, x + sign * step * np.eye(AT.arguments)[k])
+            for sign in (1, -1)
         )
         for name in found._fields:
             difference = (getattr(ahead, name) - getattr(behind, name)) / (2 * step)
             exact = getattr(found, name)[:, k]
-            assert np.abs(difference - exact).max() <= 1e-6 * (1.0 + np.abs(getattr(found, name)).max())
+            assert np.abs(difference - exact).max() <= 1e-6 * (
+                1.0 + np.abs(getattr(found, name)).max()
+            )
 
 
 def test_a_wall_pushes_on_one_side_only_and_never_pulls() -> None:
     rng = np.random.default_rng(1)
-    wall = TorqueSource(TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0), B=(10.0, 0.0))
+    wall = TorqueSource(
+        TorqueKind.WALL, a=(0.0, 0.0), b=(1.0, 0.0), K=(100.0, 0.0), B=(10.0, 0.0)
+    )
     one = site(rng, "known", [wall])
     x = np.zeros(AT.arguments)
-    assert not evaluate_site_rates(one, x).external.any()  # the stretched arm is on the free side
+    assert not evaluate_site_rates(
+        one, x
+    ).external.any()  # the stretched arm is on the free side
     x[AT.q] = np.pi, 0.0
     assert evaluate_site_rates(one, x).external[0] == pytest.approx(0.0, abs=1e-12)  # no lever
     x[AT.q] = 2.5, 0.1
     assert np.abs(evaluate_site_rates(one, x).external).max() > 1.0
     outward = np.sign(
-        evaluate_site_rates(one, x * np.where(np.arange(AT.arguments) == AT.qd.start, 0.0, 1.0)).external[0]
+        evaluate_site_rates(
+            one, x * np.where(np.arange(AT.arguments) == AT.qd.start, 0.0, 1.0)
+        ).external[0]
     )
     x[AT.qd] = outward * 1e3, 0.0
-    assert not evaluate_site_rates(one, x).external.any()  # faster outward than the spring would push
+    assert not evaluate_site_rates(
+        one, x
+    ).external.any()  # faster outward than the spring would push
 
 
 def test_an_estimate_leaves_its_box_nowhere_and_returns() -> None:
@@ -112,11 +138,16 @@ def test_an_estimate_leaves_its_box_nowhere_and_returns() -> None:
     one = site(rng, "adaptive")
     x = rng.uniform(-1, 1, AT.arguments)
     free = evaluate_site_rates(one, x).estimate
-    ends = np.where(free > 0, x[AT.estimate], np.inf), np.where(free > 0, -np.inf, x[AT.estimate])
+    ends = (
+        np.where(free > 0, x[AT.estimate], np.inf),
+        np.where(free > 0, -np.inf, x[AT.estimate]),
+    )
     held = one._replace(gains=one.gains._replace(high=tuple(ends[0]), low=tuple(ends[1])))
     assert not evaluate_site_rates(held, x).estimate.any()
     assert not differentiate_site_rates(held, x).estimate.any()
-    back = one._replace(gains=one.gains._replace(low=tuple(np.where(free > 0, x[AT.estimate], -np.inf))))
+    back = one._replace(
+        gains=one.gains._replace(low=tuple(np.where(free > 0, x[AT.estimate], -np.inf)))
+    )
     assert (evaluate_site_rates(back, x).estimate == free).all()
 
 

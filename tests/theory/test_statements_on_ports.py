@@ -26,9 +26,14 @@ def one_factor(a: float) -> Any:
     return np.array([[0.0, 1.0 - a, a], [a, 0.0, 1.0 - a], [a, 1.0 - a, 0.0]])
 
 
-def position_exchange(alpha: Any, d: float, masses: Any = (1.0, 1.5, 0.7), delay_s: float = 0.2) -> Network:
+def position_exchange(
+    alpha: Any, d: float, masses: Any = (1.0, 1.5, 0.7), delay_s: float = 0.2
+) -> Network:
     wires = tuple(
-        Wire(i, j, 10.0 * alpha[i][j], 0.0, delay_s) for i in range(3) for j in range(3) if alpha[i][j]
+        Wire(i, j, 10.0 * alpha[i][j], 0.0, delay_s)
+        for i in range(3)
+        for j in range(3)
+        if alpha[i][j]
     )
     return Network(tuple(masses), (d,) * 3, (0.0,) * 3, wires)
 
@@ -46,7 +51,10 @@ def test_shares_by_one_factor_are_reversible_at_three_places() -> None:
     alpha = sp.Matrix([[0, 1 - a, a], [a, 0, 1 - a], [a, 1 - a, 0]])
     circle = alpha[0, 1] * alpha[1, 2] * alpha[2, 0] - alpha[0, 2] * alpha[2, 1] * alpha[1, 0]
     assert sorted(sp.solve(circle, a)) == [0, sp.Rational(1, 2), 1]
-    assert {a: find_balancing_weights(one_factor(a)) is not None for a in (0.0, 0.25, 0.5, 0.75, 1.0)} == {
+    assert {
+        a: find_balancing_weights(one_factor(a)) is not None
+        for a in (0.0, 0.25, 0.5, 0.75, 1.0)
+    } == {
         0.0: True,
         0.25: False,
         0.5: True,
@@ -114,7 +122,9 @@ def reflecting(d_m: float, delay_s: float, slave_kg: float = 1.5) -> Network:
 
 
 @pytest.mark.parametrize(("delay_s", "least"), [(0.02, 12.1), (0.2, 40.0), (1.0, 360.0)])
-def test_force_reflection_needs_master_damping_that_grows_with_delay(delay_s: float, least: float) -> None:
+def test_force_reflection_needs_master_damping_that_grows_with_delay(
+    delay_s: float, least: float
+) -> None:
     """Errata 15: d_m >= k_f (2 K T + d_s)^2 / (4 d_s), K = 100 and d_s = 40; its edge within 1 %."""
     assert (2.0 * 100.0 * delay_s + 40.0) ** 2 / 160.0 == pytest.approx(least)
     assert criterion(reflecting(0.99 * least, delay_s)).below
@@ -140,7 +150,12 @@ def test_coupled_hands_are_not_weighed_like_independent_ones() -> None:
     wires = (Wire(0, 1, 100.0, 0.0, 0.2), Wire(1, 0, 1.0, 0.0, 0.2))
     network = Network((1.0, 1.5), (d, d), (0.0, 0.0), wires)
     assert not criterion(network).below
-    mirrored = (*wires, Wire(0, 1, -50.0), Wire(1, 0, -50.0))  # -50 (q1 + q2) on each, with the springs below
+    # -50 (q1 + q2) on each, with the springs below
+    mirrored = (
+        *wires,
+        Wire(0, 1, -50.0),
+        Wire(1, 0, -50.0),
+    )
     heavy = Network((1e4, 1e4 * 51.0 / 150.0), (d, d), (100.0, 100.0), mirrored)
     assert compute_delay_spectrum(heavy.loop, 1).verdict == "unstable"
 

@@ -28,7 +28,11 @@ def peer(t: float) -> tuple[Vector, Vector, Vector]:
     turn = np.array([1.3, 0.9]) * t + np.array([0.2, 1.0])
     rate, size = np.array([1.3, 0.9]), np.array([0.15, 0.2])
     middle = np.array([0.9, 0.8])
-    return middle + size * np.sin(turn), size * rate * np.cos(turn), -size * rate**2 * np.sin(turn)
+    return (
+        middle + size * np.sin(turn),
+        size * rate * np.cos(turn),
+        -size * rate**2 * np.sin(turn),
+    )
 
 
 def place(q: Vector) -> Vector:
@@ -39,7 +43,10 @@ def place(q: Vector) -> Vector:
 def jacobian(q: Vector) -> Vector:
     both = q[0] + q[1]
     return np.array(
-        [[-np.sin(q[0]) - np.sin(both), -np.sin(both)], [np.cos(q[0]) + np.cos(both), np.cos(both)]]
+        [
+            [-np.sin(q[0]) - np.sin(both), -np.sin(both)],
+            [np.cos(q[0]) + np.cos(both), np.cos(both)],
+        ]
     )
 
 
@@ -48,7 +55,10 @@ def regressor(q: Vector, qd: Vector, v: Vector, a: Vector) -> Vector:
     c, s, one, both = np.cos(q[1]), np.sin(q[1]), G * np.cos(q[0]), G * np.cos(q[0] + q[1])
     first = 2 * c * a[0] + c * a[1] - s * (qd[1] * v[0] + (qd[0] + qd[1]) * v[1])
     return np.array(
-        [[a[0], first, a[1], one, both], [0.0, c * a[0] + s * qd[0] * v[0], a[0] + a[1], 0.0, both]]
+        [
+            [a[0], first, a[1], one, both],
+            [0.0, c * a[0] + s * qd[0] * v[0], a[0] + a[1], 0.0, both],
+        ]
     )
 
 
@@ -61,7 +71,9 @@ def reference(q: Vector, x_des: Vector) -> Vector:
     return np.linalg.solve(jacobian(q), -LAMBDA * (place(q) - x_des))
 
 
-def loop(t: float, q: Vector, qd: Vector, theta_hat: Vector) -> tuple[Vector, Vector, Vector, Vector]:
+def loop(
+    t: float, q: Vector, qd: Vector, theta_hat: Vector
+) -> tuple[Vector, Vector, Vector, Vector]:
     """The sliding variable, the error's derivative, qdd and the estimate's derivative."""
     x_des, xd_des, _ = peer(t - T)
     J, v = jacobian(q), reference(q, x_des)
@@ -83,7 +95,10 @@ def follow(moves: Callable[[float], Vector], t: float, h: float) -> float:
         r, e = qd - reference(q, x_des), place(q) - x_des
         off = theta_hat - THETA
         return float(
-            0.5 * r @ inertia(q) @ r + 0.5 * off @ off / GAMMA + 0.5 * e @ (LAMBDA * KD * e) + 0.5 * stored
+            0.5 * r @ inertia(q) @ r
+            + 0.5 * off @ off / GAMMA
+            + 0.5 * e @ (LAMBDA * KD * e)
+            + 0.5 * stored
         )
 
     return (8 * (V(t + h) - V(t - h)) - V(t + 2 * h) + V(t - 2 * h)) / (12 * h)
@@ -97,7 +112,9 @@ def test_its_derivative_is_what_is_taken_and_passed_on() -> None:
         return np.concatenate([qd, qdd, rate, [now @ (KD * now) - then @ (KD * then)]])
 
     begin = np.array([0.1, 1.3, 0.0, 0.0, *(0.5 * THETA), 0.0])
-    run = solve_ivp(field, (0.0, 4.0), begin, method="DOP853", rtol=1e-12, atol=1e-13, dense_output=True)
+    run = solve_ivp(
+        field, (0.0, 4.0), begin, method="DOP853", rtol=1e-12, atol=1e-13, dense_output=True
+    )
     for t in np.linspace(0.2, 3.8, 25):
         state = run.sol(t)
         q, qd = state[:2], state[2:4]
@@ -161,11 +178,19 @@ def test_v_rises_while_a_hand_pushes() -> None:
 def test_sites_may_scale_kd_if_beta_is_divided_by_scale() -> None:
     """Kd_i = c_i Kbar needs beta_i = pi_i / c_i; the paper's ones let V rise by a third of itself."""
     scale = {"m1": 10.0, "m2": 3.0, "s": 0.3}
-    rows = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.8, "s": 0.2}, "s": {"m1": 0.8, "m2": 0.2}}
+    rows = {
+        "m1": {"m2": 0.1, "s": 0.9},
+        "m2": {"m1": 0.8, "s": 0.2},
+        "s": {"m1": 0.8, "m2": 0.2},
+    }
     made = run(
         "free",
         {
-            **{f"dominance.{i}.{j}": share for i, row in rows.items() for j, share in row.items()},
+            **{
+                f"dominance.{i}.{j}": share
+                for i, row in rows.items()
+                for j, share in row.items()
+            },
             **{f"sites.{name}.control.Kd": c for name, c in scale.items()},
             "control.Kp": 0.1,
             "duration_s": DURATION_S,

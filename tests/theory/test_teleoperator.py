@@ -9,7 +9,11 @@ from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.theory.equilibrium import find_equilibrium
 from trilat_net.theory.frequency_search import build_frequency_grid, refine_frequencies
 from trilat_net.theory.linear_loop import LinearLoop, linearise_loop
-from trilat_net.theory.operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from trilat_net.theory.operating_point import (
+    Equilibrium,
+    OperatingConditions,
+    derive_operating_conditions,
+)
 from trilat_net.theory.port_analysis import (
     build_proof_output,
     compute_proof_weights,
@@ -28,7 +32,12 @@ from trilat_net.theory.port_response import (
     to_imaginary_axis,
 )
 
-BARE: dict[str, Any] = {"sites.m1.hands": [], "sites.m2.hands": [], "sites.s.hands": [], "timeline": []}
+BARE: dict[str, Any] = {
+    "sites.m1.hands": [],
+    "sites.m2.hands": [],
+    "sites.s.hands": [],
+    "timeline": [],
+}
 POSE = (-0.6, 1.8)
 ALONE: dict[str, dict[str, Any]] = {"free": {}, "two_sites": {"sites.m.hands": []}}
 
@@ -43,13 +52,17 @@ def at_pose(
 
 def grid(loop: LinearLoop) -> np.ndarray:
     delay_s = find_longest_delay_s(loop)
-    return refine_frequencies(build_admittance(loop), build_frequency_grid(1e-3, 100.0, delay_s))
+    return refine_frequencies(
+        build_admittance(loop), build_frequency_grid(1e-3, 100.0, delay_s)
+    )
 
 
 def in_r(now: OperatingConditions, loop: LinearLoop, *, ones: bool = False) -> Passivity:
     output = build_proof_output(now, loop)
     assert output is not None
-    beta = np.repeat(np.ones(len(list_port_sites(loop))) if ones else compute_proof_weights(now), 2)
+    beta = np.repeat(
+        np.ones(len(list_port_sites(loop))) if ones else compute_proof_weights(now), 2
+    )
     return check_passivity(
         lambda at: evaluate_transfer(loop, to_imaginary_axis(at), output), grid(loop), beta
     )
@@ -57,9 +70,16 @@ def in_r(now: OperatingConditions, loop: LinearLoop, *, ones: bool = False) -> P
 
 def test_hands_back_at_their_ports_make_loop_that_had_them() -> None:
     """A hand holds a pose by a torque: that had stayed when its spring and damper were taken off."""
-    hand = {"kind": "spring", "from_rad": [-0.3, 1.6], "stiffness_nm_rad": 20.0, "damping_nm_s_rad": 3.0}
+    hand = {
+        "kind": "spring",
+        "from_rad": [-0.3, 1.6],
+        "stiffness_nm_rad": 20.0,
+        "damping_nm_s_rad": 3.0,
+    }
     dashpot = {"kind": "viscous", "damping_nm_s_rad": 0.7}
-    scenario = load_scenario("training", {**BARE, "sites.m1.hands": [hand], "sites.s.environment": [dashpot]})
+    scenario = load_scenario(
+        "training", {**BARE, "sites.m1.hands": [hand], "sites.s.environment": [dashpot]}
+    )
     rest = find_equilibrium(scenario)
     bare = linearise_teleoperator(derive_operating_conditions(scenario), rest)
     again, whole = (
@@ -88,7 +108,9 @@ def test_force_that_law_reflects_is_reflected_of_load_as_well() -> None:
 
 def test_what_acted_at_the_rest_goes_on_acting() -> None:
     scenario = load_scenario("training")
-    off = freeze_external_torques(derive_operating_conditions(scenario), find_equilibrium(scenario))
+    off = freeze_external_torques(
+        derive_operating_conditions(scenario), find_equilibrium(scenario)
+    )
     pushes = [site.actors[0].a for site in off.sites if site.actors]
     assert len(pushes) == 2
     assert np.abs(np.array(pushes)).max() > 1.0
@@ -132,7 +154,9 @@ def test_what_is_read_as_r_is_qd_plus_lambda_e() -> None:
     assert output is not None
     qd = evaluate_transfer(loop, s)[0]
     mean = np.kron(now.alpha, np.eye(2)) @ qd
-    np.testing.assert_allclose(evaluate_transfer(loop, s, output)[0], qd + (qd + mean) / s[0], rtol=1e-9)
+    np.testing.assert_allclose(
+        evaluate_transfer(loop, s, output)[0], qd + (qd + mean) / s[0], rtol=1e-9
+    )
 
 
 def test_statics_share_the_force_by_dominance() -> None:
@@ -155,8 +179,11 @@ def test_learning_gravity_is_a_spring_at_low_frequency(name: str, delay_ms: floa
     """A push moves N sites together, each a spring Gamma g^2 cos^2 q (1 + Lambda T) of its channel."""
     _, now, _, loop = at_pose(name, {"link.delay_ms": delay_ms, **ALONE[name]})
     w = 1e-4
-    Z = 1j * w * np.linalg.inv(build_admittance(loop)(np.array([w]))[0])  # stiffness of all ports
-    first, outer = (9.81**2 * np.cos(angle) ** 2 * (1.0 + 1e-3 * delay_ms) for angle in (POSE[0], sum(POSE)))
+    # stiffness of all ports
+    Z = 1j * w * np.linalg.inv(build_admittance(loop)(np.array([w]))[0])
+    first, outer = (
+        9.81**2 * np.cos(angle) ** 2 * (1.0 + 1e-3 * delay_ms) for angle in (POSE[0], sum(POSE))
+    )
     alone = np.linalg.inv(np.linalg.inv(Z)[:2, :2])  # what one hand feels, the others off
     expected = len(now.sites) * np.array([[first + outer, outer], [outer, outer]])
     np.testing.assert_allclose(alone.real, expected, rtol=2e-3)

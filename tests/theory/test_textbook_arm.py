@@ -24,18 +24,26 @@ def placed(q: Array) -> PlacedArm:
 
 
 @given(a=links, q=angles, qd=speeds, v=speeds, acc=speeds)
-def test_they_are_those_of_two_bodies(a: ArmLinks, q: Array, qd: Array, v: Array, acc: Array) -> None:
+def test_they_are_those_of_two_bodies(
+    a: ArmLinks, q: Array, qd: Array, v: Array, acc: Array
+) -> None:
     theta = theta_from_links(a)
     scale = 1e-12 * (1.0 + 1e4 * theta.sum())
     assert placed(q).inertia_matrix(theta) == pytest.approx(physics.inertia(a, q), abs=scale)
-    assert placed(q).coriolis_matrix(theta, qd) == pytest.approx(physics.coriolis(a, q, qd), abs=scale)
-    assert placed(q).gravity_torque(theta) == pytest.approx(physics.gravity(a, 9.81, q), abs=scale)
+    assert placed(q).coriolis_matrix(theta, qd) == pytest.approx(
+        physics.coriolis(a, q, qd), abs=scale
+    )
+    assert placed(q).gravity_torque(theta) == pytest.approx(
+        physics.gravity(a, 9.81, q), abs=scale
+    )
     torque = placed(q).required_torque(theta, qd, v, acc)
     assert placed(q).regressor_matrix(qd, v, acc) @ theta == pytest.approx(torque, abs=scale)
 
 
 @given(a=links, q=angles, qd=speeds, torque=speeds)
-def test_the_acceleration_needs_the_torque(a: ArmLinks, q: Array, qd: Array, torque: Array) -> None:
+def test_the_acceleration_needs_the_torque(
+    a: ArmLinks, q: Array, qd: Array, torque: Array
+) -> None:
     theta = theta_from_links(a)
     qdd = placed(q).joint_acceleration(theta, qd, torque)
     needed = placed(q).required_torque(theta, qd, qd, qdd)
@@ -51,14 +59,18 @@ def test_columns_are_arms_of_their_own(seed: int) -> None:
     each = np.zeros(4) + theta[:, None]
     found = placed(q).joint_acceleration(each, qd, torque)
     for n in range(4):
-        assert found[:, n] == pytest.approx(placed(q[:, n]).joint_acceleration(theta, qd[:, n], torque[:, n]))
+        assert found[:, n] == pytest.approx(
+            placed(q[:, n]).joint_acceleration(theta, qd[:, n], torque[:, n])
+        )
 
 
 @given(q=angles, qd=speeds)
 def test_the_tip_moves_as_its_jacobian_says(q: Array, qd: Array) -> None:
     step = 1e-30
     moved = placed(q + 1j * step * qd).end_effector_position().imag / step
-    assert placed(q).position_jacobian() @ qd == pytest.approx(moved, abs=1e-12 * (1 + np.abs(qd).max()))
+    assert placed(q).position_jacobian() @ qd == pytest.approx(
+        moved, abs=1e-12 * (1 + np.abs(qd).max())
+    )
 
 
 REFERENCES = chain_references()
@@ -96,7 +108,9 @@ def test_dynamics_and_kinematics_are_those_of_pinocchio(name: str) -> None:
         assert apart(torque, state.inverse_dynamics) <= 1e-12
         assert apart(Y.T @ state.r, state.regressor_transpose_r) <= 1e-12
         assert apart(M, state.inertia) <= 1e-12
-        assert apart(qdd, state.forward_dynamics) <= 100 * np.finfo(float).eps * np.linalg.cond(M)
+        assert apart(qdd, state.forward_dynamics) <= 100 * np.finfo(float).eps * np.linalg.cond(
+            M
+        )
         assert apart(placed.end_effector_position(), state.tip_position) <= 1e-12
         assert apart(placed.position_jacobian(), state.jacobian[:3]) <= 1e-12
 
@@ -110,12 +124,16 @@ def test_columns_are_chains_of_their_own() -> None:
         return PlacedChain(made, q).joint_acceleration(theta, qd, tau)
 
     both = [np.stack(pair, axis=1) for pair in ((first.q, second.q), (first.qd, second.qd))]
-    found = acceleration(*both, np.stack([first.tau, second.tau], axis=1), np.stack([theta, theta], axis=1))
+    found = acceleration(
+        *both, np.stack([first.tau, second.tau], axis=1), np.stack([theta, theta], axis=1)
+    )
     for n, one in enumerate((first, second)):
         assert apart(found[:, n], acceleration(one.q, one.qd, one.tau, theta)) <= 1e-12
     for k in range(7):
         off = 1e-6 * np.eye(7)[k]
-        ahead, behind = (acceleration(first.q + way * off, first.qd, first.tau, theta) for way in (1, -1))
+        ahead, behind = (
+            acceleration(first.q + way * off, first.qd, first.tau, theta) for way in (1, -1)
+        )
         exact = acceleration(first.q + 1e-24j * off, first.qd, first.tau, theta).imag / 1e-30
         assert apart(exact, (ahead - behind) / 2e-6) <= 1e-6
 
@@ -134,7 +152,11 @@ def test_drives_and_stops_are_those_of_the_compiled_leaves(name: str) -> None:
 def test_the_planar_arm_is_a_chain_of_two_joints() -> None:
     """Rods of different lengths, hung on z axes in the x-y plane."""
     (l1, m1), (l2, m2), g = (0.7, 1.3), (1.1, 0.8), 9.81
-    outer, axis, upright = m2 * l2 * l2 / 3.0, (0.0, 0.0, 1.0), tuple(map(tuple, np.eye(3).tolist()))
+    outer, axis, upright = (
+        m2 * l2 * l2 / 3.0,
+        (0.0, 0.0, 1.0),
+        tuple(map(tuple, np.eye(3).tolist())),
+    )
     inner = m1 * l1 * l1 / 3.0 + m2 * l1 * l1 + outer
     theta = np.array([inner, m2 * l1 * l2 / 2.0, outer, m1 * l1 / 2.0 + m2 * l1, m2 * l2 / 2.0])
     bodies = [
@@ -145,9 +167,14 @@ def test_the_planar_arm_is_a_chain_of_two_joints() -> None:
     q, qd, v, a = np.random.default_rng(5).normal(size=(4, 2, 6))
     planar = PlacedArm(g, (l1, l2), q)
     placed = PlacedChain(ChainSetup(joints, (0.0, -g, 0.0), (l2, 0.0, 0.0)), q)
-    of_chain, of_arm = (np.outer(values, np.ones(6)) for values in (np.concatenate(bodies), theta))
+    of_chain, of_arm = (
+        np.outer(values, np.ones(6)) for values in (np.concatenate(bodies), theta)
+    )
     assert (
-        apart(placed.required_torque(of_chain, qd, v, a), planar.required_torque(of_arm, qd, v, a)) <= 1e-12
+        apart(
+            placed.required_torque(of_chain, qd, v, a), planar.required_torque(of_arm, qd, v, a)
+        )
+        <= 1e-12
     )
     assert apart(placed.gravity_torque(of_chain), planar.gravity_torque(of_arm)) <= 1e-12
     assert apart(placed.position_jacobian()[:2], planar.position_jacobian()) <= 1e-12

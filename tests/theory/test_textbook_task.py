@@ -30,7 +30,9 @@ from trilat_net.theory.textbook_arm import (
     vector_from_rotation,
 )
 
-angles = st.one_of(st.floats(0.0, np.pi), st.floats(0.0, 1e-3), st.floats(np.pi - 1e-3, np.pi - 1e-9))
+angles = st.one_of(
+    st.floats(0.0, np.pi), st.floats(0.0, 1e-3), st.floats(np.pi - 1e-3, np.pi - 1e-9)
+)
 
 
 @given(direction=st.tuples(*[st.floats(-1.0, 1.0)] * 3), angle=angles)
@@ -53,7 +55,11 @@ LAWS: dict[str, dict[str, Any]] = {
 SITES = [
     ("planar", "m", "adaptive"),
     ("planar", "s", "p_f"),
-    *(pytest.param("posed", site, law, marks=pytest.mark.long) for site in ("m1", "s") for law in LAWS),
+    *(
+        pytest.param("posed", site, law, marks=pytest.mark.long)
+        for site in ("m1", "s")
+        for law in LAWS
+    ),
 ]
 
 
@@ -71,15 +77,26 @@ def draw(site: SiteSetup, seed: int, apart: float) -> tuple[Array, list[Array]]:
     rng, at = np.random.default_rng(seed), lay_out_arguments(site)
     state = np.zeros(at.states)
     state[at.q] = np.array(site.q0) + rng.normal(0.0, 0.1, at.joints)
-    state[at.qd], state[at.estimate] = rng.normal(0.0, 0.3, at.joints), rng.normal(0.0, 1.0, at.parameters)
-    own = evaluate_site_rates(site, np.concatenate([state, np.zeros(at.arguments - at.states)])).x
+    state[at.qd], state[at.estimate] = (
+        rng.normal(0.0, 0.3, at.joints),
+        rng.normal(0.0, 1.0, at.parameters),
+    )
+    own = evaluate_site_rates(
+        site, np.concatenate([state, np.zeros(at.arguments - at.states)])
+    ).x
     peers = []
     for _ in site.links:
         pose = own + np.concatenate([rng.normal(0.0, apart, 3), np.zeros(len(own) - 3)])
         if len(own) > 3:
-            turned = Rotation.from_rotvec(rng.normal(0.0, apart, 3)) * Rotation.from_rotvec(own[3:])
+            turned = Rotation.from_rotvec(rng.normal(0.0, apart, 3)) * Rotation.from_rotvec(
+                own[3:]
+            )
             pose[3:] = turned.as_rotvec()
-        peers.append(np.concatenate([pose, rng.normal(0.0, 0.2, len(own)), rng.normal(0.0, 2.0, len(own))]))
+        peers.append(
+            np.concatenate(
+                [pose, rng.normal(0.0, 0.2, len(own)), rng.normal(0.0, 2.0, len(own))]
+            )
+        )
     return state, peers
 
 
@@ -89,7 +106,9 @@ def by_theory(site: SiteSetup, state: Array, peers: list[Array]) -> SiteRates:
     own = evaluate_site_rates(site, x).x
     x[at.q_des] = evaluate_reference(alpha, own, [own, *(peer[:m] for peer in peers)])
     x[at.qd_des] = sum(a * peer[m : 2 * m] for a, peer in zip(alpha[1:], peers, strict=True))
-    x[at.peer_torque] = sum(-a * peer[2 * m :] for a, peer in zip(alpha[1:], peers, strict=True))
+    x[at.peer_torque] = sum(
+        -a * peer[2 * m :] for a, peer in zip(alpha[1:], peers, strict=True)
+    )
     return evaluate_site_rates(site, x)
 
 
@@ -106,14 +125,18 @@ def by_tick(site: SiteSetup, state: Array, peers: list[Array]) -> dict[str, Arra
         site_tick(0, 0, 0, *arrays, *buffers)
         accelerations.append((s.qd - state[at.qd]) * rate_hz)
         rates = (s.theta_hat - state[at.estimate]) * rate_hz
-        columns = {name: buffers.record[place].copy() for name, place in one.layout.columns().items()}
+        columns = {
+            name: buffers.record[place].copy() for name, place in one.layout.columns().items()
+        }
         records.append({**columns, "estimate": rates})
     return {**records[1], "qdd": 2.0 * accelerations[1] - accelerations[0]}
 
 
 @pytest.mark.parametrize(("text", "name", "law"), SITES)
 @pytest.mark.parametrize("apart", [0.3, 0.0])
-def test_a_site_is_that_of_a_compiled_tick(text: str, name: str, law: str, apart: float) -> None:
+def test_a_site_is_that_of_a_compiled_tick(
+    text: str, name: str, law: str, apart: float
+) -> None:
     """Its torque, what it sends, and how it moves and learns, where peers are apart and where they agree."""
     site = build(text, name, law)
     for seed in range(3):
@@ -121,7 +144,9 @@ def test_a_site_is_that_of_a_compiled_tick(text: str, name: str, law: str, apart
         found, wanted = by_theory(site, state, peers), by_tick(site, state, peers)
         names = {"tau": found.tau, "x": found.x, "xd": found.xd, "wrench": -found.reflected}
         for key, value in names.items():
-            assert np.abs(value - wanted[key]).max() <= 1e-9 * (1.0 + np.abs(wanted[key]).max()), key
+            assert np.abs(value - wanted[key]).max() <= 1e-9 * (
+                1.0 + np.abs(wanted[key]).max()
+            ), key
         if law == "adaptive":
             size = 1.0 + np.abs(found.estimate).max()
             assert np.abs(found.estimate - wanted["estimate"]).max() <= 1e-7 * size
@@ -130,7 +155,9 @@ def test_a_site_is_that_of_a_compiled_tick(text: str, name: str, law: str, apart
 
 
 @pytest.mark.parametrize(("text", "name", "law"), SITES)
-def test_its_jacobian_is_the_difference_of_compiled_ticks(text: str, name: str, law: str) -> None:
+def test_its_jacobian_is_the_difference_of_compiled_ticks(
+    text: str, name: str, law: str
+) -> None:
     site, step = build(text, name, law), 1e-6
     at = lay_out_arguments(site)
     state, peers = draw(site, 4, 0.0)
@@ -162,8 +189,13 @@ def test_rate_of_jacobian_is_its_derivative_along_motion(seed: int) -> None:
     assert isinstance(moved, PlacedChain)
     assert isinstance(here, PlacedChain)
     wanted = moved.pose_jacobian().imag / COMPLEX_STEP
-    assert np.abs(here.pose_jacobian_rate(qd) - wanted).max() <= 1e-13 * (1.0 + np.abs(wanted).max())
-    R, turned = here.end_effector_orientation(), moved.end_effector_orientation().imag / COMPLEX_STEP
+    assert np.abs(here.pose_jacobian_rate(qd) - wanted).max() <= 1e-13 * (
+        1.0 + np.abs(wanted).max()
+    )
+    R, turned = (
+        here.end_effector_orientation(),
+        moved.end_effector_orientation().imag / COMPLEX_STEP,
+    )
     across = turned @ R.T
     w = here.pose_jacobian()[3:] @ qd
     assert np.array([across[2, 1], across[0, 2], across[1, 0]]) == pytest.approx(w, abs=1e-12)

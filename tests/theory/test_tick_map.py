@@ -30,7 +30,12 @@ def spectra(scenario: Scenario, wanted: int = 4) -> tuple[Spectrum, Spectrum]:
 
 
 HANDS = [
-    {"kind": "spring", "from_rad": list(POSE), "stiffness_nm_rad": 20.0, "damping_nm_s_rad": 2.0},
+    {
+        "kind": "spring",
+        "from_rad": list(POSE),
+        "stiffness_nm_rad": 20.0,
+        "damping_nm_s_rad": 2.0,
+    },
     {
         "kind": "spring",
         "from_rad": list(POSE),
@@ -49,7 +54,9 @@ LAWS = {
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("delay_ms", [0.0, 30.0])
-def test_small_deviation_goes_tick_by_tick_as_run_does(law: str, scheme: str, delay_ms: float) -> None:
+def test_small_deviation_goes_tick_by_tick_as_run_does(
+    law: str, scheme: str, delay_ms: float
+) -> None:
     """The companion matrix carries it on; the run begins there, its peers' histories at their start poses."""
     small = 1e-6
     off = small * np.array([[1.0, -0.5], [-0.7, 0.3]])
@@ -62,7 +69,9 @@ def test_small_deviation_goes_tick_by_tick_as_run_does(law: str, scheme: str, de
             "control": LAWS[law],
             "link.delay_ms": delay_ms,
             # before the first sample a peer feels nothing: a spring off its rest would be felt
-            "sites.m.hands": [{**hand, "stiffness_nm_rad": 0.0} for hand in HANDS] if law == "p_f" else HANDS,
+            "sites.m.hands": [{**hand, "stiffness_nm_rad": 0.0} for hand in HANDS]
+            if law == "p_f"
+            else HANDS,
             "sites.m.q0_rad": (POSE + off[0]).tolist(),
             "sites.s.q0_rad": (POSE + off[1]).tolist(),
         },
@@ -71,10 +80,15 @@ def test_small_deviation_goes_tick_by_tick_as_run_does(law: str, scheme: str, de
     rest = find_equilibrium(scenario, POSE)
     assert rest.residual < 1e-10
     whole, names, late, _ = build_recursion(now, rest)
-    start = {f"{site}.q{j + 1}": off[i, j] for (i, site), j in itertools.product(enumerate("ms"), range(2))}
+    start = {
+        f"{site}.q{j + 1}": off[i, j]
+        for (i, site), j in itertools.product(enumerate("ms"), range(2))
+    }
     X = begun(whole, late, names, np.array([start.get(name, 0.0) for name in names]))
     run = trajectories(scenario)
-    q = np.array([run.sites[site].q[:, j] for site in "ms" for j in range(2)]).T - np.tile(POSE, 2)
+    q = np.array([run.sites[site].q[:, j] for site in "ms" for j in range(2)]).T - np.tile(
+        POSE, 2
+    )
     places = [names.index(f"{site}.q{j + 1}") for site in "ms" for j in range(2)]
     for k in range(1, 60):
         X = whole @ X
@@ -83,7 +97,9 @@ def test_small_deviation_goes_tick_by_tick_as_run_does(law: str, scheme: str, de
 
 def begun(whole: Array, late: NDArray[np.intp], names: Sequence[str], start: Array) -> Array:
     """The state at tick 0: the past as the start, tau_-1 = tau_0, and theta_0 = theta_hat0."""
-    X = np.concatenate([start, np.tile(start[late], (len(whole) - len(names)) // max(1, len(late)))])
+    X = np.concatenate(
+        [start, np.tile(start[late], (len(whole) - len(names)) // max(1, len(late)))]
+    )
     thetas = [place for place, name in enumerate(names) if ".theta" in name]
     taus = [place for place, name in enumerate(names) if ".tau" in name]
     if taus:  # theta_0 = eta_0 + h/2 f_0, and a tick adds h f to eta
@@ -100,14 +116,18 @@ def test_it_goes_to_continuous_loop_with_order_of_its_scheme(
     """Both with the same delay in use; the rightmost root, at rates that halve the period."""
     apart = []
     for rate_hz in (100, 200, 400):
-        scenario = load_scenario("paper", {"scheme": scheme, "link.delay_ms": delay_ms, "rate_hz": rate_hz})
+        scenario = load_scenario(
+            "paper", {"scheme": scheme, "link.delay_ms": delay_ms, "rate_hz": rate_hz}
+        )
         continuous, computed = spectra(scenario, 2)
         apart.append(abs(continuous.roots[0].s - computed.roots[0].s))
     for coarse, fine in itertools.pairwise(apart):
         assert np.log2(coarse / fine) == pytest.approx(order, abs=0.25)
 
 
-@pytest.mark.parametrize(("rate_hz", "stable"), [(80, False), (100, False), (125, True), (200, True)])
+@pytest.mark.parametrize(
+    ("rate_hz", "stable"), [(80, False), (100, False), (125, True), (200, True)]
+)
 def test_a_digital_controller_without_delay_needs_its_rate(rate_hz: int, stable: bool) -> None:
     """About Gamma g^2 h > Kp it swings by itself; the extrapolated torque does not."""
     given = {"link.delay_ms": 0.0, "rate_hz": rate_hz}
@@ -144,6 +164,8 @@ def test_a_swing_that_grows_is_that_of_a_run() -> None:
 
 
 def test_a_held_push_moves_a_mass_by_half_h_squared() -> None:
-    Phi, Gamma = discretise_zero_order_hold(np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [2.0]]), 0.1)
+    Phi, Gamma = discretise_zero_order_hold(
+        np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [2.0]]), 0.1
+    )
     assert Phi == pytest.approx(np.array([[1.0, 0.1], [0.0, 1.0]]), abs=1e-15)
     assert Gamma == pytest.approx(np.array([[0.01], [0.2]]), abs=1e-15)

@@ -2,11 +2,11 @@
 
 A site's log as columns on its full tick grid, and its peers as it sees them after their links.
 
-Invariant: a gap is filled in, so that sums have all their terms and times stay times, and is marked in
-`known`; no metric uses a row that is not known. A peer's motion is a cubic through angles and velocities
-between its records, and rest before them (L7). Between two ticks a stamp moves at rate one, as under the
-constant delay of the theorem; the difference from the sample in use at the next tick is a jump of that
-link.
+Invariant: a gap is filled in, so that sums have all their terms and times stay times, and is
+marked in `known`; no metric uses a row that is not known. A peer's motion is a cubic through
+angles and velocities between its records, and rest before them (L7). Between two ticks a stamp
+moves at rate one, as under the constant delay of the theorem; the difference from the sample in
+use at the next tick is a jump of that link.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,9 @@ RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
 _NONE: Array = np.zeros((0, 0))
 _NO_ROWS: Bools = np.zeros(0, dtype=np.bool_)
 RESUMING_S = 2.0 * BLEND_S
-"""For so long after one of the `RESTING_MODES` the torque may not be that of the law alone either."""
+"""For so long after one of the `RESTING_MODES` the torque may not be that of the law alone
+either.
+"""
 
 
 class AlignedRecords(NamedTuple):
@@ -43,19 +45,20 @@ class AlignedRecords(NamedTuple):
         rate_hz: its tick rate, Hz.
         first: the tick of row 0.
         known: True if there is a record of that tick.
-        follows: True if the site followed its peers then: no hold, no brake, no return, and no reference
-            as fast as it may move.
+        follows: True if the site followed its peers then: no hold, no brake, no return, and no
+            reference as fast as it may move.
         q, qd: joint angles, shape (K, n), rad, and velocities, rad/s.
         q_des, qd_des: the same of the reference.
         tau: control torque, shape (K, n), N m.
         tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
         theta_hat: estimate, shape (K, P).
-        used: per peer the tick of the sample in use; -1 before the first.
-        x, xd: in task space the end effector's place or pose and its derivative, shape (K, m); else empty.
+        used: per peer the tick of the sample in use; -1 before the first. x, xd: in task space
+        the end effector's place or pose and its derivative, shape (K, m); else empty.
         wrench: what tau_x amounts to there, likewise.
         axes: see `SiteLog`.
         hand: what somebody who holds the arm does, shape (K, h), see `HandInForce`; else empty.
-        rests: True in one of the `RESTING_MODES`, and for `RESUMING_S` afterwards; empty: never.
+        rests: True in one of the `RESTING_MODES`, and for `RESUMING_S` afterwards; empty:
+            never.
     """
 
     site: str
@@ -100,14 +103,20 @@ class AlignedRecords(NamedTuple):
 
     @property
     def nominal_s(self) -> Array:
-        """The same of whole nanoseconds, as the core compares them with begin and end of a torque, s."""
+        """The same of whole nanoseconds, as the core compares them with begin and end of a
+        torque, s.
+        """
         tick = np.arange(self.first, self.first + len(self.known), dtype=np.int64)
         return (tick * NS_PER_S // self.rate_hz).astype(np.float64) * 1e-9
 
     @property
     def e(self) -> Array:
         """Position error, Eq. (9), shape (K, n), rad; in task space (K, m), see `SiteLog.e`."""
-        return find_task_errors(self.x, self.q_des, self.axes) if self.x.size else self.q - self.q_des
+        return (
+            find_task_errors(self.x, self.q_des, self.axes)
+            if self.x.size
+            else self.q - self.q_des
+        )
 
     @property
     def ed(self) -> Array:
@@ -126,9 +135,11 @@ class AlignedRecords(NamedTuple):
 
 
 def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
-    """Returns the torque that a controller holds from every tick to the next, shape (K, n), N m.
+    """Returns the torque that a controller holds from every tick to the next, shape (K, n), N
+    m.
 
-    tau_k of `digital`; of `second_order` the extrapolated 1.5 tau_k - 0.5 tau_(k-1) within the limit.
+    tau_k of `digital`; of `second_order` the extrapolated 1.5 tau_k - 0.5 tau_(k-1) within the
+    limit.
     """
     held = tau.copy()
     if not digital:
@@ -139,9 +150,9 @@ def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
 def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords]:
     """Returns the records of the sites that have any, in scenario order.
 
-    The record that says `diverged` is left out: it may hold zeros in place of numbers that are not finite.
-    With `common` all end where the first site ends, as sums over all sites need it: then {} unless every site
-    has two ticks until there.
+    The record that says `diverged` is left out: it may hold zeros in place of numbers that are
+    not finite. With `common` all end where the first site ends, as sums over all sites need it:
+    then {} unless every site has two ticks until there.
     """
     rows: dict[str, Ints] = {}
     for site in log.sites:
@@ -149,7 +160,9 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
         rows[site] = first[log[site].mode[first] != "diverged"]
     if not common:
         return {
-            site: _fill_tick_grid(log.scenario, log[site], kept) for site, kept in rows.items() if len(kept)
+            site: _fill_tick_grid(log.scenario, log[site], kept)
+            for site, kept in rows.items()
+            if len(kept)
         }
     if min(map(len, rows.values())) < 2:
         return {}
@@ -158,12 +171,17 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
     if end_s <= begin_s:
         return {}
     last = {site: int(np.floor(end_s * log[site].rate_hz + 1e-6)) for site in rows}
-    found = {site: _fill_tick_grid(log.scenario, log[site], kept, last[site]) for site, kept in rows.items()}
+    found = {
+        site: _fill_tick_grid(log.scenario, log[site], kept, last[site])
+        for site, kept in rows.items()
+    }
     return found if min(len(records.known) for records in found.values()) > 1 else {}
 
 
 def find_unlimited(limits: Limits, qd_des: Array) -> Bools:
-    """Returns the rows in which no coordinate of a reference is as fast as it may be; of one row, if so."""
+    """Returns the rows in which no coordinate of a reference is as fast as it may be; of one
+    row, if so.
+    """
     return np.asarray((np.abs(qd_des) < limits.motion.qd_des_limit).all(axis=-1))
 
 
@@ -176,8 +194,12 @@ def _find_rests(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
     return tick - last <= RESUMING_S * rate_hz
 
 
-def _fill_tick_grid(scenario: Scenario, part: SiteLog, rows: Ints, last: int | None = None) -> AlignedRecords:
-    """Returns some records, one for a tick, on every tick up to `last`; missing ones are interpolated."""
+def _fill_tick_grid(
+    scenario: Scenario, part: SiteLog, rows: Ints, last: int | None = None
+) -> AlignedRecords:
+    """Returns some records, one for a tick, on every tick up to `last`; missing ones are
+    interpolated.
+    """
     names = (*RECORD_COLUMNS, *(TASK_VECTORS if part.layout.task else ()))
     names += ("hand",) if part.layout.hand else ()
     part.prepare(*names)
@@ -228,19 +250,23 @@ class PeerMotion(NamedTuple):
 
 
 class PeerTrajectory:
-    """A site's motion as a function of time: its records, polynomials between them, rest before them (L7)."""
+    """A site's motion as a function of time: its records, polynomials between them, rest before
+    them (L7).
+    """
 
     def __init__(self, records: AlignedRecords) -> None:
         self.records = records
         squares = records.shared_rate**2
         steps = 0.5 * records.h_s * (squares[1:] + squares[:-1])
-        self._squares: Array = np.vstack([np.zeros((1, squares.shape[1])), np.cumsum(steps, axis=0)])
+        self._squares: Array = np.vstack(
+            [np.zeros((1, squares.shape[1])), np.cumsum(steps, axis=0)]
+        )
 
     def at(self, t_s: Array) -> PeerMotion:
         """Returns the site at times, s since the epoch; on its ticks these are its records.
 
-        q is the cubic through angles and velocities, qd runs straight from record to record, and the
-        integral is the exact one of the trapezoid rule.
+        q is the cubic through angles and velocities, qd runs straight from record to record,
+        and the integral is the exact one of the trapezoid rule.
         """
         records = self.records
         h = self.records.h_s
@@ -255,9 +281,13 @@ class PeerTrajectory:
         qb = at[low + 1].copy()
         va = rate[low]
         vb = rate[low + 1]
-        if self.records.x.shape[1] == POSE:  # between two rotation vectors of different branches lies nothing
+        # between two rotation vectors of different branches lies nothing
+        if self.records.x.shape[1] == POSE:
             qb[:, PLACE:] = bring_nearer(qb[:, PLACE:], qa[:, PLACE:])
-        q = qa + x * (h * va + x * (3 * (qb - qa) - h * (2 * va + vb) + x * (2 * (qa - qb) + h * (va + vb))))
+        q = qa + x * (
+            h * va
+            + x * (3 * (qb - qa) - h * (2 * va + vb) + x * (2 * (qa - qb) + h * (va + vb)))
+        )
         qd = va + x * (vb - va)
         sa = va**2
         sb = vb**2
@@ -276,7 +306,8 @@ class DelayedPeer(NamedTuple):
     """A peer as a site sees it after its link.
 
     Attributes:
-        now, seen: the peer at the site's ticks, and at the stamps of the samples in use, K rows each.
+        now, seen: the peer at the site's ticks, and at the stamps of the samples in use, K rows
+        each.
         kept: the peer at the end of a period if that stamp moves at rate one, K - 1 rows.
         stamp_s: the stamp of the sample in use, shape (K,), s; NaN before the first.
     """
@@ -289,7 +320,12 @@ class DelayedPeer(NamedTuple):
     @property
     def known(self) -> Bools:
         """True if all of a period follows from records, shape (K - 1,)."""
-        ends = (self.now.known[:-1], self.now.known[1:], self.seen.known[:-1], self.seen.known[1:])
+        ends = (
+            self.now.known[:-1],
+            self.now.known[1:],
+            self.seen.known[:-1],
+            self.seen.known[1:],
+        )
         known: Bools = np.logical_and.reduce([*ends, self.kept.known])
         return known
 
@@ -309,7 +345,9 @@ def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedP
 
 
 def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
-    """Returns the rows of a site's latest ticks at given times, and True where recorded, shape (K,)."""
+    """Returns the rows of a site's latest ticks at given times, and True where recorded, shape
+    (K,).
+    """
     row = np.floor(t_s * records.rate_hz + 1e-6).astype(np.int64) - records.first
     inside = (row >= 0) & (row < len(records.known))
     row = np.clip(row, 0, len(records.known) - 1)
@@ -318,6 +356,8 @@ def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
 
 
 def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools]:
-    """Returns per site the rows of its latest ticks at those of the first one, and where all are recorded."""
+    """Returns per site the rows of its latest ticks at those of the first one, and where all
+    are recorded.
+    """
     found = [find_latest_rows(records, sites[0].t_s) for records in sites]
     return [row for row, _ in found], np.logical_and.reduce([recorded for _, recorded in found])

@@ -1,18 +1,20 @@
 """Inertia, torque, energy and end effector of an arm, over all rows of a log at once.
 
-Invariant: of the planar arm written from Section IV and Eq. (12) of the paper, independently of the core that
-ran the log; of a chain by the core's leaves, which the tests compare with Pinocchio: a kinetic term or a
-gradient is one recursion. Both have the same functions, and hardly anything else asks which arm it is.
+Invariant: of the planar arm written from Section IV and Eq. (12) of the paper, independently of
+the core that ran the log; of a chain by the core's leaves, which the tests compare with
+Pinocchio: a kinetic term or a gradient is one recursion. Both have the same functions, and
+hardly anything else asks which arm it is.
 
-Torques determine some linear combinations of a chain's ten parameters a link and nothing of the rest,
-however it moves; adaptation moves estimates along the former alone. An error of estimates is stated in
-those combinations. Which they are follows from the geometry: QR of regressors of many states, stacked,
-column by column: a column that depends on those before it adds nothing, and its parameter joins theirs.
+Torques determine some linear combinations of a chain's ten parameters a link and nothing of the
+rest, however it moves; adaptation moves estimates along the former alone. An error of estimates
+is stated in those combinations. Which they are follows from the geometry: QR of regressors of
+many states, stacked, column by column: a column that depends on those before it adds nothing,
+and its parameter joins theirs.
 
-Source: M. Gautier, "Numerical calculation of the base inertial parameters of robots", J. Robotic Systems 8
-(1991), for the QR; P. M. Wensing, S. Kim, J.-J. Slotine, "Linear matrix inequalities for physically
-consistent inertial parameter identification", IEEE Robotics and Automation Letters 3 (2018), for the
-pseudo-inertia.
+Source: M. Gautier, "Numerical calculation of the base inertial parameters of robots", J.
+Robotic Systems 8 (1991), for the QR; P. M. Wensing, S. Kim, J.-J. Slotine, "Linear matrix
+inequalities for physically consistent inertial parameter identification", IEEE Robotics and
+Automation Letters 3 (2018), for the pseudo-inertia.
 """
 
 import math
@@ -53,7 +55,8 @@ _ENERGY_SWEEPS = 20
 Numbers = NDArray[Any]
 """Real numbers, or complex ones for a derivative by complex step.
 
-Vectors have their components on the first axis and any number of columns behind it: shape (n,) or (n, B).
+Vectors have their components on the first axis and any number of columns behind it: shape (n,)
+or (n, B).
 """
 
 
@@ -65,16 +68,19 @@ def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
 
 def solve_columns(A: Numbers, b: Numbers) -> Numbers:
     """Returns the solutions of A y = b, shapes (m, m, ...) and (m, ...)."""
-    solved = np.linalg.solve(np.moveaxis(A, (0, 1), (-2, -1)), np.moveaxis(b, 0, -1)[..., np.newaxis])
+    solved = np.linalg.solve(
+        np.moveaxis(A, (0, 1), (-2, -1)), np.moveaxis(b, 0, -1)[..., np.newaxis]
+    )
     return np.moveaxis(solved[..., 0], -1, 0)
 
 
 @dataclass(frozen=True)
 class PlacedArm:
-    """The planar arm in the poses q, analytic in every argument: a complex step gives exact derivatives.
+    """The planar arm in the poses q, analytic in every argument: a complex step gives exact
+    derivatives.
 
-    "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty", Eq. (1)-(5), (24).
-    `theory.textbook_arm.PlacedChain` has the same methods.
+    "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty", Eq.
+    (1)-(5), (24). `theory.textbook_arm.PlacedChain` has the same methods.
 
     Attributes:
         g_m_s2: gravitational acceleration, m/s^2.
@@ -90,7 +96,9 @@ class PlacedArm:
         """Returns M(q), shape (2, 2, ...), kg m^2, for the parameters theta, shape (5, ...)."""
         bend = theta[1] * np.cos(self.q[1])
         coupling = theta[2] + bend
-        return np.array([[theta[0] + 2.0 * bend, coupling], [coupling, theta[2] + 0.0 * coupling]])
+        return np.array(
+            [[theta[0] + 2.0 * bend, coupling], [coupling, theta[2] + 0.0 * coupling]]
+        )
 
     def coriolis_matrix(self, theta: Numbers, qd: Numbers) -> Numbers:
         """Returns C(q, qd) by Christoffel symbols, shape (2, 2, ...), kg m^2/s."""
@@ -105,10 +113,16 @@ class PlacedArm:
     def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
         """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m: Y theta of Eq. (12)."""
         moving = multiply_columns(self.coriolis_matrix(theta, qd), v)
-        return multiply_columns(self.inertia_matrix(theta), a) + moving + self.gravity_torque(theta)
+        return (
+            multiply_columns(self.inertia_matrix(theta), a)
+            + moving
+            + self.gravity_torque(theta)
+        )
 
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-        """Returns Y(q, qd, v, a), shape (2, 5, ...), Eq. (12): column p is the torque of theta = e_p."""
+        """Returns Y(q, qd, v, a), shape (2, 5, ...), Eq. (12): column p is the torque of theta
+        = e_p.
+        """
         units = np.multiply.outer(np.eye(5), np.ones(self.q.shape[1:]))
         return np.stack([self.required_torque(unit, qd, v, a) for unit in units], axis=1)
 
@@ -117,7 +131,9 @@ class PlacedArm:
         return 0.0 * v
 
     def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
-        """Returns qdd, shape (2, ...), rad/s^2: the solution of M qdd + C qd + G = torque, Eq. (8)."""
+        """Returns qdd, shape (2, ...), rad/s^2: the solution of M qdd + C qd + G = torque, Eq.
+        (8).
+        """
         at_no_acceleration = self.required_torque(theta, qd, qd, np.zeros_like(qd))
         return solve_columns(self.inertia_matrix(theta), torque - at_no_acceleration)
 
@@ -134,7 +150,9 @@ class PlacedArm:
         """Returns the Jacobian of that position, shape (2, 2, ...), m/rad: rows x and y."""
         x, y = self.end_effector_position()
         outer = self.q[0] + self.q[1]
-        return np.array([[-y, -self.lengths_m[1] * np.sin(outer)], [x, self.lengths_m[1] * np.cos(outer)]])
+        return np.array(
+            [[-y, -self.lengths_m[1] * np.sin(outer)], [x, self.lengths_m[1] * np.cos(outer)]]
+        )
 
 
 class EndEffectorRows(NamedTuple):
@@ -149,9 +167,11 @@ class EndEffectorRows(NamedTuple):
     J: Array
 
     def find_force(self, torque: Array, least: float = 1e-15) -> Array:
-        """Returns the least force that explains torques of shape (K, n), N m: shape (K, 2) or (K, 3), N.
+        """Returns the least force that explains torques of shape (K, n), N m: shape (K, 2) or
+        (K, 3), N.
 
-        Directions in which the end effector moves less than `least` times the most are not told from none.
+        Directions in which the end effector moves less than `least` times the most are not told
+        from none.
         """
         inverse = np.linalg.pinv(self.J.transpose(0, 2, 1), rcond=least)
         found: Array = np.einsum("kij,kj->ki", inverse, torque)
@@ -194,12 +214,16 @@ class PlanarArmRows(NamedTuple):
         return multiply_columns(self.place(q).inertia_matrix(self.theta), x.T).T
 
     def law_torque(self, theta_hat: Array, q: Array, qd: Array, v: Array, a: Array) -> Array:
-        """Returns Y(q, qd, v, a) theta_hat of estimates of every row, shape (K, 5), as (K, 2), N m."""
+        """Returns Y(q, qd, v, a) theta_hat of estimates of every row, shape (K, 5), as (K, 2),
+        N m.
+        """
         return self.place(q).required_torque(theta_hat.T, qd.T, v.T, a.T).T
 
     def gradient(self, q: Array, qd: Array, v: Array, a: Array, r: Array) -> Array:
         """Returns Y'r of r = qd - v, shape (K, 5)."""
-        found: Array = np.einsum("ijk,ki->kj", self.place(q).regressor_matrix(qd.T, v.T, a.T), r)
+        found: Array = np.einsum(
+            "ijk,ki->kj", self.place(q).regressor_matrix(qd.T, v.T, a.T), r
+        )
         return found
 
     def gravity_torque(self, q: Array) -> Array:
@@ -228,13 +252,24 @@ class PlanarArmRows(NamedTuple):
         return EndEffectorRows(arm.end_effector_position().T, speed.T, J.transpose(2, 0, 1))
 
     def hanging_angle(self, q: Array) -> float:
-        """Returns how far from straight down the link is that hangs least, in one pose, shape (2,), rad."""
-        return max(abs(math.remainder(angle + math.pi / 2.0, math.tau)) for angle in np.cumsum(q))
+        """Returns how far from straight down the link is that hangs least, in one pose, shape
+        (2,), rad.
+        """
+        return max(
+            abs(math.remainder(angle + math.pi / 2.0, math.tau)) for angle in np.cumsum(q)
+        )
 
 
 @leaf
 def _put_torques(
-    chain: RowArray, theta: Array, gravity: Array, q: Array, qd: Array, v: Array, a: Array, torque: Array
+    chain: RowArray,
+    theta: Array,
+    gravity: Array,
+    q: Array,
+    qd: Array,
+    v: Array,
+    a: Array,
+    torque: Array,
 ) -> None:
     """Writes M a + C(q, qd) v + G + armature a + friction(v) of every row, shape (K, n).
 
@@ -242,8 +277,14 @@ def _put_torques(
     """
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
-        propagate_motion(chain, gravity, qd[k], v[k], a[k])
-        inverse_dynamics(chain, theta[min(k, theta.shape[0] - 1)], v[k], a[k], torque[k])
+        propagate_motion(chain=chain, gravity=gravity, qd=qd[k], v=v[k], a=a[k])
+        inverse_dynamics(
+            chain=chain,
+            theta=theta[min(k, theta.shape[0] - 1)],
+            v=v[k],
+            a=a[k],
+            torque=torque[k],
+        )
 
 
 @leaf
@@ -253,17 +294,26 @@ def _put_gradients(
     """Writes Y'r of every row, r = qd - v, shape (K, 10 n)."""
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
-        propagate_motion(chain, gravity, qd[k], v[k], a[k])
+        propagate_motion(chain=chain, gravity=gravity, qd=qd[k], v=v[k], a=a[k])
         parameter_gradient(chain, gradient[k])
 
 
 @leaf
 def _put_end_effectors(
-    chain: RowArray, theta: Array, gravity: Array, tip: Array, q: Array, at: Array, J: Array, energy: Array
+    chain: RowArray,
+    theta: Array,
+    gravity: Array,
+    tip: Array,
+    q: Array,
+    at: Array,
+    J: Array,
+    energy: Array,
 ) -> None:
-    """Writes place, (K, 3), and Jacobian, (K, 6, n), of every row, and the links' potential energy, (K,), J.
+    """Writes place, (K, 3), and Jacobian, (K, 6, n), of every row, and the links' potential
+    energy, (K,), J.
 
-    That energy is -g'(m p + R mc) of every link, p and R its place and orientation in the base's frame.
+    That energy is -g'(m p + R mc) of every link, p and R its place and orientation in the
+    base's frame.
     """
     n = chain.shape[0]
     for k in range(q.shape[0]):
@@ -281,16 +331,20 @@ def _put_end_effectors(
             p_z = p_z + step[2]
             first = LINK_PARAMETERS * i
             mc = rotate(row.R_base, (theta[first + 1], theta[first + 2], theta[first + 3]))
-            energy[k] -= theta[first] * dot(three(gravity), (p_x, p_y, p_z)) + dot(three(gravity), mc)
+            energy[k] -= theta[first] * dot(three(gravity), (p_x, p_y, p_z)) + dot(
+                three(gravity), mc
+            )
             for j in range(3):
                 J[k, j, i] = row.J_lin[j]
                 J[k, 3 + j, i] = row.J_ang[j]
 
 
 class ChainArmRows(NamedTuple):
-    """A chain of n joints over rows, by the core's recursions: what M, C and G are made of is theta.
+    """A chain of n joints over rows, by the core's recursions: what M, C and G are made of is
+    theta.
 
-    The inertia of its drives counts in M. The law knows friction and drives, so that its torque has them.
+    The inertia of its drives counts in M. The law knows friction and drives, so that its torque
+    has them.
 
     Attributes:
         theta: its true parameters, shape (10 n,).
@@ -307,7 +361,9 @@ class ChainArmRows(NamedTuple):
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
-        """True for each parameter that the torque of gravity may consist of: m and m c of every link."""
+        """True for each parameter that the torque of gravity may consist of: m and m c of every
+        link.
+        """
         return np.arange(len(self.theta)) % LINK_PARAMETERS < 4
 
     @property
@@ -322,7 +378,9 @@ class ChainArmRows(NamedTuple):
         return self._replace(chain=self.chain._replace(joints=joints))
 
     def weightless(self) -> "ChainArmRows":
-        """Returns the same chain without gravity and Coulomb friction: its torque is linear in v and a."""
+        """Returns the same chain without gravity and Coulomb friction: its torque is linear in
+        v and a.
+        """
         bare = self._of_joints(coulomb=0.0)
         return bare._replace(chain=bare.chain._replace(gravity_m_s2=(0.0, 0.0, 0.0)))
 
@@ -342,39 +400,66 @@ class ChainArmRows(NamedTuple):
         """
         torque = np.zeros_like(q)
         theta_hat, q, qd, v, a = map(np.ascontiguousarray, (theta_hat, q, qd, v, a))
-        _put_torques(self._rows, theta_hat, np.array(self.chain.gravity_m_s2), q, qd, v, a, torque)
+        _put_torques(
+            chain=self._rows,
+            theta=theta_hat,
+            gravity=np.array(self.chain.gravity_m_s2),
+            q=q,
+            qd=qd,
+            v=v,
+            a=a,
+            torque=torque,
+        )
         return torque
 
     def gradient(self, q: Array, qd: Array, v: Array, a: Array, r: Array) -> Array:  # noqa: ARG002
         """Returns Y'r of r = qd - v, shape (K, 10 n)."""
         found = np.zeros((len(q), len(self.theta)))
         q, qd, v, a = map(np.ascontiguousarray, (q, qd, v, a))
-        _put_gradients(self._rows, np.array(self.chain.gravity_m_s2), q, qd, v, a, found)
+        _put_gradients(
+            chain=self._rows,
+            gravity=np.array(self.chain.gravity_m_s2),
+            q=q,
+            qd=qd,
+            v=v,
+            a=a,
+            gradient=found,
+        )
         return found
 
     def gravity_torque(self, q: Array) -> Array:
         """Returns G(q), shape (K, n), N m."""
         still = np.zeros_like(q)
-        return self.law_torque(self.theta[np.newaxis], q, still, still, still)
+        return self.law_torque(
+            theta_hat=self.theta[np.newaxis], q=q, qd=still, v=still, a=still
+        )
 
     def _place(self, q: Array) -> tuple[Array, Array, Array]:
         found = np.zeros((len(q), 3)), np.zeros((len(q), 6, q.shape[1])), np.zeros(len(q))
         gravity = np.array(self.chain.gravity_m_s2)
         tip = np.array(self.chain.tip_m)
-        _put_end_effectors(self._rows, self.theta, gravity, tip, np.ascontiguousarray(q), *found)
+        _put_end_effectors(
+            self._rows, self.theta, gravity, tip, np.ascontiguousarray(q), *found
+        )
         return found
 
     def potential_energy(self, q: Array) -> Array:
-        """Returns the links' energy in the field of gravity, shape (K,), J; zero in the base's origin."""
+        """Returns the links' energy in the field of gravity, shape (K,), J; zero in the base's
+        origin.
+        """
         return self._place(q)[2]
 
     def friction(self, speed: Array) -> Array:
         """Returns the torque that friction takes at joint speeds, shape (K, n), N m."""
         x = speed / COULOMB_SPEED
-        return self._column("viscous") * speed + self._column("coulomb") * x / np.sqrt(1.0 + x * x)
+        return self._column("viscous") * speed + self._column("coulomb") * x / np.sqrt(
+            1.0 + x * x
+        )
 
     def stop_torque(self, q: Array, qd: Array) -> Array:
-        """Returns the torque of the joints' stops ON them, shape (K, n), N m: springs that never pull."""
+        """Returns the torque of the joints' stops ON them, shape (K, n), N m: springs that
+        never pull.
+        """
         stiffness = self._column("stop_stiffness")
         damping = self._column("stop_damping")
         under = np.maximum(self._column("lower") - q, 0.0)
@@ -392,7 +477,8 @@ class ChainArmRows(NamedTuple):
     def jacobian_rate(self, q: Array, qd: Array) -> Array:
         """Returns the derivative of the end effector's Jacobian along qd, shape (K, 3, n).
 
-        Column i turns with all joints up to i; of those after it the end effector moves about its axis.
+        Column i turns with all joints up to i; of those after it the end effector moves about
+        its axis.
         """
         J = self._place(q)[1].transpose(0, 2, 1)
         linear = J[:, :, :3]
@@ -403,10 +489,11 @@ class ChainArmRows(NamedTuple):
         return found.transpose(0, 2, 1)
 
     def hanging_angle(self, q: Array) -> float:
-        """Returns at which angle a pendulum stores as much of its energy as the chain in a pose, (n,), rad.
+        """Returns at which angle a pendulum stores as much of its energy as the chain in a
+        pose, (n,), rad.
 
-        The least and the largest energy are looked for from this pose on, joint by joint; stops do not count.
-        What has no weight never hangs: infinity.
+        The least and the largest energy are looked for from this pose on, joint by joint; stops
+        do not count. What has no weight never hangs: infinity.
         """
         low = self._find_extreme_energy(q, 1.0)
         high = self._find_extreme_energy(q, -1.0)
@@ -416,7 +503,8 @@ class ChainArmRows(NamedTuple):
         return math.acos(min(max(1.0 - 2.0 * share, -1.0), 1.0))
 
     def _find_extreme_energy(self, q: Array, sign: float) -> float:
-        """Returns the least energy (sign 1) or the largest (-1), by turns of one revolute joint at a time.
+        """Returns the least energy (sign 1) or the largest (-1), by turns of one revolute joint
+        at a time.
 
         As a function of one joint's angle it is a + b cos q + c sin q, which three angles give.
         """
@@ -447,7 +535,9 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
 
 
 def joint_positions_m(arm: ArmModel, q: Array) -> Array:
-    """Returns base, joints and end effector of angles (K, n), rad: (K, L, 2), m, of chains (K, L, 3)."""
+    """Returns base, joints and end effector of angles (K, n), rad: (K, L, 2), m, of chains (K,
+    L, 3).
+    """
     if arm.chain is None:
         points = np.zeros((len(q), 1 + JOINTS, 2))
         for pose, angles in zip(points, q, strict=True):
@@ -469,7 +559,9 @@ def joint_positions_m(arm: ArmModel, q: Array) -> Array:
 
 
 def upright_axes(chain: ChainSetup) -> Array:
-    """Returns two directions of the floor and the one up, as rows in the base's frame, shape (3, 3)."""
+    """Returns two directions of the floor and the one up, as rows in the base's frame, shape
+    (3, 3).
+    """
     down = np.array(chain.gravity_m_s2)
     size = float(np.linalg.norm(down))
     up = -down / size if size else np.array([0.0, 0.0, 1.0])
@@ -487,8 +579,10 @@ class BaseParameters(NamedTuple):
     """Combinations of parameters that torques determine.
 
     Attributes:
-        kept: per combination the parameter that it is named after, in ascending order, shape (B,).
-        combination: its factors of all parameters, 1 of its own, shape (B, P): base = combination theta.
+        kept: per combination the parameter that it is named after, in ascending order, shape
+            (B,).
+        combination: its factors of all parameters, 1 of its own, shape (B, P): base =
+            combination theta.
     """
 
     kept: NDArray[np.int64]
@@ -516,7 +610,8 @@ def _find_base_parameters(chain: ChainSetup, learnt: tuple[bool, ...]) -> BasePa
     kept = []
     for p, column in enumerate(W.T):
         rest = column - Q @ (Q.T @ column)
-        rest -= Q @ (Q.T @ rest)  # once more: the first leaves rounding of the size of the column
+        # once more: the first leaves rounding of the size of the column
+        rest -= Q @ (Q.T @ rest)
         size = float(np.linalg.norm(rest))
         if size > DEPENDENT_SHARE * float(np.linalg.norm(W)) / np.sqrt(W.shape[1]):
             Q = np.column_stack([Q, rest / size])
@@ -540,7 +635,9 @@ def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> BaseParamet
 
 
 def find_pseudo_inertias(theta: Array) -> Array:
-    """Returns the pseudo-inertia of every link, shape (n, 4, 4): [[S, m c], [m c', m]], S = tr(I) 1/2 - I."""
+    """Returns the pseudo-inertia of every link, shape (n, 4, 4): [[S, m c], [m c', m]], S =
+    tr(I) 1/2 - I.
+    """
     links = theta.reshape(-1, LINK_PARAMETERS)
     found = np.zeros((len(links), 4, 4))
     found[:, 3, 3] = links[:, 0]
@@ -553,5 +650,9 @@ def find_pseudo_inertias(theta: Array) -> Array:
 
 
 def find_consistent_links(theta: Array) -> list[bool]:
-    """Returns for each link if some body has these parameters: its pseudo-inertia is positive definite."""
-    return [bool(values.min() > 0.0) for values in np.linalg.eigvalsh(find_pseudo_inertias(theta))]
+    """Returns for each link if some body has these parameters: its pseudo-inertia is positive
+    definite.
+    """
+    return [
+        bool(values.min() > 0.0) for values in np.linalg.eigvalsh(find_pseudo_inertias(theta))
+    ]

@@ -11,13 +11,19 @@ from ..log.orientations import QUATERNION_AXES, SteadyQuaternion
 
 
 class BodyTurns:
-    """Poses of a plant's bodies in one stream: of both signs of a quaternion the nearer to the one before."""
+    """Poses of a plant's bodies in one stream: of both signs of a quaternion the nearer to the
+    one before.
+    """
 
     def __init__(self) -> None:
-        self._signs: defaultdict[int, SteadyQuaternion] = defaultdict(lambda: SteadyQuaternion(w=0))
+        self._signs: defaultdict[int, SteadyQuaternion] = defaultdict(
+            lambda: SteadyQuaternion(w=0)
+        )
 
     def align(self, bodies: Sequence[float]) -> Array:
-        """Returns poses, shape (7 b,), as given: x, y, z, m, and the unit quaternion w, x, y, z of each."""
+        """Returns poses, shape (7 b,), as given: x, y, z, m, and the unit quaternion w, x, y, z
+        of each.
+        """
         poses = np.array(bodies, dtype=np.float64).reshape(-1, PLACE + len(QUATERNION_AXES))
         for body, pose in enumerate(poses):
             pose[PLACE:] = self._signs[body].follow(pose[PLACE:].tolist())

@@ -1,12 +1,13 @@
-"""Dominance of sites: alpha of Eq. (6) over time, ramps and steps included, and the weights that it gives.
+"""Dominance of sites: alpha of Eq. (6) over time, ramps and steps included, and the weights
+that it gives.
 
-Invariant: alpha is a function of time and of the applied changes alone; a ramp starts from the value that the
-ramp before it has at that time.
+Invariant: alpha is a function of time and of the applied changes alone; a ramp starts from the
+value that the ramp before it has at that time.
 
-The weights of the sites' functionals are beta_i = pi_i / c_i: pi is the left Perron vector of alpha, c_i
-the scalar in Kd_i = c_i Kbar. Both conditions are necessary: beta' Upsilon <= 0 together with Upsilon 1 = 0
-forces equality, so there is no slack. pi as the weight of a delayed consensus is a known result
-(docs/errata.md); the paper uses ones.
+The weights of the sites' functionals are beta_i = pi_i / c_i: pi is the left Perron vector of
+alpha, c_i the scalar in Kd_i = c_i Kbar. Both conditions are necessary: beta' Upsilon <= 0
+together with Upsilon 1 = 0 forces equality, so there is no slack. pi as the weight of a delayed
+consensus is a known result (docs/errata.md); the paper uses ones.
 """
 
 from collections.abc import Sequence
@@ -52,7 +53,9 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
     Raises:
         LogError: a record names a change that is none.
     """
-    planned = evaluate_ramps(*list_ramps(log, site), t_s, 1.0 / log.scenario.sites[site].rate_hz)
+    planned = evaluate_ramps(
+        *list_ramps(log, site), t_s, 1.0 / log.scenario.sites[site].rate_hz
+    )
     there = ~find_lost_peers(log, site, t_s)
     if there.all():
         return planned
@@ -66,22 +69,28 @@ def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
 
 
 def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Returns the factors of a site at the epoch, shape (P,), and its ramps, scripted and ordered."""
+    """Returns the factors of a site at the epoch, shape (P,), and its ramps, scripted and
+    ordered.
+    """
     start, scripted = list_scripted_ramps(log.scenario, site)
-    ordered = [c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None]
+    ordered = [
+        c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None
+    ]
     return start, [*scripted, *ordered]
 
 
 def find_users(scenario: Scenario) -> tuple[str, list[str]]:
     """Returns the first slave, "" if there is none, and its users: the masters."""
     slaves, users = (
-        [site for site, spec in scenario.sites.items() if spec.role == role] for role in ("slave", "master")
+        [site for site, spec in scenario.sites.items() if spec.role == role]
+        for role in ("slave", "master")
     )
     return next(iter(slaves), ""), users
 
 
 class UserShares(NamedTuple):
-    """Who of its users leads a slave, over K times. Where that is not the program, somebody intervenes.
+    """Who of its users leads a slave, over K times. Where that is not the program, somebody
+    intervenes.
 
     Attributes:
         shares: alpha of the slave for each of them, shape (K, U).
@@ -110,7 +119,9 @@ def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> Use
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
-    """Returns which peers a site goes on without at some times, s, shape (K, P): see `core.lost_peers`."""
+    """Returns which peers a site goes on without at some times, s, shape (K, P): see
+    `core.lost_peers`.
+    """
     part = log[site]
     peers = len(log[site].peers)
     lost = np.zeros((len(t_s), peers), dtype=bool)
@@ -130,14 +141,22 @@ def list_losses(log: Log) -> list[str]:
         lost = find_lost_peers(log, site, part.t_s).astype(int)
         for j, peer in enumerate(part.peers):
             edges = np.diff(np.concatenate([[0], lost[:, j], [0]]))
-            times = np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz) if len(part) else part.t_s
-            for first, last in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+            times = (
+                np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz)
+                if len(part)
+                else part.t_s
+            )
+            for first, last in zip(
+                np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True
+            ):
                 found.append(f"{site} without {peer} {times[first]:.4g} to {times[last]:.4g} s")
     return found
 
 
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Returns the factors of a site at the epoch, shape (P,), and the ramps of the scenario's timeline."""
+    """Returns the factors of a site at the epoch, shape (P,), and the ramps of the scenario's
+    timeline.
+    """
     start = np.array([scenario.dominance[site].get(peer, 0.0) for peer in scenario.peers(site)])
     return start, scenario.scripted_ramps(site)
 
@@ -145,17 +164,25 @@ def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[Domi
 def forget_ramps(
     start: Array, ramps: Sequence[DominanceRamp], from_s: float
 ) -> tuple[Array, list[DominanceRamp]]:
-    """Returns factors and ramps that give the same history from a time on, without the ramps before it."""
+    """Returns factors and ramps that give the same history from a time on, without the ramps
+    before it.
+    """
     ordered = sorted(ramps, key=lambda ramp: ramp.start_ns)
     begun = sum(ramp.start_ns * 1e-9 <= from_s for ramp in ordered)
     if begun < 2:
         return start, ordered
     turn_s = np.array([ordered[begun - 1].start_ns * 1e-9])
-    return evaluate_ramps(start, ordered[: begun - 1], turn_s, 0.0).alpha[0], ordered[begun - 1 :]
+    return evaluate_ramps(start, ordered[: begun - 1], turn_s, 0.0).alpha[0], ordered[
+        begun - 1 :
+    ]
 
 
-def evaluate_ramps(start: Array, ramps: Sequence[DominanceRamp], t_s: Array, h_s: float) -> DominanceHistory:
-    """Returns dominance factors, at the epoch `start`, shape (P,), at ascending times, `h_s` apart, s."""
+def evaluate_ramps(
+    start: Array, ramps: Sequence[DominanceRamp], t_s: Array, h_s: float
+) -> DominanceHistory:
+    """Returns dominance factors, at the epoch `start`, shape (P,), at ascending times, `h_s`
+    apart, s.
+    """
     alpha = np.tile(start, (len(t_s), 1))
     rate = np.zeros((len(t_s), len(start)))
     before = start
@@ -189,9 +216,10 @@ class LyapunovWeights(NamedTuple):
 
     Attributes:
         beta: per site, sum N, so that equal shares give the paper's ones, shape (N,).
-        groups: the closed groups of sites, each a tuple of indices: none in it follows a site outside. Of one
-            group pi is unique, though some of its entries may be 0.
-        scales: c_i of Kd_i = c_i Kbar, c of the first site 1, shape (N,); None if the Kd differ in shape.
+        groups: the closed groups of sites, each a tuple of indices: none in it follows a site
+            outside. Of one group pi is unique, though some of its entries may be 0.
+        scales: c_i of Kd_i = c_i Kbar, c of the first site 1, shape (N,); None if the Kd differ
+            in shape.
     """
 
     beta: Array
@@ -200,7 +228,9 @@ class LyapunovWeights(NamedTuple):
 
 
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
-    """Returns the groups of sites that reach each other and no other along shares, alpha shape (N, N)."""
+    """Returns the groups of sites that reach each other and no other along shares, alpha shape
+    (N, N).
+    """
     reach = find_reach(alpha)
     groups = []
     for site in range(len(alpha)):
@@ -211,7 +241,8 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
 
 
 def left_perron_vector(alpha: Array) -> Array:
-    """Returns pi >= 0 with pi' alpha = pi' and sum 1, shape (N,); 0 for sites outside of closed groups.
+    """Returns pi >= 0 with pi' alpha = pi' and sum 1, shape (N,); 0 for sites outside of closed
+    groups.
 
     If several closed groups make it ambiguous, each counts by its number of sites.
     """
@@ -224,10 +255,11 @@ def left_perron_vector(alpha: Array) -> Array:
 
 
 def find_kd_scales(Kd: Array) -> Array | None:
-    """Returns c_i of Kd_i = c_i Kbar with c_1 = 1, or None if there are no such scalars, Kd shape (N, n).
+    """Returns c_i of Kd_i = c_i Kbar with c_1 = 1, or None if there are no such scalars, Kd
+    shape (N, n).
 
-    A number that is NaN is of an axis of the task that its site does not follow. If every Kd is zero, nothing
-    couples the sites and any scale holds: ones.
+    A number that is NaN is of an axis of the task that its site does not follow. If every Kd is
+    zero, nothing couples the sites and any scale holds: ones.
     """
     if not np.nan_to_num(Kd).any():
         return np.ones(len(Kd))
@@ -235,14 +267,19 @@ def find_kd_scales(Kd: Array) -> Array | None:
     if not sizes.all():
         return None
     shapes = Kd / sizes[:, np.newaxis]
-    if np.nan_to_num(np.fmax.reduce(shapes) - np.fmin.reduce(shapes)).max() > KD_SHAPE_TOLERANCE:
+    if (
+        np.nan_to_num(np.fmax.reduce(shapes) - np.fmin.reduce(shapes)).max()
+        > KD_SHAPE_TOLERANCE
+    ):
         return None
     scales: Array = sizes / sizes[0]
     return scales
 
 
 def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
-    """Returns beta_i = pi_i / c_i; if the Kd, shape (N, n), differ in shape, pi alone, which lets V rise."""
+    """Returns beta_i = pi_i / c_i; if the Kd, shape (N, n), differ in shape, pi alone, which
+    lets V rise.
+    """
     scales = find_kd_scales(Kd)
     beta = left_perron_vector(alpha) / (1.0 if scales is None else scales)
     return LyapunovWeights(beta * (len(beta) / beta.sum()), find_closed_groups(alpha), scales)

@@ -1,24 +1,30 @@
-"""The trend of an envelope over the second half of a record: decays, hardly, steady, grows, or undecided.
+"""The trend of an envelope over the second half of a record: decays, hardly, steady, grows, or
+undecided.
 
-Invariant: a word states what the record shows and predicts nothing; docs/definitions.md, "Stable".
+Invariant: a word states what the record shows and predicts nothing; docs/definitions.md,
+"Stable".
 
-The half is divided into n equal windows, n = 16 and, if those do not decide, n = 8. A window counts with its
-largest value, at least `FLOOR_RAD`. A straight line is fitted to the logarithms of these maxima, with the
-one-sided 99.5 % bounds of its slope (Student's t, n - 2 degrees of freedom).
+The half is divided into n equal windows, n = 16 and, if those do not decide, n = 8. A window
+counts with its largest value, at least `FLOOR_RAD`. A straight line is fitted to the logarithms
+of these maxima, with the one-sided 99.5 % bounds of its slope (Student's t, n - 2 degrees of
+freedom).
 
-GROWS: the lower bound is positive; the maxima of the four quarters of the half rise by 1 % or more each;
-and the rise does not die away: the last of the three steps, in logarithms, is at least 3/4 of the first,
-or at least 0.45 of it if the maxima rise to more than 8/5 in all (no response that starts at zero and
-saturates does that). The maxima of the four quarters of the first half must not fall by 1 % or more each:
-a fall followed by a rise is a V, and needs a longer record.
+GROWS: the lower bound is positive; the maxima of the four quarters of the half rise by 1 % or
+more each; and the rise does not die away: the last of the three steps, in logarithms, is at
+least 3/4 of the first, or at least 0.45 of it if the maxima rise to more than 8/5 in all (no
+response that starts at zero and saturates does that). The maxima of the four quarters of the
+first half must not fall by 1 % or more each: a fall followed by a rise is a V, and needs a
+longer record.
 
-DECAYS: the upper bound is negative, the line falls by a factor of two or more over the half, and the last
-quarter still takes half of its share in that; or nothing in the last quarter exceeds `FLOOR_RAD`. HARDLY: the
-line falls, by 4 % or more, and that is all. STEADY: the bounds exclude that the envelope doubles or halves
-within the half. All require that the last quarter of the half is at most twice the one before.
+DECAYS: the upper bound is negative, the line falls by a factor of two or more over the half,
+and the last quarter still takes half of its share in that; or nothing in the last quarter
+exceeds `FLOOR_RAD`. HARDLY: the line falls, by 4 % or more, and that is all. STEADY: the bounds
+exclude that the envelope doubles or halves within the half. All require that the last quarter
+of the half is at most twice the one before.
 
-UNDECIDED: everything else: too short, too irregular, growing ever more slowly, a V. No finite record
-excludes growth that begins later, or a beat longer than the run, whose rising flank looks like growth.
+UNDECIDED: everything else: too short, too irregular, growing ever more slowly, a V. No finite
+record excludes growth that begins later, or a beat longer than the run, whose rising flank
+looks like growth.
 """
 
 import math
@@ -33,8 +39,9 @@ FLOOR_RAD = 1e-12
 """An envelope below this is the rounding of the numbers, rad; of speeds, rad/s."""
 
 _T_QUANTILES = {16: 2.977, 8: 3.707}
-"""Number of windows, and the 99.5 % quantile of Student's t with two degrees of freedom less: to these
-digits, with which the classes of published runs were made."""
+"""Number of windows, and the 99.5 % quantile of Student's t with two degrees of freedom less:
+to these digits, with which the classes of published runs were made.
+"""
 
 _RISE = math.log(1.01)
 _DOUBLE = math.log(2.0)
@@ -57,10 +64,10 @@ class EnvelopeFit(NamedTuple):
     """Trend of an envelope over the second half of a run.
 
     Attributes:
-        rate_per_s: slope of the logarithm of the maxima, 1/s: the envelope goes as exp(rate t). NaN if there
-            are too few points.
-        calm: True if it falls, or the upper bound excludes a rise by a quarter within the half; and the last
-            quarter is no more than half as high again as the one before.
+        rate_per_s: slope of the logarithm of the maxima, 1/s: the envelope goes as exp(rate t).
+            NaN if there are too few points.
+        calm: True if it falls, or the upper bound excludes a rise by a quarter within the half;
+            and the last quarter is no more than half as high again as the one before.
     """
 
     trend: EnvelopeTrend
@@ -88,7 +95,8 @@ def fit_envelopes(
         t_s: ascending times, shape (K,), s.
         values: the largest |e| at each time, or since the time before, shape (K, C).
         floor: takes the place of `FLOOR_RAD`.
-        falls_first: what rises after a fall grows as well: the fall is known to be that of other modes.
+        falls_first: what rises after a fall grows as well: the fall is known to be that of
+            other modes.
     """
     fits = [EnvelopeFit(EnvelopeTrend.UNDECIDED, math.nan)] * values.shape[1]
     pending = list(range(values.shape[1]))
@@ -100,16 +108,24 @@ def fit_envelopes(
         for n, fit in zip(pending, found, strict=True):
             fits[n] = fit
         pending = [n for n in pending if fits[n].trend is EnvelopeTrend.UNDECIDED]
-    growing = [n for n, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS and not falls_first]
-    first_half = _window_maxima(-t_s[::-1], values[::-1, growing], 4, floor) if growing else None
+    growing = [
+        n for n, fit in enumerate(fits) if fit.trend is EnvelopeTrend.GROWS and not falls_first
+    ]
+    first_half = (
+        _window_maxima(-t_s[::-1], values[::-1, growing], 4, floor) if growing else None
+    )
     if first_half is not None:  # a fall, then a rise: a V
-        for n, fell in zip(growing, np.diff(np.log(first_half), axis=0).min(axis=0) >= _RISE, strict=True):
+        for n, fell in zip(
+            growing, np.diff(np.log(first_half), axis=0).min(axis=0) >= _RISE, strict=True
+        ):
             fits[n] = fits[n]._replace(trend=EnvelopeTrend.UNDECIDED) if fell else fits[n]
     return fits
 
 
 def _window_maxima(t_s: Array, values: Array, windows: int, floor: float) -> Array | None:
-    """Returns the maxima of equal windows of the second half; None if one has fewer than two points."""
+    """Returns the maxima of equal windows of the second half; None if one has fewer than two
+    points.
+    """
     if not len(t_s):
         return None
     edges = np.linspace(0.5 * (t_s[0] + t_s[-1]), t_s[-1], windows + 1)
@@ -120,7 +136,8 @@ def _window_maxima(t_s: Array, values: Array, windows: int, floor: float) -> Arr
 
 
 def _fit_maxima(maxima: Array, window_s: float, dead: float) -> list[EnvelopeFit]:
-    """Returns the classes of the maxima of equal windows, shape (n, C), by lines through their logarithms.
+    """Returns the classes of the maxima of equal windows, shape (n, C), by lines through their
+    logarithms.
 
     `dead` is the logarithm below which nothing moves.
     """
@@ -128,7 +145,9 @@ def _fit_maxima(maxima: Array, window_s: float, dead: float) -> list[EnvelopeFit
     values = np.log(maxima)
     x = np.arange(n) - 0.5 * (n - 1)
     spread = float(x @ x)
-    slopes = (x[:, np.newaxis] * values).sum(axis=0) / spread  # a matrix product's last bits may vary
+    slopes = (x[:, np.newaxis] * values).sum(
+        axis=0
+    ) / spread  # a matrix product's last bits may vary
     residual = values - values.mean(axis=0) - x[:, np.newaxis] * slopes
     bounds = _T_QUANTILES[n] * np.sqrt((residual**2).sum(axis=0) / (n - 2) / spread)
     quarters = np.log(maxima.reshape(4, n // 4, -1).max(axis=1))
@@ -152,7 +171,9 @@ def _name_trend(change: float, bound: float, steps: Array, *, dead: bool) -> Env
         steps: of the logarithm of the maxima from quarter to quarter of the half.
         dead: True if the last quarter is at the floor.
     """
-    lasts = steps[-1] >= 0.75 * steps[0] or (steps.sum() > _FROM_ZERO and steps[-1] >= 0.45 * steps[0])
+    lasts = steps[-1] >= 0.75 * steps[0] or (
+        steps.sum() > _FROM_ZERO and steps[-1] >= 0.45 * steps[0]
+    )
     if dead:
         return EnvelopeTrend.DECAYS
     if change > bound and steps.min() >= _RISE and lasts:

@@ -1,13 +1,15 @@
-"""Overview of MCAP files: layout, channels, gaps and message rates; of a trilat-net log also its health.
+"""Overview of MCAP files: layout, channels, gaps and message rates; of a trilat-net log also
+its health.
 
 That is: of its session, its loops, links and clocks, in numbers that need no re-execution.
 
-Invariant: the inventory decodes no message, so any MCAP file has one, also where its log cannot be opened;
-the overview then holds the reason. Gaps are counted only on channels with consecutive numbers. Keys end in
-their unit; a quantity that the log does not determine is None, never NaN.
+Invariant: the inventory decodes no message, so any MCAP file has one, also where its log cannot
+be opened; the overview then holds the reason. Gaps are counted only on channels with
+consecutive numbers. Keys end in their unit; a quantity that the log does not determine is None,
+never NaN.
 
-The summary of a run is the content of `summary.json`; there too keys end in their unit, and what the log
-does not determine is null.
+The summary of a run is the content of `summary.json`; there too keys end in their unit, and
+what the log does not determine is null.
 """
 
 from array import array
@@ -41,7 +43,12 @@ from .link_summary import (
     summarise_clock,
     summarise_links,
 )
-from .site_signals import SETTLED_ERROR_RAD, operator_displacement, settling_time_of_all_s, settling_time_s
+from .site_signals import (
+    SETTLED_ERROR_RAD,
+    operator_displacement,
+    settling_time_of_all_s,
+    settling_time_s,
+)
 from .timeline import find_mode_intervals, list_changes
 
 MOST_LISTED_GAPS = 1000
@@ -53,7 +60,8 @@ Absences = Mapping[str, Sequence[tuple[int, int]]]
 
 
 class FileInventory:
-    """Content of a file, or of the files of one log; `progress` gets the bytes read and those in all.
+    """Content of a file, or of the files of one log; `progress` gets the bytes read and those
+    in all.
 
     Attributes:
         files: facts of every file, keys ending in their units.
@@ -67,14 +75,18 @@ class FileInventory:
         self.files: list[JsonObject] = []
         self.metadata: dict[str, dict[str, str]] = {}
         self._about: dict[str, ChannelInfo] = {}
-        self._came: defaultdict[str, tuple[array[int], ...]] = defaultdict(  # log time, sequence, size
-            lambda: (array("Q"), array("Q"), array("Q"))
+        self._came: defaultdict[str, tuple[array[int], ...]] = (
+            defaultdict(  # log time, sequence, size
+                lambda: (array("Q"), array("Q"), array("Q"))
+            )
         )
         total = sum(path.stat().st_size for path in paths if path.is_file())
         before = 0
         for path in paths:
             with reading(path) as stream:
-                self._read(path, McapReader(stream, str(path), shift_progress(progress, before, total)))
+                self._read(
+                    path, McapReader(stream, str(path), shift_progress(progress, before, total))
+                )
             before += path.stat().st_size
 
     def _read(self, path: Path, walk: McapReader) -> None:
@@ -109,14 +121,26 @@ class FileInventory:
         """Returns the facts of every channel by topic; gaps of those of a session's sites."""
         names = [*self._about, *(topic for topic in self._came if topic not in self._about)]
         return {
-            topic: self._channel(topic) | _numbers(topic, self._came[topic][1], session, rates_hz, absences)
+            topic: self._channel(topic)
+            | _numbers(
+                topic=topic,
+                sequence=self._came[topic][1],
+                session=session,
+                rates_hz=rates_hz,
+                absences=absences,
+            )
             for topic in names
         }
 
     def _channel(self, topic: str) -> JsonObject:
-        about = self._about.get(topic, ChannelInfo(topic, "", "", "", {}))
+        about = self._about.get(
+            topic,
+            ChannelInfo(topic=topic, encoding="", schema="", schema_encoding="", metadata={}),
+        )
         log_ns, _, sizes = (np.frombuffer(c, dtype=np.uint64) for c in self._came[topic])
-        first_ns, last_ns = (int(log_ns.min()), int(log_ns.max())) if len(log_ns) else (None, None)
+        first_ns, last_ns = (
+            (int(log_ns.min()), int(log_ns.max())) if len(log_ns) else (None, None)
+        )
         span_s = 0.0 if first_ns is None or last_ns is None else (last_ns - first_ns) / NS_PER_S
         return {
             "messages": len(log_ns),
@@ -125,14 +149,20 @@ class FileInventory:
             "first_log_time_ns": first_ns,
             "last_log_time_ns": last_ns,
             # in the order of the file
-            "between_ms": percentiles(np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64)), unit=1e6),
+            "between_ms": percentiles(
+                np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64)), unit=1e6
+            ),
             "encoding": about.encoding,
             "schema": about.schema,
         }
 
 
 def _numbers(
-    topic: str, sequence: Sequence[int], session: str, rates_hz: Mapping[str, int], absences: Absences
+    topic: str,
+    sequence: Sequence[int],
+    session: str,
+    rates_hz: Mapping[str, int],
+    absences: Absences,
 ) -> JsonObject:
     """Returns the gaps of a channel with consecutive numbers; else None for each."""
     where = topics.parse_key(topic.removeprefix("/"))
@@ -145,7 +175,9 @@ def _numbers(
     for tick in sequence:
         account.take(number_message(channel, tick, rate_hz))
     for first, last in absences.get(where.member, ()):  # not made: they are not missing
-        account.begin_anew(*(count_messages(channel, ticks, rate_hz) for ticks in (last + 1, first)))
+        account.begin_anew(
+            *(count_messages(channel, ticks, rate_hz) for ticks in (last + 1, first))
+        )
     gaps = account.gaps[:MOST_LISTED_GAPS]
     return {"missing": account.missing, "gaps": gaps, "duplicates": account.duplicate}
 
@@ -159,9 +191,7 @@ class FileOverview(Result):
     def headline(self) -> str:
         """Returns which files, and how many messages."""
         messages = sum(channel["messages"] for channel in self.facts["channels"].values())
-        return (
-            f"{', '.join(file['path'] for file in self.facts['files'])}: {count_nouns(messages, 'message')}"
-        )
+        return f"{', '.join(file['path'] for file in self.facts['files'])}: {count_nouns(messages, 'message')}"
 
     def to_dict(self) -> JsonObject:
         """Returns plain values, with the keys of `trilat log info --json`."""
@@ -169,13 +199,17 @@ class FileOverview(Result):
 
     def to_rows(self) -> list[JsonObject]:
         """Returns a row per channel."""
-        return [{"topic": topic, **channel} for topic, channel in self.facts["channels"].items()]
+        return [
+            {"topic": topic, **channel} for topic, channel in self.facts["channels"].items()
+        ]
 
 
 def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
-    """Returns what an MCAP file holds, or the parts of one log; the command is `trilat log info`.
+    """Returns what an MCAP file holds, or the parts of one log; the command is `trilat log
+    info`.
 
-    `kind` is "trilat" for a log of ours that could be opened, else "mcap", with the reason in `problem`.
+    `kind` is "trilat" for a log of ours that could be opened, else "mcap", with the reason in
+    `problem`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("short.mcap")
     >>> tn.info(path).to_dict()["sites"]["m"]["records"]
@@ -190,7 +224,12 @@ def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
         return progress and (lambda done, total: progress(half * total + done, 2 * total))
 
     inventory = FileInventory(paths, report(0))
-    facts: JsonObject = {"files": inventory.files, "kind": "mcap", "problem": None, "session": None}
+    facts: JsonObject = {
+        "files": inventory.files,
+        "kind": "mcap",
+        "problem": None,
+        "session": None,
+    }
     facts |= {"sites": {}, "links": {}}
     name = ""
     rates_hz = {}
@@ -226,7 +265,9 @@ def describe_session(log: Log) -> JsonObject:
     session = log.session
     scenario = log.scenario
     epoch_ns = _number(session.get("epoch_unix_ns", ""))
-    seconds = [int(log[site].tick[-1]) / log[site].rate_hz for site in log.sites if len(log[site])]
+    seconds = [
+        int(log[site].tick[-1]) / log[site].rate_hz for site in log.sites if len(log[site])
+    ]
     began_utc = None
     if log.driver == "live" and epoch_ns is not None:
         began_at = datetime.fromtimestamp(min(epoch_ns, _LAST_EPOCH_NS) // NS_PER_S, UTC)
@@ -251,7 +292,9 @@ def describe_session(log: Log) -> JsonObject:
             "arms": list_arm_notes(scenario),
         },
         **{key: session.get(key) for key in _PROVENANCE},
-        "versions": {key[8:]: value for key, value in session.items() if key.startswith("version_")},
+        "versions": {
+            key[8:]: value for key, value in session.items() if key.startswith("version_")
+        },
         "accounts": log.accounts,
     }
 
@@ -309,7 +352,9 @@ def percentiles(
 
 
 def made_ticks(log: Log, site: str) -> int | None:
-    """Returns the number of ticks that a site made, by the event of its last start; None without one."""
+    """Returns the number of ticks that a site made, by the event of its last start; None
+    without one.
+    """
     made = [event.ticks for event in log.events if (event.kind, event.member) == ("end", site)]
     return made[-1] if made else None
 
@@ -324,13 +369,21 @@ def _number(text: str) -> int | None:
 
 
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
-    """Returns the numbers of a log, torn, short and empty ones too; `twin` is the run without operators."""
+    """Returns the numbers of a log, torn, short and empty ones too; `twin` is the run without
+    operators.
+    """
     sites = {name: _describe_site(log, name, twin) for name in log.sites}
     settled = [site["settle_s"] for site in sites.values()]
-    largest = [site["max_error_end_rad"] for site in sites.values() if site["max_error_end_rad"] is not None]
+    largest = [
+        site["max_error_end_rad"]
+        for site in sites.values()
+        if site["max_error_end_rad"] is not None
+    ]
     scenario = log.scenario
     keys = ("name", "title", "sha256", "duration_s", "seed", "scheme")
-    delays_ms = {name: finite_or_none(link.moments().mean_ms) for name, link in scenario.links.items()}
+    delays_ms = {
+        name: finite_or_none(link.moments().mean_ms) for name, link in scenario.links.items()
+    }
     return {
         "scenario": {
             **{key: getattr(scenario, key) for key in keys},
@@ -340,7 +393,11 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
             "assumed": list(scenario.assumed),
             "arms": list_arm_notes(scenario),
         },
-        "session": {**log.session, "complete": log.complete, "unknown_ends": list(log.unknown_ends)},
+        "session": {
+            **log.session,
+            "complete": log.complete,
+            "unknown_ends": list(log.unknown_ends),
+        },
         "diverged": any(site["diverged_at_s"] is not None for site in sites.values()),
         "settle_s": settling_time_of_all_s(settled),
         "settle_below_rad": SETTLED_ERROR_RAD,
@@ -405,9 +462,13 @@ def _describe_link(log: Log, use: LinkSummary) -> JsonObject:
             for state in use.stated
         ],
         "drawn_ms": use.drawn_ms._asdict() if use.drawn_ms else None,
-        "age_ms": use.age_ms._asdict() if use.age_ms else dict.fromkeys(ValueStatistics._fields),
+        "age_ms": use.age_ms._asdict()
+        if use.age_ms
+        else dict.fromkeys(ValueStatistics._fields),
         "ages": use.ages._asdict() if use.ages else None,
-        **{key: getattr(use, key) for key in ("first_use_s", "ticks_without_new", "silence_ms")},
+        **{
+            key: getattr(use, key) for key in ("first_use_s", "ticks_without_new", "silence_ms")
+        },
         "samples": counts._asdict() if counts else None,
         "late_samples": counts.late if counts else None,
         "duplicate_samples": counts.duplicate if counts else None,

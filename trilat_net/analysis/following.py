@@ -1,8 +1,10 @@
-"""How the law turns errors into motion and torque of the joints, over rows: joint by joint, or in task space.
+"""How the law turns errors into motion and torque of the joints, over rows: joint by joint, or
+in task space.
 
-Invariant: written with NumPy from the equations of `docs/laws.md`, independently of the core; J and J' of the
-followed axes alone count, and those that are not followed have no effect. Of `find_task_reference` follows
-J v = -Lambda e - damping y: what is missed where the pose is nearly singular.
+Invariant: written with NumPy from the equations of `docs/laws.md`, independently of the core; J
+and J' of the followed axes alone count, and those that are not followed have no effect. Of
+`find_task_reference` follows J v = -Lambda e - damping y: what is missed where the pose is
+nearly singular.
 """
 
 from collections.abc import Callable
@@ -18,7 +20,9 @@ from .arm_rows import ArmRows, Numbers, PlanarArmRows, multiply_columns
 
 Rows = slice | Ints
 _LEAST_EIGENVALUE = 1e-12
-"""Below this an eigenvalue of J J' is of an axis along which the end effector cannot move at all."""
+"""Below this an eigenvalue of J J' is of an axis along which the end effector cannot move at
+all.
+"""
 
 
 def find_task_reference(
@@ -36,7 +40,8 @@ def find_task_reference(
     Args:
         J: Jacobian of the followed axes, shape (m, n, ...).
         Jd: its derivative.
-        solve: A y = b for y, shape (m, ...), A being J J' + 1 of each axis that is not followed + damping.
+        solve: A y = b for y, shape (m, ...), A being J J' + 1 of each axis that is not followed
+            + damping.
         posture: psi and psi', shape (n, ...).
         error: Lambda e and Lambda ed, shape (m, ...).
     """
@@ -71,7 +76,9 @@ class JointFollowing(NamedTuple):
         return self
 
     def miss(self, rows: Rows, e: Array) -> tuple[Array, Array]:  # noqa: ARG002
-        """Returns what damping near singular poses leaves of J r and of the reference acceleration: 0."""
+        """Returns what damping near singular poses leaves of J r and of the reference
+        acceleration: 0.
+        """
         return np.zeros_like(e), np.zeros_like(e)
 
 
@@ -107,7 +114,9 @@ class TaskFollowing:
         J, Jd, inverse = (np.moveaxis(x[rows], 0, -1) for x in (self.J, self.Jd, self.inverse))
         posture = self.psi[rows].T, self.psi_rate[rows].T
         error = (self.Lambda * e).T, (self.Lambda * ed).T
-        v, a = find_task_reference(J, Jd, partial(multiply_columns, inverse), posture, error)
+        v, a = find_task_reference(
+            J=J, Jd=Jd, solve=partial(multiply_columns, inverse), posture=posture, error=error
+        )
         return v.T, a.T
 
     def lift(self, rows: Rows, de: Array) -> Array:
@@ -129,12 +138,16 @@ class TaskFollowing:
         return replace(self, psi=still, psi_rate=still)
 
     def miss(self, rows: Rows, e: Array) -> tuple[Array, Array]:
-        """Returns J r - x' - Lambda e, shape (K, m), and a - v', shape (K, n): 0 where nothing is damped."""
+        """Returns J r - x' - Lambda e, shape (K, m), and a - v', shape (K, n): 0 where nothing
+        is damped.
+        """
         damping = self.damping[rows, np.newaxis]
         rate = self.damping_rate[rows, np.newaxis]
         if not (damping.any() or rate.any()):
             return np.zeros_like(e), np.zeros_like(self.psi[rows])
-        y = self._solve(rows, -self.Lambda * e - np.einsum("kij,kj->ki", self.J[rows], self.psi[rows]))
+        y = self._solve(
+            rows, -self.Lambda * e - np.einsum("kij,kj->ki", self.J[rows], self.psi[rows])
+        )
         return damping * y, self.push(rows, self._solve(rows, rate * y))
 
 
@@ -151,7 +164,9 @@ def follow_rows(arm: ArmRows, q: Array, qd: Array, Lambda: Array) -> Following:
     J, Jd = (axes * task.scale * x for x in (place.J, arm.jacobian_rate(q, qd)))
     A = J @ J.transpose(0, 2, 1) + np.diag(1.0 - axes[:, 0])
     turn, basis = np.linalg.eigh(A)
-    inverse = (basis / np.maximum(turn, _LEAST_EIGENVALUE)[:, np.newaxis]) @ basis.transpose(0, 2, 1)
+    inverse = (basis / np.maximum(turn, _LEAST_EIGENVALUE)[:, np.newaxis]) @ basis.transpose(
+        0, 2, 1
+    )
     trace = np.trace(axes * inverse, axis1=1, axis2=2)
     limit = task.singular_value**2
     least = 1.0 / trace
@@ -163,4 +178,14 @@ def follow_rows(arm: ArmRows, q: Array, qd: Array, Lambda: Array) -> Following:
     damping_rate = np.where(damping > 0.0, bent / trace**2, 0.0)
     psi = task.posture_rate * (np.array(task.posture) - q)
     psi_rate = -task.posture_rate * qd
-    return TaskFollowing(Lambda, J, Jd, psi, psi_rate, inverse, damping, damping_rate, np.sqrt(least))
+    return TaskFollowing(
+        Lambda=Lambda,
+        J=J,
+        Jd=Jd,
+        psi=psi,
+        psi_rate=psi_rate,
+        inverse=inverse,
+        damping=damping,
+        damping_rate=damping_rate,
+        least=np.sqrt(least),
+    )

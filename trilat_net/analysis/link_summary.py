@@ -1,13 +1,15 @@
-"""Statistics of every directed link: stated and effective delay, loss, bursts, sample counts and clocks.
+"""Statistics of every directed link: stated and effective delay, loss, bursts, sample counts
+and clocks.
 
-Invariant: a quantity that the log does not determine is None. docs/definitions.md defines each: the effective
-delay is the age of the sample in use at a tick (age of information, Kaul, Yates and Gruteser 2012). Clock
-estimates are those in force while the session ran, without later improvement.
+Invariant: a quantity that the log does not determine is None. docs/definitions.md defines each:
+the effective delay is the age of the sample in use at a tick (age of information, Kaul, Yates
+and Gruteser 2012). Clock estimates are those in force while the session ran, without later
+improvement.
 
-Invariant (L4): the predicted delivery of a sample is a function of seed, link and index; the log's scenario
-and the changes that its records name determine it, also for samples that never arrived. Invariant (L3): a
-record names its inputs. Samples that only a missing record could name stay unknown and count neither as
-arrived nor as missing.
+Invariant (L4): the predicted delivery of a sample is a function of seed, link and index; the
+log's scenario and the changes that its records name determine it, also for samples that never
+arrived. Invariant (L3): a record names its inputs. Samples that only a missing record could
+name stay unknown and count neither as arrived nor as missing.
 """
 
 from typing import NamedTuple
@@ -29,11 +31,14 @@ from .timeline import StatedModel, list_changes, list_stated_models
 
 
 class PredictedDelivery(NamedTuple):
-    """Delivery of the samples 0 to M - 1 of a link's peer, as its model predicts it; times since the epoch.
+    """Delivery of the samples 0 to M - 1 of a link's peer, as its model predicts it; times
+    since the epoch.
 
     Attributes:
-        stamp_ns, due_ns: the stamp of each, and when it is due, shape (M,), ns; `LOST` for a lost one.
-        drawn_ns: the same by the model's own delay alone, without duplicates, order and play-out.
+        stamp_ns, due_ns: the stamp of each, and when it is due, shape (M,), ns; `LOST` for a
+        lost one.
+        drawn_ns: the same by the model's own delay alone, without duplicates, order and
+            play-out.
         measured: True if nothing is injected: a sample is due at once, shape (M,).
         copies: duplicates that the link makes.
     """
@@ -57,7 +62,9 @@ class PredictedDelivery(NamedTuple):
         return (self.drawn_ns[kept] - self.stamp_ns[kept]) / 1e6
 
     def release(self, rate_hz: int) -> Ints:
-        """Returns the receiver's tick at which each comes into use if it has arrived, shape (M,); or LOST."""
+        """Returns the receiver's tick at which each comes into use if it has arrived, shape
+        (M,); or LOST.
+        """
         ticks = first_ticks(np.maximum(self.due_ns, self.stamp_ns + 1), rate_hz)
         return np.where(self.lost, LOST, ticks)
 
@@ -82,7 +89,13 @@ def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDel
     drawn_ns = due_ns if np.array_equal(alone.models, models) else alone.draw(count)
     stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // setup.rate_hz
     kind = models["kind"][np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")]
-    return PredictedDelivery(stamp_ns, due_ns, drawn_ns, kind == DelayKind.MEASURED, int(whole.row.copies))
+    return PredictedDelivery(
+        stamp_ns=stamp_ns,
+        due_ns=due_ns,
+        drawn_ns=drawn_ns,
+        measured=kind == DelayKind.MEASURED,
+        copies=int(whole.row.copies),
+    )
 
 
 class Arrivals(NamedTuple):
@@ -91,7 +104,8 @@ class Arrivals(NamedTuple):
     Attributes:
         tick, sample: the receiver's tick, and the sample's own.
         delay_us: its one-way delay in the record.
-        refused: number of others with a stamp out of range, or of a tick that their sender never makes.
+        refused: number of others with a stamp out of range, or of a tick that their sender
+            never makes.
     """
 
     tick: Ints
@@ -120,7 +134,9 @@ def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
         # a link accepts no stamp before the epoch, and none further ahead than the limit
         latest_ns = at * NS_PER_S // part.rate_hz + AHEAD_LIMIT_NS
         peer_hz = log.scenario.sites[peer].rate_hz
-        limit = ((latest_ns + 1) * peer_hz - 1) // NS_PER_S  # in ticks: a stamp itself might overflow
+        limit = (
+            (latest_ns + 1) * peer_hz - 1
+        ) // NS_PER_S  # in ticks: a stamp itself might overflow
         known = (sample >= 0) & (sample <= limit) & (sample < log.scenario.ticks(peer))
         refused = len(at) - int(np.count_nonzero(known))
         found[peer] = Arrivals(at[known], sample[known], delay_us[known], refused)
@@ -128,9 +144,13 @@ def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
 
 
 def count_sent(log: Log, peer: str, newest: int) -> int:
-    """Returns how many samples a peer has sent, as far as the log shows; `newest` of them came, or -1."""
+    """Returns how many samples a peer has sent, as far as the log shows; `newest` of them came,
+    or -1.
+    """
     part = log[peer]
-    stated = [event.ticks for event in log.events if event.kind == "end" and event.member == peer]
+    stated = [
+        event.ticks for event in log.events if event.kind == "end" and event.member == peer
+    ]
     recorded = int(part.tick[-1]) + 1 if len(part) else 0
     return min(max(newest + 1, recorded, *stated), log.scenario.ticks(peer))
 
@@ -138,9 +158,10 @@ def count_sent(log: Log, peer: str, newest: int) -> int:
 def mark_judged_samples(log: Log, site: str, stamp_ns: Ints, came: Arrivals) -> Bools:
     """Returns for which samples it is known whether they arrived, shape (M,).
 
-    Known are those that arrived, those older than the newest that arrived, and those older than the slowest
-    took; except those that may have arrived in a tick whose record is missing. Given are the stamps of the
-    samples 0 to M - 1, ns since the epoch, and their first arrivals.
+    Known are those that arrived, those older than the newest that arrived, and those older than
+    the slowest took; except those that may have arrived in a tick whose record is missing.
+    Given are the stamps of the samples 0 to M - 1, ns since the epoch, and their first
+    arrivals.
     """
     part = log[site]
     count = len(stamp_ns)
@@ -181,7 +202,9 @@ class ValueStatistics(NamedTuple):
 
 
 class AgeHistogram(NamedTuple):
-    """Number of ticks per age, in bins of equal width; bin n begins at `first_ms` + n `width_ms`."""
+    """Number of ticks per age, in bins of equal width; bin n begins at `first_ms` + n
+    `width_ms`.
+    """
 
     first_ms: float
     width_ms: float
@@ -191,7 +214,8 @@ class AgeHistogram(NamedTuple):
 class ClockSummary(NamedTuple):
     """The clock of a link's sender against the receiver's: `clock.*` of docs/definitions.md.
 
-    `drift` and `rtt_min_us` are None without an estimate; `faults` says that a clock has stepped.
+    `drift` and `rtt_min_us` are None without an estimate; `faults` says that a clock has
+    stepped.
     """
 
     offset_us: int
@@ -211,7 +235,9 @@ class ClockSummary(NamedTuple):
 
 
 def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
-    """Returns the estimates of a peer's clock at a site; None if nothing was measured, as in virtual time."""
+    """Returns the estimates of a peer's clock at a site; None if nothing was measured, as in
+    virtual time.
+    """
     stats = [stats for stats in log.link_stats(site) if peer in stats.offset_us]
     if not stats:
         return None
@@ -232,7 +258,9 @@ def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
 
 
 class SampleCounts(NamedTuple):
-    """Counts of the samples of a link, by the receiver's records: `samples.*` of docs/definitions.md."""
+    """Counts of the samples of a link, by the receiver's records: `samples.*` of
+    docs/definitions.md.
+    """
 
     sent: int
     judged: int
@@ -247,10 +275,11 @@ class SampleCounts(NamedTuple):
 
 
 class LinkSummary(NamedTuple):
-    """One directed link in a run, peer -> site, as docs/definitions.md ("Links") defines each quantity.
+    """One directed link in a run, peer -> site, as docs/definitions.md ("Links") defines each
+    quantity.
 
-    What the log does not determine is None. `drawn_ms` is what the models in force, `stated`, gave to the
-    samples; `age_ms` and `ages` are the effective delay that the controller saw.
+    What the log does not determine is None. `drawn_ms` is what the models in force, `stated`,
+    gave to the samples; `age_ms` and `ages` are the effective delay that the controller saw.
     """
 
     peer: str
@@ -282,7 +311,9 @@ class LinkSummary(NamedTuple):
 def has_one_constant_delay(states: list[StatedModel]) -> bool:
     """True if the models of a link give every sample one and the same delay, and lose none."""
     (_, link), *later = states
-    exact = link.core().kind == DelayKind.CONSTANT and not (link.loss or link.duplicate or link.outages_s)
+    exact = link.core().kind == DelayKind.CONSTANT and not (
+        link.loss or link.duplicate or link.outages_s
+    )
     return exact and not later
 
 
@@ -295,13 +326,20 @@ def summarise_links(log: Log) -> list[LinkSummary]:
     changed = list_changes(log)
     came = {site: read_arrivals(log, site) for site in log.sites}
     newest = {
-        peer: max(int(there[peer].sample.max(initial=-1)) for there in came.values() if peer in there)
+        peer: max(
+            int(there[peer].sample.max(initial=-1)) for there in came.values() if peer in there
+        )
         for peer in log.sites
     }
     sent = {peer: count_sent(log, peer, tick) for peer, tick in newest.items()}
     return [
         _summarise_link(
-            log, list_stated_models(log, f"{peer}->{site}", changed), peer, site, sent[peer], over
+            log=log,
+            states=list_stated_models(log, f"{peer}->{site}", changed),
+            peer=peer,
+            site=site,
+            sent=sent[peer],
+            came=over,
         )
         for site in log.sites
         for peer, over in came[site].items()
@@ -323,16 +361,27 @@ def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
     if not array.size:
         return None
     p50, p95, p99, low, high = np.percentile(array, (50.0, 95.0, 99.0, 0.0, 100.0)).tolist()
-    return ValueStatistics(float(array.mean()), float(array.std()), p50, p95, p99, low, high)
+    return ValueStatistics(
+        mean=float(array.mean()),
+        deviation=float(array.std()),
+        p50=p50,
+        p95=p95,
+        p99=p99,
+        min=low,
+        max=high,
+    )
 
 
 def bin_ages(age_ns: Ints) -> AgeHistogram | None:
-    """Returns a histogram of ages, ns, in at most `MOST_AGE_BINS` bins of 1, 2 or 5 times 10^n ms."""
+    """Returns a histogram of ages, ns, in at most `MOST_AGE_BINS` bins of 1, 2 or 5 times 10^n
+    ms.
+    """
     if not len(age_ns):
         return None
     low = int(age_ns.min())
     high = int(age_ns.max())
-    widths = (step * 10**power for power in range(4, 15) for step in (1, 2, 5))  # ns, from 10 us
+    # ns, from 10 us
+    widths = (step * 10**power for power in range(4, 15) for step in (1, 2, 5))
     width_ns = next(width for width in widths if high // width - low // width < MOST_AGE_BINS)
     ticks = np.bincount(age_ns // width_ns - low // width_ns).tolist()
     return AgeHistogram(low // width_ns * width_ns / 1e6, width_ns / 1e6, ticks)
@@ -355,11 +404,15 @@ def _summarise_link(
     judged = int(np.count_nonzero(known))
     bursts = int(np.count_nonzero(gone[1:] & ~gone[:-1])) + int(gone[:1].any())
     pairs = (np.diff(part.tick) == 1) & (used[:-1] >= 0)
-    stamped = log.driver == "live" and len(part) > 0 and part.record(0).v >= ONE_WAY_SCHEMA_VERSION
+    stamped = (
+        log.driver == "live" and len(part) > 0 and part.record(0).v >= ONE_WAY_SCHEMA_VERSION
+    )
     first_use_s = silence_ms = None
     if (used >= 0).any():
         first_use_s = float(part.t_s[np.flatnonzero(used >= 0)[0]])
-        ticks = np.append(part.tick[np.flatnonzero(np.diff(used, prepend=-1))], part.tick[-1] + 1)
+        ticks = np.append(
+            part.tick[np.flatnonzero(np.diff(used, prepend=-1))], part.tick[-1] + 1
+        )
         silence_ms = float(np.diff(ticks * NS_PER_S // part.rate_hz).max()) / 1e6
     return LinkSummary(
         peer,
@@ -371,7 +424,9 @@ def _summarise_link(
         first_use_s=first_use_s,
         ticks_without_new=float(np.mean(np.diff(used)[pairs] == 0)) if pairs.any() else None,
         silence_ms=silence_ms,
-        counts=_count_samples(part, used, fate, came, judged) if len(part) else None,
+        counts=_count_samples(part=part, used=used, fate=fate, came=came, judged=judged)
+        if len(part)
+        else None,
         loss=lost / judged if judged else None,
         burst=lost / bursts if bursts else None,
         one_way_us=compute_statistics(came.delay_us) if stamped else None,

@@ -1,13 +1,15 @@
 """The judgement of a run: stable, not stable, or open, and what it rests on.
 
-Invariant: every command takes its word from here (docs/definitions.md, "Stable"). Each joint of each site is
-judged by itself, and the worst decides; a word states what the record shows and predicts nothing. What else
-is known of a whole log (V, the roots at its end pose) may make a stable run open, never the reverse.
+Invariant: every command takes its word from here (docs/definitions.md, "Stable"). Each joint of
+each site is judged by itself, and the worst decides; a word states what the record shows and
+predicts nothing. What else is known of a whole log (V, the roots at its end pose) may make a
+stable run open, never the reverse.
 
-The judged part is the second half of the run, or what follows the last act of an operator and the last change
-of the loop if that is less and long enough. Trends of |e| and |qd| over it are those of `envelope_trend`. A
-sustained oscillation of any size is steady; a joint that is steady while a faster one of the coupled sites
-falls may live on that (modes that decay beat), and is undecided.
+The judged part is the second half of the run, or what follows the last act of an operator and
+the last change of the loop if that is less and long enough. Trends of |e| and |qd| over it are
+those of `envelope_trend`. A sustained oscillation of any size is steady; a joint that is steady
+while a faster one of the coupled sites falls may live on that (modes that decay beat), and is
+undecided.
 """
 
 import math
@@ -32,14 +34,18 @@ from .site_signals import SETTLED_ERROR_RAD
 from .torque_sources import compute_operator_script
 
 SETTLED_SPEED_RAD_S = 1e-2
-"""The largest speed of the last second of a converged run, rad/s: the arms have come to rest."""
+"""The largest speed of the last second of a converged run, rad/s: the arms have come to rest.
+"""
 
 STATIC_SPEED_RAD_S = 2e-3
-"""The largest speed in a static window of a log, rad/s: the torques on an arm balance each other."""
+"""The largest speed in a static window of a log, rad/s: the torques on an arm balance each
+other.
+"""
 
 EQUILIBRIUM_SPEED_RAD_S = 1e-5
-"""The largest speed of the last second of a run whose end is an equilibrium, rad/s: the loop can be
-linearised there."""
+"""The largest speed of the last second of a run whose end is an equilibrium, rad/s: the loop
+can be linearised there.
+"""
 
 AGREEMENT_RAD = 2e-2
 """Sites whose angles of a joint differ by more do not agree, rad."""
@@ -48,8 +54,9 @@ THROWN_RAD = 0.5 * math.pi
 """Arms that nobody pushed and that end further from every start pose were thrown there, rad."""
 
 DRIFT_RAD = 0.05
-"""A joint that goes by more in one direction over the judged half may drift, rad; for one that is as slow as
-at rest, `SETTLED_ERROR_RAD` leaves that undecided."""
+"""A joint that goes by more in one direction over the judged half may drift, rad; for one that
+is as slow as at rest, `SETTLED_ERROR_RAD` leaves that undecided.
+"""
 
 FORCE_NM = 1e-3
 """A larger torque of an operator or environment at the end may hold sites apart, N m, and"""
@@ -57,8 +64,9 @@ HELD_SHARE = 0.02
 """an error of so much of their distance says that it does: what is pulled at has one."""
 
 LEAST_JUDGED_S = 2.0
-"""What follows the last act of an operator or change of the loop is judged by itself if it lasts so long, s,
-and"""
+"""What follows the last act of an operator or change of the loop is judged by itself if it
+lasts so long, s, and
+"""
 LEAST_JUDGED_SHARE = 0.1
 """this share of the run; else the second half is, with the act or the change in it."""
 
@@ -75,7 +83,9 @@ class Stability(StrEnum):
 
 
 class EndBehaviour(StrEnum):
-    """Behaviour of a run at its end, from the best to the worst; the text is the word for people."""
+    """Behaviour of a run at its end, from the best to the worst; the text is the word for
+    people.
+    """
 
     CONVERGED = "converged"
     DECAYS = "decaying"
@@ -134,7 +144,9 @@ class RunEnd(NamedTuple):
 
     @property
     def stability(self) -> Stability:
-        """The judgement; what may be an operator's doing is open, unless a site left its limits."""
+        """The judgement; what may be an operator's doing is open, unless a site left its
+        limits.
+        """
         own = self.behaviour.stability
         if own is Stability.NOT_STABLE:
             excused = self.operator_acts and self.behaviour is not EndBehaviour.DIVERGED
@@ -163,7 +175,9 @@ class RunEnd(NamedTuple):
         at = f" at {self.where}" if self.where else ""
         if behaviour is EndBehaviour.BOUNDED:
             hertz = self.frequency_hz
-            word = "bounded motion" if hertz is None else f"bounded oscillation at {hertz:.3g} Hz"
+            word = (
+                "bounded motion" if hertz is None else f"bounded oscillation at {hertz:.3g} Hz"
+            )
             return f"{word}{at}: {end}"
         if behaviour is EndBehaviour.UNDECIDED:
             return f"undecided, record longer{at}: |e| {error.text}, |qd| {speed.text}; {end}"
@@ -174,12 +188,14 @@ class RunTrace(NamedTuple):
     """What the judgement of a run rests on, per site in scenario order.
 
     Attributes:
-        buckets: of every `BUCKETS_PER_S`-th of a second since the epoch the largest |e| and |qd| and the last
-            q of every joint, shape (K, 3 n); -1 if it has no record. There may be columns for more joints
-            than the site has. A site's last bucket may be incomplete: it enters no trend.
+        buckets: of every `BUCKETS_PER_S`-th of a second since the epoch the largest |e| and
+            |qd| and the last q of every joint, shape (K, 3 n); -1 if it has no record. There
+            may be columns for more joints than the site has. A site's last bucket may be
+            incomplete: it enters no trend.
         tau_x: the torque of operator and environment at its last record, shape (n,), N m.
         diverged_at_s: when the first site left its limits, or None.
-        pushed_until_s: when an operator whom the scenario does not know last pushed, s; 0 for never.
+        pushed_until_s: when an operator whom the scenario does not know last pushed, s; 0 for
+            never.
         changed_until_s: when a command last changed the loop, s; 0 for never.
     """
 
@@ -195,9 +211,11 @@ NO_BUCKETS = np.zeros((0, 3))
 
 
 def reduce_to_buckets(bucket: Ints, e: Array, qd: Array, q: Array, into: Array) -> Array:
-    """Returns buckets with some more records of a site, which follow those in it; there may be spare rows.
+    """Returns buckets with some more records of a site, which follow those in it; there may be
+    spare rows.
 
-    In task space e has as many columns as the task; the fewer of e and q are filled up with zeros.
+    In task space e has as many columns as the task; the fewer of e and q are filled up with
+    zeros.
     """
     if not len(bucket):
         return into
@@ -224,14 +242,25 @@ def trace_log(log: Log) -> RunTrace:
     pushed = [(part.t_s, part.tau_x.any(axis=1)) for part in outside]
     pushed += [(part.t_s, part.hand[:, 0] > 0.0) for part in recorded if part.layout.hand]
     return RunTrace(
-        [
-            reduce_to_buckets(part.tick * BUCKETS_PER_S // part.rate_hz, part.e, part.qd, part.q, NO_BUCKETS)
+        buckets=[
+            reduce_to_buckets(
+                bucket=part.tick * BUCKETS_PER_S // part.rate_hz,
+                e=part.e,
+                qd=part.qd,
+                q=part.q,
+                into=NO_BUCKETS,
+            )
             for part in parts
         ],
-        [part.tau_x[-1] if len(part) else np.zeros(1) for part in parts],
-        log.diverged_s,
-        max((float(t_s[rows].max(initial=0.0)) for t_s, rows in pushed), default=0.0),
-        max((tick / log[site].rate_hz for site in log.sites for tick in log.changes(site)), default=0.0),
+        tau_x=[part.tau_x[-1] if len(part) else np.zeros(1) for part in parts],
+        diverged_at_s=log.diverged_s,
+        pushed_until_s=max(
+            (float(t_s[rows].max(initial=0.0)) for t_s, rows in pushed), default=0.0
+        ),
+        changed_until_s=max(
+            (tick / log[site].rate_hz for site in log.sites for tick in log.changes(site)),
+            default=0.0,
+        ),
     )
 
 
@@ -239,7 +268,9 @@ def classify_log_end(log: Log) -> RunEnd:
     """Returns the end of a log's run; torn and empty logs are undecided."""
     end = classify_run_end(log.scenario, trace_log(log))
     bounded = end.behaviour is EndBehaviour.BOUNDED
-    return end._replace(frequency_hz=_frequency_hz([log[site] for site in log.sites]) if bounded else None)
+    return end._replace(
+        frequency_hz=_frequency_hz([log[site] for site in log.sites]) if bounded else None
+    )
 
 
 def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
@@ -259,17 +290,24 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     acts = late and _choose_judged_part(t_s, acted_s)[1]
     t_s = t_s[first:]
     columns = [site[kept[first:]] for site in sites]
-    missing = tuple(name for name, site in zip(scenario.names, sites, strict=True) if not len(site))
+    missing = tuple(
+        name for name, site in zip(scenario.names, sites, strict=True) if not len(site)
+    )
     end = _find_worst_joint(scenario, t_s, columns, sites)
     counts_from_s = float(t_s[0]) if len(t_s) else 0.0
     quiet_from_s = max(acted_s, changed_s)
-    end = end._replace(missing_sites=missing, counts_from_s=counts_from_s, quiet_from_s=quiet_from_s)
+    end = end._replace(
+        missing_sites=missing, counts_from_s=counts_from_s, quiet_from_s=quiet_from_s
+    )
     if scenario.sites[scenario.names[0]].task.space == "position":
         end = end._replace(error_unit="m")
     if trace.diverged_at_s is not None:
         return end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=trace.diverged_at_s)
     if end.behaviour.stability is Stability.STABLE:
-        reasons = (*_find_disagreement(scenario, trace, t_s, columns), *_find_odd_pose(scenario, sites))
+        reasons = (
+            *_find_disagreement(scenario, trace, t_s, columns),
+            *_find_odd_pose(scenario, sites),
+        )
         if late and not acts:
             reasons += (f"the loop changes until {changed_s:.4g} s, within the judged part",)
         return end._replace(reasons=reasons)
@@ -278,9 +316,11 @@ def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
 
 
 def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
-    """Returns from which time on a run counts, of which the second half is judged, and if an operator acts.
+    """Returns from which time on a run counts, of which the second half is judged, and if an
+    operator acts.
 
-    An operator that acts in the second half and then lets go for long enough shortens the judged part.
+    An operator that acts in the second half and then lets go for long enough shortens the
+    judged part.
     """
     if not len(t_s) or acted_s <= 0.5 * (t_s[0] + t_s[-1]):
         return 0, False
@@ -292,7 +332,9 @@ def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
 def _find_worst_joint(
     scenario: Scenario, t_s: Array, columns: Sequence[Array], sites: Sequence[Array]
 ) -> RunEnd:
-    """Returns the end of the joint of the worst class, the fastest of those; the maxima are of all."""
+    """Returns the end of the joint of the worst class, the fastest of those; the maxima are of
+    all.
+    """
     signals = [site[:, kind] for site in columns for kind in (0, 1)]
     fits = iter(fit_envelopes(t_s, np.hstack(signals)))
     joints = []
@@ -301,21 +343,39 @@ def _find_worst_joint(
         trends = [[next(fits) for _ in kind] for kind in ends]
         for joint, (end_error, end_speed) in enumerate(zip(*ends, strict=True)):
             error, speed = (kind[joint] for kind in trends)
-            still = speed.trend is EnvelopeTrend.DECAYS or end_speed <= FLOOR_RAD  # too slow for a trend
+            # too slow for a trend
+            still = speed.trend is EnvelopeTrend.DECAYS or end_speed <= FLOOR_RAD
             settles = speed.trend is EnvelopeTrend.HARDLY or bool(scenario.external)
             rests = end_speed <= SETTLED_SPEED_RAD_S and (still or (speed.calm and settles))
-            behaviour = _classify_joint(error, speed, end_error, end_speed, still=still, rests=rests)
-            behaviour = _name_motion(behaviour, judged[:, 2, joint], judged[:, 1, joint], t_s, still=still)
+            behaviour = _classify_joint(
+                error, speed, end_error, end_speed, still=still, rests=rests
+            )
+            behaviour = _name_motion(
+                behaviour, judged[:, 2, joint], judged[:, 1, joint], t_s, still=still
+            )
             where = f"{name} joint {joint + 1}" if len(t_s) else ""
-            joints.append(RunEnd(behaviour, error, speed, end_error, end_speed, where))
+            joints.append(
+                RunEnd(
+                    behaviour=behaviour,
+                    error=error,
+                    speed=speed,
+                    end_error_rad=end_error,
+                    end_speed_rad_s=end_speed,
+                    where=where,
+                )
+            )
     end_s = float(t_s[-1]) if len(t_s) else 0.0
     owners = np.repeat(np.arange(len(sites)), [site.shape[2] for site in sites])
     for group in find_coupled_sites(scenario):
         for n in _find_fed_joints(joints, owners, group):
             joints[n] = joints[n]._replace(behaviour=EndBehaviour.UNDECIDED)
-        for n in _find_coasting_joints(scenario, joints, owners, group, end_s):
+        for n in _find_coasting_joints(
+            scenario=scenario, joints=joints, owners=owners, group=group, end_s=end_s
+        ):
             joints[n] = joints[n]._replace(behaviour=EndBehaviour.COASTS)
-    worst = max(joints, key=lambda one: (list(EndBehaviour).index(one.behaviour), one.end_speed_rad_s))
+    worst = max(
+        joints, key=lambda one: (list(EndBehaviour).index(one.behaviour), one.end_speed_rad_s)
+    )
     return worst._replace(
         end_error_rad=max(one.end_error_rad for one in joints),
         end_speed_rad_s=max(one.end_speed_rad_s for one in joints),
@@ -323,38 +383,54 @@ def _find_worst_joint(
 
 
 def _find_fed_joints(joints: Sequence[RunEnd], owners: Ints, group: Sequence[int]) -> list[int]:
-    """Returns the bounded joints of coupled sites of which a faster joint falls: they may live on that.
+    """Returns the bounded joints of coupled sites of which a faster joint falls: they may live
+    on that.
 
-    Modes that decay at several frequencies beat, and hand their energy on: some joint is steady for a while.
+    Modes that decay at several frequencies beat, and hand their energy on: some joint is steady
+    for a while.
     """
     own = np.flatnonzero(np.isin(owners, group)).tolist()
     falling = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
-    fastest = max((joints[n].end_speed_rad_s for n in own if joints[n].speed.trend in falling), default=0.0)
+    fastest = max(
+        (joints[n].end_speed_rad_s for n in own if joints[n].speed.trend in falling),
+        default=0.0,
+    )
     bounded = [n for n in own if joints[n].behaviour is EndBehaviour.BOUNDED]
     return [n for n in bounded if joints[n].end_speed_rad_s < fastest]
 
 
 def _find_coasting_joints(
-    scenario: Scenario, joints: Sequence[RunEnd], owners: Ints, group: Sequence[int], end_s: float
+    scenario: Scenario,
+    joints: Sequence[RunEnd],
+    owners: Ints,
+    group: Sequence[int],
+    end_s: float,
 ) -> list[int]:
     """Returns the drifting joints of coupled sites that nothing brakes.
 
-    That is so if the law of a site that nobody holds or resists at the end has no spring to a peer, and the
-    others follow it; or if that is so of all sites, and their laws take energy from the links alone.
+    That is so if the law of a site that nobody holds or resists at the end has no spring to a
+    peer, and the others follow it; or if that is so of all sites, and their laws take energy
+    from the links alone.
     """
     specs = [scenario.sites[scenario.names[site]] for site in group]
     alone = [
         spec.control
         for spec in specs
-        if not any(one.actor.start_s <= end_s < one.actor.end_s for one in (*spec.hands, *spec.environment))
+        if not any(
+            one.actor.start_s <= end_s < one.actor.end_s
+            for one in (*spec.hands, *spec.environment)
+        )
     ]
     brakeless = [law for law in alone if law.books_energy and not any(getattr(law, "d", ()))]
-    free = len(brakeless) == len(specs) or not all(any(getattr(law, "K", (1.0,))) for law in alone)
+    free = len(brakeless) == len(specs) or not all(
+        any(getattr(law, "K", (1.0,))) for law in alone
+    )
     own = np.flatnonzero(np.isin(owners, group)).tolist() if free else []
     return [
         n
         for n in own
-        if joints[n].behaviour is EndBehaviour.DRIFTS and joints[n].speed.trend is not EnvelopeTrend.GROWS
+        if joints[n].behaviour is EndBehaviour.DRIFTS
+        and joints[n].speed.trend is not EnvelopeTrend.GROWS
     ]
 
 
@@ -369,36 +445,46 @@ def _classify_joint(
 ) -> EndBehaviour:
     """Returns the class that the trends of a joint's |e| and |qd| have together.
 
-    Errors that grow while the joint gets no faster may start a drift, or follow from what an operator has
-    just done: undecided. The reverse is growth: arms that swing in unison have no error. A joint is `still`
-    if its speed decays, and `rests` if it is slow and falls, however little; what goes on at a small speed
-    may go on for ever, or grow. That of arms outside of the program need not fall.
+    Errors that grow while the joint gets no faster may start a drift, or follow from what an
+    operator has just done: undecided. The reverse is growth: arms that swing in unison have no
+    error. A joint is `still` if its speed decays, and `rests` if it is slow and falls, however
+    little; what goes on at a small speed may go on for ever, or grow. That of arms outside of
+    the program need not fall.
     """
     if speed.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.GROWS
     if error.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.UNDECIDED
     if not rests and not still:
-        if end_speed_rad_s <= SETTLED_SPEED_RAD_S:  # it hardly moves, and its trend says nothing
+        # it hardly moves, and its trend says nothing
+        if end_speed_rad_s <= SETTLED_SPEED_RAD_S:
             return EndBehaviour.UNDECIDED
-        goes_on = {EnvelopeTrend.HARDLY: EndBehaviour.HARDLY, EnvelopeTrend.STEADY: EndBehaviour.BOUNDED}
+        goes_on = {
+            EnvelopeTrend.HARDLY: EndBehaviour.HARDLY,
+            EnvelopeTrend.STEADY: EndBehaviour.BOUNDED,
+        }
         return goes_on.get(speed.trend, EndBehaviour.UNDECIDED)
-    if error.calm and (end_error_rad <= SETTLED_ERROR_RAD or error.trend is EnvelopeTrend.STEADY):
+    if error.calm and (
+        end_error_rad <= SETTLED_ERROR_RAD or error.trend is EnvelopeTrend.STEADY
+    ):
         return EndBehaviour.CONVERGED if rests else EndBehaviour.DECAYS
     if error.trend is EnvelopeTrend.DECAYS:
         near = rests and end_error_rad <= SETTLED_ERROR_RAD
         return EndBehaviour.CONVERGED if near else EndBehaviour.DECAYS
-    return EndBehaviour.HARDLY if error.trend is EnvelopeTrend.HARDLY else EndBehaviour.UNDECIDED
+    return (
+        EndBehaviour.HARDLY if error.trend is EnvelopeTrend.HARDLY else EndBehaviour.UNDECIDED
+    )
 
 
 def _name_motion(
     behaviour: EndBehaviour, q: Array, fastest: Array, t_s: Array, *, still: bool
 ) -> EndBehaviour:
-    """Returns the class of a joint, and of one that moves on by where it goes in the judged half.
+    """Returns the class of a joint, and of one that moves on by where it goes in the judged
+    half.
 
-    It drifts if every quarter takes half of its share or more in one way, and its mean speed is at least half
-    of the largest: what swings on its way is no drift. A bounded oscillation changes its sign. What is as
-    slow as at rest, and goes one way, is undecided before that.
+    It drifts if every quarter takes half of its share or more in one way, and its mean speed is
+    at least half of the largest: what swings on its way is no drift. A bounded oscillation
+    changes its sign. What is as slow as at rest, and goes one way, is undecided before that.
     """
     moves = behaviour in _MOVES_ON or (behaviour is EndBehaviour.CONVERGED and not still)
     if not moves or len(t_s) < BUCKETS_PER_S:
@@ -413,7 +499,10 @@ def _name_motion(
             return EndBehaviour.DRIFTS
         if total >= SETTLED_ERROR_RAD and behaviour is EndBehaviour.CONVERGED:
             return EndBehaviour.UNDECIDED
-    swings = behaviour is not EndBehaviour.BOUNDED or _count_sign_changes(q[first:]) >= MIN_SIGN_CHANGES
+    swings = (
+        behaviour is not EndBehaviour.BOUNDED
+        or _count_sign_changes(q[first:]) >= MIN_SIGN_CHANGES
+    )
     return behaviour if swings else EndBehaviour.UNDECIDED
 
 
@@ -429,7 +518,10 @@ def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
         for peer, share in (change.to if change.dominance else {}).items():
             joined[scenario.names.index(change.dominance), scenario.names.index(peer)] += share
     reach = find_reach(joined + joined.T)
-    return [list(map(int, rows)) for rows in {tuple(np.flatnonzero(row).tolist()): None for row in reach}]
+    return [
+        list(map(int, rows))
+        for rows in {tuple(np.flatnonzero(row).tolist()): None for row in reach}
+    ]
 
 
 def _find_disagreement(
@@ -443,20 +535,33 @@ def _find_disagreement(
         q = np.array([columns[n][:, 2] for n in group])
         apart = np.ptp(q, axis=0)
         joint = int(apart[-1].argmax())
-        nearer = fit_envelopes(t_s, apart.max(axis=1, keepdims=True))[0].trend is EnvelopeTrend.DECAYS
+        nearer = (
+            fit_envelopes(t_s, apart.max(axis=1, keepdims=True))[0].trend
+            is EnvelopeTrend.DECAYS
+        )
         pulled = max(np.abs(trace.tau_x[n]).max() for n in group) > FORCE_NM
-        held = pulled and max(columns[n][-1, 0].max() for n in group) > HELD_SHARE * apart[-1, joint]
+        held = (
+            pulled
+            and max(columns[n][-1, 0].max() for n in group) > HELD_SHARE * apart[-1, joint]
+        )
         at = q[_find_held_sites(scenario, trace, joint, float(t_s[-1]))[group], -1, joint]
         held |= len(at) > 0 and apart[-1, joint] - np.ptp(at) < AGREEMENT_RAD
         if apart[-1, joint] > AGREEMENT_RAD and not (nearer or held):
-            ends = [scenario.names[group[int(pick(q[:, -1, joint]))]] for pick in (np.argmin, np.argmax)]
+            ends = [
+                scenario.names[group[int(pick(q[:, -1, joint]))]]
+                for pick in (np.argmin, np.argmax)
+            ]
             yield f"{' and '.join(ends)} stand {apart[-1, joint]:.3g} rad apart, and nothing holds them there"
 
 
-def _find_held_sites(scenario: Scenario, trace: RunTrace, joint: int, end_s: float) -> NDArray[np.bool_]:
-    """Returns at which sites a joint is held at the end, by the stiffness of a hand, or of what is touched.
+def _find_held_sites(
+    scenario: Scenario, trace: RunTrace, joint: int, end_s: float
+) -> NDArray[np.bool_]:
+    """Returns at which sites a joint is held at the end, by the stiffness of a hand, or of what
+    is touched.
 
-    A hand at the place that it wants needs no torque, and holds all the same. An own kind is taken to hold.
+    A hand at the place that it wants needs no torque, and holds all the same. An own kind is
+    taken to hold.
     """
     held = np.zeros(len(scenario.names), dtype=np.bool_)
     for n, (spec, tau_x) in enumerate(zip(scenario.sites.values(), trace.tau_x, strict=True)):
@@ -479,12 +584,16 @@ def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
     n = int(np.argmax(away))
     if hanging:
         yield f"{', '.join(hanging)} {'hangs' if len(hanging) == 1 else 'hang'}: the arms fell"
-    elif away[n] > THROWN_RAD and not (scenario.external or any(s.hands for s in scenario.sites.values())):
+    elif away[n] > THROWN_RAD and not (
+        scenario.external or any(s.hands for s in scenario.sites.values())
+    ):
         yield f"{scenario.names[n]} ends {away[n]:.3g} rad away from every start pose, and nobody pushed"
 
 
 def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
-    """Returns the sites, of those whose last angles are given, whose arms hang and did not at the start."""
+    """Returns the sites, of those whose last angles are given, whose arms hang and did not at
+    the start.
+    """
     arms = {name: build_arm_rows(scenario, name) for name in ends}
     starts = {name: np.array(scenario.sites[name].q0_rad) for name in ends}
     return [
@@ -495,14 +604,18 @@ def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[st
 
 
 def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
-    """Returns when an operator last changed what it does before the end of a run, s; 0 if none ever did."""
+    """Returns when an operator last changed what it does before the end of a run, s; 0 if none
+    ever did.
+    """
     t_s = np.arange(0.0, span_s, 1.0 / BUCKETS_PER_S)
     last_s = 0.0
     for name, spec in scenario.sites.items():
         start = np.array([spec.q0_rad])
         J = build_arm_rows(scenario, name).place_end_effector(start, 0.0 * start).J[0]
         for source in (one.actor for one in spec.hands if one.actor.acts not in LIVE_KINDS):
-            script = compute_operator_script(source, t_s, np.eye(len(source.a)) if source.a else J)
+            script = compute_operator_script(
+                source, t_s, np.eye(len(source.a)) if source.a else J
+            )
             changed = np.abs(np.diff(script, axis=0)).max(axis=1, initial=0.0) > 0.0
             edges = [at_s for at_s in (source.start_s, source.end_s) if at_s < span_s]
             last_s = max(last_s, *edges, float(t_s[1:][changed].max(initial=0.0)))
@@ -510,16 +623,24 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
 
 
 def find_last_change(scenario: Scenario, span_s: float) -> float:
-    """Returns when the loop last changed before the end of a run, s: by its timeline or an environment."""
-    ends_s = [change.at_s + change.ramp_s for change in scenario.timeline if change.at_s < span_s]
+    """Returns when the loop last changed before the end of a run, s: by its timeline or an
+    environment.
+    """
+    ends_s = [
+        change.at_s + change.ramp_s for change in scenario.timeline if change.at_s < span_s
+    ]
     for spec in scenario.sites.values():
-        edges = (at_s for one in spec.environment for at_s in (one.actor.start_s, one.actor.end_s))
+        edges = (
+            at_s for one in spec.environment for at_s in (one.actor.start_s, one.actor.end_s)
+        )
         ends_s += [at_s for at_s in edges if at_s < span_s]
     return max([0.0, *ends_s])
 
 
 def _frequency_hz(parts: list[SiteLog]) -> float | None:
-    """Returns the frequency of the fastest joint in the second half, by its changes of sign, or None."""
+    """Returns the frequency of the fastest joint in the second half, by its changes of sign, or
+    None.
+    """
     halves = [(part, part.qd[len(part) // 2 :]) for part in parts]
     part, half = max(halves, key=lambda pair: float(np.abs(pair[1]).max()))
     column = half[:, int(np.abs(half).max(axis=0).argmax())]

@@ -1,6 +1,8 @@
-"""One view of a recorded run: its sites' records aligned, the torques by source, dominance, links and walls.
+"""One view of a recorded run: its sites' records aligned, the torques by source, dominance,
+links and walls.
 
-Invariant: whatever is derived from a log is derived once, by `RunView.once`, whoever asks first.
+Invariant: whatever is derived from a log is derived once, by `RunView.once`, whoever asks
+first.
 """
 
 from collections.abc import Callable, Iterable
@@ -25,7 +27,9 @@ T = TypeVar("T")
 
 
 class SiteRun(NamedTuple):
-    """A site with records: these aligned, the torque ON its arm by source, and its dominance factors."""
+    """A site with records: these aligned, the torque ON its arm by source, and its dominance
+    factors.
+    """
 
     records: AlignedRecords
     torque: TorqueSplit
@@ -55,13 +59,19 @@ class RunView:
     def sites(self) -> dict[str, SiteRun]:
         """The sites with records."""
         return {
-            site: SiteRun(own, attribute_torque(own, self.scenario), trace_dominance(self.log, site, own.t_s))
+            site: SiteRun(
+                own,
+                attribute_torque(own, self.scenario),
+                trace_dominance(self.log, site, own.t_s),
+            )
             for site, own in align_records(self.log).items()
         }
 
     @cached_property
     def shared(self) -> dict[str, SiteRun]:
-        """The same as what sites share: in task space places for angles, and forces for torques."""
+        """The same as what sites share: in task space places for angles, and forces for
+        torques.
+        """
         return {site: _view_shared(self.scenario, run) for site, run in self.sites.items()}
 
     @cached_property
@@ -84,14 +94,17 @@ class RunView:
         }
 
     def places(self, of: str) -> Iterable[str]:
-        """Returns the names of the places of a kind: "run" (one, by ""), "site", "link" or "wall"."""
+        """Returns the names of the places of a kind: "run" (one, by ""), "site", "link" or
+        "wall".
+        """
         return {"run": [""], "site": self.log.sites, "link": self.links, "wall": self.walls}[of]
 
 
 def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
     """Returns a site's run as what sites share.
 
-    What an operator was to do is turned into forces in the first pose, so that what stands still does.
+    What an operator was to do is turned into forces in the first pose, so that what stands
+    still does.
     """
     records, torque, dominance = run
     arm = build_arm_rows(scenario, records.site)

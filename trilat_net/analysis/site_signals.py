@@ -1,10 +1,12 @@
-"""Signals of a site as columns over its records, and its settling time; empty logs give empty columns.
+"""Signals of a site as columns over its records, and its settling time; empty logs give empty
+columns.
 
-Invariant: one definition of each signal, for figures, page, summary and metrics. Torques of operators and
-environment are those ON the arm, the negative of the record's tau_x of Eq. (8).
+Invariant: one definition of each signal, for figures, page, summary and metrics. Torques of
+operators and environment are those ON the arm, the negative of the record's tau_x of Eq. (8).
 
-For plots columns are decimated: every bucket keeps the minimum and the maximum of every column, so a spike
-of one tick at 1 kHz stays visible; a row of NaN stands in every gap wider than a bucket.
+For plots columns are decimated: every bucket keeps the minimum and the maximum of every column,
+so a spike of one tick at 1 kHz stays visible; a row of NaN stands in every gap wider than a
+bucket.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +21,9 @@ from ..log.record_columns import Ints
 from ..log.site_log import SiteLog
 
 SETTLED_ERROR_RAD = 1e-2
-"""A site has settled once no joint's error exceeds this any more, rad, or none along an axis, m."""
+"""A site has settled once no joint's error exceeds this any more, rad, or none along an axis,
+m.
+"""
 
 
 Signal = Callable[[SiteLog], Array]
@@ -31,7 +35,8 @@ joint_errors: Signal = attrgetter("e")
 controller_torques: Signal = attrgetter("tau")
 """tau, Eq. (13), shape (K, n), N m."""
 parameter_estimates: Signal = attrgetter("theta_hat")
-"""theta_hat, Eq. (15), shape (K, P); P = 5 of the planar arm, kg m^2 and kg m, 10 n of a chain."""
+"""theta_hat, Eq. (15), shape (K, P); P = 5 of the planar arm, kg m^2 and kg m, 10 n of a chain.
+"""
 
 
 def reference_angles(part: SiteLog) -> Array:
@@ -45,22 +50,34 @@ def follows_in_task_space(log: Log) -> bool:
 
 
 def joint_error_rates(part: SiteLog) -> Array:
-    """Returns qd - qd_des, Eq. (18), shape (K, n), rad/s; in task space xd - xd_des, shape (K, m)."""
-    return (part.xd - part.qd_des) * np.array(part.axes) if part.layout.task else part.qd - part.qd_des
+    """Returns qd - qd_des, Eq. (18), shape (K, n), rad/s; in task space xd - xd_des, shape (K,
+    m).
+    """
+    return (
+        (part.xd - part.qd_des) * np.array(part.axes)
+        if part.layout.task
+        else part.qd - part.qd_des
+    )
 
 
 def shared_unit(log: Log) -> str:
     """Returns the unit of what sites share and of their errors: "rad", "m", or of poses both."""
-    return {"joints": "rad", "position": "m"}.get(log.scenario.sites[log.sites[0]].task.space, "m, rad")
+    return {"joints": "rad", "position": "m"}.get(
+        log.scenario.sites[log.sites[0]].task.space, "m, rad"
+    )
 
 
 def external_torques(part: SiteLog) -> Array:
-    """Returns the torque of operator and environment ON the arm, shape (K, n), N m: the negative of tau_x."""
+    """Returns the torque of operator and environment ON the arm, shape (K, n), N m: the
+    negative of tau_x.
+    """
     return 0.0 - part.tau_x  # 0 - 0 is 0, where -0 would print as such
 
 
 def sample_ages_ms(log: Log, site: str) -> Array:
-    """Returns the age of the sample in use per peer, shape (K, N - 1), ms; NaN before the first."""
+    """Returns the age of the sample in use per peer, shape (K, N - 1), ms; NaN before the
+    first.
+    """
     part = log[site]
     columns = [part.age_s(peer, log.scenario.sites[peer].rate_hz) * 1e3 for peer in part.peers]
     return np.array(columns).reshape(len(part.peers), len(part)).T
@@ -68,7 +85,9 @@ def sample_ages_ms(log: Log, site: str) -> Array:
 
 def sites_with_operator(log: Log) -> list[str]:
     """Returns the sites with an operator, by the scenario or by the records."""
-    return [name for name in log.sites if log.scenario.sites[name].hands or np.any(log[name].tau_x)]
+    return [
+        name for name in log.sites if log.scenario.sites[name].hands or np.any(log[name].tau_x)
+    ]
 
 
 def largest_magnitude(values: Array) -> Array:
@@ -84,7 +103,9 @@ def largest_remaining_error(part: SiteLog) -> Array:
 
 
 def settling_time_s(part: SiteLog) -> float | None:
-    """Returns when an error last exceeded `SETTLED_ERROR_RAD`, s; 0 if none did, None if one still does."""
+    """Returns when an error last exceeded `SETTLED_ERROR_RAD`, s; 0 if none did, None if one
+    still does.
+    """
     if not len(part):
         return None
     above = np.flatnonzero(largest_remaining_error(part) > SETTLED_ERROR_RAD)
@@ -100,18 +121,23 @@ def settling_time_of_all_s(times_s: Sequence[float | None]) -> float | None:
 
 
 def operator_displacement(log: Log, twin: Log, site: str) -> tuple[Ints, Array, Array]:
-    """Returns how far operators moved a site: q of the log minus q of its twin without them, (K, n), rad.
+    """Returns how far operators moved a site: q of the log minus q of its twin without them,
+    (K, n), rad.
 
     Before it stand the ticks that both logs have, and their times, s.
     """
     part = log[site]
     other = twin[site]
-    tick, ours, theirs = np.intersect1d(part.tick, other.tick, assume_unique=True, return_indices=True)
+    tick, ours, theirs = np.intersect1d(
+        part.tick, other.tick, assume_unique=True, return_indices=True
+    )
     return tick, part.t_s[ours], joint_angles(part)[ours] - joint_angles(other)[theirs]
 
 
 class DecimatedTrace(NamedTuple):
-    """C columns over P ticks, ready to be drawn; a row of NaN stands in every gap that can be seen."""
+    """C columns over P ticks, ready to be drawn; a row of NaN stands in every gap that can be
+    seen.
+    """
 
     tick: Ints
     t_s: Array
@@ -119,7 +145,8 @@ class DecimatedTrace(NamedTuple):
 
 
 def extreme_rows(values: Array, buckets: int) -> Ints:
-    """Returns the rows to keep, ascending: the first, the last, and each bucket's extremes per column.
+    """Returns the rows to keep, ascending: the first, the last, and each bucket's extremes per
+    column.
 
     Buckets are equal runs of rows. NaN is no extreme, but a bucket of nothing else keeps one.
     """
@@ -152,7 +179,11 @@ def decimate(tick: Ints, t_s: Array, values: Array, buckets: int) -> DecimatedTr
     before = np.flatnonzero(np.diff(tick) > widest)
     keep = np.union1d(extreme_rows(values, buckets), np.concatenate([before, before + 1]))
     after = np.searchsorted(keep, before) + 1
-    step_s = (t_s[before + 1] - t_s[before]) / (tick[before + 1] - tick[before]) if len(before) else t_s[:0]
+    step_s = (
+        (t_s[before + 1] - t_s[before]) / (tick[before + 1] - tick[before])
+        if len(before)
+        else t_s[:0]
+    )
     return DecimatedTrace(
         np.insert(tick[keep], after, tick[before] + 1),
         np.insert(t_s[keep], after, t_s[before] + step_s),

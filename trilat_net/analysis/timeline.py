@@ -1,6 +1,8 @@
-"""Timeline of a run: applied changes, link models in force, intervals of hold, brake and return, divergence.
+"""Timeline of a run: applied changes, link models in force, intervals of hold, brake and
+return, divergence.
 
-Invariant: every entry comes from the scenario or from a record; none is inferred from a trajectory.
+Invariant: every entry comes from the scenario or from a record; none is inferred from a
+trajectory.
 """
 
 from collections.abc import Sequence
@@ -24,7 +26,8 @@ from ..scenario.scenario_types import Change
 
 
 class AppliedChange(NamedTuple):
-    """A change of a link or of a site's dominance factors, or an order, and the site that carried it out.
+    """A change of a link or of a site's dominance factors, or an order, and the site that
+    carried it out.
 
     Attributes:
         change: what was changed or ordered, and when.
@@ -51,12 +54,16 @@ class AppliedChange(NamedTuple):
             return self.change.order.replace("_", " ") + ticks
         if self.change.link:
             return self.change.after.describe()
-        shares = ", ".join(f"{peer} {share:g}" for peer, share in self.change.to.items() if share)
+        shares = ", ".join(
+            f"{peer} {share:g}" for peer, share in self.change.to.items() if share
+        )
         return f"{shares} within {self.change.ramp_s:g} s" if self.change.ramp_s else shares
 
 
 class ModeInterval(NamedTuple):
-    """An interval of hold, brake or return, up to the first tick after it, or the end of the last period."""
+    """An interval of hold, brake or return, up to the first tick after it, or the end of the
+    last period.
+    """
 
     mode: str
     from_s: float
@@ -76,7 +83,8 @@ class StatedModel(NamedTuple):
 
 
 def list_changes(log: Log) -> list[AppliedChange]:
-    """Returns the changes before the end of the run, in the order of the times from which they held.
+    """Returns the changes before the end of the run, in the order of the times from which they
+    held.
 
     Ticks that were not made are among them if they were so many that the site held.
 
@@ -84,8 +92,13 @@ def list_changes(log: Log) -> list[AppliedChange]:
         LogError: a record names a change that is none.
     """
     planned = log.scenario.timeline
-    found = [AppliedChange(change, find_owner(change), None, describe_change(change)) for change in planned]
-    said = {(event.member, event.command): event for event in log.events if event.kind == "change"}
+    found = [
+        AppliedChange(change, find_owner(change), None, describe_change(change))
+        for change in planned
+    ]
+    said = {
+        (event.member, event.command): event for event in log.events if event.kind == "change"
+    }
     for site in log.sites:
         log.commands(site)  # refuses what is no change of that site's
         for tick, texts in log.changes(site).items():
@@ -97,18 +110,28 @@ def list_changes(log: Log) -> list[AppliedChange]:
                     sentence = describe_event(event.kind, event.text, event.command)
                 found.append(AppliedChange(change, site, tick, sentence))
     before_s = recorded_end_s(log)
-    kept = (c for c in found if c.change.at_s < before_s and not 0 < c.change.ticks <= HELD_OVERRUN_TICKS)
+    kept = (
+        c
+        for c in found
+        if c.change.at_s < before_s and not 0 < c.change.ticks <= HELD_OVERRUN_TICKS
+    )
     return sorted(kept, key=lambda changed: changed.change.at_s)
 
 
-def list_stated_models(log: Log, link: str, changed: Sequence[AppliedChange]) -> list[StatedModel]:
+def list_stated_models(
+    log: Log, link: str, changed: Sequence[AppliedChange]
+) -> list[StatedModel]:
     """Returns the models of a link, "j->i", from the start and after every listed change of it."""
-    later = [StatedModel(c.change.at_s, c.change.after) for c in changed if c.change.link == link]
+    later = [
+        StatedModel(c.change.at_s, c.change.after) for c in changed if c.change.link == link
+    ]
     return [StatedModel(0.0, log.scenario.links[link]), *later]
 
 
 def recorded_end_s(log: Log) -> float:
-    """Returns when the run ended, s: the end of the last record's period; without records, its plan."""
+    """Returns when the run ended, s: the end of the last record's period; without records, its
+    plan.
+    """
     parts = [log[name] for name in log.sites]
     ends = [float(part.t_s[-1]) + 1.0 / part.rate_hz for part in parts if len(part)]
     return max(ends, default=log.scenario.duration_s)
@@ -144,17 +167,31 @@ class RaisedAlarm(NamedTuple):
 
 
 def list_alarms(log: Log) -> list[RaisedAlarm]:
-    """Returns the alarms of all sites, in the order of their beginnings; of a stop with who ordered it."""
-    orderers = {(one.site, one.taken_at_tick): find_orderer(one.sentence) for one in list_changes(log)}
+    """Returns the alarms of all sites, in the order of their beginnings; of a stop with who
+    ordered it.
+    """
+    orderers = {
+        (one.site, one.taken_at_tick): find_orderer(one.sentence) for one in list_changes(log)
+    }
     found = []
     for site in log.sites:
         part = log[site]
         glides = log.scenario.sites[site].on_stale.action == "glide"
         for mode, from_s, to_s in find_mode_intervals(part) if glides else ():
             state = part.states[int(np.searchsorted(part.t_s, from_s))]
-            alarm = find_alarm(log.scenario.name, site, mode, state.mem, len(state.q_des))
+            alarm = find_alarm(
+                session=log.scenario.name,
+                site=site,
+                mode=mode,
+                mem=state.mem,
+                shared=len(state.q_des),
+            )
             if alarm is not None:
                 orderer = orderers.get((site, state.tick), "")
                 reason = f"ordered by {orderer}" if orderer else alarm.reason
-                found.append(RaisedAlarm(site, alarm.word, reason, from_s, to_s))
+                found.append(
+                    RaisedAlarm(
+                        site=site, word=alarm.word, reason=reason, from_s=from_s, to_s=to_s
+                    )
+                )
     return sorted(found, key=lambda one: one.from_s)

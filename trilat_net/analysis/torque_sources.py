@@ -1,8 +1,10 @@
-"""Torque on an arm by its sources, operator and environment models, over all rows of a log at once.
+"""Torque on an arm by its sources, operator and environment models, over all rows of a log at
+once.
 
-Invariant: written from the definitions of the scenario, independently of the core; the tests compare the two.
-Torques act ON the arm. A torque that the scenario does not explain is the operator's: the record's torque
-less the environment's. An operator has a script only if its torque matches the scenario.
+Invariant: written from the definitions of the scenario, independently of the core; the tests
+compare the two. Torques act ON the arm. A torque that the scenario does not explain is the
+operator's: the record's torque less the environment's. An operator has a script only if its
+torque matches the scenario.
 """
 
 from collections.abc import Iterable
@@ -36,16 +38,21 @@ def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
 def wall_force(wall: TorqueSource, t_s: Array, end_effector: EndEffectorRows) -> Array:
     """Returns the force of a wall along its normal, shape (K,), N: it pushes, and never pulls.
 
-    max(K depth - B outward speed, 0) inside of it, 0 outside, and before its start and after its end.
+    max(K depth - B outward speed, 0) inside of it, 0 outside, and before its start and after
+    its end.
     """
     depth = wall_depth(wall, end_effector)
-    push = np.maximum(wall.K[0] * depth - wall.B[0] * (end_effector.speed @ np.array(wall.b)), 0.0)
+    push = np.maximum(
+        wall.K[0] * depth - wall.B[0] * (end_effector.speed @ np.array(wall.b)), 0.0
+    )
     there = (t_s >= wall.start_s) & (t_s < wall.end_s) & (depth > 0.0)
     return np.where(there, push, 0.0)
 
 
 def follow_target(source: TorqueSource, t_s: Array) -> tuple[Array, Array]:
-    """Returns the target of a spring, which moves from a to b with minimum jerk, and its velocity, (K, n)."""
+    """Returns the target of a spring, which moves from a to b with minimum jerk, and its
+    velocity, (K, n).
+    """
     span_s = source.move_end_s - source.move_start_s
     x = (t_s > source.move_start_s).astype(np.float64)
     per_s = 0.0
@@ -55,7 +62,9 @@ def follow_target(source: TorqueSource, t_s: Array) -> tuple[Array, Array]:
     a = np.array(source.a)
     way = np.array(source.b) - np.array(source.a)
     x = x[:, None]
-    return a + x**3 * (10.0 + x * (6.0 * x - 15.0)) * way, 30.0 * x**2 * (1.0 - x) ** 2 * per_s * way
+    return a + x**3 * (10.0 + x * (6.0 * x - 15.0)) * way, 30.0 * x**2 * (
+        1.0 - x
+    ) ** 2 * per_s * way
 
 
 def compute_spring_effort(source: TorqueSource, t_s: Array, at: Array, speed: Array) -> Array:
@@ -68,7 +77,8 @@ def compute_spring_effort(source: TorqueSource, t_s: Array, at: Array, speed: Ar
 def compute_source_torque(
     source: TorqueSource, t_s: Array, q: Array, qd: Array, end_effector: EndEffectorRows
 ) -> Array:
-    """Returns the torque of a spring, a damper, a wall or an own kind ON the arm, shape (K, n), N m.
+    """Returns the torque of a spring, a damper, a wall or an own kind ON the arm, shape (K, n),
+    N m.
 
     Raises:
         ValueError: it is another source: a scripted torque is no function of the state.
@@ -97,7 +107,9 @@ def compute_source_torque(
 def compute_live_torque(
     source: TorqueSource, hand: Array, q: Array, qd: Array, end_effector: EndEffectorRows
 ) -> Array:
-    """Returns the torque of a live hand ON the arm, shape (K, n), N m, by the `hand` of its records."""
+    """Returns the torque of a live hand ON the arm, shape (K, n), N m, by the `hand` of its
+    records.
+    """
     size = (hand.shape[1] - 3) // 2
     target = hand[:, 3 : 3 + size]
     rate = hand[:, 3 + size :]
@@ -107,20 +119,23 @@ def compute_live_torque(
     if source.acts is not TorqueKind.LIVE_FORCE:
         pull = np.array(source.K) * (target - at) + np.array(source.B) * (rate - speed)
     norm = np.linalg.norm(pull, axis=1)
-    share = hand[:, 0] * np.where(norm > source.limit, source.limit / np.maximum(norm, source.limit), 1.0)
+    share = hand[:, 0] * np.where(
+        norm > source.limit, source.limit / np.maximum(norm, source.limit), 1.0
+    )
     effort: Array = share[:, None] * pull
     return effort if at_joints else np.einsum("kij,ki->kj", end_effector.J, effort)
 
 
 class TorqueSplit(NamedTuple):
-    """The torque ON an arm over its rows, shape (K, n) each, N m; its stops are part of the arm.
+    """The torque ON an arm over its rows, shape (K, n) each, N m; its stops are part of the
+    arm.
 
     Attributes:
-        end_effector: its position, speed and Jacobian.
-        operator_now, operator_held: of the operator: a function of the present, and computed once a tick.
-        environment_now, environment_held: the same of the environment.
-        script: the operator's intention, see `compute_operator_script`; None if not asked for, or if its
-            torque does not match the scenario.
+        end_effector: its position, speed and Jacobian. operator_now, operator_held: of the
+        operator: a function of the present, and computed once a tick. environment_now,
+        environment_held: the same of the environment.
+        script: the operator's intention, see `compute_operator_script`; None if not asked for,
+            or if its torque does not match the scenario.
     """
 
     end_effector: EndEffectorRows
@@ -145,15 +160,29 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     """Returns the torque on a site's arm by its sources, held and not; without the script."""
     spec = scenario.sites[records.site]
     t_s = records.nominal_s
-    end_effector = build_arm_rows(scenario, records.site).place_end_effector(records.q, records.qd)
+    end_effector = build_arm_rows(scenario, records.site).place_end_effector(
+        records.q, records.qd
+    )
 
     def add(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
         total = np.zeros_like(records.q)
         for source in (one.actor for one in sources if one.actor.sampled is sampled):
             if source.acts in LIVE_KINDS:
-                torque = compute_live_torque(source, records.hand, records.q, records.qd, end_effector)
+                torque = compute_live_torque(
+                    source=source,
+                    hand=records.hand,
+                    q=records.q,
+                    qd=records.qd,
+                    end_effector=end_effector,
+                )
             else:
-                torque = compute_source_torque(source, t_s, records.q, records.qd, end_effector)
+                torque = compute_source_torque(
+                    source=source,
+                    t_s=t_s,
+                    q=records.q,
+                    qd=records.qd,
+                    end_effector=end_effector,
+                )
             total = total + torque
         return total
 
@@ -161,16 +190,23 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     held = add(spec.environment, sampled=True)
     operator_held = add(spec.hands, sampled=True)
     operator_now = -records.tau_x - now - held - operator_held
-    return TorqueSplit(end_effector, operator_now, operator_held, now, held)
+    return TorqueSplit(
+        end_effector=end_effector,
+        operator_now=operator_now,
+        operator_held=operator_held,
+        environment_now=now,
+        environment_held=held,
+    )
 
 
 def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array:
-    """Returns the intention of an operator, which does not depend on the arm's motion, shape (K, n), N m.
+    """Returns the intention of an operator, which does not depend on the arm's motion, shape
+    (K, n), N m.
 
-    A scripted torque itself (pulse, recorded, chirp, multisine); of a spring K times the displacement of its
-    target and B times the target's speed, of one of the end effector by the Jacobian J of one pose, shape
-    (2, 2) or (3, n); of an own kind what it does to an arm at zero, at rest. It moves if and only if the
-    operator does.
+    A scripted torque itself (pulse, recorded, chirp, multisine); of a spring K times the
+    displacement of its target and B times the target's speed, of one of the end effector by the
+    Jacobian J of one pose, shape (2, 2) or (3, n); of an own kind what it does to an arm at
+    zero, at rest. It moves if and only if the operator does.
     """
     if source.acts is TorqueKind.PULSE:
         x = np.clip((t_s - source.start_s) / (source.end_s - source.start_s), 0.0, 1.0)
@@ -205,7 +241,8 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
 def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     """Returns the torque on a site's arm by its sources, with the operator's script.
 
-    Without an operator in the scenario, the operator's torque is exactly zero where only rounding is left.
+    Without an operator in the scenario, the operator's torque is exactly zero where only
+    rounding is left.
     """
     split = split_torque(records, scenario)
     t_s = records.nominal_s
@@ -215,15 +252,29 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
     for source in (one.actor for one in spec.hands):
         if source.acts in LIVE_KINDS:
             at_start = np.broadcast_to(records.q[0], records.q.shape)
-            still = build_arm_rows(scenario, records.site).place_end_effector(at_start, 0.0 * at_start)
-            scripts = scripts + compute_live_torque(source, records.hand, at_start, 0.0 * at_start, still)
+            still = build_arm_rows(scenario, records.site).place_end_effector(
+                at_start, 0.0 * at_start
+            )
+            scripts = scripts + compute_live_torque(
+                source=source,
+                hand=records.hand,
+                q=at_start,
+                qd=0.0 * at_start,
+                end_effector=still,
+            )
             continue
         script = compute_operator_script(source, t_s, split.end_effector.J[0])
         scripts = scripts + script
         if source.acts in SCRIPTED_KINDS:
             expected = expected + script
         elif not source.sampled:
-            torque = compute_source_torque(source, t_s, records.q, records.qd, split.end_effector)
+            torque = compute_source_torque(
+                source=source,
+                t_s=t_s,
+                q=records.q,
+                qd=records.qd,
+                end_effector=split.end_effector,
+            )
             expected = expected + torque
     tolerance = SCRIPT_TORQUE_TOLERANCE * (1.0 + np.abs(records.tau_x))
     matches = np.abs(split.operator_now - expected) <= tolerance
@@ -235,14 +286,15 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
 
 
 class WallEnergy(NamedTuple):
-    """The energy that a touched wall gave which is held over a tick h, and the damping that would take it.
+    """The energy that a touched wall gave which is held over a tick h, and the damping that
+    would take it.
 
-    It does the work F_k (x_{k+1} - x_k); with its spring's energy K x^2 / 2 booked it gives
-    K (x_{k+1} - x_k)^2 / 2 in every tick of a contact, less what its damping B takes. A damper b of the arm
-    itself takes all of it if b > K h / 2 + B: Colgate and Schenkel, "Passivity of a class of sampled-data
-    systems", J. Robotic Systems 14 (1997). That is sufficient, for a B on the speed at the tick while that is
-    straight within one (docs/certificate.md); whether the loop is stable in contact is told by the map from
-    tick to tick, `trilat linear`.
+    It does the work F_k (x_{k+1} - x_k); with its spring's energy K x^2 / 2 booked it gives K
+    (x_{k+1} - x_k)^2 / 2 in every tick of a contact, less what its damping B takes. A damper b
+    of the arm itself takes all of it if b > K h / 2 + B: Colgate and Schenkel, "Passivity of a
+    class of sampled-data systems", J. Robotic Systems 14 (1997). That is sufficient, for a B on
+    the speed at the tick while that is straight within one (docs/certificate.md); whether the
+    loop is stable in contact is told by the map from tick to tick, `trilat linear`.
 
     Attributes:
         site: whose wall.
@@ -267,14 +319,18 @@ def find_wall_energies(log: Log) -> list[WallEnergy]:
     found = []
     for site, records in align_records(log).items():
         spec = log.scenario.sites[site]
-        end_effector = build_arm_rows(log.scenario, site).place_end_effector(records.q, records.qd)
+        end_effector = build_arm_rows(log.scenario, site).place_end_effector(
+            records.q, records.qd
+        )
         for wall in list_sampled_walls(spec):
             force = wall_force(wall, records.nominal_s, end_effector)
             touched = force > 0.0
             if touched.any():
                 needed = 0.5 * wall.K[0] * records.h_s + wall.B[0]
                 gave = _find_given_energy(wall, records, end_effector, force)
-                own = _find_own_damping(spec, wall, end_effector.J[touched], records.nominal_s[touched])
+                own = _find_own_damping(
+                    spec, wall, end_effector.J[touched], records.nominal_s[touched]
+                )
                 found.append(WallEnergy(site, gave, needed, own))
     return found
 
@@ -292,7 +348,8 @@ def _find_given_energy(
 
 
 def _find_own_damping(spec: SiteSpec, wall: TorqueSource, J: Array, t_s: Array) -> float:
-    """Returns the least of 1 / (n'J D^-1 J'n), D the damping of joints that acts continuously, N s/m.
+    """Returns the least of 1 / (n'J D^-1 J'n), D the damping of joints that acts continuously,
+    N s/m.
 
     J and t_s are of the rows in contact; what does not act at all of them is no damping.
     """

@@ -1,12 +1,14 @@
-"""What became of small pushes in a run: by how much they grew or died, at the end and in between.
+"""What became of small pushes in a run: by how much they grew or died, at the end and in
+between.
 
-Invariant: a push is judged by the velocities of its twin minus those of the run, which a shift of all arms
-to another rest leaves at zero. Sites that no shares connect are judged by themselves: what one does hides no
-other.
+Invariant: a push is judged by the velocities of its twin minus those of the run, which a shift
+of all arms to another rest leaves at zero. Sites that no shares connect are judged by
+themselves: what one does hides no other.
 
-The amplitude of a difference d at 20 Hz is A, A^2 = sum over joints of d^2 + (d' / w)^2, with w the frequency
-that makes both parts equal on average: of a single mode it goes as exp(rate t), without its swing. The rate
-is the slope of log A over the judged part, with the bounds and words of `envelope_trend`.
+The amplitude of a difference d at 20 Hz is A, A^2 = sum over joints of d^2 + (d' / w)^2, with w
+the frequency that makes both parts equal on average: of a single mode it goes as exp(rate t),
+without its swing. The rate is the slope of log A over the judged part, with the bounds and
+words of `envelope_trend`.
 """
 
 import math
@@ -71,11 +73,14 @@ class PushGrowth(NamedTuple):
         push: the push.
         trend: of the difference.
         rate_per_s: it goes as exp(rate t), 1/s; NaN if the part is too short.
-        factor: by how much it changed over the part; 0: it died down to the rounding of the numbers.
+        factor: by how much it changed over the part; 0: it died down to the rounding of the
+            numbers.
         joint: the joint at which it is largest at the end.
         group: the place of those sites among the groups.
-        becomes_rad_s: the largest difference of the last second, rad/s, as if nothing was made small again.
-        ended_s: when its twin ended before the run, s: it died down to the rounding, or it grew and diverged.
+        becomes_rad_s: the largest difference of the last second, rad/s, as if nothing was made
+            small again.
+        ended_s: when its twin ended before the run, s: it died down to the rounding, or it grew
+            and diverged.
     """
 
     push: Push
@@ -89,7 +94,9 @@ class PushGrowth(NamedTuple):
 
 
 class LeftRest(NamedTuple):
-    """A time in which a run went away from a rest, and from its twins, while nobody acted on it."""
+    """A time in which a run went away from a rest, and from its twins, while nobody acted on
+    it.
+    """
 
     from_s: float
     to_s: float
@@ -122,7 +129,9 @@ class TwinGrowth(NamedTuple):
     @property
     def worst(self) -> PushGrowth | None:
         """The push that grew most, or died most slowly."""
-        return max(self.pushes, key=lambda one: (_ORDER.index(one.trend), one.rate_per_s), default=None)
+        return max(
+            self.pushes, key=lambda one: (_ORDER.index(one.trend), one.rate_per_s), default=None
+        )
 
     @property
     def trend(self) -> EnvelopeTrend:
@@ -131,21 +140,29 @@ class TwinGrowth(NamedTuple):
 
     @property
     def grows(self) -> bool:
-        """True if half of the pushes of some sites or more grow; by a factor of two if links are random."""
+        """True if half of the pushes of some sites or more grow; by a factor of two if links
+        are random.
+        """
         return self.grow_by(DOUBLES if self.random else 1.0, always=True)
 
     def grow_by(self, factor: float, *, always: bool) -> bool:
-        """True if half of the pushes of some sites or more grow by a factor; `always`: all the time."""
+        """True if half of the pushes of some sites or more grow by a factor; `always`: all the
+        time.
+        """
         for place in {one.group for one in self.pushes}:
             group = [one for one in self.pushes if one.group == place]
             grown = [one for one in group if one.factor >= factor]
-            if 2 * sum(one.trend is EnvelopeTrend.GROWS or not always for one in grown) >= len(group):
+            if 2 * sum(one.trend is EnvelopeTrend.GROWS or not always for one in grown) >= len(
+                group
+            ):
                 return True
         return False
 
     @property
     def needs_s(self) -> float | None:
-        """How long a run would have to be for a fall at this rate to be clear, s; None if nothing falls."""
+        """How long a run would have to be for a fall at this rate to be clear, s; None if
+        nothing falls.
+        """
         worst = self.worst
         if worst is None or not worst.rate_per_s < 0.0 or self.trend is EnvelopeTrend.DECAYS:
             return None
@@ -153,7 +170,9 @@ class TwinGrowth(NamedTuple):
 
     @property
     def excluded_rate_per_s(self) -> float:
-        """A push at a larger rate had grown by `CLEAR_GROWTH`, 1/s; infinite unless every push dies away."""
+        """A push at a larger rate had grown by `CLEAR_GROWTH`, 1/s; infinite unless every push
+        dies away.
+        """
         judged_s = self.to_s - self.from_s
         dies = self.trend is EnvelopeTrend.DECAYS and judged_s > 0.0
         return math.log(CLEAR_GROWTH) / judged_s if dies else math.inf
@@ -200,9 +219,7 @@ class TwinGrowth(NamedTuple):
         in_s = f"in {self.to_s - self.from_s:.4g} s ({worst.rate_per_s:+.3g} /s)"
         changed = f"x {worst.factor:.3g} {in_s}, most at {worst.joint}"
         if self.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY):
-            return (
-                f"twins: every push dies away; the slowest, {what}, to {worst.factor:.3g} of its size {in_s}"
-            )
+            return f"twins: every push dies away; the slowest, {what}, to {worst.factor:.3g} of its size {in_s}"
         if self.trend is EnvelopeTrend.GROWS:
             return f"twins: a push of {what} grows {changed}"
         more = "" if self.needs_s is None else f"; a run of {self.needs_s:.3g} s would tell"
@@ -210,23 +227,29 @@ class TwinGrowth(NamedTuple):
 
 
 class TwinVerdict(NamedTuple):
-    """The judgement of a run's end and of its twins together; the reason, if twins changed or doubt it."""
+    """The judgement of a run's end and of its twins together; the reason, if twins changed or
+    doubt it.
+    """
 
     stability: Stability
     reason: str = ""
 
 
-def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool | None, rises: bool) -> TwinVerdict:
+def judge_end_by_twins(
+    end: RunEnd, twins: TwinGrowth, *, settles: bool | None, rises: bool
+) -> TwinVerdict:
     """Returns the judgement of a run by its end and by its twins.
 
-    What grows away from its twins is not stable, wherever it is; what comes together with them is not said to
-    grow. A stable run needs pushes that die away; where small motions are known to settle, none that grows.
-    Arms too slow to get anywhere, all of whose pushes die away, need no trend of the motion that is left.
+    What grows away from its twins is not stable, wherever it is; what comes together with them
+    is not said to grow. A stable run needs pushes that die away; where small motions are known
+    to settle, none that grows. Arms too slow to get anywhere, all of whose pushes die away,
+    need no trend of the motion that is left.
 
     Args:
         end: the end of the run.
         twins: what became of small pushes.
-        settles: whether small motions settle, by roots that are exact or by the theorem; None: not known.
+        settles: whether small motions settle, by roots that are exact or by the theorem; None:
+            not known.
         rises: V rose by what nobody gave.
     """
     own = end.stability
@@ -234,9 +257,12 @@ def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool | None, 
     if not twins.pushes or end.behaviour is EndBehaviour.DIVERGED:
         return TwinVerdict(own)
     falls = (
-        end.speed.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY) and end.end_speed_rad_s > FLOOR_RAD
+        end.speed.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
+        and end.end_speed_rad_s > FLOOR_RAD
     )
-    grows = (twins.grows or (settles is False and twins.grow_by(DOUBLES, always=False))) and not falls
+    grows = (
+        twins.grows or (settles is False and twins.grow_by(DOUBLES, always=False))
+    ) and not falls
     left = twins.left is not None and end.behaviour is not EndBehaviour.COASTS
     if (grows or left) and not end.operator_acts:
         return TwinVerdict(Stability.NOT_STABLE, twins.text)
@@ -245,9 +271,15 @@ def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool | None, 
         doubtful = trend is EnvelopeTrend.GROWS or not settles
         return TwinVerdict(Stability.OPEN, twins.text) if doubtful else TwinVerdict(own)
     if own is Stability.NOT_STABLE:
-        alone = end.behaviour is EndBehaviour.GROWS and trend is not EnvelopeTrend.GROWS and not rises
+        alone = (
+            end.behaviour is EndBehaviour.GROWS
+            and trend is not EnvelopeTrend.GROWS
+            and not rises
+        )
         return TwinVerdict(Stability.OPEN, twins.text) if dies or alone else TwinVerdict(own)
-    trendless = end.behaviour in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED) and not end.missing_sites
+    trendless = (
+        end.behaviour in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED) and not end.missing_sites
+    )
     stays = end.end_speed_rad_s * (twins.to_s - twins.from_s) <= SETTLED_ERROR_RAD
     rests = stays and trend is EnvelopeTrend.DECAYS
     if trendless and dies and (settles or rests) and not (end.reasons or end.operator_acts):
@@ -255,7 +287,9 @@ def judge_end_by_twins(end: RunEnd, twins: TwinGrowth, *, settles: bool | None, 
     return TwinVerdict(own)
 
 
-def measure_twins(log: Log, end: RunEnd, count: int = TWINS, *, own_laws: bool = False) -> TwinGrowth:
+def measure_twins(
+    log: Log, end: RunEnd, count: int = TWINS, *, own_laws: bool = False
+) -> TwinGrowth:
     """Returns what became of small pushes in a run, of which its end is known already.
 
     Raises:
@@ -268,7 +302,9 @@ def measure_twins(log: Log, end: RunEnd, count: int = TWINS, *, own_laws: bool =
     return judge_twins(log.scenario, twins, end.counts_from_s, end.quiet_from_s)
 
 
-def measure_virtual_twins(scenario: Scenario, end: RunEnd, duration_s: float, count: int) -> TwinGrowth:
+def measure_virtual_twins(
+    scenario: Scenario, end: RunEnd, duration_s: float, count: int
+) -> TwinGrowth:
     """Returns the same of a run in virtual time, of so many seconds, without a log.
 
     Raises:
@@ -278,7 +314,9 @@ def measure_virtual_twins(scenario: Scenario, end: RunEnd, duration_s: float, co
     return judge_twins(scenario, twins, end.counts_from_s, end.quiet_from_s)
 
 
-def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_from_s: float) -> TwinGrowth:
+def judge_twins(
+    scenario: Scenario, twins: Twins, counts_from_s: float, quiet_from_s: float
+) -> TwinGrowth:
     """Returns what became of the twins of a run.
 
     Args:
@@ -288,7 +326,9 @@ def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_fr
         quiet_from_s: since when nobody acts on it, and its loop does not change, s.
     """
     t_s = twins.paths[0].t_s
-    rows = np.flatnonzero(twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1))
+    rows = np.flatnonzero(
+        twins.speed.any(axis=1) | np.isfinite(twins.paths[0].largest).any(axis=1)
+    )
     end = int(rows[-1]) if len(rows) else 0  # the last interval may be of one tick
     first = min(int(np.searchsorted(t_s, counts_from_s)), end)
     pushes = []
@@ -299,7 +339,13 @@ def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_fr
         amplitudes = [measure_amplitude(path, group) for path in twins.paths]
         for path, amplitude in zip(twins.paths, amplitudes, strict=True):
             if np.isfinite(amplitude[first:end]).any():
-                judged = _judge_push(path, amplitude, group, slice(first, end), twins.joints)
+                judged = _judge_push(
+                    path=path,
+                    amplitude=amplitude,
+                    group=group,
+                    part=slice(first, end),
+                    joints=twins.joints,
+                )
                 pushes.append(judged._replace(group=place))
         quiet = slice(int(np.searchsorted(t_s, quiet_from_s)), end)
         left += list(_find_departures(twins, amplitudes, group, quiet))
@@ -316,12 +362,16 @@ def judge_twins(scenario: Scenario, twins: Twins, counts_from_s: float, quiet_fr
 
 
 def measure_amplitude(path: TwinPath, group: Sequence[int]) -> Array:
-    """Returns the logarithm of the amplitude of a difference at some joints, shape (K,); -inf: none."""
+    """Returns the logarithm of the amplitude of a difference at some joints, shape (K,); -inf:
+    none.
+    """
     amplitude: Array = path.largest[:, group].max(axis=1)
     for leg in map(slice, path.pushed, [*path.pushed[1:], len(amplitude)]):
         if leg.stop - leg.start > 2:
             whole = _measure_leg(path.last[leg][:, group], path.scale[leg], amplitude[leg])
-            amplitude[leg] = np.where(np.isfinite(whole), np.maximum(whole, amplitude[leg]), amplitude[leg])
+            amplitude[leg] = np.where(
+                np.isfinite(whole), np.maximum(whole, amplitude[leg]), amplitude[leg]
+            )
     return amplitude
 
 
@@ -331,7 +381,9 @@ def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
         d = last * np.exp(scale - peak)[:, np.newaxis]
         rate = np.gradient(d, 1.0 / BUCKETS_PER_S, axis=0)
         around = np.exp(2.0 * (_running_maximum(largest) - peak))
-        weights = np.where(np.isfinite(largest) & (around > 0.0), 1.0 / around, 0.0)[:, np.newaxis]
+        weights = np.where(np.isfinite(largest) & (around > 0.0), 1.0 / around, 0.0)[
+            :, np.newaxis
+        ]
         omega2 = float((weights * rate**2).sum() / (weights * d**2).sum())
         whole: Array = np.log((d**2 + rate**2 / omega2).sum(axis=1)) / 2.0 + peak
     return whole
@@ -339,7 +391,9 @@ def _measure_leg(last: Array, scale: Array, largest: Array) -> Array:
 
 def _running_maximum(values: Array) -> Array:
     padded = np.pad(values, BUCKETS_PER_S // 2, constant_values=-np.inf)
-    found: Array = np.lib.stride_tricks.sliding_window_view(padded, BUCKETS_PER_S + 1).max(axis=1)
+    found: Array = np.lib.stride_tricks.sliding_window_view(padded, BUCKETS_PER_S + 1).max(
+        axis=1
+    )
     return found
 
 
@@ -356,7 +410,8 @@ def _judge_push(
 ) -> PushGrowth:
     """Returns what became of a push.
 
-    One that died down and was pushed anew counts from the last time, if that is long enough ago.
+    One that died down and was pushed anew counts from the last time, if that is long enough
+    ago.
     """
     t_s = path.t_s
     first = part.start
@@ -368,7 +423,15 @@ def _judge_push(
     joint = joints[group[int(largest.argmax())]]
     since = max(first, legs[-2])
     fit = _fit(t_s[since:end], amplitude[since:end])
-    found = PushGrowth(path.push, fit.trend, fit.rate_per_s, 0.0, joint, 0, _exp(float(largest.max())))
+    found = PushGrowth(
+        push=path.push,
+        trend=fit.trend,
+        rate_per_s=fit.rate_per_s,
+        factor=0.0,
+        joint=joint,
+        group=0,
+        becomes_rad_s=_exp(float(largest.max())),
+    )
     if path.died is not None or end < part.stop - BUCKETS_PER_S:
         trend = EnvelopeTrend.GROWS if path.died is None else EnvelopeTrend.DECAYS
         return found._replace(trend=trend, ended_s=float(t_s[end - 1]))
@@ -401,17 +464,24 @@ def _find_departures(
             rows = slice(start, start + 2 * size)  # of which the second half is judged
             own = _fit(t_s[rows], speed[rows])
             rate_per_s = own.rate_per_s
-            if own.trend is not EnvelopeTrend.GROWS or rate_per_s * size < math.log(DOUBLES) * BUCKETS_PER_S:
+            if (
+                own.trend is not EnvelopeTrend.GROWS
+                or rate_per_s * size < math.log(DOUBLES) * BUCKETS_PER_S
+            ):
                 continue
             fits = [_fit(t_s[rows], amplitude[rows]) for amplitude in amplitudes]
             if 2 * sum(fit.trend is EnvelopeTrend.GROWS for fit in fits) >= len(fits):
                 last = twins.speed[rows.stop - BUCKETS_PER_S : rows.stop, group].max(axis=0)
                 joint = twins.joints[group[int(last.argmax())]]
-                yield LeftRest(float(t_s[start + size]), float(t_s[rows.stop - 1]), rate_per_s, joint)
+                yield LeftRest(
+                    float(t_s[start + size]), float(t_s[rows.stop - 1]), rate_per_s, joint
+                )
 
 
 class LinearSizes(NamedTuple):
-    """Sizes of a push between which twins are the same but for their scale, and what is beyond, in words."""
+    """Sizes of a push between which twins are the same but for their scale, and what is beyond,
+    in words.
+    """
 
     smallest: float
     largest: float
@@ -420,7 +490,9 @@ class LinearSizes(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class PushedTwins(Result):
-    """Twins of a log that were pushed at an instant, s; what became of them; for which sizes it is linear."""
+    """Twins of a log that were pushed at an instant, s; what became of them; for which sizes it
+    is linear.
+    """
 
     log: Log
     at_s: float
@@ -446,7 +518,13 @@ class PushedTwins(Result):
     def headline(self) -> str:
         """Returns for which sizes a push is linear, or what became of the worst one."""
         worst = self.growth.worst
-        return self.linear.text if self.linear else self.describe(worst) if worst else self.growth.text
+        return (
+            self.linear.text
+            if self.linear
+            else self.describe(worst)
+            if worst
+            else self.growth.text
+        )
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per push."""
@@ -462,9 +540,13 @@ class PushedTwins(Result):
 
 
 def twin(
-    log: str | Path | Log, at_s: float = 0.0, push: Mapping[str, float] | Sequence[str] = (), delta: str = ""
+    log: str | Path | Log,
+    at_s: float = 0.0,
+    push: Mapping[str, float] | Sequence[str] = (),
+    delta: str = "",
 ) -> PushedTwins:
-    """Executes a run again, beside twins that are pushed at an instant; the command is `trilat twin`.
+    """Executes a run again, beside twins that are pushed at an instant; the command is `trilat
+    twin`.
 
     >>> found = tn.twin(tn.simulate("two_sites", duration_s=4), at_s=1, push={"m.q1": 1e-6})
     >>> found.growth.pushes[0].rate_per_s < 0.0
@@ -473,8 +555,9 @@ def twin(
     Args:
         log: the log, or its path.
         at_s: when, s.
-        push: sizes by what is pushed: a joint's angle, `{"m1.q1": 1e-6}`, its speed, `m1.qd1`, an estimate,
-            `m1.theta1`, or many in a drawn direction, `m1.q`, `q`; a twin each. By default as `certify` does.
+        push: sizes by what is pushed: a joint's angle, `{"m1.q1": 1e-6}`, its speed, `m1.qd1`,
+            an estimate, `m1.theta1`, or many in a drawn direction, `m1.q`, `q`; a twin each. By
+            default as `certify` does.
         delta: sizes of one push, as in "1e-9:1e-3", of which each decade has a twin.
 
     Raises:
@@ -487,7 +570,9 @@ def twin(
     asked = push.items() if isinstance(push, Mapping) else [*map(_read_push, push)]
     end_s = max(len(log[name]) / log[name].rate_hz for name in log.sites)
     if not 0.0 <= at_s < end_s and end_s > 0.0:
-        raise UsageError(f"--at {at_s:g}: a push is within the run, from 0 s until before {end_s:g} s")
+        raise UsageError(
+            f"--at {at_s:g}: a push is within the run, from 0 s until before {end_s:g} s"
+        )
     if delta and len(asked) > 1:
         raise UsageError(
             f"--delta sweeps the size of one push, not of {', '.join(what for what, _ in asked)}"
@@ -495,12 +580,16 @@ def twin(
     if delta:
         (what, _) = next(iter(asked), ("q", 0.0))
         sizes = _read_sizes(delta)
-        pushes = [aim_push(scenario, what, size, at_s)._replace(largest=math.inf) for size in sizes]
+        pushes = [
+            aim_push(scenario, what, size, at_s)._replace(largest=math.inf) for size in sizes
+        ]
     else:
         usual = [one._replace(at_s=at_s, again=False) for one in choose_pushes(scenario, TWINS)]
         pushes = [aim_push(scenario, what, size, at_s) for what, size in asked] or usual
     growth = judge_twins(scenario, run_twins(log, pushes, own_laws=True), at_s, math.inf)
-    return PushedTwins(log, at_s, growth, _find_linear_sizes(scenario, growth, sizes) if delta else None)
+    return PushedTwins(
+        log, at_s, growth, _find_linear_sizes(scenario, growth, sizes) if delta else None
+    )
 
 
 def _read_push(text: str) -> tuple[str, float]:
@@ -508,7 +597,9 @@ def _read_push(text: str) -> tuple[str, float]:
     try:
         return what.strip(), float(size) if stated else PUSH_RAD
     except ValueError:
-        raise UsageError(f"--push {text}: its size is a number, as in m1.q1=1e-6, not {size!r}") from None
+        raise UsageError(
+            f"--push {text}: its size is a number, as in m1.q1=1e-6, not {size!r}"
+        ) from None
 
 
 def _read_sizes(text: str) -> list[float]:
@@ -519,10 +610,15 @@ def _read_sizes(text: str) -> list[float]:
     if not LEAST_PUSH <= low < high / 9.99 <= MOST_PUSH / 9.99:
         allowed = f"from {LEAST_PUSH:g} to {MOST_PUSH:g}, a decade apart or more"
         raise UsageError(f"--delta is two sizes {allowed}, as in 1e-9:1e-3, not {text!r}")
-    return [float(f"{low * 10.0**n:.6g}") for n in range(math.floor(math.log10(high / low) + 1e-3) + 1)]
+    return [
+        float(f"{low * 10.0**n:.6g}")
+        for n in range(math.floor(math.log10(high / low) + 1e-3) + 1)
+    ]
 
 
-def _find_linear_sizes(scenario: Scenario, growth: TwinGrowth, sizes: Sequence[float]) -> LinearSizes:
+def _find_linear_sizes(
+    scenario: Scenario, growth: TwinGrowth, sizes: Sequence[float]
+) -> LinearSizes:
     assert growth.twins is not None
     paths = growth.twins.paths
     every = range(len(growth.twins.joints))
@@ -536,9 +632,12 @@ def _find_linear_sizes(scenario: Scenario, growth: TwinGrowth, sizes: Sequence[f
         at = int(np.abs(apart).argmax())
         if abs(apart[at]) > SAME_SCALED:
             grows = any(
-                one.trend is EnvelopeTrend.GROWS and one.push is paths[n].push for one in growth.pushes
+                one.trend is EnvelopeTrend.GROWS and one.push is paths[n].push
+                for one in growth.pushes
             )
-            acts = {one.actor.acts for site in scenario.sites.values() for one in site.environment}
+            acts = {
+                one.actor.acts for site in scenario.sites.values() for one in site.environment
+            }
             does = "saturates" if grows and apart[at] < 0.0 else "goes another way"
             does += " (there is a wall)" if TorqueKind.WALL in acts else ""
             times = f"x {_exp(float(apart[at])):.3g} of that at {paths[0].t_s[at]:.4g} s"
@@ -547,5 +646,7 @@ def _find_linear_sizes(scenario: Scenario, growth: TwinGrowth, sizes: Sequence[f
     last = sizes[n] if beyond else sizes[-1]
     linear = f"linear from {sizes[0]:g} to {last:g} {unit}"
     return LinearSizes(
-        sizes[0], last, (linear if last > sizes[0] else f"not linear, from {last:g} {unit} on") + beyond
+        sizes[0],
+        last,
+        (linear if last > sizes[0] else f"not linear, from {last:g} {unit} on") + beyond,
     )

@@ -1,8 +1,8 @@
 """The `trilat` command: registers all commands and maps errors to exit codes.
 
-Invariant: a command parses, calls one function of the library and prints. It exits 0 on success, 1 on a
-failed run or comparison, 2 on bad input, 4 when a law of a log may not run, 5 when a disk takes no more,
-128 + n when signal n ended it; an error is one sentence.
+Invariant: a command parses, calls one function of the library and prints. It exits 0 on
+success, 1 on a failed run or comparison, 2 on bad input, 4 when a law of a log may not run, 5
+when a disk takes no more, 128 + n when signal n ended it; an error is one sentence.
 """
 
 import errno
@@ -28,7 +28,8 @@ from .options import flag
 class _Commands(TyperGroup):
     """The group of all commands; Ctrl-C ends any of them with 130, not with the framework's 1.
 
-    Its exception gets lost where Python raises it inside a `__del__`; `Interrupt` remembers the signal.
+    Its exception gets lost where Python raises it inside a `__del__`; `Interrupt` remembers the
+    signal.
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -44,7 +45,9 @@ class _Commands(TyperGroup):
                     return super().invoke(ctx)
             except KeyboardInterrupt:
                 err.print("interrupted")
-                raise typer.Exit(interrupt.exit_code if interrupt.requested() else 130) from None
+                raise typer.Exit(
+                    interrupt.exit_code if interrupt.requested() else 130
+                ) from None
 
 
 app = typer.Typer(
@@ -67,7 +70,10 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def _main(
     _: Annotated[
-        bool, flag("--version", "Print the version and exit.", is_eager=True, callback=_print_version)
+        bool,
+        flag(
+            "--version", "Print the version and exit.", is_eager=True, callback=_print_version
+        ),
     ] = False,
 ) -> None:
     pass
@@ -120,12 +126,19 @@ def _add_commands() -> None:
 _add_commands()
 
 _TOO_LITTLE = "there is too little memory: 3 GiB of addresses suffice (ulimit -v), and 1 GiB of memory itself"
-_WITHOUT_MEMORY = ("failed to map segment", "libllvmlite", "start new thread", "allocate memory")
+_WITHOUT_MEMORY = (
+    "failed to map segment",
+    "libllvmlite",
+    "start new thread",
+    "allocate memory",
+)
 """What Python, Numba and threads say who get none."""
 
 
 def _run() -> None:
-    """Runs `trilat`; a library that `trilat-net-core` does without, and that is missing, is named."""
+    """Runs `trilat`; a library that `trilat-net-core` does without, and that is missing, is
+    named.
+    """
     try:
         app()
     except ModuleNotFoundError as error:
@@ -145,16 +158,21 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except (MemoryError, ImportError, RuntimeError, OSError) as error:
-        if isinstance(error, MemoryError) or any(text in str(error) for text in _WITHOUT_MEMORY):
+        if isinstance(error, MemoryError) or any(
+            text in str(error) for text in _WITHOUT_MEMORY
+        ):
             sys.stderr.write(f"error: {_TOO_LITTLE}\n")  # to lay it out takes memory, too
             sys.exit(1)
         if not isinstance(error, OSError):  # else a full disk, a folder that vanished
             raise
-        refused = os.name == "nt" and error.errno == errno.EINVAL  # a name, or without one a closed pipe
+        # a name, or without one a closed pipe
+        refused = os.name == "nt" and error.errno == errno.EINVAL
         if isinstance(error, BrokenPipeError) or (refused and not error.filename):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(0)
-        print_error(f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}")
+        print_error(
+            f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}"
+        )
         bad_name = refused or error.errno == errno.ENAMETOOLONG
         sys.exit(LogRefused.exit_code if error.errno in DISK_ERRNOS else 2 if bad_name else 1)
     finally:

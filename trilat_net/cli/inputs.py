@@ -26,8 +26,12 @@ def scenario_list_command(as_json: options.JsonOption = False) -> None:
             for name, one in chosen
         ]
         return terminal.print_json(facts)
-    rows = [(name, str(len(one.names)), f"{one.duration_s:g} s", one.title) for name, one in chosen]
-    return terminal.print_table(TextTable(("name", "sites", "time", "what it is"), rows, align="lrrl"))
+    rows = [
+        (name, str(len(one.names)), f"{one.duration_s:g} s", one.title) for name, one in chosen
+    ]
+    return terminal.print_table(
+        TextTable(("name", "sites", "time", "what it is"), rows, align="lrrl")
+    )
 
 
 @options.command("paper --set control.Kd=5")
@@ -48,7 +52,9 @@ def scenario_show_command(
 
 @options.command("mine.toml")
 def scenario_check_command(
-    file: options.ScenarioArgument, overrides: options.SetOption = None, as_json: options.JsonOption = False
+    file: options.ScenarioArgument,
+    overrides: options.SetOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Checks a scenario, and prints what follows from it."""
     from ..scenario.describe import describe_scenario
@@ -66,7 +72,8 @@ def scenario_check_command(
 
 @options.command("mine.toml")
 def scenario_new_command(
-    file: Annotated[Path, typer.Argument(help="File to write.")], force: options.ForceOption = False
+    file: Annotated[Path, typer.Argument(help="File to write.")],
+    force: options.ForceOption = False,
 ) -> None:
     """Writes a commented template, with the unit of every key."""
     from ..scenario import read_template
@@ -82,7 +89,9 @@ def _tell_skeleton(kind: str, written: list[Path], key: str, then: str) -> None:
     file, test = written
     code = f"{file.stem}:{name_skeleton_class(file.stem, kind)}"
     there = "" if file.parent == Path() else f"cd {file.parent}, and "
-    terminal.print_text(f"{file}: a {kind} that works; {test.name}: its test. Change the {kind}, {there}run")
+    terminal.print_text(
+        f"{file}: a {kind} that works; {test.name}: its test. Change the {kind}, {there}run"
+    )
     terminal.print_text(f"  trilat sim paper --set {key.format(code)} -o {file.stem}.mcap")
     terminal.print_texts([f"  trilat {then} {file.stem}.mcap", f"  pytest {test.name}"])
 
@@ -125,19 +134,24 @@ def new_plant_command(
 def trace_import_command(
     form: Annotated[str, typer.Argument(help="irtt, ping or csv.", metavar="FORM")],
     file: Annotated[Path, typer.Argument(metavar="FILE")],
-    out: Annotated[Path | None, value("--out -o", "CSV", "Default: FILE as -trace.csv, here.")] = None,
+    out: Annotated[
+        Path | None, value("--out -o", "CSV", "Default: FILE as -trace.csv, here.")
+    ] = None,
     way: Annotated[str, value("--way", "half|send|receive|whole")] = "",
     column: Annotated[str, value("--column", "NAME", "Column of the delays in a table.")] = "",
-    every_s: Annotated[float, value("--every", "S", "Interval of a ping without times, s.")] = 1.0,
+    every_s: Annotated[
+        float, value("--every", "S", "Interval of a ping without times, s.")
+    ] = 1.0,
     as_json: options.JsonOption = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Makes a trace for links from what another program measured, and prints statistics of the network.
+    """Makes a trace for links from what another program measured, and prints statistics of the
+    network.
 
     Options:
         file: JSON of irtt, lines of ping or fping, or a table with a header.
-        way: Half a round trip, one way of irtt (send or receive), or delays as they are. Default: half of a
-            round trip, a one-way delay as it is.
+        way: Half a round trip, one way of irtt (send or receive), or delays as they are.
+            Default: half of a round trip, a one-way delay as it is.
     """
     from ..scenario.delay_traces import import_trace
 
@@ -157,13 +171,17 @@ def keys_new_command(
     folder: Annotated[Path, typer.Argument(help="New folder of the keys.", metavar="DIR")],
     members: Annotated[list[str], typer.Argument(metavar="MEMBER...")],
     hosts: Annotated[list[str] | None, value("--host", "NAME")] = None,
-    days: Annotated[int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")] = 30,
+    days: Annotated[
+        int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")
+    ] = 30,
 ) -> None:
-    """Makes keys: a private certificate authority, and for each member a folder for its machine alone.
+    """Makes keys: a private certificate authority, and for each member a folder for its machine
+    alone.
 
-    Bring each folder to its machine by a channel that you trust, and give it as --keys. Members without keys,
-    or with keys of another authority, cannot connect; a member can send only under its own name. Keep the
-    folder `authority` where no member runs: `trilat keys renew` needs it before the keys end.
+    Bring each folder to its machine by a channel that you trust, and give it as --keys. Members
+    without keys, or with keys of another authority, cannot connect; a member can send only
+    under its own name. Keep the folder `authority` where no member runs: `trilat keys renew`
+    needs it before the keys end.
 
     Options:
         members: The sites; and recorder, operator, router, bridge if there are any.
@@ -182,14 +200,20 @@ def keys_new_command(
 
 @options.command("keys", "keys m1 recorder --days 90")
 def keys_renew_command(
-    folder: Annotated[Path, typer.Argument(help="Folder that trilat keys new has made.", metavar="DIR")],
+    folder: Annotated[
+        Path, typer.Argument(help="Folder that trilat keys new has made.", metavar="DIR")
+    ],
     members: Annotated[list[str] | None, typer.Argument(metavar="[MEMBER]...")] = None,
-    days: Annotated[int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")] = 30,
+    days: Annotated[
+        int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")
+    ] = 30,
 ) -> None:
-    """Renews the certificates of members, by the authority in the folder; their private keys stay.
+    """Renews the certificates of members, by the authority in the folder; their private keys
+    stay.
 
-    Bring the files authority.pem, certificate.pem and members.json of each folder to its machine again, and
-    start the member anew before its next session: a running one keeps its old certificate.
+    Bring the files authority.pem, certificate.pem and members.json of each folder to its
+    machine again, and start the member anew before its next session: a running one keeps its
+    old certificate.
 
     Options:
         members: Default: all members whose folders are there.
@@ -206,7 +230,8 @@ def keys_pair_command(
 ) -> None:
     """Makes a pair of Ed25519 keys, to sign logs and to check signatures.
 
-    Keep NAME.key private. Give NAME.pub, by a channel that they trust, to those who check your logs.
+    Keep NAME.key private. Give NAME.pub, by a channel that they trust, to those who check your
+    logs.
     """
     from ..log.log_signature import create_signing_keys
 
@@ -220,12 +245,20 @@ def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
     as_json: options.JsonOption = False,
 ) -> None:
-    """Shows whose keys these are, until when they are valid, and the Zenoh settings that follow from them."""
+    """Shows whose keys these are, until when they are valid, and the Zenoh settings that follow
+    from them.
+    """
     from ..net.member_keys import read_member_keys
 
     keys = read_member_keys(folder)
     if as_json:
-        facts = {"member": keys.member, "members": list(keys.members), "until": keys.ends.isoformat()}
+        facts = {
+            "member": keys.member,
+            "members": list(keys.members),
+            "until": keys.ends.isoformat(),
+        }
         return terminal.print_json({**facts, "zenoh": keys.settings})
-    terminal.print_line(f"{keys.member} of {', '.join(keys.members)}; until {keys.ends:%Y-%m-%d %H:%M} UTC")
+    terminal.print_line(
+        f"{keys.member} of {', '.join(keys.members)}; until {keys.ends:%Y-%m-%d %H:%M} UTC"
+    )
     return terminal.print_json(keys.settings)

@@ -36,8 +36,8 @@ def log_check_command(
 ) -> None:
     """Checks that a log is well-formed, complete and consistent; executes nothing.
 
-    Exit code 0: sound; 1: not sound; 2: no such file. Of files of other programs only the structure is
-    checked.
+    Exit code 0: sound; 1: not sound; 2: no such file. Of files of other programs only the
+    structure is checked.
     """
     from ..log.session_check import check_file
 
@@ -60,14 +60,16 @@ def log_check_command(
 @options.command("run.mcap --key lab.key")
 def log_sign_command(
     file: options.LogArgument,
-    key: Annotated[Path, options.value("--key", "KEY", "Private key, made by trilat keys pair.")],
+    key: Annotated[
+        Path, options.value("--key", "KEY", "Private key, made by trilat keys pair.")
+    ],
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Signs a finished log with Ed25519: writes FILE.sig, and leaves FILE as it is.
 
-    The signature covers the digest chain: all messages and everything that describes them. The owner of the
-    public key checks it with: trilat log check FILE --key PUB
+    The signature covers the digest chain: all messages and everything that describes them. The
+    owner of the public key checks it with: trilat log check FILE --key PUB
     """
     from ..log.log_signature import sign_log
 
@@ -84,15 +86,17 @@ def log_recover_command(
     file: options.LogArgument,
     output: Annotated[
         Path | None,
-        options.value("-o --out --output", "OUT", "Default: FILE without .active, or FILE.recovered.mcap."),
+        options.value(
+            "-o --out --output", "OUT", "Default: FILE without .active, or FILE.recovered.mcap."
+        ),
     ] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
     """Recovers a torn or damaged log into a new, whole file; the original is not changed.
 
-    Works on every MCAP file. Exit code 0: nothing was lost; 3: something was lost, and is listed; 1: nothing
-    could be recovered.
+    Works on every MCAP file. Exit code 0: nothing was lost; 3: something was lost, and is
+    listed; 1: nothing could be recovered.
     """
     from ..log.recover import recover
 
@@ -116,13 +120,13 @@ def log_export_command(
     """Exports a log to files for other tools: names end in their units, numbers are exact.
 
     Options:
-        form: ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with a file per
-            site and kind; npz, mat: one file with an array per column; lerobot: a dataset of LeRobot, an
-            episode for each log of the files and folders that are given.
-        settings: Setting of a form, repeatable: of lerobot fps=30, program=m2 (a user that is a program);
-            of ros2 names=crtk (or a file of names).
-        actions: Actions of lerobot as its plugin takes them: places of end effectors, or angles of joints.
-            Default: what sites share.
+        form: ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with
+            a file per site and kind; npz, mat: one file with an array per column; lerobot: a
+            dataset of LeRobot, an episode for each log of the files and folders that are given.
+        settings: Setting of a form, repeatable: of lerobot fps=30, program=m2 (a user that is a
+            program); of ros2 names=crtk (or a file of names).
+        actions: Actions of lerobot as its plugin takes them: places of end effectors, or angles
+            of joints. Default: what sites share.
         output: File or folder; default: next to FILE, named after it.
     """
     from ..log.log_reader import open_logs
@@ -140,7 +144,9 @@ def log_export_command(
     records = {site: sum(len(log[site]) for log in logs) for site in logs[0].sites}
     told = told or f"{count_nouns(sum(records.values()), 'record')} of {', '.join(records)}"
     if as_json:
-        terminal.print_json({"file": exporter.path.as_posix(), "format": form, "records": records})
+        terminal.print_json(
+            {"file": exporter.path.as_posix(), "format": form, "records": records}
+        )
     else:
         terminal.print_text(f"{exporter.path}: {told}")
 
@@ -155,14 +161,16 @@ def log_view_command(
         bool, typer.Option("--web", help="Serve the viewer to a browser on this machine.")
     ] = False,
     save: Annotated[
-        Path | None, options.value("--save", "OUT.rrd", "Write a file for Rerun instead of opening it.")
+        Path | None,
+        options.value("--save", "OUT.rrd", "Write a file for Rerun instead of opening it."),
     ] = None,
     force: options.ForceOption = False,
 ) -> None:
     """Opens a log in Rerun: a column per site, a name for every curve.
 
-    If a log lacks the standard channels (--views off), was not finished or has parts, they are first made in
-    a temporary file. Where Rerun is not installed, the log's page opens in a browser instead.
+    If a log lacks the standard channels (--views off), was not finished or has parts, they are
+    first made in a temporary file. Where Rerun is not installed, the log's page opens in a
+    browser instead.
     """
     from importlib.util import find_spec
 
@@ -191,7 +199,9 @@ def _open_page(files: list[Path]) -> None:
     from ..files import format_extra_install, make_results_folder, refuse_link
     from ..reporting.conclude import conclude
 
-    terminal.print_note(f"Rerun is not installed ({format_extra_install('view')}); this is the log's page")
+    terminal.print_note(
+        f"Rerun is not installed ({format_extra_install('view')}); this is the log's page"
+    )
     folder = files[0].with_suffix("")
     refuse_link(folder)
     page = folder / "report.html"

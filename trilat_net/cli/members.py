@@ -1,4 +1,6 @@
-"""Processes that take part in a session: a site, the recorder, a log that is played again, a router."""
+"""Processes that take part in a session: a site, the recorder, a log that is played again, a
+router.
+"""
 
 import math
 import os
@@ -29,13 +31,21 @@ if TYPE_CHECKING:
 @options.command("m1 --scenario paper")
 def site_command(
     name: Annotated[str, typer.Argument(autocompletion=options.complete_sites)],
-    scenario: Annotated[str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)],
-    session: Annotated[str | None, value("--session", "ID", "Default: the scenario's name.")] = None,
+    scenario: Annotated[
+        str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)
+    ],
+    session: Annotated[
+        str | None, value("--session", "ID", "Default: the scenario's name.")
+    ] = None,
     *,
     ways: options.MemberOptions,
-    join_timeout: Annotated[float, seconds("--join-timeout", "Longest wait for the others, s.")] = 60.0,
+    join_timeout: Annotated[
+        float, seconds("--join-timeout", "Longest wait for the others, s.")
+    ] = 60.0,
     needs_recorder: options.NeedsRecorderOption = False,
-    cpu: Annotated[int | None, typer.Option("--cpu", help="Pin the process to this processor.")] = None,
+    cpu: Annotated[
+        int | None, typer.Option("--cpu", help="Pin the process to this processor.")
+    ] = None,
     stay: Annotated[float, seconds("--stay")] = 0.0,
     without: Annotated[list[str] | None, value("--without", "SITE")] = None,
     leave_timeout: Annotated[float | None, seconds("--leave-timeout")] = None,
@@ -47,15 +57,17 @@ def site_command(
 ) -> None:
     """Runs one site as one process: for separate terminals or machines.
 
-    Without endpoints, the sites of a session find each other on this machine: each listens at a loopback port
-    derived from session and site, and connects to the sites that precede it in the scenario.
+    Without endpoints, the sites of a session find each other on this machine: each listens at a
+    loopback port derived from session and site, and connects to the sites that precede it in
+    the scenario.
 
     Options:
         name: Name of the site in the scenario.
         scenario: Name of a shipped scenario, or path of a TOML file.
         stay: At the end, wait until the recorder has left, at most this long, s.
         without: Option of the first site: begin without SITE, which may join later; repeatable.
-        leave_timeout: Under glide: time to go on without a site that has left, s; default: to the end.
+        leave_timeout: Under glide: time to go on without a site that has left, s; default: to
+            the end.
     """
     from sites.site_parts import SiteOptions
     from sites.site_process import run_site
@@ -91,8 +103,12 @@ def hand_command(
     scenario: Annotated[
         str, typer.Option("--scenario", "-s", autocompletion=options.complete_scenarios)
     ] = "",
-    session: Annotated[str | None, value("--session", "ID", "Default: the scenario's name.")] = None,
-    join_timeout: Annotated[float, seconds("--join-timeout", "Longest wait for the site, s.")] = 60.0,
+    session: Annotated[
+        str | None, value("--session", "ID", "Default: the scenario's name.")
+    ] = None,
+    join_timeout: Annotated[
+        float, seconds("--join-timeout", "Longest wait for the site, s.")
+    ] = 60.0,
     duration: options.DurationOption = None,
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
@@ -100,22 +116,34 @@ def hand_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Runs a hand at a site: a class of your own in a process of its own, or a device that you hold.
+    """Runs a hand at a site: a class of your own in a process of its own, or a device that you
+    hold.
 
-    The class (kind = "own", process = true) sees what the site sees, and decides; the site lets each decision
-    act after the hand's delay_ms. A device (kind = "live") leads the arm of a session that runs already.
+    The class (kind = "own", process = true) sees what the site sees, and decides; the site lets
+    each decision act after the hand's delay_ms. A device (kind = "live") leads the arm of a
+    session that runs already.
 
     Options:
         name: Name of the site in the scenario.
-        scenario: Of a class: the scenario that the site runs: a shipped name, or path of a TOML file.
-        device: haply_inverse3 or spacemouse; the scenario of the session says how it leads the arm.
+        scenario: Of a class: the scenario that the site runs: a shipped name, or path of a TOML
+            file.
+        device: haply_inverse3 or spacemouse; the scenario of the session says how it leads the
+            arm.
     """
     if device is not None:
-        if extra := {"--scenario", "--duration", "--seed", "--set"} & set(options.given_options(context)):
-            raise UsageError(f"--device leads an arm of a session that runs: leave out {min(extra)}")
-        return _lead_by_device(device, name, session, reach, join_timeout)
+        if extra := {"--scenario", "--duration", "--seed", "--set"} & set(
+            options.given_options(context)
+        ):
+            raise UsageError(
+                f"--device leads an arm of a session that runs: leave out {min(extra)}"
+            )
+        return _lead_by_device(
+            device=device, name=name, session=session, reach=reach, timeout_s=join_timeout
+        )
     if not scenario:
-        raise UsageError("a class of your own needs --scenario, a device that you hold --device")
+        raise UsageError(
+            "a class of your own needs --scenario, a device that you hold --device"
+        )
     from sites.hand_process import run_hand
 
     from ..net.connection import default_endpoints
@@ -126,9 +154,19 @@ def hand_command(
     identity = options.check_session_name(session or chosen.name)
     places = default_endpoints(identity, chosen.names, encrypted=reach.keys is not None)
     find_site(chosen, name)
-    connection = options.MemberOptions(None, *reach).resolve((), [places[name]]).require(OPERATOR)
+    connection = (
+        options.MemberOptions(None, *reach).resolve((), [places[name]]).require(OPERATOR)
+    )
     with Interrupt() as interrupt:
-        run_hand(chosen, name, identity, connection, interrupt, terminal.print_line, join_timeout)
+        run_hand(
+            scenario=chosen,
+            name=name,
+            session=identity,
+            connection=connection,
+            interrupt=interrupt,
+            say=terminal.print_line,
+            timeout_s=join_timeout,
+        )
     if interrupt.requested():
         raise typer.Exit(interrupt.exit_code)
     return None
@@ -177,7 +215,9 @@ def record_command(
     exclude: Annotated[list[str] | None, value("--exclude", "KEYS")] = None,
     split_size: Annotated[float | None, value("--split-size", "MIB")] = None,
     split_duration: Annotated[float | None, value("--split-duration", "S")] = None,
-    carry_on: Annotated[bool, flag("--continue", "If the log exists, write its next part.")] = False,
+    carry_on: Annotated[
+        bool, flag("--continue", "If the log exists, write its next part.")
+    ] = False,
     durable: Annotated[bool, flag("--durable")] = False,
     views: options.ViewsOption = "100",
     force: options.ForceOption = False,
@@ -185,8 +225,9 @@ def record_command(
 ) -> None:
     """Records a session into an MCAP log, from its epoch to its end or to Ctrl-C.
 
-    Without endpoints it asks the first site, at its loopback port, for the others. Parts are named
-    FILE-001.mcap and so on. The name of a file ends in .active until the file is finished.
+    Without endpoints it asks the first site, at its loopback port, for the others. Parts are
+    named FILE-001.mcap and so on. The name of a file ends in .active until the file is
+    finished.
 
     Options:
         output: Default: SESSION.mcap; with --conclude run.mcap in the next free folder.
@@ -232,7 +273,11 @@ def record_command(
         if warning := describe_load(measure_busy_share(clock)):
             terminal.print_note(warning)
 
-    then = (lambda: _conclude(list(find_parts(path).values()), png=png)) if concluded else lambda: None
+    then = (
+        (lambda: _conclude(list(find_parts(path).values()), png=png))
+        if concluded
+        else lambda: None
+    )
     try:
         code = record_session(
             session=session,
@@ -269,7 +314,9 @@ def _conclude(parts: list[Path], *, png: bool) -> None:
         raise CodeWithheld(f"{parts[0]}: not all was judged: it needs trilat verify --law FILE")
     if not conclusion.passed:
         raise RunFailed(f"{parts[0]}: failed a check")
-    if ended := next((event for event in log.events if event.kind in ("diverged", "failed")), None):
+    if ended := next(
+        (event for event in log.events if event.kind in ("diverged", "failed")), None
+    ):
         raise RunFailed(f"{parts[0]}: {ended.text}")
 
 
@@ -279,12 +326,16 @@ def replay_command(
     rate: Annotated[str, value("--rate", "X")] = "1",
     loop: Annotated[bool, flag("--loop", "Start over at the end, until Ctrl-C.")] = False,
     start: Annotated[float | None, value("--start", "S")] = None,
-    stop: Annotated[float | None, value("--stop", "S", "End of the part to play, s since tick 0.")] = None,
+    stop: Annotated[
+        float | None, value("--stop", "S", "End of the part to play, s since tick 0.")
+    ] = None,
     duration: Annotated[float | None, value("--duration", "S")] = None,
     include: Annotated[list[str] | None, value("--include", "KEYEXPR")] = None,
     exclude: Annotated[list[str] | None, value("--exclude", "KEYEXPR")] = None,
     prefix: Annotated[str, value("--prefix", "WORD")] = "replay",
-    session: Annotated[str | None, value("--session", "ID", "Name of the session, without a prefix.")] = None,
+    session: Annotated[
+        str | None, value("--session", "ID", "Name of the session, without a prefix.")
+    ] = None,
     time: Annotated[str, value("--time", "publish|log")] = "publish",
     low_cpu: Annotated[bool, flag("--low-cpu")] = False,
     needs_recorder: options.NeedsRecorderOption = False,
@@ -298,21 +349,23 @@ def replay_command(
 ) -> None:
     """Publishes a log over Zenoh with its original timing, as a session of its own.
 
-    To recorders, viewers and `trilat ping` it looks like a running session: it answers for the sites of the
-    log, and its messages are theirs, byte for byte. Without endpoints it listens where the session's first
-    site would.
+    To recorders, viewers and `trilat ping` it looks like a running session: it answers for the
+    sites of the log, and its messages are theirs, byte for byte. Without endpoints it listens
+    where the session's first site would.
 
     Options:
         files: An MCAP log, or the parts of one in their order.
         rate: Speed relative to the recording, or max: as fast as possible.
         start: Start of the part to play, s since tick 0.
         duration: Duration of the part to play, s, instead of --stop.
-        include: Play only these channels, as in '**/m1/*'; repeatable. Default: all of the sites.
+        include: Play only these channels, as in '**/m1/*'; repeatable. Default: all of the
+            sites.
         exclude: Leave these channels out, as in '**/link'; repeatable.
         prefix: Name the session WORD-NAME; with '' NAME, as recorded.
         time: Play messages at their times of sending, or of arrival.
         low_cpu: Sleep until every deadline, which is about 0.1 ms less exact.
-        preload: Largest log held in memory; another process reads a larger one during the replay.
+        preload: Largest log held in memory; another process reads a larger one during the
+            replay.
     """
     from recorder.play.play_process import PlayOptions, play_log
     from recorder.play.player import parse_rate
@@ -322,22 +375,50 @@ def replay_command(
 
     if preload < 0:
         raise UsageError(f"--preload is a number of MiB, not {preload}")
-    selection = parse_selection(include or (), exclude or (), start, stop, duration, time)
+    selection = parse_selection(
+        include=include or (),
+        exclude=exclude or (),
+        start_s=start,
+        stop_s=stop,
+        duration_s=duration,
+        time=time,
+    )
     speed = parse_rate(rate)
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         facts, block = preload_messages(files, selection, preload << 20, progress)
-    name = options.check_session_name(session or (f"{prefix}-{facts.session}" if prefix else facts.session))
-    ways = options.MemberOptions(listen, connect, router, zenoh_config, None, insecure)
+    name = options.check_session_name(
+        session or (f"{prefix}-{facts.session}" if prefix else facts.session)
+    )
+    ways = options.MemberOptions(
+        listen=listen,
+        connect=connect,
+        router=router,
+        zenoh_config=zenoh_config,
+        keys=None,
+        insecure=insecure,
+    )
     connection = ways.resolve([default_endpoint(name, 0)], [])
-    play = PlayOptions(name, speed, loop, low_cpu, needs_recorder)
-    tell = partial((terminal.err if as_json else terminal.out).print, markup=False, soft_wrap=True)
+    play = PlayOptions(
+        session=name, rate=speed, loop=loop, low_cpu=low_cpu, needs_recorder=needs_recorder
+    )
+    tell = partial(
+        (terminal.err if as_json else terminal.out).print, markup=False, soft_wrap=True
+    )
     _announce_playback(facts, name, speed, tell)
     reported = set(facts.torn)  # playing may add to them
     _warn_torn(facts.torn)
     clock = SystemClock()
     with Interrupt() as interrupt:
         outcome = play_log(
-            (facts, block), files, selection, play, connection, clock, interrupt.requested, tell, _line(clock)
+            loaded=(facts, block),
+            paths=files,
+            selection=selection,
+            options=play,
+            connection=connection,
+            clock=clock,
+            stopped=interrupt.requested,
+            say=tell,
+            show=_line(clock),
         )
     if outcome is None:
         raise typer.Exit(interrupt.exit_code)
@@ -353,7 +434,9 @@ def replay_command(
         raise typer.Exit(1)
 
 
-def _announce_playback(facts: "SessionHeader", name: str, rate: float, tell: Callable[[str], None]) -> None:
+def _announce_playback(
+    facts: "SessionHeader", name: str, rate: float, tell: Callable[[str], None]
+) -> None:
     from ..net.messages import VERSION
 
     speed = "as fast as possible" if math.isinf(rate) else f"at {rate:g} times its speed"
@@ -392,7 +475,9 @@ def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any
         "rounds": outcome.rounds,
         "rate": None if math.isinf(rate) else rate,
         "took_s": round(outcome.took_s, 6),
-        "late_us": None if late is None else {"p50": late.p50_us, "p99": late.p99_us, "max": late.max_us},
+        "late_us": None
+        if late is None
+        else {"p50": late.p50_us, "p99": late.p99_us, "max": late.max_us},
         "held_s": round(outcome.held_s, 3),
         "cut": outcome.cut,
         "strays": outcome.strays,
@@ -411,8 +496,14 @@ def _show_playback(outcome: "PlaybackSummary") -> None:
     late = outcome.lateness
     total = f"{count_nouns(sum(outcome.counts.values()), 'message')} in {outcome.took_s:.2f} s"
     rounds = f", {count_nouns(outcome.rounds, 'round')}" if outcome.rounds > 1 else ""
-    how = f"; late by p50 {late.p50_us} us, p99 {late.p99_us} us, max {late.max_us} us" if late else ""
-    held = f"; waited {outcome.held_s:.2f} s for slow subscribers" if outcome.held_s > 0.1 else ""
+    how = (
+        f"; late by p50 {late.p50_us} us, p99 {late.p99_us} us, max {late.max_us} us"
+        if late
+        else ""
+    )
+    held = (
+        f"; waited {outcome.held_s:.2f} s for slow subscribers" if outcome.held_s > 0.1 else ""
+    )
     dropped = "" if outcome.cut else "; none dropped"
     terminal.print_text(f"{total}{rounds}{how}{held}{dropped}")
     if outcome.recorders:
@@ -468,32 +559,63 @@ def router_command(
     insecure: options.InsecureOption = False,
     until_idle: Annotated[
         float | None,
-        seconds("--until-idle", "End once all members have been gone for this long, s; default: never."),
+        seconds(
+            "--until-idle",
+            "End once all members have been gone for this long, s; default: never.",
+        ),
     ] = None,
 ) -> None:
     """Connects sites that cannot reach each other directly, for example behind NAT.
 
-    Sites and the recorder name it with --router and start in any order. It runs until Ctrl-C; a session
-    continues when the router is restarted. Routers that --connect to each other act as one.
+    Sites and the recorder name it with --router and start in any order. It runs until Ctrl-C; a
+    session continues when the router is restarted. Routers that --connect to each other act as
+    one.
     """
-    from ..net.connection import open_bus, resolve_member_connection, run_router, secure_connection
+    from ..net.connection import (
+        open_bus,
+        resolve_member_connection,
+        run_router,
+        secure_connection,
+    )
     from ..net.zenoh_bus import read_zenoh_file
     from ..net.zenoh_config import ROUTER
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
     places = [LOOPBACK if keys is None else ANY_ADDRESS]
-    named = resolve_member_connection(listen, connect, None, file, places, (), routes=True)
+    named = resolve_member_connection(
+        listen=listen,
+        connect=connect,
+        routers=None,
+        file=file,
+        listen_else=places,
+        connect_else=(),
+        routes=True,
+    )
     connection = secure_connection(named, keys, insecure=insecure).require(ROUTER)
     if text := connection.describe_end():
         terminal.print_note(text)
     clock = SystemClock()
     with Interrupt() as interrupt:
-        bus = open_bus(connection, clock, interrupt.requested, None, terminal.print_line)
+        bus = open_bus(
+            connection=connection,
+            clock=clock,
+            stopped=interrupt.requested,
+            timeout_s=None,
+            say=terminal.print_line,
+        )
         if bus is None:
             raise typer.Exit(interrupt.exit_code)
         with closing(bus):
-            _say_of_router(f"listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it")
-            run_router(bus, clock, interrupt.requested, _say_of_router, until_idle)
+            _say_of_router(
+                f"listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it"
+            )
+            run_router(
+                bus=bus,
+                clock=clock,
+                stopped=interrupt.requested,
+                say=_say_of_router,
+                until_idle_s=until_idle,
+            )
         raise typer.Exit(interrupt.exit_code if interrupt.requested() else 0)
 
 
@@ -517,8 +639,9 @@ def ros2_command(
 ) -> None:
     """Shows a session to ROS 2; its programs hold arms, and its robots are external arms.
 
-    ROS needs RMW_IMPLEMENTATION=rmw_zenoh_cpp and its router; nothing of ROS is needed here. The bridge waits
-    for the router, and ends with the session. docs/ros2.md has all topics and services.
+    ROS needs RMW_IMPLEMENTATION=rmw_zenoh_cpp and its router; nothing of ROS is needed here.
+    The bridge waits for the router, and ends with the session. docs/ros2.md has all topics and
+    services.
 
     Options:
         distro: Distribution of ROS 2 whose form is written.
@@ -542,9 +665,25 @@ def ros2_command(
     running = RunningSession(name, reach.resolve(operates=False).require(BRIDGE))
 
     def open_graph(refusals: Refusals) -> Ros2Graph:
-        return Ros2Graph(refusals, ros or [options.ROS_ROUTER], name, "trilat", SystemClock(), domain, distro)
+        return Ros2Graph(
+            refusals=refusals,
+            routers=ros or [options.ROS_ROUTER],
+            namespace=name,
+            name="trilat",
+            clock=SystemClock(),
+            domain=domain,
+            distro=distro,
+        )
 
     with Interrupt() as interrupt:
-        serve_ros2(running, open_graph, rate, table, interrupt.requested, terminal.print_line, timeout)
+        serve_ros2(
+            running=running,
+            open_graph=open_graph,
+            rate_hz=rate,
+            table=table,
+            stopped=interrupt.requested,
+            say=terminal.print_line,
+            timeout_s=timeout,
+        )
     if interrupt.requested():
         raise typer.Exit(interrupt.exit_code)

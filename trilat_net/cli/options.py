@@ -1,4 +1,6 @@
-"""Options that several commands share, alone or together, and the scenario, connection or log they mean."""
+"""Options that several commands share, alone or together, and the scenario, connection or log
+they mean.
+"""
 
 import inspect
 import re
@@ -22,19 +24,27 @@ if TYPE_CHECKING:
 Runs = TypeVar("Runs", bound=Callable[..., None])
 
 
-def check_range(low: float, high: float, what: str) -> Callable[[typer.CallbackParam, float | None], Any]:
-    """Returns a check of an option that refuses a number out of a range; `what` names such numbers."""
+def check_range(
+    low: float, high: float, what: str
+) -> Callable[[typer.CallbackParam, float | None], Any]:
+    """Returns a check of an option that refuses a number out of a range; `what` names such
+    numbers.
+    """
 
     def check(param: typer.CallbackParam, value: float | None) -> float | None:
         if value is not None and not low <= value <= high:
-            raise UsageError(f"{param.opts[0]} is {what} from {low:.7g} to {high:.7g}, not {value:g}")
+            raise UsageError(
+                f"{param.opts[0]} is {what} from {low:.7g} to {high:.7g}, not {value:g}"
+            )
         return value
 
     return check
 
 
 def value(names: str, metavar: str, text: str = "", **more: Any) -> Any:
-    """Returns an option that takes a value, with its help; several names are separated by spaces."""
+    """Returns an option that takes a value, with its help; several names are separated by
+    spaces.
+    """
     return typer.Option(*names.split(), metavar=metavar, help=text, **more)
 
 
@@ -55,7 +65,8 @@ _TOLD = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
 def command(*examples: str) -> Callable[[Runs], Runs]:
     """Declares a command of the program, with the arguments of its examples.
 
-    An option whose help does not fit into its line has it in the section `Options` of the docstring.
+    An option whose help does not fit into its line has it in the section `Options` of the
+    docstring.
     """
 
     def declare(run: Runs) -> Runs:
@@ -70,7 +81,9 @@ def command(*examples: str) -> Callable[[Runs], Runs]:
 
 
 def complete_scenarios(incomplete: str) -> list[str]:
-    """Returns what a shell completes to a scenario: shipped names, and TOML files and folders here."""
+    """Returns what a shell completes to a scenario: shipped names, and TOML files and folders
+    here.
+    """
     shipped = (entry.name.removesuffix(".toml") for entry in _SCENARIOS.iterdir())
     names = [name for name in shipped if "." not in name and not name.startswith("_")]
     folder = Path(incomplete).parent if "/" in incomplete else Path()
@@ -86,15 +99,20 @@ def complete_figures(incomplete: str) -> list[str]:
 
 
 def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
-    """Returns what a shell completes to a site: those of the scenario or the log that was named before."""
+    """Returns what a shell completes to a site: those of the scenario or the log that was named
+    before.
+    """
     from ..log.log_reader import open_log
     from ..scenario import load_scenario
 
     files = context.params.get("files") or []
-    if "files" in context.params and not files:  # before an option without its value they are not parsed
+    # before an option without its value they are not parsed
+    if "files" in context.params and not files:
         files = [Path(word) for word in context.args]
     try:
-        names = open_log(*files).sites if files else load_scenario(context.params["scenario"]).names
+        names = (
+            open_log(*files).sites if files else load_scenario(context.params["scenario"]).names
+        )
     except (TrilatError, KeyError, TypeError):
         return []
     return [name for name in names if name.startswith(incomplete)]
@@ -105,19 +123,26 @@ _SCENARIOS = resources.files("trilat_net") / "scenarios"
 ScenarioArgument = Annotated[
     str,
     typer.Argument(
-        help="Name of a shipped scenario, or path of a TOML file.", autocompletion=complete_scenarios
+        help="Name of a shipped scenario, or path of a TOML file.",
+        autocompletion=complete_scenarios,
     ),
 ]
 SetOption = Annotated[
-    list[str] | None, value("--set", "KEY=VALUE", "Override a key, as in control.Kd=5; repeatable.")
+    list[str] | None,
+    value("--set", "KEY=VALUE", "Override a key, as in control.Kd=5; repeatable."),
 ]
 SeedOption = Annotated[int | None, typer.Option("--seed", help="Override the scenario's seed.")]
-DurationOption = Annotated[float | None, value("--duration", "S", "Override the duration of the run, s.")]
+DurationOption = Annotated[
+    float | None, value("--duration", "S", "Override the duration of the run, s.")
+]
 ForceOption = Annotated[bool, flag("--force", "Replace existing files.")]
 ListenOption = Annotated[
-    list[str] | None, value("--listen", "EP", "Endpoint to listen at, as in tcp/192.0.2.1:7447.")
+    list[str] | None,
+    value("--listen", "EP", "Endpoint to listen at, as in tcp/192.0.2.1:7447."),
 ]
-ConnectOption = Annotated[list[str] | None, value("--connect", "EP", "Endpoint to connect to; repeatable.")]
+ConnectOption = Annotated[
+    list[str] | None, value("--connect", "EP", "Endpoint to connect to; repeatable.")
+]
 
 RouterOption = Annotated[
     list[str] | None,
@@ -129,9 +154,12 @@ RouterOption = Annotated[
     ),
 ]
 ZenohConfigOption = Annotated[
-    Path | None, value("--zenoh-config", "FILE", "Your own Zenoh configuration: TLS, QUIC, access.")
+    Path | None,
+    value("--zenoh-config", "FILE", "Your own Zenoh configuration: TLS, QUIC, access."),
 ]
-KeysOption = Annotated[Path | None, value("--keys", "DIR", "Folder of this member's keys (trilat keys new).")]
+KeysOption = Annotated[
+    Path | None, value("--keys", "DIR", "Folder of this member's keys (trilat keys new).")
+]
 InsecureOption = Annotated[
     bool, flag("--insecure", "Allow --listen on a network whose users you trust, unencrypted.")
 ]
@@ -144,7 +172,8 @@ MOST_LETTERS = 80
 def check_session_name(name: str) -> str:
     """Refuses a session name that cannot be part of a key."""
     if len(name) > MOST_LETTERS or not re.fullmatch("[A-Za-z0-9_.-]+", name):
-        letters = "" if name.isascii() else "; its letters are a to z and A to Z"  # others look alike
+        # others look alike
+        letters = "" if name.isascii() else "; its letters are a to z and A to Z"
         raise UsageError(
             f"a session's name is at most {MOST_LETTERS} letters, digits, _, - and ., "
             f"not {ascii(name)[:80]}{letters}"
@@ -181,7 +210,9 @@ ViewsOption = Annotated[
     ),
 ]
 
-JobsOption = Annotated[int | None, value("--jobs", "N", "Processes; default: one per core.", min=1)]
+JobsOption = Annotated[
+    int | None, value("--jobs", "N", "Processes; default: one per core.", min=1)
+]
 
 
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
@@ -191,7 +222,9 @@ LogsArgument = Annotated[
 ROS_ROUTER = "tcp/127.0.0.1:7447"
 RosRouterOption = Annotated[
     list[str] | None,
-    value("--ros", "EP", f"Endpoint of ROS's Zenoh router (rmw_zenohd); default: {ROS_ROUTER}."),
+    value(
+        "--ros", "EP", f"Endpoint of ROS's Zenoh router (rmw_zenohd); default: {ROS_ROUTER}."
+    ),
 ]
 RosDomainOption = Annotated[int, value("--domain", "N", "ROS_DOMAIN_ID.", min=0, max=232)]
 NeedsRecorderOption = Annotated[bool, flag("--needs-recorder", "Wait for a recorder.")]
@@ -234,8 +267,12 @@ def check_picture(path: Path | None, *, force: bool) -> None:
         raise UsageError(f"{path}: there is no folder {path.parent}")
 
 
-def print_drawn(found: "Result", picture: Path | None, figure: str, shown: Any, *, as_json: bool) -> None:
-    """Prints a result; if asked for, writes the figure of what is shown, as "twin_differences:draw_twins"."""
+def print_drawn(
+    found: "Result", picture: Path | None, figure: str, shown: Any, *, as_json: bool
+) -> None:
+    """Prints a result; if asked for, writes the figure of what is shown, as
+    "twin_differences:draw_twins".
+    """
     if picture is not None:
         from ..reporting.style import REPORT_DPI, write_figure
 
@@ -267,9 +304,16 @@ def split_names(text: str | None) -> list[str]:
 
 
 def given_options(context: typer.Context) -> list[str]:
-    """Returns the options and arguments that were given, by the first name of each, as they are declared."""
-    sources = ((param, context.get_parameter_source(param.name or "")) for param in context.command.params)
-    return [param.opts[0] for param, source in sources if source and source.name == "COMMANDLINE"]
+    """Returns the options and arguments that were given, by the first name of each, as they are
+    declared.
+    """
+    sources = (
+        (param, context.get_parameter_source(param.name or ""))
+        for param in context.command.params
+    )
+    return [
+        param.opts[0] for param, source in sources if source and source.name == "COMMANDLINE"
+    ]
 
 
 class MemberOptions(NamedTuple):
@@ -389,25 +433,42 @@ class PageServing(NamedTuple):
     """The options of a command that serves a page."""
 
     host: Annotated[
-        str, value("--host", "ADDRESS", "Address of the page; beyond loopback with --tls or --insecure.")
+        str,
+        value(
+            "--host",
+            "ADDRESS",
+            "Address of the page; beyond loopback with --tls or --insecure.",
+        ),
     ] = "127.0.0.1"
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")] = 0
-    insecure: Annotated[bool, flag("--insecure", "Allow --host beyond loopback, without encryption.")] = False
-    browser: Annotated[bool, flag("--browser/--no-browser", "Open a browser if there is one.")] = True
-    tls: Annotated[Path | None, value("--tls", "DIR", "Encrypt by a member's keys in this folder.")] = None
+    port: Annotated[
+        int, typer.Option("--port", min=0, max=65535, help="Port of the page; 0: any.")
+    ] = 0
+    insecure: Annotated[
+        bool, flag("--insecure", "Allow --host beyond loopback, without encryption.")
+    ] = False
+    browser: Annotated[
+        bool, flag("--browser/--no-browser", "Open a browser if there is one.")
+    ] = True
+    tls: Annotated[
+        Path | None, value("--tls", "DIR", "Encrypt by a member's keys in this folder.")
+    ] = None
 
 
 _TUPLES = (MemberOptions, Reach, LawFiles, RunOptions, PageServing)
 
 
 def spread(run: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a command with an option for every field of its parameters that are tuples of options."""
+    """Returns a command with an option for every field of its parameters that are tuples of
+    options.
+    """
     given = inspect.signature(run).parameters
     kinds = {n: p.annotation for n, p in given.items() if p.annotation in _TUPLES}
     parameters = [
         inner.replace(kind=inspect.Parameter.KEYWORD_ONLY)
         for name, outer in given.items()
-        for inner in (inspect.signature(kinds[name]).parameters.values() if name in kinds else [outer])
+        for inner in (
+            inspect.signature(kinds[name]).parameters.values() if name in kinds else [outer]
+        )
     ]
 
     @wraps(run)

@@ -1,4 +1,6 @@
-"""Runs: a scenario in virtual time, and a log executed again, judged, measured, changed or drawn."""
+"""Runs: a scenario in virtual time, and a log executed again, judged, measured, changed or
+drawn.
+"""
 
 from dataclasses import replace
 from enum import StrEnum
@@ -22,7 +24,9 @@ if TYPE_CHECKING:
 @options.command("free -o free.mcap --set link.delay_ms=400")
 def sim_command(
     scenario: options.ScenarioArgument,
-    output: Annotated[Path | None, value("-o --out --output", "FILE", "Default: NAME.mcap.")] = None,
+    output: Annotated[
+        Path | None, value("-o --out --output", "FILE", "Default: NAME.mcap.")
+    ] = None,
     duration: options.DurationOption = None,
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
@@ -38,9 +42,13 @@ def sim_command(
     path = output if output is not None else Path(f"{chosen.name}.mcap")
     views_hz = parse_viz_rate(views)
     with Interrupt(compiles=True) as interrupt:
-        within = record_virtual(chosen, path, force=force, stopped=interrupt.requested, views_hz=views_hz)
+        within = record_virtual(
+            chosen, path, force=force, stopped=interrupt.requested, views_hz=views_hz
+        )
     if interrupt.requested():
-        terminal.err.print(f"interrupted; {path} holds the records so far", markup=False, soft_wrap=True)
+        terminal.err.print(
+            f"interrupted; {path} holds the records so far", markup=False, soft_wrap=True
+        )
         raise typer.Exit(interrupt.exit_code)
     if as_json:
         from ..log.log_reader import open_log
@@ -52,7 +60,11 @@ def sim_command(
         chains = any(spec.arm.urdf for spec in chosen.sites.values())
         terminal.print_error(
             f"{path}: the run diverged: a joint passed its qd_limit_rad_s, and the run ended there"
-            + ("; a urdf states such limits, and limits.qd_limit_rad_s others" if chains else "")
+            + (
+                "; a urdf states such limits, and limits.qd_limit_rad_s others"
+                if chains
+                else ""
+            )
         )
         raise typer.Exit(1)
 
@@ -69,20 +81,25 @@ def verify_command(
 ) -> None:
     """Executes every site again from a log and compares every computed field of every record.
 
-    Exit code 0: all agrees, the log is as it was made, and enough of every site was judged. 1: something
-    differs, was changed, or is missing. 2: no log. 4: a site's law is code from outside that may not run
-    without --law; all else agrees.
+    Exit code 0: all agrees, the log is as it was made, and enough of every site was judged. 1:
+    something differs, was changed, or is missing. 2: no log. 4: a site's law is code from
+    outside that may not run without --law; all else agrees.
 
     Options:
         virtual: Compare with virtual time too, with and without the log's arrivals.
-        resume_every: Start sites afresh from the records every N ticks: shows what a law knows besides.
+        resume_every: Start sites afresh from the records every N ticks: shows what a law knows
+            besides.
     """
     from ..execution.log_checks import run_log_checks
 
     log = laws.open(*files)
     with terminal.progress_bar(f"executing {files[0]}") as progress:
         result = run_log_checks(
-            log, virtual=virtual, progress=progress, min_coverage=min_coverage, resume_every=resume_every
+            log,
+            virtual=virtual,
+            progress=progress,
+            min_coverage=min_coverage,
+            resume_every=resume_every,
         )
     terminal.print_result(result, as_json=as_json)
     raise typer.Exit(result.exit_code)
@@ -98,26 +115,31 @@ def certify_command(
     accept: Annotated[
         list[Accepted] | None,
         typer.Option(
-            "--accept", help="Also exit 0 for a bounded oscillation, or an open judgement; repeatable."
+            "--accept",
+            help="Also exit 0 for a bounded oscillation, or an open judgement; repeatable.",
         ),
     ] = None,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     own_laws: Annotated[
-        bool, flag("--own-laws", "Run code of imported laws for the energies that they declare.")
+        bool,
+        flag("--own-laws", "Run code of imported laws for the energies that they declare."),
     ] = False,
-    twins: Annotated[int, value("--twins", "N", "Twins that get a small push; 0: none.", min=0, max=99)] = 8,
+    twins: Annotated[
+        int, value("--twins", "N", "Twins that get a small push; 0: none.", min=0, max=99)
+    ] = 8,
     *,
     laws: options.LawFiles,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Judges a run: stable, not stable or open; V and its energy balance, premises, roots at the end pose.
+    """Judges a run: stable, not stable or open; V and its energy balance, premises, roots at
+    the end pose.
 
-    Executes the run again beside twins that get a small push, and no code of imported laws without --law or
-    --own-laws.
-    docs/certificate.md defines every word and every key of the JSON.
+    Executes the run again beside twins that get a small push, and no code of imported laws
+    without --law or --own-laws. docs/certificate.md defines every word and every key of the
+    JSON.
 
-    Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged) or open, with
-    the reasons. 2: no log.
+    Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged) or
+    open, with the reasons. 2: no log.
     """
     from ..theory.linear_analysis import certify_run
 
@@ -140,10 +162,12 @@ def twin_command(
     files: options.LogsArgument,
     at_s: Annotated[float, value("--at", "S", "The instant of the push, s.")] = 0.0,
     push: Annotated[
-        list[str] | None, value("--push", "WHAT=SIZE", _PUSHED, autocompletion=options.complete_sites)
+        list[str] | None,
+        value("--push", "WHAT=SIZE", _PUSHED, autocompletion=options.complete_sites),
     ] = None,
     delta: Annotated[
-        str, value("--delta", "LOW:HIGH", "Sizes of one push, as in 1e-9:1e-3: a twin per decade.")
+        str,
+        value("--delta", "LOW:HIGH", "Sizes of one push, as in 1e-9:1e-3: a twin per decade."),
     ] = "",
     picture: Annotated[
         Path | None, value("-o --out --output", "FILE", "Draw a figure: .png, .svg or .pdf.")
@@ -153,10 +177,11 @@ def twin_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Executes a run again, beside twins that get a small push at an instant: it dies away, or it grows.
+    """Executes a run again, beside twins that get a small push at an instant: it dies away, or
+    it grows.
 
-    Nothing of the difference is a model: the twins get the arrivals, delays, hands and changes of the run
-    (docs/certificate.md, "Twins"). Exit code 0 for any growth.
+    Nothing of the difference is a model: the twins get the arrivals, delays, hands and changes
+    of the run (docs/certificate.md, "Twins"). Exit code 0 for any growth.
     """
     from ..analysis.twin_growth import twin
 
@@ -171,26 +196,31 @@ def twin_command(
 def identify_hand_command(
     file: options.LogsArgument,
     site: Annotated[
-        str, value("--site", "SITE", "Whose arm it holds.", autocompletion=options.complete_sites)
+        str,
+        value("--site", "SITE", "Whose arm it holds.", autocompletion=options.complete_sites),
     ] = "m1",
     as_json: options.JsonOption = False,
 ) -> None:
-    """Finds mass, damping and stiffness of the hand at an arm, from a run in which sines move that arm.
+    """Finds mass, damping and stiffness of the hand at an arm, from a run in which sines move
+    that arm.
 
-    The scenario has an operator of kind "multisine" at any site (docs/ports.md, "Measured operators"). What
-    is found, as JSON, is what `trilat linear --operators` takes.
+    The scenario has an operator of kind "multisine" at any site (docs/ports.md, "Measured
+    operators"). What is found, as JSON, is what `trilat linear --operators` takes.
     """
     from ..studies.hand_impedance import identify_hand
 
-    terminal.print_result(identify_hand(terminal.open_with_progress(*file), site), as_json=as_json)
+    terminal.print_result(
+        identify_hand(terminal.open_with_progress(*file), site), as_json=as_json
+    )
 
 
 @options.command("run.mcap")
 def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = False) -> None:
-    """Measures a run: tracking, effort, energies, force sharing, impedance, walls, learning, network.
+    """Measures a run: tracking, effort, energies, force sharing, impedance, walls, learning,
+    network.
 
-    Sites, links and walls are columns. A dash is a missing number; if the run could have one, the reason is
-    given below the table. docs/metrics.md has every formula.
+    Sites, links and walls are columns. A dash is a missing number; if the run could have one,
+    the reason is given below the table. docs/metrics.md has every formula.
     """
     from ..analysis.metrics.log_metrics import compute_log_metrics
 
@@ -202,11 +232,16 @@ def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = Fa
 def figure_command(
     file: options.LogArgument,
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="NAME", autocompletion=options.complete_figures)
+        list[str] | None,
+        typer.Argument(metavar="NAME", autocompletion=options.complete_figures),
     ] = None,
     width_in: Annotated[float, value("--width", "3.5|7")] = 3.5,
-    formats: Annotated[str, value("--format", "pdf,png,svg", "One or more formats.")] = "pdf,png",
-    folder: Annotated[Path | None, value("--out -o", "DIR", "Default: FILE without .mcap, -figures.")] = None,
+    formats: Annotated[
+        str, value("--format", "pdf,png,svg", "One or more formats.")
+    ] = "pdf,png",
+    folder: Annotated[
+        Path | None, value("--out -o", "DIR", "Default: FILE without .mcap, -figures.")
+    ] = None,
     others: Annotated[list[Path] | None, value("--with", "FILE")] = None,
     *,
     laws: options.LawFiles,
@@ -214,7 +249,8 @@ def figure_command(
     as_json: Annotated[bool, flag("--json", "Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Draws figures of a log for a paper: vectors, type 8 pt, fonts embedded, the same bytes every time.
+    """Draws figures of a log for a paper: vectors, type 8 pt, fonts embedded, the same bytes
+    every time.
 
     Options:
         names: Names of figures, see --list; default: all that FILE has.
@@ -229,7 +265,8 @@ def figure_command(
     from ..reporting.figures.registry import write_figures, write_overlay
 
     place = folder
-    if place is None:  # nobody has named the folder: who sent the log may have planted a link there
+    # nobody has named the folder: who sent the log may have planted a link there
+    if place is None:
         place = file.with_name(f"{file.stem}-figures")
         refuse_link(place)
     kinds = [kind.strip().lower() for kind in formats.split(",") if kind.strip()]
@@ -238,8 +275,13 @@ def figure_command(
     shape: dict[str, Any] = {"width_in": width_in, "formats": kinds, "force": force}
     if others:
         if names:
-            raise UsageError("--with draws the figure overlay, and no other: leave the names out")
-        logs = {file.stem: log, **{one.stem: terminal.open_with_progress(one) for one in others}}
+            raise UsageError(
+                "--with draws the figure overlay, and no other: leave the names out"
+            )
+        logs = {
+            file.stem: log,
+            **{one.stem: terminal.open_with_progress(one) for one in others},
+        }
         if len(logs) <= len(others):
             raise UsageError("logs that are drawn over one another need names of their own")
         paths = write_overlay(logs, place, **shape)
@@ -257,20 +299,27 @@ def _list_figures(log: "Log", *, as_json: bool) -> None:
 
     absent = {name: plate.absent(log) for name, plate in FIGURES.items()}
     if as_json:
-        rows = [{"name": n, "about": FIGURES[n].about, "absent": why or None} for n, why in absent.items()]
+        rows = [
+            {"name": n, "about": FIGURES[n].about, "absent": why or None}
+            for n, why in absent.items()
+        ]
         terminal.print_json(rows)
         return
     drawable = [(name, FIGURES[name].about) for name, why in absent.items() if not why]
     terminal.print_table(TextTable(("figure", "shows"), drawable))
     for name, why in absent.items():
         if why:
-            terminal.out.print(f"[dim]{name}: nothing to show: {escape(why)}[/dim]", soft_wrap=True)
+            terminal.out.print(
+                f"[dim]{name}: nothing to show: {escape(why)}[/dim]", soft_wrap=True
+            )
 
 
 @options.command("run.mcap -o report")
 def report_command(
     files: options.LogsArgument,
-    folder: Annotated[Path | None, value("-o --out", "DIR", "Default: FILE without .mcap.")] = None,
+    folder: Annotated[
+        Path | None, value("-o --out", "DIR", "Default: FILE without .mcap.")
+    ] = None,
     *,
     laws: options.LawFiles,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
@@ -283,7 +332,8 @@ def report_command(
     from ..reporting.conclude import conclude
 
     log = laws.open(*files)  # before its folder is made
-    if folder is None:  # nobody has named the folder: who sent the log may have planted a link there
+    # nobody has named the folder: who sent the log may have planted a link there
+    if folder is None:
         folder = files[0].with_suffix("")
         refuse_link(folder)
     results = make_results_folder(folder, "", force=force)
@@ -299,7 +349,10 @@ def rerun_command(
     replace: Annotated[
         list[str] | None,
         value(
-            "--replace", "SITE", "Execute this site again; repeatable.", autocompletion=options.complete_sites
+            "--replace",
+            "SITE",
+            "Execute this site again; repeatable.",
+            autocompletion=options.complete_sites,
         ),
     ] = None,
     closed_loop: Annotated[
@@ -308,11 +361,14 @@ def rerun_command(
     overrides: options.SetOption = None,
     *,
     laws: options.LawFiles,
-    output: Annotated[Path | None, value("-o --out --output", "FILE", "Write the result as a log.")] = None,
+    output: Annotated[
+        Path | None, value("-o --out --output", "FILE", "Write the result as a log.")
+    ] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Executes sites of a log again with changed settings, and compares the result with the log.
+    """Executes sites of a log again with changed settings, and compares the result with the
+    log.
 
     Without --closed-loop the other sites stay as recorded and do not react.
     """
@@ -326,7 +382,9 @@ def rerun_command(
         refuse_existing(output, force=force, unfinished=active_path(output))
     log = laws.open(*files)
     with terminal.progress_bar("executing") as progress:
-        again = rerun(log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress)
+        again = rerun(
+            log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress
+        )
     if output is not None:
         again.save(output, force=force)
     if as_json:
@@ -346,29 +404,41 @@ def linear_command(
     scenario: options.ScenarioArgument,
     overrides: options.SetOption = None,
     pose: Annotated[
-        str | None, value("--pose", "Q1,Q2,...", "Pose of all sites, rad, true theta; default: a run's end.")
+        str | None,
+        value(
+            "--pose", "Q1,Q2,...", "Pose of all sites, rad, true theta; default: a run's end."
+        ),
     ] = None,
     roots: Annotated[int, value("--roots", "N", "Number of roots to print.")] = 6,
     over: Annotated[
-        list[str] | None, value("--over", "KEY=LOW:HIGH", "Find where stability changes; repeatable.")
+        list[str] | None,
+        value("--over", "KEY=LOW:HIGH", "Find where stability changes; repeatable."),
     ] = None,
-    ports: Annotated[bool, flag("--ports/--no-ports", "Print what operators feel, and passivity.")] = True,
+    ports: Annotated[
+        bool, flag("--ports/--no-ports", "Print what operators feel, and passivity.")
+    ] = True,
     operators: Annotated[
         list[Path] | None,
-        value("--operators", "FILE", "A measured operator, of `identify hand --json`; repeatable."),
+        value(
+            "--operators", "FILE", "A measured operator, of `identify hand --json`; repeatable."
+        ),
     ] = None,
-    picture: Annotated[Path | None, value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")] = None,
+    picture: Annotated[
+        Path | None, value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")
+    ] = None,
     what: Annotated[
-        LinearFigure, typer.Option("--draw", help="What to draw: roots, impedances, or passivity.")
+        LinearFigure,
+        typer.Option("--draw", help="What to draw: roots, impedances, or passivity."),
     ] = LinearFigure.ROOTS,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Linearises the loop about its equilibrium: stability of small motions, and the operators' impedances.
+    """Linearises the loop about its equilibrium: stability of small motions, and the operators'
+    impedances.
 
-    With delays: roots, delay margin, edges of stability (docs/linear.md); then, with operators and
-    environments off, passivity, Llewellyn's criterion, and impedance (docs/ports.md). Exit code 0 for
-    any verdict.
+    With delays: roots, delay margin, edges of stability (docs/linear.md); then, with operators
+    and environments off, passivity, Llewellyn's criterion, and impedance (docs/ports.md). Exit
+    code 0 for any verdict.
     """
     options.check_picture(picture, force=force)
     from ..studies.hand_impedance import read_hands
@@ -385,7 +455,9 @@ def linear_command(
         hands=read_hands(operators or []),
     )
     shown = found if ports or as_json else replace(found, ports=None)
-    name, of = ("root_map", found) if what is LinearFigure.ROOTS else (f"port_{what}", found.ports)
+    name, of = (
+        ("root_map", found) if what is LinearFigure.ROOTS else (f"port_{what}", found.ports)
+    )
     options.print_drawn(shown, picture, f"linear_figures:draw_{name}", of, as_json=as_json)
 
 
@@ -395,4 +467,6 @@ def _pose(text: str | None) -> tuple[float, ...] | None:
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError:
-        raise UsageError(f"--pose is angles in rad, as in --pose 0.1,0.3, not {text!r}") from None
+        raise UsageError(
+            f"--pose is angles in rad, as in --pose 0.1,0.3, not {text!r}"
+        ) from None

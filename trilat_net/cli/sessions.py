@@ -1,4 +1,6 @@
-"""Sessions: begun on this machine, shown, measured, changed, stopped; and whether one can run here."""
+"""Sessions: begun on this machine, shown, measured, changed, stopped; and whether one can run
+here.
+"""
 
 import re
 from contextlib import suppress
@@ -24,13 +26,19 @@ if TYPE_CHECKING:
 
 
 @options.command("paper --duration 10 --set control.Kd=5")
-def demo_command(scenario: options.ScenarioArgument = "paper", *, run: options.RunOptions) -> None:
-    """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and reports."""
+def demo_command(
+    scenario: options.ScenarioArgument = "paper", *, run: options.RunOptions
+) -> None:
+    """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and
+    reports.
+    """
     run_and_report(run.load(scenario), run)
 
 
 def _describe_kept(path: Path) -> str:
-    """Returns what the log of a session that was interrupted holds and lacks; "" if it cannot be read."""
+    """Returns what the log of a session that was interrupted holds and lacks; "" if it cannot
+    be read.
+    """
     from ..errors import LogError
     from ..log.log_reader import open_log
 
@@ -39,8 +47,12 @@ def _describe_kept(path: Path) -> str:
     return ""
 
 
-def run_and_report(chosen: "Scenario", run: options.RunOptions, page: "PageAttendant | None" = None) -> None:
-    """Runs a scenario live, then verifies and reports; a page may end it as planned, and gets the report."""
+def run_and_report(
+    chosen: "Scenario", run: options.RunOptions, page: "PageAttendant | None" = None
+) -> None:
+    """Runs a scenario live, then verifies and reports; a page may end it as planned, and gets
+    the report.
+    """
     from sites.demo_session import run_demo
 
     from ..files import make_results_folder, require_libraries
@@ -56,12 +68,18 @@ def run_and_report(chosen: "Scenario", run: options.RunOptions, page: "PageAtten
         terminal.print_error(problem)
     there = outcome.log.exists()
     if outcome.interrupted and not (page and there):
-        kept = f"; {outcome.log} holds what there was{_describe_kept(outcome.log)}" if there else ""
+        kept = (
+            f"; {outcome.log} holds what there was{_describe_kept(outcome.log)}"
+            if there
+            else ""
+        )
         terminal.err.print(f"interrupted{kept}", markup=False, soft_wrap=True)
         raise typer.Exit(128 + outcome.interrupted)
     if not there:
         raise typer.Exit(outcome.exit_code)
-    _, conclusion = terminal.conclude_files([outcome.log], results, as_json=run.as_json, png=run.png)
+    _, conclusion = terminal.conclude_files(
+        [outcome.log], results, as_json=run.as_json, png=run.png
+    )
     if page is not None:
         page.offer((conclusion.page, outcome.log))
     if outcome.problems or not conclusion.passed:
@@ -80,8 +98,8 @@ def live_command(
 ) -> None:
     """Runs a scenario live, with a page on which to watch it and take hold of the arms.
 
-    The page's button or Ctrl-C ends the session; then its log is verified and reported. With --session the
-    page shows a session that already runs, and leaves it running.
+    The page's button or Ctrl-C ends the session; then its log is verified and reported. With
+    --session the page shows a session that already runs, and leaves it running.
 
     Options:
         session: Show this running session instead of starting one.
@@ -94,7 +112,16 @@ def live_command(
     page = PageOptions(*serving)
     page.check()
     if session is not None:
-        alone = {"--duration", "--out", "--seed", "--set", "--force", "--png", "--json", "scenario"}
+        alone = {
+            "--duration",
+            "--out",
+            "--seed",
+            "--set",
+            "--force",
+            "--png",
+            "--json",
+            "scenario",
+        }
         if extra := alone & set(options.given_options(context)):
             raise UsageError(
                 f"--session shows a session that runs already: leave out {', '.join(sorted(extra))}"
@@ -102,7 +129,16 @@ def live_command(
         connection = reach.resolve()
         name = options.check_session_name(session)
         show = partial(show_on_page, page, clock, name, say)
-        raise typer.Exit(watch_session(name, connection, clock, show, say, 10.0))
+        raise typer.Exit(
+            watch_session(
+                session=name,
+                connection=connection,
+                clock=clock,
+                show=show,
+                say=say,
+                timeout_s=10.0,
+            )
+        )
     if any(reach):
         raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
     with PageAttendant(page, clock) as attendant:
@@ -118,7 +154,9 @@ def ping_command(
     session: Annotated[str, value("--session", "ID", "Session to measure.")] = "paper",
     *,
     reach: options.Reach,
-    count: Annotated[int, value("--count", "N", "Round trips to each member.", callback=_check_count)] = 50,
+    count: Annotated[
+        int, value("--count", "N", "Round trips to each member.", callback=_check_count)
+    ] = 50,
     timeout: options.AnswerOption = 3.0,
     benchmark: Annotated[
         str | None, value("--benchmark", "SCENARIO", autocompletion=options.complete_scenarios)
@@ -129,7 +167,9 @@ def ping_command(
     overrides: options.SetOption = None,
     seconds: Annotated[
         float | None,
-        value("--seconds", "S", callback=options.check_range(1.0, 86400.0, "a number of seconds")),
+        value(
+            "--seconds", "S", callback=options.check_range(1.0, 86400.0, "a number of seconds")
+        ),
     ] = None,
     picture: Annotated[Path | None, value("--figure", "FILE")] = None,
     force: options.ForceOption = False,
@@ -141,29 +181,41 @@ def ping_command(
 ) -> None:
     """Shows round trip, clock offset and jitter between here and every member of a session.
 
-    The session may still wait for members. If it runs, the links that its sites measure are shown too.
-    Without endpoints it asks the first site, at its loopback port, for the others.
+    The session may still wait for members. If it runs, the links that its sites measure are
+    shown too. Without endpoints it asks the first site, at its loopback port, for the others.
 
-    With --benchmark it needs no session: it measures if the network is good enough for a scenario, by the
-    delay margin of trilat linear. The far end is trilat ping --answer EP on another machine, given as
-    --connect EP; without one it runs here, over TCP, TLS and QUIC. This takes half a minute; exit code 1 if
-    the network is not good enough.
+    With --benchmark it needs no session: it measures if the network is good enough for a
+    scenario, by the delay margin of trilat linear. The far end is trilat ping --answer EP on
+    another machine, given as --connect EP; without one it runs here, over TCP, TLS and QUIC.
+    This takes half a minute; exit code 1 if the network is not good enough.
 
-    With --ros2 it needs no session either: it listens to a topic of ROS 2 over Zenoh, of any type, unseen
-    (docs/ros2.md).
+    With --ros2 it needs no session either: it listens to a topic of ROS 2 over Zenoh, of any
+    type, unseen (docs/ros2.md).
 
     Options:
         benchmark: Measure the network instead, by size, rate and transport, for this scenario.
         ros2: Measure how long messages of this topic of ROS 2 take instead.
-        seconds: Duration of all cases together, s; default 24. With --answer: time until it ends; with
-            --ros2: 5.
+        seconds: Duration of all cases together, s; default 24. With --answer: time until it
+            ends; with --ros2: 5.
         picture: Draw the benchmark: .png, .svg or .pdf.
         answer: Answer benchmarks from elsewhere, at this endpoint; repeatable.
     """
-    ways = {"--benchmark": benchmark is not None, "--ros2": ros2 is not None, "--answer": bool(answer)}
+    ways = {
+        "--benchmark": benchmark is not None,
+        "--ros2": ros2 is not None,
+        "--answer": bool(answer),
+    }
     _refuse_others(context, next((way for way, chosen in ways.items() if chosen), ""))
     if benchmark is not None:
-        return _benchmark(benchmark, overrides, seconds, reach, picture, force=force, as_json=as_json)
+        return _benchmark(
+            scenario=benchmark,
+            overrides=overrides,
+            seconds=seconds,
+            reach=reach,
+            picture=picture,
+            force=force,
+            as_json=as_json,
+        )
     if ros2 is not None:
         return _ping_topic(ros2, ros, domain, seconds or 5.0, as_json=as_json)
     if answer:
@@ -174,7 +226,12 @@ def ping_command(
     clock = make_system_clock(clock_offset, clock_drift)
     with Interrupt() as interrupt:
         found = ping_session(
-            connection, clock, options.check_session_name(session), count, timeout, interrupt.requested
+            connection=connection,
+            clock=clock,
+            session=options.check_session_name(session),
+            count=count,
+            timeout_s=timeout,
+            stopped=interrupt.requested,
         )
         if found is None:
             raise typer.Exit(interrupt.exit_code)
@@ -184,7 +241,16 @@ def ping_command(
     return None
 
 
-_OF_BENCHMARK = {"--benchmark", "--set", "--seconds", "--figure", "--force", "--connect", "--keys", "--json"}
+_OF_BENCHMARK = {
+    "--benchmark",
+    "--set",
+    "--seconds",
+    "--figure",
+    "--force",
+    "--connect",
+    "--keys",
+    "--json",
+}
 _OF_ANSWER = {"--answer", "--seconds", "--keys", "--insecure"}
 _OF_ROS2 = {"--ros2", "--ros", "--domain", "--seconds", "--json"}
 
@@ -213,16 +279,24 @@ def _benchmark(
     from sites.network_benchmark import DEFAULT_S, ping_benchmark
 
     found = ping_benchmark(
-        scenario, overrides or [], duration_s=seconds or DEFAULT_S, connect=reach.connect, keys=reach.keys
+        scenario,
+        overrides or [],
+        duration_s=seconds or DEFAULT_S,
+        connect=reach.connect,
+        keys=reach.keys,
     )
 
     shown = found.to_dict()
-    options.print_drawn(found, picture, "linear_figures:draw_network_delays", shown, as_json=as_json)
+    options.print_drawn(
+        found, picture, "linear_figures:draw_network_delays", shown, as_json=as_json
+    )
     if not found.good:
         raise typer.Exit(1)
 
 
-def _ping_topic(topic: str, routers: list[str] | None, domain: int, lasts_s: float, *, as_json: bool) -> None:
+def _ping_topic(
+    topic: str, routers: list[str] | None, domain: int, lasts_s: float, *, as_json: bool
+) -> None:
     from sites.session_ping import ping_topic
 
     from ..net.ros2_graph import Refusals, Ros2Graph
@@ -231,14 +305,23 @@ def _ping_topic(topic: str, routers: list[str] | None, domain: int, lasts_s: flo
     name = check_ros_name(topic, "topic")
     clock = SystemClock()
     graph = Ros2Graph(
-        Refusals(terminal.print_note), routers or [options.ROS_ROUTER], "", "trilat_ping", clock, domain
+        refusals=Refusals(terminal.print_note),
+        routers=routers or [options.ROS_ROUTER],
+        namespace="",
+        name="trilat_ping",
+        clock=clock,
+        domain=domain,
     )
     with graph, Interrupt() as interrupt:
-        found = ping_topic(graph, clock, name, lasts_s, interrupt.requested)
+        found = ping_topic(
+            graph=graph, clock=clock, topic=name, lasts_s=lasts_s, stopped=interrupt.requested
+        )
     terminal.print_result(found, as_json=as_json)
 
 
-def _answer(endpoints: list[str], keys: Path | None, seconds: float | None, *, insecure: bool) -> None:
+def _answer(
+    endpoints: list[str], keys: Path | None, seconds: float | None, *, insecure: bool
+) -> None:
     from math import inf
 
     from sites.network_benchmark import run_far_end
@@ -246,7 +329,9 @@ def _answer(endpoints: list[str], keys: Path | None, seconds: float | None, *, i
     with Interrupt() as interrupt:
         stopped = interrupt.requested
         last_s = seconds or inf
-        run_far_end(endpoints, keys, stopped, last_s, insecure=insecure, say=terminal.print_line)
+        run_far_end(
+            endpoints, keys, stopped, last_s, insecure=insecure, say=terminal.print_line
+        )
     if interrupt.requested():
         raise typer.Exit(interrupt.exit_code)
 
@@ -261,21 +346,34 @@ def watch_command(
     reach: options.Reach,
     timeout: options.AnswerOption = 10.0,
 ) -> None:
-    """Shows a running session in a terminal, with a line per site, until the session ends or Ctrl-C.
+    """Shows a running session in a terminal, with a line per site, until the session ends or
+    Ctrl-C.
 
-    Each line has angles, |e|, torque, mode, the age of each peer's sample and who holds the arm. The line
-    above has V. Without endpoints it asks the first site, at its loopback port, for the others.
+    Each line has angles, |e|, torque, mode, the age of each peer's sample and who holds the
+    arm. The line above has V. Without endpoints it asks the first site, at its loopback port,
+    for the others.
     """
     from live.terminal_watch import show_in_terminal, watch_session
 
     name = options.check_session_name(session)
     clock = SystemClock()
     show = partial(show_in_terminal, clock, name, as_site, terminal.out)
-    raise typer.Exit(watch_session(name, reach.resolve(), clock, show, terminal.print_line, timeout))
+    raise typer.Exit(
+        watch_session(
+            session=name,
+            connection=reach.resolve(),
+            clock=clock,
+            show=show,
+            say=terminal.print_line,
+            timeout_s=timeout,
+        )
+    )
 
 
 SessionOption = Annotated[str, value("--session", "ID", "The session.")]
-SitesArgument = Annotated[list[str] | None, typer.Argument(metavar="SITE...", help="Default: all.")]
+SitesArgument = Annotated[
+    list[str] | None, typer.Argument(metavar="SITE...", help="Default: all.")
+]
 
 
 def _find(session: str, reach: options.Reach, *, stops: bool = False) -> "RunningSession":
@@ -289,15 +387,17 @@ def _find(session: str, reach: options.Reach, *, stops: bool = False) -> "Runnin
 def stop_command(
     session: SessionOption,
     sites: SitesArgument = None,
-    end: Annotated[bool, flag("--end", "End the whole session instead; recorders get every record.")] = False,
+    end: Annotated[
+        bool, flag("--end", "End the whole session instead; recorders get every record.")
+    ] = False,
     *,
     reach: options.Reach,
 ) -> None:
     """Stops arms at once while the session goes on: they come to rest where they are.
 
-    They stay stopped until `trilat enable`. With --end all sites end their run at the same time instead.
-    Without endpoints it asks sites on this machine at once where their files say that they are, else the
-    first site, at its loopback port, for the others.
+    They stay stopped until `trilat enable`. With --end all sites end their run at the same time
+    instead. Without endpoints it asks sites on this machine at once where their files say that
+    they are, else the first site, at its loopback port, for the others.
     """
     if end and sites:
         raise UsageError("--end ends the whole session: name no site")
@@ -306,7 +406,9 @@ def stop_command(
 
 
 @options.command("--session paper s")
-def enable_command(session: SessionOption, sites: SitesArgument = None, *, reach: options.Reach) -> None:
+def enable_command(
+    session: SessionOption, sites: SitesArgument = None, *, reach: options.Reach
+) -> None:
     """Lets stopped arms follow again: they wait for their peers and align with them."""
     terminal.print_texts(_find(session, reach).enable(*(sites or ())))
 
@@ -318,7 +420,9 @@ def reset_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Ends the fault of sites unless its cause persists: they wait for their peers and align with them."""
+    """Ends the fault of sites unless its cause persists: they wait for their peers and align
+    with them.
+    """
     terminal.print_texts(_find(session, reach).reset(*sites))
 
 
@@ -342,7 +446,9 @@ def parse_share(text: str) -> float:
     try:
         return float(number) / (100.0 if number != text.strip() else 1.0)
     except ValueError:
-        raise UsageError(f"a share is a number or a percentage, as in 0.05 or 5%, not {text!r}") from None
+        raise UsageError(
+            f"a share is a number or a percentage, as in 0.05 or 5%, not {text!r}"
+        ) from None
 
 
 def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
@@ -359,7 +465,9 @@ def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
 
 def set_command(
     context: typer.Context,
-    session: Annotated[str | None, value("--session", "ID", "Session to change; required.")] = None,
+    session: Annotated[
+        str | None, value("--session", "ID", "Session to change; required.")
+    ] = None,
     *,
     reach: options.Reach,
 ) -> None:
@@ -375,11 +483,16 @@ def set_command(
 def set_link_command(
     context: typer.Context,
     name: Annotated[str, typer.Argument(help="The link, as in m1->s.", metavar="FROM->TO")],
-    delay: Annotated[str | None, typer.Option("--delay", help="New delay, as in 350ms.")] = None,
+    delay: Annotated[
+        str | None, typer.Option("--delay", help="New delay, as in 350ms.")
+    ] = None,
     loss: Annotated[str | None, typer.Option("--loss", help="New loss, as in 5%.")] = None,
-    preset: Annotated[str | None, typer.Option("--preset", help="A named link, as in 4g.")] = None,
+    preset: Annotated[
+        str | None, typer.Option("--preset", help="A named link, as in 4g.")
+    ] = None,
     to: Annotated[
-        list[str] | None, value("--to", "KEY=VALUE", "Any key of a link, as in model=gamma; repeatable.")
+        list[str] | None,
+        value("--to", "KEY=VALUE", "Any key of a link, as in model=gamma; repeatable."),
     ] = None,
 ) -> None:
     """Changes the given keys of a directed link; a model or a preset replaces all of them."""
@@ -403,13 +516,24 @@ def set_dominance_command(
     context: typer.Context,
     site: Annotated[str, typer.Argument(help="Site whose dominance row changes.")],
     shares: Annotated[
-        list[str], typer.Argument(metavar="PEER=SHARE...", help="New shares of its peers, which sum to 1.")
+        list[str],
+        typer.Argument(
+            metavar="PEER=SHARE...", help="New shares of its peers, which sum to 1."
+        ),
     ],
-    ramp: Annotated[str, typer.Option("--ramp", help="Duration of the change, as in 2s.")] = "1s",
+    ramp: Annotated[
+        str, typer.Option("--ramp", help="Duration of the change, as in 2s.")
+    ] = "1s",
 ) -> None:
     """Changes one row of the dominance matrix along a linear ramp; it sums to 1 throughout."""
-    table = {peer: parse_share(str(value)) for peer, value in parse_pairs(shares, "m1=0.9").items()}
-    _send_change(context, site, {"dominance": site, "to": table, "ramp_s": parse_milliseconds(ramp) / 1e3})
+    table = {
+        peer: parse_share(str(value)) for peer, value in parse_pairs(shares, "m1=0.9").items()
+    }
+    _send_change(
+        context,
+        site,
+        {"dominance": site, "to": table, "ramp_s": parse_milliseconds(ramp) / 1e3},
+    )
 
 
 def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> None:
@@ -433,21 +557,32 @@ def doctor_command(
     *,
     ways: options.MemberOptions,
     session: Annotated[
-        str | None, value("--session", "ID", "Also ask the members of this session for their clocks.")
+        str | None,
+        value("--session", "ID", "Also ask the members of this session for their clocks."),
     ] = None,
-    folder: Annotated[Path, value("--out -o", "DIR", "Folder where results would go.")] = Path("runs"),
+    folder: Annotated[Path, value("--out -o", "DIR", "Folder where results would go.")] = Path(
+        "runs"
+    ),
     as_json: options.JsonOption = False,
 ) -> None:
-    """Checks keys, endpoints, clocks, real-time rights, disk and processors: one line per finding.
+    """Checks keys, endpoints, clocks, real-time rights, disk and processors: one line per
+    finding.
 
-    Give it the options that a site, recorder or router on this machine would get. Exit code 1 if a check
-    fails.
+    Give it the options that a site, recorder or router on this machine would get. Exit code 1
+    if a check fails.
     """
     from sites.doctor import examine_machine
 
     connection = ways.find_endpoints()
     name = None if session is None else options.check_session_name(session)
-    examined = examine_machine(connection, ways.keys, folder, name, SystemClock(), insecure=ways.insecure)
+    examined = examine_machine(
+        connection=connection,
+        keys=ways.keys,
+        folder=folder,
+        session=name,
+        clock=SystemClock(),
+        insecure=ways.insecure,
+    )
     findings = []
     for finding in examined:
         findings.append(finding)

@@ -1,6 +1,8 @@
-"""Studies of some runs: scenarios with what they [expect], logs side by side, laws, experiments with people.
+"""Studies of some runs: scenarios with what they [expect], logs side by side, laws, experiments
+with people.
 
-Invariant: numbers are printed and nothing is ranked. A suite that is interrupted goes on by the same command.
+Invariant: numbers are printed and nothing is ranked. A suite that is interrupted goes on by the
+same command.
 """
 
 import os
@@ -45,18 +47,27 @@ def test_command(
         ),
     ] = None,
     live: Annotated[
-        bool, flag("--live/--virtual", "Run live over a network, one after the other, or in virtual time.")
+        bool,
+        flag(
+            "--live/--virtual",
+            "Run live over a network, one after the other, or in virtual time.",
+        ),
     ] = False,
     seeds: Annotated[
-        str | None, value("--seeds", "LIST", "Seeds, as in 1..20 or 1,5,9; default: the scenario's.")
+        str | None,
+        value("--seeds", "LIST", "Seeds, as in 1..20 or 1,5,9; default: the scenario's."),
     ] = None,
-    junit: Annotated[Path | None, value("--junit", "FILE", "Write the results as JUnit XML as well.")] = None,
+    junit: Annotated[
+        Path | None, value("--junit", "FILE", "Write the results as JUnit XML as well.")
+    ] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
     overrides: options.SetOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    r"""Runs scenarios and checks their \[expect]: margins, and commands that repeat what failed."""
+    r"""Runs scenarios and checks their \[expect]: margins, and commands that repeat what
+    failed.
+    """
     from ..files import write_whole
     from ..studies.executor import check_workers
     from ..studies.trials import encode_junit_xml
@@ -95,14 +106,18 @@ def parse_seeds(text: str | None) -> list[int]:
     return seeds
 
 
-def _batch(sources: list[str], seeds: list[int], overrides: list[str], *, live: bool) -> "list[Trial]":
+def _batch(
+    sources: list[str], seeds: list[int], overrides: list[str], *, live: bool
+) -> "list[Trial]":
     """Returns all trials; without sources, of every shipped scenario that expects something."""
     from ..scenario import list_shipped, load_scenario
     from ..studies.trials import trials
 
     chosen = sources or [name for name in list_shipped() if load_scenario(name).expect.asks]
     return [
-        trial for source in dict.fromkeys(chosen) for trial in trials(source, seeds, overrides, live=live)
+        trial
+        for source in dict.fromkeys(chosen)
+        for trial in trials(source, seeds, overrides, live=live)
     ]
 
 
@@ -159,7 +174,8 @@ _LINES = 10
 def show_progress(
     label: str, print_line: Callable[[str], None], items: str = "runs"
 ) -> Iterator[Callable[[int, int], None]]:
-    """Yields a function to call with (done, total): it shows a bar, or lines where there is no terminal.
+    """Yields a function to call with (done, total): it shows a bar, or lines where there is no
+    terminal.
 
     Args:
         label: what a bar is called.
@@ -192,7 +208,13 @@ def show_progress(
 
 
 def _run_tuning(
-    asked: "TuningPlan", folder: Path | None, jobs: int | None, on: str | None, *, force: bool, as_json: bool
+    asked: "TuningPlan",
+    folder: Path | None,
+    jobs: int | None,
+    on: str | None,
+    *,
+    force: bool,
+    as_json: bool,
 ) -> None:
     from ..files import make_results_folder
     from ..studies.executor import count_workers
@@ -242,16 +264,17 @@ def compare_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Compares logs and the differences of their experiments; or control laws, all tuned by one procedure.
+    """Compares logs and the differences of their experiments; or control laws, all tuned by one
+    procedure.
 
     Ranks nothing: arms that hang, or that no operator moves, also have small errors.
 
     Options:
         files: Two or more MCAP logs.
         tune: Compare tuned control laws in this scenario instead.
-        law: Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: adaptive_robust, known, p_f, wave,
-            tdpa, tanks, four_channel, six_channel, saturated_pd, authority, impedance, smith, and your own,
-            as in mylaws:Law.
+        law: Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: adaptive_robust,
+            known, p_f, wave, tdpa, tanks, four_channel, six_channel, saturated_pd, authority,
+            impedance, smith, and your own, as in mylaws:Law.
         seeds: Seeds of the scenario that each candidate is the mean of.
         objective: The objective besides effort.
         gravity: Gravity that all laws assume, in % of the truth.
@@ -260,7 +283,9 @@ def compare_command(
     if tune is None:
         for name in options.given_options(context):
             if name not in ("files", "--json"):
-                raise UsageError(f"{name} belongs to --tune SCENARIO; logs are compared as they are")
+                raise UsageError(
+                    f"{name} belongs to --tune SCENARIO; logs are compared as they are"
+                )
         from ..studies.log_comparison import compare
 
         logs = [terminal.open_with_progress(file) for file in files or []]
@@ -283,28 +308,40 @@ def compare_command(
     _run_tuning(asked, output, jobs, on, force=force, as_json=as_json)
 
 
-@options.command("--arm arm6.urdf --delay 40ms --figure gains.png", "--arm my.urdf --delay measured:run.mcap")
+@options.command(
+    "--arm arm6.urdf --delay 40ms --figure gains.png", "--arm my.urdf --delay measured:run.mcap"
+)
 def tune_command(
     arm: Annotated[Path, value("--arm", "URDF", "The arm: a file, or a shipped one.")],
     delay: Annotated[str, value("--delay", "40ms|measured:SESSION|CSV")],
     law: Annotated[str, value("--law", "LAW", "p_d, pd_d or saturated_pd.")] = "p_d",
-    tip: Annotated[str, value("--tip", "LINK", "End link; default: the only one without a child.")] = "",
-    sites: Annotated[int, value("--sites", "2|3", "How many such arms follow one another.")] = 2,
+    tip: Annotated[
+        str, value("--tip", "LINK", "End link; default: the only one without a child.")
+    ] = "",
+    sites: Annotated[
+        int, value("--sites", "2|3", "How many such arms follow one another.")
+    ] = 2,
     rate: Annotated[int, value("--rate", "HZ", "Tick rate.")] = 1000,
-    margin: Annotated[float, value("--margin", "FACTOR", "By how much K is below the edge.")] = 2.0,
+    margin: Annotated[
+        float, value("--margin", "FACTOR", "By how much K is below the edge.")
+    ] = 2.0,
     damping: Annotated[float, value("--damping", "RATIO", "Damping ratio of an arm.")] = 0.7,
     quantile: Annotated[float, value("--quantile", "SHARE")] = 1.0,
     overrides: options.SetOption = None,
     *,
     reach: options.Reach,
-    picture: Annotated[Path | None, value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")] = None,
+    picture: Annotated[
+        Path | None, value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")
+    ] = None,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Finds the largest gains that an arm bears over a delay, with a margin, and confirms them by runs.
+    """Finds the largest gains that an arm bears over a delay, with a margin, and confirms them
+    by runs.
 
-    Such arms follow one another over links of that delay both ways (docs/arms.md). The last line is one to
-    paste into a scenario. Exit code 0: all runs do as the linear loop predicts. 1: one does not.
+    Such arms follow one another over links of that delay both ways (docs/arms.md). The last
+    line is one to paste into a scenario. Exit code 0: all runs do as the linear loop predicts.
+    1: one does not.
 
     Options:
         delay: One way; the delays of a log, of a running session, or of a table t_s,delay_ms.
@@ -317,14 +354,20 @@ def tune_command(
     wanted: dict[str, Any] = {"margin": margin, "damping": damping, "quantile": quantile}
     there = _measure_delay(delay, reach)
     with terminal.progress_bar("edge and runs") as show:
-        found = tune_arm(arm, there, law, **loop, **wanted, curve=picture is not None, progress=show)
-    options.print_drawn(found, picture, "linear_figures:draw_arm_gains", found.to_dict(), as_json=as_json)
+        found = tune_arm(
+            arm, there, law, **loop, **wanted, curve=picture is not None, progress=show
+        )
+    options.print_drawn(
+        found, picture, "linear_figures:draw_arm_gains", found.to_dict(), as_json=as_json
+    )
     if not found.agree:
         raise typer.Exit(1)
 
 
 def _measure_delay(text: str, reach: options.Reach) -> str:
-    """Returns a delay; of a running session that of its slowest link, or half of its longest round trip."""
+    """Returns a delay; of a running session that of its slowest link, or half of its longest
+    round trip.
+    """
     name = text.removeprefix("measured:")
     if name == text or name.endswith(".mcap"):
         return text
@@ -342,17 +385,25 @@ def _tune(laws: list[str], study: str, jobs: int | None, on: str | None) -> None
     from ..studies.bench.bench_plan import GAINS_FILE, STUDIES, tune_laws, write_gains
 
     asked = STUDIES[study].laws
-    unknown = [law for law in laws if law not in {law for known in asked.values() for law in known}]
+    unknown = [
+        law for law in laws if law not in {law for known in asked.values() for law in known}
+    ]
     if unknown:
         raise UsageError(f"--law: {unknown[0]} is none of the study {study}")
-    wanted = {form: [law for law in known if law in laws or not laws] for form, known in asked.items()}
+    wanted = {
+        form: [law for law in known if law in laws or not laws] for form, known in asked.items()
+    }
     with show_progress("tuning", terminal.print_note) as progress:
-        found = tune_laws({form: kept for form, kept in wanted.items() if kept}, jobs, on, progress)
+        found = tune_laws(
+            {form: kept for form, kept in wanted.items() if kept}, jobs, on, progress
+        )
     write_gains(found)
     terminal.print_paths([GAINS_FILE])
 
 
-def _run(folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bool) -> "BenchResults":
+def _run(
+    folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bool
+) -> "BenchResults":
     from ..studies.bench import run_bench
 
     try:
@@ -365,12 +416,18 @@ def _run(folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bo
 
 @options.command("--small", "--study round-trips --law wave,smith")
 def bench_command(
-    study: Annotated[str, value("--study", "full|small|round-trips", "Part of the suite to run.")] = "full",
-    small: Annotated[bool, typer.Option("--small", help="Same as --study small: some minutes.")] = False,
+    study: Annotated[
+        str, value("--study", "full|small|round-trips", "Part of the suite to run.")
+    ] = "full",
+    small: Annotated[
+        bool, typer.Option("--small", help="Same as --study small: some minutes.")
+    ] = False,
     task: Annotated[str | None, value("--task", "TASK,TASK...", "Only these tasks.")] = None,
     law: Annotated[str | None, value("--law", "LAW,LAW...", "Only these laws.")] = None,
     link: Annotated[str | None, value("--link", "LINK,LINK...")] = None,
-    seeds: Annotated[int | None, value("--seeds", "N", "Number of seeds; default: the study's.")] = None,
+    seeds: Annotated[
+        int | None, value("--seeds", "N", "Number of seeds; default: the study's.")
+    ] = None,
     cell: Annotated[str | None, value("--cell", "TASK/LAW/LINK")] = None,
     tune: Annotated[bool, typer.Option("--tune", rich_help_panel="Gains")] = False,
     confirm: Annotated[bool, typer.Option("--confirm")] = False,
@@ -379,9 +436,11 @@ def bench_command(
     on: options.OnOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs control laws on the same tasks over the same links: stability, energy, errors, effort, stiffness.
+    """Runs control laws on the same tasks over the same links: stability, energy, errors,
+    effort, stiffness.
 
-    One procedure tuned the gains of every law. Finished runs are kept: the same command continues.
+    One procedure tuned the gains of every law. Finished runs are kept: the same command
+    continues.
 
     Options:
         link: Other links, as in rtt68-loss10,4g.
@@ -410,16 +469,22 @@ def bench_command(
         return
     stale = find_stale({str(one.tuned): one.tuned for one in plan.cells}.values())
     if stale:
-        terminal.print_note(f"tuned for another text of law or task, see --tune: {', '.join(stale)}")
+        terminal.print_note(
+            f"tuned for another text of law or task, see --tune: {', '.join(stale)}"
+        )
     folder = prepare_bench_folder(plan, output)
     terminal.print_note(
         f"{count_nouns(len(plan.cells), 'cell')}, {count_nouns(plan.runs, 'run')}, into {folder.path}"
     )
     results = _run(folder, jobs, on, confirm=confirm)
     given = {"--task": task, "--law": law, "--link": link, "--seeds": seeds}
-    words = [word for key, value in given.items() if value is not None for word in (key, str(value))]
+    words = [
+        word for key, value in given.items() if value is not None for word in (key, str(value))
+    ]
     words += ["--confirm"] if confirm else []
-    paths = write_bench(results, folder.path, format_command("bench", "--study", chosen, *words))
+    paths = write_bench(
+        results, folder.path, format_command("bench", "--study", chosen, *words)
+    )
     terminal.print_result(results, as_json=as_json)
     terminal.print_paths([] if as_json else paths)
 
@@ -442,7 +507,9 @@ def experiment_new_command(
 
 
 @options.command("reaching.toml")
-def experiment_check_command(file: ProtocolArgument, as_json: options.JsonOption = False) -> None:
+def experiment_check_command(
+    file: ProtocolArgument, as_json: options.JsonOption = False
+) -> None:
     """Prints the plan of a protocol, or everything that is wrong with it."""
     from ..studies.experiment.experiment_run import check_experiment
 
@@ -451,8 +518,12 @@ def experiment_check_command(file: ProtocolArgument, as_json: options.JsonOption
 
 @options.command("reaching.toml", "two-people.toml --live", "runs/experiment-reaching-001")
 def experiment_run_command(
-    file: Annotated[Path, typer.Argument(help="A protocol, or the folder of one that goes on.")],
-    out: Annotated[Path | None, value("--out -o", "DIR", "Default: runs/experiment-NAME-N.")] = None,
+    file: Annotated[
+        Path, typer.Argument(help="A protocol, or the folder of one that goes on.")
+    ],
+    out: Annotated[
+        Path | None, value("--out -o", "DIR", "Default: runs/experiment-NAME-N.")
+    ] = None,
     live: Annotated[bool, flag("--live", "With people, on pages in their browsers.")] = False,
     *,
     serving: options.PageServing,
@@ -462,8 +533,9 @@ def experiment_run_command(
 ) -> None:
     """Runs an experiment: with synthetic participants in virtual time, or with people.
 
-    Each trial leaves a verified log. With --live it prints a link for the experimenter and one for each user;
-    trials begin once all users are ready on their pages. The page's button or Ctrl-C ends it for now.
+    Each trial leaves a verified log. With --live it prints a link for the experimenter and one
+    for each user; trials begin once all users are ready on their pages. The page's button or
+    Ctrl-C ends it for now.
     """
     from live.page_server import PageOptions
 
@@ -478,7 +550,9 @@ def experiment_run_command(
         terminal.print_text(
             f"{count_nouns(len(begun.plan.trials), 'trial')}, into {begun.folder}; it goes on after Ctrl-C by"
         )
-        terminal.print_text(f"  trilat experiment run {begun.folder}{' --live' if live else ''}")
+        terminal.print_text(
+            f"  trilat experiment run {begun.folder}{' --live' if live else ''}"
+        )
         if live:
             from live.experiment_sessions import run_with_people
 
@@ -494,10 +568,14 @@ def experiment_run_command(
 @options.command("runs/experiment-reaching-001")
 def experiment_analyse_command(
     folder: FolderArgument,
-    out: Annotated[Path | None, value("--out -o", "DIR", "Default: its folder analysis.")] = None,
+    out: Annotated[
+        Path | None, value("--out -o", "DIR", "Default: its folder analysis.")
+    ] = None,
     exclude: Annotated[
         list[str] | None,
-        value("--exclude", "WHO=WHY", "Leave out a participant or pair, and say why; repeatable."),
+        value(
+            "--exclude", "WHO=WHY", "Leave out a participant or pair, and say why; repeatable."
+        ),
     ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -512,19 +590,29 @@ def experiment_analyse_command(
 
 @options.command("0.8 --participants 16")
 def experiment_power_command(
-    effect: Annotated[float, typer.Argument(help="Cohen's d_z of a paired comparison.", min=0.01, max=10.0)],
-    participants: Annotated[int | None, value("--participants", "N", "How many there are.", min=2)] = None,
+    effect: Annotated[
+        float, typer.Argument(help="Cohen's d_z of a paired comparison.", min=0.01, max=10.0)
+    ],
+    participants: Annotated[
+        int | None, value("--participants", "N", "How many there are.", min=2)
+    ] = None,
     seed: Annotated[int, value("--seed", "S", "Of the experiments that are drawn.")] = 1,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Tells how many participants it takes to find an effect, by theory and by drawn experiments."""
+    """Tells how many participants it takes to find an effect, by theory and by drawn
+    experiments.
+    """
     from ..studies.experiment.experiment_analysis import compute_experiment_power
 
-    terminal.print_result(compute_experiment_power(effect, participants, seed=seed), as_json=as_json)
+    terminal.print_result(
+        compute_experiment_power(effect, participants, seed=seed), as_json=as_json
+    )
 
 
 @options.command("runs/experiment-reaching-001")
-def experiment_status_command(folder: FolderArgument, as_json: options.JsonOption = False) -> None:
+def experiment_status_command(
+    folder: FolderArgument, as_json: options.JsonOption = False
+) -> None:
     """Prints how far an experiment is, and whether its logs are those that its trials wrote."""
     from ..studies.experiment.experiment_run import list_log_problems, open_experiment
 

@@ -1,7 +1,8 @@
-"""`trilat sweep`: runs a scenario over a grid of its keys, maps stability, finds edges, confirms cells live.
+"""`trilat sweep`: runs a scenario over a grid of its keys, maps stability, finds edges,
+confirms cells live.
 
-Invariant: everything printed is in the result files too, except live runs, which have logs. A sweep that is
-interrupted prints the command that resumes it.
+Invariant: everything printed is in the result files too, except live runs, which have logs. A
+sweep that is interrupted prints the command that resumes it.
 """
 
 from collections.abc import Callable, Sequence
@@ -57,7 +58,9 @@ def _draw_map(
     words = [] if width is None else ["--width", f"{width:g}"]
     command = build_sweep_command(results.plan, "--map", *words)
     terminal.print_text("map: the lines of theory ...")
-    with show_progress("linear analysis", terminal.print_text, "columns of the map") as progress:
+    with show_progress(
+        "linear analysis", terminal.print_text, "columns of the map"
+    ) as progress:
         made = build_stability_map(results, (command,), jobs, progress, on=on)
     terminal.print_texts(f"note: {line}" for line in made.remarks)
     terminal.print_text("map: drawing ...")
@@ -76,7 +79,8 @@ def _search_margins(
     *,
     as_json: bool,
 ) -> None:
-    """Searches edges along one key, prints them with theory, and writes margin.json and margin.md.
+    """Searches edges along one key, prints them with theory, and writes margin.json and
+    margin.md.
 
     The last axis of the plan is the two ends of the range.
     """
@@ -88,7 +92,11 @@ def _search_margins(
         terminal.lines_aside(as_json),
         show_progress("searching", terminal.print_text, "places") as progress,
     ):
-        found = SweepMargins(asked, within, search_margins(asked, within, jobs, progress, on))
+        found = SweepMargins(
+            asked,
+            within,
+            search_margins(plan=asked, within=within, jobs=jobs, progress=progress, on=on),
+        )
     paths = found.write(chosen)
     if not as_json:
         terminal.out.print()
@@ -154,7 +162,9 @@ def _run_sweep(
         terminal.out.print("nothing was left to run")
     speed = [sweep_run.describe_sweep_speed(swept)] if swept.runs else []
     _print_results(
-        swept.results, [*speed, f"results: {folder.path / sweep_results.RESULTS_FILE}"], folder.path
+        swept.results,
+        [*speed, f"results: {folder.path / sweep_results.RESULTS_FILE}"],
+        folder.path,
     )
     return swept
 
@@ -167,7 +177,9 @@ def _run_in_folder(
 
     try:
         with show_progress("sweeping", terminal.print_text) as progress:
-            return run_sweep(folder, jobs, progress, expected.entries, on)
+            return run_sweep(
+                folder=folder, jobs=jobs, progress=progress, known=expected.entries, on=on
+            )
     except KeyboardInterrupt:
         resume = join_words(["trilat", "sweep", "--resume", str(folder.path)])
         kept = (
@@ -194,7 +206,9 @@ def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
     if as_json:
         return terminal.print_json([dict(row) for row in results.of_cell(number)])
     for row in results.of_cell(number):
-        command, note = build_reproduce_command(results, row, path if path.is_dir() else path.parent)
+        command, note = build_reproduce_command(
+            results, row, path if path.is_dir() else path.parent
+        )
         if note:
             terminal.print_note(note)
         terminal.print_line(command)
@@ -209,7 +223,8 @@ def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
 def sweep_command(
     context: typer.Context,
     scenario: Annotated[
-        str | None, typer.Argument(metavar="[SCENARIO|RESULTS]", autocompletion=options.complete_scenarios)
+        str | None,
+        typer.Argument(metavar="[SCENARIO|RESULTS]", autocompletion=options.complete_scenarios),
     ] = None,
     over: Annotated[list[str] | None, value("--over", "KEY=VALUES")] = None,
     seeds: Annotated[str | None, value("--seeds", "N|LIST")] = None,
@@ -219,30 +234,38 @@ def sweep_command(
     judge: Annotated[str, value("--judge", "verdict|twins")] = "verdict",
     metric: Annotated[list[str] | None, value("--metric", "KEY")] = None,
     output: Annotated[Path | None, value("-o --out", "DIR")] = None,
-    resume: Annotated[Path | None, value("--resume", "DIR", "Continue an interrupted sweep.")] = None,
+    resume: Annotated[
+        Path | None, value("--resume", "DIR", "Continue an interrupted sweep.")
+    ] = None,
     cell: Annotated[int | None, value("--cell", "N")] = None,
     jobs: options.JobsOption = None,
     on: options.OnOption = None,
     yes: Annotated[bool, flag("--yes", "Run an oversized sweep.")] = False,
     overrides: options.SetOption = None,
-    mapped: Annotated[bool, _option("--map", help="Draw the stability map with theory lines.")] = False,
+    mapped: Annotated[
+        bool, _option("--map", help="Draw the stability map with theory lines.")
+    ] = False,
     width: Annotated[float | None, _option("--width", metavar="3.5|7")] = None,
     margin: Annotated[str | None, _option("--margin", metavar="KEY=FROM:TO")] = None,
     tolerance: Annotated[float, _option("--tolerance", metavar="SHARE")] = 0.005,
     confirm: Annotated[int | None, _option("--confirm", metavar="K", min=1)] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs a scenario over a grid of its keys, in virtual time on all cores, and classifies stability.
+    """Runs a scenario over a grid of its keys, in virtual time on all cores, and classifies
+    stability.
 
-    Finished runs are kept, however the sweep ends: --resume, or the same command with the same -o, continues.
+    Finished runs are kept, however the sweep ends: --resume, or the same command with the same
+    -o, continues.
 
     Options:
-        scenario: Name of a shipped scenario, or path of a TOML file; or path of the results of a sweep.
+        scenario: Name of a shipped scenario, or path of a TOML file; or path of the results of
+            a sweep.
         over: An axis, as in link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.
         seeds: How many seeds, or a list, as in 1..20; default: one.
         law: Sweep laws as well; default: the scenario's.
         longest: Longest run of an undecided cell, s; default: eight times the duration.
-        judge: What a map shows: classes, or growth exponents of pushed twins, for which short runs suffice.
+        judge: What a map shows: classes, or growth exponents of pushed twins, for which short
+            runs suffice.
         metric: Measure this of every run besides (docs/metrics.md); repeatable.
         output: Folder of the results; a sweep in it is continued. Default: runs/sweep-NAME-N.
         cell: With results: print the commands that make logs of a cell.
@@ -263,7 +286,9 @@ def sweep_command(
         raise UsageError("--confirm is of results: trilat sweep FOLDER --confirm 5")
     if resume is not None:
         if scenario is not None or cell is not None:
-            raise UsageError("--resume goes on with the sweep of its folder: leave the rest out")
+            raise UsageError(
+                "--resume goes on with the sweep of its folder: leave the rest out"
+            )
         with terminal.lines_aside(as_json):
             swept = _run_sweep(None, resume, jobs, on, yes=yes)
     elif cell is not None:
@@ -273,16 +298,22 @@ def sweep_command(
     elif results is not None:
         return _show_results(results, confirm, draw if mapped else None, as_json=as_json)
     elif scenario is None or not (over or law or seeds or margin):
-        raise UsageError("name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50")
+        raise UsageError(
+            "name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50"
+        )
     else:
         within = None if margin is None else parse_search_range(margin, tolerance)
         axes = [*(over or []), *([] if within is None else [format_range_axis(within)])]
         laws = options.split_names(law)
         texts = options.list_overrides(overrides, duration)
         more: dict[str, Any] = {"longest_s": longest, "judge": judge, "metrics": metric or ()}
-        asked = plan_sweep(scenario, texts, over=axes, seeds=parse_seed_count(seeds), laws=laws, **more)
+        asked = plan_sweep(
+            scenario, texts, over=axes, seeds=parse_seed_count(seeds), laws=laws, **more
+        )
         if within is not None:
-            return _search_margins(asked, within, output, jobs, on, as_json=as_json)
+            return _search_margins(
+                asked=asked, within=within, folder=output, jobs=jobs, on=on, as_json=as_json
+            )
         with terminal.lines_aside(as_json):
             swept = _run_sweep(asked, output, jobs, on, yes=yes)
     if mapped:
@@ -294,7 +325,11 @@ def sweep_command(
 
 
 def _show_results(
-    path: Path, confirm: int | None, draw: "Callable[[SweepResults, Path], None] | None", *, as_json: bool
+    path: Path,
+    confirm: int | None,
+    draw: "Callable[[SweepResults, Path], None] | None",
+    *,
+    as_json: bool,
 ) -> None:
     from ..studies.sweep.sweep_results import describe_sweep_plan, read_results
 
@@ -311,7 +346,17 @@ def _show_results(
         terminal.print_json(results.to_dict())
 
 
-_OF_A_PLAN = ("--over", "--seeds", "--law", "-o", "--longest", "--judge", "--metric", "--set", "--duration")
+_OF_A_PLAN = (
+    "--over",
+    "--seeds",
+    "--law",
+    "-o",
+    "--longest",
+    "--judge",
+    "--metric",
+    "--set",
+    "--duration",
+)
 
 
 def _refuse_beside_results(given: Sequence[str]) -> None:
@@ -323,7 +368,9 @@ def _refuse_beside_results(given: Sequence[str]) -> None:
 
 
 def parse_seed_count(text: str | None) -> int | list[int]:
-    """Returns the number of seeds of a text such as 10, or the seeds of 1..20, 1,5,9 or 7,; 1 for None."""
+    """Returns the number of seeds of a text such as 10, or the seeds of 1..20, 1,5,9 or 7,; 1
+    for None.
+    """
     if text is None:
         return 1
     if text.strip().isdecimal() and len(text) < 19:
@@ -336,4 +383,6 @@ def _is_results(source: str) -> bool:
     from ..scenario import list_shipped
     from ..studies.sweep.sweep_results import PLAN_FILE
 
-    return source not in list_shipped() and (source.endswith(".csv") or (Path(source) / PLAN_FILE).exists())
+    return source not in list_shipped() and (
+        source.endswith(".csv") or (Path(source) / PLAN_FILE).exists()
+    )

@@ -1,21 +1,26 @@
-"""A serial chain of revolute and prismatic joints: kinematics, inverse and forward dynamics, by recursion.
+"""A serial chain of revolute and prismatic joints: kinematics, inverse and forward dynamics, by
+recursion.
 
-Invariant: nothing is allocated, and every sum has a fixed order. Each link has ten inertial parameters,
-pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) about the origin of its own frame, in which all dynamics are
-linear; theta is theirs one after the other, shape (10 n,). A link's frame is that of its joint, whose axis
-is constant in it. Of a spatial vector the linear half comes first, at the frame's origin.
+Invariant: nothing is allocated, and every sum has a fixed order. Each link has ten inertial
+parameters, pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) about the origin of its own frame, in
+which all dynamics are linear; theta is theirs one after the other, shape (10 n,). A link's
+frame is that of its joint, whose axis is constant in it. Of a spatial vector the linear half
+comes first, at the frame's origin.
 
-Equations: Newton-Euler recursion with the two velocities that Eq. (12) of the paper needs apart,
+Equations: Newton-Euler recursion with the two velocities that Eq. (12) of the paper needs
+apart,
 
     V_i = X V_p + S qd      W_i = X W_p + S v      A_i = X A_p + S a + V_i x (S v)
     f_i = I A_i + 1/2 (V_i x* I W_i + W_i x* I V_i - I (V_i x W_i))      tau_i = S' f_i
 
-whose product of velocities is the one by Christoffel symbols, so that dM/dt - 2 C is skew, Eq. (4). With
-s = V - W the gradient of r' tau by pi is Y' r of Eq. (15), link by link, without a regressor.
+whose product of velocities is the one by Christoffel symbols, so that dM/dt - 2 C is skew, Eq.
+(4). With s = V - W the gradient of r' tau by pi is Y' r of Eq. (15), link by link, without a
+regressor.
 
-Source: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors, Newton-Euler and
-composite bodies; G. Niemeyer and J.-J. Slotine, "Performance in adaptive manipulator control", Int. J.
-Robotics Research 10 (1991), for the recursion of the adaptive law.
+Source: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors,
+Newton-Euler and composite bodies; G. Niemeyer and J.-J. Slotine, "Performance in adaptive
+manipulator control", Int. J. Robotics Research 10 (1991), for the recursion of the adaptive
+law.
 """
 
 from collections.abc import Sequence
@@ -32,7 +37,9 @@ from .vectors import Array, Row, RowArray, Vector
 LINK_PARAMETERS = 10
 MAX_JOINTS = 12
 COULOMB_SPEED = 0.01
-"""The speed, rad/s or m/s, at which Coulomb friction has 71 % of its full size: it is smooth through 0."""
+"""The speed, rad/s or m/s, at which Coulomb friction has 71 % of its full size: it is smooth
+through 0.
+"""
 
 Three = tuple[float, float, float]
 Matrix = tuple[Three, Three, Three]
@@ -44,7 +51,8 @@ class ChainJoint(NamedTuple):
     Attributes:
         prismatic: true: it slides (m, N), else it turns (rad, N m).
         axis: of motion, length 1, in the link's frame.
-        rotation: orientation of the link's frame in that of the link before, at position 0: three rows.
+        rotation: orientation of the link's frame in that of the link before, at position 0:
+            three rows.
         origin_m: its place there.
         armature_kg_m2: inertia of the drive as the joint has it; kg of a prismatic joint.
         viscous: friction per speed, N m s/rad or N s/m.
@@ -68,21 +76,37 @@ class ChainJoint(NamedTuple):
     stop_damping: float = 0.0
 
 
-_DRIVE = ("armature_kg_m2", "viscous", "coulomb", "lower", "upper", "stop_stiffness", "stop_damping")
+_DRIVE = (
+    "armature_kg_m2",
+    "viscous",
+    "coulomb",
+    "lower",
+    "upper",
+    "stop_stiffness",
+    "stop_damping",
+)
 _MOTIONS = ("V_lin", "V_ang", "W_lin", "W_ang", "A_lin", "A_ang", "f_lin", "f_ang")
 _TIP = ("J_lin", "J_ang", "p_base", "axis_base")
 
 
 @cache
 def chain_dtype(joints: int) -> np.dtype[np.void]:
-    """Returns the layout of a chain of so many joints: a row each, of constants and of work space."""
+    """Returns the layout of a chain of so many joints: a row each, of constants and of work
+    space.
+    """
     return np.dtype(
         (
             np.record,
             [
                 ("prismatic", "i8"),
-                *((name, "f8", (3, 3)) for name in ("at_rest", "by_sine", "by_cosine", "R", "R_base")),
-                *((name, "f8", (3,)) for name in ("axis", "origin", "slide", "p", *_MOTIONS, *_TIP)),
+                *(
+                    (name, "f8", (3, 3))
+                    for name in ("at_rest", "by_sine", "by_cosine", "R", "R_base")
+                ),
+                *(
+                    (name, "f8", (3,))
+                    for name in ("axis", "origin", "slide", "p", *_MOTIONS, *_TIP)
+                ),
                 *((name, "f8") for name in (*_DRIVE, "bias")),
                 ("composite", "f8", (LINK_PARAMETERS,)),
                 ("M", "f8", (joints,)),
@@ -92,9 +116,11 @@ def chain_dtype(joints: int) -> np.dtype[np.void]:
 
 
 def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
-    """Returns the rows of a chain, shape (n,), see `chain_dtype`, which may be of a longer chain.
+    """Returns the rows of a chain, shape (n,), see `chain_dtype`, which may be of a longer
+    chain.
 
-    The rotation of a joint is F + sin q F [a] + (1 - cos q) F [a]^2 (Rodrigues), three constant matrices.
+    The rotation of a joint is F + sin q F [a] + (1 - cos q) F [a]^2 (Rodrigues), three constant
+    matrices.
     """
     rows = np.zeros(len(joints), chain_dtype(width or len(joints)))
     row: Row
@@ -206,13 +232,17 @@ def place_joints(chain: RowArray, q: Vector) -> None:
             c = 1.0 - c
         for j in range(3):
             for k in range(3):
-                row.R[j, k] = row.at_rest[j, k] + s * row.by_sine[j, k] + c * row.by_cosine[j, k]
+                row.R[j, k] = (
+                    row.at_rest[j, k] + s * row.by_sine[j, k] + c * row.by_cosine[j, k]
+                )
             row.p[j] = row.origin[j] + q[i] * row.slide[j]
 
 
 @leaf
 def _move(row: Row, linear: Three, angular: Three, rate: float) -> tuple[Three, Three]:
-    """Returns X V_p + S rate: a spatial velocity of the link before, in this frame, and the joint's."""
+    """Returns X V_p + S rate: a spatial velocity of the link before, in this frame, and the
+    joint's.
+    """
     lin = rotate_back(row.R, add(linear, cross(angular, three(row.p))))
     ang = rotate_back(row.R, angular)
     if row.prismatic == 0:
@@ -262,7 +292,9 @@ def _pass_force(row: Row, before: Row) -> None:
 
 
 @leaf
-def propagate_motion(chain: RowArray, gravity: Vector, qd: Vector, v: Vector, a: Vector) -> None:
+def propagate_motion(
+    chain: RowArray, gravity: Vector, qd: Vector, v: Vector, a: Vector
+) -> None:
     """Writes V, W and A of every link, after `place_joints`.
 
     Args:
@@ -306,10 +338,14 @@ def _force_cross(V: tuple[Three, Three], f: tuple[Three, Three]) -> tuple[Three,
 
 
 @leaf
-def inverse_dynamics(chain: RowArray, theta: Vector, v: Vector, a: Vector, torque: Array) -> None:
-    """Writes M a + C(q, qd) v + G + armature a + friction(v), shape (n,), after `propagate_motion`.
+def inverse_dynamics(
+    chain: RowArray, theta: Vector, v: Vector, a: Vector, torque: Array
+) -> None:
+    """Writes M a + C(q, qd) v + G + armature a + friction(v), shape (n,), after
+    `propagate_motion`.
 
-    Friction at the reference velocity makes r' (friction(qd) - friction(v)) >= 0: it only ever takes energy.
+    Friction at the reference velocity makes r' (friction(qd) - friction(v)) >= 0: it only ever
+    takes energy.
     """
     n = chain.shape[0]
     for i in range(n):
@@ -364,15 +400,23 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
         first = LINK_PARAMETERS * i
         for p in range(first, first + LINK_PARAMETERS):
             gradient[p] = 0.0
-        _add_products(1.0, s, (three(row.A_lin), three(row.A_ang)), first, gradient)
-        _add_products(-0.5, _motion_cross(V, s), W, first, gradient)
-        _add_products(-0.5, _motion_cross(W, s), V, first, gradient)
-        _add_products(-0.5, s, _motion_cross(V, W), first, gradient)
+        _add_products(
+            factor=1.0,
+            x=s,
+            y=(three(row.A_lin), three(row.A_ang)),
+            first=first,
+            gradient=gradient,
+        )
+        _add_products(factor=-0.5, x=_motion_cross(V, s), y=W, first=first, gradient=gradient)
+        _add_products(factor=-0.5, x=_motion_cross(W, s), y=V, first=first, gradient=gradient)
+        _add_products(factor=-0.5, x=s, y=_motion_cross(V, W), first=first, gradient=gradient)
 
 
 @leaf
 def _add_composite(row: Row, before: Row) -> None:
-    """Adds a composite body to the one of the link before, about the origin of that link's frame."""
+    """Adds a composite body to the one of the link before, about the origin of that link's
+    frame.
+    """
     pi = row.composite
     total = before.composite
     R = row.R
@@ -399,7 +443,9 @@ def _add_composite(row: Row, before: Row) -> None:
 
 @leaf
 def mass_matrix(chain: RowArray, theta: Vector) -> None:
-    """Writes M(q) with the drives' inertia, lower triangle, into the rows' `M`, after `place_joints`."""
+    """Writes M(q) with the drives' inertia, lower triangle, into the rows' `M`, after
+    `place_joints`.
+    """
     n = chain.shape[0]
     for i in range(n):
         row: Row = chain[i]
@@ -458,7 +504,9 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
         put_three(row.f_ang, add(f[1], turning[1]))
     for i in range(n - 1, -1, -1):
         row = chain[i]
-        row.bias = _along_axis(row, three(row.f_lin), three(row.f_ang)) + friction_torque(row, qd[i])
+        row.bias = _along_axis(row, three(row.f_lin), three(row.f_ang)) + friction_torque(
+            row, qd[i]
+        )
         row.bias -= _stop_torque(row, q[i], qd[i])
         if i > 0:
             _pass_force(row, chain[i - 1])
@@ -466,10 +514,18 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
 
 @leaf
 def put_model(
-    chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector, M: Array, bias: Array
+    chain: RowArray,
+    theta: Vector,
+    gravity: Vector,
+    q: Vector,
+    qd: Vector,
+    M: Array,
+    bias: Array,
 ) -> None:
-    """Writes M, shape (n, n), and C qd + G + friction - stops, shape (n,), after `place_joints`."""
-    _bias(chain, theta, gravity, q, qd)
+    """Writes M, shape (n, n), and C qd + G + friction - stops, shape (n,), after
+    `place_joints`.
+    """
+    _bias(chain=chain, theta=theta, gravity=gravity, q=q, qd=qd)
     mass_matrix(chain, theta)
     for i in range(chain.shape[0]):
         row: Row = chain[i]
@@ -480,15 +536,21 @@ def put_model(
 
 @leaf
 def find_acceleration(
-    chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector, torque: Vector, qdd: Array
+    chain: RowArray,
+    theta: Vector,
+    gravity: Vector,
+    q: Vector,
+    qd: Vector,
+    torque: Vector,
+    qdd: Array,
 ) -> None:
     """Writes the accelerations, Eq. (8), shape (n,), after `place_joints`.
 
-    M qdd = torque - C qd - G - friction + stops, `torque` being the whole torque on the joints. M is factored
-    as L D L' in place, which needs no square root.
+    M qdd = torque - C qd - G - friction + stops, `torque` being the whole torque on the joints.
+    M is factored as L D L' in place, which needs no square root.
     """
     n = chain.shape[0]
-    _bias(chain, theta, gravity, q, qd)
+    _bias(chain=chain, theta=theta, gravity=gravity, q=q, qd=qd)
     mass_matrix(chain, theta)
     for i in range(n):
         row: Row = chain[i]
@@ -511,11 +573,13 @@ def find_acceleration(
 
 @leaf
 def place_end_effector(chain: RowArray, tip: Vector) -> Three:
-    """Returns the end effector's place, and writes Jacobian and orientations into the rows, all in base axes.
+    """Returns the end effector's place, and writes Jacobian and orientations into the rows, all
+    in base axes.
 
     Args:
-        chain: the chain's rows, after `place_joints`; written: J_lin, m/rad or 1, J_ang, 1 or 0, and of
-            every link its orientation R_base, its joint's place p_base and axis axis_base.
+        chain: the chain's rows, after `place_joints`; written: J_lin, m/rad or 1, J_ang, 1 or
+            0, and of every link its orientation R_base, its joint's place p_base and axis
+            axis_base.
         tip: the end effector in the last link's frame, m, shape (3,).
     """
     n = chain.shape[0]

@@ -1,7 +1,8 @@
-"""The stages of a tick that depend on the arm, for a chain of n joints: by recursion, in rows of arrays.
+"""The stages of a tick that depend on the arm, for a chain of n joints: by recursion, in rows
+of arrays.
 
-Invariant: `two_link_stages` has the same functions for the planar two-link arm, and `kernel` takes one or
-the other. `chain` is the rows of the site's joints, see `chain_dtype`.
+Invariant: `two_link_stages` has the same functions for the planar two-link arm, and `kernel`
+takes one or the other. `chain` is the rows of the site's joints, see `chain_dtype`.
 """
 
 from math import isfinite
@@ -46,7 +47,7 @@ def update_errors(s: Row, chain: RowArray) -> None:
     else:
         _update_joint_errors(s, chain.shape[0])
     if s.law == _ADAPTIVE:
-        propagate_motion(chain, s.gravity, s.qd, s.v, s.a)
+        propagate_motion(chain=chain, gravity=s.gravity, qd=s.qd, v=s.v, a=s.a)
         parameter_gradient(chain, s.Yr)
 
 
@@ -70,16 +71,18 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 
 @leaf
 def update_torque(s: Row, chain: RowArray) -> None:
-    """Writes the torque of the site's law, within its limits: Eq. (13), or `control.damped_torque`'s."""
+    """Writes the torque of the site's law, within its limits: Eq. (13), or
+    `control.damped_torque`'s.
+    """
     if s.law == _ADAPTIVE:
-        inverse_dynamics(chain, s.theta_hat, s.v, s.a, s.tau)
+        inverse_dynamics(chain=chain, theta=s.theta_hat, v=s.v, a=s.a, torque=s.tau)
     else:
         put_gravity(s, chain, s.known, s.tau)
     if s.task:
-        add_task_torque(s, s.Kd, s.ed, -1.0, s.tau)
+        add_task_torque(s=s, gains=s.Kd, values=s.ed, factor=-1.0, torque=s.tau)
         if s.law != _ADAPTIVE:
-            add_task_torque(s, s.K, s.e, -1.0, s.tau)
-            add_task_torque(s, s.k_f, s.felt, 1.0, s.tau)
+            add_task_torque(s=s, gains=s.K, values=s.e, factor=-1.0, torque=s.tau)
+            add_task_torque(s=s, gains=s.k_f, values=s.felt, factor=1.0, torque=s.tau)
     for i in range(chain.shape[0]):
         torque: float = s.tau[i]
         if not s.task:
@@ -99,9 +102,11 @@ def update_torque(s: Row, chain: RowArray) -> None:
 
 @leaf
 def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
-    """Writes G of these parameters, N m, shape (n,), for the pose in which the joints are placed."""
-    propagate_motion(chain, s.gravity, s.zeros, s.zeros, s.zeros)
-    inverse_dynamics(chain, theta, s.zeros, s.zeros, torque)
+    """Writes G of these parameters, N m, shape (n,), for the pose in which the joints are
+    placed.
+    """
+    propagate_motion(chain=chain, gravity=s.gravity, qd=s.zeros, v=s.zeros, a=s.zeros)
+    inverse_dynamics(chain=chain, theta=theta, v=s.zeros, a=s.zeros, torque=torque)
 
 
 @leaf
@@ -113,13 +118,16 @@ def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None
 
 @leaf
 def update_model(s: Row, chain: RowArray) -> None:
-    """Writes what a law may know of the arm in this tick: G, and if it wants them M and the bias torque.
+    """Writes what a law may know of the arm in this tick: G, and if it wants them M and the
+    bias torque.
 
     The bias is C qd + G with friction, less the torque of the stops. The joints are placed.
     """
     put_gravity(s, chain, s.known, s.G)
     if s.needs_model != 0:
-        put_model(chain, s.known, s.gravity, s.q, s.qd, s.M, s.bias)
+        put_model(
+            chain=chain, theta=s.known, gravity=s.gravity, q=s.q, qd=s.qd, M=s.M, bias=s.bias
+        )
 
 
 @leaf
@@ -136,17 +144,49 @@ def put_source_torque(
     """Writes the torque of actors with this `sampled` ON the arm whose q and qd are `state`."""
     place_joints(chain, state)
     qd = state[chain.shape[0] :]
-    put_torque_on_chain(t_s, state, qd, s.tip, chain, actors, table, sampled, torque)
+    put_torque_on_chain(
+        t_s=t_s,
+        q=state,
+        qd=qd,
+        tip=s.tip,
+        chain=chain,
+        actors=actors,
+        table=table,
+        sampled=sampled,
+        torque=torque,
+    )
 
 
 @leaf
 def update_external_torque(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments now, the part of it held, and the force of a wall."""
+    """Writes the torque of operators and environments now, the part of it held, and the force
+    of a wall.
+    """
     place_joints(chain, s.q)
-    held_n = put_torque_on_chain(t_s, s.q, s.qd, s.tip, chain, actors, table, 1, s.held)
-    now_n = put_torque_on_chain(t_s, s.q, s.qd, s.tip, chain, actors, table, 0, s.on_arm)
+    held_n = put_torque_on_chain(
+        t_s=t_s,
+        q=s.q,
+        qd=s.qd,
+        tip=s.tip,
+        chain=chain,
+        actors=actors,
+        table=table,
+        sampled=1,
+        torque=s.held,
+    )
+    now_n = put_torque_on_chain(
+        t_s=t_s,
+        q=s.q,
+        qd=s.qd,
+        tip=s.tip,
+        chain=chain,
+        actors=actors,
+        table=table,
+        sampled=0,
+        torque=s.on_arm,
+    )
     s.wall_n = max(held_n, now_n)
     for i in range(chain.shape[0]):
         s.on_arm[i] += s.held[i] + s.sensed[i]  # one of the two is zero
@@ -158,17 +198,39 @@ def update_external_torque(
 def _put_acceleration(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes `stage_qdd`: the acceleration at a stage's q and qd under the held u and the actors then."""
+    """Writes `stage_qdd`: the acceleration at a stage's q and qd under the held u and the
+    actors then.
+    """
     place_joints(chain, s.stage_q)
-    put_torque_on_chain(t_s, s.stage_q, s.stage_qd, s.tip, chain, actors, table, 0, s.stage_torque)
+    put_torque_on_chain(
+        t_s=t_s,
+        q=s.stage_q,
+        qd=s.stage_qd,
+        tip=s.tip,
+        chain=chain,
+        actors=actors,
+        table=table,
+        sampled=0,
+        torque=s.stage_torque,
+    )
     for i in range(chain.shape[0]):
         s.stage_torque[i] += s.u[i]
-    find_acceleration(chain, s.theta, s.gravity, s.stage_q, s.stage_qd, s.stage_torque, s.stage_qdd)
+    find_acceleration(
+        chain=chain,
+        theta=s.theta,
+        gravity=s.gravity,
+        q=s.stage_q,
+        qd=s.stage_qd,
+        torque=s.stage_torque,
+        qdd=s.stage_qdd,
+    )
 
 
 @leaf
 def _use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
-    """Adds a stage's rates to the sums, and writes the q and qd of the next, `ahead_s` from the beginning."""
+    """Adds a stage's rates to the sums, and writes the q and qd of the next, `ahead_s` from the
+    beginning.
+    """
     for i in range(joints):
         s.sum_qd[i] += weight * s.stage_qd[i]
         s.sum_qdd[i] += weight * s.stage_qdd[i]
@@ -178,22 +240,29 @@ def _use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
 
 @leaf
 def advance_arm(
-    t_s: float, h_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
+    t_s: float,
+    h_s: float,
+    s: Row,
+    chain: RowArray,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
 ) -> bool:
-    """Advances q and qd by one period under the torque `s.u`; false where the result is not finite."""
+    """Advances q and qd by one period under the torque `s.u`; false where the result is not
+    finite.
+    """
     n = chain.shape[0]
     for i in range(n):
         s.stage_q[i] = s.q[i]
         s.stage_qd[i] = s.qd[i]
         s.sum_qd[i] = s.sum_qdd[i] = 0.0
     half = 0.5 * h_s
-    _put_acceleration(t_s, s, chain, actors, table)
+    _put_acceleration(t_s=t_s, s=s, chain=chain, actors=actors, table=table)
     _use_stage(s, n, 1.0, half)
-    _put_acceleration(t_s + half, s, chain, actors, table)
+    _put_acceleration(t_s=t_s + half, s=s, chain=chain, actors=actors, table=table)
     _use_stage(s, n, 2.0, half)
-    _put_acceleration(t_s + half, s, chain, actors, table)
+    _put_acceleration(t_s=t_s + half, s=s, chain=chain, actors=actors, table=table)
     _use_stage(s, n, 2.0, h_s)
-    _put_acceleration(t_s + h_s, s, chain, actors, table)
+    _put_acceleration(t_s=t_s + h_s, s=s, chain=chain, actors=actors, table=table)
     _use_stage(s, n, 1.0, 0.0)
     finite = True
     for i in range(n):

@@ -1,8 +1,8 @@
 """The network's effect on each sample of a directed link: its due time, or its loss.
 
-Invariant (L4): the delivery of sample m is a function of the link's key, m, and the model in force at its
-stamp. All memory (bursts of loss, correlated delay, order) advances sample by sample, by index, in
-whatever order samples arrive.
+Invariant (L4): the delivery of sample m is a function of the link's key, m, and the model in
+force at its stamp. All memory (bursts of loss, correlated delay, order) advances sample by
+sample, by index, in whatever order samples arrive.
 """
 
 from .delay import (
@@ -35,7 +35,9 @@ _OWN = int(DelayKind.OWN)
 
 @leaf
 def _in_outage(stamp_ns: int, link: Row, points: Points) -> bool:
-    """True if a stamp lies in an outage of the link, which includes its beginning and not its end."""
+    """True if a stamp lies in an outage of the link, which includes its beginning and not its
+    end.
+    """
     for n in range(link.outage_first, link.outage_first + link.outage_count):
         if points[n, 0] <= stamp_ns < points[n, 1]:
             return True
@@ -44,7 +46,8 @@ def _in_outage(stamp_ns: int, link: Row, points: Points) -> bool:
 
 @leaf
 def _draw_loss(sample: int, fresh: bool, link: Row, model: Row) -> bool:
-    """Advances the two-state chain of losses (Gilbert, Elliott) by one sample; True if that is lost.
+    """Advances the two-state chain of losses (Gilbert, Elliott) by one sample; True if that is
+    lost.
 
     A fresh chain begins in its stationary distribution.
     """
@@ -63,7 +66,9 @@ def _draw_loss(sample: int, fresh: bool, link: Row, model: Row) -> bool:
 
 
 @leaf
-def _delay_us(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, points: Points) -> int:
+def _delay_us(
+    sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, points: Points
+) -> int:
     """Returns the delay of a sample, us, or LOST by its trace."""
     key: DrawKey = link.key
     if model.kind == _MEASURED:
@@ -73,18 +78,26 @@ def _delay_us(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, po
     if model.kind == _SINE:
         return clamp_delay_us(sine_delay_us(stamp_ns, model))
     if model.kind == _AR1:
-        link.memory = next_correlated(key, sample, model.weight, link.memory, fresh)
+        link.memory = next_correlated(
+            key=key, sample=sample, correlation=model.weight, before=link.memory, fresh=fresh
+        )
         return clamp_delay_us(model.location + model.scale * link.memory)
     if model.kind == _OWN:
-        return clamp_delay_us(own_delay_us(key, sample, stamp_ns, model, points))
+        return clamp_delay_us(
+            own_delay_us(key=key, sample=sample, stamp_ns=stamp_ns, model=model, points=points)
+        )
     return clamp_delay_us(draw_delay_us(key, sample, DELAY, model))
 
 
 @leaf
-def _due_ns(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, points: Points) -> int:
+def _due_ns(
+    sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, points: Points
+) -> int:
     """Returns when a sample is due, ns since the epoch, or LOST."""
     lost = _draw_loss(sample, fresh, link, model)
-    delay_us = _delay_us(sample, stamp_ns, fresh, link, model, points)
+    delay_us = _delay_us(
+        sample=sample, stamp_ns=stamp_ns, fresh=fresh, link=link, model=model, points=points
+    )
     if lost or delay_us < 0 or _in_outage(stamp_ns, link, points):
         return LOST
     if model.duplicate > 0.0:
@@ -93,7 +106,9 @@ def _due_ns(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, poin
         if u < model.duplicate:
             link.copies += 1
             if model.kind < _AR1:  # models with memory or by time give the copy the same delay
-                delay_us = min(delay_us, clamp_delay_us(draw_delay_us(key, sample, COPY, model)))
+                delay_us = min(
+                    delay_us, clamp_delay_us(draw_delay_us(key, sample, COPY, model))
+                )
     due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
     if model.in_order == 1:
         due_ns = max(due_ns, link.due_before)
@@ -102,8 +117,11 @@ def _due_ns(sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, poin
 
 
 @leaf
-def schedule_deliveries(sample: int, link: Row, models: Row, dues: IntArray, points: Points) -> None:
-    """Decides when every sample up to one is due, and writes it into `dues`, the oldest ones over.
+def schedule_deliveries(
+    sample: int, link: Row, models: Row, dues: IntArray, points: Points
+) -> None:
+    """Decides when every sample up to one is due, and writes it into `dues`, the oldest ones
+    over.
 
     `link` is a row of LINK_DTYPE; the others are those of `LinkArrays`.
     """
@@ -115,5 +133,12 @@ def schedule_deliveries(sample: int, link: Row, models: Row, dues: IntArray, poi
         while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
             link.model += 1
             fresh = True
-        dues[m % kept] = _due_ns(m, stamp_ns, fresh, link, models[link.model], points)
+        dues[m % kept] = _due_ns(
+            sample=m,
+            stamp_ns=stamp_ns,
+            fresh=fresh,
+            link=link,
+            model=models[link.model],
+            points=points,
+        )
         link.foreseen = m

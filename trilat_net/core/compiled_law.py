@@ -1,8 +1,9 @@
-"""A control law whose `torque` is compiled: the same class, the same bits, the speed of the kernel.
+"""A control law whose `torque` is compiled: the same class, the same bits, the speed of the
+kernel.
 
-Invariant: a law is compiled for the layout of its rows alone; its numbers stand in a row of floats, and the
-kernel calls it by its address, so that no law recompiles the kernel. An index out of range and a division by
-zero raise as they do in plain Python.
+Invariant: a law is compiled for the layout of its rows alone; its numbers stand in a row of
+floats, and the kernel calls it by its address, so that no law recompiles the kernel. An index
+out of range and a division by zero raise as they do in plain Python.
 """
 
 import dis
@@ -27,7 +28,14 @@ from .link import ChannelArrays
 from .plugged import call_at, digest_beside, find_address
 from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
-from .user_law import LawInput, LawResults, check_results, describe_failure, law_name, list_remembered
+from .user_law import (
+    LawInput,
+    LawResults,
+    check_results,
+    describe_failure,
+    law_name,
+    list_remembered,
+)
 from .vectors import Array, Row, RowArray
 
 _CHECKED: Any = {"_nrt": False, "boundscheck": True}
@@ -35,7 +43,8 @@ T = TypeVar("T")
 
 
 def compiled(law: T) -> T:
-    """Has the `torque` of a control law compiled, or a function that it calls; for use as a decorator.
+    """Has the `torque` of a control law compiled, or a function that it calls; for use as a
+    decorator.
 
     >>> @tn.compiled
     ... class Damper:
@@ -45,7 +54,8 @@ def compiled(law: T) -> T:
     ...         for i in range(now.joints):
     ...             now.tau[i] = -now.qd[i]
 
-    A class with memory needs `remembers`. What Numba does not take is refused when a site is built.
+    A class with memory needs `remembers`. What Numba does not take is refused when a site is
+    built.
     """
     if not isinstance(law, type):
         return cast(T, numba.njit(**_CHECKED)(law))
@@ -79,8 +89,10 @@ def law_stage(
     channel: ChannelArrays,
     sent: Array,
 ) -> None:
-    """Stage 6 of a compiled law, whose numbers are `law`; while it is `asked`, what is raised is its own."""
-    update_law_view(k, t_ns, site, links, chain)
+    """Stage 6 of a compiled law, whose numbers are `law`; while it is `asked`, what is raised
+    is its own.
+    """
+    update_law_view(k=k, t_ns=t_ns, site=site, links=links, chain=chain)
     s: Row = site[0]
     s.asked = 1
     call_at(address, (law, site, links, channel.received, sent))
@@ -116,7 +128,9 @@ class _Form(NamedTuple):
 
 
 def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np.void] | None:
-    """Returns the layout of some vectors, of `width` numbers if more of them stand in an array's row."""
+    """Returns the layout of some vectors, of `width` numbers if more of them stand in an
+    array's row.
+    """
     if not vectors:
         return None
     lengths = [vector.length for vector in vectors]
@@ -131,7 +145,9 @@ def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np
 
 @cache
 def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
-    """Returns a compiled function of the law's numbers, the site, its links, what came and what is sent."""
+    """Returns a compiled function of the law's numbers, the site, its links, what came and what
+    is sent.
+    """
     law_dtype = form.law
     received_dtype = form.received
     to_all_dtype = form.to_all
@@ -145,9 +161,23 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     def call(law: Any, site: Any, links: Any, received: Any, sent: Any) -> None:
         s = site[0]
         got = () if received_dtype is None else received.reshape(-1).view(received_dtype)
-        each = () if sent_dtype is None else sent[common : common + peers * own].view(sent_dtype)
+        each = (
+            () if sent_dtype is None else sent[common : common + peers * own].view(sent_dtype)
+        )
         every = None if to_all_dtype is None else sent[:common].view(to_all_dtype)[0]
-        first = (s.k, s.t_s, s.h_s, s.q, s.qd, s.q_des, s.qd_des, s.felt, s.joints, s.shared, s.tau)
+        first = (
+            s.k,
+            s.t_s,
+            s.h_s,
+            s.q,
+            s.qd,
+            s.q_des,
+            s.qd_des,
+            s.felt,
+            s.joints,
+            s.shared,
+            s.tau,
+        )
         last = (s.tau_x, s.tau_before, s.q_before, s.G, s.theta_hat, s.M, s.bias)
         now = LawInput(*first, links, got, each, every, *last)
         compute(law[:numbers].view(law_dtype)[0], now)
@@ -157,7 +187,9 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     floats = types.float64
     signature = types.none(floats[::1], *rows, floats[:, ::1], floats[::1])
     if made_of := digest_beside(torque):
-        name = hashlib.sha256(f"{made_of} {torque.__module__} {torque.__qualname__} {form}".encode())
+        name = hashlib.sha256(
+            f"{made_of} {torque.__module__} {torque.__qualname__} {form}".encode()
+        )
         return compile_named(call, f"law_{name.hexdigest()[:32]}", signature, **_CHECKED)
     called = numba.njit(signature, **_CHECKED)(call)
     if any(known.return_type != types.none for known in compute.nopython_signatures):
@@ -172,10 +204,14 @@ def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
     """
     code = list(dis.get_instructions(type(law).torque))
     written = {one.argval for one in code if one.opname == "STORE_ATTR"}
-    named = {one.argval for one in code if one.opname in ("LOAD_ATTR", "LOAD_METHOD", "STORE_ATTR")}
+    named = {
+        one.argval for one in code if one.opname in ("LOAD_ATTR", "LOAD_METHOD", "STORE_ATTR")
+    }
     named |= vars(law).keys()  # which functions that `torque` calls may name
     found = {}
-    for name in dict.fromkeys([*list_remembered(law), *sorted(filter(lambda one: hasattr(law, one), named))]):
+    for name in dict.fromkeys(
+        [*list_remembered(law), *sorted(filter(lambda one: hasattr(law, one), named))]
+    ):
         value = getattr(law, name)
         try:
             numbers = np.asarray(value)
@@ -184,7 +220,9 @@ def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
         if numbers.dtype.kind not in "fiub" or not numbers.size:
             continue
         changes = name in list_remembered(law) or name in written or isinstance(value, list)
-        found[name] = numbers.astype(np.float64 if changes or numbers.dtype.kind == "f" else np.int64)
+        found[name] = numbers.astype(
+            np.float64 if changes or numbers.dtype.kind == "f" else np.int64
+        )
     return found
 
 
@@ -200,16 +238,22 @@ def _explain(error: Exception, law: Any) -> str:
     found = re.search(r"Unknown attribute '(\w+)' of type Record", text)
     if name := error.args[0] if isinstance(error, KeyError) else found and found[1]:
         if hasattr(law, name) and callable(getattr(law, name)):
-            return f"it calls its method {name}{where}: use a function with @trilat_net.compiled"
-        kind = f"a {type(getattr(law, name)).__name__}" if hasattr(law, name) else "no attribute of it"
+            return (
+                f"it calls its method {name}{where}: use a function with @trilat_net.compiled"
+            )
+        kind = (
+            f"a {type(getattr(law, name)).__name__}"
+            if hasattr(law, name)
+            else "no attribute of it"
+        )
         return f"self.{name} is {kind}{where}: a number, or a list of numbers of fixed length, is taken"
     if found := re.search(r"Untyped global name '(\w+)'", text):
-        return (
-            f"it uses {found[1]}{where}, which is neither a number nor a function with @trilat_net.compiled"
-        )
+        return f"it uses {found[1]}{where}, which is neither a number nor a function with @trilat_net.compiled"
     plain = [line.strip() for line in text.splitlines() if line.strip()]
     told = [
-        line for line in plain if not line.startswith(("Failed in", "File", "During", "-", "^", "<", "["))
+        line
+        for line in plain
+        if not line.startswith(("Failed in", "File", "During", "-", "^", "<", "["))
     ]
     return f"{(told or plain)[0].rstrip('.:')}{where}"
 
@@ -236,17 +280,19 @@ class CompiledLaw:
         numbers = _read_numbers(law)
         received = 0 if arrays.channel is None else arrays.channel.received.shape[-1]
         if missing := [name for name in list_remembered(law) if name not in numbers]:
-            problem = f"{missing[0]}, which it remembers, is neither a number nor a list of numbers"
+            problem = (
+                f"{missing[0]}, which it remembers, is neither a number nor a list of numbers"
+            )
             raise ScenarioError(f"{law_name(law)}: {problem}", path=path)
         fields: Any = [(name, value.dtype, value.shape) for name, value in numbers.items()]
         form = _Form(
-            np.dtype((np.record, fields or [("nothing", "f8")])),
-            arrays.site.dtype,
-            arrays.links.dtype,
-            _vectors_dtype(setup.received_vectors, received),
-            _vectors_dtype(setup.channel.of(per_peer=False)),
-            _vectors_dtype(setup.channel.of(per_peer=True)),
-            len(setup.links),
+            law=np.dtype((np.record, fields or [("nothing", "f8")])),
+            site=arrays.site.dtype,
+            link=arrays.links.dtype,
+            received=_vectors_dtype(setup.received_vectors, received),
+            to_all=_vectors_dtype(setup.channel.of(per_peer=False)),
+            sent=_vectors_dtype(setup.channel.of(per_peer=True)),
+            peers=len(setup.links),
         )
         try:
             self._function = _compile_law(type(law).torque, form)
@@ -283,7 +329,9 @@ class CompiledLaw:
         a = self._arrays
         assert a.channel is not None
         try:
-            self._stage(k, t_ns, self.address, self.row, a.site, a.links, a.chain, a.channel, self._sent)
+            self._stage(
+                k, t_ns, self.address, self.row, a.site, a.links, a.chain, a.channel, self._sent
+            )
         except Exception as error:  # whatever the law raises
             raise self.find_failure(error) or error from None
         return self.memory
@@ -299,20 +347,26 @@ class CompiledLaw:
         self.row[: self._remembered] = memory
 
     def find_failure(self, error: Exception) -> LawFailed | None:
-        """Returns the failure of this law that made its machine code raise; None: it was not asked."""
+        """Returns the failure of this law that made its machine code raise; None: it was not
+        asked.
+        """
         s: Row = self._arrays.site[0]
         if not s.asked:
             return None
         if isinstance(error, FloatingPointError):
             numbers = (s.tau, s.theta_hat, self.row[: self._remembered], self._sent)
             try:
-                check_results(self._law, self._name, s.k, LawResults(*(one.tolist() for one in numbers)))
+                check_results(
+                    self._law, self._name, s.k, LawResults(*(one.tolist() for one in numbers))
+                )
             except LawFailed as failed:
                 return failed
         return describe_failure(self._law, self._name, int(s.k), error)
 
 
-def plug_law(law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> PlainLaw | CompiledLaw:
+def plug_law(
+    law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array
+) -> PlainLaw | CompiledLaw:
     """Returns a law at its site, ready to be asked, see `PlainLaw`.
 
     Raises:

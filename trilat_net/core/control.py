@@ -1,13 +1,13 @@
 """The control laws: the paper's adaptive one, split as its equations are, and the classics.
 
-Invariant: errors and regressor of tick k never depend on the estimate of tick k, which keeps the second-
-order update explicit. Gains are diagonal and written as vectors, one number per joint (N m s/rad, Lambda in
-1/s) or per parameter; angles are rad, speeds rad/s, torques N m.
+Invariant: errors and regressor of tick k never depend on the estimate of tick k, which keeps
+the second- order update explicit. Gains are diagonal and written as vectors, one number per
+joint (N m s/rad, Lambda in 1/s) or per parameter; angles are rad, speeds rad/s, torques N m.
 
-Source: Eq. (9)-(13), (15) of the paper; P+d and PD+d after Nuno, Basanez, Ortega and Spong, "Position
-Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics Research 28 (2009);
-direct force reflection after Lawrence, "Stability and transparency in bilateral teleoperation", IEEE
-Trans. Robotics and Automation 9 (1993).
+Source: Eq. (9)-(13), (15) of the paper; P+d and PD+d after Nuno, Basanez, Ortega and Spong,
+"Position Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics
+Research 28 (2009); direct force reflection after Lawrence, "Stability and transparency in
+bilateral teleoperation", IEEE Trans. Robotics and Automation 9 (1993).
 """
 
 from math import sqrt
@@ -63,7 +63,13 @@ def limit_torque(torque: float, limit: float) -> float:
 
 @leaf
 def adaptive_torque(
-    Y: tuple[Five, Five], theta_hat: Vector, Kp: Vector, Kd: Vector, r: Vector, ed: Vector, limit: float
+    Y: tuple[Five, Five],
+    theta_hat: Vector,
+    Kp: Vector,
+    Kd: Vector,
+    r: Vector,
+    ed: Vector,
+    limit: float,
 ) -> Pair:
     """Returns tau = Y theta_hat - Kp r - Kd ed, Eq. (13), within +-limit.
 
@@ -80,7 +86,8 @@ def adaptive_torque(
 
 @leaf
 def robust_torque(rho: float, width: float, r: float) -> float:
-    """Returns rho r / sqrt(r^2 + width^2), which opposes r: all of rho where it is fast, never a step.
+    """Returns rho r / sqrt(r^2 + width^2), which opposes r: all of rho where it is fast, never
+    a step.
 
     Against a disturbance of at most rho, r times both is never above ROBUST_RESIDUE rho width.
     """
@@ -98,8 +105,8 @@ def _clip(value: float, low: float, high: float) -> float:
 def project_estimate(theta_hat: Vector, low: Vector, high: Vector) -> Five:
     """Returns every parameter clipped to its box.
 
-    For a diagonal Gamma and a truth inside the box this never lets (theta_hat - theta)' Gamma^-1 (theta_hat -
-    theta) rise, so that V' <= 0 stands.
+    For a diagonal Gamma and a truth inside the box this never lets (theta_hat - theta)'
+    Gamma^-1 (theta_hat - theta) rise, so that V' <= 0 stands.
     """
     return (
         _clip(theta_hat[0], low[0], high[0]),
@@ -125,12 +132,14 @@ def damped_torque(
     felt: Vector,
     limit: float,
 ) -> Pair:
-    """Returns tau = G(q) - K e - d qd - Kd ed + k_f felt, within +-limit: the laws of known gravity.
+    """Returns tau = G(q) - K e - d qd - Kd ed + k_f felt, within +-limit: the laws of known
+    gravity.
 
-    P+d has Kd = k_f = 0. For N sites with reversible shares, one K, one d and one constant delay T its
-    linearised loop is stable from d = max(abs(lambda_min(alpha)), 0.2172) K T on, whatever the masses, for
-    two sites with 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2; for other shares no such bound holds. PD+d has k_f = 0.
-    Direct force reflection has Kd = 0: K and d at the slave, d and k_f at the master.
+    P+d has Kd = k_f = 0. For N sites with reversible shares, one K, one d and one constant
+    delay T its linearised loop is stable from d = max(abs(lambda_min(alpha)), 0.2172) K T on,
+    whatever the masses, for two sites with 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2; for other shares
+    no such bound holds. PD+d has k_f = 0. Direct force reflection has Kd = 0: K and d at the
+    slave, d and k_f at the master.
 
     Args:
         theta: the parameters that the law takes the arm to have, shape (5,).

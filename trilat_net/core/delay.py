@@ -1,7 +1,8 @@
 """Delay models of a link, as the core computes them.
 
-Invariant (L4): a delay is a function of the link's key, the sample's index and its stamp, rounded to whole
-microseconds. Only AR1 depends on the sample before; it advances by index, not by arrival.
+Invariant (L4): a delay is a function of the link's key, the sample's index and its stamp,
+rounded to whole microseconds. Only AR1 depends on the sample before; it advances by index, not
+by arrival.
 """
 
 import math
@@ -21,14 +22,18 @@ MAX_DELAY_US = 10_000_000
 
 
 class DelayKind(IntEnum):
-    """The kinds of delay, and the meaning of the four parameters of a `LinkModel` in each; times in us.
+    """The kinds of delay, and the meaning of the four parameters of a `LinkModel` in each;
+    times in us.
 
-    CONSTANT: location. UNIFORM: location +- scale. NORMAL: mean `location`, deviation `scale`, drawn again
-    where it falls below zero. GAMMA: shape `extra`, `scale`. LOG_NORMAL: exp of normal (`location`, `scale`).
+    CONSTANT: location. UNIFORM: location +- scale. NORMAL: mean `location`, deviation `scale`,
+    drawn again where it falls below zero. GAMMA: shape `extra`, `scale`. LOG_NORMAL: exp of
+    normal (`location`, `scale`).
     HYPER_EXPONENTIAL: `location` + Exp(`scale`), or with probability `weight` + Exp(`extra`).
-    AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample, cut off at zero.
-    SINE: location + scale sin(2 pi t / extra + weight). TRACE: a table by time. MEASURED: none is
-    injected; a sample is used as soon as it has come. OWN: a function of its own, never above `location`.
+    AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample, cut off
+    at zero.
+    SINE: location + scale sin(2 pi t / extra + weight). TRACE: a table by time. MEASURED: none
+    is injected; a sample is used as soon as it has come. OWN: a function of its own, never
+    above `location`.
     """
 
     CONSTANT = 0
@@ -56,9 +61,11 @@ class LinkModel(NamedTuple):
 
     Attributes:
         from_ns: the first stamp that it applies to, ns since the epoch.
-        kind: a `DelayKind`, which gives `location`, `scale`, `extra` and `weight` their meaning.
+        kind: a `DelayKind`, which gives `location`, `scale`, `extra` and `weight` their
+            meaning.
         at_end: a `TraceEnd`, of a trace.
-        trace_first: where the points of a trace, or the numbers of an own kind, begin in the site's table.
+        trace_first: where the points of a trace, or the numbers of an own kind, begin in the
+            site's table.
         trace_count: how many they are.
         loss_good: probability that a sample is lost in the good state.
         loss_bad: probability that it is lost in the bad state.
@@ -67,8 +74,8 @@ class LinkModel(NamedTuple):
         duplicate: probability that a sample has a copy, with a delay of its own.
         in_order: 1: no sample is released before an older one; 0: the newest wins.
         playout_us: every sample is held at least so long, us.
-        call: the address of an own kind's function, which sees `key`, `sample` and `stamp_ns`, and writes
-            `drawn_us`; see `plugged`.
+        call: the address of an own kind's function, which sees `key`, `sample` and `stamp_ns`,
+            and writes `drawn_us`; see `plugged`.
     """
 
     from_ns: int = 0
@@ -95,13 +102,21 @@ class LinkModel(NamedTuple):
 
 
 LINK_MODEL_DTYPE = np.dtype(
-    (np.record, [(name, "f8" if kind is float else "i8") for name, kind in LinkModel.__annotations__.items()])
+    (
+        np.record,
+        [
+            (name, "f8" if kind is float else "i8")
+            for name, kind in LinkModel.__annotations__.items()
+        ],
+    )
 )
 
 
 _LARGEST_NORMAL = 8.6
 _LARGEST_EXPONENTIAL = 36.8
-"""No draw is larger in magnitude: that of Box and Muller, and -log, of 2^-53, see `unit_interval`."""
+"""No draw is larger in magnitude: that of Box and Muller, and -log, of 2^-53, see
+`unit_interval`.
+"""
 
 
 def _longest_us(model: LinkModel, trace: Points | None) -> float:
@@ -131,7 +146,9 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
 
 
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
-    """Returns a delay that no sample of a link exceeds, us, play-out included; traces: per model, or None."""
+    """Returns a delay that no sample of a link exceeds, us, play-out included; traces: per
+    model, or None.
+    """
     longest = [
         max(math.ceil(min(_longest_us(model, trace), MAX_DELAY_US)) + 1, model.playout_us)
         for model, trace in zip(models, traces, strict=True)
@@ -155,7 +172,9 @@ _LOOP = int(TraceEnd.LOOP)
 
 @leaf
 def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
-    """Returns a draw of a distribution without memory, us, not rounded; purpose: DELAY, or COPY."""
+    """Returns a draw of a distribution without memory, us, not rounded; purpose: DELAY, or
+    COPY.
+    """
     location: float = model.location
     scale: float = model.scale
     extra: float = model.extra
@@ -163,7 +182,8 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
         u, _ = uniforms(key, sample, purpose, 0)
         return location + scale * (2.0 * u - 1.0)
     if model.kind == _NORMAL:
-        for attempt in range(64):  # the mean is not negative: each attempt suits with 1/2 or more
+        # the mean is not negative: each attempt suits with 1/2 or more
+        for attempt in range(64):
             x = location + scale * standard_normal(key, sample, purpose, attempt)
             if x >= 0.0:
                 return x
@@ -178,8 +198,12 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
 
 
 @leaf
-def next_correlated(key: DrawKey, sample: int, correlation: float, before: float, fresh: bool) -> float:
-    """Returns the next number of an AR(1) sequence, standard normal; a fresh one has no number before."""
+def next_correlated(
+    key: DrawKey, sample: int, correlation: float, before: float, fresh: bool
+) -> float:
+    """Returns the next number of an AR(1) sequence, standard normal; a fresh one has no number
+    before.
+    """
     x = standard_normal(key, sample, DELAY, 0)
     if fresh:
         return x
@@ -197,9 +221,11 @@ def sine_delay_us(stamp_ns: int, model: Row) -> float:
 
 @leaf
 def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
-    """Returns the delay of a trace, that of its last point at or before the stamp; -1: the sample is lost.
+    """Returns the delay of a trace, that of its last point at or before the stamp; -1: the
+    sample is lost.
 
-    The last point lasts as long as the one before it; after that the trace holds it or begins again.
+    The last point lasts as long as the one before it; after that the trace holds it or begins
+    again.
     """
     first = model.trace_first
     count = model.trace_count
@@ -214,13 +240,17 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
 
 @leaf
 def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
-    """Returns two uniform numbers for an own kind, a function of the link's key, an index and an attempt."""
+    """Returns two uniform numbers for an own kind, a function of the link's key, an index and
+    an attempt.
+    """
     return uniforms(np.uint64(now.key), index, DELAY, attempt)
 
 
 @leaf
 def own_delay_us(key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points) -> float:
-    """Returns the delay of an own kind, us, not rounded; its numbers stand in the table, two a row."""
+    """Returns the delay of an own kind, us, not rounded; its numbers stand in the table, two a
+    row.
+    """
     model.key = np.int64(key)
     model.sample = sample
     model.stamp_ns = stamp_ns

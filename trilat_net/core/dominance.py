@@ -1,13 +1,14 @@
-"""Dominance: who follows whom, by how much, and the reference that a site derives from its peers.
+"""Dominance: who follows whom, by how much, and the reference that a site derives from its
+peers.
 
-Invariant: rows of alpha sum to one, the diagonal is zero, and beta is the LEFT null vector of Upsilon.
-While factors change, they are a function of time and of the ramps alone; between two rows that sum to 1
-every row does. A stale peer stops the reference; the return is smooth: from the held pose to the peers along
-3 x^2 - 2 x^3.
+Invariant: rows of alpha sum to one, the diagonal is zero, and beta is the LEFT null vector of
+Upsilon. While factors change, they are a function of time and of the ramps alone; between two
+rows that sum to 1 every row does. A stale peer stops the reference; the return is smooth: from
+the held pose to the peers along 3 x^2 - 2 x^3.
 
-Source: Eq. (6), (7), (20) of the paper. The paper takes beta = (1, 1, 1); that is the right null vector,
-and a left one only if the columns sum to one as well. The left one of an irreducible matrix is its Perron
-vector, positive and unique up to its length.
+Source: Eq. (6), (7), (20) of the paper. The paper takes beta = (1, 1, 1); that is the right
+null vector, and a left one only if the columns sum to one as well. The left one of an
+irreducible matrix is its Perron vector, positive and unique up to its length.
 """
 
 import numpy as np
@@ -23,7 +24,9 @@ ROW_SUM_TOLERANCE = 1e-9
 
 
 def find_row_problem(row: Array, own: int) -> str | None:
-    """Returns the problem of one row of alpha, shape (N,), of site `own`, or None: Eq. (7) for N sites."""
+    """Returns the problem of one row of alpha, shape (N,), of site `own`, or None: Eq. (7) for
+    N sites.
+    """
     if not np.isfinite(row).all():
         return "shares must be finite numbers"
     if row[own] != 0.0:
@@ -36,7 +39,9 @@ def find_row_problem(row: Array, own: int) -> str | None:
 
 
 def find_reach(alpha: Array) -> NDArray[np.bool_]:
-    """Returns which site reaches which along links with a factor above 0, shape (N, N), for alpha so."""
+    """Returns which site reaches which along links with a factor above 0, shape (N, N), for
+    alpha so.
+    """
     reach: NDArray[np.bool_] = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
     for _ in range(len(alpha).bit_length()):
         reach = reach @ reach
@@ -44,16 +49,20 @@ def find_reach(alpha: Array) -> NDArray[np.bool_]:
 
 
 def is_irreducible(alpha: Array) -> bool:
-    """True if every site reaches every other along links with a factor above 0, alpha of shape (N, N)."""
+    """True if every site reaches every other along links with a factor above 0, alpha of shape
+    (N, N).
+    """
     return bool(find_reach(alpha).all())
 
 
 def find_balancing_weights(alpha: Array) -> Array | None:
-    """Returns D > 0 with D_i alpha_ij = D_j alpha_ji (detailed balance), shape (N,); None if there is none.
+    """Returns D > 0 with D_i alpha_ij = D_j alpha_ji (detailed balance), shape (N,); None if
+    there is none.
 
-    Shares that have such weights are reversible: their products are the same along every circle and against
-    it (Kolmogorov), alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for three sites, and the eigenvalues of
-    alpha are real. Links out of a group of sites that reach each other are left out: no circle has them.
+    Shares that have such weights are reversible: their products are the same along every circle
+    and against it (Kolmogorov), alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for three
+    sites, and the eigenvalues of alpha are real. Links out of a group of sites that reach each
+    other are left out: no circle has them.
     """
     reach = find_reach(alpha)
     followed = reach & reach.T & (alpha > 0.0)
@@ -77,11 +86,13 @@ def find_balancing_weights(alpha: Array) -> Array | None:
 def perron_vector(alpha: Array) -> Array:
     """Returns beta > 0 with beta' Upsilon = 0 and sum 1, shape (N,), for an irreducible alpha.
 
-    By the elimination of Grassmann, Taksar and Heyman (1985): no subtraction occurs, so every entry is
-    right to a few units in its last place, however many orders of magnitude the factors differ by.
+    By the elimination of Grassmann, Taksar and Heyman (1985): no subtraction occurs, so every
+    entry is right to a few units in its last place, however many orders of magnitude the
+    factors differ by.
 
     Raises:
-        ValueError: alpha is reducible; then some site's weight would be zero, or beta not unique.
+        ValueError: alpha is reducible; then some site's weight would be zero, or beta not
+            unique.
     """
     if not is_irreducible(alpha):
         raise ValueError("alpha is reducible: beta has a zero entry or is not unique")
@@ -103,7 +114,9 @@ RAMP_COLUMNS = 2
 
 
 @leaf
-def _interpolate(t_ns: float, start_ns: float, end_ns: float, before: float, after: float) -> float:
+def _interpolate(
+    t_ns: float, start_ns: float, end_ns: float, before: float, after: float
+) -> float:
     if t_ns >= end_ns:
         return after
     return before + (after - before) * ((t_ns - start_ns) / (end_ns - start_ns))
@@ -113,9 +126,9 @@ def _interpolate(t_ns: float, start_ns: float, end_ns: float, before: float, aft
 def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
     """Writes alpha and its derivative at time t into every link.
 
-    The first `count` rows of `ramps`, shape (R, RAMP_COLUMNS + P), are filled, in the order of their starts;
-    row 0 holds the factors at the epoch. A ramp begins where the one before it is at that time, complete or
-    not.
+    The first `count` rows of `ramps`, shape (R, RAMP_COLUMNS + P), are filled, in the order of
+    their starts; row 0 holds the factors at the epoch. A ramp begins where the one before it is
+    at that time, complete or not.
     """
     for j in range(links.shape[0]):
         link: Row = links[j]
@@ -126,20 +139,30 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
             if t_ns < ramps[n, 0]:
                 break
             before = _interpolate(
-                ramps[n, 0], ramps[current, 0], ramps[current, 1], before, ramps[current, column]
+                t_ns=ramps[n, 0],
+                start_ns=ramps[current, 0],
+                end_ns=ramps[current, 1],
+                before=before,
+                after=ramps[current, column],
             )
             current = n
         start_ns = ramps[current, 0]
         end_ns = ramps[current, 1]
         after = ramps[current, column]
-        link.alpha = _interpolate(t_ns, start_ns, end_ns, before, after)
-        link.alpha_rate = (after - before) / ((end_ns - start_ns) * 1e-9) if t_ns < end_ns else 0.0
+        link.alpha = _interpolate(
+            t_ns=t_ns, start_ns=start_ns, end_ns=end_ns, before=before, after=after
+        )
+        link.alpha_rate = (
+            (after - before) / ((end_ns - start_ns) * 1e-9) if t_ns < end_ns else 0.0
+        )
 
 
 def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
-    """Folds the ramps that are over at time t into the first row, and returns how many rows are left.
+    """Folds the ramps that are over at time t into the first row, and returns how many rows are
+    left.
 
-    A ramp begins where the one before it is at that time. Row 0 then holds that of the last one that has
+    A ramp begins where the one before it is at that time. Row 0 then holds that of the last one
+    that has
     begun: from there on `apply_ramps` writes the same bits.
     """
     last = int(np.searchsorted(ramps[1:count, 0], t_ns, side="right"))
@@ -150,7 +173,13 @@ def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
     for n in range(1, last + 1):
         start_ns, end_ns = ramps[current, :RAMP_COLUMNS]
         for j, after in enumerate(ramps[current, RAMP_COLUMNS:]):
-            before[j] = _interpolate(ramps[n, 0], start_ns, end_ns, before[j], after)
+            before[j] = _interpolate(
+                t_ns=ramps[n, 0],
+                start_ns=start_ns,
+                end_ns=end_ns,
+                before=before[j],
+                after=after,
+            )
         current = n
     ramps[0, RAMP_COLUMNS:] = before
     ramps[1 : count - last + 1] = ramps[last:count].copy()
@@ -168,7 +197,9 @@ _ACT_BRAKE = int(StaleAction.BRAKE)
 
 @leaf
 def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
-    """True if a peer that is followed is older than `age_ns`; before its first sample it is as old as t."""
+    """True if a peer that is followed is older than `age_ns`; before its first sample it is as
+    old as t.
+    """
     for j in range(links.shape[0]):
         link: Row = links[j]
         stamp_ns = tick_ns(max(link.used, 0), link.rate_hz)

@@ -1,11 +1,12 @@
 """Sine, cosine and hyperbolic tangent by plain arithmetic: the same bits on every machine.
 
-Invariant: additions and products in a fixed order, nothing of the platform's mathematics library, so an arm
-moves alike on every machine with IEEE doubles. The platform's own functions differ in the last bit from one
-C library to the next, and a replay must not.
+Invariant: additions and products in a fixed order, nothing of the platform's mathematics
+library, so an arm moves alike on every machine with IEEE doubles. The platform's own functions
+differ in the last bit from one C library to the next, and a replay must not.
 
-The angle is reduced by pi/2 in three parts (Cody and Waite, "Software Manual for the Elementary Functions",
-1980); the polynomials are those of S. Moshier's Cephes library, for an eighth of a turn on either side.
+The angle is reduced by pi/2 in three parts (Cody and Waite, "Software Manual for the Elementary
+Functions", 1980); the polynomials are those of S. Moshier's Cephes library, for an eighth of a
+turn on either side.
 
 The hyperbolic tangent has the fractions of S. Moshier's Cephes library.
 """
@@ -26,8 +27,8 @@ LARGEST_RAD = 2.0**30
 def sincos(x: float) -> tuple[float, float]:
     """Returns sine and cosine of an angle, rad, to one unit in the last place of 1.
 
-    NaN where the angle is not finite or beyond `LARGEST_RAD`. Beyond 1e5 rad the reduction rounds as the
-    angle itself does.
+    NaN where the angle is not finite or beyond `LARGEST_RAD`. Beyond 1e5 rad the reduction
+    rounds as the angle itself does.
     """
     if not abs(x) <= LARGEST_RAD:
         return math.nan, math.nan
@@ -73,8 +74,12 @@ def tanh(x: float) -> float:
     z = x * x
     size = abs(x)
     if size < _SMALL:
-        above = (-9.64399179425052238628e-1 * z - 9.92877231001918586564e1) * z - 1.61468768441708447952e3
-        below = ((z + 1.12811678491632931402e2) * z + 2.23548839060100448583e3) * z + 4.84406305325125486048e3
+        above = (
+            -9.64399179425052238628e-1 * z - 9.92877231001918586564e1
+        ) * z - 1.61468768441708447952e3
+        below = (
+            (z + 1.12811678491632931402e2) * z + 2.23548839060100448583e3
+        ) * z + 4.84406305325125486048e3
         return x + x * z * (above / below)
     if size >= _LARGE:
         return 1.0 if x > 0.0 else -1.0
@@ -83,8 +88,13 @@ def tanh(x: float) -> float:
     halvings = math.floor(2.0 * size * _LOG_2_OF_E + 0.5)
     y = (2.0 * size - halvings * _LOG_2_HIGH) - halvings * _LOG_2_LOW
     z = y * y
-    above = y * ((1.26177193074810590878e-4 * z + 3.02994407707441961300e-2) * z + 9.99999999999999999910e-1)
-    below = (3.00198505138664455042e-6 * z + 2.52448340349684104192e-3) * z + 2.27265548208155028766e-1
+    above = y * (
+        (1.26177193074810590878e-4 * z + 3.02994407707441961300e-2) * z
+        + 9.99999999999999999910e-1
+    )
+    below = (
+        3.00198505138664455042e-6 * z + 2.52448340349684104192e-3
+    ) * z + 2.27265548208155028766e-1
     below = below * z + 2.0
     grown = (1.0 + 2.0 * above / (below - above)) * float(1 << int(halvings))
     tangent = 1.0 - 2.0 / (grown + 1.0)

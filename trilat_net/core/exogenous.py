@@ -1,9 +1,11 @@
 """Exogenous torque: the effect of operators and environments on the arm.
 
-Invariant: the torque is a function of time and of the arm's state, so each stage of the integrator
-evaluates it; a `sampled` source is evaluated once a tick and held, as in a digital haptic wall.
+Invariant: the torque is a function of time and of the arm's state, so each stage of the
+integrator evaluates it; a `sampled` source is evaluated once a tick and held, as in a digital
+haptic wall.
 
-Scenarios state the torque ON the arm; the paper's tau_x, which Eq. (8) subtracts, is its negative.
+Scenarios state the torque ON the arm; the paper's tau_x, which Eq. (8) subtracts, is its
+negative.
 """
 
 import math
@@ -25,13 +27,14 @@ from .vectors import Array, Pair, Row, RowArray, Vector, count_begun
 class TorqueKind(IntEnum):
     """The kinds of operators and environments.
 
-    PULSE is a scripted torque, smooth at both ends. HAND and TASK_HAND are a spring and a damper towards a
-    target that moves along a minimum-jerk path, of the joints or of the end effector. RECORDED is torque by a
-    table. VISCOUS resists motion of the joints. WALL pushes the end effector out of a half-space, and never
-    pulls. CHIRP is a sine whose frequency rises or falls in straight lines, again and again. MULTISINE is a
-    sum of sines of one amplitude. OWN_JOINTS and OWN_TIP have a compiled function of their own, of the joints
-    or of the end effector. LIVE_TIP and LIVE_JOINT are springs and dampers towards a target that
-    somebody moves while the run goes on, LIVE_FORCE is a force that somebody sets, see `live_hand`.
+    PULSE is a scripted torque, smooth at both ends. HAND and TASK_HAND are a spring and a
+    damper towards a target that moves along a minimum-jerk path, of the joints or of the end
+    effector. RECORDED is torque by a table. VISCOUS resists motion of the joints. WALL pushes
+    the end effector out of a half-space, and never pulls. CHIRP is a sine whose frequency rises
+    or falls in straight lines, again and again. MULTISINE is a sum of sines of one amplitude.
+    OWN_JOINTS and OWN_TIP have a compiled function of their own, of the joints or of the end
+    effector. LIVE_TIP and LIVE_JOINT are springs and dampers towards a target that somebody
+    moves while the run goes on, LIVE_FORCE is a force that somebody sets, see `live_hand`.
     """
 
     PULSE = 0
@@ -66,18 +69,20 @@ class TorqueSource(NamedTuple):
         end_s: when it ends, s.
         move_start_s: when its target begins to move, s; CHIRP: beginning of its first sweep.
         move_end_s: when its target arrives, s; CHIRP: end of its first sweep.
-        a: PULSE, CHIRP: peak, N m. MULTISINE: amplitude of each sine, N m. HAND, TASK_HAND: target before,
-            rad or m. WALL: a point of it, m.
-        b: HAND, TASK_HAND: target after. WALL: its normal, length 1, away from the wall. CHIRP: frequencies
-            at the beginning and the end of a sweep, Hz.
+        a: PULSE, CHIRP: peak, N m. MULTISINE: amplitude of each sine, N m. HAND, TASK_HAND:
+            target before, rad or m. WALL: a point of it, m.
+        b: HAND, TASK_HAND: target after. WALL: its normal, length 1, away from the wall. CHIRP:
+            frequencies at the beginning and the end of a sweep, Hz.
         K: stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (the first one).
-        B: damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (the first one).
+        B: damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (the first
+            one).
         sampled: true: evaluated once a tick and held.
-        table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (rows, 1 + n). MULTISINE:
-            rows of frequency, Hz, phase at the start in turns, and columns that are not used.
+        table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (rows, 1 + n).
+            MULTISINE: rows of frequency, Hz, phase at the start in turns, and columns that are
+            not used.
         limit: of a live hand: the largest norm of its force, N, or torque, N m.
-        grip: of a live hand: how much of its force acts, 0 to 1. Its `a` is its target, or its force, and its
-            `b` where the target would be a second later.
+        grip: of a live hand: how much of its force acts, 0 to 1. Its `a` is its target, or its
+            force, and its `b` where the target would be a second later.
         model: of an own kind what its numbers and its function `act` are of; see `plugged`.
     """
 
@@ -103,12 +108,17 @@ _NUMBERS = ("a", "b", "K", "B")
 
 @cache
 def torque_source_dtype(width: int) -> np.dtype[np.void]:
-    """Returns the layout of operators and environments whose vectors have up to so many numbers.
+    """Returns the layout of operators and environments whose vectors have up to so many
+    numbers.
 
-    A function of its own, at the address `call`, reads t_s, coordinates, at and speed, and writes effort.
+    A function of its own, at the address `call`, reads t_s, coordinates, at and speed, and
+    writes effort.
     """
     fields = [
-        *((name, "i8") for name in ("acts", "sampled", "table_first", "table_count", "call", "coordinates")),
+        *(
+            (name, "i8")
+            for name in ("acts", "sampled", "table_first", "table_count", "call", "coordinates")
+        ),
         *((name, "f8") for name in (*_SCALARS, "t_s")),
         *((name, "f8", (width,)) for name in (*_NUMBERS, "at", "speed", "effort")),
     ]
@@ -135,7 +145,8 @@ _LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
 def torque_source_rows(
     actors: tuple[TorqueSource, ...], joints: int = 2, axes: int = 2
 ) -> tuple[TorqueSourceRows, TorqueTable]:
-    """Returns the actors of an arm of so many joints in a space of so many axes, and all their tables in one.
+    """Returns the actors of an arm of so many joints in a space of so many axes, and all their
+    tables in one.
 
     Each actor has a row.
     """
@@ -170,22 +181,28 @@ def torque_source_rows(
 def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
     """Returns the progress of a minimum-jerk move, 0 to 1, and its rate, 1/s.
 
-    10 x^3 - 15 x^4 + 6 x^5 between start and end, after Flash and Hogan, "The coordination of arm
-    movements", J. Neuroscience 5 (1985).
+    10 x^3 - 15 x^4 + 6 x^5 between start and end, after Flash and Hogan, "The coordination of
+    arm movements", J. Neuroscience 5 (1985).
     """
     if t_s <= start_s:
         return 0.0, 0.0
     if t_s >= end_s:
         return 1.0, 0.0
     x = (t_s - start_s) / (end_s - start_s)
-    return x * x * x * (10.0 + x * (6.0 * x - 15.0)), 30.0 * x * x * (1.0 - x) * (1.0 - x) / (end_s - start_s)
+    return x * x * x * (10.0 + x * (6.0 * x - 15.0)), 30.0 * x * x * (1.0 - x) * (1.0 - x) / (
+        end_s - start_s
+    )
 
 
 @leaf
-def _spring_along(actor: Row, i: int, progress: float, rate: float, at: float, speed: float) -> float:
+def _spring_along(
+    actor: Row, i: int, progress: float, rate: float, at: float, speed: float
+) -> float:
     """Returns K (target - at) + B (its velocity - speed) along one coordinate."""
     way: float = actor.b[i] - actor.a[i]
-    pull: float = actor.K[i] * (actor.a[i] + progress * way - at) + actor.B[i] * (rate * way - speed)
+    pull: float = actor.K[i] * (actor.a[i] + progress * way - at) + actor.B[i] * (
+        rate * way - speed
+    )
     return pull
 
 
@@ -199,7 +216,9 @@ def _target_progress(actor: Row, t_s: float) -> Pair:
 
 @leaf
 def _live_share(actor: Row, square: float) -> float:
-    """Returns the factor of a live hand's force, whose square is given: its grip, within its limit."""
+    """Returns the factor of a live hand's force, whose square is given: its grip, within its
+    limit.
+    """
     share: float = actor.grip
     if square > actor.limit * actor.limit:
         share *= actor.limit / math.sqrt(square)
@@ -209,8 +228,8 @@ def _live_share(actor: Row, square: float) -> float:
 @leaf
 def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
     progress, rate = _target_progress(actor, t_s)
-    x = _spring_along(actor, 0, progress, rate, at[0], speed[0])
-    y = _spring_along(actor, 1, progress, rate, at[1], speed[1])
+    x = _spring_along(actor=actor, i=0, progress=progress, rate=rate, at=at[0], speed=speed[0])
+    y = _spring_along(actor=actor, i=1, progress=progress, rate=rate, at=at[1], speed=speed[1])
     if actor.acts < _LIVE_TIP:
         return x, y
     if actor.acts == _LIVE_FORCE:
@@ -222,7 +241,9 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
 
 @leaf
 def _table_place(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, float]:
-    """Returns the two rows of a table around a time and the part of the way between; -1 outside of it."""
+    """Returns the two rows of a table around a time and the part of the way between; -1 outside
+    of it.
+    """
     first = actor.table_first
     count = actor.table_count
     if count < 1 or t_s < table[first, 0] or t_s > table[first + count - 1, 0]:
@@ -274,13 +295,15 @@ def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
 def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
     """Returns the torque of a pulse, chirp or multisine in parts of `a`.
 
-    A pulse is sin^2(pi (t - start) / (end - start)): smooth at both ends, as in Fig. 3 of the paper, whose
-    numbers are not printed.
+    A pulse is sin^2(pi (t - start) / (end - start)): smooth at both ends, as in Fig. 3 of the
+    paper, whose numbers are not printed.
     """
     if actor.acts == _PULSE:
         s, _ = sincos(math.pi * (t_s - actor.start_s) / (actor.end_s - actor.start_s))
         return s * s
-    return _chirp_size(actor, t_s) if actor.acts == _CHIRP else _multisine_size(actor, t_s, table)
+    return (
+        _chirp_size(actor, t_s) if actor.acts == _CHIRP else _multisine_size(actor, t_s, table)
+    )
 
 
 @leaf
@@ -324,7 +347,9 @@ def _own_pair(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTa
 def _end_effector_torque(
     actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector, table: TorqueTable
 ) -> SourceTorque:
-    """Returns J' F of a force at the end effector: an operator's, or a wall's, and |F| of a wall."""
+    """Returns J' F of a force at the end effector: an operator's, or a wall's, and |F| of a
+    wall.
+    """
     _, at = forward_kinematics(lengths, q)
     x, y = end_effector_jacobian(lengths, q)
     speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
@@ -333,7 +358,7 @@ def _end_effector_torque(
         force = _wall_force(actor, at, speed)
         wall_n = math.sqrt(force[0] * force[0] + force[1] * force[1])
     elif actor.acts == _OWN_TIP:
-        force = _own_pair(actor, t_s, at, speed, table)
+        force = _own_pair(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
     else:
         force = _spring_force(actor, t_s, at, speed)
     return x[0] * force[0] + y[0] * force[1], x[1] * force[0] + y[1] * force[1], wall_n
@@ -353,9 +378,11 @@ def source_torque(
     elif actor.acts == _RECORDED:
         torque = _recorded_torque(actor, t_s, table)
     elif actor.acts == _OWN_JOINTS:
-        torque = _own_pair(actor, t_s, q, qd, table)
+        torque = _own_pair(actor=actor, t_s=t_s, at=q, speed=qd, table=table)
     elif _is_at_end_effector(actor):
-        return _end_effector_torque(actor, t_s, q, qd, lengths, table)
+        return _end_effector_torque(
+            actor=actor, t_s=t_s, q=q, qd=qd, lengths=lengths, table=table
+        )
     else:
         size = _scripted_size(actor, t_s, table)
         torque = actor.a[0] * size, actor.a[1] * size
@@ -372,12 +399,16 @@ def torque_on_arm(
     table: TorqueTable,
     sampled: int,
 ) -> SourceTorque:
-    """Returns the torque of all actors with this `sampled` (1 or 0) ON the arm; -tau_x of Eq. (8)."""
+    """Returns the torque of all actors with this `sampled` (1 or 0) ON the arm; -tau_x of Eq.
+    (8).
+    """
     total_0 = total_1 = largest_n = 0.0
     for n in range(actors.shape[0]):
         actor: Row = actors[n]
         if actor.sampled == sampled:
-            torque = source_torque(t_s, q, qd, lengths, actor, table)
+            torque = source_torque(
+                t_s=t_s, q=q, qd=qd, lengths=lengths, actor=actor, table=table
+            )
             total_0 += torque[0]
             total_1 += torque[1]
             largest_n = max(largest_n, torque[2])
@@ -385,8 +416,12 @@ def torque_on_arm(
 
 
 @leaf
-def _force_in_space(actor: Row, t_s: float, at: Three, speed: Three, table: TorqueTable) -> Three:
-    """Returns the force of a spring, a wall or an own kind on an end effector in three dimensions, N."""
+def _force_in_space(
+    actor: Row, t_s: float, at: Three, speed: Three, table: TorqueTable
+) -> Three:
+    """Returns the force of a spring, a wall or an own kind on an end effector in three
+    dimensions, N.
+    """
     if actor.acts == _OWN_TIP:
         for i in range(3):
             actor.at[i] = at[i]
@@ -395,9 +430,15 @@ def _force_in_space(actor: Row, t_s: float, at: Three, speed: Three, table: Torq
         return three(actor.effort)
     if actor.acts != _WALL:
         progress, rate = _target_progress(actor, t_s)
-        x = _spring_along(actor, 0, progress, rate, at[0], speed[0])
-        y = _spring_along(actor, 1, progress, rate, at[1], speed[1])
-        z = _spring_along(actor, 2, progress, rate, at[2], speed[2])
+        x = _spring_along(
+            actor=actor, i=0, progress=progress, rate=rate, at=at[0], speed=speed[0]
+        )
+        y = _spring_along(
+            actor=actor, i=1, progress=progress, rate=rate, at=at[1], speed=speed[1]
+        )
+        z = _spring_along(
+            actor=actor, i=2, progress=progress, rate=rate, at=at[2], speed=speed[2]
+        )
         if actor.acts == _TASK_HAND:
             return x, y, z
         if actor.acts == _LIVE_FORCE:
@@ -415,7 +456,13 @@ def _force_in_space(actor: Row, t_s: float, at: Three, speed: Three, table: Torq
 
 @leaf
 def _add_joint_torque(
-    actor: Row, t_s: float, q: Vector, qd: Vector, joints: int, table: TorqueTable, torque: Array
+    actor: Row,
+    t_s: float,
+    q: Vector,
+    qd: Vector,
+    joints: int,
+    table: TorqueTable,
+    torque: Array,
 ) -> None:
     """Adds the torque of an actor that acts on the joints themselves."""
     if actor.acts == _HAND or actor.acts == _LIVE_JOINT:
@@ -424,11 +471,15 @@ def _add_joint_torque(
         square = 0.0
         if actor.acts == _LIVE_JOINT:
             for i in range(joints):
-                pull = _spring_along(actor, i, progress, rate, q[i], qd[i])
+                pull = _spring_along(
+                    actor=actor, i=i, progress=progress, rate=rate, at=q[i], speed=qd[i]
+                )
                 square += pull * pull
             share = _live_share(actor, square)
         for i in range(joints):
-            torque[i] += share * _spring_along(actor, i, progress, rate, q[i], qd[i])
+            torque[i] += share * _spring_along(
+                actor=actor, i=i, progress=progress, rate=rate, at=q[i], speed=qd[i]
+            )
     elif actor.acts == _VISCOUS:
         for i in range(joints):
             torque[i] -= actor.B[i] * qd[i]
@@ -452,7 +503,9 @@ def _add_joint_torque(
 
 @leaf
 def _tip_motion(qd: Vector, tip: Vector, chain: RowArray) -> tuple[Three, Three]:
-    """Returns place and velocity of a chain's end effector, and leaves its Jacobian in the chain's rows."""
+    """Returns place and velocity of a chain's end effector, and leaves its Jacobian in the
+    chain's rows.
+    """
     at = place_end_effector(chain, tip)
     v_0 = v_1 = v_2 = 0.0
     for i in range(chain.shape[0]):
@@ -475,7 +528,8 @@ def put_torque_on_chain(
     sampled: int,
     torque: Array,
 ) -> float:
-    """Writes the torque of all actors with this `sampled` ON a chain whose joints are placed, shape (n,).
+    """Writes the torque of all actors with this `sampled` ON a chain whose joints are placed,
+    shape (n,).
 
     Returns the largest force of a wall in it, N.
     """
@@ -490,12 +544,14 @@ def put_torque_on_chain(
         if actor.sampled != sampled or not actor.start_s <= t_s < actor.end_s:
             continue
         if not _is_at_end_effector(actor):
-            _add_joint_torque(actor, t_s, q, qd, n, table, torque)
+            _add_joint_torque(
+                actor=actor, t_s=t_s, q=q, qd=qd, joints=n, table=table, torque=torque
+            )
             continue
         if not placed:
             at, speed = _tip_motion(qd, tip, chain)
             placed = True
-        force = _force_in_space(actor, t_s, at, speed, table)
+        force = _force_in_space(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
         for i in range(n):
             torque[i] += dot(three(chain[i].J_lin), force)
         if actor.acts == _WALL:

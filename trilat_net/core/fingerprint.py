@@ -1,8 +1,8 @@
 """A fingerprint of the platform's arithmetic, by behaviour.
 
-Invariant (L5): two platforms with the same fingerprint gave the same bits for many sines and cosines and
-for a short run of two sites with random links; only between such platforms does verification demand bit
-equality.
+Invariant (L5): two platforms with the same fingerprint gave the same bits for many sines and
+cosines and for a short run of two sites with random links; only between such platforms does
+verification demand bit equality.
 """
 
 import hashlib
@@ -31,7 +31,18 @@ def _sines(angles: Array, results: Array) -> None:
 
 
 def _setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
-    theta = theta_from_links(ArmLinks(1.0, 1.1, 0.5, 0.09, 0.9, 0.8, 0.4, 0.05))
+    theta = theta_from_links(
+        ArmLinks(
+            l1_m=1.0,
+            m1_kg=1.1,
+            lc1_m=0.5,
+            I1_kg_m2=0.09,
+            l2_m=0.9,
+            m2_kg=0.8,
+            lc2_m=0.4,
+            I2_kg_m2=0.05,
+        )
+    )
     return SiteSetup(
         name=name,
         rate_hz=1000,
@@ -52,7 +63,11 @@ def _setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
         q0=q0,
         qd0=(0.1, -0.2),
         actors=(TorqueSource(TorqueKind.PULSE, 0.01, 0.15, a=(3.0, 2.0)),),
-        links=(LinkSetup(peer, 1.0, 1000, (0.0, 0.0), 7, (_LINK,)),),
+        links=(
+            LinkSetup(
+                peer=peer, alpha=1.0, rate_hz=1000, q0=(0.0, 0.0), key=7, models=(_LINK,)
+            ),
+        ),
     )
 
 
@@ -67,6 +82,8 @@ def compute_fingerprint() -> str:
     outputs = [site.step(TickInput(0)) for site in sites]
     for k in range(1, _TICKS):
         arrivals = [[Arrival(0, k - 1, outputs[1 - i].q, outputs[1 - i].qd)] for i in (0, 1)]
-        outputs = [site.step(TickInput(k, came)) for site, came in zip(sites, arrivals, strict=True)]
+        outputs = [
+            site.step(TickInput(k, came)) for site, came in zip(sites, arrivals, strict=True)
+        ]
         digest.update(np.array([o.q + o.qd + o.tau + o.theta_hat for o in outputs]).tobytes())
     return digest.hexdigest()[:16]

@@ -1,7 +1,7 @@
 """A run of all sites in virtual time, compiled as a whole and reduced to peaks as it proceeds.
 
-Invariant: its leaves are those of `Site.step`, in the order of the virtual-time driver (nominal time,
-then the scenario's order of sites), and its numbers are that driver's, bit for bit.
+Invariant: its leaves are those of `Site.step`, in the order of the virtual-time driver (nominal
+time, then the scenario's order of sites), and its numbers are that driver's, bit for bit.
 """
 
 from functools import cache
@@ -25,13 +25,15 @@ NEVER_NS = 2**63 - 1
 
 _PROGRESS = ("tick", "t_ns", "ticks", "rate_hz", "bucket", "part", "apart_ns", "diverged_ns")
 PROGRESS_DTYPE = np.dtype((np.record, [(name, "i8") for name in _PROGRESS]))
-"""A site's progress: its next tick and the time of that, how many it makes in all; the bucket, and how many
-BUCKETS_PER_S-th ticks of it are gone; when its |e| last was above the limit of rest, and when it diverged
-(-1: never)."""
+"""A site's progress: its next tick and the time of that, how many it makes in all; the bucket,
+and how many BUCKETS_PER_S-th ticks of it are gone; when its |e| last was above the limit of
+rest, and when it diverged (-1: never).
+"""
 
 
 class KeptRecords(NamedTuple):
-    """The last records of a site, kept as long as a peer may still want them; of all sites one axis more.
+    """The last records of a site, kept as long as a peer may still want them; of all sites one
+    axis more.
 
     Attributes:
         t_ns: their nominal times, ns since the epoch, shape (a power of two,).
@@ -46,9 +48,9 @@ class KeptRecords(NamedTuple):
 def sums_dtype(joints: int) -> np.dtype[np.void]:
     """Returns the layout of a site's sums over its records.
 
-    Of |tau - G|^2 and of e^2; the largest force of a wall; the work of its environments, from which of its
-    actors on (-1: it has none). And of the record before: q, the present and the held torque of the
-    environments; `off` is scratch.
+    Of |tau - G|^2 and of e^2; the largest force of a wall; the work of its environments, from
+    which of its actors on (-1: it has none). And of the record before: q, the present and the
+    held torque of the environments; `off` is scratch.
     """
     fields: list[Any] = [("first_environment", "i8")]
     fields += [(name, "f8") for name in ("effort", "force_peak_n", "environment_j")]
@@ -60,7 +62,9 @@ _DIVERGED = int(Mode.DIVERGED)
 
 
 def largest_of_joints(buckets: Array) -> Array:
-    """Returns the largest |e| and |qd| of any joint, of buckets as `run_until` makes them, shape (K, 2)."""
+    """Returns the largest |e| and |qd| of any joint, of buckets as `run_until` makes them,
+    shape (K, 2).
+    """
     joints = buckets.shape[1] // 3
     found: Array = buckets[:, : 2 * joints].reshape(-1, 2, joints).max(axis=2)
     return found
@@ -74,13 +78,15 @@ def _first_sent(s: Row) -> int:
 
 
 class RecordedFeed(NamedTuple):
-    """What came to the sites of a recorded run from outside, in place of prompt samples and free hands.
+    """What came to the sites of a recorded run from outside, in place of prompt samples and
+    free hands.
 
     Attributes:
-        first: by site, peer and tick the place of its first arrival, shape (N, P, K + 1); K = 0: every sample
-            comes at the first tick after its stamp.
+        first: by site, peer and tick the place of its first arrival, shape (N, P, K + 1); K =
+            0: every sample comes at the first tick after its stamp.
         samples: the ticks of the samples that arrive, in order.
-        hands: by site and tick grip, target, and target plus rate of its live hand, shape (N, K, 1 + 2 size).
+        hands: by site and tick grip, target, and target plus rate of its live hand, shape (N,
+            K, 1 + 2 size).
         hand_rows: which of a site's torque sources that is, shape (N,); -1: it has none.
     """
 
@@ -91,7 +97,9 @@ class RecordedFeed(NamedTuple):
 
 
 @leaf
-def _accept_made(k: int, rate_hz: int, peer: Row, sample: int, sent: KeptRecords, link: LinkArrays) -> None:
+def _accept_made(
+    k: int, rate_hz: int, peer: Row, sample: int, sent: KeptRecords, link: LinkArrays
+) -> None:
     """Accepts a sample that its sender has made."""
     n = peer.joints
     m = peer.shared
@@ -104,7 +112,16 @@ def _accept_made(k: int, rate_hz: int, peer: Row, sample: int, sent: KeptRecords
         qd = sent_at - 2 * m
         tau_x = sent_at - m
     row = sent.rows[sample & (sent.t_ns.shape[0] - 1)]
-    accept_sample(k, rate_hz, sample, row[q:], row[qd:], row[tau_x:], row[sent_at:], link)
+    accept_sample(
+        k=k,
+        rate_hz=rate_hz,
+        tick=sample,
+        q=row[q:],
+        qd=row[qd:],
+        tau_x=row[tau_x:],
+        sent=row[sent_at:],
+        link=link,
+    )
 
 
 @leaf
@@ -118,9 +135,11 @@ def _receive(
     sent: KeptRecords,
     link: LinkArrays,
 ) -> int:
-    """Accepts a peer's samples before time t, of the `made` there are; returns which is the next."""
+    """Accepts a peer's samples before time t, of the `made` there are; returns which is the
+    next.
+    """
     while next_sample < made and sent.t_ns[next_sample & (sent.t_ns.shape[0] - 1)] < t_ns:
-        _accept_made(k, rate_hz, peer, next_sample, sent, link)
+        _accept_made(k=k, rate_hz=rate_hz, peer=peer, sample=next_sample, sent=sent, link=link)
         next_sample += 1
     return next_sample
 
@@ -147,7 +166,8 @@ def _update_peaks(
     bucket = progress.bucket
     joints = peaks.shape[1] // 3
     here = _first_sent(s) - 3 * s.shared if s.task else 0
-    for i in range(joints):  # where a task has more or fewer coordinates than there are joints, zeros stand
+    # where a task has more or fewer coordinates than there are joints, zeros stand
+    for i in range(joints):
         e = speed = angle = 0.0
         if i < s.shared:
             e = row[here + i] - row[2 * s.joints + i]
@@ -190,9 +210,20 @@ def _put_source_torque(
     torque: Array,
 ) -> None:
     if chain is None:
-        two_link_stages.put_source_torque(t_s, s, row, actors, table, sampled, torque)
+        two_link_stages.put_source_torque(
+            t_s=t_s, s=s, state=row, actors=actors, table=table, sampled=sampled, torque=torque
+        )
     else:
-        chain_stages.put_source_torque(t_s, s, chain, row, actors, table, sampled, torque)
+        chain_stages.put_source_torque(
+            t_s=t_s,
+            s=s,
+            chain=chain,
+            state=row,
+            actors=actors,
+            table=table,
+            sampled=sampled,
+            torque=torque,
+        )
 
 
 @leaf
@@ -223,8 +254,26 @@ def _update_sums(
         sums.held[i] = s.held[i]
         sums.now[i] = s.on_arm[i] - s.held[i]
     if first > 0:  # beside operators, whose rows come first
-        _put_source_torque(t_s, s, chain, row, actors[first:], table, 0, sums.now)
-        _put_source_torque(t_s, s, chain, row, actors[first:], table, 1, sums.held)
+        _put_source_torque(
+            t_s=t_s,
+            s=s,
+            chain=chain,
+            row=row,
+            actors=actors[first:],
+            table=table,
+            sampled=0,
+            torque=sums.now,
+        )
+        _put_source_torque(
+            t_s=t_s,
+            s=s,
+            chain=chain,
+            row=row,
+            actors=actors[first:],
+            table=table,
+            sampled=1,
+            torque=sums.held,
+        )
     sums.force_peak_n = max(sums.force_peak_n, s.wall_n)
     for i in range(n):
         if k > 0:
@@ -239,7 +288,8 @@ class LawArrays(NamedTuple):
     """The plugged laws of all sites.
 
     Attributes:
-        addresses: of the machine code of each site's law, shape (N,); 0: it has none, see `CompiledLaw`.
+        addresses: of the machine code of each site's law, shape (N,); 0: it has none, see
+            `CompiledLaw`.
         rows: the numbers of each law, shape (N, most).
         sent: what each law sends, shape (N, most).
     """
@@ -266,7 +316,17 @@ def _find_torque(
     row = laws.rows[i]
     sent = laws.sent[i]
     address = laws.addresses[i]
-    law_stage(own.tick, own.t_ns, address, row, site, links, chain, channel, sent)
+    law_stage(
+        k=own.tick,
+        t_ns=own.t_ns,
+        address=address,
+        law=row,
+        site=site,
+        links=links,
+        chain=chain,
+        channel=channel,
+        sent=sent,
+    )
 
 
 @leaf
@@ -298,23 +358,48 @@ def sense_site(
         j = p if p < i else p + 1
         peer: Row = progress[j]
         link = LinkArrays(
-            links[p : p + 1],
-            arrays.models[i, p],
-            arrays.dues[i, p],
-            arrays.calendars[i, p],
-            arrays.points,
-            channel_of(channel_of(arrays.channel, i), p),
+            state=links[p : p + 1],
+            models=arrays.models[i, p],
+            dues=arrays.dues[i, p],
+            calendar=arrays.calendars[i, p],
+            points=arrays.points,
+            channel=channel_of(channel_of(arrays.channel, i), p),
         )
         sender: Row = arrays.site[j, 0]
         kept = KeptRecords(sent.t_ns[j], sent.rows[j])
         if k + 1 < feed.first.shape[2]:
             for n in range(feed.first[i, p, k], feed.first[i, p, k + 1]):
-                _accept_made(k, rate_hz, sender, feed.samples[n], kept, link)
+                _accept_made(
+                    k=k,
+                    rate_hz=rate_hz,
+                    peer=sender,
+                    sample=feed.samples[n],
+                    sent=kept,
+                    link=link,
+                )
         else:
-            taken[i, p] = _receive(k, t_ns, rate_hz, sender, peer.tick, taken[i, p], kept, link)
+            taken[i, p] = _receive(
+                k=k,
+                t_ns=t_ns,
+                rate_hz=rate_hz,
+                peer=sender,
+                made=peer.tick,
+                next_sample=taken[i, p],
+                sent=kept,
+                link=link,
+            )
         recall_sample(k, rate_hz, link)
     _take_hand(i, k, arrays.actors[i], feed)
-    reference_stages(k, t_ns, site, links, arrays.ramps[i], arrays.actors[i], arrays.table, chain)
+    reference_stages(
+        k=k,
+        t_ns=t_ns,
+        site=site,
+        links=links,
+        ramps=arrays.ramps[i],
+        actors=arrays.actors[i],
+        table=arrays.table,
+        chain=chain,
+    )
 
 
 @leaf
@@ -335,15 +420,40 @@ def finish_site(
     t_ns = own.t_ns
     rate_hz = own.rate_hz
     site = arrays.site[i]
-    _find_torque(i, own, arrays, chain, laws)
+    _find_torque(i=i, own=own, arrays=arrays, chain=chain, laws=laws)
     page = k & (sent.t_ns.shape[1] - 1)
     sent.t_ns[i, page] = t_ns
     record = sent.rows[i, page]
-    act_stages(k, t_ns, site, arrays.actors[i], arrays.table, chain, record)
+    act_stages(
+        k=k,
+        t_ns=t_ns,
+        site=site,
+        actors=arrays.actors[i],
+        table=arrays.table,
+        chain=chain,
+        record=record,
+    )
     _record_sent(site[0], i, record, laws)
     total: Row = sums[i]
-    _update_peaks(record, t_ns, apart_rad, site[0], own, peaks[i], total)
-    _update_sums(k, t_ns, site[0], chain, arrays.actors[i], arrays.table, record, total)
+    _update_peaks(
+        row=record,
+        t_ns=t_ns,
+        apart_rad=apart_rad,
+        s=site[0],
+        progress=own,
+        peaks=peaks[i],
+        sums=total,
+    )
+    _update_sums(
+        k=k,
+        t_ns=t_ns,
+        s=site[0],
+        chain=chain,
+        actors=arrays.actors[i],
+        table=arrays.table,
+        row=record,
+        sums=total,
+    )
     own.tick = k + 1
     own.t_ns = tick_ns(k + 1, rate_hz) if k + 1 < own.ticks else NEVER_NS
     mode: int = site[0].mode
@@ -373,11 +483,12 @@ def run_until(
         taken: the next sample of each peer to accept, shape (N, P).
         sent: each site's last records.
         feed: what came from outside in a run that was recorded.
-        peaks: of each bucket per joint the largest |e|, then per joint the largest |qd|, then the last q of
-            each; -1 where there is no record; shape (N, buckets, 3 n).
+        peaks: of each bucket per joint the largest |e|, then per joint the largest |qd|, then
+            the last q of each; -1 where there is no record; shape (N, buckets, 3 n).
         sums: of each site, shape (N,), see `sums_dtype`.
         arrays: of all sites, see `stack_site_arrays`.
-        chains: its `chain` once more: an argument that is None keeps the leaves of chains uncompiled.
+        chains: its `chain` once more: an argument that is None keeps the leaves of chains
+            uncompiled.
         laws: compiled laws that are plugged in; None: there are none.
     """
     count = progress.shape[0]
@@ -393,12 +504,48 @@ def run_until(
             if own.t_ns != t_ns:
                 continue
             if chains is None:
-                sense_site(i, progress, taken, sent, feed, arrays, None)
-                mode = finish_site(i, apart_rad, progress, sent, peaks, sums, arrays, None, laws)
+                sense_site(
+                    i=i,
+                    progress=progress,
+                    taken=taken,
+                    sent=sent,
+                    feed=feed,
+                    arrays=arrays,
+                    chain=None,
+                )
+                mode = finish_site(
+                    i=i,
+                    apart_rad=apart_rad,
+                    progress=progress,
+                    sent=sent,
+                    peaks=peaks,
+                    sums=sums,
+                    arrays=arrays,
+                    chain=None,
+                    laws=laws,
+                )
             else:
                 chain = chains[i, : arrays.site[i, 0].joints]
-                sense_site(i, progress, taken, sent, feed, arrays, chain)
-                mode = finish_site(i, apart_rad, progress, sent, peaks, sums, arrays, chain, laws)
+                sense_site(
+                    i=i,
+                    progress=progress,
+                    taken=taken,
+                    sent=sent,
+                    feed=feed,
+                    arrays=arrays,
+                    chain=chain,
+                )
+                mode = finish_site(
+                    i=i,
+                    apart_rad=apart_rad,
+                    progress=progress,
+                    sent=sent,
+                    peaks=peaks,
+                    sums=sums,
+                    arrays=arrays,
+                    chain=chain,
+                    laws=laws,
+                )
             if mode == _DIVERGED:
                 own.diverged_ns = t_ns
                 last_ns = t_ns

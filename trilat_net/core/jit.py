@@ -1,11 +1,12 @@
 # mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
 """The one typed wrapper around Numba.
 
-Invariants: a leaf is compiled for float64 without reordering (no fastmath), so compiled and plain Python
-runs give the same bits. Machine code is cached in the user's cache directory, in a folder named after a
-hash of all sources of the core: Numba alone notices a change of the file that holds a leaf, not of the
-leaves it calls. A wheel brings such a folder with code for the generic processor of its platform, which is
-used where the user's has none for this processor. Nobody else's code is compiled or looked for otherwise.
+Invariants: a leaf is compiled for float64 without reordering (no fastmath), so compiled and
+plain Python runs give the same bits. Machine code is cached in the user's cache directory, in a
+folder named after a hash of all sources of the core: Numba alone notices a change of the file
+that holds a leaf, not of the leaves it calls. A wheel brings such a folder with code for the
+generic processor of its platform, which is used where the user's has none for this processor.
+Nobody else's code is compiled or looked for otherwise.
 """
 
 import hashlib
@@ -36,7 +37,12 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 with suppress(OSError, IndexError):  # of Linux alone
-    _addresses = Path("/proc/self/limits").read_text("utf-8").partition("Max address space")[2].split()[0]
+    _addresses = (
+        Path("/proc/self/limits")
+        .read_text("utf-8")
+        .partition("Max address space")[2]
+        .split()[0]
+    )
     if _addresses != "unlimited" and int(_addresses) < 1 << 30:
         raise MemoryError  # LLVM and OpenBLAS would try for ever, deaf to signals, or abort
 
@@ -59,7 +65,9 @@ def _core_digest() -> str:
 
 
 def _writable_cache() -> Path | None:
-    """Returns the directory for compiled leaves, or None if it cannot be written (then: memory only)."""
+    """Returns the directory for compiled leaves, or None if it cannot be written (then: memory
+    only).
+    """
     try:
         directory = _cache_root() / "trilat-net" / _core_digest()
         directory.mkdir(parents=True, exist_ok=True)
@@ -75,18 +83,22 @@ _ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """True if there is machine code of a whole tick of this version of the core, which is compiled last."""
-    folders = (folder for folder in (_CACHE, _SHIPPED if _ships else None) if folder is not None)
+    """True if there is machine code of a whole tick of this version of the core, which is
+    compiled last.
+    """
+    folders = (
+        folder for folder in (_CACHE, _SHIPPED if _ships else None) if folder is not None
+    )
     return any(next(folder.rglob("kernel.site_tick-*.nbc"), None) for folder in folders)
 
 
-COMPILING = (
-    "compiling, once for this machine and each number of joints: half a minute, or minutes of a busy one ..."
-)
+COMPILING = "compiling, once for this machine and each number of joints: half a minute, or minutes of a busy one ..."
 
 
 class _CompilingNotice(event.Listener):
-    """Says once, wherever errors go, why the first run takes longer; a signal may end it at any time."""
+    """Says once, wherever errors go, why the first run takes longer; a signal may end it at any
+    time.
+    """
 
     def __init__(self) -> None:
         self.said = False
@@ -96,7 +108,9 @@ class _CompilingNotice(event.Listener):
     def on_start(self, begun: Any) -> None:
         """Says so as anything of the core is compiled."""
         self._restore.append(let_signals_kill())
-        if not self.said and begun.data["dispatcher"].py_func.__module__.startswith(__package__):
+        if not self.said and begun.data["dispatcher"].py_func.__module__.startswith(
+            __package__
+        ):
             self.said = True
             self.say(COMPILING)
 
@@ -113,8 +127,9 @@ _register("numba:compile", compiling_notice)
 def _mangle_record(record: types.Record) -> tuple[str, tuple[str]]:
     """Names a record in the symbols of machine code by its fields.
 
-    Numba numbers records in the order in which a process meets them. Leaves that two processes compiled for
-    two layouts then have the same symbols, and a third process that loads both from the cache mixes them up.
+    Numba numbers records in the order in which a process meets them. Leaves that two processes
+    compiled for two layouts then have the same symbols, and a third process that loads both
+    from the cache mixes them up.
     """
     return "Record", (f"r{hashlib.sha256(record.name.encode()).hexdigest()[:16]}",)
 
@@ -123,12 +138,16 @@ _record: Any = types.Record
 _record.mangling_args = property(_mangle_record)
 
 _OPTIONS: Any = {"_nrt": False}
-"""No leaf makes an array, so no reference is counted, which would cost more than the arithmetic does."""
+"""No leaf makes an array, so no reference is counted, which would cost more than the arithmetic
+does.
+"""
 _WITHIN = "within"  # another leaf, compiled as a part of it
 
 
 class _Place:
-    """Where the machine code of a function is kept, as Numba asks for it; its source counts by content."""
+    """Where the machine code of a function is kept, as Numba asks for it; its source counts by
+    content.
+    """
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._line = function.__code__.co_firstlineno
@@ -150,7 +169,9 @@ class _Place:
 
 
 class _Placed(CompileResultCacheImpl):
-    """How the machine code of a leaf is kept; of one within others it is what LLVM optimises later."""
+    """How the machine code of a leaf is kept; of one within others it is what LLVM optimises
+    later.
+    """
 
     _locator_classes = cast(Any, [_Place])
 
@@ -162,7 +183,14 @@ class _Placed(CompileResultCacheImpl):
         library.within = True
         library._finalized = True
         library._final_module = parse_bitcode(code)
-        names = ("fndesc", "environment", "signature", "objectmode", "lifted", "type_annotation")
+        names = (
+            "fndesc",
+            "environment",
+            "signature",
+            "objectmode",
+            "lifted",
+            "type_annotation",
+        )
         fields = dict(zip((*names, "reload_init", "referenced_envs"), kept[1:], strict=True))
         contexts = {"target_context": context, "typing_context": context.typing_context}
         return _within(compile_result(library=library, **contexts, **fields))
@@ -205,7 +233,9 @@ class _LeafCache(FunctionCache):
         self._within = files(str(place), f"{base}-within", stamp)
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Returns what is kept, or None; Numba first readies itself to compile, which takes far longer."""
+        """Returns what is kept, or None; Numba first readies itself to compile, which takes far
+        longer.
+        """
         with self._guard_against_spurious_io_errors():
             found = self._load_overload(signature, context)
             if found is None and _ships:
@@ -230,10 +260,11 @@ class _LeafCache(FunctionCache):
 
 
 class _LeafLibrary(JITCodeLibrary):
-    """The code of a leaf; that of one within another is neither optimised nor made executable by itself.
+    """The code of a leaf; that of one within another is neither optimised nor made executable
+    by itself.
 
-    It is optimised as a part of whatever calls it, once. Numba does so at every leaf between as well, and has
-    wrappers for calls from Python at each: half of the time to compile.
+    It is optimised as a part of whatever calls it, once. Numba does so at every leaf between as
+    well, and has wrappers for calls from Python at each: half of the time to compile.
     """
 
     within = False
@@ -255,7 +286,9 @@ class _LeafLibrary(JITCodeLibrary):
 
 
 def _within(made: Any) -> Any:
-    """Returns a leaf within others as they find it: by an object in place of what Python would call."""
+    """Returns a leaf within others as they find it: by an object in place of what Python would
+    call.
+    """
     made = made._replace(entry_point=object())
     made.target_context.insert_user_function(made.entry_point, made.fndesc, [made.library])
     return made
@@ -273,7 +306,9 @@ class _LeafCompiler(Compiler):
         state.library.enable_object_caching()
         state.library.within = within
         if within:
-            state.flags.no_compile = state.flags.no_cpython_wrapper = state.flags.no_cfunc_wrapper = True
+            state.flags.no_compile = state.flags.no_cpython_wrapper = (
+                state.flags.no_cfunc_wrapper
+            ) = True
         _LeafCompiler.depth += 1
         try:
             made = super().compile_extra(function)
@@ -293,7 +328,9 @@ class _Leaf(CPUDispatcher):
     _compiler: Any
 
     def get_call_template(self, arguments: Any, named: Any) -> Any:
-        """Returns what a caller is to know: not one leaf for every constant that somebody passes."""
+        """Returns what a caller is to know: not one leaf for every constant that somebody
+        passes.
+        """
         plain = {name: types.unliteral(one) for name, one in named.items()}
         return super().get_call_template(tuple(map(types.unliteral, arguments)), plain)
 
@@ -316,7 +353,9 @@ class _Leaf(CPUDispatcher):
             if known is None:
                 known = self._cache.load_within(kinds, self.targetctx)
                 if known is None:
-                    with event.trigger_event("numba:compile", data={"dispatcher": self, "args": kinds}):
+                    with event.trigger_event(
+                        "numba:compile", data={"dispatcher": self, "args": kinds}
+                    ):
                         known = self._compiler.compile(kinds, result)
                     self._cache.save_within(kinds, known)
                 self.add_overload(known)
@@ -332,7 +371,9 @@ def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Ca
 
 
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function of numbers and arrays; its type, as seen by a reader or mypy, stays the same."""
+    """Compiles a function of numbers and arrays; its type, as seen by a reader or mypy, stays
+    the same.
+    """
     if _config.DISABLE_JIT:
         return function
     options = {"nopython": True, "boundscheck": None, **_OPTIONS}
@@ -342,19 +383,25 @@ def leaf(function: Callable[P, R]) -> Callable[P, R]:
 
 
 class _NamedCache(_LeafCache):
-    """Machine code of a function whose name tells all that it is made of, what it closes over too."""
+    """Machine code of a function whose name tells all that it is made of, what it closes over
+    too.
+    """
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, Any]:
         return signature, codegen.magic_tuple()
 
 
-def compile_named(function: Callable[..., None], name: str, signature: Any, **options: Any) -> Any:
+def compile_named(
+    function: Callable[..., None], name: str, signature: Any, **options: Any
+) -> Any:
     """Compiles a closure for a signature, or loads it if one of this name was compiled before.
 
-    The name goes into the symbols of the machine code: no two closures may share one in any process.
+    The name goes into the symbols of the machine code: no two closures may share one in any
+    process.
     """
     function.__qualname__ = name
-    dispatcher = numba.njit(**{**options, **_OPTIONS})(function)  # what is only loaded counts no references
+    # what is only loaded counts no references
+    dispatcher = numba.njit(**{**options, **_OPTIONS})(function)
     dispatcher._cache = cast(Any, _NamedCache)(function)
     dispatcher.compile(signature)
     return dispatcher

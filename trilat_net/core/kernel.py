@@ -1,8 +1,9 @@
 """One tick of one site, compiled: its eight stages in order, and the integrator of the arm.
 
-Invariant: one call computes a whole tick, and every stage is a leaf that the fused virtual-time run calls
-as well. The arm advances one period by the classical Runge-Kutta method of fourth order: each of its
-stages evaluates operators and environments, and what is held over the period is constant.
+Invariant: one call computes a whole tick, and every stage is a leaf that the fused virtual-time
+run calls as well. The arm advances one period by the classical Runge-Kutta method of fourth
+order: each of its stages evaluates operators and environments, and what is held over the period
+is constant.
 """
 
 from math import isfinite
@@ -32,7 +33,9 @@ _OWN = int(Law.OWN)
 
 @leaf
 def _place_arm(s: Row, chain: RowArray | None, links: RowArray, refers: bool) -> None:
-    """Places the joints of a chain; if it refers to its peers anew, the orientation of its reference too."""
+    """Places the joints of a chain; if it refers to its peers anew, the orientation of its
+    reference too.
+    """
     if chain is None:
         return
     chain_stages.place_chain(s, chain)
@@ -65,7 +68,9 @@ def _adapts(s: Row) -> bool:
 
 @leaf
 def _update_estimate(k: int, s: Row, chain: RowArray | None) -> None:
-    """Stage 5: the trapezoid rule for Eq. (15), explicit since Y' r does not depend on the estimate."""
+    """Stage 5: the trapezoid rule for Eq. (15), explicit since Y' r does not depend on the
+    estimate.
+    """
     if s.scheme == _DIGITAL or k == s.first or s.law != _ADAPTIVE or not _adapts(s):
         return
     for p in range(s.Yr.shape[0]):
@@ -98,7 +103,9 @@ def _put_known_gravity(s: Row, chain: RowArray | None, torque: Array) -> None:
 
 @leaf
 def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
-    """Ends stage 6: the torque of an arm at rest or on its way back, and none that changes too fast."""
+    """Ends stage 6: the torque of an arm at rest or on its way back, and none that changes too
+    fast.
+    """
     resting = False
     if s.on_stale == _GLIDE:
         if s.reason != _NOT_FINITE and s.mode != _DIVERGED and not is_torque_finite(s):
@@ -117,7 +124,9 @@ def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
 
 @leaf
 def _write_record(s: Row, row: Array) -> None:
-    """Writes the record's floats, see `Layout.columns`; one that is not finite diverges the run and is 0."""
+    """Writes the record's floats, see `Layout.columns`; one that is not finite diverges the run
+    and is 0.
+    """
     n = s.joints
     m = s.shared
     P = s.parameters
@@ -156,21 +165,35 @@ def _update_external_torque(
     if chain is None:
         two_link_stages.update_external_torque(t_s, s, actors, table)
     else:
-        chain_stages.update_external_torque(t_s, s, chain, actors, table)
+        chain_stages.update_external_torque(
+            t_s=t_s, s=s, chain=chain, actors=actors, table=table
+        )
 
 
 @leaf
 def _advance_arm(
-    t_s: float, h_s: float, s: Row, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
+    t_s: float,
+    h_s: float,
+    s: Row,
+    chain: RowArray | None,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
 ) -> bool:
     if chain is None:
-        return two_link_stages.advance_arm(t_s, h_s, s, actors, table)
-    return chain_stages.advance_arm(t_s, h_s, s, chain, actors, table)
+        return two_link_stages.advance_arm(t_s=t_s, h_s=h_s, s=s, actors=actors, table=table)
+    return chain_stages.advance_arm(
+        t_s=t_s, h_s=h_s, s=s, chain=chain, actors=actors, table=table
+    )
 
 
 @leaf
 def _advance(
-    k: int, t_ns: int, s: Row, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
+    k: int,
+    t_ns: int,
+    s: Row,
+    chain: RowArray | None,
+    actors: TorqueSourceRows,
+    table: TorqueTable,
 ) -> None:
     """Stage 8: advances the state from t_k to t_{k+1} and keeps what tick k+1 needs of tick k.
 
@@ -183,9 +206,13 @@ def _advance(
         for i in range(s.u.shape[0]):
             torque = s.tau[i]
             if s.scheme != _DIGITAL and k > s.first:
-                torque = control.limit_torque(1.5 * s.tau[i] - 0.5 * s.tau_before[i], s.tau_limit[i])
+                torque = control.limit_torque(
+                    1.5 * s.tau[i] - 0.5 * s.tau_before[i], s.tau_limit[i]
+                )
             s.u[i] = torque + s.held[i]
-        if not _advance_arm(t_ns * 1e-9, h_s, s, chain, actors, table):
+        if not _advance_arm(
+            t_s=t_ns * 1e-9, h_s=h_s, s=s, chain=chain, actors=actors, table=table
+        ):
             s.mode = _DIVERGED
     if s.scheme == _DIGITAL and s.law == _ADAPTIVE and adapts and s.mode != _DIVERGED:
         _advance_estimate(s, chain, h_s, s.Yr)
@@ -197,7 +224,9 @@ def _advance(
 
 @leaf
 def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
-    """Returns what one peer sends, of what all peers do; of stacked arrays, what the peers of one site do."""
+    """Returns what one peer sends, of what all peers do; of stacked arrays, what the peers of
+    one site do.
+    """
     if channel is None:
         return None
     return ChannelArrays(channel.waiting[peer], channel.received[peer], channel.places[peer])
@@ -207,12 +236,12 @@ def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None
 def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
     """Returns the arrays of the link from one peer."""
     return LinkArrays(
-        arrays.links[peer : peer + 1],
-        arrays.models[peer],
-        arrays.dues[peer],
-        arrays.calendars[peer],
-        arrays.points,
-        channel_of(arrays.channel, peer),
+        state=arrays.links[peer : peer + 1],
+        models=arrays.models[peer],
+        dues=arrays.dues[peer],
+        calendar=arrays.calendars[peer],
+        points=arrays.points,
+        channel=channel_of(arrays.channel, peer),
     )
 
 
@@ -231,7 +260,16 @@ def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -
         link = link_arrays(arrays, arrival.peer)
         forces = buffers.forces[n]
         sent = buffers.sent[n]
-        accept_sample(k, rate_hz, arrival.tick, arrival.q, arrival.qd, forces, sent, link)
+        accept_sample(
+            k=k,
+            rate_hz=rate_hz,
+            tick=arrival.tick,
+            q=arrival.q,
+            qd=arrival.qd,
+            tau_x=forces,
+            sent=sent,
+            link=link,
+        )
 
 
 @leaf
@@ -245,7 +283,9 @@ def reference_stages(
     table: TorqueTable,
     chain: RowArray | None,
 ) -> None:
-    """Stages 3 to 5 of a tick and its external torque, with the samples that it releases in use."""
+    """Stages 3 to 5 of a tick and its external torque, with the samples that it releases in
+    use.
+    """
     s: Row = site[0]
     update_reference(t_ns, s, links, ramps)  # 3 reference
     _place_arm(s, chain, links, True)
@@ -257,12 +297,16 @@ def reference_stages(
         limit_reference(k, s)
     _update_errors(s, chain)  # 4 errors
     _update_estimate(k, s, chain)  # 5 estimate
-    _update_external_torque(t_ns * 1e-9, s, chain, actors, table)
+    _update_external_torque(t_s=t_ns * 1e-9, s=s, chain=chain, actors=actors, table=table)
 
 
 @leaf
-def sense_stages(k: int, t_ns: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Stages 1 to 5 of a tick: its arrivals, the reference, the errors, the estimate, the external torque."""
+def sense_stages(
+    k: int, t_ns: int, count: int, arrays: SiteArrays, buffers: TickBuffers
+) -> None:
+    """Stages 1 to 5 of a tick: its arrivals, the reference, the errors, the estimate, the
+    external torque.
+    """
     rate_hz = arrays.site[0].rate_hz
     for missed in range(k - arrays.site[0].skipped, k):  # ticks that the site did not make
         for j in range(arrays.links.shape[0]):
@@ -271,7 +315,16 @@ def sense_stages(k: int, t_ns: int, count: int, arrays: SiteArrays, buffers: Tic
     for j in range(arrays.links.shape[0]):  # 2 recall
         recall_sample(k, rate_hz, link_arrays(arrays, j))
     a = arrays
-    reference_stages(k, t_ns, a.site, a.links, a.ramps, a.actors, a.table, a.chain)
+    reference_stages(
+        k=k,
+        t_ns=t_ns,
+        site=a.site,
+        links=a.links,
+        ramps=a.ramps,
+        actors=a.actors,
+        table=a.table,
+        chain=a.chain,
+    )
 
 
 @leaf
@@ -284,7 +337,9 @@ def act_stages(
     chain: RowArray | None,
     record: Array,
 ) -> None:
-    """Stages 7 and 8 of a tick, with the law's torque in place: the record, and the step to the next tick."""
+    """Stages 7 and 8 of a tick, with the law's torque in place: the record, and the step to the
+    next tick.
+    """
     s: Row = site[0]
     _guard_torque(k, t_ns, s, chain)
     for i in range(s.joints):
@@ -292,7 +347,7 @@ def act_stages(
             s.mode = _DIVERGED
     _write_record(s, record)  # 7 emit
     if s.mode != _DIVERGED:  # 8 advance
-        _advance(k, t_ns, s, chain, actors, table)
+        _advance(k=k, t_ns=t_ns, s=s, chain=chain, actors=actors, table=table)
 
 
 @leaf
@@ -318,22 +373,48 @@ def site_tick(
 ) -> None:
     """Computes tick k of one site at t_ns, ns since the epoch, with its first `count` arrivals.
 
-    It takes the fields of `SiteArrays` and `TickBuffers` one by one: passed from Python as tuples they would
-    cost more than a microsecond.
+    It takes the fields of `SiteArrays` and `TickBuffers` one by one: passed from Python as
+    tuples they would cost more than a microsecond.
     """
-    arrays = SiteArrays(site, links, models, dues, calendars, points, ramps, actors, table, chain, channel)
-    sense_stages(k, t_ns, count, arrays, TickBuffers(arrivals, forces, sent, record))
+    arrays = SiteArrays(
+        site=site,
+        links=links,
+        models=models,
+        dues=dues,
+        calendars=calendars,
+        points=points,
+        ramps=ramps,
+        actors=actors,
+        table=table,
+        chain=chain,
+        channel=channel,
+    )
+    sense_stages(
+        k=k,
+        t_ns=t_ns,
+        count=count,
+        arrays=arrays,
+        buffers=TickBuffers(arrivals, forces, sent, record),
+    )
     torque_stage(site, chain)  # 6 torque
-    act_stages(k, t_ns, site, actors, table, chain, record)
+    act_stages(
+        k=k, t_ns=t_ns, site=site, actors=actors, table=table, chain=chain, record=record
+    )
 
 
 @leaf
 def resume_stages(k: int, arrays: SiteArrays) -> None:
-    """Repeats the end of tick k (stages 4 and 8) from a state that was filled in from its record."""
+    """Repeats the end of tick k (stages 4 and 8) from a state that was filled in from its
+    record.
+    """
     s: Row = arrays.site[0]
     t_ns = tick_ns(k, s.rate_hz)
     _place_arm(s, arrays.chain, arrays.links, False)
     _update_errors(s, arrays.chain)
-    _update_external_torque(t_ns * 1e-9, s, arrays.chain, arrays.actors, arrays.table)
+    _update_external_torque(
+        t_s=t_ns * 1e-9, s=s, chain=arrays.chain, actors=arrays.actors, table=arrays.table
+    )
     if s.mode != _DIVERGED:
-        _advance(k, t_ns, s, arrays.chain, arrays.actors, arrays.table)
+        _advance(
+            k=k, t_ns=t_ns, s=s, chain=arrays.chain, actors=arrays.actors, table=arrays.table
+        )

@@ -1,9 +1,10 @@
-"""What a control law sends to its peers besides the motion and the exogenous torque of its record.
+"""What a control law sends to its peers besides the motion and the exogenous torque of its
+record.
 
-Invariant: a law declares its vectors once; their numbers stand one behind the other in the field `ch` of its
-record and of its sample: first the vectors that go to all peers, then per peer, in scenario order, those
-that go to that peer alone. A receiver takes the first part and its own; what it took in is thereby found in
-the sender's record.
+Invariant: a law declares its vectors once; their numbers stand one behind the other in the
+field `ch` of its record and of its sample: first the vectors that go to all peers, then per
+peer, in scenario order, those that go to that peer alone. A receiver takes the first part and
+its own; what it took in is thereby found in the sender's record.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,7 +15,9 @@ from ..errors import count_nouns
 MAX_SENT = 16
 """Most numbers per joint that a law sends to a peer."""
 MAX_RECORD_SENT = 1024
-"""Most numbers that a law sends to all its peers together, which are in the record of every tick."""
+"""Most numbers that a law sends to all its peers together, which are in the record of every
+tick.
+"""
 
 
 class SentVector(NamedTuple):
@@ -85,7 +88,9 @@ class LawChannel(NamedTuple):
         return self.numbers(per_peer=False) + self.peers * self.numbers(per_peer=True)
 
     def find_places(self, vectors: Sequence[SentVector]) -> list[int]:
-        """Returns where each number of some vectors stands in a peer's part; -1: it is not sent."""
+        """Returns where each number of some vectors stands in a peer's part; -1: it is not
+        sent.
+        """
         first = 0
         firsts = {}
         for vector in self.vectors:
@@ -98,7 +103,9 @@ class LawChannel(NamedTuple):
         ]
 
     def entries(self, peers: Sequence[str]) -> Iterator[SentEntry]:
-        """Yields what each number of a record is, in order; `peers` are the names of the site's peers."""
+        """Yields what each number of a record is, in order; `peers` are the names of the site's
+        peers.
+        """
         for per_peer, places in ((False, ("",)), (True, peers)):
             for peer in places:
                 for vector in self.vectors:

@@ -1,7 +1,9 @@
-"""The energies by which a control law is proved passive, as functions of what its site recorded.
+"""The energies by which a control law is proved passive, as functions of what its site
+recorded.
 
-Invariant: of energy that a law gives to a peer the peer takes no more than came; what a law stores is never
-below zero, and what it has taken for good never falls. Then the arms get no more than they gave.
+Invariant: of energy that a law gives to a peer the peer takes no more than came; what a law
+stores is never below zero, and what it has taken for good never falls. Then the arms get no
+more than they gave.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +19,8 @@ class PeerRecords(NamedTuple):
 
     Attributes:
         tick: of the sample in use, shape (K,); -1 before the first.
-        received: what the peer's law sent with that sample, by name, shape (K, length); zeros before one.
+        received: what the peer's law sent with that sample, by name, shape (K, length); zeros
+            before one.
         sent: what went to this peer alone at that tick, by name.
     """
 
@@ -35,7 +38,8 @@ class LawRecords(NamedTuple):
         tau: control torque within its limits, shape (K, n), N m.
         tau_x: exogenous torque; ON the arm acts its negative.
         to_all: what went to all peers, by name, shape (K, length).
-        memory: what the law remembered after the tick, by the names of `remembers`, shape (K, length).
+        memory: what the law remembered after the tick, by the names of `remembers`, shape (K,
+            length).
         peers: in scenario order.
     """
 
@@ -50,7 +54,8 @@ class LawRecords(NamedTuple):
 
 
 class LawEnergies(NamedTuple):
-    """Energies of a law at K ticks, J, shape (K,) each, or (K, parts); flows are sums since the beginning.
+    """Energies of a law at K ticks, J, shape (K,) each, or (K, parts); flows are sums since the
+    beginning.
 
     Each part, a joint's for instance, must not be below zero by itself.
 
@@ -60,7 +65,8 @@ class LawEnergies(NamedTuple):
         port: what the arm gave to the law by the law's own books; None: what it gave indeed.
         store: what the law stores.
         taken: what it has taken for good, by its own formula; None: what is left of the others.
-        observed: per peer, what the site knows to be left of what the peer sent; (): nothing of that kind.
+        observed: per peer, what the site knows to be left of what the peer sent; (): nothing of
+            that kind.
         weight: by which its arm's energy counts in the sum over all sites.
         gravity: share of gravity that the law carries, whose work is not its own.
     """
@@ -76,6 +82,8 @@ class LawEnergies(NamedTuple):
 
 
 def sum_work(tau: Array, q: Array) -> Array:
-    """Returns the work of torques that are held from tick to tick, up to each tick, shape (K,), J."""
+    """Returns the work of torques that are held from tick to tick, up to each tick, shape (K,),
+    J.
+    """
     steps: Array = np.einsum("kj,kj->k", tau[:-1], np.diff(q, axis=0))
     return np.concatenate([[0.0], np.cumsum(steps)])

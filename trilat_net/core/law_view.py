@@ -1,7 +1,8 @@
-"""What a plugged control law gets to see of a tick, filled into the site's row and the rows of its links.
+"""What a plugged control law gets to see of a tick, filled into the site's row and the rows of
+its links.
 
-Invariant: of one tick the compiled and the plain form of a law see the same numbers. What a law sends stays
-in force until it writes it anew.
+Invariant: of one tick the compiled and the plain form of a law see the same numbers. What a law
+sends stays in force until it writes it anew.
 """
 
 from collections.abc import Sequence
@@ -30,8 +31,12 @@ def _update_model(s: Row, chain: RowArray | None) -> None:
 
 
 @leaf
-def update_law_view(k: int, t_ns: int, site: RowArray, links: RowArray, chain: RowArray | None) -> None:
-    """Writes what a law sees of a tick that no stage wrote: time, model, peers; and no torque yet."""
+def update_law_view(
+    k: int, t_ns: int, site: RowArray, links: RowArray, chain: RowArray | None
+) -> None:
+    """Writes what a law sees of a tick that no stage wrote: time, model, peers; and no torque
+    yet.
+    """
     s: Row = site[0]
     s.k = k
     s.t_s = k / s.rate_hz
@@ -64,7 +69,8 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
 
 
 class PlainLaw:
-    """A law in plain Python at its site: it gets lists, and its results are written into the site's row.
+    """A law in plain Python at its site: it gets lists, and its results are written into the
+    site's row.
 
     Args:
         law: the law.
@@ -92,7 +98,9 @@ class PlainLaw:
         self._of_peers = [column if column.ndim == 1 else column[:, :m] for column in columns]
         self._received = None if arrays.channel is None else arrays.channel.received
         self._receives = setup.received_vectors
-        self._sends = {per_peer: setup.channel.of(per_peer=per_peer) for per_peer in (False, True)}
+        self._sends = {
+            per_peer: setup.channel.of(per_peer=per_peer) for per_peer in (False, True)
+        }
         self._common = setup.channel.numbers(per_peer=False)
         self._own = setup.channel.numbers(per_peer=True)
 
@@ -102,7 +110,8 @@ class PlainLaw:
         self._update = bind_leaf(update_law_view, 0, 0, a.site, a.links, a.chain)
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Stage 6 of tick k: takes torque, estimate and what is sent in; returns the law's memory.
+        """Stage 6 of tick k: takes torque, estimate and what is sent in; returns the law's
+        memory.
 
         Raises:
             LawFailed: it failed.
@@ -143,7 +152,8 @@ class PlainLaw:
             peers=tuple(map(PeerView, *columns)),
             received=tuple(_name_vectors(self._receives, numbers) for numbers in received),
             sent=tuple(
-                _name_vectors(self._sends[True], sent[common + j * own :]) for j in range(len(columns[0]))
+                _name_vectors(self._sends[True], sent[common + j * own :])
+                for j in range(len(columns[0]))
             ),
             to_all=_name_vectors(self._sends[False], sent),
             inertia=LawVector(map(LawVector, self._inertia.tolist())),
@@ -163,7 +173,9 @@ class PlainLaw:
                     values = list(getattr(named, vector.name))
                     if len(values) != vector.length:
                         where = f"sent[{place}]" if per_peer else "to_all"
-                        problem = f"has {count_nouns(len(values), 'number')}, not {vector.length}"
+                        problem = (
+                            f"has {count_nouns(len(values), 'number')}, not {vector.length}"
+                        )
                         raise ValueError(f"{where}.{vector.name} {problem}")
                     sent += map(float, values)
         return sent

@@ -1,27 +1,29 @@
-"""A live hand: what somebody who takes hold of an arm does in each tick, by the messages that came in.
+"""A live hand: what somebody who takes hold of an arm does in each tick, by the messages that
+came in.
 
-Invariant: `advance_hand` is the whole state machine, a pure function of what it remembers and of the
-messages that came in before a tick. What is in force in a tick is an input of the tick and stands in its
-record, so a log repeats people without their messages.
+Invariant: `advance_hand` is the whole state machine, a pure function of what it remembers and
+of the messages that came in before a tick. What is in force in a tick is an input of the tick
+and stands in its record, so a log repeats people without their messages.
 
-Whoever takes hold begins where the arm is, with no force: the grip grows from 0 to 1 within `GRIP_NS`;
-while a grip still fades, from that grip, its target and the target's velocity. A target glides to its
-newest goal in a straight line, over a quarter more than the time between the last two messages, so that
-it does not stop where one is a little late. A hand that is silent for `SILENCE_NS` lets go: the target
-comes to rest and the grip fades within `GRIP_NS`.
+Whoever takes hold begins where the arm is, with no force: the grip grows from 0 to 1 within
+`GRIP_NS`; while a grip still fades, from that grip, its target and the target's velocity. A
+target glides to its newest goal in a straight line, over a quarter more than the time between
+the last two messages, so that it does not stop where one is a little late. A hand that is
+silent for `SILENCE_NS` lets go: the target comes to rest and the grip fades within `GRIP_NS`.
 
-Goals lie within the arm's reach: one beyond is moved to the nearest point of it. From tick to tick the
-velocity of a target changes by at most its acceleration limit times the period, whatever messages come
-and however unevenly, and while it glides its speed does not exceed the largest one from which it can
-stop at its goal, Eq. (L1):
+Goals lie within the arm's reach: one beyond is moved to the nearest point of it. From tick to
+tick the velocity of a target changes by at most its acceleration limit times the period,
+whatever messages come and however unevenly, and while it glides its speed does not exceed the
+largest one from which it can stop at its goal, Eq. (L1):
 
-    v(d) = a h (D / (n + 1) + n / 2),  D = d / (a h^2),  n = floor((sqrt(1 + 8 D) - 1) / 2)       (L1)
+    v(d) = a h (D / (n + 1) + n / 2),  D = d / (a h^2),  n = floor((sqrt(1 + 8 D) - 1) / 2)
+    (L1)
 
-with d the distance to the goal, a the acceleration limit and h the period. A target at that speed needs
-n more ticks, each a h slower, and their ways h v, h (v - a h), ... add up to d exactly. A target that
-begins at rest therefore moves in a straight line and comes to rest at a still goal without overshoot. If
-the goal comes back along that line, the target passes it by no more than the way in which it can stop,
-at most V^2 / (2 a) + V h / 2 at the speed limit V.
+with d the distance to the goal, a the acceleration limit and h the period. A target at that
+speed needs n more ticks, each a h slower, and their ways h v, h (v - a h), ... add up to d
+exactly. A target that begins at rest therefore moves in a straight line and comes to rest at a
+still goal without overshoot. If the goal comes back along that line, the target passes it by no
+more than the way in which it can stop, at most V^2 / (2 a) + V h / 2 at the speed limit V.
 """
 
 import math
@@ -68,7 +70,8 @@ class HandReach(NamedTuple):
         nearest = tuple(goal)
         if self.low:
             nearest = tuple(
-                min(max(x, low), high) for x, low, high in zip(goal, self.low, self.high, strict=True)
+                min(max(x, low), high)
+                for x, low, high in zip(goal, self.low, self.high, strict=True)
             )
         if not self.centre:
             return nearest
@@ -90,9 +93,11 @@ class HandRules(NamedTuple):
         size: how many numbers its target has: one per axis, or per joint.
         rate_hz: tick rate of the site.
         speed_limit: largest speed of the target, m/s or rad/s.
-        from_arm: true: the target begins where the arm is; false: it is a force, which begins at 0.
+        from_arm: true: the target begins where the arm is; false: it is a force, which begins
+            at 0.
         farthest: largest norm of a goal that is taken, m, rad or N.
-        acceleration_limit: largest change of the target's velocity in a second, m/s^2 or rad/s^2; inf: none.
+        acceleration_limit: largest change of the target's velocity in a second, m/s^2 or
+            rad/s^2; inf: none.
         reach: where goals may lie.
     """
 
@@ -172,7 +177,13 @@ class HandInForce(NamedTuple):
         """Returns the hand of a record's vector."""
         size = (len(vector) - 3) // 2
         grip, number, source, *rest = vector
-        return cls(grip, int(number), int(source), tuple(rest[:size]), tuple(rest[size:]))
+        return cls(
+            grip=grip,
+            number=int(number),
+            source=int(source),
+            target=tuple(rest[:size]),
+            rate=tuple(rest[size:]),
+        )
 
 
 class HandStep(NamedTuple):
@@ -182,7 +193,8 @@ class HandStep(NamedTuple):
         memory: for the next tick.
         vector: what is in force, see `HandInForce`.
         refused: reasons, one for each message that had no effect.
-        changes: who took hold or let go, in order: the source, and one of TAKEN, RELEASED, SILENT.
+        changes: who took hold or let go, in order: the source, and one of TAKEN, RELEASED,
+            SILENT.
     """
 
     memory: HandMemory
@@ -228,7 +240,9 @@ def advance_hand(
         held = now.source or grip > 0.0
         now = now._replace(target=target, grip=grip) if held else HandMemory(before=now.before)
     for command in commands:
-        now, outcome = _take_command(rules, now, t_ns, command, place)
+        now, outcome = _take_command(
+            rules=rules, memory=now, t_ns=t_ns, command=command, place=place
+        )
         if outcome in (TAKEN, RELEASED):
             changes.append((command.source, outcome))
         elif outcome:
@@ -238,7 +252,9 @@ def advance_hand(
         now = _let_go(now, now.number - 1)
     if not now.target:
         return HandStep(now, free_hand(rules.size), tuple(refused), tuple(changes))
-    now = now._replace(rate=_find_rate(rules, now, t_ns) if now.source else _find_fading_rate(rules, now))
+    now = now._replace(
+        rate=_find_rate(rules, now, t_ns) if now.source else _find_fading_rate(rules, now)
+    )
     vector = [now.grip, float(now.number), float(now.source), *now.target, *now.rate]
     return HandStep(now, vector, tuple(refused), tuple(changes))
 
@@ -259,7 +275,9 @@ def find_stopping_speed(distance: float, acceleration: float, h_s: float) -> flo
 
 
 _plain_stopping_speed = getattr(find_stopping_speed, "py_func", find_stopping_speed)
-"""Without compilation: a call from Python into compiled code takes longer than its few operations."""
+"""Without compilation: a call from Python into compiled code takes longer than its few
+operations.
+"""
 
 
 @leaf
@@ -275,9 +293,11 @@ def glide(
     rate: Array,
     rows: Array,
 ) -> float:
-    """Does as `advance_hand` of a held arm in ticks without a message, compiled: a row of `rows` each.
+    """Does as `advance_hand` of a held arm in ticks without a message, compiled: a row of
+    `rows` each.
 
-    A row is as `HandInForce`, but for number and source. Target and rate are changed; returns the grip.
+    A row is as `HandInForce`, but for number and source. Target and rate are changed; returns
+    the grip.
     """
     h_s = 1.0 / rate_hz
     firmer = 1e9 / (GRIP_NS * rate_hz)
@@ -287,7 +307,15 @@ def glide(
         grip = min(grip + firmer, 1.0)
         left_s = max((arrives_ns - t_ns) * 1e-9, h_s)
         if acceleration < math.inf:
-            _glide_tick(left_s, h_s, speed_limit, acceleration, goal, target, rate)
+            _glide_tick(
+                left_s=left_s,
+                h_s=h_s,
+                speed_limit=speed_limit,
+                acceleration=acceleration,
+                goal=goal,
+                target=target,
+                rate=rate,
+            )
         else:
             square = 0.0
             for i in range(size):
@@ -315,7 +343,9 @@ def _glide_tick(
     target: Array,
     rate: Array,
 ) -> None:
-    """Moves a target on by a tick and changes its rate within both limits, as `_find_limited_rate`."""
+    """Moves a target on by a tick and changes its rate within both limits, as
+    `_find_limited_rate`.
+    """
     size = target.shape[0]
     square = 0.0
     for i in range(size):
@@ -356,7 +386,13 @@ def _take_command(
     if not memory.source:
         still = (0.0,) * rules.size
         start = memory.target or (tuple(map(float, place())) if rules.from_arm else still)
-        held = HandMemory(command.source, command.number, memory.grip, start, memory.rate or still)
+        held = HandMemory(
+            source=command.source,
+            number=command.number,
+            grip=memory.grip,
+            target=start,
+            rate=memory.rate or still,
+        )
         held = held._replace(heard_ns=t_ns, before=memory.before)
         return _aim(rules, held, command, t_ns + GLIDE_NS), TAKEN
     memory = memory._replace(heard_ns=t_ns)
@@ -367,9 +403,13 @@ def _take_command(
     return _aim(rules, memory, command, t_ns + between_ns), ""
 
 
-def _aim(rules: HandRules, memory: HandMemory, command: HandCommand, arrives_ns: int) -> HandMemory:
+def _aim(
+    rules: HandRules, memory: HandMemory, command: HandCommand, arrives_ns: int
+) -> HandMemory:
     goal = rules.reach.find_nearest(command.target)
-    return memory._replace(number=command.number, goal=goal, arrives_ns=arrives_ns, sent_ns=command.sent_ns)
+    return memory._replace(
+        number=command.number, goal=goal, arrives_ns=arrives_ns, sent_ns=command.sent_ns
+    )
 
 
 def _let_go(memory: HandMemory, number: int) -> HandMemory:
@@ -387,11 +427,13 @@ def _find_fading_rate(rules: HandRules, memory: HandMemory) -> tuple[float, ...]
     return tuple(slower / speed * v for v in memory.rate)
 
 
-def _find_limited_rate(rules: HandRules, memory: HandMemory, left_s: float) -> tuple[float, ...]:
+def _find_limited_rate(
+    rules: HandRules, memory: HandMemory, left_s: float
+) -> tuple[float, ...]:
     """Returns the velocity of a target whose acceleration is limited, see Eq. (L1).
 
-    Both limits are balls around a velocity within them, so that a velocity between the last one and the
-    wanted one keeps them too.
+    Both limits are balls around a velocity within them, so that a velocity between the last one
+    and the wanted one keeps them too.
     """
     h_s = 1.0 / rules.rate_hz
     way = [goal - x for goal, x in zip(memory.goal, memory.target, strict=True)]

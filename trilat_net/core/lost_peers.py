@@ -1,8 +1,10 @@
-"""Peers that a site goes on without: a lost master's share goes to the others, until it is back.
+"""Peers that a site goes on without: a lost master's share goes to the others, until it is
+back.
 
-Invariant: what is decided follows from the samples in use and from what is remembered, tick by tick. Nobody
-is dropped without whom those that are left would not all reach each other, nor the last one that is followed:
-then the site holds. The reference never jumps: the site aligns with what is left, and with who is back.
+Invariant: what is decided follows from the samples in use and from what is remembered, tick by
+tick. Nobody is dropped without whom those that are left would not all reach each other, nor the
+last one that is followed: then the site holds. The reference never jumps: the site aligns with
+what is left, and with who is back.
 """
 
 from .chain import add, scale, three
@@ -21,12 +23,19 @@ _RESTORED = int(LifeReason.RESTORED)
 
 @leaf
 def _can_go_without(lost: int, t_ns: int, site: Row, links: RowArray) -> bool:
-    """True if those that are left, without this peer, follow each other, and the site one of them."""
+    """True if those that are left, without this peer, follow each other, and the site one of
+    them.
+    """
     everyone = site.bit
     own = 0
     for j in range(links.shape[0]):
         link: Row = links[j]
-        if j != lost and link.gone == 0.0 and link.used >= 0 and t_ns - link.used_ns <= site.stale_ns:
+        if (
+            j != lost
+            and link.gone == 0.0
+            and link.used >= 0
+            and t_ns - link.used_ns <= site.stale_ns
+        ):
             everyone |= link.bit
             if link.alpha > 0.0:
                 own |= link.bit
@@ -46,7 +55,8 @@ def _can_go_without(lost: int, t_ns: int, site: Row, links: RowArray) -> bool:
 def _is_turned_little(back: int, site: Row, links: RowArray) -> bool:
     """True if this peer's share turns the reference by no more than an alignment may.
 
-    The turn between two orientations is no longer than the difference of their vectors from the own one.
+    The turn between two orientations is no longer than the difference of their vectors from the
+    own one.
     """
     own = rotation_matrix(three(site.x[3:]))
     whole = 0.0
@@ -66,7 +76,9 @@ def _is_turned_little(back: int, site: Row, links: RowArray) -> bool:
 
 @leaf
 def _is_near(back: int, site: Row, links: RowArray) -> bool:
-    """True if the reference with this peer is no farther from that without it than an alignment may go."""
+    """True if the reference with this peer is no farther from that without it than an alignment
+    may go.
+    """
     if has_orientation(site) and not _is_turned_little(back, site, links):
         return False
     for i in range(straight_coordinates(site)):
@@ -85,7 +97,9 @@ def _is_near(back: int, site: Row, links: RowArray) -> bool:
 
 @leaf
 def _share_out(links: RowArray) -> bool:
-    """Gives the shares of those that are gone to the others; false if nobody is left to have them."""
+    """Gives the shares of those that are gone to the others; false if nobody is left to have
+    them.
+    """
     whole = whole_rate = 0.0
     some = False
     for j in range(links.shape[0]):
@@ -100,7 +114,9 @@ def _share_out(links: RowArray) -> bool:
     for j in range(links.shape[0] if some else 0):
         link = links[j]
         if link.gone == 0.0:
-            link.alpha_rate = (link.alpha_rate * whole - link.alpha * whole_rate) / (whole * whole)
+            link.alpha_rate = (link.alpha_rate * whole - link.alpha * whole_rate) / (
+                whole * whole
+            )
             link.alpha /= whole
         else:
             link.alpha = link.alpha_rate = 0.0
@@ -109,7 +125,8 @@ def _share_out(links: RowArray) -> bool:
 
 @leaf
 def regroup(t_ns: int, site: Row, links: RowArray) -> None:
-    """Drops peers that are lost and takes back those that are there again; divides the shares among the rest.
+    """Drops peers that are lost and takes back those that are there again; divides the shares
+    among the rest.
 
     Before it `alpha` of a link is the share that is planned, afterwards the one in force.
     """

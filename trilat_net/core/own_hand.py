@@ -1,8 +1,10 @@
-"""A hand of one's own: a program that sees what its site knows, and moves, turns or pushes the arm.
+"""A hand of one's own: a program that sees what its site knows, and moves, turns or pushes the
+arm.
 
-Invariant: what is decided at a tick by what was seen at that tick acts a fixed time later, whoever decides
-and wherever, as a sample is in use a fixed time after its stamp (L2). A decision that comes later than that
-acts at once. What acts is an input of the tick, as of any live hand, so a log repeats it without the program.
+Invariant: what is decided at a tick by what was seen at that tick acts a fixed time later,
+whoever decides and wherever, as a sample is in use a fixed time after its stamp (L2). A
+decision that comes later than that acts at once. What acts is an input of the tick, as of any
+live hand, so a log repeats it without the program.
 """
 
 import math
@@ -13,7 +15,15 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from ..errors import count_nouns
-from .live_hand import SILENCE_NS, HandCommand, HandMemory, HandRules, HandStep, advance_hand, glide
+from .live_hand import (
+    SILENCE_NS,
+    HandCommand,
+    HandMemory,
+    HandRules,
+    HandStep,
+    advance_hand,
+    glide,
+)
 from .site_arrays import SiteArrays
 from .site_setup import Layout
 from .ticks import tick_ns
@@ -36,7 +46,8 @@ class HandContext(NamedTuple):
     Attributes:
         site: the site whose arm it holds.
         peers: names of the peers, in scenario order.
-        mode: "tip": it moves the end effector; "joint": it turns the joints; "force": it pushes.
+        mode: "tip": it moves the end effector; "joint": it turns the joints; "force": it
+            pushes.
         size: how many numbers it acts with: an axis each, m or N; or a joint each, rad.
         rate_hz: how often it is asked, Hz.
         delay_s: time from what it sees to what it does, s.
@@ -67,13 +78,15 @@ class HandView(NamedTuple):
         t_s: its nominal time since the epoch, s.
         q: joint angles of the arm, rad, shape (n,).
         qd: joint velocities, rad/s.
-        pose: where the arm is in the coordinates of the hand: its end effector, m, or its joints, rad.
+        pose: where the arm is in the coordinates of the hand: its end effector, m, or its
+            joints, rad.
         q_des: the reference of the tick before, rad or m, shape (m,).
         tau_x: exogenous torque of the tick before, N m; the torque ON the arm is its negative.
-        target: where the hand's own target is, m or rad, or its force, N; zeros while it does not hold.
+        target: where the hand's own target is, m or rad, or its force, N; zeros while it does
+            not hold.
         grip: how firm it holds, 0 to 1.
-        peers: the peers in scenario order, by the samples that were in use at the tick before: q and qd have
-            m numbers, and an age is that at this tick.
+        peers: the peers in scenario order, by the samples that were in use at the tick before:
+            q and qd have m numbers, and an age is that at this tick.
     """
 
     k: int
@@ -92,7 +105,9 @@ class HandProgram(Protocol):
     """A hand of one's own; its class is called with `HandContext` and its settings, by name."""
 
     def act(self, now: HandView) -> Sequence[float] | None:
-        """Returns the target of the end effector, m, or of the joints, rad, or a force, N; None: lets go."""
+        """Returns the target of the end effector, m, or of the joints, rad, or a force, N;
+        None: lets go.
+        """
 
 
 class OwnHand:
@@ -125,7 +140,9 @@ class OwnHand:
         return k % self.every == 0
 
     def find_next(self, k: int) -> int:
-        """Returns the first tick after this one at which it is asked, or what it decided begins to act."""
+        """Returns the first tick after this one at which it is asked, or what it decided begins
+        to act.
+        """
         asked = (k // self.every + 1) * self.every
         return min([asked, *(due for due, _ in self._due if due > k)])
 
@@ -141,20 +158,22 @@ class OwnHand:
         numbers = [links[name].tolist() for name in ("alpha", "used", "rate_hz", "new")]
         shared = [links[name][:, :m].copy() for name in ("q", "qd", "tau_x")]
         peers = tuple(
-            PeerView(alpha, used, (now_ns - tick_ns(max(used, 0), its_rate_hz)) * 1e-9, new, *states)
+            PeerView(
+                alpha, used, (now_ns - tick_ns(max(used, 0), its_rate_hz)) * 1e-9, new, *states
+            )
             for alpha, used, its_rate_hz, new, *states in zip(*numbers, *shared, strict=True)
         )
         return HandView(
-            k,
-            k / rate_hz,
-            q,
-            own["qd"][0, :n].copy(),
-            np.asarray(self._place(q.tolist()), dtype=np.float64),
-            own["q_des"][0, :m].copy(),
-            0.0 - own["on_arm"][0, :n],
-            np.array(self._memory.target or (0.0,) * self._rules.size),
-            self._memory.grip,
-            peers,
+            k=k,
+            t_s=k / rate_hz,
+            q=q,
+            qd=own["qd"][0, :n].copy(),
+            pose=np.asarray(self._place(q.tolist()), dtype=np.float64),
+            q_des=own["q_des"][0, :m].copy(),
+            tau_x=0.0 - own["on_arm"][0, :n],
+            target=np.array(self._memory.target or (0.0,) * self._rules.size),
+            grip=self._memory.grip,
+            peers=peers,
         )
 
     def decide(self, k: int, goal: Sequence[float] | None) -> None:
@@ -167,40 +186,63 @@ class OwnHand:
         """
         numbers = () if goal is None else tuple(float(one) for one in goal)
         if goal is not None and len(numbers) != self._rules.size:
-            raise ValueError(f"it acts with {count_nouns(len(numbers), 'number')}, not {self._rules.size}")
+            raise ValueError(
+                f"it acts with {count_nouns(len(numbers), 'number')}, not {self._rules.size}"
+            )
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"it acts with {list(numbers)}, which is not finite")
         if (size := math.hypot(*numbers)) > self._rules.farthest:
-            raise ValueError(f"it acts with a norm of {size:g}, at most {self._rules.farthest:g} is taken")
+            raise ValueError(
+                f"it acts with a norm of {size:g}, at most {self._rules.farthest:g} is taken"
+            )
         if k <= self._newest:
             return
         self._newest = k
         due = k + self.delay
         command = HandCommand(
-            PROGRAM, k // self.every, goal is not None, numbers, tick_ns(due, self._rules.rate_hz)
+            source=PROGRAM,
+            number=k // self.every,
+            grip=goal is not None,
+            target=numbers,
+            sent_ns=tick_ns(due, self._rules.rate_hz),
         )
         self._due.append((due, command))
 
     def let_go(self, k: int) -> None:
         """Lets go at tick k, whatever was decided before."""
         self._due.clear()
-        command = HandCommand(PROGRAM, k // self.every, False, (), tick_ns(k, self._rules.rate_hz))
+        command = HandCommand(
+            source=PROGRAM,
+            number=k // self.every,
+            grip=False,
+            target=(),
+            sent_ns=tick_ns(k, self._rules.rate_hz),
+        )
         self._due.append((k, command))
 
     def advance(self, k: int, angles: Callable[[], Sequence[float]]) -> HandStep:
-        """Returns what it does in tick k, see `advance_hand`; `angles` returns those of the joints, rad."""
+        """Returns what it does in tick k, see `advance_hand`; `angles` returns those of the
+        joints, rad.
+        """
         commands = []
         while self._due and self._due[0][0] <= k:
             commands.append(self._due.popleft()[1])
         t_ns = tick_ns(k, self._rules.rate_hz)
-        step = advance_hand(self._rules, self._memory, t_ns, commands, lambda: self._place(angles()))
+        step = advance_hand(
+            rules=self._rules,
+            memory=self._memory,
+            t_ns=t_ns,
+            commands=commands,
+            place=lambda: self._place(angles()),
+        )
         self._memory = step.memory
         return step
 
     def advance_until(self, k: int, end: int, angles: Callable[[], Sequence[float]]) -> Array:
         """Returns what it does from tick k until it needs the arm again, before tick `end`.
 
-        Of each tick there is a row, as `HandInForce`. The same as `advance` tick by tick, bit for bit.
+        Of each tick there is a row, as `HandInForce`. The same as `advance` tick by tick, bit
+        for bit.
         """
         size = self._rules.size
         rate_hz = self._rules.rate_hz
@@ -211,16 +253,16 @@ class OwnHand:
         if held.source and tick_ns(k + len(rows) - 1, rate_hz) - held.heard_ns <= SILENCE_NS:
             goal, target, rate = (np.array(one) for one in (held.goal, held.target, held.rate))
             grip = glide(
-                k + 1,
-                rate_hz,
-                held.grip,
-                held.arrives_ns,
-                self._rules.speed_limit,
-                self._rules.acceleration_limit,
-                goal,
-                target,
-                rate,
-                rows[1:],
+                first=k + 1,
+                rate_hz=rate_hz,
+                grip=held.grip,
+                arrives_ns=held.arrives_ns,
+                speed_limit=self._rules.speed_limit,
+                acceleration=self._rules.acceleration_limit,
+                goal=goal,
+                target=target,
+                rate=rate,
+                rows=rows[1:],
             )
             rows[1:, 1] = held.number
             rows[1:, 2] = held.source

@@ -1,11 +1,11 @@
 """Counter-based random numbers: a pure function of where they are used, without state or order.
 
-Invariant (L4): a draw is a function of (seed, link, sample index, purpose) and of nothing else; the same
-on every machine, in every driver, in any order of arrival.
+Invariant (L4): a draw is a function of (seed, link, sample index, purpose) and of nothing else;
+the same on every machine, in every driver, in any order of arrival.
 
-Philox-4x32 with ten rounds: Salmon, Moraes, Dror and Shaw, "Parallel Random Numbers: As Easy as 1, 2, 3",
-SC 2011. It is written here because compiled leaves call it per sample; the tests hold its known-answer
-vectors.
+Philox-4x32 with ten rounds: Salmon, Moraes, Dror and Shaw, "Parallel Random Numbers: As Easy as
+1, 2, 3", SC 2011. It is written here because compiled leaves call it per sample; the tests hold
+its known-answer vectors.
 """
 
 import hashlib
@@ -40,7 +40,9 @@ def link_key(seed: int, link: str) -> int:
 def philox(
     c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
 ) -> PhiloxWords:
-    """Returns four 32-bit words for a 128-bit counter and a 64-bit key, all as 32-bit words in uint64."""
+    """Returns four 32-bit words for a 128-bit counter and a 64-bit key, all as 32-bit words in
+    uint64.
+    """
     for _ in range(_ROUNDS):
         p0 = _M0 * c0
         p1 = _M1 * c2
@@ -55,7 +57,8 @@ def philox(
 
 @leaf
 def unit_interval(high: np.uint64, low: np.uint64) -> float:
-    """Returns a number of the open interval (0, 1) from two 32-bit words: 52 bits, then a half, exactly.
+    """Returns a number of the open interval (0, 1) from two 32-bit words: 52 bits, then a half,
+    exactly.
 
     With 53 bits the largest one would round to 1.
     """
@@ -66,18 +69,26 @@ def unit_interval(high: np.uint64, low: np.uint64) -> float:
 def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[float, float]:
     """Returns two numbers, uniform on the open interval (0, 1).
 
-    Draws of different purposes are independent; `attempt` counts those of a method that rejects some.
+    Draws of different purposes are independent; `attempt` counts those of a method that rejects
+    some.
     """
     index = np.uint64(sample)
     a, b, c, d = philox(
-        index & _LOW, index >> _SHIFT, np.uint64(purpose), np.uint64(attempt), key & _LOW, key >> _SHIFT
+        c0=index & _LOW,
+        c1=index >> _SHIFT,
+        c2=np.uint64(purpose),
+        c3=np.uint64(attempt),
+        k0=key & _LOW,
+        k1=key >> _SHIFT,
     )
     return unit_interval(a, b), unit_interval(c, d)
 
 
 @leaf
 def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> float:
-    """Returns a standard normal number, by the method of Box and Muller; arguments as in `uniforms`."""
+    """Returns a standard normal number, by the method of Box and Muller; arguments as in
+    `uniforms`.
+    """
     u, v = uniforms(key, sample, purpose, attempt)
     return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)
 
@@ -86,8 +97,9 @@ def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> fl
 def standard_gamma(key: DrawKey, sample: int, purpose: int, shape: float) -> float:
     """Returns a gamma number of the given shape and scale 1.
 
-    By rejection: Marsaglia and Tsang, "A Simple Method for Generating Gamma Variables", ACM TOMS 26 (2000);
-    below shape 1 by their boost from shape + 1. It uses up `purpose + 1` and `purpose + 2` as well.
+    By rejection: Marsaglia and Tsang, "A Simple Method for Generating Gamma Variables", ACM
+    TOMS 26 (2000); below shape 1 by their boost from shape + 1. It uses up `purpose + 1` and
+    `purpose + 2` as well.
     """
     boost = 1.0
     k = shape

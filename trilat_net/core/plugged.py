@@ -1,7 +1,9 @@
-"""Functions that the kernel calls by their address: of operators and delay models in files of their own.
+"""Functions that the kernel calls by their address: of operators and delay models in files of
+their own.
 
-Invariant: a function is compiled for the layout of its numbers and of its row; the numbers themselves stand
-in a table, so that no value compiles anything and no function recompiles the kernel.
+Invariant: a function is compiled for the layout of its numbers and of its row; the numbers
+themselves stand in a table, so that no value compiles anything and no function recompiles the
+kernel.
 """
 
 import hashlib
@@ -44,19 +46,27 @@ def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
 
 
 call_at: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
-"""Calls the function at an address with a tuple of arguments; what it raises goes on to the caller."""
+"""Calls the function at an address with a tuple of arguments; what it raises goes on to the
+caller.
+"""
 
 
 def digest_beside(function: Callable[..., Any]) -> str:
-    """Returns a hash of the sources beside a function of this package; "": it is from elsewhere."""
+    """Returns a hash of the sources beside a function of this package; "": it is from
+    elsewhere.
+    """
     folder = Path(function.__code__.co_filename).parent
     if not folder.is_relative_to(Path(__file__).parents[1]):
         return ""
-    return hashlib.sha256(b"".join(one.read_bytes() for one in sorted(folder.glob("*.py")))).hexdigest()
+    return hashlib.sha256(
+        b"".join(one.read_bytes() for one in sorted(folder.glob("*.py")))
+    ).hexdigest()
 
 
 def find_address(compiled: Any) -> int:
-    """Returns the address of the machine code of a function that was compiled for one signature."""
+    """Returns the address of the machine code of a function that was compiled for one
+    signature.
+    """
     result = compiled.get_compile_result(compiled.nopython_signatures[0])
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
@@ -64,16 +74,24 @@ def find_address(compiled: Any) -> int:
 def _numbers_of(model: Any) -> dict[str, Array]:
     """Returns the numbers of a model by name; what is no number is left out."""
     named = {name: np.asarray(getattr(model, name)) for name in model.__struct_fields__}
-    return {name: value.astype(np.float64) for name, value in named.items() if value.dtype.kind in "fiub"}
+    return {
+        name: value.astype(np.float64)
+        for name, value in named.items()
+        if value.dtype.kind in "fiub"
+    }
 
 
 def list_numbers(model: Any) -> Array:
     """Returns the numbers of a model one after another, as its compiled function finds them."""
-    return np.concatenate([np.zeros(0), *(value.ravel() for value in _numbers_of(model).values())])
+    return np.concatenate(
+        [np.zeros(0), *(value.ravel() for value in _numbers_of(model).values())]
+    )
 
 
 @cache
-def _compile(function: Callable[..., None], form: np.dtype[np.void], row: np.dtype[np.void]) -> Any:
+def _compile(
+    function: Callable[..., None], form: np.dtype[np.void], row: np.dtype[np.void]
+) -> Any:
     count = form.itemsize // 8
     compute = numba.njit(**_OPTIONS)(function)
 
@@ -93,7 +111,9 @@ def _compile(function: Callable[..., None], form: np.dtype[np.void], row: np.dty
 
 
 def plug(model: Any, name: str, row: np.dtype[np.void]) -> int:
-    """Returns the address of a function of a model, called with its numbers and a row of that layout."""
+    """Returns the address of a function of a model, called with its numbers and a row of that
+    layout.
+    """
     fields: Any = [(key, value.dtype, value.shape) for key, value in _numbers_of(model).items()]
     function = getattr(type(model), name)
     call = _compile(function, np.dtype((np.record, fields or [("nothing", "f8")])), row)

@@ -1,38 +1,46 @@
-"""How an arm comes to rest where it is, and stays there: while its site waits, holds, is stopped or in fault.
+"""How an arm comes to rest where it is, and stays there: while its site waits, holds, is
+stopped or in fault.
 
-The reference of a joint begins at the joint's own angle and speed v, and comes to rest within T:
+The reference of a joint begins at the joint's own angle and speed v, and comes to rest within
+T:
 
-    |qd_ref| falls by (1 - h / T_left) per period h, T_left = max(LEAST_STOP_S - t, max_i |qd_ref_i| / a_i)
-    qd_ref = 0 from the tick on in which the joint turns, and never more than the joint's own speed
+    |qd_ref| falls by (1 - h / T_left) per period h, T_left = max(LEAST_STOP_S - t, max_i
+    |qd_ref_i| / a_i) qd_ref = 0 from the tick on in which the joint turns, and never more than
+    the joint's own speed
 
-where a_i is the deceleration that half of the torque limit gives. If nothing slows the joints down sooner,
-this is qd_ref = v (1 - t / T) with T = max(LEAST_STOP_S, max_i |v_i| / a_i). q_ref is the integral of qd_ref;
-while an arm is fast (see below) or a torque is at its limit, q_ref moves along with a joint that would
-otherwise get farther away from it.
+where a_i is the deceleration that half of the torque limit gives. If nothing slows the joints
+down sooner, this is qd_ref = v (1 - t / T) with T = max(LEAST_STOP_S, max_i |v_i| / a_i). q_ref
+is the integral of qd_ref; while an arm is fast (see below) or a torque is at its limit, q_ref
+moves along with a joint that would otherwise get farther away from it.
 
-The torque is that of the law on this reference. It is gravity, as far as that is known or learnt, for a law
-that failed, that does not hold by its reference, and for every law while the arm is fast: while B |qd| of
-some joint exceeds the limit of its torque. In both cases
+The torque is that of the law on this reference. It is gravity, as far as that is known or
+learnt, for a law that failed, that does not hold by its reference, and for every law while the
+arm is fast: while B |qd| of some joint exceeds the limit of its torque. In both cases
 
     + w - B s,    s = qd - qd_ref + Lambda (q - q_ref),    w' = -k B s
 
-is added. w begins as the part of the last torque that the law does not account for, times 1 - max B |qd| /
-tau_limit: the torque of a slow arm holds what nobody knew of gravity or hands, that of a fast arm follows
-from its motion. While the arm brakes, w loses B |qd| in every tick in which it works with the motion of its
-joint. Lambda is that of the adaptive law in joint space, and else `REST_RATE_1_S`; in task space the estimate
-stays as it is. docs/links.md derives how much energy all this can add to an arm.
+is added. w begins as the part of the last torque that the law does not account for, times 1 -
+max B |qd| /
+tau_limit: the torque of a slow arm holds what nobody knew of gravity or hands, that of a fast
+arm follows from its motion. While the arm brakes, w loses B |qd| in every tick in which it
+works with the motion of its joint. Lambda is that of the adaptive law in joint space, and else
+`REST_RATE_1_S`; in task space the estimate stays as it is. docs/links.md derives how much
+energy all this can add to an arm.
 
-The limit of a torque's rate never holds back what takes power from the arm: against its motion the torque of
-a joint may change by B |qd| more in a tick. That is the step of a viscous brake of B which is put on at that
+The limit of a torque's rate never holds back what takes power from the arm: against its motion
+the torque of a joint may change by B |qd| more in a tick. That is the step of a viscous brake
+of B which is put on at that
 speed: it brings the joint to rest within `RestGains.time_s`, and it vanishes with the speed.
 
 Invariant:
 
-- The reference of a joint only slows down, keeps its direction, and is never faster than the joint.
-- While an arm brakes, no term but w works with the motion of a joint, and w adds at most h w^2 / 2 B.
-- Once the reference rests and no torque is limited, S + 1/2 w' (k B)^-1 w of the adaptive law in joint space
-  never rises, S being its storage: B adds to Kp, and w is one more estimate, of a constant torque whose true
-  value is zero.
+- The reference of a joint only slows down, keeps its direction, and is never faster than the
+  joint.
+- While an arm brakes, no term but w works with the motion of a joint, and w adds at most h w^2
+  / 2 B.
+- Once the reference rests and no torque is limited, S + 1/2 w' (k B)^-1 w of the adaptive law
+  in joint space never rises, S being its storage: B adds to Kp, and w is one more estimate, of
+  a constant torque whose true value is zero.
 """
 
 from math import inf, isfinite
@@ -44,7 +52,9 @@ from .ticks import NS_PER_S, LifeReason, Mode
 from .vectors import Array, Row
 
 REST_RATE_1_S = 3.0
-"""By how much of the way an arm goes back to its rest in a second, where its law has no Lambda of joints."""
+"""By how much of the way an arm goes back to its rest in a second, where its law has no Lambda
+of joints.
+"""
 
 _ROUNDING_S = 1e-9
 """By less than this the last step of a reference misses the end of its time."""
@@ -85,7 +95,9 @@ def is_fast(site: Row) -> bool:
 
 @leaf
 def rests_by_law(site: Row) -> bool:
-    """True if the torque of a site that rests has that of its law in it, which then goes on learning."""
+    """True if the torque of a site that rests has that of its law in it, which then goes on
+    learning.
+    """
     holds = site.law != _OWN or site.holds != 0
     learns_in_task = site.task != 0 and site.law != _KNOWN
     usable = holds and not learns_in_task and site.reason != _NOT_FINITE
@@ -94,7 +106,9 @@ def rests_by_law(site: Row) -> bool:
 
 @leaf
 def begin_rest(t_ns: int, mode: int, reason: int, site: Row) -> None:
-    """Enters a mode in which the arm comes to rest; what rests already goes on, unless its law failed."""
+    """Enters a mode in which the arm comes to rest; what rests already goes on, unless its law
+    failed.
+    """
     goes_on = rests(site) and reason != _NOT_FINITE and site.reason != _NOT_FINITE
     site.mode = mode
     site.reason = reason
@@ -171,7 +185,9 @@ def _brakes(t_ns: int, site: Row) -> bool:
 
 @leaf
 def put_rest_reference(site: Row, q: Array, qd: Array) -> None:
-    """Writes the reference of an arm that comes to rest; in task space where its end effector is."""
+    """Writes the reference of an arm that comes to rest; in task space where its end effector
+    is.
+    """
     for i in range(q.shape[0]):
         if site.task:
             q[i] = site.x[i]
@@ -215,7 +231,9 @@ def add_rest_torque(k: int, t_ns: int, site: Row) -> None:
 
 @leaf
 def advance_rest(site: Row) -> None:
-    """Advances w to the next tick, but no farther beyond a limit that already holds the torque back."""
+    """Advances w to the next tick, but no farther beyond a limit that already holds the torque
+    back.
+    """
     for i in range(site.joints):
         step = -site.integral[i] * _find_slip(site, i) / site.rate_hz
         if isfinite(step) and (site.u[i] - site.tau[i]) * step <= 0.0:
@@ -224,7 +242,9 @@ def advance_rest(site: Row) -> None:
 
 @leaf
 def limit_torque_rate(site: Row) -> None:
-    """Holds the torque within reach of that of the tick before; before the first tick there is none."""
+    """Holds the torque within reach of that of the tick before; before the first tick there is
+    none.
+    """
     braking = rests(site)
     for i in range(site.joints):
         if site.tau_rate[i] < inf:

@@ -1,9 +1,11 @@
-"""Rotations as vectors: axis times angle, rad, by plain arithmetic with the same bits on every machine.
+"""Rotations as vectors: axis times angle, rad, by plain arithmetic with the same bits on every
+machine.
 
-Invariant: a rotation vector is at most half a turn long; `rotation_matrix` and `rotation_vector` undo each
-other. The arc tangent is that of S. Moshier's Cephes library. A turn of which only the vector changes has
-the angular velocity J(vector) vector', with J the left Jacobian of the rotation group (J. Sola, J. Deray and
-D. Atchuthan, "A micro Lie theory for state estimation in robotics", arXiv 1812.01537, Eq. 145, 146).
+Invariant: a rotation vector is at most half a turn long; `rotation_matrix` and
+`rotation_vector` undo each other. The arc tangent is that of S. Moshier's Cephes library. A
+turn of which only the vector changes has the angular velocity J(vector) vector', with J the
+left Jacobian of the rotation group (J. Sola, J. Deray and D. Atchuthan, "A micro Lie theory for
+state estimation in robotics", arXiv 1812.01537, Eq. 145, 146).
 """
 
 import math
@@ -16,7 +18,9 @@ from .vectors import Array
 _SMALL = 1e-8
 """Below this, a sine is its angle to the last bit."""
 _SHORT = 0.02
-"""Below this, rad, the first terms of a series are exact to the last bit, and closed forms are not."""
+"""Below this, rad, the first terms of a series are exact to the last bit, and closed forms are
+not.
+"""
 
 
 @leaf
@@ -105,7 +109,9 @@ def rotation_vector(R: Array | Matrix) -> Three:
 
 @leaf
 def turn_between(R: Array | Matrix, other: Array | Matrix) -> Three:
-    """Returns the vector of R other': the turn from the other orientation to this one, in base axes."""
+    """Returns the vector of R other': the turn from the other orientation to this one, in base
+    axes.
+    """
     a = other[0]
     b = other[1]
     c = other[2]
@@ -164,7 +170,9 @@ def turning_velocity(turn: Three, rate: Three) -> Three:
 
 @leaf
 def turn_rate(turn: Three, velocity: Three) -> Three:
-    """Returns the derivative of a turn's vector at this angular velocity: undoes `turning_velocity`."""
+    """Returns the derivative of a turn's vector at this angular velocity: undoes
+    `turning_velocity`.
+    """
     angle = length(turn)
     a2 = angle * angle
     if angle < _SHORT:

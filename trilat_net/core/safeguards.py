@@ -1,7 +1,7 @@
 """How fast a reference may change, and a torque that goes back to that of the law.
 
-Invariant: whatever a law asks for, the reference moves no faster than its limit. Without limits, and in other
-modes, nothing changes.
+Invariant: whatever a law asks for, the reference moves no faster than its limit. Without
+limits, and in other modes, nothing changes.
 """
 
 from math import inf, isfinite
@@ -18,7 +18,9 @@ BLEND_S = 0.1
 
 @leaf
 def limit_reference(k: int, site: Row) -> None:
-    """Holds the reference back to its limit of speed, from the own pose on; and makes up for it so."""
+    """Holds the reference back to its limit of speed, from the own pose on; and makes up for it
+    so.
+    """
     if k == site.first:
         for i in range(site.shared):
             site.q_followed[i] = site.x[i] if site.task else site.q[i]

@@ -1,18 +1,19 @@
-"""The life of a site under the rule `glide`: it waits, aligns, follows, and holds while a peer is silent.
+"""The life of a site under the rule `glide`: it waits, aligns, follows, and holds while a peer
+is silent.
 
     WAITING -> RETURN (aligns) -> RUN (engaged) -> HOLD -> RETURN -> RUN
     any -> FAULT (a limit, a number that is not finite, its arm lost)  -- RESET  -> WAITING
     any -> STOPPED (an order, or nobody holds its dead-man switch) -- ENABLE, HELD -> WAITING
 
-Invariant: in WAITING, HOLD, STOPPED and FAULT the arm comes to rest where it is and stays there, in one way
-(`resting`): the reference leaves the peers, begins at the own pose with the own velocity, and falls to rest.
-From there to the peers and while it follows them neither it nor its derivative jumps, and the second is the
-derivative of the first: while the site aligns, the way from the peers' reference falls to zero with its rate,
-no faster than `align_speed` beyond what it had. Of an orientation the way is the rotation vector of the turn
-from the peers' to the own one, and a rate is an angular velocity. A peer that rests or aligns itself is
-followed like any other.
-FAULT and STOPPED are latched. No message of a peer leads there or back. A switch that is held again ends what
-its release began, but no stop by order.
+Invariant: in WAITING, HOLD, STOPPED and FAULT the arm comes to rest where it is and stays
+there, in one way (`resting`): the reference leaves the peers, begins at the own pose with the
+own velocity, and falls to rest. From there to the peers and while it follows them neither it
+nor its derivative jumps, and the second is the derivative of the first: while the site aligns,
+the way from the peers' reference falls to zero with its rate, no faster than `align_speed`
+beyond what it had. Of an orientation the way is the rotation vector of the turn from the peers'
+to the own one, and a rate is an angular velocity. A peer that rests or aligns itself is
+followed like any other. FAULT and STOPPED are latched. No message of a peer leads there or
+back. A switch that is held again ends what its release began, but no stop by order.
 """
 
 from math import isfinite
@@ -80,7 +81,9 @@ _TAKE_HOLD = int(LifeOrder.HELD)
 
 @leaf
 def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
-    """True if of every peer that is followed a sample came into use no longer ago than `silence_ns`."""
+    """True if of every peer that is followed a sample came into use no longer ago than
+    `silence_ns`.
+    """
     for j in range(links.shape[0]):
         link: Row = links[j]
         if link.alpha > 0.0 and (link.used < 0 or t_ns - link.used_ns > silence_ns):
@@ -102,10 +105,14 @@ def _align_s(site: Row) -> float:
 
 @leaf
 def _begin_aligning(t_ns: int, site: Row, reason: int, q: Array, qd: Array) -> None:
-    """Begins to align from a reference q that moves at qd, if the peers are no farther than the limit."""
+    """Begins to align from a reference q that moves at qd, if the peers are no farther than the
+    limit.
+    """
     turn = rate = (0.0, 0.0, 0.0)
     if has_orientation(site):
-        turn = turn_between(rotation_matrix(three(q[3:])), rotation_matrix(three(site.q_des[3:])))
+        turn = turn_between(
+            rotation_matrix(three(q[3:])), rotation_matrix(three(site.q_des[3:]))
+        )
         rate = turn_rate(turn, subtract(three(qd[3:]), rotate_by(turn, three(site.qd_des[3:]))))
     near = length(turn) <= site.align_limit
     for i in range(straight_coordinates(site)):
@@ -129,7 +136,7 @@ def _begin_aligning(t_ns: int, site: Row, reason: int, q: Array, qd: Array) -> N
 def _leave_rest(t_ns: int, site: Row, reason: int) -> None:
     """Begins to align from the reference of an arm at rest."""
     put_rest_reference(site, site.q_followed, site.qd_followed)
-    _begin_aligning(t_ns, site, reason, site.q_followed, site.qd_followed)
+    _begin_aligning(t_ns=t_ns, site=site, reason=reason, q=site.q_followed, qd=site.qd_followed)
 
 
 @leaf
@@ -224,7 +231,9 @@ def _update_mode(t_ns: int, site: Row, links: RowArray) -> None:
         begin_rest(t_ns, _HOLD, _PEER_SILENT, site)
     elif site.regrouped and (site.mode == _RUN or site.mode == _ALIGN):
         _carry_on(site)
-        _begin_aligning(t_ns, site, site.regrouped, site.q_followed, site.qd_followed)
+        _begin_aligning(
+            t_ns=t_ns, site=site, reason=site.regrouped, q=site.q_followed, qd=site.qd_followed
+        )
     elif site.mode == _ALIGN and (t_ns - site.return_from_ns) * 1e-9 >= _align_s(site):
         site.mode = _RUN
         site.reason = _ALIGNED

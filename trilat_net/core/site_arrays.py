@@ -1,8 +1,8 @@
 """The arrays of a running site: their layout, and how a setup fills them.
 
-Invariant: the kernel reads and writes nothing else; two sites of one setup have the same arrays. A site's
-state is one row of a structured array: one argument that costs a quarter of a microsecond to pass, and
-fields with the paper's names.
+Invariant: the kernel reads and writes nothing else; two sites of one setup have the same
+arrays. A site's state is one row of a structured array: one argument that costs a quarter of a
+microsecond to pass, and fields with the paper's names.
 """
 
 from collections.abc import Sequence
@@ -17,14 +17,31 @@ from .channel import LOST
 from .delay import LINK_MODEL_DTYPE, MAX_DELAY_US, LinkModel, max_delay_us
 from .dominance import RAMP_COLUMNS, fold_ramps
 from .exogenous import TorqueSourceRows, TorqueTable, torque_source_rows
-from .link import AHEAD_LIMIT_NS, ChannelArrays, calendar_pages, link_dtype, sample_dtype, span_ticks
+from .link import (
+    AHEAD_LIMIT_NS,
+    ChannelArrays,
+    calendar_pages,
+    link_dtype,
+    sample_dtype,
+    span_ticks,
+)
 from .site_setup import Gains, Law, Layout, LinkSetup, SiteSetup
 from .ticks import MAX_ARRIVALS, NS_PER_S, CoreChange, DominanceRamp, LifeOrder, Mode
 from .two_link_arm import JOINTS, PARAMETERS
 from .vectors import Array, IntArray, Points, Row, RowArray
 
 _SETTINGS = (
-    *("rate_hz", "first", "scheme", "law", "external", "ramps", "on_stale", "stale_ns", "return_ns"),
+    *(
+        "rate_hz",
+        "first",
+        "scheme",
+        "law",
+        "external",
+        "ramps",
+        "on_stale",
+        "stale_ns",
+        "return_ns",
+    ),
     *("theta_known", "needs_model", "remembered", "asked", "order", "skipped"),
     *("degrades", "regrouped", "bit", "holds"),
 )
@@ -32,7 +49,19 @@ _COUNTS = ("joints", "shared", "parameters", "task", "sent")
 _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0", "absolute"))
 """Constant gains; the first estimate becomes `theta_hat`."""
 _PER_JOINT = (
-    *("tau_limit", "qd_limit", "Kp", "d", "q", "qd", "tau", "tau_before", "on_arm", "held", "sensed"),
+    *(
+        "tau_limit",
+        "qd_limit",
+        "Kp",
+        "d",
+        "q",
+        "qd",
+        "tau",
+        "tau_before",
+        "on_arm",
+        "held",
+        "sensed",
+    ),
     *("r", "u", "tau_x", "q_before", "G", "bias", "rho", "width", "friction"),
     *("q_min", "q_max", "tau_rate", "tau_held", "q_rest", "qd_rest"),
     *("damping", "integral", "deceleration"),
@@ -73,13 +102,22 @@ _OF_CHAIN = (
 
 @cache
 def site_dtype(layout: Layout) -> np.dtype[np.void]:
-    """Returns the layout of a site's row: its settings and gains, its state, the results within a tick."""
-    fields: list[Any] = [(name, "i8") for name in (*_SETTINGS, *_COUNTS, "mode", "return_from_ns", "reason")]
+    """Returns the layout of a site's row: its settings and gains, its state, the results within
+    a tick.
+    """
+    fields: list[Any] = [
+        (name, "i8") for name in (*_SETTINGS, *_COUNTS, "mode", "return_from_ns", "reason")
+    ]
     fields += [
         *((name, "f8") for name in ("g", "wall_n", "align_speed", "align_limit")),
         ("lengths", "f8", (2,)),
     ]
-    fields += [("k", "i8"), ("t_s", "f8"), ("h_s", "f8"), ("M", "f8", (layout.joints, layout.joints))]
+    fields += [
+        ("k", "i8"),
+        ("t_s", "f8"),
+        ("h_s", "f8"),
+        ("M", "f8", (layout.joints, layout.joints)),
+    ]
     for names, count in (
         (_PER_JOINT, layout.joints),
         (_PER_COORDINATE, layout.shared),
@@ -93,7 +131,8 @@ def site_dtype(layout: Layout) -> np.dtype[np.void]:
         fields += [(name, "f8") for name in ("scale", "posture_rate", "singular_value")]
         fields += [(name, "f8", (layout.shared, layout.joints)) for name in ("J", "Jd")]
         fields += [("A", "f8", (layout.shared, layout.shared)), ("tip_back", "f8", (3, 3))]
-    fields.append(("Y", "f8", (JOINTS, PARAMETERS)))  # the leaves of the planar arm are compiled for any
+    # the leaves of the planar arm are compiled for any
+    fields.append(("Y", "f8", (JOINTS, PARAMETERS)))
     return np.dtype((np.record, fields))
 
 
@@ -101,12 +140,16 @@ def site_dtype(layout: Layout) -> np.dtype[np.void]:
 def arrival_dtype(shared: int) -> np.dtype[np.void]:
     """Returns the layout of an arrival whose vectors have so many numbers."""
     return np.dtype(
-        (np.record, [("peer", "i8"), ("tick", "i8"), ("q", "f8", (shared,)), ("qd", "f8", (shared,))])
+        (
+            np.record,
+            [("peer", "i8"), ("tick", "i8"), ("q", "f8", (shared,)), ("qd", "f8", (shared,))],
+        )
     )
 
 
 class SiteArrays(NamedTuple):
-    """The arrays of one site, or of several that are stacked: then each has one axis more, in front.
+    """The arrays of one site, or of several that are stacked: then each has one axis more, in
+    front.
 
     Attributes:
         site: state and constants, shape (1,), see `site_dtype`.
@@ -118,8 +161,10 @@ class SiteArrays(NamedTuple):
         ramps: how dominance factors change, shape (R, RAMP_COLUMNS + P).
         actors: operators and environments, shape (A,), see `torque_source_dtype`.
         table: their recorded torques, shape (rows, 1 + n); of stacked sites one for all.
-        chain: the joints of a chain, shape (n,), see `chain_dtype`; None: the planar two-link arm.
-        channel: what the peers' laws send, per peer, for a plugged law; None: the law is one of the kernel's.
+        chain: the joints of a chain, shape (n,), see `chain_dtype`; None: the planar two-link
+            arm.
+        channel: what the peers' laws send, per peer, for a plugged law; None: the law is one of
+            the kernel's.
     """
 
     site: RowArray
@@ -176,9 +221,10 @@ def build_site_arrays(
 
     Args:
         setup: all that the site is built from.
-        spare: room for so many more changes of a link, and for so many of the dominance factors.
-        pages: pages of a link, and samples whose due times it keeps; 0: pages for its delays, and due times
-            for as long as a sample may be late.
+        spare: room for so many more changes of a link, and for so many of the dominance
+            factors.
+        pages: pages of a link, and samples whose due times it keeps; 0: pages for its delays,
+            and due times for as long as a sample may be late.
         layout: of the arrays, if they are to be larger than the site needs.
         plugged: with the arrays of a plugged law, also if the site's is none.
     """
@@ -197,33 +243,53 @@ def build_site_arrays(
     chain = None if setup.chain is None else build_chain(setup.chain.joints, layout.joints)
     site = _build_site(setup, layout)
     channel = _build_channel(setup, pages) if plugged or setup.own is not None else None
-    arrays = SiteArrays(site, rows, models, dues, calendars, points, ramps, actors, table, chain, channel)
+    arrays = SiteArrays(
+        site=site,
+        links=rows,
+        models=models,
+        dues=dues,
+        calendars=calendars,
+        points=points,
+        ramps=ramps,
+        actors=actors,
+        table=table,
+        chain=chain,
+        channel=channel,
+    )
     for ramp in setup.ramps:
         add_ramp(arrays, ramp)
     return arrays
 
 
 def needed_pages(setup: SiteSetup) -> int:
-    """Returns the pages of a site's links: for its delays, by senders that are ahead of it a little."""
+    """Returns the pages of a site's links: for its delays, by senders that are ahead of it a
+    little.
+    """
     longest = max(max_delay_us(link.models, link.traces) for link in setup.links)
     return calendar_pages(setup.rate_hz, longest, _NEAR_NS)
 
 
 def links_bytes(setup: SiteSetup, pages: int) -> int:
     """Returns the memory of a site's links with so many pages each, bytes."""
-    numbers = sum(vector.length for vector in setup.received_vectors) if setup.own is not None else 0
+    numbers = (
+        sum(vector.length for vector in setup.received_vectors) if setup.own is not None else 0
+    )
     page = sample_dtype(setup.layout.shared).itemsize + 8 * numbers
     return len(setup.links) * (pages * page + 8 * _kept_dues(setup))
 
 
 def _kept_dues(setup: SiteSetup) -> int:
-    """Returns how many due times a link keeps: from the latest sample there may be to the one most ahead."""
+    """Returns how many due times a link keeps: from the latest sample there may be to the one
+    most ahead.
+    """
     fastest_hz = max(setup.rate_hz, *(link.rate_hz for link in setup.links))
     return span_ticks(MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS, fastest_hz) + _SLACK
 
 
 def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
-    """Returns the arrays of a site before tick k with calendars of more pages, and in them all that waits."""
+    """Returns the arrays of a site before tick k with calendars of more pages, and in them all
+    that waits.
+    """
     ticks = np.arange(k, k + arrays.calendars.shape[1])
     old = ticks & (len(ticks) - 1)
     new = ticks & (pages - 1)
@@ -239,12 +305,15 @@ def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
 
 
 class LinkRoom:
-    """The room of a site's links: for its delays, and more for senders further ahead and delays that grow.
+    """The room of a site's links: for its delays, and more for senders further ahead and delays
+    that grow.
 
-    Never more than `MAX_LINKS_BYTES`: what does not fit is refused as it is filed, like a stamp out of range.
+    Never more than `MAX_LINKS_BYTES`: what does not fit is refused as it is filed, like a stamp
+    out of range.
 
     Attributes:
-        newest: per peer a sample that fits at any tick from the last one on, and all older ones with it.
+        newest: per peer a sample that fits at any tick from the last one on, and all older ones
+            with it.
     """
 
     def __init__(self, setup: SiteSetup) -> None:
@@ -254,7 +323,10 @@ class LinkRoom:
         self.newest = [-1] * len(setup.links)
         self.most_pages = needed_pages(setup)
         most = calendar_pages(setup.rate_hz)
-        while self.most_pages < most and links_bytes(setup, 2 * self.most_pages) <= MAX_LINKS_BYTES:
+        while (
+            self.most_pages < most
+            and links_bytes(setup, 2 * self.most_pages) <= MAX_LINKS_BYTES
+        ):
             self.most_pages *= 2
 
     def clear(self) -> None:
@@ -267,7 +339,9 @@ class LinkRoom:
         self.newest[peer] = -1
 
     def make(self, arrays: SiteArrays, k: int, peer: int, tick: int) -> SiteArrays:
-        """Returns the arrays at tick k with room for a peer's sample, if one from as far ahead is taken."""
+        """Returns the arrays at tick k with room for a peer's sample, if one from as far ahead
+        is taken.
+        """
         wait = span_ticks(self._delay_us[peer] * 1000, self._rate_hz) + _SLACK
         ahead = tick * self._rate_hz // self._peer_hz[peer] - k
         if ahead > span_ticks(AHEAD_LIMIT_NS, self._rate_hz):
@@ -281,7 +355,9 @@ class LinkRoom:
 
 
 def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
-    """Adds a change of the dominance factors to those that are planned, in the order of their starts."""
+    """Adds a change of the dominance factors to those that are planned, in the order of their
+    starts.
+    """
     site: Row = arrays.site[0]
     count = int(site.ramps)
     ramps = arrays.ramps
@@ -307,11 +383,14 @@ def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
 MAX_CHANGES = 4096
 """Most changes of one link that a site takes besides its scenario's."""
 MAX_RAMPS = 256
-"""Most changes of the dominance factors that wait to begin, besides the scenario's; any number in a run."""
+"""Most changes of the dominance factors that wait to begin, besides the scenario's; any number
+in a run.
+"""
 
 
 def take_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
-    """Takes a change in; one that is planned for later, by the scenario or an earlier order, still comes.
+    """Takes a change in; one that is planned for later, by the scenario or an earlier order,
+    still comes.
 
     Args:
         arrays: of the site.
@@ -333,12 +412,16 @@ def take_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
     if change.ramp is not None:
         s.ramps = fold_ramps(t_ns, int(s.ramps), arrays.ramps)
         if s.ramps >= len(arrays.ramps):
-            raise ValueError(f"at most {MAX_RAMPS} changes of the shares of a site wait to begin")
+            raise ValueError(
+                f"at most {MAX_RAMPS} changes of the shares of a site wait to begin"
+            )
         add_ramp(arrays, change.ramp)
 
 
 _NEAR_NS = NS_PER_S // 4
-"""By how much senders are ahead of a receiver that is a little late: a calendar has pages for that."""
+"""By how much senders are ahead of a receiver that is a little late: a calendar has pages for
+that.
+"""
 MAX_LINKS_BYTES = 64 << 20
 """Most memory of a site's links, bytes."""
 _SLACK = 4
@@ -350,7 +433,8 @@ _NEVER_SAMPLED = 2
 def stack_site_arrays(
     setups: Sequence[SiteSetup], spare: int = 0, longest_us: int = 0, late_ns: int = 0
 ) -> SiteArrays:
-    """Returns the arrays of all sites of a run stacked, with links no longer than their delays need.
+    """Returns the arrays of all sites of a run stacked, with links no longer than their delays
+    need.
 
     An array that is shorter than another site's is filled up with rows that are never read.
 
@@ -360,14 +444,18 @@ def stack_site_arrays(
         longest_us: the longest delay of such a change, us.
         late_ns: by how much samples may come late, ns.
     """
-    longest = max(max_delay_us(link.models, link.traces) for setup in setups for link in setup.links)
+    longest = max(
+        max_delay_us(link.models, link.traces) for setup in setups for link in setup.links
+    )
     fastest_hz = max(setup.rate_hz for setup in setups)
     margin_ns = late_ns + _SLACK * NS_PER_S // fastest_hz
     pages = calendar_pages(fastest_hz, max(longest, longest_us), margin_ns)
     layouts = [setup.layout for setup in setups]
     largest = Layout(*map(max, zip(*layouts, strict=True)))
     plugged = any(setup.own is not None for setup in setups)
-    sites = [build_site_arrays(one, (spare,) * 2, pages, largest, plugged=plugged) for one in setups]
+    sites = [
+        build_site_arrays(one, (spare,) * 2, pages, largest, plugged=plugged) for one in setups
+    ]
     first_point = first_torque = 0
     for site in sites:  # one table of points, and one of torques, for all
         site.models["trace_first"] += first_point
@@ -383,7 +471,9 @@ def stack_site_arrays(
     channels = [site.channel for site in sites if site.channel is not None]
     if not channels:
         del columns["channel"]
-    joined: dict[str, Any] = {name: np.concatenate(columns.pop(name)) for name in ("points", "table")}
+    joined: dict[str, Any] = {
+        name: np.concatenate(columns.pop(name)) for name in ("points", "table")
+    }
     if channels:
         joined["channel"] = _stack_channels(setups, columns.pop("channel"))
     stacked: dict[str, Any] = {name: _stack_padded(column) for name, column in columns.items()}
@@ -405,11 +495,17 @@ def select_site(stacked: SiteArrays, i: int, layout: Layout) -> SiteArrays:
     )
 
 
-def _stack_channels(setups: Sequence[SiteSetup], channels: Sequence[ChannelArrays]) -> ChannelArrays:
-    """Returns the channels of several sites stacked; places are those in the numbers of the peer's record."""
+def _stack_channels(
+    setups: Sequence[SiteSetup], channels: Sequence[ChannelArrays]
+) -> ChannelArrays:
+    """Returns the channels of several sites stacked; places are those in the numbers of the
+    peer's record.
+    """
     for setup, channel in zip(setups, channels, strict=True):
         for link, places in zip(setup.links, channel.places, strict=True):
-            common, own = (link.channel.numbers(per_peer=per_peer) for per_peer in (False, True))
+            common, own = (
+                link.channel.numbers(per_peer=per_peer) for per_peer in (False, True)
+            )
             places[places >= common] += link.place * own
     waiting, received, places = map(_stack_padded, zip(*channels, strict=True))
     for channel, whole in zip(channels, places, strict=True):
@@ -422,7 +518,10 @@ def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
     shape = np.max([array.shape for array in arrays], axis=0)
     return np.stack(
         [
-            np.pad(array, [(0, most - length) for most, length in zip(shape, array.shape, strict=True)])
+            np.pad(
+                array,
+                [(0, most - length) for most, length in zip(shape, array.shape, strict=True)],
+            )
             for array in arrays
         ]
     )
@@ -468,7 +567,11 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
         s.axes[: own.shared] = task.axes
         s.posture[: own.joints] = task.posture or setup.q0
     vectors = {name: getattr(gains, name) for name in _GAINS}
-    vectors |= {"tau_limit": setup.tau_limit_nm, "qd_limit": setup.qd_limit_rad_s, "theta": setup.theta}
+    vectors |= {
+        "tau_limit": setup.tau_limit_nm,
+        "qd_limit": setup.qd_limit_rad_s,
+        "theta": setup.theta,
+    }
     vectors |= {**setup.limits._asdict(), **setup.rest.vectors()}
     vectors |= {"q": setup.q0, "qd": setup.qd0, "q_before": setup.q0}
     if gains.law is Law.OWN and setup.theta_known:
@@ -490,16 +593,24 @@ def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
     numbers = sum(vector.length for vector in vectors)
     places = np.array([link.channel.find_places(vectors) for link in links], dtype=np.int64)
     shape = (len(links), numbers)
-    return ChannelArrays(np.zeros((len(links), pages, numbers)), np.zeros(shape), places.reshape(shape))
+    return ChannelArrays(
+        np.zeros((len(links), pages, numbers)), np.zeros(shape), places.reshape(shape)
+    )
 
 
-def _build_links(links: Sequence[LinkSetup], spare: int, shared: int) -> tuple[RowArray, RowArray, Points]:
+def _build_links(
+    links: Sequence[LinkSetup], spare: int, shared: int
+) -> tuple[RowArray, RowArray, Points]:
     """Returns the links' rows, their models, and the points of their traces and outages."""
     rows = np.zeros(len(links), link_dtype(shared))
-    all_models = np.zeros((len(links), max(len(link.models) for link in links) + spare), LINK_MODEL_DTYPE)
+    all_models = np.zeros(
+        (len(links), max(len(link.models) for link in links) + spare), LINK_MODEL_DTYPE
+    )
     traces = [trace for link in links for trace in link.traces if trace is not None]
     outages = [outage for link in links for outage in link.outages]
-    points = np.array([pair for trace in traces for pair in trace] + outages, dtype=np.int64).reshape(-1, 2)
+    points = np.array(
+        [pair for trace in traces for pair in trace] + outages, dtype=np.int64
+    ).reshape(-1, 2)
     trace_first = 0
     outage_first = sum(map(len, traces))
     row: Row

@@ -25,8 +25,8 @@ from .vectors import Array, Points, Vector
 class Scheme(IntEnum):
     """How the continuous law is sampled.
 
-    SECOND_ORDER extrapolates the torque to mid-period and updates the estimate by the trapezoid rule;
-    DIGITAL is zero-order hold and forward Euler, as in a plain digital controller.
+    SECOND_ORDER extrapolates the torque to mid-period and updates the estimate by the trapezoid
+    rule; DIGITAL is zero-order hold and forward Euler, as in a plain digital controller.
     """
 
     SECOND_ORDER = 0
@@ -36,9 +36,10 @@ class Scheme(IntEnum):
 class Law(IntEnum):
     """The control law of a site.
 
-    ADAPTIVE is the paper's, Eq. (13) and (15), with its estimate in a box if one is given. KNOWN knows
-    gravity: tau = G(q) - K e - d qd - Kd ed + k_f felt, which is P+d, PD+d, or direct force reflection. OWN
-    is a user's law, in Python.
+    ADAPTIVE is the paper's, Eq. (13) and (15), with its estimate in a box if one is given.
+    KNOWN knows
+    gravity: tau = G(q) - K e - d qd - Kd ed + k_f felt, which is P+d, PD+d, or direct force
+    reflection. OWN is a user's law, in Python.
     """
 
     ADAPTIVE = 0
@@ -53,8 +54,9 @@ LEAST_STOP_S = 0.1
 class StaleAction(IntEnum):
     """The action of a site while a peer that it follows is stale.
 
-    USE goes on with the last sample; HOLD stays at the reference that was in force; BRAKE stays where the
-    arm was. GLIDE lets the reference come to rest, and begins by waiting for all peers, see `session_life`.
+    USE goes on with the last sample; HOLD stays at the reference that was in force; BRAKE stays
+    where the arm was. GLIDE lets the reference come to rest, and begins by waiting for all
+    peers, see `session_life`.
     """
 
     USE = 0
@@ -68,10 +70,11 @@ class StaleRule(NamedTuple):
 
     Attributes:
         action: the site's action then.
-        age_ns: a peer whose sample in use is older is stale, ns; of GLIDE one of which none came into use for
-            so long.
+        age_ns: a peer whose sample in use is older is stale, ns; of GLIDE one of which none
+            came into use for so long.
         return_ns: duration of the return to the peers, ns.
-        align_speed: of GLIDE, the largest speed of the way to the peers, rad/s (of a place m/s).
+        align_speed: of GLIDE, the largest speed of the way to the peers, rad/s (of a place
+            m/s).
         align_limit: of GLIDE, the longest way that it goes by itself, rad (of a place m).
         degrades: of GLIDE, true: it goes on without a peer that is lost, see `lost_peers`.
     """
@@ -85,7 +88,8 @@ class StaleRule(NamedTuple):
 
 
 class MotionLimits(NamedTuple):
-    """How far an arm may go, and how fast its reference and its torque may change; one number, or one each.
+    """How far an arm may go, and how fast its reference and its torque may change; one number,
+    or one each.
 
     Attributes:
         q_min: least joint angles, rad.
@@ -116,10 +120,16 @@ class RestGains(NamedTuple):
     def vectors(self) -> dict[str, Vector]:
         """Returns the gains that the core has: k B besides, k one quarter of 1 / time_s."""
         integral = tuple(float(B) / (4.0 * self.time_s) for B in self.damping)
-        return {"damping": self.damping, "integral": integral, "deceleration": self.deceleration}
+        return {
+            "damping": self.damping,
+            "integral": integral,
+            "deceleration": self.deceleration,
+        }
 
     def stop_s(self, qd: Array) -> Array:
-        """Returns the time in which the reference comes to rest from velocities of shape (..., n), rad/s."""
+        """Returns the time in which the reference comes to rest from velocities of shape (...,
+        n), rad/s.
+        """
         found: Array = np.maximum(LEAST_STOP_S, (np.abs(qd) / self.deceleration).max(axis=-1))
         return found
 
@@ -131,14 +141,16 @@ class LinkSetup(NamedTuple):
         peer: the peer's name.
         alpha: its dominance factor in this site's reference, Eq. (6), dimensionless.
         rate_hz: the peer's tick rate, Hz.
-        q0: the peer's start pose, rad, or its end effector's, in use until its first sample is due (L7).
+        q0: the peer's start pose, rad, or its end effector's, in use until its first sample is
+            due (L7).
         key: the key of the link's draws, see `link_key`.
         models: in the order of their first stamps; the first applies from stamp 0.
         traces: per model the points of its trace, shape (n, 2), see `Points`, or None.
         outages: when the link is cut: pairs of first stamp and end, ns.
         channel: what the peer's law sends besides its motion.
         place: the site's place among the peers of its peer, in scenario order.
-        speed_limit: largest speed of the peer's joints, rad/s, for who drops samples beyond; () for no one.
+        speed_limit: largest speed of the peer's joints, rad/s, for who drops samples beyond; ()
+            for no one.
         bit: of the peer in sets of sites.
         followed: the set of sites that the peer follows.
         dispensable: true: a site that degrades may go on without it.
@@ -187,7 +199,9 @@ class Layout(NamedTuple):
     def of_arm(
         cls, chain: "ChainSetup | None", sent: int = 0, actors: Sequence[TorqueSource] = ()
     ) -> "Layout":
-        """Returns the layout of a chain, or without one of the planar two-link arm; its law sends so much."""
+        """Returns the layout of a chain, or without one of the planar two-link arm; its law
+        sends so much.
+        """
         n = JOINTS if chain is None else len(chain.joints)
         live = next((actor.acts for actor in actors if actor.acts in LIVE_KINDS), None)
         size = n if live is TorqueKind.LIVE_JOINT else 2 if chain is None else 3
@@ -196,7 +210,15 @@ class Layout(NamedTuple):
             return cls(sent=sent, hand=hand)
         task = chain.task
         shared = n if task is None else len(task.axes)
-        return cls(n, shared, LINK_PARAMETERS * n, True, task is not None, sent, hand)
+        return cls(
+            joints=n,
+            shared=shared,
+            parameters=LINK_PARAMETERS * n,
+            chain=True,
+            task=task is not None,
+            sent=sent,
+            hand=hand,
+        )
 
     def lengths(self) -> dict[str, int]:
         """Returns how many numbers the vectors of a record have, in their order."""
@@ -209,43 +231,59 @@ class Layout(NamedTuple):
         return {**vectors, "theta_hat": self.parameters, **shared, **given}
 
     def columns(self) -> dict[str, slice]:
-        """Returns where the vectors that a tick computes stand in its row of floats, in their order."""
-        lengths = {name: n for name, n in self.lengths().items() if name not in ("hand", "bodies")}
+        """Returns where the vectors that a tick computes stand in its row of floats, in their
+        order.
+        """
+        lengths = {
+            name: n for name, n in self.lengths().items() if name not in ("hand", "bodies")
+        }
         ends = accumulate(lengths.values())
         return {
-            name: slice(end - length, end) for (name, length), end in zip(lengths.items(), ends, strict=True)
+            name: slice(end - length, end)
+            for (name, length), end in zip(lengths.items(), ends, strict=True)
         }
 
     def life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Returns how many numbers a site that glides, with so many peers, has in a record's `mem`.
+        """Returns how many numbers a site that glides, with so many peers, has in a record's
+        `mem`.
 
-        In task space there are the pose and the velocities of `rest_columns`. Of one that degrades the last
-        of them are `gone` of its peers.
+        In task space there are the pose and the velocities of `rest_columns`. Of one that
+        degrades the last of them are `gone` of its peers.
         """
         end: int = self.rest_columns(peers).stop
         return end + peers * degrades
 
     def rest_columns(self, peers: int) -> slice:
-        """Returns where `mem` has the joint pose and the velocities from which an arm in task space rests."""
+        """Returns where `mem` has the joint pose and the velocities from which an arm in task
+        space rests.
+        """
         first = 2 * (self.shared + 1) + peers + self.joints
         return slice(first, first + 2 * self.joints * self.task)
 
     def find_lost(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
         """Returns the peers without which a site that degrades goes on, by a record's `mem`."""
         end = self.life_memory(len(peers), degrades=True)
-        return [peer for peer, gone in zip(peers, mem[end - len(peers) : end], strict=False) if gone]
+        return [
+            peer for peer, gone in zip(peers, mem[end - len(peers) : end], strict=False) if gone
+        ]
 
     @property
     def floats(self) -> int:
         """Length of a record's row of floats."""
-        return 4 * self.joints + (5 if self.task else 2) * self.shared + self.parameters + self.sent
+        return (
+            4 * self.joints
+            + (5 if self.task else 2) * self.shared
+            + self.parameters
+            + self.sent
+        )
 
 
 class TaskSetup(NamedTuple):
     """How a site follows with its end effector.
 
     Attributes:
-        axes: per coordinate 1: the site follows along it, 0: not. Three of them: a place; six: a pose.
+        axes: per coordinate 1: the site follows along it, 0: not. Three of them: a place; six:
+            a pose.
         scale: metres of the task per metre of this arm.
         posture: joint angles that it moves towards as far as the task leaves it free, rad.
         posture_rate: by how much of the way in a second, 1/s.
@@ -278,7 +316,8 @@ class ChainSetup(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """A control law and its gains, diagonal ones as vectors; those of other laws have no effect.
+    """A control law and its gains, diagonal ones as vectors; those of other laws have no
+    effect.
 
     A vector of one number stands for one whose entries are all that number.
 
@@ -298,7 +337,8 @@ class Gains(NamedTuple):
         rho: largest robust torque of ADAPTIVE, shape (n,), N m.
         width: speed r at which it is 0.71 of that, shape (n,), rad/s.
         friction: share of a chain's joint friction that ADAPTIVE compensates, shape (n,).
-        absolute: true: r of ADAPTIVE is qd + Lambda q, and Kp takes it to that of the peers; only linearised.
+        absolute: true: r of ADAPTIVE is qd + Lambda q, and Kp takes it to that of the peers;
+            only linearised.
     """
 
     law: Law
@@ -338,9 +378,11 @@ class SiteSetup(NamedTuple):
         links: the peers in scenario order.
         ramps: scripted changes of the dominance factors, in the order of their starts.
         on_stale: the rule for a stale peer.
-        external: true: the arm is outside of the program; it is measured, and nothing is integrated.
+        external: true: the arm is outside of the program; it is measured, and nothing is
+            integrated.
         own: makes the user's law, if it is one.
-        theta_known: false: `theta` is not that of the arm, which is outside of the program and unidentified.
+        theta_known: false: `theta` is not that of the arm, which is outside of the program and
+            unidentified.
         chain: the arm, if it is a chain; None: it is the planar two-link arm.
         channel: what the site's law sends to its peers.
         limits: further limits.
@@ -376,7 +418,9 @@ class SiteSetup(NamedTuple):
     @property
     def layout(self) -> Layout:
         """How many numbers its vectors have."""
-        return Layout.of_arm(self.chain, self.channel.floats, self.actors)._replace(bodies=7 * self.bodies)
+        return Layout.of_arm(self.chain, self.channel.floats, self.actors)._replace(
+            bodies=7 * self.bodies
+        )
 
     @property
     def received_vectors(self) -> tuple[SentVector, ...]:

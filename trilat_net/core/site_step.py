@@ -1,8 +1,8 @@
 """A site, and `Site.step`: the one place that computes a site's tick.
 
-Invariant: a site advances by `step` alone, and `step` is a pure function of the site's state and the
-tick's input: no clock, no socket, no chance. Live, in virtual time and from a log, the same ticks give
-the same bits.
+Invariant: a site advances by `step` alone, and `step` is a pure function of the site's state
+and the tick's input: no clock, no socket, no chance. Live, in virtual time and from a log, the
+same ticks give the same bits.
 
 `Site` is thin Python around `kernel.site_tick`: it packs arrivals and unpacks the record.
 """
@@ -20,7 +20,14 @@ from .compiled_law import plug_law
 from .delay import DelayKind
 from .exogenous import LIVE_KINDS
 from .jit import bind_leaf
-from .kernel import accept_stage, act_stages, find_release, resume_stages, sense_stages, site_tick
+from .kernel import (
+    accept_stage,
+    act_stages,
+    find_release,
+    resume_stages,
+    sense_stages,
+    site_tick,
+)
 from .live_hand import HandInForce, free_hand
 from .site_arrays import (
     MAX_CHANGES,
@@ -98,20 +105,35 @@ class Site:
         self._received_counts = counts if self._user_law is not None and any(counts) else None
         self._glides = setup.on_stale.action is StaleAction.GLIDE
         self._degrades = setup.on_stale.degrades
-        self._law_memory: list[float] = [] if self._law is None or not self._glides else self._law.memory
+        self._law_memory: list[float] = (
+            [] if self._law is None or not self._glides else self._law.memory
+        )
         self._remembers = self._glides or self._user_law is not None
         s = self._site  # its fields are looked up once: that takes longer than to read them
-        own = (s["q_held"][0], s["return_from_ns"], s["qd_held"][0], s["reason"], s["tau_held"][0])
+        own = (
+            s["q_held"][0],
+            s["return_from_ns"],
+            s["qd_held"][0],
+            s["reason"],
+            s["tau_held"][0],
+        )
         rest = s["q_rest"][0], s["qd_rest"][0]
         self._held_fields = (*own, self._links["used_ns"], self._links["gone"], *rest)
         self._reflects = bool(np.any(setup.gains.k_f)) or self._user_law is not None
-        self._keeps_forces = self._reflects or self._hand is not None  # a hand of one's own sees them
+        # a hand of one's own sees them
+        self._keeps_forces = self._reflects or self._hand is not None
 
     def _find_hand(self, place: int) -> tuple[Array, Array, Array]:
-        """Returns grip, target, and target a second later of the live hand at a place among the actors."""
+        """Returns grip, target, and target a second later of the live hand at a place among the
+        actors.
+        """
         actors = self._arrays.actors
         size = (self.layout.hand - 3) // 2
-        return actors["grip"][place : place + 1], actors["a"][place, :size], actors["b"][place, :size]
+        return (
+            actors["grip"][place : place + 1],
+            actors["a"][place, :size],
+            actors["b"][place, :size],
+        )
 
     def _plug_law(self, setup: SiteSetup) -> None:
         """Makes the law of a setup that has its own."""
@@ -124,10 +146,13 @@ class Site:
             self._law = plug_law(self._user_law, setup, a, self._sent)
             self._law.bind()  # compiled now, and not within the time that the law has for a tick
             self._sense = bind_leaf(sense_stages, 0, 0, 0, a, b)
-            self._act = bind_leaf(act_stages, 0, 0, a.site, a.actors, a.table, a.chain, b.record)
+            self._act = bind_leaf(
+                act_stages, 0, 0, a.site, a.actors, a.table, a.chain, b.record
+            )
 
     def order(self, command: CoreChange, t_ns: int) -> None:
-        """Takes in a change; one that is planned for later, by the scenario or an earlier order, still comes.
+        """Takes in a change; one that is planned for later, by the scenario or an earlier
+        order, still comes.
 
         Args:
             command: the change.
@@ -141,10 +166,11 @@ class Site:
             self._room.lengthen(command.peer, command.model)
 
     def begin_at(self, k: int) -> None:
-        """Lets tick k be the first one, of a site that joins a running session; for a site without ticks.
+        """Lets tick k be the first one, of a site that joins a running session; for a site
+        without ticks.
 
-        Its arm stands where it starts, no sample of a peer is in use, and none is under way; its channels are
-        where they would be.
+        Its arm stands where it starts, no sample of a peer is in use, and none is under way;
+        its channels are where they would be.
         """
         if k <= self._site["first"]:
             self.prime(k, [None] * len(self.peers), ())
@@ -163,7 +189,8 @@ class Site:
 
         Raises:
             ValueError: more than MAX_ARRIVALS arrivals, or more changes than `order` takes.
-            LawFailed: a user's law did, and the site does not go on without it, as under `glide`.
+            LawFailed: a user's law did, and the site does not go on without it, as under
+                `glide`.
         """
         t_ns = tick.k * NS_PER_S // self.rate_hz
         count = len(tick.arrivals)
@@ -192,7 +219,11 @@ class Site:
         motion, task = self._columns
         mode = self._mode.item()
         texts = [command.text for command in tick.commands]
-        memory = self._held_memory() + memory if self._remembers or mode not in (_RUN, _DIVERGED) else []
+        memory = (
+            self._held_memory() + memory
+            if self._remembers or mode not in (_RUN, _DIVERGED)
+            else []
+        )
         taken = self._used.tolist(), self._crc(packed, count), texts, memory
         states = [row[column] for column in motion]
         shared = [row[column] for column in task] or _NO_TASK
@@ -202,8 +233,9 @@ class Site:
     def _ask_law(self, k: int, t_ns: int) -> list[float]:
         """Stage 6 of a plugged law; returns its memory.
 
-        Under the rule `glide` a law that fails gives no torque, which is a FAULT: it is not asked until that
-        is reset, and then goes on from the memory that it had before it failed.
+        Under the rule `glide` a law that fails gives no torque, which is a FAULT: it is not
+        asked until that is reset, and then goes on from the memory that it had before it
+        failed.
         """
         assert self._law is not None
         s: Row = self._site[0]
@@ -248,7 +280,9 @@ class Site:
         return angles
 
     def _take_hand(self, vector: Sequence[float]) -> Sequence[float]:
-        """Puts what a live hand does into its row; returns it as a record has it, () if there is none."""
+        """Puts what a live hand does into its row; returns it as a record has it, () if there
+        is none.
+        """
         if self._hand is None:
             return ()
         grip, target, ahead = self._hand
@@ -271,21 +305,35 @@ class Site:
 
     def _held_memory(self) -> list[float]:
         """Returns the part of `TickRecord.mem` that a site has which holds, brakes or returns."""
-        q_held, return_from_ns, qd_held, reason, tau_held, used_ns, gone, pose, speed = self._held_fields
+        q_held, return_from_ns, qd_held, reason, tau_held, used_ns, gone, pose, speed = (
+            self._held_fields
+        )
         held = [*q_held.tolist(), float(return_from_ns.item())]
         if not self._glides:
             return held
         heard = map(float, used_ns.tolist())
         lost = gone.tolist() if self._degrades else ()
         rest = (*pose.tolist(), *speed.tolist()) if self.layout.task else ()
-        return [*held, *qd_held.tolist(), float(reason.item()), *heard, *tau_held.tolist(), *rest, *lost]
+        return [
+            *held,
+            *qd_held.tolist(),
+            float(reason.item()),
+            *heard,
+            *tau_held.tolist(),
+            *rest,
+            *lost,
+        ]
 
     def counts(self) -> tuple[LinkCounts, ...]:
         """Returns what each link has counted since the start, in scenario order."""
-        return tuple(LinkCounts(*(int(link[field]) for field in LinkCounts._fields)) for link in self._links)
+        return tuple(
+            LinkCounts(*(int(link[field]) for field in LinkCounts._fields))
+            for link in self._links
+        )
 
     def release_tick(self, peer: int, tick: int) -> int | None:
-        """Returns the tick of this site at which a peer's sample comes into use if it has arrived by then.
+        """Returns the tick of this site at which a peer's sample comes into use if it has
+        arrived by then.
 
         None if it never does: its link loses it, or has turned its page.
         """
@@ -302,7 +350,8 @@ class Site:
         return int(self._links[peer]["rate_hz"])
 
     def resume(self, before: TickRecord, last: TickRecord) -> None:
-        """Restores the arm and its controller after `step(last.tick)`, from two records in a row.
+        """Restores the arm and its controller after `step(last.tick)`, from two records in a
+        row.
 
         `prime` restores the links.
 
@@ -348,7 +397,9 @@ class Site:
             self._law_memory = list(rest)
         resume_stages(last.tick, self._arrays)
 
-    def prime(self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]) -> None:
+    def prime(
+        self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]
+    ) -> None:
         """Restores the links before tick k.
 
         Args:
@@ -362,7 +413,9 @@ class Site:
         self._arrays.calendars["tick"] = -1
         self._room.clear()
         link: Row
-        for n, (link, start, sample) in enumerate(zip(self._links, self._starts, in_use, strict=True)):
+        for n, (link, start, sample) in enumerate(
+            zip(self._links, self._starts, in_use, strict=True)
+        ):
             # the channel's memory is a function of what went before
             link.foreseen = -1
             link.model = 0
@@ -378,15 +431,20 @@ class Site:
                 link.qd = sample.qd
                 link.tau_x = sample.tau_x or 0.0
             if (channel := self._arrays.channel) is not None:
-                sent = np.append(() if sample is None else sample.ch, 0.0)  # place -1 is this zero
+                # place -1 is this zero
+                sent = np.append(() if sample is None else sample.ch, 0.0)
                 channel.received[n] = sent[channel.places[n]] if len(sent) > 1 else 0.0
         self._pack(k, waiting)
         accept_stage(k, len(waiting), self._arrays, self._buffers)
 
     def _pack(self, k: int, arrivals: Sequence[Arrival]) -> int:
-        """Writes arrivals at tick k into their buffers and makes room for them; returns their bytes there."""
+        """Writes arrivals at tick k into their buffers and makes room for them; returns their
+        bytes there.
+        """
         if len(arrivals) > MAX_ARRIVALS:
-            raise ValueError(f"a tick takes at most {MAX_ARRIVALS} arrivals, got {len(arrivals)}")
+            raise ValueError(
+                f"a tick takes at most {MAX_ARRIVALS} arrivals, got {len(arrivals)}"
+            )
         offset = 0
         newest = self._room.newest
         for peer, tick, q, qd, *_ in arrivals:

@@ -1,22 +1,25 @@
-"""Following in task space: end effectors agree on a place, or on a place and an orientation, of unlike arms.
+"""Following in task space: end effectors agree on a place, or on a place and an orientation, of
+unlike arms.
 
-Invariant: all vectors of the task are in the frame that the sites share, `shared` of them: 3 of a place, m,
-and 3 more of an orientation as `rotation_vector`. An axis that a site does not follow has no effect on it.
+Invariant: all vectors of the task are in the frame that the sites share, `shared` of them: 3 of
+a place, m, and 3 more of an orientation as `rotation_vector`. An axis that a site does not
+follow has no effect on it.
 
-With J the Jacobian of the followed axes, x the end effector's pose and e = x - x_des, the reference
-velocity of the joints and its derivative are
+With J the Jacobian of the followed axes, x the end effector's pose and e = x - x_des, the
+reference velocity of the joints and its derivative are
 
-    v = psi + J' y,    J J' y = -Lambda e - J psi            (v = J+ (-Lambda e) + (I - J+ J) psi)
-    a = v' ,           J J' y' = -Lambda e' - J' psi - J psi' - (J' J^T + J J'^T) y
+    v = psi + J' y,    J J' y = -Lambda e - J psi            (v = J+ (-Lambda e) + (I - J+ J)
+    psi) a = v' ,           J J' y' = -Lambda e' - J' psi - J psi' - (J' J^T + J J'^T) y
 
 with psi = -k (q - q_posture) in the null space, so that r = qd - v gives J r = x' + Lambda e.
 
-J J' gets a damping that is zero while 1 / trace((J J')^-1), a lower bound of the square of the least singular
-value, is above that of `singular_value`.
+J J' gets a damping that is zero while 1 / trace((J J')^-1), a lower bound of the square of the
+least singular value, is above that of `singular_value`.
 
-Source: Y.-C. Liu and N. Chopra, "Controlled synchronization of heterogeneous robotic manipulators in the task
-space", IEEE Trans. Robotics 28 (2012); damping after Y. Nakamura and H. Hanafusa, "Inverse kinematic
-solutions with singularity robustness", J. Dynamic Systems, Measurement, and Control 108 (1986).
+Source: Y.-C. Liu and N. Chopra, "Controlled synchronization of heterogeneous robotic
+manipulators in the task space", IEEE Trans. Robotics 28 (2012); damping after Y. Nakamura and
+H. Hanafusa, "Inverse kinematic solutions with singularity robustness", J. Dynamic Systems,
+Measurement, and Control 108 (1986).
 """
 
 from .chain import Three, add, cross, place_end_effector, put_three, scale, subtract, three
@@ -40,7 +43,9 @@ def has_orientation(s: Row) -> bool:
 
 @leaf
 def straight_coordinates(s: Row) -> int:
-    """Returns how many of the first coordinates have differences: all but those of an orientation."""
+    """Returns how many of the first coordinates have differences: all but those of an
+    orientation.
+    """
     return PLACE if has_orientation(s) else s.q_des.shape[0]
 
 
@@ -94,7 +99,8 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
 
 @leaf
 def update_orientation_reference(s: Row, links: RowArray) -> None:
-    """Writes the orientation of the reference: the own one less the sum of alpha_ij Log(R_i R_j').
+    """Writes the orientation of the reference: the own one less the sum of alpha_ij Log(R_i
+    R_j').
 
     Its derivative is the sum of alpha_ij w_j, which is exact only for orientations that agree.
     """
@@ -104,14 +110,18 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
         link: Row = links[j]
         turn = turn_between(own, rotation_matrix(three(link.q[3:])))
         apart = add(apart, scale(link.alpha, turn))
-        rate = add(rate, add(scale(link.alpha, three(link.qd[3:])), scale(-link.alpha_rate, turn)))
+        rate = add(
+            rate, add(scale(link.alpha, three(link.qd[3:])), scale(-link.alpha_rate, turn))
+        )
     put_three(s.q_des[3:], add_turn(scale(-1.0, apart), three(s.x[3:])))
     put_three(s.qd_des[3:], rate)
 
 
 @leaf
 def _factor(s: Row, damping: float) -> None:
-    """Writes the factors L D L' of J J' + damping, for the axes that are followed, into s.A (lower part)."""
+    """Writes the factors L D L' of J J' + damping, for the axes that are followed, into s.A
+    (lower part).
+    """
     for j in range(s.shared):
         for k in range(j + 1):
             total = damping + 1.0 - s.axes[j] if j == k else 0.0
@@ -191,7 +201,9 @@ def update_task_errors(s: Row) -> None:
     for j in range(m):
         s.b[j] = -s.Lambda[j] * s.ed[j]
         for i in range(n):
-            s.b[j] -= s.Jd[j, i] * (s.v[i] + s.stage_qd[i]) + s.J[j, i] * (s.a[i] + s.stage_q[i])
+            s.b[j] -= s.Jd[j, i] * (s.v[i] + s.stage_qd[i]) + s.J[j, i] * (
+                s.a[i] + s.stage_q[i]
+            )
     _solve(s, s.b, s.y)
     for i in range(n):
         s.v[i] += s.stage_qd[i]
@@ -211,7 +223,9 @@ def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: 
 
 @leaf
 def update_wrench(s: Row) -> None:
-    """Writes what tau_x amounts to at the end effector, along the followed axes: (J J')^-1 J tau_x."""
+    """Writes what tau_x amounts to at the end effector, along the followed axes: (J J')^-1 J
+    tau_x.
+    """
     for j in range(s.shared):
         s.b[j] = 0.0
         for i in range(s.joints):

@@ -1,8 +1,8 @@
 """Ticks: their nominal times, and the input and the record of one.
 
-Invariant (L1): tick k of a loop of `rate_hz` lies at `k * 10^9 // rate_hz` nanoseconds after the epoch;
-integers, one rounding rule, no drift. Invariant (L3): the record of a tick names its inputs; the sample
-in use is an output.
+Invariant (L1): tick k of a loop of `rate_hz` lies at `k * 10^9 // rate_hz` nanoseconds after
+the epoch; integers, one rounding rule, no drift. Invariant (L3): the record of a tick names its
+inputs; the sample in use is an output.
 """
 
 from collections.abc import Sequence
@@ -39,11 +39,12 @@ MAX_ARRIVALS = 4096
 class Mode(IntEnum):
     """The mode of a site in a tick.
 
-    RUN follows the peers. A stale peer leads to HOLD (stays at the last reference) or BRAKE (stays where
-    the arm is); a fresh sample from there to RETURN (goes back to the peers over a time) and so to RUN. Under
-    the rule `glide` a site is WAITING for its peers before it goes to them, see `session_life`. DIVERGED,
-    past a limit, is final. Under `glide` a limit leads to FAULT and an order to STOPPED in its place: the
-    arm comes to rest, as in HOLD, and only another order leads back to WAITING.
+    RUN follows the peers. A stale peer leads to HOLD (stays at the last reference) or BRAKE
+    (stays where the arm is); a fresh sample from there to RETURN (goes back to the peers over a
+    time) and so to RUN. Under the rule `glide` a site is WAITING for its peers before it goes
+    to them, see `session_life`. DIVERGED, past a limit, is final. Under `glide` a limit leads
+    to FAULT and an order to STOPPED in its place: the arm comes to rest, as in HOLD, and only
+    another order leads back to WAITING.
     """
 
     RUN = 1
@@ -84,11 +85,11 @@ class LifeReason(IntEnum):
 class LifeOrder(IntEnum):
     """What a site under the rule `glide` is ordered to do, see `session_life`.
 
-    STOP leads to STOPPED, from where ENABLE leads back; RESET leads back from FAULT. The others come from the
-    site itself, at an arm outside of the program: ARM_SILENT and ARM_LOST say that no measurement came for a
-    time, ARM_BACK that one came again, RELEASED that nobody holds its dead-man switch, HELD that somebody
-    does again, OVERRUN that it did not make some ticks. Of several in one tick, the one of the highest number
-    counts, and OVERRUN besides.
+    STOP leads to STOPPED, from where ENABLE leads back; RESET leads back from FAULT. The others
+    come from the site itself, at an arm outside of the program: ARM_SILENT and ARM_LOST say
+    that no measurement came for a time, ARM_BACK that one came again, RELEASED that nobody
+    holds its dead-man switch, HELD that somebody does again, OVERRUN that it did not make some
+    ticks. Of several in one tick, the one of the highest number counts, and OVERRUN besides.
     """
 
     ENABLE = 1
@@ -143,7 +144,8 @@ class CoreChange(NamedTuple):
 
     Attributes:
         text: its text in the record, from which every reader derives the same change.
-        peer: the link that it changes, by its peer's index; -1 for a change of the dominance factors.
+        peer: the link that it changes, by its peer's index; -1 for a change of the dominance
+            factors.
         model: the link's model from then on.
         ramp: the change of the dominance factors.
         order: what the site is to do.
@@ -164,7 +166,8 @@ class PlantState(NamedTuple):
     Attributes:
         q: joint angles, rad.
         qd: joint velocities, rad/s.
-        tau_x: torque of operator and environment, N m, in the sign of the record; empty: none is measured.
+        tau_x: torque of operator and environment, N m, in the sign of the record; empty: none
+            is measured.
         bodies: poses of what else is in its scene, as a record has them.
     """
 
@@ -182,7 +185,8 @@ class TickInput(NamedTuple):
         arrivals: the samples since the tick before, in order.
         commands: the changes ordered since then.
         measured: the present state of an external plant; None: unchanged.
-        hand: what a live hand does in this tick, see `live_hand.free_hand`; empty: nobody holds the arm.
+        hand: what a live hand does in this tick, see `live_hand.free_hand`; empty: nobody holds
+            the arm.
     """
 
     k: int
@@ -193,7 +197,8 @@ class TickInput(NamedTuple):
 
 
 class TickRecord(NamedTuple):
-    """The record of one tick: the state AT t_k and what followed from it, never the advanced state.
+    """The record of one tick: the state AT t_k and what followed from it, never the advanced
+    state.
 
     Attributes:
         tick: k.
@@ -204,24 +209,26 @@ class TickRecord(NamedTuple):
         q_des: reference q_id, Eq. (6), rad.
         qd_des: its derivative, rad/s.
         tau: control torque, Eq. (13), N m.
-        tau_x: exogenous torque in the sign of Eq. (8), N m; the torque ON the arm is its negative.
+        tau_x: exogenous torque in the sign of Eq. (8), N m; the torque ON the arm is its
+            negative.
         theta_hat: estimate of the parameters.
         used: tick of the sample in use, per peer in scenario order; -1 before the first.
-        rx_crc: CRC-32 of this tick's arrivals as the step took them in, little-endian
-            (peer i64, tick i64, q f64s, qd f64s) each, followed by their tau_x if the law reflects force;
-            shows a changed input at its own tick.
+        rx_crc: CRC-32 of this tick's arrivals as the step took them in, little-endian (peer
+            i64, tick i64, q f64s, qd f64s) each, followed by their tau_x if the law reflects
+            force; shows a changed input at its own tick.
         cmd: texts of the changes that it took in.
-        mem: the rest of the site's memory: empty in RUN and DIVERGED, else the pose that it holds, rad, and
-            the time at which it began to return, ns since the epoch (0 before). A site with a user's law
-            always has these, and the law's memory after them. Under the rule `glide` a site always has what
-            `session_life` remembers in their place.
-        x: in task space what the site shares of its end effector: its place, m, and orientation; else empty.
+        mem: the rest of the site's memory: empty in RUN and DIVERGED, else the pose that it
+            holds, rad, and the time at which it began to return, ns since the epoch (0 before).
+            A site with a user's law always has these, and the law's memory after them. Under
+            the rule `glide` a site always has what `session_life` remembers in their place.
+        x: in task space what the site shares of its end effector: its place, m, and
+            orientation; else empty.
         xd: its derivative, m/s and rad/s.
         wrench: what tau_x amounts to there, N and N m.
         ch: what the site's law sends besides, see `LawChannel`.
         hand: what a live hand does in this tick, see `live_hand`; empty if the site has none.
-        bodies: poses of the bodies of its plant, seven numbers each: x, y, z in the arm's base frame, m, and
-            the unit quaternion w, x, y, z; empty if it has none.
+        bodies: poses of the bodies of its plant, seven numbers each: x, y, z in the arm's base
+            frame, m, and the unit quaternion w, x, y, z; empty if it has none.
     """
 
     tick: int
@@ -246,7 +253,9 @@ class TickRecord(NamedTuple):
     bodies: Sequence[float] = ()
 
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Returns the motion and the exogenous torque that peers get, in the coordinates that sites share."""
+        """Returns the motion and the exogenous torque that peers get, in the coordinates that
+        sites share.
+        """
         return (self.x, self.xd, self.wrench) if self.x else (self.q, self.qd, self.tau_x)
 
 
@@ -291,7 +300,9 @@ _REASONS = {
 
 
 def find_life_reason(output: TickRecord) -> LifeReason:
-    """Returns why a site under the rule `glide` last changed its mode, as its record remembers it."""
+    """Returns why a site under the rule `glide` last changed its mode, as its record remembers
+    it.
+    """
     return LifeReason(int(output.mem[2 * len(output.q_des) + 1]))
 
 
@@ -302,8 +313,10 @@ class LifeAlarm(NamedTuple):
         word: the mode, in capitals.
         reason: why.
         advice: what to do, at a terminal.
-        order: the order that ends it, "enable" or "reset", where a page has a button for it; "" if none does.
-        before: what has to be done before that order, a clause that ends in ", then"; "" if nothing.
+        order: the order that ends it, "enable" or "reset", where a page has a button for it; ""
+            if none does.
+        before: what has to be done before that order, a clause that ends in ", then"; "" if
+            nothing.
     """
 
     word: str
@@ -324,9 +337,15 @@ _ONCE_HEARD = "it goes on by itself once all its peers are heard"
 
 
 def find_alarm(
-    session: str, site: str, mode: str, mem: Sequence[float], shared: int, lost: Sequence[str] = ()
+    session: str,
+    site: str,
+    mode: str,
+    mem: Sequence[float],
+    shared: int,
+    lost: Sequence[str] = (),
 ) -> LifeAlarm | None:
-    """Returns the alarm of a site under the rule `glide`, by a record with `shared` coordinates; or None.
+    """Returns the alarm of a site under the rule `glide`, by a record with `shared`
+    coordinates; or None.
 
     `lost` are the peers that it goes on without.
     """
@@ -334,15 +353,22 @@ def find_alarm(
         reason = LifeReason(int(mem[2 * shared + 1]))
     except (IndexError, ValueError, OverflowError):  # of another rule, or a stranger's
         return None
-    if mode not in ("fault", "stopped", "hold") and (mode, reason) != ("waiting", LifeReason.ALIGN_LIMIT):
+    if mode not in ("fault", "stopped", "hold") and (mode, reason) != (
+        "waiting",
+        LifeReason.ALIGN_LIMIT,
+    ):
         names = ", ".join(lost)
         advice = f"the share comes back by itself once {names} is there again"
-        return LifeAlarm(f"WITHOUT {names}", "the others have its share", advice) if lost else None
+        return (
+            LifeAlarm(f"WITHOUT {names}", "the others have its share", advice) if lost else None
+        )
     order = {"fault": "reset", "stopped": "enable"}.get(mode, "")
     if reason is LifeReason.RELEASED:  # the dead-man switch ends it, and no order
         order = ""
     before = _REMEDIES.get(reason, "") if mode == "fault" else ""
-    advice = f"{before} trilat {order} --session {session} {site}".lstrip() if order else _ONCE_HEARD
+    advice = (
+        f"{before} trilat {order} --session {session} {site}".lstrip() if order else _ONCE_HEARD
+    )
     advice = {
         (mode, LifeReason.RELEASED): "hold the switch",
         ("hold", LifeReason.ARM_SILENT): "it goes on by itself once its arm is heard",
@@ -350,7 +376,7 @@ def find_alarm(
         ("waiting", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
     }.get((mode, reason), advice)
     why = _REASONS.get(reason, reason.name.lower().replace("_", " "))
-    return LifeAlarm(mode.upper(), why, advice, order, before)
+    return LifeAlarm(word=mode.upper(), reason=why, advice=advice, order=order, before=before)
 
 
 def describe_mode(
@@ -379,4 +405,6 @@ def describe_mode(
 def describe_divergence(site: str, output: TickRecord) -> str:
     """Returns the text of the event that a site diverged."""
     speed = max(abs(v) for v in output.qd)
-    return f"{site} diverged at t = {output.t_ns * 1e-9:.3f} s: a joint moves at {speed:.4g} rad/s"
+    return (
+        f"{site} diverged at t = {output.t_ns * 1e-9:.3f} s: a joint moves at {speed:.4g} rad/s"
+    )

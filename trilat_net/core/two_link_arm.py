@@ -1,13 +1,15 @@
-"""The planar two-link arm: inertia, Coriolis, gravity, regressor, forward dynamics and kinematics.
+"""The planar two-link arm: inertia, Coriolis, gravity, regressor, forward dynamics and
+kinematics.
 
-Invariant: every dynamic term is linear in theta, Eq. (5), and takes theta, shape (5,), never lengths and
-masses. Vectors are read by index and returned as tuples, matrices as tuples of rows (`vectors`). Everywhere q
-is the joint angles, rad, qd their velocities, rad/s, g the gravitational acceleration, m/s^2, and `lengths`
-those of the two links, m.
+Invariant: every dynamic term is linear in theta, Eq. (5), and takes theta, shape (5,), never
+lengths and masses. Vectors are read by index and returned as tuples, matrices as tuples of rows
+(`vectors`). Everywhere q is the joint angles, rad, qd their velocities, rad/s, g the
+gravitational acceleration, m/s^2, and `lengths` those of the two links, m.
 
-Source: "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty", Eq. (1)-(5),
-(8), (12), (24). Angles are measured from the horizontal; the second one is relative to the first link.
-Eq. (24) prints theta_5 = m2 l2, which holds only for lc2 = l2; here it is m2 lc2.
+Source: "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty",
+Eq. (1)-(5), (8), (12), (24). Angles are measured from the horizontal; the second one is
+relative to the first link. Eq. (24) prints theta_5 = m2 l2, which holds only for lc2 = l2; here
+it is m2 lc2.
 """
 
 from typing import NamedTuple
@@ -47,7 +49,9 @@ class ArmLinks(NamedTuple):
 
 
 def theta_from_links(links: ArmLinks) -> Array:
-    """Returns theta, shape (5,), of Eq. (24): three inertial entries in kg m^2, two gravity ones in kg m."""
+    """Returns theta, shape (5,), of Eq. (24): three inertial entries in kg m^2, two gravity
+    ones in kg m.
+    """
     a = links
     return np.array(
         [
@@ -63,7 +67,8 @@ def theta_from_links(links: ArmLinks) -> Array:
 def is_positive_definite(theta: Array) -> bool:
     """True if M(q) is positive definite in every pose, with a margin (Property 1).
 
-    Its determinant, theta_1 theta_3 - theta_3^2 - theta_2^2 cos^2 q_2, is least for the stretched arm.
+    Its determinant, theta_1 theta_3 - theta_3^2 - theta_2^2 cos^2 q_2, is least for the
+    stretched arm.
     """
     least = theta[0] * theta[2] - theta[2] ** 2 - theta[1] ** 2
     return bool(theta[2] > 0.0 and least > 1e-9 * theta[0] * theta[2])
@@ -90,9 +95,9 @@ def gravity(theta: Vector, g: float, q: Vector) -> Pair:
 def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Five, Five]:
     """Returns Y(q, qd, v, a), two rows, with Y theta = M(q) a + C(q, qd) v + G(q).
 
-    The paper prints Y(q, qd, qdd) only; Eq. (12) needs the two velocities apart: qd enters through
-    C, and v is the reference velocity that C multiplies, a the reference acceleration. With v = qd and
-    a = qdd this is the printed one, Eq. (5).
+    The paper prints Y(q, qd, qdd) only; Eq. (12) needs the two velocities apart: qd enters
+    through C, and v is the reference velocity that C multiplies, a the reference acceleration.
+    With v = qd and a = qdd this is the printed one, Eq. (5).
     """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])
@@ -106,8 +111,8 @@ def regressor(g: float, q: Vector, qd: Vector, v: Vector, a: Vector) -> tuple[Fi
 def forward_dynamics(theta: Vector, g: float, q: Vector, qd: Vector, torque: Vector) -> Pair:
     """Returns qdd, rad/s^2: the solution of M qdd = torque - C qd - G, Eq. (8).
 
-    `torque` is the whole torque on the joints, tau - tau_x, N m. Written out by Cramer's rule: a step takes
-    four of these, and their cost is that of the sines.
+    `torque` is the whole torque on the joints, tau - tau_x, N m. Written out by Cramer's rule:
+    a step takes four of these, and their cost is that of the sines.
     """
     s1, c1 = sincos(q[0])
     s2, c2 = sincos(q[1])

@@ -1,7 +1,8 @@
-"""The stages of a tick that depend on the arm, for the planar two-link arm: unrolled, in registers.
+"""The stages of a tick that depend on the arm, for the planar two-link arm: unrolled, in
+registers.
 
-Invariant: `chain_stages` has the same functions for a chain of n joints, which take its rows as well;
-`kernel` takes one or the other.
+Invariant: `chain_stages` has the same functions for a chain of n joints, which take its rows as
+well; `kernel` takes one or the other.
 """
 
 from math import inf, isfinite
@@ -22,10 +23,10 @@ def update_errors(s: Row) -> None:
     q = pair(s.q)
     qd = pair(s.qd)
     Lambda = pair(s.Lambda)
-    e, ed, r = control.control_errors(q, qd, s.q_des, s.qd_des, Lambda)
+    e, ed, r = control.control_errors(q=q, qd=qd, q_des=s.q_des, qd_des=s.qd_des, Lambda=Lambda)
     v = (-Lambda[0] * e[0], -Lambda[1] * e[1])
     a = (-Lambda[0] * ed[0], -Lambda[1] * ed[1])
-    Y = regressor(s.g, q, qd, v, a)
+    Y = regressor(g=s.g, q=q, qd=qd, v=v, a=a)
     put(s.e, e)
     put(s.ed, ed)
     put(s.r, r)
@@ -46,7 +47,9 @@ def update_torque(s: Row) -> None:
     """Writes the torque of the site's law, within its limits."""
     if s.law == _ADAPTIVE:
         Y = (five(s.Y[0]), five(s.Y[1]))
-        tau = control.adaptive_torque(Y, five(s.theta_hat), s.Kp, s.Kd, s.r, s.ed, inf)
+        tau = control.adaptive_torque(
+            Y=Y, theta_hat=five(s.theta_hat), Kp=s.Kp, Kd=s.Kd, r=s.r, ed=s.ed, limit=inf
+        )
         if s.rho[0] > 0.0 or s.rho[1] > 0.0:
             opposing = (
                 control.robust_torque(s.rho[0], s.width[0], s.r[0]),
@@ -68,14 +71,18 @@ def put_gravity_torque(s: Row, torque: Array) -> None:
 
 @leaf
 def put_gravity(s: Row, theta: Array, torque: Array) -> None:
-    """Writes G of these parameters: the regressor's last columns are g cos q_1 and g cos(q_1 + q_2)."""
+    """Writes G of these parameters: the regressor's last columns are g cos q_1 and g cos(q_1 +
+    q_2).
+    """
     outer = s.Y[1, 4] * theta[4]
     put(torque, (s.Y[0, 3] * theta[3] + outer, outer))
 
 
 @leaf
 def update_model(s: Row) -> None:
-    """Writes what a law may know of the arm in this tick: G, and if it wants them M and C qd + G."""
+    """Writes what a law may know of the arm in this tick: G, and if it wants them M and C qd +
+    G.
+    """
     put_gravity(s, s.known, s.G)
     if s.needs_model != 0:
         q = pair(s.q)
@@ -83,7 +90,7 @@ def update_model(s: Row) -> None:
         M = inertia(s.known, q)
         put(s.M[0], M[0])
         put(s.M[1], M[1])
-        Y = regressor(s.g, q, qd, qd, (0.0, 0.0))
+        Y = regressor(g=s.g, q=q, qd=qd, v=qd, a=(0.0, 0.0))
         for i in range(2):
             s.bias[i] = 0.0
             for p in range(5):
@@ -103,18 +110,34 @@ def put_source_torque(
     """Writes the torque of actors with this `sampled` ON the arm whose q and qd are `state`."""
     q = (state[0], state[1])
     qd = (state[2], state[3])
-    on_arm = torque_on_arm(t_s, q, qd, pair(s.lengths), actors, table, sampled)
+    on_arm = torque_on_arm(
+        t_s=t_s,
+        q=q,
+        qd=qd,
+        lengths=pair(s.lengths),
+        actors=actors,
+        table=table,
+        sampled=sampled,
+    )
     put(torque, (on_arm[0], on_arm[1]))
 
 
 @leaf
-def update_external_torque(t_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable) -> None:
-    """Writes the torque of operators and environments now, the part of it held, and the force of a wall."""
+def update_external_torque(
+    t_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
+) -> None:
+    """Writes the torque of operators and environments now, the part of it held, and the force
+    of a wall.
+    """
     q = pair(s.q)
     qd = pair(s.qd)
     lengths = pair(s.lengths)
-    held = torque_on_arm(t_s, q, qd, lengths, actors, table, 1)
-    now = torque_on_arm(t_s, q, qd, lengths, actors, table, 0)
+    held = torque_on_arm(
+        t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=1
+    )
+    now = torque_on_arm(
+        t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=0
+    )
     put(s.held, (held[0], held[1]))
     s.wall_n = max(held[2], now[2])
     put(s.on_arm, (now[0] + held[0], now[1] + held[1]))
@@ -141,9 +164,15 @@ def _acceleration(
     acts: TorqueSourceRows,
     table: TorqueTable,
 ) -> Pair:
-    """Returns qdd at one stage: under the held u, and the actors at that stage's time and state."""
-    on_arm = torque_on_arm(t_s, q, qd, lengths, acts, table, 0)
-    return forward_dynamics(theta, g, q, qd, (on_arm[0] + u[0], on_arm[1] + u[1]))
+    """Returns qdd at one stage: under the held u, and the actors at that stage's time and
+    state.
+    """
+    on_arm = torque_on_arm(
+        t_s=t_s, q=q, qd=qd, lengths=lengths, actors=acts, table=table, sampled=0
+    )
+    return forward_dynamics(
+        theta=theta, g=g, q=q, qd=qd, torque=(on_arm[0] + u[0], on_arm[1] + u[1])
+    )
 
 
 @leaf
@@ -167,26 +196,77 @@ def rk4_step(
     sixth = h_s / 6.0
     q1 = (q[0], q[1])
     v1 = (qd[0], qd[1])
-    a1 = _acceleration(t_s, q1, v1, u, theta, g, lengths, acts, table)
+    a1 = _acceleration(
+        t_s=t_s, q=q1, qd=v1, u=u, theta=theta, g=g, lengths=lengths, acts=acts, table=table
+    )
     q2 = add_scaled(q1, half, v1)
     v2 = add_scaled(v1, half, a1)
-    a2 = _acceleration(t_s + half, q2, v2, u, theta, g, lengths, acts, table)
+    a2 = _acceleration(
+        t_s=t_s + half,
+        q=q2,
+        qd=v2,
+        u=u,
+        theta=theta,
+        g=g,
+        lengths=lengths,
+        acts=acts,
+        table=table,
+    )
     q3 = add_scaled(q1, half, v2)
     v3 = add_scaled(v1, half, a2)
-    a3 = _acceleration(t_s + half, q3, v3, u, theta, g, lengths, acts, table)
+    a3 = _acceleration(
+        t_s=t_s + half,
+        q=q3,
+        qd=v3,
+        u=u,
+        theta=theta,
+        g=g,
+        lengths=lengths,
+        acts=acts,
+        table=table,
+    )
     q4 = add_scaled(q1, h_s, v3)
     v4 = add_scaled(v1, h_s, a3)
-    a4 = _acceleration(t_s + h_s, q4, v4, u, theta, g, lengths, acts, table)
-    v_sum = (v1[0] + 2.0 * v2[0] + 2.0 * v3[0] + v4[0], v1[1] + 2.0 * v2[1] + 2.0 * v3[1] + v4[1])
-    a_sum = (a1[0] + 2.0 * a2[0] + 2.0 * a3[0] + a4[0], a1[1] + 2.0 * a2[1] + 2.0 * a3[1] + a4[1])
+    a4 = _acceleration(
+        t_s=t_s + h_s,
+        q=q4,
+        qd=v4,
+        u=u,
+        theta=theta,
+        g=g,
+        lengths=lengths,
+        acts=acts,
+        table=table,
+    )
+    v_sum = (
+        v1[0] + 2.0 * v2[0] + 2.0 * v3[0] + v4[0],
+        v1[1] + 2.0 * v2[1] + 2.0 * v3[1] + v4[1],
+    )
+    a_sum = (
+        a1[0] + 2.0 * a2[0] + 2.0 * a3[0] + a4[0],
+        a1[1] + 2.0 * a2[1] + 2.0 * a3[1] + a4[1],
+    )
     return add_scaled(q1, sixth, v_sum), add_scaled(v1, sixth, a_sum)
 
 
 @leaf
-def advance_arm(t_s: float, h_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable) -> bool:
-    """Advances q and qd by one period under the torque `s.u`; false where the result is not finite."""
+def advance_arm(
+    t_s: float, h_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
+) -> bool:
+    """Advances q and qd by one period under the torque `s.u`; false where the result is not
+    finite.
+    """
     q, qd = rk4_step(
-        t_s, h_s, pair(s.q), pair(s.qd), pair(s.u), five(s.theta), s.g, pair(s.lengths), actors, table
+        t_s=t_s,
+        h_s=h_s,
+        q=pair(s.q),
+        qd=pair(s.qd),
+        u=pair(s.u),
+        theta=five(s.theta),
+        g=s.g,
+        lengths=pair(s.lengths),
+        acts=actors,
+        table=table,
     )
     if not (isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])):
         return False

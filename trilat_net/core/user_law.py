@@ -1,7 +1,7 @@
 """A user's control law, in plain Python.
 
-Invariant: it is part of the site's step, a function of its input and its memory; the memory is in the
-record of every tick, so a log resumes in the middle of a run.
+Invariant: it is part of the site's step, a function of its input and its memory; the memory is
+in the record of every tick, so a log resumes in the middle of a run.
 """
 
 import math
@@ -31,12 +31,12 @@ class LawContext(NamedTuple):
         rate_hz: its tick rate, Hz.
         g_m_s2: gravitational acceleration, m/s^2.
         lengths_m: of the two links.
-        theta: the arm's true parameters, shape (5,), for a law that claims to know them; () if they are
-            unknown, as of a real arm that was not identified.
+        theta: the arm's true parameters, shape (5,), for a law that claims to know them; () if
+            they are unknown, as of a real arm that was not identified.
         tau_limit_nm: largest torque of a joint, N m; one number, or one per joint.
         joints: how many joints the arm has.
-        coordinates: how many numbers q, qd and tau_x of a peer have: one per joint, or one per coordinate of
-            the end effector.
+        coordinates: how many numbers q, qd and tau_x of a peer have: one per joint, or one per
+            coordinate of the end effector.
         peers: names of the peers, in scenario order.
     """
 
@@ -58,7 +58,9 @@ def _by_number(operate: Callable[[Any, Any], Any]) -> Any:
         if not isinstance(other, list | tuple):
             return NotImplemented  # an array's own arithmetic, and its array
         if len(other) != len(numbers):
-            raise ValueError(f"arithmetic of {count_nouns(len(numbers), 'number')} with {len(other)}")
+            raise ValueError(
+                f"arithmetic of {count_nouns(len(numbers), 'number')} with {len(other)}"
+            )
         return LawVector(map(operate, numbers, other))
 
     return compute
@@ -87,7 +89,8 @@ class PeerView(NamedTuple):
         new: 1 if it came into use at this tick, else 0.
         q: of the sample, rad or m.
         qd: its derivative.
-        tau_x: the exogenous torque of the peer, N m or N; the torque ON its arm is the negative.
+        tau_x: the exogenous torque of the peer, N m or N; the torque ON its arm is the
+            negative.
     """
 
     alpha: float
@@ -100,12 +103,14 @@ class PeerView(NamedTuple):
 
 
 class LawInput(NamedTuple):
-    """The input of a law at a tick; a vector has one number per joint, or per coordinate that sites share.
+    """The input of a law at a tick; a vector has one number per joint, or per coordinate that
+    sites share.
 
     >>> def torque(self, now: tn.LawInput) -> list[float]:
     ...     return [-d * speed for d, speed in zip(self.d, now.qd)]
 
-    In plain Python vectors are `LawVector`, with arithmetic; compiled, their numbers are taken one by one.
+    In plain Python vectors are `LawVector`, with arithmetic; compiled, their numbers are taken
+    one by one.
 
     Attributes:
         k: the tick.
@@ -118,17 +123,20 @@ class LawInput(NamedTuple):
         felt: the torque on the peers' arms as received, weighted by dominance, N m.
         joints: how many there are.
         coordinates: how many numbers the vectors of a peer have.
-        tau: the torque of each joint, N m, for the law to write; more than the limit is cut off.
+        tau: the torque of each joint, N m, for the law to write; more than the limit is cut
+            off.
         peers: the peers in scenario order.
-        received: per peer the vectors that its law sent with the sample in use, by their names; zeros before
-            the first, and of a peer whose law sends no such vector.
-        sent: per peer the vectors that go to it alone, for the law to write; unwritten, they stay.
+        received: per peer the vectors that its law sent with the sample in use, by their names;
+            zeros before the first, and of a peer whose law sends no such vector.
+        sent: per peer the vectors that go to it alone, for the law to write; unwritten, they
+            stay.
         to_all: the vectors that go to all peers, likewise.
         tau_x: exogenous torque of this tick, N m; the torque ON the arm is its negative.
         tau_before: torque of the tick before, within its limits, N m; zeros at tick 0.
         q_before: joint angles of the tick before, rad; the start pose at tick 0.
         gravity: the torque that holds the arm, N m; zeros where its parameters are unknown.
-        theta_hat: the estimate in the record, for the law to write; unwritten, it stays as it was.
+        theta_hat: the estimate in the record, for the law to write; unwritten, it stays as it
+            was.
         inertia: M(q), a row per joint, for a law that `needs_model`; else zeros.
         bias: C qd + G (of a chain with friction, less the torque of its stops), N m, likewise.
     """
@@ -158,16 +166,20 @@ class LawInput(NamedTuple):
 
 
 class UserLaw(Protocol):
-    """A control law; its class is called with `LawContext` and the keys of its `[control]` table, by name.
+    """A control law; its class is called with `LawContext` and the keys of its `[control]`
+    table, by name.
 
-    All that `torque` needs of the ticks so far is its memory: the attributes that its class names in
-    `remembers`, or what a method `memory()` returns as numbers, from which `recall(memory)` restores it. It
-    may have an attribute `theta_hat`, a number per parameter, which is recorded. One whose torque is right
-    while the reference is held, because it follows that and nothing else of its peers, has `holds = True`.
+    All that `torque` needs of the ticks so far is its memory: the attributes that its class
+    names in `remembers`, or what a method `memory()` returns as numbers, from which
+    `recall(memory)` restores it. It may have an attribute `theta_hat`, a number per parameter,
+    which is recorded. One whose torque is right while the reference is held, because it follows
+    that and nothing else of its peers, has `holds = True`.
     """
 
     def torque(self, now: LawInput) -> Sequence[float] | None:
-        """Returns the torque of each joint, N m, or writes `now.tau`; more than the limit is cut off."""
+        """Returns the torque of each joint, N m, or writes `now.tau`; more than the limit is
+        cut off.
+        """
 
 
 UserLawFactory = Callable[[LawContext], UserLaw]
@@ -193,10 +205,16 @@ def call_law(
     except (Exception, SystemExit) as error:
         raise describe_failure(law, site, now.k, error) from error
     parameters = len(now.theta_hat)
-    for name, values, length in (("torque", torque, now.joints), ("theta_hat", estimate, parameters)):
+    for name, values, length in (
+        ("torque", torque, now.joints),
+        ("theta_hat", estimate, parameters),
+    ):
         if len(values) != length:
             raise _law_error(
-                law, site, now.k, f"{name} has {count_nouns(len(values), 'number')}, not {length}"
+                law,
+                site,
+                now.k,
+                f"{name} has {count_nouns(len(values), 'number')}, not {length}",
             )
     check_results(law, site, now.k, results)
     return results
@@ -218,15 +236,21 @@ def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> No
         LawFailed: with the first of them.
     """
     if (count := len(results.memory)) > MAX_LAW_MEMORY:
-        problem = f"memory has {count_nouns(count, 'number')}, at most {MAX_LAW_MEMORY} are kept"
+        problem = (
+            f"memory has {count_nouns(count, 'number')}, at most {MAX_LAW_MEMORY} are kept"
+        )
         raise _law_error(law, site, tick, problem)
     for name, values in zip(results._fields, results, strict=True):
         if not all(map(math.isfinite, values)):
             first = next(n for n, value in enumerate(values) if not math.isfinite(value))
-            raise _law_error(law, site, tick, f"{name}[{first}] is {values[first]}, no finite number")
+            raise _law_error(
+                law, site, tick, f"{name}[{first}] is {values[first]}, no finite number"
+            )
 
 
-def describe_failure(law: UserLaw, site: str, tick: int | None, error: BaseException) -> LawFailed:
+def describe_failure(
+    law: UserLaw, site: str, tick: int | None, error: BaseException
+) -> LawFailed:
     """Returns the failure of a law that raised."""
     problem = _one_line(error)
     hint = "; for more than + - * / make it an array, as in numpy.asarray(now.q)"
@@ -249,7 +273,9 @@ def _fill(value: Any, numbers: Iterator[float]) -> Any:
         number = next(numbers)
         return int(number) if isinstance(value, int) and number.is_integer() else number
     if isinstance(value, np.ndarray):
-        return np.array([next(numbers) for _ in range(value.size)], value.dtype).reshape(value.shape)
+        return np.array([next(numbers) for _ in range(value.size)], value.dtype).reshape(
+            value.shape
+        )
     return type(value)(_fill(one, numbers) for one in value)
 
 

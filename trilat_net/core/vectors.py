@@ -1,7 +1,8 @@
-"""Types of the core's numbers: arrays, rows of structured arrays, and vectors of fixed length as tuples.
+"""Types of the core's numbers: arrays, rows of structured arrays, and vectors of fixed length
+as tuples.
 
-Invariant: a leaf takes vectors (tuples or rows of arrays, read by index) and returns tuples, which stay in
-registers while a tick is computed; only `put` writes.
+Invariant: a leaf takes vectors (tuples or rows of arrays, read by index) and returns tuples,
+which stay in registers while a tick is computed; only `put` writes.
 """
 
 from collections.abc import Sequence
@@ -41,7 +42,9 @@ def put(a: Any, values: Any) -> None:
 
 @leaf
 def count_begun(table: Any, first: int, count: int, now: float) -> int:
-    """Returns how many of so many rows, in the order of their times, begin at a time or before it."""
+    """Returns how many of so many rows, in the order of their times, begin at a time or before
+    it.
+    """
     low = first
     high = first + count
     while low < high:
@@ -59,8 +62,9 @@ Row = Any
 """A row of a structured array; NumPy's types cannot name its fields."""
 
 Points = NDArray[np.int64]
-"""A table of pairs, shape (n, 2): traces (time since their first point and delay, us; a delay of -1 is a
-sample lost) and outages (first and last stamp, ns), one after the other."""
+"""A table of pairs, shape (n, 2): traces (time since their first point and delay, us; a delay
+of -1 is a sample lost) and outages (first and last stamp, ns), one after the other.
+"""
 
 RowArray = NDArray[np.void]
 IntArray = NDArray[np.int64]

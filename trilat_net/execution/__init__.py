@@ -1,1 +1,3 @@
-"""Drivers that run `Site.step` again: in virtual time, from a log, and from a log with changed settings."""
+"""Drivers that run `Site.step` again: in virtual time, from a log, and from a log with changed
+settings.
+"""

@@ -1,14 +1,15 @@
-"""The virtual-time driver without a log: all sites in one compiled loop, about 1000 times real time.
+"""The virtual-time driver without a log: all sites in one compiled loop, about 1000 times real
+time.
 
 It keeps the peaks of every 50 ms, and sums over the run, in place of records.
 
-Invariant: the result equals `execution.virtual` with its default network, bit for bit; scenarios that the
-compiled loop cannot run are refused. Between two states
-only floating-point numbers are mixed; counters, times and modes are those of one of them, and numbers that
-are equal in both stay as they are, bit for bit.
+Invariant: the result equals `execution.virtual` with its default network, bit for bit;
+scenarios that the compiled loop cannot run are refused. Between two states only floating-point
+numbers are mixed; counters, times and modes are those of one of them, and numbers that are
+equal in both stay as they are, bit for bit.
 
-A run with the inputs of a log is the recorded one, bit for bit. A sample that came before its own stamp is
-handed over at the first tick after it: none is in use earlier (L2).
+A run with the inputs of a log is the recorded one, bit for bit. A sample that came before its
+own stamp is handed over at the first tick after it: none is in use earlier (L2).
 """
 
 import math
@@ -73,7 +74,9 @@ class RunState:
                 self._floats.append(np.tile(_float_words(array.dtype), array.size))
 
     def approach(self, other: "RunState", factor: float) -> None:
-        """Becomes another state of the same run plus so much of the difference to it; 0: its very bits."""
+        """Becomes another state of the same run plus so much of the difference to it; 0: its
+        very bits.
+        """
         for own, its, floats in zip(self._words, other._words, self._floats, strict=True):
             if factor == 0.0:
                 own[:] = its
@@ -87,11 +90,12 @@ class RunState:
 
 
 def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
-    """Refuses a scenario that the compiled loop cannot run; arms of `plants` are moved by those.
+    """Refuses a scenario that the compiled loop cannot run; arms of `plants` are moved by
+    those.
 
     Raises:
-        ScenarioError: another arm is external, or a site is so much slower than another that too many samples
-            would arrive in one of its ticks.
+        ScenarioError: another arm is external, or a site is so much slower than another that
+            too many samples would arrive in one of its ticks.
     """
     refuse_external_arms(scenario, plants)
     if (ratio := _largest_ratio(scenario)) > MAX_ARRIVALS:
@@ -113,7 +117,8 @@ class HandActor(Protocol):
     """A live hand in a compiled run."""
 
     def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Returns what it does from tick k until it needs the arm again, before tick `end`, a row a tick.
+        """Returns what it does from tick k until it needs the arm again, before tick `end`, a
+        row a tick.
 
         A row is as `HandInForce`.
         """
@@ -140,7 +145,8 @@ class RunInputs(NamedTuple):
 
     Attributes:
         feed: arrivals, and what live hands did.
-        changes: the tick before which a site takes a change in, the site's place, and the change, by time.
+        changes: the tick before which a site takes a change in, the site's place, and the
+            change, by time.
         late_ns: by how much samples came late, at the most, ns.
         longest_us: the longest delay that a change gave a link, us.
     """
@@ -152,7 +158,9 @@ class RunInputs(NamedTuple):
 
 
 def make_prompt_inputs(sites: int) -> RunInputs:
-    """Returns the inputs of a run in virtual time: every sample comes at once, and no live hand acts."""
+    """Returns the inputs of a run in virtual time: every sample comes at once, and no live hand
+    acts.
+    """
     nothing = RecordedFeed(
         np.zeros((sites, max(sites - 1, 1), 0), np.int64),
         np.zeros(0, np.int64),
@@ -165,10 +173,10 @@ def make_prompt_inputs(sites: int) -> RunInputs:
 class FusedRun:
     """A run of all sites of a scenario; from |e| = `apart_rad` on, a site is not settled.
 
-    Laws that are compiled run in the loop; those in plain Python are asked between its stages, tick by tick.
-    `keep` of a site's last records are kept for `take_records`. With `inputs` it is a recorded run again;
-    else hands of one's own act, and `hands` in their place: the loop pauses where one is asked. `plants` move
-    arms of sites, between any two ticks.
+    Laws that are compiled run in the loop; those in plain Python are asked between its stages,
+    tick by tick. `keep` of a site's last records are kept for `take_records`. With `inputs` it
+    is a recorded run again; else hands of one's own act, and `hands` in their place: the loop
+    pauses where one is asked. `plants` move arms of sites, between any two ticks.
 
     Raises:
         ScenarioError: see `check_fusable`; or a law cannot be made.
@@ -192,7 +200,9 @@ class FusedRun:
         if inputs is None:
             self._meet_hands({**make_hand_players(scenario), **hands}, setups)
         changes = self._inputs.changes
-        self._tables = stack_site_arrays(setups, len(changes), self._inputs.longest_us, self._inputs.late_ns)
+        self._tables = stack_site_arrays(
+            setups, len(changes), self._inputs.longest_us, self._inputs.late_ns
+        )
         self._changes = deque(changes)
         self._layouts = [setup.layout for setup in setups]
         self._plug_laws(setups)
@@ -205,14 +215,18 @@ class FusedRun:
         late_ticks = self._inputs.late_ns * int(self._progress["rate_hz"].max()) // NS_PER_S + 2
         kept = 1 << max(_largest_ratio(scenario) + 1, keep, late_ticks).bit_length()
         floats = max(layout.floats for layout in self._layouts)
-        self._sent = KeptRecords(np.zeros((count, kept), dtype=np.int64), np.zeros((count, kept, floats)))
+        self._sent = KeptRecords(
+            np.zeros((count, kept), dtype=np.int64), np.zeros((count, kept, floats))
+        )
         self._peaks = np.full((count, 0, 3 * joints), -1.0)
         self._sums: RowArray = np.zeros(count, sums_dtype(joints))
         self._sums["first_environment"] = [
             len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
         ]
         self._taken_ticks = [0] * count
-        self._plants = {i: plants[name] for i, name in enumerate(scenario.names) if name in plants}
+        self._plants = {
+            i: plants[name] for i, name in enumerate(scenario.names) if name in plants
+        }
         self._torques = {i: self._layouts[i].columns()["tau"] for i in self._plants}
         self._acted = dict[int, int]()
         self._moved = dict.fromkeys(self._plants, 0)
@@ -221,9 +235,14 @@ class FusedRun:
 
     def _meet_hands(self, hands: Mapping[str, HandActor], setups: Sequence[SiteSetup]) -> None:
         """Makes room for what hands do, of every tick; each is asked at ticks of its own."""
-        self._hands = {i: hands[setup.name] for i, setup in enumerate(setups) if setup.name in hands}
+        self._hands = {
+            i: hands[setup.name] for i, setup in enumerate(setups) if setup.name in hands
+        }
         if self._hands:
-            rows = [_find_live_row(setup) if i in self._hands else -1 for i, setup in enumerate(setups)]
+            rows = [
+                _find_live_row(setup) if i in self._hands else -1
+                for i, setup in enumerate(setups)
+            ]
             size = max((setups[i].layout.hand - 3) // 2 for i in self._hands)
             acts = np.zeros((len(setups), 0, 1 + 2 * size))
             feed = self._inputs.feed._replace(hands=acts, hand_rows=np.array(rows))
@@ -252,7 +271,8 @@ class FusedRun:
         self._law_arrays = LawArrays(addresses, rows, sent)
 
     def step_to(self, last_ns: int) -> None:
-        """Makes the planned ticks up to a time, ns since the epoch, and takes in the changes before it.
+        """Makes the planned ticks up to a time, ns since the epoch, and takes in the changes
+        before it.
 
         A diverged run stays as it is.
 
@@ -272,7 +292,9 @@ class FusedRun:
             self._step_until(last_ns)
 
     def _step_until(self, last_ns: int) -> None:
-        """Steps every site up to a time, in pieces within which no hand is asked and no plant moves."""
+        """Steps every site up to a time, in pieces within which no hand is asked and no plant
+        moves.
+        """
         while self.has_programs and self.diverged_s is None:
             asked_ns = [*map(self._let_act, self._hands), *map(self._let_move, self._plants)]
             if min(asked_ns) > last_ns:
@@ -283,7 +305,9 @@ class FusedRun:
             self._let_move(i)
 
     def _let_move(self, i: int) -> int:
-        """Lets the plant of a site move on to the site's next tick; returns the time of the one after, ns."""
+        """Lets the plant of a site move on to the site's next tick; returns the time of the one
+        after, ns.
+        """
         k = int(self._progress[i]["tick"])
         plant = self._plants[i]
         own = self.arrays(i).site[0]
@@ -294,10 +318,14 @@ class FusedRun:
         own["q"][:n] = plant.state.q
         own["qd"][:n] = plant.state.qd
         own["sensed"][:n] = [-torque for torque in plant.state.tau_x] or 0.0
-        return NEVER_NS if self._progress[i]["t_ns"] == NEVER_NS else tick_ns(k + 1, plant.rate_hz)
+        return (
+            NEVER_NS if self._progress[i]["t_ns"] == NEVER_NS else tick_ns(k + 1, plant.rate_hz)
+        )
 
     def _let_act(self, i: int) -> int:
-        """Lets the hand of a site act at the ticks before it is asked again; returns the time of that, ns."""
+        """Lets the hand of a site act at the ticks before it is asked again; returns the time
+        of that, ns.
+        """
         progress = self._progress[i]
         hand = self._hands[i]
         acts = self._inputs.feed.hands
@@ -313,13 +341,27 @@ class FusedRun:
         return tick_ns(self._acted[i], rate_hz)
 
     def _step_piece(self, last_ns: int) -> None:
-        rows = (self._progress, self._taken, self._sent, self._inputs.feed, self._peaks, self._sums)
+        rows = (
+            self._progress,
+            self._taken,
+            self._sent,
+            self._inputs.feed,
+            self._peaks,
+            self._sums,
+        )
         compiled = [law for law in self._laws.values() if isinstance(law, CompiledLaw)]
         try:
             if len(compiled) < len(self._laws):
                 self._run_plain_until(last_ns)
             else:
-                run_until(last_ns, self._apart_rad, *rows, self._tables, self._tables.chain, self._law_arrays)
+                run_until(
+                    last_ns,
+                    self._apart_rad,
+                    *rows,
+                    self._tables,
+                    self._tables.chain,
+                    self._law_arrays,
+                )
         except LawFailed:
             raise
         except Exception as error:  # whatever a compiled law raises
@@ -344,7 +386,9 @@ class FusedRun:
                     progress[i]["diverged_ns"] = last_ns = t_ns
 
     def advance(self, until_s: float) -> None:
-        """Continues the run to the end of a scenario of `until_s` seconds; a diverged run stays as it is."""
+        """Continues the run to the end of a scenario of `until_s` seconds; a diverged run stays
+        as it is.
+        """
         if until_s <= self.ran_s or self.diverged_s is not None:
             return
         rates_hz = self._progress["rate_hz"].tolist()
@@ -359,8 +403,12 @@ class FusedRun:
             progress.ticks = count
             if progress.tick < count:
                 progress.t_ns = tick_ns(progress.tick, progress.rate_hz)
-        most_s = max(count / rate for count, rate in zip(ticks, self._progress["rate_hz"], strict=True))
-        grown = np.full((len(ticks), math.ceil(most_s * BUCKETS_PER_S) + 1, self._peaks.shape[2]), -1.0)
+        most_s = max(
+            count / rate for count, rate in zip(ticks, self._progress["rate_hz"], strict=True)
+        )
+        grown = np.full(
+            (len(ticks), math.ceil(most_s * BUCKETS_PER_S) + 1, self._peaks.shape[2]), -1.0
+        )
         grown[:, : self._peaks.shape[1]] = self._peaks
         self._peaks = grown
         if self._hands:
@@ -388,7 +436,8 @@ class FusedRun:
         self.approach(other, 0.0)
 
     def approach(self, other: "FusedRun", factor: float) -> None:
-        """Becomes another run plus so much of its difference to that, whose records it has made by now.
+        """Becomes another run plus so much of its difference to that, whose records it has made
+        by now.
 
         A run that has programs cannot.
         """
@@ -403,7 +452,9 @@ class FusedRun:
                 law.recall((its + factor * (own - its)).tolist())
 
     def arrays(self, i: int) -> SiteArrays:
-        """Returns what a site is made of, as its next tick will find it; to be read, not written."""
+        """Returns what a site is made of, as its next tick will find it; to be read, not
+        written.
+        """
         if i not in self._selected:
             self._selected[i] = select_site(self._tables, i, self._layouts[i])
         return self._selected[i]
@@ -417,7 +468,9 @@ class FusedRun:
         return float(np.abs(self._tables.site[field] - other._tables.site[field]).max())
 
     def advance_watching(self, until_s: float) -> tuple[Array, Array]:
-        """Continues the run; returns q, (100, N, n), rad, and theta_hat, (100, N, P), of its last quarter."""
+        """Continues the run; returns q, (100, N, n), rad, and theta_hat, (100, N, P), of its
+        last quarter.
+        """
         found = []
         for t_s in np.linspace(0.75 * until_s, until_s, 100):
             self.advance(float(t_s))
@@ -448,13 +501,17 @@ class FusedRun:
         -1 marks a bucket without a record of that site; the last one may be incomplete.
         """
         return tuple(
-            self._peaks[n, : (int(progress["tick"]) - 1) * BUCKETS_PER_S // int(progress["rate_hz"]) + 1]
+            self._peaks[
+                n, : (int(progress["tick"]) - 1) * BUCKETS_PER_S // int(progress["rate_hz"]) + 1
+            ]
             for n, progress in enumerate(self._progress)
         )
 
     @property
     def maxima(self) -> tuple[Array, ...]:
-        """Largest |e|, rad, and |qd|, rad/s, of any joint, of the same buckets, shape (buckets, 2) each."""
+        """Largest |e|, rad, and |qd|, rad/s, of any joint, of the same buckets, shape (buckets,
+        2) each.
+        """
         return tuple(map(largest_of_joints, self.buckets))
 
     @property
@@ -466,7 +523,9 @@ class FusedRun:
         return RunTotals(
             rms_error_rad=float(np.sqrt(self._sums["errors"] / ticks[:, None]).max()),
             effort_nm=float(
-                np.sqrt(np.mean(self._sums["effort"] / (self._tables.site["joints"][:, 0] * ticks)))
+                np.sqrt(
+                    np.mean(self._sums["effort"] / (self._tables.site["joints"][:, 0] * ticks))
+                )
             ),
             force_peak_n=float(self._sums["force_peak_n"].max()) if touched else None,
             walls_j=float(self._sums["environment_j"].sum())
@@ -486,7 +545,9 @@ class FusedRun:
 
     @property
     def memories(self) -> list[Array]:
-        """What the laws of sites remember after the last tick; of one that is not plugged in nothing."""
+        """What the laws of sites remember after the last tick; of one that is not plugged in
+        nothing.
+        """
         laws = [self._laws.get(i) for i in range(len(self._progress))]
         return [np.array([] if law is None else law.memory, dtype=np.float64) for law in laws]
 
@@ -494,11 +555,14 @@ class FusedRun:
     def tau_x(self) -> list[Array]:
         """The exogenous torque of each site's last record, shape (n,) each, N m."""
         return [
-            row[layout.columns()["tau_x"]] for row, layout in zip(self.records, self._layouts, strict=True)
+            row[layout.columns()["tau_x"]]
+            for row, layout in zip(self.records, self._layouts, strict=True)
         ]
 
     def take_records(self) -> list[tuple[IntArray, Array]]:
-        """Returns of each site the records since the last call, as far as they are kept: t, ns, and a row."""
+        """Returns of each site the records since the last call, as far as they are kept: t, ns,
+        and a row.
+        """
         found = []
         for n, progress in enumerate(self._progress):
             pages = self._sent.t_ns.shape[1]
@@ -515,7 +579,9 @@ class FusedRun:
         return np.array([self._last_row(n) for n in range(len(self._progress))])
 
     def _last_row(self, n: int) -> Array:
-        row: Array = self._sent.rows[n, (int(self._progress[n]["tick"]) - 1) % self._sent.t_ns.shape[1]]
+        row: Array = self._sent.rows[
+            n, (int(self._progress[n]["tick"]) - 1) % self._sent.t_ns.shape[1]
+        ]
         return row
 
 
@@ -583,7 +649,9 @@ def _list_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
             first[i, p] = total + np.searchsorted(at[order], np.arange(ticks + 1))
             listed.append(sent[order])
             total += len(sent)
-            late_ns = max(late_ns, int((at * NS_PER_S // part.rate_hz - stamps_ns).max(initial=0)))
+            late_ns = max(
+                late_ns, int((at * NS_PER_S // part.rate_hz - stamps_ns).max(initial=0))
+            )
     return first, np.concatenate([*listed, np.zeros(0, np.int64)]), late_ns
 
 

@@ -1,4 +1,5 @@
-"""The checks of a log, one line each: complete, executed again, scenario hash, compared with virtual time.
+"""The checks of a log, one line each: complete, executed again, scenario hash, compared with
+virtual time.
 
 Invariant: every claim rests on an execution made just now.
 """
@@ -26,7 +27,8 @@ MAX_GAPS_NAMED = 60
 class LogCheckReport(CheckReport):
     """The result of executing a log again, and a finding for that and for every other check.
 
-    It passed if the log is as it was made, enough of it was judged, and every execution agreed with it.
+    It passed if the log is as it was made, enough of it was judged, and every execution agreed
+    with it.
     """
 
     log: Log
@@ -44,7 +46,9 @@ class LogCheckReport(CheckReport):
         return self.result.identical
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat verify --json`: every gap, the first difference."""
+        """Returns plain values, with the keys of `trilat verify --json`: every gap, the first
+        difference.
+        """
         result = self.result
         first = self.result.first
         return {
@@ -61,10 +65,16 @@ class LogCheckReport(CheckReport):
             "judged": result.coverage.to_json(),
             "integrity": result.integrity.state.name.lower(),
             "gaps": [{"site": site, "first": a, "last": b} for site, a, b in result.gaps],
-            "not_made": [{"site": site, "first": a, "last": b} for site, a, b in result.absences],
+            "not_made": [
+                {"site": site, "first": a, "last": b} for site, a, b in result.absences
+            ],
             "first_difference": None
             if first is None
-            else {**first._asdict(), "logged": repr(first.logged), "computed": repr(first.computed)},
+            else {
+                **first._asdict(),
+                "logged": repr(first.logged),
+                "computed": repr(first.computed),
+            },
             "checks": self.to_rows(),
         }
 
@@ -86,10 +96,14 @@ def run_log_checks(
         ScenarioError: a user law that may run cannot be made.
     """
     result = verify(log, progress, min_coverage=min_coverage, resume_every=resume_every)
-    return LogCheckReport(log, result, list(_checks(log, result, virtual=virtual, progress=progress)))
+    return LogCheckReport(
+        log, result, list(_checks(log, result, virtual=virtual, progress=progress))
+    )
 
 
-def check_log_files(sources: Sequence[str], min_coverage: float, allowed: CodeConsents) -> list[Finding]:
+def check_log_files(
+    sources: Sequence[str], min_coverage: float, allowed: CodeConsents
+) -> list[Finding]:
     """Returns a line per check of a log in files, in a worker where `allowed` laws may run.
 
     A user law that cannot be made fails one.
@@ -102,9 +116,14 @@ def check_log_files(sources: Sequence[str], min_coverage: float, allowed: CodeCo
         return [Finding("executed again", f"cannot be: {error}", False)]
 
 
-def _checks(log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None) -> Iterator[Finding]:
-    others = [name for name in log.sites if name not in log.executed_sites]  # of an open-loop rerun
-    recorded = f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
+def _checks(
+    log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None
+) -> Iterator[Finding]:
+    # of an open-loop rerun
+    others = [name for name in log.sites if name not in log.executed_sites]
+    recorded = (
+        f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
+    )
     yield _records_line(log, result)
     yield Finding("integrity", result.integrity.text, result.integrity.passed)
     for law in find_user_laws(log.scenario):
@@ -112,20 +131,31 @@ def _checks(log: Log, result: VerifyResult, *, virtual: bool, progress: Progress
     yield _verify_line(result, recorded)
     if log.scenario.external:
         arms = " and ".join(log.scenario.external)
-        yield Finding("plant", f"the motion of {arms} was measured and is not judged, its control is", True)
+        yield Finding(
+            "plant",
+            f"the motion of {arms} was measured and is not judged, its control is",
+            True,
+        )
     if log.session.get("scenario_sha256") != log.scenario_sha256:
-        yield Finding("scenario", "is not the one whose hash the log names: it was changed", False)
+        yield Finding(
+            "scenario", "is not the one whose hash the log names: it was changed", False
+        )
     if virtual and result.withheld:
         why = f"the law of {' and '.join(result.withheld)} may not run"
         yield Finding("virtual time", f"not compared: {why}", False, judged=False)
     elif virtual and recorded:
-        yield Finding("virtual time", f"is another run: {recorded} as recorded, and did not react", True)
+        yield Finding(
+            "virtual time", f"is another run: {recorded} as recorded, and did not react", True
+        )
     elif virtual and log.absences:
         away = " and ".join(log.absences)
-        yield Finding("virtual time", f"is another run: {away} left, or came while it ran", True)
+        yield Finding(
+            "virtual time", f"is another run: {away} left, or came while it ran", True
+        )
     elif virtual:
         twins = compare_with_virtual(log, progress)
-        gap = min((first for _, first, _ in result.gaps), default=None)  # what arrived there is unknown
+        # what arrived there is unknown
+        gap = min((first for _, first, _ in result.gaps), default=None)
         yield _virtual_line("virtual time fed with the log's arrivals", twins.fed, gap)
         why = "a link was measured, not modelled" if log.scenario.measured else ""
         why = "an arm was external" if log.scenario.external else why
@@ -134,9 +164,13 @@ def _checks(log: Log, result: VerifyResult, *, virtual: bool, progress: Progress
             return
         late = twins.late
         gone = twins.lost
-        came = f"{count_nouns(len(late), 'late sample')}" + (f", the first: {late[0]}" if late else "")
+        came = f"{count_nouns(len(late), 'late sample')}" + (
+            f", the first: {late[0]}" if late else ""
+        )
         lost = f"; {len(gone)} lost on the way, the first: {gone[0]}" if gone else ""
-        yield _virtual_line(f"plain virtual time ({came}{lost})", twins.plain, twins.excused_from)
+        yield _virtual_line(
+            f"plain virtual time ({came}{lost})", twins.plain, twins.excused_from
+        )
 
 
 def _records_line(log: Log, result: VerifyResult) -> Finding:
@@ -151,12 +185,18 @@ def _records_line(log: Log, result: VerifyResult) -> Finding:
         text += f"; damaged in {len(log.damaged)} place{'s' * (len(log.damaged) > 1)}"
     elif not log.complete:
         text += "; the file was not finished"
-    passed = (not coverage.expected or coverage.share >= result.min_coverage) and not log.damaged
+    passed = (
+        not coverage.expected or coverage.share >= result.min_coverage
+    ) and not log.damaged
     return Finding("records", text, passed)
 
 
 def _verify_line(result: VerifyResult, recorded: str) -> Finding:
-    how = "whole runs, bit for bit" if result.whole_run else "tick by tick to 1e-9: another platform made it"
+    how = (
+        "whole runs, bit for bit"
+        if result.whole_run
+        else "tick by tick to 1e-9: another platform made it"
+    )
     text = f"{result.identical}/{count_nouns(result.records, 'record')} identical ({how})"
     if result.gaps:
         text += f"; no records of {_gaps_text(result.gaps)}"
@@ -187,7 +227,9 @@ def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
     return "; ".join(texts) + more
 
 
-def _virtual_line(label: str, comparison: RecordComparison, excused_from: int | None) -> Finding:
+def _virtual_line(
+    label: str, comparison: RecordComparison, excused_from: int | None
+) -> Finding:
     """Excuses a difference only from the tick at which the first late or lost sample was due."""
     first = comparison.first
     text = f"{comparison.identical}/{count_nouns(comparison.records, 'record')} identical"

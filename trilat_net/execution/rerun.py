@@ -1,11 +1,12 @@
-"""What-if on a log: executes one or more sites again with changed settings and compares them with the log.
+"""What-if on a log: executes one or more sites again with changed settings and compares them
+with the log.
 
     again = rerun("run.mcap", replace=["s"], set={"control.Kd": 5})
     again.sites["s"].error_rms_rad, again.after["s"].q
 
-Invariants: in open loop the recorded sites do not react; in closed loop every site is executed over the
-network of the log. Without changes both give the log, bit for bit. Both sides of every figure cover the
-same instants: records of the log that the rerun executed too.
+Invariants: in open loop the recorded sites do not react; in closed loop every site is executed
+over the network of the log. Without changes both give the log, bit for bit. Both sides of every
+figure cover the same instants: records of the log that the rerun executed too.
 """
 
 import io
@@ -64,14 +65,15 @@ class SiteEffect(NamedTuple):
     Attributes:
         executed: executed ticks.
         compared: of those, the ones at whose time the log has a record.
-        identical: of those, the ones of which every computed field has the same bits (with changes: except
-            the CRC of the arrivals).
+        identical: of those, the ones of which every computed field has the same bits (with
+            changes: except the CRC of the arrivals).
         stands: records of the log that stand, since too little is known to execute them.
         assumed: executed ticks without a record: their arrivals are assumed.
         lacking: samples that arrived and are not in the log.
         first: the first difference, or None; also None if rates changed.
         diverged_at_s: time at which it left its limits, or None.
-        q_rms_rad: root mean square of q minus q in the log, of the joint for which it is largest.
+        q_rms_rad: root mean square of q minus q in the log, of the joint for which it is
+            largest.
         q_max_rad: the largest such difference.
         q_max_at_s: its time.
         error_rms_rad: root mean square of e, Eq. (9), of the joint for which it is largest.
@@ -97,7 +99,8 @@ class SiteEffect(NamedTuple):
 
 
 class LinkEffect(NamedTuple):
-    """Age of the sample in use on one link of an executed site, over the ticks at which both had one.
+    """Age of the sample in use on one link of an executed site, over the ticks at which both
+    had one.
 
     Attributes:
         link: as in "m1->s".
@@ -116,14 +119,24 @@ class LinkEffect(NamedTuple):
 def compare_site_rerun(
     log: Log, request: RerunRequest, site: RerunSite, ticks: Sequence[RerunTick]
 ) -> tuple[SiteEffect, list[LinkEffect]]:
-    """Returns the effect of a rerun on a site after its last tick, and on the links on which it receives."""
+    """Returns the effect of a rerun on a site after its last tick, and on the links on which it
+    receives.
+    """
     before = log[site.name]
     executed = [tick for tick in ticks if not tick.kept]
     rate_hz = request.scenario.sites[site.name].rate_hz
     payloads = [tick.payload for tick in executed]
     layout = request.scenario.layout(site.name)
     axes = request.scenario.arms[site.name].axes
-    after = SiteLog(site.name, before.peers, rate_hz, payloads, "rerun", layout=layout, axes=axes)
+    after = SiteLog(
+        name=site.name,
+        peers=before.peers,
+        rate_hz=rate_hz,
+        payloads=payloads,
+        source="rerun",
+        layout=layout,
+        axes=axes,
+    )
     _, rows, rows_here = np.intersect1d(before.t_ns, after.t_ns, return_indices=True)
     last = executed[-1] if executed else None
     effect = SiteEffect(
@@ -135,11 +148,15 @@ def compare_site_rerun(
         assumed=sum(tick.tick in site.deliveries.unrecorded for tick in executed),
         lacking=site.lacking,
         first=site.first,
-        diverged_at_s=last.t_ns / NS_PER_S if last is not None and last.mode is Mode.DIVERGED else None,
+        diverged_at_s=last.t_ns / NS_PER_S
+        if last is not None and last.mode is Mode.DIVERGED
+        else None,
     )
     if not len(rows):
         return effect, []
-    links = _compare_links(log, request, before, after, rows, rows_here)
+    links = _compare_links(
+        log=log, request=request, before=before, after=after, rows=rows, rows_here=rows_here
+    )
     with np.errstate(over="ignore"):  # a damaged log holds any finite numbers
         moved = after.q[rows_here] - before.q[rows]
         place = int(np.abs(moved).max(axis=1).argmax())
@@ -167,7 +184,12 @@ def _largest(values: Array) -> float:
 
 
 def _compare_links(
-    log: Log, request: RerunRequest, before: SiteLog, after: SiteLog, rows: Ints, rows_here: Ints
+    log: Log,
+    request: RerunRequest,
+    before: SiteLog,
+    after: SiteLog,
+    rows: Ints,
+    rows_here: Ints,
 ) -> list[LinkEffect]:
     found = []
     for peer in before.peers:
@@ -183,7 +205,9 @@ def _compare_links(
 
 @dataclass(frozen=True, repr=False)
 class Rerun(Result):
-    """A log and its rerun: every executed tick, and the effects per executed site and per link to it."""
+    """A log and its rerun: every executed tick, and the effects per executed site and per link
+    to it.
+    """
 
     before: Log
     request: RerunRequest
@@ -206,11 +230,12 @@ class Rerun(Result):
         return open_log(stream)
 
     def write(self, stream: Sink, views_hz: float = 0.0) -> None:
-        """Writes the rerun as a log into a stream, which stays open; see `LogWriter` for the views.
+        """Writes the rerun as a log into a stream, which stays open; see `LogWriter` for the
+        views.
 
-        Executed sites are written anew, recorded sites byte for byte. The file names its source log by
-        SHA-256, the executed sites and the changes; its scenario is the one that holds in it. Executed sites
-        have no measured values (timing, round trips).
+        Executed sites are written anew, recorded sites byte for byte. The file names its source
+        log by SHA-256, the executed sites and the changes; its scenario is the one that holds
+        in it. Executed sites have no measured values (timing, round trips).
 
         Raises:
             LogError: the log's epoch is no time.
@@ -224,7 +249,13 @@ class Rerun(Result):
             raise LogError(f"{log.source}: its epoch_unix_ns is no time: {epoch[:40]!r}")
         metadata = rerun_metadata(log, request)
         writer = LogWriter(
-            stream, request.scenario, session, RERUN_DRIVER, epoch_unix_ns, metadata, views_hz=views_hz
+            stream=stream,
+            scenario=request.scenario,
+            session=session,
+            driver=RERUN_DRIVER,
+            epoch_unix_ns=epoch_unix_ns,
+            facts=metadata,
+            views_hz=views_hz,
         )
         channels = {}
         entries = []
@@ -234,13 +265,16 @@ class Rerun(Result):
             if name in request.recorded:
                 entries.append(_copy_recorded(log, name, own))
             else:
-                entries.append(_encode_executed([tick for tick in self.ticks if tick.site == name], own))
+                entries.append(
+                    _encode_executed([tick for tick in self.ticks if tick.site == name], own)
+                )
         for entry in merge(*entries, key=lambda entry: entry.t_ns):
             channels[entry.site].write(entry, writer, epoch_unix_ns)
         writer.finish(describe_accounts(channels.values()))
 
     def save(self, path: Path, *, force: bool = False) -> None:
-        """Writes the rerun as a log with standard channels into a file; `force` lets it replace one.
+        """Writes the rerun as a log with standard channels into a file; `force` lets it replace
+        one.
 
         Raises:
             UsageError: the file exists, or cannot be made.
@@ -319,7 +353,8 @@ def rerun(
     Raises:
         LogError: the log cannot be read, or does not tell enough.
         UsageError: the sites are not named, or in two ways.
-        ScenarioError: there is no such site, or an override is not valid or cannot have an effect.
+        ScenarioError: there is no such site, or an override is not valid or cannot have an
+            effect.
         CodeWithheld: the law of an executed site is code from outside that may not run.
     """
     before = log if isinstance(log, Log) else open_log(log)
@@ -356,7 +391,10 @@ def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[Site
     events = [event for event in log.events if event.member == name]
     events.sort(key=lambda event: event.t_ns)  # those before the epoch come first
     return merge(
-        (channels.record(state, payload) for state, payload in zip(part.states, part.payloads, strict=True)),
+        (
+            channels.record(state, payload)
+            for state, payload in zip(part.states, part.payloads, strict=True)
+        ),
         (channels.stats(stats) for stats in log.link_stats(name)),
         (channels.event(event, n) for n, event in enumerate(events)),
         key=lambda entry: entry.t_ns,
@@ -372,7 +410,9 @@ def _encode_executed(ticks: Sequence[RerunTick], channels: SiteChannels) -> Iter
 
 
 def _nest(value: Any) -> Any:
-    """Returns a value for JSON: every tuple with names spelt out, and every number beyond JSON as None."""
+    """Returns a value for JSON: every tuple with names spelt out, and every number beyond JSON
+    as None.
+    """
     if hasattr(value, "_asdict"):
         return {key: _nest(one) for key, one in value._asdict().items()}
     return finite_or_none(value) if isinstance(value, float) else value
@@ -399,7 +439,9 @@ def _describe_limits(again: Rerun) -> Iterator[str]:
     for effect in again.sites.values():
         name = effect.site
         if effect.stands:
-            kept = count_nouns(effect.stands, "record stands as it is", "records stand as they are")
+            kept = count_nouns(
+                effect.stands, "record stands as it is", "records stand as they are"
+            )
             yield f"{name}: {kept}: too little is known to execute more"
         if effect.assumed:
             unknown = count_nouns(effect.assumed, "tick has", "ticks have")
@@ -407,7 +449,9 @@ def _describe_limits(again: Rerun) -> Iterator[str]:
         if away := again.before.absent_ticks(name):
             yield f"{name}: {away} of them it did not make: it was away, and is executed as if it were not"
         if effect.lacking:
-            lost = count_nouns(effect.lacking, "sample that arrived is", "samples that arrived are")
+            lost = count_nouns(
+                effect.lacking, "sample that arrived is", "samples that arrived are"
+            )
             yield f"{name}: {lost} not in the log: executed without"
         if not effect.executed:
             yield f"{name}: nothing could be executed"

@@ -1,12 +1,12 @@
 """Executes the sites of a rerun in turn, each against the samples that arrived at it.
 
-Invariants: a site advances by `Site.step` alone. It receives the samples of recorded peers as logged and
-those of executed peers as computed now, each at the tick at which the log says that it arrived. Without
-changes a site resumes after a gap from two consecutive records, and the record stands where too little is
-known; with changes its own steps carry it through gaps.
+Invariants: a site advances by `Site.step` alone. It receives the samples of recorded peers as
+logged and those of executed peers as computed now, each at the tick at which the log says that
+it arrived. Without changes a site resumes after a gap from two consecutive records, and the
+record stands where too little is known; with changes its own steps carry it through gaps.
 
-Only executed sites can be changed. A key that affects no executed site is refused; one that affects
-recorded sites too changes nothing of theirs, and the result reports it.
+Only executed sites can be changed. A key that affects no executed site is refused; one that
+affects recorded sites too changes nothing of theirs, and the result reports it.
 """
 
 import bisect
@@ -26,9 +26,26 @@ from ..net.timing import LoopStats
 from ..net.wire import encode_state
 from ..scenario import Scenario, find_owner, find_site, load_scenario, parse_scenario
 from ..scenario.describe import describe_law, describe_value, flatten_table
-from .resumption import ReceivedMotion, RecordedInputs, find_recorded_hand, make_arrival, read_output
-from .verify import PROGRESS_EVERY, RecordDifference, equal_bits, equal_record, find_first_difference
-from .virtual_network import Deliveries, complete_deliveries, recorded_deliveries, retime_deliveries
+from .resumption import (
+    ReceivedMotion,
+    RecordedInputs,
+    find_recorded_hand,
+    make_arrival,
+    read_output,
+)
+from .verify import (
+    PROGRESS_EVERY,
+    RecordDifference,
+    equal_bits,
+    equal_record,
+    find_first_difference,
+)
+from .virtual_network import (
+    Deliveries,
+    complete_deliveries,
+    recorded_deliveries,
+    retime_deliveries,
+)
 
 RerunOverrides = Mapping[str, Any] | Sequence[str]
 
@@ -48,7 +65,8 @@ class RerunRequest:
     """A rerun: its sites, its scenario and its changes.
 
     Attributes:
-        scenario: the scenario of the rerun: changed for the executed sites, the log's for the others.
+        scenario: the scenario of the rerun: changed for the executed sites, the log's for the
+            others.
         replaced: the executed sites, in scenario order.
         without_effect: requested changes of recorded sites, which change nothing.
     """
@@ -62,23 +80,29 @@ class RerunRequest:
 
     @property
     def mode(self) -> str:
-        """The mode in words: "closed loop" if every site is executed, so that each reacts to the others."""
+        """The mode in words: "closed loop" if every site is executed, so that each reacts to
+        the others.
+        """
         return "open loop" if self.recorded else "closed loop"
 
 
 def resolve_rerun_request(
     log: Log, replace: Sequence[str], overrides: RerunOverrides, *, closed_loop: bool
 ) -> RerunRequest:
-    """Checks a request for a rerun and resolves its scenario, with overrides as `load_scenario` takes them.
+    """Checks a request for a rerun and resolves its scenario, with overrides as `load_scenario`
+    takes them.
 
     Raises:
         UsageError: the sites are not named, or in two ways.
-        ScenarioError: there is no such site, or an override is not valid or cannot have an effect.
+        ScenarioError: there is no such site, or an override is not valid or cannot have an
+            effect.
     """
     original = log.scenario
     names = original.names
     if closed_loop and replace:
-        raise UsageError("--closed-loop executes every site: leave out --replace, or --closed-loop")
+        raise UsageError(
+            "--closed-loop executes every site: leave out --replace, or --closed-loop"
+        )
     if not closed_loop and not replace:
         hint = f"--replace NAME (of {', '.join(names)}), or --closed-loop for all of them"
         raise UsageError(f"which sites shall be executed? Give {hint}")
@@ -101,26 +125,41 @@ def resolve_rerun_request(
     scenario = _join_scenarios(original, wanted, recorded) if recorded else wanted
     changes = _find_changes(original, scenario)
     without = [changed for changed in _find_changes(original, wanted) if changed not in changes]
-    return RerunRequest(original, scenario, replaced, recorded, changes, without)
+    return RerunRequest(
+        original=original,
+        scenario=scenario,
+        replaced=replaced,
+        recorded=recorded,
+        changes=changes,
+        without_effect=without,
+    )
 
 
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
     group, _, rest = key.partition(".")
     if group in _TEXT_KEYS:
-        raise ScenarioError("is nothing that is executed: it has no effect in a rerun", path=key)
+        raise ScenarioError(
+            "is nothing that is executed: it has no effect in a rerun", path=key
+        )
     if group == "rate_hz" or rest.endswith(".rate_hz"):
         return  # `_check_frame` judges what comes of it
     member = rest.partition(".")[0]
-    concerned = {"sites": member, "dominance": member, "links": member.partition("->")[2]}.get(group, "")
+    concerned = {"sites": member, "dominance": member, "links": member.partition("->")[2]}.get(
+        group, ""
+    )
     if concerned in recorded:
         why = f"{concerned} stays as recorded{', and a link belongs to its receiver' * (group == 'links')}"
         only = f"only {', '.join(replaced)} is executed"
-        raise ScenarioError(f"has no effect: {why}; {only}: add --replace {concerned}", path=key)
+        raise ScenarioError(
+            f"has no effect: {why}; {only}: add --replace {concerned}", path=key
+        )
 
 
 def _check_frame(original: Scenario, wanted: Scenario, recorded: Sequence[str]) -> None:
     if wanted.names != original.names:
-        raise ScenarioError(f"a rerun has the sites of the log, {', '.join(original.names)}", path="sites")
+        raise ScenarioError(
+            f"a rerun has the sites of the log, {', '.join(original.names)}", path="sites"
+        )
     if wanted.duration_s > original.duration_s:
         raise ScenarioError(
             f"the experiment of the log lasts {original.duration_s:g} s: what the network would have done "
@@ -153,7 +192,9 @@ def _join_scenarios(original: Scenario, wanted: Scenario, recorded: Sequence[str
 
 
 def _find_changes(original: Scenario, other: Scenario) -> list[ChangedValue]:
-    before, after = (dict(flatten_table(msgspec.to_builtins(scenario))) for scenario in (original, other))
+    before, after = (
+        dict(flatten_table(msgspec.to_builtins(scenario))) for scenario in (original, other)
+    )
     return [
         ChangedValue(key, before.get(key), after.get(key))
         for key in before | after
@@ -172,7 +213,9 @@ def describe_rerun_changes(request: RerunRequest) -> list[str]:
             every = len(names) == len(request.scenario.links)
             lines.append(f"{'every link' if every else ', '.join(names)}: {change}")
         else:
-            lines.append(f"{subject}{' of ' + ', '.join(names) if all(names) else ''}: {change}")
+            lines.append(
+                f"{subject}{' of ' + ', '.join(names) if all(names) else ''}: {change}"
+            )
     return lines
 
 
@@ -190,7 +233,9 @@ def _describe_parts(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
             yield whole
 
 
-def _describe_whole(request: RerunRequest, group: str, owner: str, key: str) -> tuple[str, str, str] | None:
+def _describe_whole(
+    request: RerunRequest, group: str, owner: str, key: str
+) -> tuple[str, str, str] | None:
     """Describes a link, or a law of another kind, as a whole; None if single values say it all."""
     before = request.original
     after = request.scenario
@@ -198,7 +243,9 @@ def _describe_whole(request: RerunRequest, group: str, owner: str, key: str) -> 
         links = [scenario.links[owner].describe() for scenario in (before, after)]
         return None if links[0] == links[1] else ("link", owner, " -> ".join(links))
     if group == "sites" and key.startswith("control."):
-        laws = [msgspec.to_builtins(scenario.sites[owner].control) for scenario in (before, after)]
+        laws = [
+            msgspec.to_builtins(scenario.sites[owner].control) for scenario in (before, after)
+        ]
         same = laws[0]["law"] == laws[1]["law"]
         return None if same else ("control", owner, " -> ".join(map(describe_law, laws)))
     return None
@@ -215,7 +262,8 @@ class RerunTick(NamedTuple):
 
     Attributes:
         payload: its record as it would be published; the log's own if `kept`.
-        same: True if the log has a record of that tick of which every computed field has the same bits.
+        same: True if the log has a record of that tick of which every computed field has the
+            same bits.
         kept: True if the log's record stands, because too little is known to execute it.
         stats: its statistics, at the ticks that have some.
     """
@@ -264,7 +312,13 @@ class RerunSite:
         self._part = part
         self.deliveries = deliveries
         self._changed = bool(request.changes)
-        self._inputs = RecordedInputs(part, samples, log.last_ticks, log.commands(name), setup.links)
+        self._inputs = RecordedInputs(
+            part=part,
+            samples=samples,
+            ends=log.last_ticks,
+            changes=log.commands(name),
+            links=setup.links,
+        )
         self._last = min(deliveries.last, scenario.ticks(name) - 1)
         same_rate = self._site.rate_hz == part.rate_hz
         self._recorded: list[int] = part.tick.tolist() if same_rate else []
@@ -287,7 +341,8 @@ class RerunSite:
         """Executes one tick.
 
         Raises:
-            LogError: the log orders more changes than a site takes, or holds an impossible record.
+            LogError: the log orders more changes than a site takes, or holds an impossible
+                record.
         """
         n = self._places.get(self.k)
         try:
@@ -300,7 +355,8 @@ class RerunSite:
             raise LogError(f"{self.name}, tick {self.k}: {error}") from None
         self.diverged = made.mode is Mode.DIVERGED
         self.k += 1
-        if not (self._changed and self._certain) and self.k not in self._places:  # on to the next record
+        # on to the next record
+        if not (self._changed and self._certain) and self.k not in self._places:
             place = bisect.bisect_right(self._recorded, self.k)
             self.k = self._recorded[place] if place < len(self._recorded) else self._last + 1
             self._certain = False
@@ -320,21 +376,55 @@ class RerunSite:
             state = self._part.states[n]
             peers = self._part.peers
             # arrivals have another CRC if peers are changed or the log lacks a sample
-            comparable = output._replace(rx_crc=state.rx_crc) if self._changed or missing else output
+            comparable = (
+                output._replace(rx_crc=state.rx_crc) if self._changed or missing else output
+            )
             same = equal_record(state, comparable, peers)
             if not same and not self._changed and self._inputs.in_doubt(state, output):
                 return self._keep(n)
             if not same and self.first is None:
-                self.first = find_first_difference(state, comparable, peers, equal_bits, self._channel)
+                self.first = find_first_difference(
+                    logged=state,
+                    computed=comparable,
+                    peers=peers,
+                    equal=equal_bits,
+                    channel=self._channel,
+                )
         self.output = output
-        payload = encode_state(self.name, self._boot, self._part.peers, output, arrivals[:MAX_ARRIVALS], 0, 0)
-        return RerunTick(self.name, output.tick, output.t_ns, output.mode, payload, same, False, stats)
+        payload = encode_state(
+            site=self.name,
+            boot=self._boot,
+            peers=self._part.peers,
+            output=output,
+            arrivals=arrivals[:MAX_ARRIVALS],
+            late_us=0,
+            busy_us=0,
+        )
+        return RerunTick(
+            site=self.name,
+            tick=output.tick,
+            t_ns=output.t_ns,
+            mode=output.mode,
+            payload=payload,
+            same=same,
+            kept=False,
+            stats=stats,
+        )
 
     def _keep(self, n: int) -> RerunTick:
         self._certain = False
         self.output = output = read_output(self._part.states[n], self._part.peers)
         payload = self._part.payloads[n]
-        return RerunTick(self.name, output.tick, output.t_ns, output.mode, payload, False, True, None)
+        return RerunTick(
+            site=self.name,
+            tick=output.tick,
+            t_ns=output.t_ns,
+            mode=output.mode,
+            payload=payload,
+            same=False,
+            kept=True,
+            stats=None,
+        )
 
 
 MEMORY_S = 120
@@ -357,7 +447,13 @@ class RerunExecution:
         }
         samples |= self._recent  # filled as they are computed
         self.sites = {
-            name: RerunSite(log, request, name, self._find_deliveries(name), samples)
+            name: RerunSite(
+                log=log,
+                request=request,
+                name=name,
+                deliveries=self._find_deliveries(name),
+                samples=samples,
+            )
             for name in request.replaced
         }
 
@@ -369,7 +465,9 @@ class RerunExecution:
             return recorded_deliveries(part)
         before = [original.sites[peer].rate_hz for peer in part.peers]
         after = [scenario.sites[peer].rate_hz for peer in part.peers]
-        found = complete_deliveries(part, before, [self._log.last_ticks[peer] for peer in part.peers])
+        found = complete_deliveries(
+            part, before, [self._log.last_ticks[peer] for peer in part.peers]
+        )
         rate_hz = scenario.sites[name].rate_hz
         if (part.rate_hz, before) == (rate_hz, after):
             return found
@@ -378,7 +476,13 @@ class RerunExecution:
                 f"{self._log.source}: the records of {name} begin at tick {found.first}: "
                 "a site that begins in the middle keeps its rate, and so do its peers"
             )
-        return retime_deliveries(found, part.rate_hz, rate_hz, before, after)
+        return retime_deliveries(
+            deliveries=found,
+            rate_hz=part.rate_hz,
+            new_rate_hz=rate_hz,
+            rates_hz=before,
+            new_rates_hz=after,
+        )
 
     def run(self, progress: Progress | None = None) -> Iterator[RerunTick]:
         """Yields every tick of every executed site, in order of time as far as arrivals allow.
@@ -387,11 +491,15 @@ class RerunExecution:
         """
         sites = list(self.sites.values())
         total = sum(site.deliveries.last + 1 - site.deliveries.first for site in sites)
-        pending = sorted((site.t_ns, place, site.k) for place, site in enumerate(sites) if not site.done)
+        pending = sorted(
+            (site.t_ns, place, site.k) for place, site in enumerate(sites) if not site.done
+        )
         done = 0
         last_ns = None
         while pending and (last_ns is None or pending[0][0] <= last_ns):
-            first = next((n for n, (_, at, k) in enumerate(pending) if self._is_ready(at, k)), 0)
+            first = next(
+                (n for n, (_, at, k) in enumerate(pending) if self._is_ready(at, k)), 0
+            )
             t_ns, place, _ = pending.pop(first)
             site = sites[place]
             made = site.advance()

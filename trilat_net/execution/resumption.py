@@ -1,7 +1,8 @@
 """The inputs of one site as its log recorded them, and its state in the middle of the log.
 
-Invariant (L3): two consecutive records and the contents of the links suffice to resume. Arrivals at ticks
-without a record are unknown; samples that no record lists are assumed to have arrived there.
+Invariant (L3): two consecutive records and the contents of the links suffice to resume.
+Arrivals at ticks without a record are unknown; samples that no record lists are assumed to have
+arrived there.
 """
 
 from bisect import bisect_left
@@ -44,24 +45,54 @@ def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
     return TickRecord._make([*begin, *_MOTION(state), *taken, mem, *_REST(state)])
 
 
-def make_arrival(peer: int, tick: int, sample: ReceivedMotion | TickRecord, latency_us: int = 0) -> Arrival:
-    """Returns the arrival of a peer's sample, whose numbers are those of its record, see `take_parts`."""
+def make_arrival(
+    peer: int, tick: int, sample: ReceivedMotion | TickRecord, latency_us: int = 0
+) -> Arrival:
+    """Returns the arrival of a peer's sample, whose numbers are those of its record, see
+    `take_parts`.
+    """
     if isinstance(sample, Arrival) or not sample.x:
-        return Arrival(peer, tick, sample.q, sample.qd, latency_us, sample.tau_x, sample.ch)
-    return Arrival(peer, tick, sample.x, sample.xd, latency_us, sample.wrench, sample.ch)
+        return Arrival(
+            peer=peer,
+            tick=tick,
+            q=sample.q,
+            qd=sample.qd,
+            latency_us=latency_us,
+            tau_x=sample.tau_x,
+            ch=sample.ch,
+        )
+    return Arrival(
+        peer=peer,
+        tick=tick,
+        q=sample.x,
+        qd=sample.xd,
+        latency_us=latency_us,
+        tau_x=sample.wrench,
+        ch=sample.ch,
+    )
 
 
 def take_parts(arrivals: Sequence[Arrival], links: Sequence[LinkSetup]) -> list[Arrival]:
-    """Returns the arrivals of whole samples as a site takes them in: without what is for other peers."""
+    """Returns the arrivals of whole samples as a site takes them in: without what is for other
+    peers.
+    """
     return [
-        one._replace(ch=links[one.peer].channel.part(one.ch, links[one.peer].place)) if one.ch else one
+        one._replace(ch=links[one.peer].channel.part(one.ch, links[one.peer].place))
+        if one.ch
+        else one
         for one in arrivals
     ]
 
 
 def find_recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
-    """Returns what a live hand did at a tick, by the latest record until then; [] without a live hand."""
-    until = np.searchsorted(part.t_ns, k * NS_PER_S // site.rate_hz, side="right") if part.layout.hand else 0
+    """Returns what a live hand did at a tick, by the latest record until then; [] without a
+    live hand.
+    """
+    until = (
+        np.searchsorted(part.t_ns, k * NS_PER_S // site.rate_hz, side="right")
+        if part.layout.hand
+        else 0
+    )
     found: list[float] = part.hand[int(until) - 1].tolist() if until else []
     return found
 
@@ -91,14 +122,18 @@ class RecordedInputs(Generic[Change]):
         self.lacking: list[set[int]] = [set() for _ in part.peers]
 
     def take_changes(self, tick: int) -> list[tuple[int, Change]]:
-        """Returns the changes up to a tick that have not been taken yet, each with its own tick."""
+        """Returns the changes up to a tick that have not been taken yet, each with its own
+        tick.
+        """
         taken: list[tuple[int, Change]] = []
         while self._changes and self._changes[-1][0] <= tick:
             named, changes = self._changes.pop()
             taken += [(named, change) for change in changes]
         return taken
 
-    def arrivals(self, entries: Sequence[ArrivalEntry]) -> tuple[list[Arrival], list[ArrivalEntry]]:
+    def arrivals(
+        self, entries: Sequence[ArrivalEntry]
+    ) -> tuple[list[Arrival], list[ArrivalEntry]]:
         """Returns the arrivals that entries list, and the entries whose sample no record holds."""
         arrivals: list[Arrival] = []
         missing: list[ArrivalEntry] = []
@@ -118,18 +153,24 @@ class RecordedInputs(Generic[Change]):
             self.lacking[peer].add(tick)
 
     def can_resume(self, n: int, *, apart: bool = False) -> bool:
-        """True if the two records before record n are consecutive and the samples in use are known.
+        """True if the two records before record n are consecutive and the samples in use are
+        known.
 
-        Those that are not known do not matter to a site that holds, `apart` from its peers, by a reference of
-        its own.
+        Those that are not known do not matter to a site that holds, `apart` from its peers, by
+        a reference of its own.
         """
         states = self._part.states
-        if n < 2 or [s.tick for s in states[n - 2 : n]] != [states[n].tick - 2, states[n].tick - 1]:
+        if n < 2 or [s.tick for s in states[n - 2 : n]] != [
+            states[n].tick - 2,
+            states[n].tick - 1,
+        ]:
             return False
         in_use = read_output(states[n - 1], self._part.peers).used
         if apart and states[n - 1].mode in RESTING_MODES:
             return True
-        return all(used < 0 or used in known for used, known in zip(in_use, self.samples, strict=True))
+        return all(
+            used < 0 or used in known for used, known in zip(in_use, self.samples, strict=True)
+        )
 
     def resume(self, site: Site, n: int, changes: Sequence[CoreChange] = ()) -> None:
         """Brings a site into its state at record n, after `changes`, if it `can_resume` there."""
@@ -146,11 +187,17 @@ class RecordedInputs(Generic[Change]):
                 unknown = (0.0,) * len(last.q_des)
                 sample = Arrival(j, used, unknown, unknown)
                 self.lacking[j].add(used)
-            in_use += [None] if sample is None else take_parts([make_arrival(j, used, sample)], self._links)
+            in_use += (
+                [None]
+                if sample is None
+                else take_parts([make_arrival(j, used, sample)], self._links)
+            )
             # a sample older than the one in use is never used any more
             self.lacking[j] = {tick for tick in self.lacking[j] if tick >= used}
             certain, self.assumed[j] = self._find_waiting(n, j, used, site.peer_rate_hz(j))
-            arrived, missing = self.arrivals([(j, tick, 0) for tick in sorted(certain | self.assumed[j])])
+            arrived, missing = self.arrivals(
+                [(j, tick, 0) for tick in sorted(certain | self.assumed[j])]
+            )
             self.add_lacking(missing)
             waiting += arrived
         site.prime(states[n].tick, in_use, waiting[-MAX_ARRIVALS:])
@@ -165,11 +212,14 @@ class RecordedInputs(Generic[Change]):
             for j, peer in enumerate(self._part.peers)
         )
 
-    def _find_waiting(self, n: int, peer: int, used: int, rate_hz: int) -> tuple[set[int], set[int]]:
-        """Returns the samples newer than the one in use that arrived before record n: (certain, probable).
+    def _find_waiting(
+        self, n: int, peer: int, used: int, rate_hz: int
+    ) -> tuple[set[int], set[int]]:
+        """Returns the samples newer than the one in use that arrived before record n: (certain,
+        probable).
 
-        Certain are those that a record before n lists. Probable are those that no record lists and that are
-        older than record n, or than the first sample that arrived after it.
+        Certain are those that a record before n lists. Probable are those that no record lists
+        and that are older than record n, or than the first sample that arrived after it.
         """
         states = self._part.states
         first_listed, records, ticks = self._listing[peer]
@@ -177,14 +227,19 @@ class RecordedInputs(Generic[Change]):
         next_listed = ticks[place] if place < len(records) else self.ends[peer] + 1
         newest = max(-(-states[n].t_ns * rate_hz // NS_PER_S) - 1, next_listed - 1)
         before = (
-            tick for state in states[max(0, n - _LOOK_BACK) : n] for j, tick, _ in state.rx if j == peer
+            tick
+            for state in states[max(0, n - _LOOK_BACK) : n]
+            for j, tick, _ in state.rx
+            if j == peer
         )
         highest = max(before, default=-1)
         certain: set[int] = set()
         probable: set[int] = set()
         # a waiting sample was sent within the longest delay there is
         oldest = (states[n].t_ns - MAX_DELAY_US * 1000) * rate_hz // NS_PER_S
-        for tick in range(max(used + 1, oldest), min(max(newest, highest), self.ends[peer]) + 1):
+        for tick in range(
+            max(used + 1, oldest), min(max(newest, highest), self.ends[peer]) + 1
+        ):
             listed = first_listed.get(tick)
             if listed is None and tick <= newest:
                 probable.add(tick)
@@ -198,7 +253,9 @@ class RecordedInputs(Generic[Change]):
 
         Beside it the records that list any sample of it, and the first that each of them lists.
         """
-        listing: list[tuple[dict[int, int], list[int], list[int]]] = [({}, [], []) for _ in self.samples]
+        listing: list[tuple[dict[int, int], list[int], list[int]]] = [
+            ({}, [], []) for _ in self.samples
+        ]
         for m, state in enumerate(self._part.states):
             for peer, tick, _ in state.rx:
                 if 0 <= peer < len(listing):

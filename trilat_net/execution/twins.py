@@ -1,13 +1,13 @@
 """Twins of a run: the same run again, pushed by a little at an instant.
 
-Invariant: the run is executed again from its own inputs and compared with its records, bit for bit. A twin
-gets the same arrivals, changes, hands and random delays; so what differs is the push and what became of it,
-and nothing else. Nothing of the difference is a model.
+Invariant: the run is executed again from its own inputs and compared with its records, bit for
+bit. A twin gets the same arrivals, changes, hands and random delays; so what differs is the
+push and what became of it, and nothing else. Nothing of the difference is a model.
 
-A difference that has grown is made small again along itself (Benettin, Galgani, Giorgilli and Strelcyn,
-Meccanica 15, 1980): all numbers of the twin's state, past samples included, go back to the run's plus a
-fraction of the difference, and what is counted goes on from where it was. One that has died down to the
-rounding of the numbers is pushed anew.
+A difference that has grown is made small again along itself (Benettin, Galgani, Giorgilli and
+Strelcyn, Meccanica 15, 1980): all numbers of the twin's state, past samples included, go back
+to the run's plus a fraction of the difference, and what is counted goes on from where it was.
+One that has died down to the rounding of the numbers is pushed anew.
 """
 
 import math
@@ -29,8 +29,9 @@ from .fused import FusedRun, RunInputs, explain_no_repetition, read_run_inputs
 PUSH_RAD = 1e-6
 """The usual push, rad."""
 LARGEST = 1e-4
-"""A difference larger than this, rad or rad/s, and than ten times its push, is made small again at the end of
-its window."""
+"""A difference larger than this, rad or rad/s, and than ten times its push, is made small again
+at the end of its window.
+"""
 SMALLEST = 1e-12
 """One smaller than this is lost in the rounding of the numbers."""
 WINDOWS = 16
@@ -45,7 +46,8 @@ class Push(NamedTuple):
         field: "q", rad; "qd", rad/s; or "theta_hat".
         by: of each site and number the push, shape (N, n).
         at_s: the instant, s since the epoch.
-        again: a twin that died down is pushed again, at the end of a window; else it ends there.
+        again: a twin that died down is pushed again, at the end of a window; else it ends
+            there.
         largest: a difference larger than this is made small again; math.inf: none is.
     """
 
@@ -63,12 +65,14 @@ class TwinPath(NamedTuple):
     Attributes:
         push: the push.
         t_s: ends of intervals of 50 ms, shape (K,), s.
-        largest: logarithm of the largest difference of velocities in an interval, rad/s, of every joint of
-            all sites, as if nothing had been made small again, shape (K, J); -inf where there is none.
+        largest: logarithm of the largest difference of velocities in an interval, rad/s, of
+            every joint of all sites, as if nothing had been made small again, shape (K, J);
+            -inf where there is none.
         last: the difference at the last tick of an interval, shape (K, J), rad/s, with
         scale: the logarithm of the factor by which it was made small, shape (K,).
         pushed: the places in `t_s` at which it was pushed.
-        died: the place from which on there is nothing but rounding; None: it is pushed anew, or lives.
+        died: the place from which on there is nothing but rounding; None: it is pushed anew, or
+            lives.
     """
 
     push: Push
@@ -86,7 +90,8 @@ class Twins(NamedTuple):
     Attributes:
         paths: of each push.
         joints: names of the joints, as in "m1 joint 1".
-        speed: the largest speed of every joint of the run itself in an interval, shape (K, J), rad/s.
+        speed: the largest speed of every joint of the run itself in an interval, shape (K, J),
+            rad/s.
         same: True if the run that was executed again has the bits of the records.
     """
 
@@ -106,9 +111,11 @@ def list_joints(scenario: Scenario) -> tuple[str, ...]:
 
 
 def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
-    """Returns so many pushes: each joint, as far as they go, the estimates, and random ones of all joints.
+    """Returns so many pushes: each joint, as far as they go, the estimates, and random ones of
+    all joints.
 
-    The random ones are by less and more than `PUSH_RAD`: growth that is not of small motions alone differs.
+    The random ones are by less and more than `PUSH_RAD`: growth that is not of small motions
+    alone differs.
     """
     each = [(joint.replace(" joint ", ".q"), PUSH_RAD) for joint in list_joints(scenario)]
     learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
@@ -125,25 +132,37 @@ MOST_PUSH = 1.0
 _TARGET = re.compile(r"(?:([a-z][a-z0-9_]*)\.)?(qd?|theta)([1-9]\d*)?")
 
 
-def aim_push(scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: float = 0.0) -> Push:
-    """Returns the push of a number, "m1.q1", "s.qd2", "m2.theta3", or of many in a drawn direction, "m1.q".
+def aim_push(
+    scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: float = 0.0
+) -> Push:
+    """Returns the push of a number, "m1.q1", "s.qd2", "m2.theta3", or of many in a drawn
+    direction, "m1.q".
 
     Its twin is pushed once. One that is not small is never made small again.
 
     Raises:
         UsageError: there is no such number, or no such size.
     """
-    site, kind, number = found.groups() if (found := _TARGET.fullmatch(target)) else (None, "", "1")
+    site, kind, number = (
+        found.groups() if (found := _TARGET.fullmatch(target)) else (None, "", "1")
+    )
     layouts = {name: scenario.layout(name) for name in scenario.names}
     adaptive = Law.ADAPTIVE
     joints = [one.joints for one in layouts.values()]
-    estimates = [one.parameters * (scenario.gains(name).law is adaptive) for name, one in layouts.items()]
+    estimates = [
+        one.parameters * (scenario.gains(name).law is adaptive) for name, one in layouts.items()
+    ]
     part, counts = ("estimate", estimates) if kind == "theta" else ("joint", joints)
-    owners = [n for n, name in enumerate(layouts) if site in (None, name) and counts[n] >= int(number or 1)]
+    owners = [
+        n
+        for n, name in enumerate(layouts)
+        if site in (None, name) and counts[n] >= int(number or 1)
+    ]
     if not owners or (number and not site):
         each = zip(layouts, joints, estimates, strict=True)
         there = ", ".join(
-            f"{name} ({count_nouns(n, 'joint')}, {count_nouns(m, 'estimate')})" for name, n, m in each
+            f"{name} ({count_nouns(n, 'joint')}, {count_nouns(m, 'estimate')})"
+            for name, n, m in each
         )
         names = ", ".join(f"{scenario.names[0]}.{one}" for one in ("q1", "qd1", "theta1", "q"))
         raise UsageError(f"--push {target}: no such number; as in {names}, or q, of {there}")
@@ -160,7 +179,14 @@ def aim_push(scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: floa
     of = f"{site} {part} {number}" if number else f"all {part}s{f' of {site}' if site else ''}"
     field = "theta_hat" if kind == "theta" else kind
     largest = LARGEST if abs(size) < LARGEST else math.inf
-    return Push(f"{size:g} {unit} {of}", field, by, at_s, False, largest)
+    return Push(
+        name=f"{size:g} {unit} {of}",
+        field=field,
+        by=by,
+        at_s=at_s,
+        again=False,
+        largest=largest,
+    )
 
 
 def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Twins:
@@ -173,7 +199,9 @@ def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Tw
     if why := explain_no_repetition(log, own_laws=own_laws):
         raise NotRepeatable(f"no twins: {why}")
     ticks = [len(log[name]) for name in log.scenario.names]
-    return _TwinRuns(log.scenario, pushes, ticks, read_run_inputs(log), log).run()
+    return _TwinRuns(
+        scenario=log.scenario, pushes=pushes, ticks=ticks, inputs=read_run_inputs(log), log=log
+    ).run()
 
 
 def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: float) -> Twins:
@@ -183,12 +211,16 @@ def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: fl
         ScenarioError: virtual time cannot run it.
         NotRepeatable: a push is beyond its end.
     """
-    ticks = [max(1, round(duration_s * scenario.sites[name].rate_hz)) for name in scenario.names]
+    ticks = [
+        max(1, round(duration_s * scenario.sites[name].rate_hz)) for name in scenario.names
+    ]
     return _TwinRuns(scenario, pushes, ticks).run()
 
 
 class _TwinRuns:
-    """A run of so many ticks of each site and its twins, side by side; of a log, if there is one."""
+    """A run of so many ticks of each site and its twins, side by side; of a log, if there is
+    one.
+    """
 
     def __init__(
         self,
@@ -204,9 +236,15 @@ class _TwinRuns:
         rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
         end_s = max(n / hz for n, hz in zip(ticks, rates_hz, strict=True))
         if any(not 0.0 <= push.at_s < end_s for push in pushes):
-            raise NotRepeatable(f"no twins: a push lies within the run, from 0 s until before {end_s:g} s")
-        equal = np.ceil(np.linspace(0.0, end_s, WINDOWS + 1)[1:] * BUCKETS_PER_S) / BUCKETS_PER_S
-        self._ends = np.array(sorted({*equal.tolist(), *({push.at_s for push in pushes} - {0.0})}))
+            raise NotRepeatable(
+                f"no twins: a push lies within the run, from 0 s until before {end_s:g} s"
+            )
+        equal = (
+            np.ceil(np.linspace(0.0, end_s, WINDOWS + 1)[1:] * BUCKETS_PER_S) / BUCKETS_PER_S
+        )
+        self._ends = np.array(
+            sorted({*equal.tolist(), *({push.at_s for push in pushes} - {0.0})})
+        )
         keep = math.ceil(float(np.diff(self._ends, prepend=0.0).max()) * max(rates_hz)) + 2
         runs = [FusedRun(scenario, keep=keep, inputs=inputs) for _ in range(1 + len(pushes))]
         for run in runs:
@@ -232,8 +270,17 @@ class _TwinRuns:
             for end_s in self._ends.tolist():
                 self._make_window(end_s)
         t_s = (np.arange(len(self._speed)) + 1.0) / BUCKETS_PER_S
-        kept = zip(self._largest, self._last, self._scales, map(tuple, self._pushed), self._died, strict=True)
-        paths = [TwinPath(push, t_s, *found) for push, found in zip(self._pushes, kept, strict=True)]
+        kept = zip(
+            self._largest,
+            self._last,
+            self._scales,
+            map(tuple, self._pushed),
+            self._died,
+            strict=True,
+        )
+        paths = [
+            TwinPath(push, t_s, *found) for push, found in zip(self._pushes, kept, strict=True)
+        ]
         return Twins(paths, self._joints, self._speed, self._same)
 
     def _make_window(self, end_s: float) -> None:
@@ -243,7 +290,9 @@ class _TwinRuns:
         if self._log is not None:
             self._compare(self._log, kept)
         for at, starts, qd, _ in self._cut(kept, kept):
-            self._speed[at] = np.maximum(self._speed[at], np.maximum.reduceat(np.abs(qd), starts, axis=0))
+            self._speed[at] = np.maximum(
+                self._speed[at], np.maximum.reduceat(np.abs(qd), starts, axis=0)
+            )
         for n, twin in enumerate(self._twins):
             if self._pushed[n] and self._died[n] is None:
                 twin.step_to(last_ns)
@@ -266,7 +315,11 @@ class _TwinRuns:
             columns = layout.columns()
             first = int(np.searchsorted(part.t_ns, t_ns[0])) if len(t_ns) else 0
             here = slice(first, first + len(t_ns))
-            for signal, recorded in (("q", part.q[here]), ("qd", part.qd[here]), ("tau", part.tau[here])):
+            for signal, recorded in (
+                ("q", part.q[here]),
+                ("qd", part.qd[here]),
+                ("tau", part.tau[here]),
+            ):
                 apart = np.abs(rows[:, columns[signal]] - recorded).max(initial=0.0)
                 self._same &= bool(apart == 0.0)
                 if not apart <= SAME_RUN:
@@ -279,7 +332,9 @@ class _TwinRuns:
         self, kept: Sequence[tuple[Ints, Array]], own: Sequence[tuple[Ints, Array]]
     ) -> Iterator[tuple[tuple[Ints, ...], Ints, Array, Array]]:
         place = 0
-        for layout, (t_ns, rows), (own_ns, own_rows) in zip(self._layouts, kept, own, strict=True):
+        for layout, (t_ns, rows), (own_ns, own_rows) in zip(
+            self._layouts, kept, own, strict=True
+        ):
             qd = layout.columns()["qd"]
             made = min(len(t_ns), len(own_ns))
             if made:
@@ -289,10 +344,14 @@ class _TwinRuns:
                 yield at, starts, rows[:made, qd], own_rows[:made, qd]
             place += layout.joints
 
-    def _measure(self, n: int, kept: Sequence[tuple[Ints, Array]], own: Sequence[tuple[Ints, Array]]) -> None:
+    def _measure(
+        self, n: int, kept: Sequence[tuple[Ints, Array]], own: Sequence[tuple[Ints, Array]]
+    ) -> None:
         for at, starts, qd, own_qd in self._cut(kept, own):
             apart = own_qd - qd
-            largest = np.log(np.maximum.reduceat(np.abs(apart), starts, axis=0)) + self._scale[n]
+            largest = (
+                np.log(np.maximum.reduceat(np.abs(apart), starts, axis=0)) + self._scale[n]
+            )
             self._largest[n][at] = np.maximum(self._largest[n][at], largest)
             self._last[n][at] = apart[np.append(starts[1:], len(apart)) - 1]
             self._scales[n, at[0].reshape(-1)] = self._scale[n]
@@ -303,14 +362,19 @@ class _TwinRuns:
         push = self._pushes[n]
         q, qd = (twin.measure_distance(self._run, field) for field in ("q", "qd"))
         pushed = float(np.abs(push.by).max())  # nothing is made larger than it is
-        recent = self._largest[n, max(0, last - BUCKETS_PER_S) : last].max(initial=-np.inf) - self._scale[n]
+        recent = (
+            self._largest[n, max(0, last - BUCKETS_PER_S) : last].max(initial=-np.inf)
+            - self._scale[n]
+        )
         dead = recent < math.log(SMALLEST)  # whatever is left of it as a shift to another rest
         if dead and push.again:
             twin.copy_state(self._run)
             self._push(n, end_s)
         elif dead and twin.diverged_s is None:
             alive = self._largest[n].max(axis=1) - self._scales[n] >= math.log(SMALLEST)
-            self._died[n] = int(np.flatnonzero(alive)[-1]) + 1 if alive.any() else self._pushed[n][0]
+            self._died[n] = (
+                int(np.flatnonzero(alive)[-1]) + 1 if alive.any() else self._pushed[n][0]
+            )
             self._largest[n, self._died[n] :] = -np.inf
         elif push.largest < math.inf and not max(q, qd) <= max(push.largest, 10.0 * pushed):
             factor = pushed / max(q, qd)
@@ -319,4 +383,6 @@ class _TwinRuns:
 
 
 SAME_RUN = 1e-7
-"""Executed on another platform, where the last bits differ, a run may be so far from its records, rad."""
+"""Executed on another platform, where the last bits differ, a run may be so far from its
+records, rad.
+"""

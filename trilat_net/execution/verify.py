@@ -1,10 +1,10 @@
 """Executes every site again from its log and compares every computed field of every record.
 
-Invariant (L3, L5): the log alone feeds `Site.step`, besides user control laws that it names by hash. On the
-platform that made the log (by fingerprint) whole runs are executed and must agree bit for bit; elsewhere
-each tick is recomputed from the two records before it, to 1e-9 (1 + |a|). A gap is reported; execution
-resumes after it from two consecutive records, and records that cannot be judged are counted, never
-reported as differences.
+Invariant (L3, L5): the log alone feeds `Site.step`, besides user control laws that it names by
+hash. On the platform that made the log (by fingerprint) whole runs are executed and must agree
+bit for bit; elsewhere each tick is recomputed from the two records before it, to 1e-9 (1 +
+|a|). A gap is reported; execution resumes after it from two consecutive records, and records
+that cannot be judged are counted, never reported as differences.
 """
 
 from array import array
@@ -58,7 +58,9 @@ class RecordDifference(NamedTuple):
             f"{value!r} ({value.hex()})" if isinstance(value, float) else repr(value)
             for value in (self.logged, self.computed)
         )
-        return f"{self.site}, tick {self.tick}, {self.field}: logged {logged}, computed {computed}"
+        return (
+            f"{self.site}, tick {self.tick}, {self.field}: logged {logged}, computed {computed}"
+        )
 
 
 def equal_bits(a: float, b: float) -> bool:
@@ -73,7 +75,13 @@ def equal_to_tolerance(a: float, b: float) -> bool:
 
 def describe_law_failure(failed: LawFailed) -> RecordDifference:
     """Returns the difference of a user law that fails now and did not when the log was made."""
-    return RecordDifference(failed.site, failed.tick or 0, "record", "is there", failed.problem)
+    return RecordDifference(
+        site=failed.site,
+        tick=failed.tick or 0,
+        field="record",
+        logged="is there",
+        computed=failed.problem,
+    )
 
 
 _vectors_of = attrgetter(*STATE_VECTORS, "mem")
@@ -107,14 +115,22 @@ def find_first_difference(
 
     `channel` has the names of what the site's law sends.
     """
-    for name, a, b, same in _compare_fields(logged, computed, peers, equal, channel):
+    for name, a, b, same in _compare_fields(
+        logged=logged, computed=computed, peers=peers, equal=equal, channel=channel
+    ):
         if not same:
-            return RecordDifference(logged.site, logged.tick, name, a, b)
+            return RecordDifference(
+                site=logged.site, tick=logged.tick, field=name, logged=a, computed=b
+            )
     return None
 
 
 def _compare_fields(
-    logged: State, computed: TickRecord, peers: tuple[str, ...], equal: NumberEquality, channel: LawChannel
+    logged: State,
+    computed: TickRecord,
+    peers: tuple[str, ...],
+    equal: NumberEquality,
+    channel: LawChannel,
 ) -> Iterator[tuple[str, Any, Any, bool]]:
     mode = MODE_WORDS[computed.mode]
     yield "tick", logged.tick, computed.tick, logged.tick == computed.tick
@@ -137,7 +153,9 @@ def _compare_fields(
         yield f"used[{peer}]", a, b, a == b
     yield "rx (its CRC-32)", logged.rx_crc, computed.rx_crc, logged.rx_crc == computed.rx_crc
     yield "cmd", logged.cmd, computed.cmd, logged.cmd == computed.cmd
-    alike = all(equal(float(a), float(b)) for a, b in zip(logged.mem, computed.mem, strict=False))
+    alike = all(
+        equal(float(a), float(b)) for a, b in zip(logged.mem, computed.mem, strict=False)
+    )
     yield "mem", logged.mem, computed.mem, alike and len(logged.mem) == len(computed.mem)
 
 
@@ -146,7 +164,8 @@ class VerifyResult:
     """The result of executing a log again, in numbers of records.
 
     Attributes:
-        whole_run: True if whole runs were executed and bits compared; False if tick by tick, to 1e-9.
+        whole_run: True if whole runs were executed and bits compared; False if tick by tick, to
+            1e-9.
         coverage: ticks by site: those that were executed and compared, and those of the run.
         min_coverage: the least share of them that passes.
         integrity: whether the log is as it was made.
@@ -154,7 +173,8 @@ class VerifyResult:
         first: the difference of the earliest tick.
         gaps: missing ticks: (site, first, last).
         absences: ticks that a site did not make between two of its starts, likewise.
-        withheld: sites whose law may not run, which were not executed; all else is of the others.
+        withheld: sites whose law may not run, which were not executed; all else is of the
+            others.
     """
 
     whole_run: bool
@@ -177,13 +197,23 @@ class VerifyResult:
 
     @property
     def passed(self) -> bool:
-        """True if no record differs, enough of every site was judged, and the log is as it was made."""
+        """True if no record differs, enough of every site was judged, and the log is as it was
+        made.
+        """
         enough = not self.withheld and self.coverage.share >= self.min_coverage
         return self.agreed and enough and self.integrity.passed
 
     def add(self, other: "VerifyResult") -> None:
         """Adds the result of other sites, which were executed from another log."""
-        for name in ("records", "identical", "unjudged", "differing", "gaps", "absences", "withheld"):
+        for name in (
+            "records",
+            "identical",
+            "unjudged",
+            "differing",
+            "gaps",
+            "absences",
+            "withheld",
+        ):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         for name in other.withheld:
             self.coverage.expected.pop(name, None)
@@ -210,10 +240,11 @@ PROGRESS_EVERY = 256
 class SiteVerifier:
     """One site, executed from its records.
 
-    While it is `certain`, the site's state follows from the records before. A gap ends that, and so does the
-    use of a sample that the log lacks; two consecutive records restore it. Arrivals inside a gap are unknown:
-    samples that no record lists are assumed to have arrived there, and while one of them is in use a
-    difference counts as unjudged. The same holds for a sample that arrived but whose own record is missing.
+    While it is `certain`, the site's state follows from the records before. A gap ends that,
+    and so does the use of a sample that the log lacks; two consecutive records restore it.
+    Arrivals inside a gap are unknown: samples that no record lists are assumed to have arrived
+    there, and while one of them is in use a difference counts as unjudged. The same holds for a
+    sample that arrived but whose own record is missing.
     """
 
     def __init__(
@@ -244,10 +275,18 @@ class SiteVerifier:
         self._own_end = log.last_ticks[site]
         self._equal = equal_bits if result.whole_run else equal_to_tolerance
         self._certain = True
-        self._inputs = RecordedInputs(log[site], by_tick, log.last_ticks, log.changes(site), setup.links)
+        self._inputs = RecordedInputs(
+            part=log[site],
+            samples=by_tick,
+            ends=log.last_ticks,
+            changes=log.changes(site),
+            links=setup.links,
+        )
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
-        """Executes every record; `report` gets the number of records of all sites so far, now and then."""
+        """Executes every record; `report` gets the number of records of all sites so far, now
+        and then.
+        """
         result = self._result
         states = self._log.states
         name = self._log.name
@@ -258,7 +297,15 @@ class SiteVerifier:
                 report(result.records)
             result.records += 1
             if state.tick == expected - 1 and state.boot not in self._starts:
-                result.add_difference(RecordDifference(state.site, state.tick, "tick", state.tick, expected))
+                result.add_difference(
+                    RecordDifference(
+                        site=state.site,
+                        tick=state.tick,
+                        field="tick",
+                        logged=state.tick,
+                        computed=expected,
+                    )
+                )
                 continue
             if self._boot is None or (state.boot != self._boot and state.boot in self._starts):
                 expected = self._begin_start(n, expected)
@@ -285,7 +332,15 @@ class SiteVerifier:
                 result.add_difference(describe_law_failure(failed)._replace(tick=state.tick))
             except ValueError as error:  # no site takes so many changes
                 self._certain = False
-                result.add_difference(RecordDifference(name, state.tick, "cmd", "here", str(error)))
+                result.add_difference(
+                    RecordDifference(
+                        site=name,
+                        tick=state.tick,
+                        field="cmd",
+                        logged="here",
+                        computed=str(error),
+                    )
+                )
         result.coverage.judged[name] = result.records - result.unjudged - before
         if expected <= self._own_end:
             result.gaps.append((name, expected, self._own_end))
@@ -311,7 +366,9 @@ class SiteVerifier:
         return first
 
     def _start_afresh(self, n: int, state: State) -> None:
-        """Has record n made by a site that knows the records before it alone, if they tell enough."""
+        """Has record n made by a site that knows the records before it alone, if they tell
+        enough.
+        """
         known = self._certain and n - 2 >= self._began
         if not known or self._law_failed or not self._inputs.can_resume(n, apart=self._apart):
             return
@@ -325,16 +382,30 @@ class SiteVerifier:
     def _find_other_sender(self, state: State) -> RecordDifference | None:
         name = self._log.name
         if state.boot != (boot := self._boot):
-            return RecordDifference(name, state.tick, "boot", state.boot, boot)
-        return None if state.site == name else RecordDifference(name, state.tick, "site", state.site, name)
+            return RecordDifference(
+                site=name, tick=state.tick, field="boot", logged=state.boot, computed=boot
+            )
+        return (
+            None
+            if state.site == name
+            else RecordDifference(
+                site=name, tick=state.tick, field="site", logged=state.site, computed=name
+            )
+        )
 
     def _verify_record(self, n: int, state: State) -> None:
         result = self._result
         states = self._log.states
         peers = self._log.peers
         difference = self._find_other_sender(state)
-        if not result.whole_run and n - 2 >= self._began and states[n - 2].tick == state.tick - 2:
-            self._site.resume(read_output(states[n - 2], peers), read_output(states[n - 1], peers))
+        if (
+            not result.whole_run
+            and n - 2 >= self._began
+            and states[n - 2].tick == state.tick - 2
+        ):
+            self._site.resume(
+                read_output(states[n - 2], peers), read_output(states[n - 1], peers)
+            )
         arrivals, missing = self._inputs.arrivals(state.rx)
         invalid = None
         if missing:
@@ -342,13 +413,29 @@ class SiteVerifier:
             arrivals, missing = self._inputs.arrivals(entries)
             self._inputs.add_lacking(missing)
         changes, invalid_change = self._parse_changes(state.tick)
-        plant = PlantState(state.q, state.qd, state.tau_x, state.bodies) if self._external else None
-        output = self._site.step(TickInput(state.tick, arrivals[:MAX_ARRIVALS], changes, plant, state.hand))
+        plant = (
+            PlantState(state.q, state.qd, state.tau_x, state.bodies) if self._external else None
+        )
+        output = self._site.step(
+            TickInput(
+                k=state.tick,
+                arrivals=arrivals[:MAX_ARRIVALS],
+                commands=changes,
+                measured=plant,
+                hand=state.hand,
+            )
+        )
         if missing:  # the CRC of a sample that the log lacks cannot be checked
             output = output._replace(rx_crc=state.rx_crc)
         difference = invalid_change or invalid or difference
         if difference is None and not equal_record(state, output, peers):
-            difference = find_first_difference(state, output, peers, self._equal, self._channel)
+            difference = find_first_difference(
+                logged=state,
+                computed=output,
+                peers=peers,
+                equal=self._equal,
+                channel=self._channel,
+            )
             if difference is not None and self._inputs.in_doubt(state, output):
                 result.unjudged += 1
                 self._certain = False
@@ -359,26 +446,43 @@ class SiteVerifier:
             result.add_difference(difference)
 
     def _parse_changes(self, tick: int) -> tuple[list[CoreChange], RecordDifference | None]:
-        """Returns the changes up to a tick that were not executed yet; an invalid one is a difference."""
+        """Returns the changes up to a tick that were not executed yet; an invalid one is a
+        difference.
+        """
         changes: list[CoreChange] = []
         for named, text in self._inputs.take_changes(tick):
             try:
                 changes.append(parse_core_change(self._scenario, self._log.name, text))
             except ScenarioError:
                 valid = "a change of one of its links or of its shares"
-                return changes, RecordDifference(self._log.name, named, "cmd", text, valid)
+                return changes, RecordDifference(
+                    site=self._log.name, tick=named, field="cmd", logged=text, computed=valid
+                )
         self._taken += changes[:MAX_RAMPS]
         return changes[:MAX_RAMPS], None
 
-    def _check_arrivals(self, state: State) -> tuple[Sequence[ArrivalEntry], RecordDifference | None]:
+    def _check_arrivals(
+        self, state: State
+    ) -> tuple[Sequence[ArrivalEntry], RecordDifference | None]:
         for n, (peer, tick, _) in enumerate(state.rx):
             if not 0 <= peer < len(self._inputs.samples):
-                invalid = RecordDifference(state.site, state.tick, "rx (peer)", peer, "an index of a peer")
+                invalid = RecordDifference(
+                    site=state.site,
+                    tick=state.tick,
+                    field="rx (peer)",
+                    logged=peer,
+                    computed="an index of a peer",
+                )
                 return state.rx[:n], invalid
-            if tick not in self._inputs.samples[peer] and not 0 <= tick <= self._inputs.ends[peer]:
+            if (
+                tick not in self._inputs.samples[peer]
+                and not 0 <= tick <= self._inputs.ends[peer]
+            ):
                 valid = f"a tick from 0 to {self._inputs.ends[peer]}"
                 where = f"rx[{self._log.peers[peer]}]"
-                return state.rx[:n], RecordDifference(state.site, state.tick, where, tick, valid)
+                return state.rx[:n], RecordDifference(
+                    site=state.site, tick=state.tick, field=where, logged=tick, computed=valid
+                )
         return state.rx, None
 
 
@@ -395,8 +499,8 @@ def verify(
         log: the log.
         progress: called now and then.
         min_coverage: the least share of every site's ticks that must be judged to pass.
-        resume_every: at every tick that it divides a site starts afresh from the records, so that what a law
-            knows besides shows; 0: at none.
+        resume_every: at every tick that it divides a site starts afresh from the records, so
+            that what a law knows besides shows; 0: at none.
 
     Raises:
         LogError: a record cannot be read.
@@ -407,13 +511,17 @@ def verify(
         sites = log.executed_sites
         total = sum(len(log[name]) for name in sites)
         report = None if progress is None else lambda done: progress(done, total)
-        _execute_sites(log, sites, result, report, resume_every)
+        _execute_sites(
+            log=log, sites=sites, result=result, report=report, resume_every=resume_every
+        )
         others = [name for name in log.sites if name not in sites]
         if others and (source := open_rerun_source(log)) is not None:
             for name in others:
                 _compare_with_source(log[name], source[name], result)
             theirs = _begin(source, min_coverage)
-            _execute_sites(source, [name for name in source.executed_sites if name in others], theirs)
+            _execute_sites(
+                source, [name for name in source.executed_sites if name in others], theirs
+            )
             result.add(theirs)
     return result
 
@@ -441,7 +549,9 @@ def _execute_sites(
     for name in withheld:
         result.coverage.expected.pop(name, None)
     for name in (name for name in sites if name not in withheld):
-        SiteVerifier(log, name, by_tick, result, resume_every).run(report)
+        SiteVerifier(
+            log=log, site=name, by_tick=by_tick, result=result, resume_every=resume_every
+        ).run(report)
 
 
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:
@@ -450,13 +560,25 @@ def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResul
     for ours, theirs in zip_longest(recorded.states, source.states):
         if ours is None or theirs is None or ours != msgspec.structs.replace(theirs, v=ours.v):
             tick = (ours or theirs).tick
-            result.add_difference(RecordDifference(recorded.name, tick, "record", "here", "in its log"))
+            result.add_difference(
+                RecordDifference(
+                    site=recorded.name,
+                    tick=tick,
+                    field="record",
+                    logged="here",
+                    computed="in its log",
+                )
+            )
             return
 
 
 def open_rerun_source(log: Log) -> Log | None:
-    """Returns the log that a rerun was made of, if it stands beside it and is the same file; else None."""
-    names, digests = (log.session.get(key, "").split() for key in ("rerun_of", "rerun_of_sha256"))
+    """Returns the log that a rerun was made of, if it stands beside it and is the same file;
+    else None.
+    """
+    names, digests = (
+        log.session.get(key, "").split() for key in ("rerun_of", "rerun_of_sha256")
+    )
     files = [Path(log.sources[0]).with_name(Path(name).name) for name in names]
     if not files or len(files) != len(digests) or not all(map(Path.is_file, files)):
         return None

@@ -1,10 +1,11 @@
-"""The virtual-time driver: a counter in place of the clock, a simulated network in place of the bus.
+"""The virtual-time driver: a counter in place of the clock, a simulated network in place of the
+bus.
 
-Invariant: sites advance by `Site.step` alone, in order of nominal time and then of the scenario, so that two
-runs of one scenario and seed give the same file, byte for byte.
+Invariant: sites advance by `Site.step` alone, in order of nominal time and then of the
+scenario, so that two runs of one scenario and seed give the same file, byte for byte.
 
-What it writes of a site are records, link statistics and events. Messages of older schema versions are
-written in the present one; a message of the present version keeps its bytes.
+What it writes of a site are records, link statistics and events. Messages of older schema
+versions are written in the present one; a message of the present version keeps its bytes.
 """
 
 import bisect
@@ -66,7 +67,9 @@ class SiteEntry(NamedTuple):
 
 
 class SiteChannels:
-    """Turns the ticks and messages of one site into entries, writes them, and keeps their accounts."""
+    """Turns the ticks and messages of one site into entries, writes them, and keeps their
+    accounts.
+    """
 
     def __init__(self, scenario: Scenario, session: str, site: str, boot: int) -> None:
         self.peers = scenario.peers(site)
@@ -85,7 +88,9 @@ class SiteChannels:
     def follow(
         self, output: TickRecord, stats: LinkStats | None, law_failure: Exception | None = None
     ) -> Sequence[SiteEntry]:
-        """Returns the entries after the record of an executed tick: statistics if any, change of mode."""
+        """Returns the entries after the record of an executed tick: statistics if any, change
+        of mode.
+        """
         self.ticks = output.tick + 1
         self._t_ns = output.t_ns
         self._excuse_skipped(output.tick, output.cmd)
@@ -96,27 +101,41 @@ class SiteChannels:
             text = (
                 describe_divergence(self._site, output)
                 if diverged
-                else describe_mode(self._site, output, glides=self._glides, law_failure=law_failure)
+                else describe_mode(
+                    self._site, output, glides=self._glides, law_failure=law_failure
+                )
             )
-            entries.append(self.new_event("diverged" if diverged else "mode", text, output.t_ns))
+            entries.append(
+                self.new_event("diverged" if diverged else "mode", text, output.t_ns)
+            )
         return entries
 
     def _excuse_skipped(self, tick: int, cmd: Sequence[str]) -> None:
         if skipped := count_skipped_ticks(cmd):
             for channel in (topics.STATE, topics.LINK):
-                self.accounts[channel].begin_anew(*skipped_numbers(channel, tick, skipped, self._rate_hz))
+                self.accounts[channel].begin_anew(
+                    *skipped_numbers(channel, tick, skipped, self._rate_hz)
+                )
 
     def end(self, t_ns: int | None = None) -> SiteEntry:
         """Returns the entry of the event that ends the site's run, by default at its last tick."""
         when_ns = self._t_ns if t_ns is None else t_ns
-        return self.new_event("end", f"{self._site} made {count_nouns(self.ticks, 'tick')}", when_ns)
+        return self.new_event(
+            "end", f"{self._site} made {count_nouns(self.ticks, 'tick')}", when_ns
+        )
 
     def new_event(self, kind: str, text: str, t_ns: int) -> SiteEntry:
         """Returns the entry of a new event of the site."""
         n = self._events
         self._events += 1
         event = Event(
-            member=self._site, boot=self._boot, n=n, kind=kind, text=text, t_ns=t_ns, ticks=self.ticks
+            member=self._site,
+            boot=self._boot,
+            n=n,
+            kind=kind,
+            text=text,
+            t_ns=t_ns,
+            ticks=self.ticks,
         )
         return self.event(event, n)
 
@@ -125,30 +144,69 @@ class SiteChannels:
         self._excuse_skipped(state.tick, state.cmd)
         sent_ns = state.sent_ns if state.v >= SENT_TIME_SINCE else state.t_ns
         if state.v != VERSION:
-            arrivals = [Arrival(peer, tick, (), (), us) for peer, tick, us in state.rx]
+            arrivals = [
+                Arrival(peer=peer, tick=tick, q=(), qd=(), latency_us=us)
+                for peer, tick, us in state.rx
+            ]
             output = read_output(state, self.peers)
             late_us = state.late_us
             busy_us = state.busy_us
             payload = encode_state(
-                state.site, state.boot, self.peers, output, arrivals, late_us, busy_us, sent_ns, state.echo
+                site=state.site,
+                boot=state.boot,
+                peers=self.peers,
+                output=output,
+                arrivals=arrivals,
+                late_us=late_us,
+                busy_us=busy_us,
+                sent_ns=sent_ns,
+                echo=state.echo,
             )
-        return SiteEntry(self._site, state.t_ns, sent_ns, topics.STATE, state.tick, payload, state)
+        return SiteEntry(
+            site=self._site,
+            t_ns=state.t_ns,
+            sent_ns=sent_ns,
+            channel=topics.STATE,
+            sequence=state.tick,
+            payload=payload,
+            message=state,
+        )
 
     def stats(self, stats: LinkStats) -> SiteEntry:
         """Returns the entry of link statistics."""
-        payload = encode(stats if stats.v == VERSION else msgspec.structs.replace(stats, v=VERSION))
-        return SiteEntry(self._site, stats.t_ns, stats.t_ns, topics.LINK, stats.tick, payload, stats)
+        payload = encode(
+            stats if stats.v == VERSION else msgspec.structs.replace(stats, v=VERSION)
+        )
+        return SiteEntry(
+            site=self._site,
+            t_ns=stats.t_ns,
+            sent_ns=stats.t_ns,
+            channel=topics.LINK,
+            sequence=stats.tick,
+            payload=payload,
+            message=stats,
+        )
 
     def event(self, event: Event, n: int) -> SiteEntry:
         """Returns the entry of an event; `n` is its number if it has none of its own."""
         numbered = event if event.n >= 0 else msgspec.structs.replace(event, n=n)
         payload = encode(msgspec.structs.replace(numbered, v=VERSION))
         t_ns = max(event.t_ns, 0)
-        return SiteEntry(self._site, t_ns, t_ns, topics.EVENT, numbered.n, payload, numbered)
+        return SiteEntry(
+            site=self._site,
+            t_ns=t_ns,
+            sent_ns=t_ns,
+            channel=topics.EVENT,
+            sequence=numbered.n,
+            payload=payload,
+            message=numbered,
+        )
 
     def write(self, entry: SiteEntry, writer: LogWriter, epoch_unix_ns: int = 0) -> None:
         """Writes an entry into a log."""
-        self.accounts[entry.channel].take(number_message(entry.channel, entry.sequence, self._rate_hz))
+        self.accounts[entry.channel].take(
+            number_message(entry.channel, entry.sequence, self._rate_hz)
+        )
         log_ns = min(max(0, epoch_unix_ns + entry.t_ns), MAX_TIME_NS)
         key = self.keys[entry.channel]
         writer.add(key, entry.payload, entry.sent_ns, log_ns, entry.sequence, entry.message)
@@ -183,8 +241,8 @@ def check_virtual(scenario: Scenario) -> None:
     """Refuses a scenario that virtual time cannot run, before anything is written.
 
     Raises:
-        ScenarioError: an arm is outside of the program, or a user law cannot be made, or its file has another
-            hash.
+        ScenarioError: an arm is outside of the program, or a user law cannot be made, or its
+            file has another hash.
     """
     refuse_external_arms(scenario, set(scenario.external) - set(scenario.outside))
     for name, spec in scenario.sites.items():
@@ -213,9 +271,10 @@ def execute_virtual(
 ) -> Iterator[SiteTick]:
     """Yields every tick of every site: in order of nominal time, then of the scenario.
 
-    A site whose network is not ready lets the others go first; by default every sample arrives at the next
-    tick. A run that diverges ends with the ticks of that instant. `ends` holds the last tick of sites that
-    make fewer than the scenario has. Live hands do what `hands` says; else nobody holds an arm.
+    A site whose network is not ready lets the others go first; by default every sample arrives
+    at the next tick. A run that diverges ends with the ticks of that instant. `ends` holds the
+    last tick of sites that make fewer than the scenario has. Live hands do what `hands` says;
+    else nobody holds an arm.
 
     Raises:
         ScenarioError: an arm is external and `measured` and `plants` lack it.
@@ -223,7 +282,9 @@ def execute_virtual(
         PlantFailed: a plant of one's own did.
     """
     refuse_external_arms(scenario, {**measured, **plants})
-    joined = network or PromptNetwork({name: spec.rate_hz for name, spec in scenario.sites.items()})
+    joined = network or PromptNetwork(
+        {name: spec.rate_hz for name, spec in scenario.sites.items()}
+    )
     setups = [scenario.setup(name) for name in scenario.names]
     sites = [Site(setup) for setup in setups]
     ticks = [min(scenario.ticks(n), ends.get(n, scenario.ticks(n)) + 1) for n in scenario.names]
@@ -234,7 +295,9 @@ def execute_virtual(
     while pending and pending[0][0] <= last_ns:
         place = 0
         if not joined.ready(sites[pending[0][1]].name, pending[0][2]):
-            place = next((n for n, (_, i, k) in enumerate(pending) if joined.ready(sites[i].name, k)), 0)
+            place = next(
+                (n for n, (_, i, k) in enumerate(pending) if joined.ready(sites[i].name, k)), 0
+            )
         t_ns, index, k = pending.pop(place)
         site = sites[index]
         arrivals = take_parts(joined.deliver(site.name, k), setups[index].links)
@@ -243,7 +306,11 @@ def execute_virtual(
         hand = hands[site.name](site, k) if site.name in hands else ()
         plant = plants.get(site.name)
         at = arm.get(k) if plant is None else plant.state
-        output = site.step(TickInput(k, arrivals, ordered.get(k, ()), at, hand))
+        output = site.step(
+            TickInput(
+                k=k, arrivals=arrivals, commands=ordered.get(k, ()), measured=at, hand=hand
+            )
+        )
         if plant is not None:
             plant.move(k, output.tau)
         joined.send(site.name, output)
@@ -271,9 +338,19 @@ class _VirtualChannels(SiteChannels):
         self._stats = LoopStats(site, boot)
 
     def tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
-        payload = encode_state(self._site, self._boot, self.peers, output, arrivals, 0, 0)
+        payload = encode_state(
+            site=self._site,
+            boot=self._boot,
+            peers=self.peers,
+            output=output,
+            arrivals=arrivals,
+            late_us=0,
+            busy_us=0,
+        )
         self.accounts[topics.STATE].take(output.tick)
-        self._writer.add(self.keys[topics.STATE], payload, output.t_ns, output.t_ns, output.tick, output)
+        self._writer.add(
+            self.keys[topics.STATE], payload, output.t_ns, output.t_ns, output.tick, output
+        )
         due = self._stats.due(output.tick, count_skipped_ticks(output.cmd))
         stats = self._stats.take(output) if due else None
         for entry in self.follow(output, stats, self._runs.law_failure):
@@ -282,7 +359,9 @@ class _VirtualChannels(SiteChannels):
     def tell(self, news: list[tuple[int, str]]) -> None:
         """Writes what a hand has done as events."""
         for k, text in news:
-            self.write(self.new_event("hand", text, k * NS_PER_S // self._rate_hz), self._writer)
+            self.write(
+                self.new_event("hand", text, k * NS_PER_S // self._rate_hz), self._writer
+            )
         news.clear()
 
 
@@ -296,11 +375,12 @@ def write_virtual_log(
     hands: HandTracks = {},  # noqa: B006
     commands: ChangeSchedule = {},  # noqa: B006
 ) -> bool:
-    """Runs a scenario in virtual time and writes its log, which is finished however the run ends.
+    """Runs a scenario in virtual time and writes its log, which is finished however the run
+    ends.
 
-    The stream stays open. Once `stopped` is True the run ends, and the file is finished with what there is.
-    `views_hz` is the rate of the standard channels, Hz, see `log.ros2.viz_channels`; `network`, `hands` and
-    `commands` are as for `execute_virtual`.
+    The stream stays open. Once `stopped` is True the run ends, and the file is finished with
+    what there is. `views_hz` is the rate of the standard channels, Hz, see
+    `log.ros2.viz_channels`; `network`, `hands` and `commands` are as for `execute_virtual`.
 
     Returns:
         True if the run stayed within its limits, False if it diverged.
@@ -314,13 +394,22 @@ def write_virtual_log(
     own = make_hand_players(scenario)
     plants = make_plant_players(scenario)
     acts = {**{name: player.track for name, player in own.items()}, **hands}
-    writer = LogWriter(stream, scenario, scenario.name, "virtual", 0, views_hz=views_hz)
+    writer = LogWriter(
+        stream=stream,
+        scenario=scenario,
+        session=scenario.name,
+        driver="virtual",
+        epoch_unix_ns=0,
+        views_hz=views_hz,
+    )
     members: dict[str, _VirtualChannels] = {}
     within = True
     t_ns = 0
     try:
         with process.pause_gc():
-            ticks = execute_virtual(scenario, network, commands=commands, hands=acts, plants=plants)
+            ticks = execute_virtual(
+                scenario, network, commands=commands, hands=acts, plants=plants
+            )
             for site, arrivals, output in ticks:
                 if site.name not in members:
                     members[site.name] = _VirtualChannels(scenario, site, writer)
@@ -357,7 +446,8 @@ def record_virtual(
     views_hz: float = VIZ_HZ,
     hands: HandTracks = {},  # noqa: B006
 ) -> bool:
-    """Runs a scenario in virtual time into a file, see `write_virtual_log`; `force` lets it replace one.
+    """Runs a scenario in virtual time into a file, see `write_virtual_log`; `force` lets it
+    replace one.
 
     Raises:
         UsageError: the file exists, or cannot be made.
@@ -366,7 +456,9 @@ def record_virtual(
         LawFailed: a user law failed; the file is finished with the ticks before.
     """
     with LogFile(path, force=force) as stream:
-        return write_virtual_log(scenario, stream, stopped=stopped, views_hz=views_hz, hands=hands)
+        return write_virtual_log(
+            scenario, stream, stopped=stopped, views_hz=views_hz, hands=hands
+        )
 
 
 class SimulatedLog(Log):
@@ -384,7 +476,8 @@ class SimulatedLog(Log):
         self._make = make
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
-        """Writes the file that `trilat sim -o` writes, and returns its path; `force` lets it replace one.
+        """Writes the file that `trilat sim -o` writes, and returns its path; `force` lets it
+        replace one.
 
         The run is made once more, with the standard channels that viewers show.
 

@@ -1,7 +1,8 @@
 """Compares a log with virtual time and finds the samples that arrived late.
 
-Invariant (L2): virtual time fed with a log's arrivals equals that log on every tick, always; plain virtual
-time equals it until the first sample arrives after its due tick, or is lost on the way.
+Invariant (L2): virtual time fed with a log's arrivals equals that log on every tick, always;
+plain virtual time equals it until the first sample arrives after its due tick, or is lost on
+the way.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,12 +22,20 @@ from ..log.mcap_reader import Progress
 from ..scenario import Scenario
 from . import virtual
 from .resumption import ArrivalEntry, find_recorded_hand
-from .verify import RecordDifference, describe_law_failure, equal_bits, equal_record, find_first_difference
+from .verify import (
+    RecordDifference,
+    describe_law_failure,
+    equal_bits,
+    equal_record,
+    find_first_difference,
+)
 from .virtual_network import Network, RecordedNetwork, complete_deliveries, recorded_deliveries
 
 
 class RecordComparison(NamedTuple):
-    """Agreement of a log with another execution: equal bits, and the first difference by tick, then site."""
+    """Agreement of a log with another execution: equal bits, and the first difference by tick,
+    then site.
+    """
 
     records: int
     identical: int
@@ -34,7 +43,8 @@ class RecordComparison(NamedTuple):
 
 
 class LateSample(NamedTuple):
-    """A sample of a peer that was not at a site when it was due; the last two are the site's ticks.
+    """A sample of a peer that was not at a site when it was due; the last two are the site's
+    ticks.
 
     A sample that was lost on the way, not by its link's model, has no `arrived_tick`.
     """
@@ -53,7 +63,8 @@ class LateSample(NamedTuple):
 def compare_records(
     log: Log, executed: Iterable[tuple[str, TickRecord]], *, arrivals: bool
 ) -> RecordComparison:
-    """Compares every record of a log with another execution, (site, record) in any order, bit for bit.
+    """Compares every record of a log with another execution, (site, record) in any order, bit
+    for bit.
 
     Without `arrivals` only what was computed from them must be equal.
     """
@@ -82,11 +93,13 @@ def compare_records(
 def find_absent_samples(log: Log) -> list[LateSample]:
     """Returns every sample that was not there when it was due, by the tick at which it was due.
 
-    One that never came counts as lost if a record at that tick, or after it, still has an older one in use.
+    One that never came counts as lost if a record at that tick, or after it, still has an older
+    one in use.
     """
     absent = []
     for name in log.sites:
-        site = Site(log.scenario.setup(name)._replace(own=None))  # only its links matter: no law runs
+        # only its links matter: no law runs
+        site = Site(log.scenario.setup(name)._replace(own=None))
         part = log[name]
         ordered = log.commands(name)
         _, rows = part.arrivals
@@ -97,25 +110,50 @@ def find_absent_samples(log: Log) -> list[LateSample]:
             for command in ordered.get(state.tick, ()):
                 site.order(command, state.t_ns)
             for peer, tick, _ in state.rx:
-                made = 0 <= peer < len(ticks) and 0 <= tick < ticks[peer]  # a damaged record names any
+                # a damaged record names any
+                made = 0 <= peer < len(ticks) and 0 <= tick < ticks[peer]
                 due = site.release_tick(peer, tick) if made else None
                 if due is not None and due < state.tick and not site.measures(peer):
-                    absent.append(LateSample(name, site.peers[peer], tick, due, state.tick))
+                    absent.append(
+                        LateSample(
+                            site=name,
+                            peer=site.peers[peer],
+                            tick=tick,
+                            due_tick=due,
+                            arrived_tick=state.tick,
+                        )
+                    )
             for j, sender in enumerate(part.peers):
-                sent = min(state.t_ns * site.peer_rate_hz(j) // NS_PER_S, log.last_ticks[sender]) + 1
+                sent = (
+                    min(state.t_ns * site.peer_rate_hz(j) // NS_PER_S, log.last_ticks[sender])
+                    + 1
+                )
                 for tick in range(asked[j], sent):
-                    due = None if tick in came[j] or site.measures(j) else site.release_tick(j, tick)
+                    due = (
+                        None
+                        if tick in came[j] or site.measures(j)
+                        else site.release_tick(j, tick)
+                    )
                     if due is None:
                         continue
                     place = int(np.searchsorted(part.tick, due))
                     if (part.used[sender][place : place + 1] < tick).any():
-                        absent.append(LateSample(name, sender, tick, due, None))
+                        absent.append(
+                            LateSample(
+                                site=name,
+                                peer=sender,
+                                tick=tick,
+                                due_tick=due,
+                                arrived_tick=None,
+                            )
+                        )
                 asked[j] = max(asked[j], sent)
     return sorted(absent, key=lambda sample: sample.due_tick)
 
 
 class VirtualComparison(NamedTuple):
-    """A log against virtual time: equal if fed with its arrivals, else until the first late or lost sample.
+    """A log against virtual time: equal if fed with its arrivals, else until the first late or
+    lost sample.
 
     The plain one is empty if an arm is external: there is no such run.
     """
@@ -136,7 +174,9 @@ class VirtualComparison(NamedTuple):
 
     @property
     def excused_from(self) -> int | None:
-        """The tick from which plain virtual time may differ; None if every sample was there in time."""
+        """The tick from which plain virtual time may differ; None if every sample was there in
+        time.
+        """
         return self.absent[0].due_tick if self.absent else None
 
 
@@ -157,13 +197,22 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
         hands = {name: partial(find_recorded_hand, log[name]) for name in scenario.names}
 
         def execute(network: Network | None, before: int) -> Iterator[tuple[str, TickRecord]]:
-            ticks = virtual.execute_virtual(scenario, network, ordered, arms, log.last_ticks, hands)
+            ticks = virtual.execute_virtual(
+                scenario=scenario,
+                network=network,
+                commands=ordered,
+                measured=arms,
+                ends=log.last_ticks,
+                hands=hands,
+            )
             for n, (site, _, output) in enumerate(ticks):
                 if progress is not None and n % 256 == 0:
                     progress(before + n, total)
                 yield site.name, output
 
-        recorded = RecordedNetwork({name: _complete_arrivals(log, name) for name in log.sites}, peers)
+        recorded = RecordedNetwork(
+            {name: _complete_arrivals(log, name) for name in log.sites}, peers
+        )
         fed = compare_records(log, execute(recorded, 0), arrivals=True)
         if arms:
             plain = RecordComparison(0, 0, None)
@@ -173,16 +222,22 @@ def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualC
 
 
 def _complete_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
-    """Returns the arrivals of a site by tick; in gaps those that are assumed, if not too much is missing."""
+    """Returns the arrivals of a site by tick; in gaps those that are assumed, if not too much
+    is missing.
+    """
     part = log[name]
     rates_hz = [log.scenario.sites[peer].rate_hz for peer in part.peers]
     with suppress(LogError):
-        return complete_deliveries(part, rates_hz, [log.last_ticks[peer] for peer in part.peers]).at
+        return complete_deliveries(
+            part, rates_hz, [log.last_ticks[peer] for peer in part.peers]
+        ).at
     return recorded_deliveries(part).at
 
 
 def _recorded_scenario(log: Log) -> Scenario:
-    ends_s = [(log[name].last_tick + 1) / log[name].rate_hz for name in log.sites if len(log[name])]
+    ends_s = [
+        (log[name].last_tick + 1) / log[name].rate_hz for name in log.sites if len(log[name])
+    ]
     duration_s = min(log.scenario.duration_s, max(ends_s, default=log.scenario.duration_s))
     return msgspec.structs.replace(log.scenario, duration_s=duration_s)
 

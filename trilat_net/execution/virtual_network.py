@@ -1,9 +1,10 @@
-"""Networks of an execution: the receiver's tick at which each sample arrives, prompt or as a log recorded it.
+"""Networks of an execution: the receiver's tick at which each sample arrives, prompt or as a
+log recorded it.
 
-Invariant (L2): delay belongs to the link. A network only decides at which tick a sample arrives; as long as
-that precedes the tick at which the sample is due, the numbers do not depend on it. A rerun delivers a sample
-where the log says that it arrived, never where the log excludes it; in ticks without a record an arrival is
-assumed, and counted as such.
+Invariant (L2): delay belongs to the link. A network only decides at which tick a sample
+arrives; as long as that precedes the tick at which the sample is due, the numbers do not depend
+on it. A rerun delivers a sample where the log says that it arrived, never where the log
+excludes it; in ticks without a record an arrival is assumed, and counted as such.
 """
 
 from bisect import bisect_left
@@ -34,7 +35,9 @@ class Network(Protocol):
 
 
 class PromptNetwork:
-    """Every sample arrives at the first tick of the receiver after its stamp; `rates` by site, Hz."""
+    """Every sample arrives at the first tick of the receiver after its stamp; `rates` by site,
+    Hz.
+    """
 
     def __init__(self, rates: Mapping[str, int]) -> None:
         self._rates = rates
@@ -65,7 +68,9 @@ class PromptNetwork:
 
 
 class RecordedNetwork:
-    """Samples arrive where a log says that they did, per site and tick; running sites make their content."""
+    """Samples arrive where a log says that they did, per site and tick; running sites make
+    their content.
+    """
 
     def __init__(
         self,
@@ -106,7 +111,8 @@ class RecordedNetwork:
 
 
 class Deliveries(NamedTuple):
-    """The arrivals of one site per tick, in order, from the first tick with a record to the last, or -1.
+    """The arrivals of one site per tick, in order, from the first tick with a record to the
+    last, or -1.
 
     In the `unrecorded` ticks between them arrivals are assumed.
     """
@@ -129,12 +135,15 @@ def recorded_deliveries(part: SiteLog) -> Deliveries:
     return Deliveries(at, frozenset(), min(at, default=0), max(at, default=-1))
 
 
-def complete_deliveries(part: SiteLog, rates_hz: Sequence[int], ends: Sequence[int]) -> Deliveries:
+def complete_deliveries(
+    part: SiteLog, rates_hz: Sequence[int], ends: Sequence[int]
+) -> Deliveries:
     """Returns the arrivals of a site at every tick from its first record to its last.
 
-    At ticks without a record those samples arrive that no record lists and that can have arrived there: after
-    they were sent, after the last earlier sample that a record lists, before the first later one, as near as
-    possible to the median delay of their link. `ends` are the last ticks that the peers made.
+    At ticks without a record those samples arrive that no record lists and that can have
+    arrived there: after they were sent, after the last earlier sample that a record lists,
+    before the first later one, as near as possible to the median delay of their link. `ends`
+    are the last ticks that the peers made.
 
     Raises:
         LogError: fewer than half of those ticks have a record.
@@ -152,7 +161,14 @@ def complete_deliveries(part: SiteLog, rates_hz: Sequence[int], ends: Sequence[i
     missing = [tick for tick in range(known.first, known.last) if tick not in at]
     assumed: dict[int, list[list[int]]] = {}
     for peer, (peer_hz, end) in enumerate(zip(rates_hz, ends, strict=True)):
-        for tick, entry in _assume_arrivals(known, missing, part.rate_hz, peer, peer_hz, end):
+        for tick, entry in _assume_arrivals(
+            known=known,
+            missing=missing,
+            rate_hz=part.rate_hz,
+            peer=peer,
+            peer_hz=peer_hz,
+            end=end,
+        ):
             assumed.setdefault(tick, []).append(entry)
     filled = at | {tick: sorted(entries) for tick, entries in assumed.items()}
     return known._replace(at=filled, unrecorded=frozenset(missing))
@@ -201,9 +217,9 @@ def retime_deliveries(
 ) -> Deliveries:
     """Returns the arrivals over the same network for sites that tick at other rates.
 
-    A sample is under way for as long as the last sample of the log that was not stamped later, from its stamp
-    to the tick that received it; if that one never arrived, neither does this one. Rates, Hz: the site's and
-    its peers', in the log and in the rerun.
+    A sample is under way for as long as the last sample of the log that was not stamped later,
+    from its stamp to the tick that received it; if that one never arrived, neither does this
+    one. Rates, Hz: the site's and its peers', in the log and in the rerun.
     """
     end_ns = deliveries.last * NS_PER_S // rate_hz
     at: dict[int, list[ArrivalEntry]] = {}

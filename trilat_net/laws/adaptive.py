@@ -18,11 +18,12 @@ from .interface import ADAPTATION, CONVERGENCE, DAMPING, ERROR_DAMPING, ControlL
 class Adaptive(ControlLaw):
     """The paper's adaptive law, Eq. (13) and (15).
 
-    Stable for any constant delays without external torque, if the dominance matrix is irreducible and the Kd
-    of all sites are one matrix but for a scalar each (the paper's theorem, weights of docs/errata.md). This
-    is sufficient; it does not cover delays that vary.
+    Stable for any constant delays without external torque, if the dominance matrix is
+    irreducible and the Kd of all sites are one matrix but for a scalar each (the paper's
+    theorem, weights of docs/errata.md). This is sufficient; it does not cover delays that vary.
 
-    Gamma = 0 and theta_hat0 = theta make the law of known parameters; Kd = 0 removes the error's damping.
+    Gamma = 0 and theta_hat0 = theta make the law of known parameters; Kd = 0 removes the
+    error's damping.
 
     Attributes:
         Lambda: per joint, 1/s.
@@ -39,12 +40,24 @@ class Adaptive(ControlLaw):
     theta_hat0: Parameters = (0.0,)
 
     has_functional: ClassVar = True
-    tune: ClassVar = {"Lambda": CONVERGENCE, "Kp": DAMPING, "Kd": ERROR_DAMPING, "Gamma": ADAPTATION}
+    tune: ClassVar = {
+        "Lambda": CONVERGENCE,
+        "Kp": DAMPING,
+        "Kd": ERROR_DAMPING,
+        "Gamma": ADAPTATION,
+    }
     told: ClassVar = "gravity, as its first estimate"
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
         """Returns the gains for the core, for an arm of parameters theta."""
-        return Gains(Law.ADAPTIVE, self.Lambda, self.Kp, self.Kd, self.Gamma, self.theta_hat0)
+        return Gains(
+            law=Law.ADAPTIVE,
+            Lambda=self.Lambda,
+            Kp=self.Kp,
+            Kd=self.Kd,
+            Gamma=self.Gamma,
+            theta_hat0=self.theta_hat0,
+        )
 
     def exchanges_positions(self) -> bool:
         """True if it does not learn."""

@@ -14,9 +14,9 @@ from .interface import TuningSite
 class AdaptiveBox(Adaptive):
     """The paper's law with every estimate held in a box.
 
-    A box that holds the truth, at its edge too, keeps V' <= 0; one that holds it strictly inside also removes
-    the spring by which learning gravity ties the arms to a pose. Projection after Ioannou and Sun, "Robust
-    Adaptive Control" (1996), 4.4.
+    A box that holds the truth, at its edge too, keeps V' <= 0; one that holds it strictly
+    inside also removes the spring by which learning gravity ties the arms to a pose. Projection
+    after Ioannou and Sun, "Robust Adaptive Control" (1996), 4.4.
 
     Attributes:
         Lambda, Kp, Kd, Gamma, theta_hat0: as of `Adaptive`.

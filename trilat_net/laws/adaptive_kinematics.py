@@ -1,17 +1,19 @@
-"""The paper's law between the places of end effectors, with unknown masses and unknown lengths of the links.
+"""The paper's law between the places of end effectors, with unknown masses and unknown lengths
+of the links.
 
-The place x and its velocity are measured; the Jacobian is that of estimated lengths, J_hat = J + J~. With
-e = x - sum_j alpha_ij x_j(t - T), v = -J_hat^-1 Lambda e, a = v' and r = qd - v
+The place x and its velocity are measured; the Jacobian is that of estimated lengths, J_hat = J
++ J~. With e = x - sum_j alpha_ij x_j(t - T), v = -J_hat^-1 Lambda e, a = v' and r = qd - v
 
     tau = Y(q, qd, v, a) theta_hat - Kp r - J_hat' Kd ed
     theta_hat' = -Gamma Y' r,    l_hat' = Gamma_l Y_k' Kd ed,    Y_k l_hat = J_hat qd
 
-J_hat r = x' + Y_k (l_hat - l) + Lambda e: what the wrong lengths add to -r'J_hat' Kd ed the derivative of 1/2
-(l_hat - l)' Gamma_l^-1 (l_hat - l) takes away, and V' is that of known lengths (docs/laws.md).
+J_hat r = x' + Y_k (l_hat - l) + Lambda e: what the wrong lengths add to -r'J_hat' Kd ed the
+derivative of 1/2 (l_hat - l)' Gamma_l^-1 (l_hat - l) takes away, and V' is that of known
+lengths (docs/laws.md).
 
-Invariant: both estimates advance by the trapezoid rule, as that of the adaptive law; lengths stay in their
-box, which lets that term fall no less. Adaptive Jacobian after C. C. Cheah, C. Liu and J.-J. E. Slotine, Int.
-J. Robotics Research 25 (2006).
+Invariant: both estimates advance by the trapezoid rule, as that of the adaptive law; lengths
+stay in their box, which lets that term fall no less. Adaptive Jacobian after C. C. Cheah, C.
+Liu and J.-J. E. Slotine, Int. J. Robotics Research 25 (2006).
 """
 
 from collections.abc import Mapping
@@ -33,7 +35,9 @@ LEAST_SINE = 0.1
 
 
 @leaf
-def _solve(l1: float, l2: float, q0: float, q1: float, b0: float, b1: float) -> tuple[float, float]:
+def _solve(
+    l1: float, l2: float, q0: float, q1: float, b0: float, b1: float
+) -> tuple[float, float]:
     """Returns J^-1 b of the planar arm with these lengths."""
     (s0, c0) = sincos(q0)
     (s01, c01) = sincos(q0 + q1)
@@ -68,7 +72,9 @@ def _turn(
     qd: tuple[float, float],
     v: tuple[float, float],
 ) -> tuple[float, float]:
-    """Returns the derivative of the Jacobian, with the joints and the lengths at these rates, times v."""
+    """Returns the derivative of the Jacobian, with the joints and the lengths at these rates,
+    times v.
+    """
     (s0, c0) = sincos(q[0])
     (s01, c01) = sincos(q[0] + q[1])
     inner = lengths[0] * qd[0]
@@ -82,11 +88,13 @@ def _turn(
 
 @compiled
 class AdaptiveKinematics(ControlLaw):
-    """The paper's law between the places of end effectors, of planar arms whose lengths nobody knows.
+    """The paper's law between the places of end effectors, of planar arms whose lengths nobody
+    knows.
 
-    The place and velocity of the end effector are measured, and compared in the frame of the bases; masses
-    and lengths are learnt. C. C. Cheah, C. Liu and J.-J. E. Slotine, "Adaptive tracking control for robots
-    with unknown kinematic and dynamic properties", Int. J. Robotics Research 25(3), 283-296, 2006.
+    The place and velocity of the end effector are measured, and compared in the frame of the
+    bases; masses and lengths are learnt. C. C. Cheah, C. Liu and J.-J. E. Slotine, "Adaptive
+    tracking control for robots with unknown kinematic and dynamic properties", Int. J. Robotics
+    Research 25(3), 283-296, 2006.
 
     Attributes:
         Lambda: per coordinate x and y, 1/s.
@@ -112,7 +120,10 @@ class AdaptiveKinematics(ControlLaw):
 
     planar: ClassVar = True
     compares_places: ClassVar = True
-    sends: ClassVar[dict[str, Any]] = {"x": {"unit": "m", "length": 2}, "xd": {"unit": "m/s", "length": 2}}
+    sends: ClassVar[dict[str, Any]] = {
+        "x": {"unit": "m", "length": 2},
+        "xd": {"unit": "m/s", "length": 2},
+    }
     remembers: ClassVar = ("theta_hat", "Yr", "lengths_m", "rate_m_s")
     tune: ClassVar = {
         "Lambda": CONVERGENCE,
@@ -147,7 +158,8 @@ class AdaptiveKinematics(ControlLaw):
         for j in range(len(now.peers)):
             peer = now.peers[j]
             came = now.received[j]
-            if peer.tick >= 0:  # a peer of whom nothing came yet is where the arm itself is, and stands
+            # a peer of whom nothing came yet is where the arm itself is, and stands
+            if peer.tick >= 0:
                 e0 += peer.alpha * (x - came.x[0])
                 e1 += peer.alpha * (y - came.x[1])
                 ed0 -= peer.alpha * came.xd[0]
@@ -167,13 +179,22 @@ class AdaptiveKinematics(ControlLaw):
         l2 = self.lengths_m[1]
         g1 = self.rate_m_s[0] if self.least_m < l1 < self.most_m else 0.0
         g2 = self.rate_m_s[1] if self.least_m < l2 < self.most_m else 0.0
-        v = _solve(l1, l2, q[0], q[1], -self.Lambda[0] * e0, -self.Lambda[1] * e1)
-        turned = _turn((l1, l2), (g1, g2), q, qd, v)
-        a = _solve(l1, l2, q[0], q[1], -self.Lambda[0] * ed0 - turned[0], -self.Lambda[1] * ed1 - turned[1])
+        v = _solve(
+            l1=l1, l2=l2, q0=q[0], q1=q[1], b0=-self.Lambda[0] * e0, b1=-self.Lambda[1] * e1
+        )
+        turned = _turn(lengths=(l1, l2), rates=(g1, g2), q=q, qd=qd, v=v)
+        a = _solve(
+            l1=l1,
+            l2=l2,
+            q0=q[0],
+            q1=q[1],
+            b0=-self.Lambda[0] * ed0 - turned[0],
+            b1=-self.Lambda[1] * ed1 - turned[1],
+        )
         r = (qd[0] - v[0], qd[1] - v[1])
         now.tau[0] = -self.Kp[0] * r[0] - (l1 * pull[0] + l2 * pull[1])
         now.tau[1] = -self.Kp[1] * r[1] - l2 * pull[1]
-        first, second = regressor(self.g_m_s2, q, qd, v, a)
+        first, second = regressor(g=self.g_m_s2, q=q, qd=qd, v=v, a=a)
         for p in range(len(self.Yr)):
             Yr = first[p] * r[0] + second[p] * r[1]
             if now.k > 0:
@@ -184,9 +205,13 @@ class AdaptiveKinematics(ControlLaw):
             now.tau[1] += second[p] * self.theta_hat[p]
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the premises: constant delays, elbows that stay bent, lengths within their bounds."""
+        """Returns the premises: constant delays, elbows that stay bent, lengths within their
+        bounds.
+        """
         if np.isnan(situation.longest_s):
-            return StabilityCondition(None, "proved for constant delays, and a delay here varies")
+            return StabilityCondition(
+                None, "proved for constant delays, and a delay here varies"
+            )
         return StabilityCondition(
             None,
             f"for every constant delay, while abs(sin q2) > {LEAST_SINE:g} and the lengths are within "
@@ -195,5 +220,7 @@ class AdaptiveKinematics(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns tuned gains with the first estimate; lengths are learnt from those that the law assumes."""
+        """Returns tuned gains with the first estimate; lengths are learnt from those that the
+        law assumes.
+        """
         return {**gains, "theta_hat0": at.estimate}

@@ -1,4 +1,6 @@
-"""The adaptive law in a box, with a term against torque that no estimate explains; the kernel computes it."""
+"""The adaptive law in a box, with a term against torque that no estimate explains; the kernel
+computes it.
+"""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -15,11 +17,13 @@ from .interface import TuningSite
 
 
 class AdaptiveRobust(AdaptiveBox):
-    """The law with a box, and a term against torque that no estimate explains: - rho r / sqrt(r^2 + width^2).
+    """The law with a box, and a term against torque that no estimate explains: - rho r /
+    sqrt(r^2 + width^2).
 
-    For constant delays, no operator, theta in its box and a disturbance of at most rho at every joint, the
-    mean over time of what V dissipates is at most 0.3003 sum_i beta_i sum rho width; no more is claimed.
-    Smoothed after Slotine and Li, "Applied Nonlinear Control" (1991), 7.1; docs/laws.md derives the bound.
+    For constant delays, no operator, theta in its box and a disturbance of at most rho at every
+    joint, the mean over time of what V dissipates is at most 0.3003 sum_i beta_i sum rho width;
+    no more is claimed. Smoothed after Slotine and Li, "Applied Nonlinear Control" (1991), 7.1;
+    docs/laws.md derives the bound.
 
     Attributes:
         Lambda, Kp, Kd, Gamma, theta_hat0, theta_low, theta_high: as of `AdaptiveBox`.
@@ -54,5 +58,10 @@ class AdaptiveRobust(AdaptiveBox):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Where r = 0 the robust term damps by a tenth of Kp, which the joints can take besides."""
-        return {**AdaptiveBox.write_control(gains, at), "width_rad_s": 10.0 * gains["rho_nm"] / gains["Kp"]}
+        """Where r = 0 the robust term damps by a tenth of Kp, which the joints can take
+        besides.
+        """
+        return {
+            **AdaptiveBox.write_control(gains, at),
+            "width_rad_s": 10.0 * gains["rho_nm"] / gains["Kp"],
+        }

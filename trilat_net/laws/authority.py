@@ -3,8 +3,8 @@
     slave    tau = G + K (sum_j alpha_j q_j - q) - d qd
     user i   tau = G + K alpha_ij (q_j - q_i) - d qd_i,    j: the other user
 
-A user with the share a has alpha_ij = 1 - a: who leads less is guided more. What a user hears of the slave is
-left out.
+A user with the share a has alpha_ij = 1 - a: who leads less is guided more. What a user hears
+of the slave is left out.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,13 @@ from ..core.site_setup import Gains, Law
 from ..core.user_law import LawInput
 from ..core.vectors import Array
 from ..fields import NotNegative, NotNegativeJoints, PositiveJoints
-from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition, judge_position_exchange
+from .conditions import (
+    LawSituation,
+    LinearForm,
+    LinearSituation,
+    StabilityCondition,
+    judge_position_exchange,
+)
 from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 
 
@@ -25,8 +31,8 @@ from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 class Authority(ControlLaw):
     """Two users share the authority over a slave, and feel each other but not the environment.
 
-    After Nudehi, Mukherjee and Ghodoussi, "A shared-control approach to haptic interface design for minimally
-    invasive telesurgical training", IEEE T-CST, 2005.
+    After Nudehi, Mukherjee and Ghodoussi, "A shared-control approach to haptic interface design
+    for minimally invasive telesurgical training", IEEE T-CST, 2005.
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -62,7 +68,11 @@ class Authority(ControlLaw):
         """Returns the springs to the users."""
         form = LinearForm(len(at.inertia))
         for j in at.peers:
-            share = at.alpha[at.site, j] * float(getattr(at.laws[j], "leads", False)) * np.array(self.K)
+            share = (
+                at.alpha[at.site, j]
+                * float(getattr(at.laws[j], "leads", False))
+                * np.array(self.K)
+            )
             form.add("tau", "q", -share)
             form.add("tau", ("from", j), share)
             form.add(("to", j), "q", 1.0)
@@ -70,14 +80,26 @@ class Authority(ControlLaw):
 
     def explain_idle_shares(self, at: LawSituation) -> str:
         """Returns whom a user does not feel: those who do not lead."""
-        idle = [name for name, law in zip(at.names, at.laws, strict=True) if not getattr(law, "leads", False)]
-        return f"users feel those who lead alone, not {', '.join(idle)}" if self.leads and idle else ""
+        idle = [
+            name
+            for name, law in zip(at.names, at.laws, strict=True)
+            if not getattr(law, "leads", False)
+        ]
+        return (
+            f"users feel those who lead alone, not {', '.join(idle)}"
+            if self.leads and idle
+            else ""
+        )
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition of P+d among the users; the slave follows them and closes no loop."""
+        """Returns the condition of P+d among the users; the slave follows them and closes no
+        loop.
+        """
         users = [n for n, law in enumerate(situation.laws) if getattr(law, "leads", False)]
         if situation.site not in users:
-            return StabilityCondition(True, "it follows and closes no loop: stable for every delay and d > 0")
+            return StabilityCondition(
+                True, "it follows and closes no loop: stable for every delay and d > 0"
+            )
         among = situation.restrict(users)
         return judge_position_exchange(among, "K", "d")
 

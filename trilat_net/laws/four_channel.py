@@ -1,9 +1,10 @@
 """Positions and forces both ways: the four-channel law, and its relatives of fewer channels.
 
-q_des, qd_des, qdd_des and felt are weighted by dominance; tau_h is the torque ON an arm. With two sites, in
-Lawrence's symbols, C2 and C6 are gains of the master, C3 and C5 of the slave.
+q_des, qd_des, qdd_des and felt are weighted by dominance; tau_h is the torque ON an arm. With
+two sites, in Lawrence's symbols, C2 and C6 are gains of the master, C3 and C5 of the slave.
 
-Invariant: the acceleration that is sent is that of the arm's model under the torques of its tick.
+Invariant: the acceleration that is sent is that of the arm's model under the torques of its
+tick.
 """
 
 from typing import Any, ClassVar
@@ -33,9 +34,10 @@ _NEUTRAL = (
 class FourChannel(ControlLaw):
     """Positions and forces both ways, with known gravity.
 
-    tau = G + K (q_des - q) + B (qd_des - qd) + acceleration M qdd_des + force_peer felt + force_own tau_h.
-    Ideal transparency without delay: force_peer = 1 + force_own at both sites, acceleration = 1. Lawrence,
-    IEEE T-RA 9, 1993; local force feedback: Hashtrudi-Zaad and Salcudean, IEEE T-RA 18, 2002.
+    tau = G + K (q_des - q) + B (qd_des - qd) + acceleration M qdd_des + force_peer felt +
+    force_own tau_h. Ideal transparency without delay: force_peer = 1 + force_own at both sites,
+    acceleration = 1. Lawrence, IEEE T-RA 9, 1993; local force feedback: Hashtrudi-Zaad and
+    Salcudean, IEEE T-RA 18, 2002.
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -61,7 +63,8 @@ class FourChannel(ControlLaw):
         """Makes room for the arm's model."""
         self.needs_model = self.acceleration > 0.0
         self.limit = (np.zeros(facts.joints) + facts.tau_limit_nm).tolist()
-        self.rows = [0.0] * (facts.joints * (facts.joints + 1))  # M and the torque that accelerates it
+        # M and the torque that accelerates it
+        self.rows = [0.0] * (facts.joints * (facts.joints + 1))
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque; sends the acceleration that it makes."""
@@ -97,7 +100,9 @@ class FourChannel(ControlLaw):
             now.to_all.qdd[i] = rest / rows[i * width + i]
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the same law as one of known gravity, which has neither qdd nor the arm's own torque."""
+        """Returns the same law as one of known gravity, which has neither qdd nor the arm's own
+        torque.
+        """
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, Kd=self.B, d=(0.0,), k_f=self.force_peer, known=known)
 
@@ -113,7 +118,9 @@ class FourChannel(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns that acceleration = 1 is unstable with any delay; else Llewellyn's condition decides."""
+        """Returns that acceleration = 1 is unstable with any delay; else Llewellyn's condition
+        decides.
+        """
         if self.acceleration >= 1.0:
             return StabilityCondition(False, _NEUTRAL)
         return StabilityCondition(None, _LLEWELLYN)

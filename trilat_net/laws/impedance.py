@@ -1,11 +1,12 @@
-"""Impedance control of several users and a slave: each arm is made a mass, a damper and a spring.
+"""Impedance control of several users and a slave: each arm is made a mass, a damper and a
+spring.
 
-    M (qdd - 0) + B (qd - qd_ref) + K (q - q_ref) = tau_h + sum_j f_j(t - T)
-    tau = M(q) qdd + C qd + G - tau_h                                                (inner loop)
+    M (qdd - 0) + B (qd - qd_ref) + K (q - q_ref) = tau_h + sum_j f_j(t - T) tau = M(q) qdd + C
+    qd + G - tau_h                                                (inner loop)
 
-A master's reference is its start pose at rest; the slave's is the pose of the masters, weighted by its
-dominance factors alpha_j, and it sends alpha_j tau_h to master j: the force of its environment in the shares
-in which the masters lead it. Masters send nothing.
+A master's reference is its start pose at rest; the slave's is the pose of the masters, weighted
+by its dominance factors alpha_j, and it sends alpha_j tau_h to master j: the force of its
+environment in the shares in which the masters lead it. Masters send nothing.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,10 +25,11 @@ from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningSite
 
 @compiled
 class Impedance(ControlLaw):
-    """Impedance control of several users and a slave, by inverse dynamics with known parameters.
+    """Impedance control of several users and a slave, by inverse dynamics with known
+    parameters.
 
-    M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + what the slave sends of its environment's force. After
-    Shahbazi, Atashzar, Talebi and Patel, IEEE/ASME T-Mech 20(4), 2015.
+    M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + what the slave sends of its environment's
+    force. After Shahbazi, Atashzar, Talebi and Patel, IEEE/ASME T-Mech 20(4), 2015.
 
     Attributes:
         M: inertia of the impedance, per joint, kg m^2.
@@ -41,7 +43,9 @@ class Impedance(ControlLaw):
     K: PositiveJoints = (50.0,)
     follows: bool = False
 
-    sends: ClassVar[dict[str, Any]] = {"force": {"unit": "N m", "length": "joints", "per_peer": True}}
+    sends: ClassVar[dict[str, Any]] = {
+        "force": {"unit": "N m", "length": "joints", "per_peer": True}
+    }
     remembers: ClassVar = ("start",)
     tune: ClassVar = {"M": INERTIA, "B": DAMPING, "K": STIFFNESS}
     told: ClassVar = "gravity AND inertia exactly: more than the others"
@@ -64,7 +68,9 @@ class Impedance(ControlLaw):
             for j in range(len(now.peers)):
                 force += now.received[j].force[i]
                 now.sent[j].force[i] = (0.0 - now.tau_x[i]) * follows * now.peers[j].alpha
-            force -= self.B[i] * (now.qd[i] - follows * now.qd_des[i]) + self.K[i] * (now.q[i] - q_ref)
+            force -= self.B[i] * (now.qd[i] - follows * now.qd_des[i]) + self.K[i] * (
+                now.q[i] - q_ref
+            )
             self.qdd[i] = force / self.M[i]
         for i in range(now.joints):
             tau = now.bias[i] + now.tau_x[i]
@@ -95,15 +101,21 @@ class Impedance(ControlLaw):
         return "" if self.follows else "follows = false stays at its start pose"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the stiffest spring at the slave's arm for which the small-gain theorem holds."""
-        followers = [n for n, law in enumerate(situation.laws) if getattr(law, "follows", False)]
+        """Returns the stiffest spring at the slave's arm for which the small-gain theorem
+        holds.
+        """
+        followers = [
+            n for n, law in enumerate(situation.laws) if getattr(law, "follows", False)
+        ]
         if len(followers) != 1 or not all(law.kind is Impedance for law in situation.laws):
             return StabilityCondition(
                 False, "one site follows, and all the others have this law with follows = false"
             )
         K_e = find_stiffest_wall(situation.laws, situation.alpha[followers[0]], followers[0])
         if K_e == 0.0:
-            return StabilityCondition(False, "the small-gain theorem asks for B > 0 at every site")
+            return StabilityCondition(
+                False, "the small-gain theorem asks for B > 0 at every site"
+            )
         most = "of any stiffness" if K_e == np.inf else f"of up to {K_e:.4g} N m/rad"
         text = f"for any delays, varying ones too, in free motion and at a spring {most} at the slave"
         return StabilityCondition(True, f"{text} (small gain: sufficient)")
@@ -115,10 +127,12 @@ class Impedance(ControlLaw):
 
 
 def find_stiffest_wall(laws: Sequence[Any], shares: Array, slave: int) -> float:
-    """Returns the largest stiffness at the slave with loop gain below 1 at all frequencies, N m/rad.
+    """Returns the largest stiffness at the slave with loop gain below 1 at all frequencies, N
+    m/rad.
 
-    The loop from the slave's force to itself is sum a_i^2 K_e (K_s + B_s s) / ((M_s s^2 + B_s s + K_s + K_e)
-    (M_i s^2 + B_i s + K_i)), whatever its delays. inf: there is no largest; 0: not even free motion decays.
+    The loop from the slave's force to itself is sum a_i^2 K_e (K_s + B_s s) / ((M_s s^2 + B_s s
+    + K_s + K_e) (M_i s^2 + B_i s + K_i)), whatever its delays. inf: there is no largest; 0: not
+    even free motion decays.
     """
     s = 1j * np.geomspace(1e-2, 1e4, 4000)
     gains = [np.array([law.M, law.B, law.K]) for law in laws]
@@ -133,7 +147,9 @@ def find_stiffest_wall(laws: Sequence[Any], shares: Array, slave: int) -> float:
             if n != slave
         )
         walls = np.geomspace(1e-2, 1e6, 400)
-        loop = np.abs(walls[:, None] * (K + B * s) / (M * s * s + B * s + K + walls[:, None]) * back)
+        loop = np.abs(
+            walls[:, None] * (K + B * s) / (M * s * s + B * s + K + walls[:, None]) * back
+        )
         wrong = np.flatnonzero(loop.max(axis=1) >= 1.0)
         if len(wrong):
             most = min(most, float(walls[max(0, wrong[0] - 1)]))

@@ -1,8 +1,9 @@
 """What a built-in control law is made of, and the gains of a law as a scenario holds them.
 
-Invariant: a law is one class. Its annotations are its gains, with their ranges and defaults: of them the
-frozen `Settings` of a scenario are made, with the methods of the class that speak of gains; at a site an
-instance computes torques. The kernel's own laws have `gains` in place of `torque`.
+Invariant: a law is one class. Its annotations are its gains, with their ranges and defaults: of
+them the frozen `Settings` of a scenario are made, with the methods of the class that speak of
+gains; at a site an instance computes torques. The kernel's own laws have `gains` in place of
+`torque`.
 """
 
 import ast
@@ -26,7 +27,9 @@ from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCond
 from .sent_vectors import SentVectorSpecs, convert_sends
 
 GainRange = tuple[float, float, str] | tuple[float, float, str, str]
-"""Of a gain that is tuned: the least and the largest value, the unit, and the role of sites that have it."""
+"""Of a gain that is tuned: the least and the largest value, the unit, and the role of sites
+that have it.
+"""
 STIFFNESS = (1.0, 1000.0, "N m/rad")
 DAMPING = (0.5, 200.0, "N m s/rad")
 ERROR_DAMPING = (0.1, 50.0, "N m s/rad")
@@ -54,7 +57,9 @@ class TuningSite(NamedTuple):
 
 
 class LawSettings(Frozen, frozen=True):
-    """The gains of a law, and what the law says of itself with these; a law has its own of these methods."""
+    """The gains of a law, and what the law says of itself with these; a law has its own of
+    these methods.
+    """
 
     kind: ClassVar[Any] = None
     """The class of the law; of an imported one None."""
@@ -76,7 +81,9 @@ class LawSettings(Frozen, frozen=True):
 
     @property
     def books_energy(self) -> bool:
-        """True if it keeps account of energy together with the laws of its peers: then all sites have it."""
+        """True if it keeps account of energy together with the laws of its peers: then all
+        sites have it.
+        """
         return self.plugged and issubclass(self.kind, EnergyLaw)
 
     @property
@@ -85,7 +92,8 @@ class LawSettings(Frozen, frozen=True):
         return str(self.__struct_config__.tag)
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses gains that contradict each other, and a number of sites; errors call the law `path`.
+        """Refuses gains that contradict each other, and a number of sites; errors call the law
+        `path`.
 
         Raises:
             ScenarioError: with the path of the key.
@@ -100,7 +108,8 @@ class LawSettings(Frozen, frozen=True):
         return Gains(Law.OWN)
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the law of known gravity, or the adaptive one, whose small motions are this law's.
+        """Returns the law of known gravity, or the adaptive one, whose small motions are this
+        law's.
 
         With those of `linear_form`, if it has any; None: there is none.
         """
@@ -115,15 +124,21 @@ class LawSettings(Frozen, frozen=True):
         return ""
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns what the stability of the law at a site rests on; None if that is not known here."""
+        """Returns what the stability of the law at a site rests on; None if that is not known
+        here.
+        """
         return None
 
     def exchanges_positions(self) -> bool:
-        """True if the law is a spring between poses, with known gravity: shares have to be reversible."""
+        """True if the law is a spring between poses, with known gravity: shares have to be
+        reversible.
+        """
         return False
 
     def at_shares(self, names: Sequence[str], alpha: Array) -> Any:  # noqa: ARG002
-        """Returns the law with what it takes of the dominance factors at the start, alpha, shape (N, N)."""
+        """Returns the law with what it takes of the dominance factors at the start, alpha,
+        shape (N, N).
+        """
         return self
 
     def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
@@ -144,7 +159,9 @@ class LawSettings(Frozen, frozen=True):
             return None
 
         def make(context: LawContext) -> UserLaw:
-            check_law_class_at(self.kind, self.tag, context, sites, scheme)
+            check_law_class_at(
+                kind=self.kind, code=self.tag, context=context, sites=sites, scheme=scheme
+            )
             law: UserLaw = make_instance(self.kind, self.tag, context, asdict(self))
             return law
 
@@ -160,8 +177,8 @@ class ControlLaw:
     """A built-in control law; what `LawSettings` has besides, a law may have of its own.
 
     Attributes:
-        Settings: its gains as a scenario holds them.
-        sends, remembers, schemes, sites, needs_theta, needs_model: as of any law, see docs/own-controller.md.
+        Settings: its gains as a scenario holds them. sends, remembers, schemes, sites,
+        needs_theta, needs_model: as of any law, see docs/own-controller.md.
         tune: of the gains that are tuned their ranges, by name.
         told: what it uses of what all laws are told, in words.
     """
@@ -179,7 +196,9 @@ class ControlLaw:
     def __init__(self, facts: LawContext, **gains: Any) -> None:
         """Makes the law of a site with these gains; `facts` is what is known before the run."""
         for name, value in gains.items():
-            if not isinstance(getattr(type(self), name, None), bool | float | int | str | tuple | dict):
+            if not isinstance(
+                getattr(type(self), name, None), bool | float | int | str | tuple | dict
+            ):
                 raise TypeError(f"it has no gain {name!r}")
             setattr(self, name, value)
         self.begin(facts)
@@ -203,7 +222,9 @@ class ControlLaw:
 
 
 class EnergyLaw(ControlLaw):
-    """A law that keeps account of energy: what one end sends, the other books, so that all sites have it."""
+    """A law that keeps account of energy: what one end sends, the other books, so that all
+    sites have it.
+    """
 
     gravity: NotNegative = 1.0
     schemes: ClassVar[tuple[str, ...]] = ("digital",)
@@ -219,7 +240,10 @@ def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
         if not _is_class_variable(hint)
     }
     said = {
-        name: value for base in bases for name, value in vars(base).items() if _speaks_of_gains(name, value)
+        name: value
+        for base in bases
+        for name, value in vars(base).items()
+        if _speaks_of_gains(name, value)
     }
     made: Any = msgspec.defstruct(
         "Settings",
@@ -248,7 +272,9 @@ def _speaks_of_gains(name: str, value: Any) -> bool:
     return name in LawSettings.__annotations__
 
 
-def check_law_class_at(kind: Any, code: str, context: LawContext, sites: int, scheme: str) -> None:
+def check_law_class_at(
+    kind: Any, code: str, context: LawContext, sites: int, scheme: str
+) -> None:
     """Refuses a class that is no law, or none for such a site.
 
     A law may say what it is for: `sites = 2` or `sites = (2, 4)`, `schemes = ("digital",)`, and
@@ -258,12 +284,15 @@ def check_law_class_at(kind: Any, code: str, context: LawContext, sites: int, sc
         ScenarioError: with the path of the key.
     """
     path = f"sites.{context.site}.control.law"
-    keeps = any(hasattr(kind, name) for name in ("memory", "recall")) and not hasattr(kind, "remembers")
+    keeps = any(hasattr(kind, name) for name in ("memory", "recall")) and not hasattr(
+        kind, "remembers"
+    )
     methods = ("torque", "memory", "recall") if keeps else ("torque",)
     missing = [name for name in methods if not callable(getattr(kind, name, None))]
     if missing:
         raise ScenarioError(
-            f"{code} has no {', '.join(missing)}; see {find_page('own-controller.md')}", path=path
+            f"{code} has no {', '.join(missing)}; see {find_page('own-controller.md')}",
+            path=path,
         )
     if not (keeps or hasattr(kind, "remembers")) and (written := _find_written(kind)):
         raise ScenarioError(
@@ -272,16 +301,30 @@ def check_law_class_at(kind: Any, code: str, context: LawContext, sites: int, sc
             path=path,
         )
     stated = getattr(kind, "sites", None)
-    ends = (2, sys.maxsize) if stated is None else (stated, stated) if isinstance(stated, int) else stated
-    if not (isinstance(ends, tuple | list) and len(ends) == 2 and all(isinstance(n, int) for n in ends)):
-        raise ScenarioError(f"{code}: sites must be as in 2 or (2, 4), is {stated!r}", path=path)
+    ends = (
+        (2, sys.maxsize)
+        if stated is None
+        else (stated, stated)
+        if isinstance(stated, int)
+        else stated
+    )
+    if not (
+        isinstance(ends, tuple | list)
+        and len(ends) == 2
+        and all(isinstance(n, int) for n in ends)
+    ):
+        raise ScenarioError(
+            f"{code}: sites must be as in 2 or (2, 4), is {stated!r}", path=path
+        )
     least, most = ends
     if not least <= sites <= most:
         wanted = f"{least}" if least == most else f"{least} to {most}"
         raise ScenarioError(f"{code} is for {wanted} sites, and here are {sites}", path=path)
     if scheme not in (schemes := getattr(kind, "schemes", None) or (scheme,)):
         wanted = " or ".join(map(repr, schemes))
-        raise ScenarioError(f"{code} is for scheme = {wanted}, and here it is {scheme!r}", path=path)
+        raise ScenarioError(
+            f"{code} is for scheme = {wanted}, and here it is {scheme!r}", path=path
+        )
     if getattr(kind, "needs_theta", False) and not context.theta:
         raise ScenarioError(
             f"{code} needs the arm's parameters, which are unknown (arm.known = false): identify the arm "
@@ -292,15 +335,24 @@ def check_law_class_at(kind: Any, code: str, context: LawContext, sites: int, sc
 
 def _find_written(kind: Any) -> list[str]:
     """Returns what a class writes of itself after `__init__`, unless by calls, as of append."""
-    methods = [one for base in kind.__mro__ for one in vars(base).values() if inspect.isfunction(one)]
-    sources = [textwrap.dedent(inspect.getsource(one)) for one in methods if one.__name__ != "__init__"]
+    methods = [
+        one for base in kind.__mro__ for one in vars(base).values() if inspect.isfunction(one)
+    ]
+    sources = [
+        textwrap.dedent(inspect.getsource(one)) for one in methods if one.__name__ != "__init__"
+    ]
     nodes = (node for text in sources for node in ast.walk(ast.parse(text)))
-    written = [ast.unparse(node) for node in nodes if isinstance(getattr(node, "ctx", None), ast.Store)]
+    written = [
+        ast.unparse(node) for node in nodes if isinstance(getattr(node, "ctx", None), ast.Store)
+    ]
     return [found[1] for one in written if (found := re.match(r"self\.(\w+)", one))]
 
 
-def make_instance(kind: Any, code: str, context: Any, settings: dict[str, Any], path: str = "") -> Any:
-    """Returns a law, or what else a class makes of its context and settings; errors call the key `path`.
+def make_instance(
+    kind: Any, code: str, context: Any, settings: dict[str, Any], path: str = ""
+) -> Any:
+    """Returns a law, or what else a class makes of its context and settings; errors call the
+    key `path`.
 
     Raises:
         ScenarioError: it raised.
@@ -309,5 +361,9 @@ def make_instance(kind: Any, code: str, context: Any, settings: dict[str, Any], 
         return kind(context, **settings)
     except (Exception, SystemExit) as error:  # the user's code
         given = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
-        problem = f"cannot be made with {given or 'no settings'}: {type(error).__name__}: {error}"
-        raise ScenarioError(f"{code} {problem}", path=path or f"sites.{context.site}.control") from None
+        problem = (
+            f"cannot be made with {given or 'no settings'}: {type(error).__name__}: {error}"
+        )
+        raise ScenarioError(
+            f"{code} {problem}", path=path or f"sites.{context.site}.control"
+        ) from None

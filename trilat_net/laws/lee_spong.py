@@ -1,4 +1,6 @@
-"""PD+d under its published bound of the damping; the kernel computes it (`core.control.damped_torque`)."""
+"""PD+d under its published bound of the damping; the kernel computes it
+(`core.control.damped_torque`).
+"""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -13,7 +15,8 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw, TuningSite
 class LeeSpong(ControlLaw):
     """PD+d under its published bound: d = K T_max + P_e for delays up to T_max.
 
-    Lee and Spong, "Passive bilateral teleoperation with constant time delay", IEEE T-RO 22, 2006.
+    Lee and Spong, "Passive bilateral teleoperation with constant time delay", IEEE T-RO 22,
+    2006.
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -35,7 +38,8 @@ class LeeSpong(ControlLaw):
     def damping(self) -> tuple[float, ...]:
         """The damping d per joint, N m s/rad."""
         return tuple(
-            stiff * 1e-3 * self.T_max_ms + extra for stiff, extra in zip(self.K, self.P_e, strict=True)
+            stiff * 1e-3 * self.T_max_ms + extra
+            for stiff, extra in zip(self.K, self.P_e, strict=True)
         )
 
     def gains(self, theta: Array) -> Gains:
@@ -49,6 +53,8 @@ class LeeSpong(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """T_max is half of the longest mean round trip: for delays that vary its bound is not proved."""
+        """T_max is half of the longest mean round trip: for delays that vary its bound is not
+        proved.
+        """
         told = {"T_max_ms": at.longest_ms, "gravity": at.gravity}
         return {"K": gains["K"], "Kd": gains["Kd"], "P_e": gains["d_extra"], **told}

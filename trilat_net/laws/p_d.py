@@ -11,10 +11,11 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 class PD(ControlLaw):
     """P+d with known gravity: tau = G(q) - K e - d qd.
 
-    For reversible shares, equal gains and one constant delay T the linearised loop of N sites is stable
-    whatever the masses if d > max(abs(lambda_min(alpha)), 0.2172) K T, and for some masses only then; two
-    sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares some heavy arms are unstable at any d. That
-    is in continuous time: held torques need more (docs/laws.md).
+    For reversible shares, equal gains and one constant delay T the linearised loop of N sites
+    is stable whatever the masses if d > max(abs(lambda_min(alpha)), 0.2172) K T, and for some
+    masses only then; two sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares some
+    heavy arms are unstable at any d. That is in continuous time: held torques need more
+    (docs/laws.md).
 
     Attributes:
         K: stiffness per joint, N m/rad.

@@ -1,4 +1,6 @@
-"""Direct force reflection with known gravity; the kernel computes it (`core.control.damped_torque`)."""
+"""Direct force reflection with known gravity; the kernel computes it
+(`core.control.damped_torque`).
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -14,10 +16,10 @@ from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 class PF(ControlLaw):
     """Direct force reflection with known gravity: tau = G(q) - K e - d qd + k_f felt.
 
-    `felt` is the torque of operators and environments on the peers' arms as received, weighted by dominance.
-    A slave has K and k_f = 0, a master K = 0 and k_f. It is stable in free motion; for any passive operator
-    and wall the master needs d >= k_f (2 K T + d_s)^2 / (4 d_s), K and d_s of the slave. It is for one master
-    and one slave.
+    `felt` is the torque of operators and environments on the peers' arms as received, weighted
+    by dominance. A slave has K and k_f = 0, a master K = 0 and k_f. It is stable in free
+    motion; for any passive operator and wall the master needs d >= k_f (2 K T + d_s)^2 / (4
+    d_s), K and d_s of the slave. It is for one master and one slave.
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -40,7 +42,9 @@ class PF(ControlLaw):
 
     def gains(self, theta: Array) -> Gains:
         """Returns the gains for the core, for an arm of parameters theta."""
-        return Gains(Law.KNOWN, K=self.K, d=self.d, k_f=self.k_f, known=(theta * self.gravity).tolist())
+        return Gains(
+            Law.KNOWN, K=self.K, d=self.d, k_f=self.k_f, known=(theta * self.gravity).tolist()
+        )
 
     def check(self, path: str, sites: int) -> None:
         """Refuses more sites than two: nobody could tell whose contact is felt."""
@@ -73,5 +77,10 @@ class PF(ControlLaw):
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
         """Returns the gains of a site by its role."""
         if at.role == "master":
-            return {"K": 0.0, "d": gains["d_master"], "k_f": gains["k_f"], "gravity": at.gravity}
+            return {
+                "K": 0.0,
+                "d": gains["d_master"],
+                "k_f": gains["k_f"],
+                "gravity": at.gravity,
+            }
         return {"K": gains["K"], "d": gains["d_slave"], "k_f": 0.0, "gravity": at.gravity}

@@ -11,7 +11,8 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw
 class PdD(ControlLaw):
     """PD+d with known gravity: tau = G(q) - K e - Kd ed - d qd.
 
-    For constant delays, and Kd / K alike at all sites, the condition of P+d on K and d is sufficient.
+    For constant delays, and Kd / K alike at all sites, the condition of P+d on K and d is
+    sufficient.
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -29,7 +30,9 @@ class PdD(ControlLaw):
 
     def gains(self, theta: Array) -> Gains:
         """Returns the gains for the core, for an arm of parameters theta."""
-        return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.d, known=(theta * self.gravity).tolist())
+        return Gains(
+            Law.KNOWN, K=self.K, Kd=self.Kd, d=self.d, known=(theta * self.gravity).tolist()
+        )
 
     def exchanges_positions(self) -> bool:
         """True if it knows gravity exactly."""

@@ -19,10 +19,11 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 
 @compiled
 class SaturatedPd(ControlLaw):
-    """P+d whose pull towards each peer saturates: tau = G - sum alpha_ij P tanh(K (q - q_j) / P) - d qd.
+    """P+d whose pull towards each peer saturates: tau = G - sum alpha_ij P tanh(K (q - q_j) /
+    P) - d qd.
 
-    Zakerimanesh, Hashemzadeh and Ghiasi, "Dual-user nonlinear teleoperation subjected to varying time delay
-    and bounded inputs", ISA Transactions 68, 2017.
+    Zakerimanesh, Hashemzadeh and Ghiasi, "Dual-user nonlinear teleoperation subjected to
+    varying time delay and bounded inputs", ISA Transactions 68, 2017.
 
     Attributes:
         K: stiffness of small errors, per joint, N m/rad.
@@ -36,9 +37,7 @@ class SaturatedPd(ControlLaw):
     d: NotNegativeJoints = (3.0,)
     gravity: NotNegative = 1.0
 
-    linear_note: ClassVar = (
-        "saturated_pd has the slope K of small errors: where sites disagree at rest it pulls less"
-    )
+    linear_note: ClassVar = "saturated_pd has the slope K of small errors: where sites disagree at rest it pulls less"
     tune: ClassVar = {"K": STIFFNESS, "P": (0.5, 50.0, "N m"), "d": DAMPING}
     needs_theta: ClassVar = True
 
@@ -48,7 +47,11 @@ class SaturatedPd(ControlLaw):
             tau = self.gravity * now.gravity[i] - self.d[i] * now.qd[i]
             for j in range(len(now.peers)):
                 peer = now.peers[j]
-                tau -= peer.alpha * self.P[i] * tanh(self.K[i] * (now.q[i] - peer.q[i]) / self.P[i])
+                tau -= (
+                    peer.alpha
+                    * self.P[i]
+                    * tanh(self.K[i] * (now.q[i] - peer.q[i]) / self.P[i])
+                )
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
@@ -56,10 +59,14 @@ class SaturatedPd(ControlLaw):
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=(theta * self.gravity).tolist())
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition of P+d (the slope is nowhere above K), and what the torque limit leaves."""
+        """Returns the condition of P+d (the slope is nowhere above K), and what the torque
+        limit leaves.
+        """
         found = judge_position_exchange(situation, "K", "d")
         if not situation.gravity_nm:
-            return found._replace(text=f"{found.text}; and tau_limit_nm above gravity + P + d |qd|")
+            return found._replace(
+                text=f"{found.text}; and tau_limit_nm above gravity + P + d |qd|"
+            )
         gravity = self.gravity * np.array(situation.gravity_nm)
         room = np.array(situation.tau_limit_nm) - gravity - np.array(self.P)
         if room.min() <= 0.0:

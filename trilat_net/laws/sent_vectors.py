@@ -1,7 +1,7 @@
 """What a control law sends to its peers, as its class declares it.
 
-Invariant: a declaration is a literal in the class of the law, so that nothing of a user's code runs to read
-it; it stands in the resolved scenario, which is enough to read the law's records.
+Invariant: a declaration is a literal in the class of the law, so that nothing of a user's code
+runs to read it; it stands in the resolved scenario, which is enough to read the law's records.
 """
 
 import ast
@@ -26,20 +26,27 @@ class SentVectorSpec(Frozen, frozen=True):
 
     Attributes:
         unit: of its numbers, as in "J"; "" for those without.
-        length: how many numbers it has: "joints", "coordinates" (that sites share), or a number.
+        length: how many numbers it has: "joints", "coordinates" (that sites share), or a
+            number.
         per_peer: true: another one for each peer; false: the same for all.
     """
 
     unit: Annotated[str, Meta(max_length=24, pattern=r"^[ -~]*$")] = ""
-    length: Literal["joints", "coordinates"] | Annotated[int, Meta(ge=1, le=MAX_SENT * MAX_JOINTS)] = "joints"
+    length: (
+        Literal["joints", "coordinates"] | Annotated[int, Meta(ge=1, le=MAX_SENT * MAX_JOINTS)]
+    ) = "joints"
     per_peer: bool = False
 
 
 SentVectorSpecs = dict[str, SentVectorSpec]
 
 
-def build_channel(sends: Mapping[str, SentVectorSpec], layout: Layout, peers: int) -> LawChannel:
-    """Returns the channel of a law at a site with vectors of such lengths and with so many peers."""
+def build_channel(
+    sends: Mapping[str, SentVectorSpec], layout: Layout, peers: int
+) -> LawChannel:
+    """Returns the channel of a law at a site with vectors of such lengths and with so many
+    peers.
+    """
     counts = {"joints": layout.joints, "coordinates": layout.shared}
     vectors = [
         SentVector(
@@ -54,13 +61,19 @@ def build_channel(sends: Mapping[str, SentVectorSpec], layout: Layout, peers: in
 
 
 def check_sends(channel: LawChannel, joints: int, path: str) -> None:
-    """Refuses names that no attribute can have, and more numbers than a sample holds; `path`: of the law.
+    """Refuses names that no attribute can have, and more numbers than a sample holds; `path`:
+    of the law.
 
     Raises:
         ScenarioError: with the path of the key.
     """
     for name, *_ in channel.vectors:
-        if not name.isidentifier() or keyword.iskeyword(name) or name.startswith("_") or len(name) > 24:
+        if (
+            not name.isidentifier()
+            or keyword.iskeyword(name)
+            or name.startswith("_")
+            or len(name) > 24
+        ):
             problem = "is no name for a vector: a letter, then letters, digits and _, at most 24 of them"
         elif hasattr(np.record, name) or hasattr(tuple, name):
             problem = "is taken: every record of numbers has an attribute of that name; choose another"
@@ -84,7 +97,8 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
 
 
 def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDef]:
-    """Returns the classes that a file defines at its top level, by their names; nothing of it runs.
+    """Returns the classes that a file defines at its top level, by their names; nothing of it
+    runs.
 
     Raises:
         ScenarioError: it is no Python.
@@ -97,16 +111,24 @@ def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDe
 
 
 def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpecs:
-    """Returns what the class of a law declares that it sends, as its file writes it, without running it.
+    """Returns what the class of a law declares that it sends, as its file writes it, without
+    running it.
 
     Raises:
-        ScenarioError: the file is no Python, or the declaration is no literal, or none of vectors.
+        ScenarioError: the file is no Python, or the declaration is no literal, or none of
+            vectors.
     """
     found: Any = {}
     law = parse_classes(source, file, path).get(code.partition(":")[2])
-    for node in (line for line in (law.body if law else ()) if isinstance(line, ast.Assign | ast.AnnAssign)):
+    for node in (
+        line
+        for line in (law.body if law else ())
+        if isinstance(line, ast.Assign | ast.AnnAssign)
+    ):
         targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-        if node.value is None or "sends" not in {one.id for one in targets if isinstance(one, ast.Name)}:
+        if node.value is None or "sends" not in {
+            one.id for one in targets if isinstance(one, ast.Name)
+        }:
             continue
         where = f"{code}: sends in line {node.lineno} of {file.name}"
         try:

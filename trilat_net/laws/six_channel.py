@@ -12,9 +12,9 @@ from .four_channel import FourChannel
 class SixChannel(FourChannel):
     """The four-channel law of two users and a slave whose dominance is one factor a.
 
-    The sites are user 1, user 2 and slave, in this order. User 1 follows the slave by a and user 2 by 1 - a,
-    user 2 the slave by 1 - a and user 1 by a, the slave user 1 by a and user 2 by 1 - a. After Khademian and
-    Hashtrudi-Zaad, IEEE/ASME T-Mech 17, 2012.
+    The sites are user 1, user 2 and slave, in this order. User 1 follows the slave by a and
+    user 2 by 1 - a, user 2 the slave by 1 - a and user 1 by a, the slave user 1 by a and user 2
+    by 1 - a. After Khademian and Hashtrudi-Zaad, IEEE/ASME T-Mech 17, 2012.
     """
 
     sites: ClassVar = 3

@@ -1,11 +1,11 @@
 """P+d of a master and a slave with a Smith predictor at the master.
 
-    slave    tau = G - K (q_s - q_m(t - T)) - d qd_s,  sends w = q_s - x,  x: the model under q_m(t - T)
-    master   tau = G - K (q_m - x - w(t - T)) - d qd_m,  x: the model under q_m now
+    slave    tau = G - K (q_s - q_m(t - T)) - d qd_s,  sends w = q_s - x,  x: the model under
+    q_m(t - T) master   tau = G - K (q_m - x - w(t - T)) - d qd_m,  x: the model under q_m now
     model    inertia x'' = K (q_m - x) - d x'
 
-Both ends run the same model, so that nothing of the past is kept, however long a delay is: w is what the
-model misses, as of contact. A master is told apart by what it leads.
+Both ends run the same model, so that nothing of the past is kept, however long a delay is: w is
+what the model misses, as of contact. A master is told apart by what it leads.
 
 Invariant: the model moves as an arm does whose torque is held over a tick (`digital`).
 """
@@ -28,12 +28,14 @@ from .interface import DAMPING, INERTIA, STIFFNESS, ControlLaw, TuningSite
 class Smith(ControlLaw):
     """P+d of a master and a slave with a Smith predictor of the slave at the master.
 
-    Smith, "Closer control of loops with dead time", Chemical Engineering Progress 53, 1957 (from memory).
+    Smith, "Closer control of loops with dead time", Chemical Engineering Progress 53, 1957
+    (from memory).
 
     Attributes:
         K: stiffness per joint, N m/rad.
         d: damping of the arm's velocity, per joint, N m s/rad.
-        inertia: of the model of the slave, per joint, kg m^2; K, d and inertia are alike at both sites.
+        inertia: of the model of the slave, per joint, kg m^2; K, d and inertia are alike at
+            both sites.
         predicts: true of the master.
         gravity: share of gravity that it knows, 1: exactly.
     """
@@ -62,7 +64,11 @@ class Smith(ControlLaw):
             if now.k == 0:
                 self.x[i] = now.peers[0].q[i] if self.predicts else now.q[i]
             goal = self.x[i] + now.received[0].w[i] if self.predicts else now.peers[0].q[i]
-            now.tau[i] = self.gravity * now.gravity[i] - self.K[i] * (now.q[i] - goal) - self.d[i] * now.qd[i]
+            now.tau[i] = (
+                self.gravity * now.gravity[i]
+                - self.K[i] * (now.q[i] - goal)
+                - self.d[i] * now.qd[i]
+            )
             now.to_all.w[i] = 0.0 if self.predicts else now.q[i] - self.x[i]
             leads = now.q[i] if self.predicts else goal
             pull = self.K[i] * (leads - self.x[i]) - self.d[i] * self.xd[i]
@@ -76,7 +82,9 @@ class Smith(ControlLaw):
         return Gains(Law.KNOWN, K=K, d=self.d, known=(theta * self.gravity).tolist())
 
     def linear_form(self, at: LinearSituation) -> LinearForm | None:
-        """Returns the model, which the master has under its own pose and the slave under what came."""
+        """Returns the model, which the master has under its own pose and the slave under what
+        came.
+        """
         (peer,) = at.peers
         K = np.array(self.K)
         m = np.array(self.inertia)
@@ -100,7 +108,9 @@ class Smith(ControlLaw):
         if [getattr(law, "predicts", None) for law in laws].count(True) != 1:
             return StabilityCondition(False, "one of the two sites has predicts = true")
         if any(
-            getattr(law, key, None) != getattr(self, key) for law in laws for key in ("K", "d", "inertia")
+            getattr(law, key, None) != getattr(self, key)
+            for law in laws
+            for key in ("K", "d", "inertia")
         ):
             return StabilityCondition(False, "K, d and inertia must be alike at both sites")
         text = "a slave in free motion whose inertia is the model's makes the loop one without delay (d > 0)"

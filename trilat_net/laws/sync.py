@@ -1,6 +1,7 @@
 """Adaptive synchronisation of outputs r = qd + Lambda q, with its defect under gravity.
 
-r has the absolute pose in it. With gravity every equilibrium has Y_G' r = 0, so the arms end at q = 0.
+r has the absolute pose in it. With gravity every equilibrium has Y_G' r = 0, so the arms end at
+q = 0.
 
 Invariant: the estimate advances by the trapezoid rule, as that of the adaptive law.
 """
@@ -24,9 +25,10 @@ from .interface import ADAPTATION, CONVERGENCE, DAMPING, ControlLaw, TuningSite
 class Sync(ControlLaw):
     """Adaptive synchronisation of r = qd + Lambda q: under gravity all arms end at q = 0.
 
-    tau = Y(q, qd, -Lambda q, -Lambda qd) theta_hat + K (sum alpha_ij r_j - r), theta_hat' = -Gamma Y' r. For
-    planar arms. Chopra, Spong and Lozano, "Synchronization of bilateral teleoperators with time delay",
-    Automatica 44, 2008; the defect: Nuno, Ortega and Basanez, Automatica 46, 2010.
+    tau = Y(q, qd, -Lambda q, -Lambda qd) theta_hat + K (sum alpha_ij r_j - r), theta_hat' =
+    -Gamma Y' r. For planar arms. Chopra, Spong and Lozano, "Synchronization of bilateral
+    teleoperators with time delay", Automatica 44, 2008; the defect: Nuno, Ortega and Basanez,
+    Automatica 46, 2010.
 
     Attributes:
         Lambda: per joint, 1/s.
@@ -59,7 +61,7 @@ class Sync(ControlLaw):
         w1 = now.qd[1]
         v = (-self.Lambda[0] * q0, -self.Lambda[1] * q1)
         a = (-self.Lambda[0] * w0, -self.Lambda[1] * w1)
-        first, second = regressor(self.g_m_s2, (q0, q1), (w0, w1), v, a)
+        first, second = regressor(g=self.g_m_s2, q=(q0, q1), qd=(w0, w1), v=v, a=a)
         r0 = w0 - v[0]
         r1 = w1 - v[1]
         now.tau[0] = self.K[0] * (now.qd_des[0] + self.Lambda[0] * now.q_des[0] - r0)
@@ -75,13 +77,17 @@ class Sync(ControlLaw):
 
     def linear_gains(self, theta: Array) -> Gains | None:  # noqa: ARG002
         """Returns the adaptive law whose r is that of the absolute pose."""
-        gains = Gains(Law.ADAPTIVE, self.Lambda, self.K, Gamma=self.Gamma, theta_hat0=self.theta_hat0)
+        gains = Gains(
+            Law.ADAPTIVE, self.Lambda, self.K, Gamma=self.Gamma, theta_hat0=self.theta_hat0
+        )
         return gains._replace(absolute=True)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
         """Returns that every constant delay is allowed, and what it then does."""
         if np.isnan(situation.longest_s):
-            return StabilityCondition(None, "proved for constant delays, and a delay here varies")
+            return StabilityCondition(
+                None, "proved for constant delays, and a delay here varies"
+            )
         text = "r of all sites agree for every constant delay, any Lambda, K and Gamma > 0 (sufficient)"
         return StabilityCondition(
             True, f"{text}; but under gravity the arms end at q = 0, wherever they are led"

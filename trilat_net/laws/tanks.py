@@ -1,8 +1,10 @@
-"""Two layers: a transparency layer that may do anything, over a tank of energy that pays for it.
+"""Two layers: a transparency layer that may do anything, over a tank of energy that pays for
+it.
 
-Invariant: a tank is filled by the work that the arm does on its controller and by the energy packets of the
-peers, and pays the work that the torque does on the arm, tau times the step in q; where it is empty, there is
-no torque of the transparency layer. Packets are cumulative: lost samples cost nothing.
+Invariant: a tank is filled by the work that the arm does on its controller and by the energy
+packets of the peers, and pays the work that the torque does on the arm, tau times the step in
+q; where it is empty, there is no torque of the transparency layer. Packets are cumulative: lost
+samples cost nothing.
 """
 
 from typing import Any, ClassVar
@@ -21,8 +23,8 @@ from .interface import ERROR_DAMPING, STIFFNESS, EnergyLaw
 class Tanks(EnergyLaw):
     """Two layers: springs to the reference, over a tank per site that pays for what they do.
 
-    Any shares, any delays: the tanks are passive. Franken, Stramigioli, Misra, Secchi and Macchelli, IEEE
-    Transactions on Robotics 27 (4), 2011.
+    Any shares, any delays: the tanks are passive. Franken, Stramigioli, Misra, Secchi and
+    Macchelli, IEEE Transactions on Robotics 27 (4), 2011.
 
     Attributes:
         K: stiffness of the transparency layer per joint, N m/rad.
@@ -32,8 +34,8 @@ class Tanks(EnergyLaw):
         fill_nm_s_rad_J: damping of the arm per energy that is missing from it, N m s/rad/J.
         packet_1_s: rate at which a tank is emptied towards the peers, 1/s.
         by_shares: true: peers get parts by this site's dominance factors; false: equal ones.
-        acceleration_rad_s2: most by which a joint accelerates, as far as tanks cover it: in the period to
-            come it moves by qd h and half of this times h^2 more.
+        acceleration_rad_s2: most by which a joint accelerates, as far as tanks cover it: in the
+            period to come it moves by qd h and half of this times h^2 more.
     """
 
     K: PositiveJoints = (100.0,)
@@ -46,7 +48,10 @@ class Tanks(EnergyLaw):
     acceleration_rad_s2: NotNegative = 100.0
 
     sends: ClassVar[Any] = {
-        "H": {"unit": "J", "length": 1},  # what is in the tank: peers have no use for it, logs have
+        "H": {
+            "unit": "J",
+            "length": 1,
+        },  # what is in the tank: peers have no use for it, logs have
         "E": {"unit": "J", "length": 1, "per_peer": True},
     }
     remembers: ClassVar = ("E_seen", "carried")
@@ -89,7 +94,9 @@ class Tanks(EnergyLaw):
         damping = 0.0
         if self.guarded:
             affordable = (
-                0.0 if H <= 0.0 else min(1.0, H / max(abs(power) * now.h_s + force * self.farther, H))
+                0.0
+                if H <= 0.0
+                else min(1.0, H / max(abs(power) * now.h_s + force * self.farther, H))
             )
             damping = self.fill_nm_s_rad_J * max(self.level_J - H, 0.0)
         for i in range(n):
@@ -102,7 +109,14 @@ class Tanks(EnergyLaw):
         took = [seen.memory["E_seen"][:, j : j + 1] for j in range(len(gave))]
         port = -sum_work(seen.tau - seen.memory["carried"], seen.q)
         taken = np.zeros(len(port))
-        return LawEnergies(gave, took, port, seen.to_all["H"], taken, gravity=self.gravity)
+        return LawEnergies(
+            gave=gave,
+            took=took,
+            port=port,
+            store=seen.to_all["H"],
+            taken=taken,
+            gravity=self.gravity,
+        )
 
     def explain_no_linear_form(self) -> str:
         """Returns why it cannot be linearised."""

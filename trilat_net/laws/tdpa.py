@@ -1,11 +1,13 @@
-"""Time-domain passivity control: each end of a coupling watches what it takes out, and limits it.
+"""Time-domain passivity control: each end of a coupling watches what it takes out, and limits
+it.
 
-Invariant: in every directed coupling of a follower to a leader each end books, cumulatively and per joint,
-the energy that it puts in; the other end takes out no more than it knows of.
+Invariant: in every directed coupling of a follower to a leader each end books, cumulatively and
+per joint, the energy that it puts in; the other end takes out no more than it knows of.
 
-A follower is moved by F = K (goal - q) + B (v - qd), goal += h v, v = sum alpha_j v_j: the velocities of the
-peers by dominance. Peer j feels -alpha_j F. Where all sites follow there is a coupling each way. While a site
-waits, aligns or holds, what its reference lacks of the way to the peers adds to the goal, at no cost.
+A follower is moved by F = K (goal - q) + B (v - qd), goal += h v, v = sum alpha_j v_j: the
+velocities of the peers by dominance. Peer j feels -alpha_j F. Where all sites follow there is a
+coupling each way. While a site waits, aligns or holds, what its reference lacks of the way to
+the peers adds to the goal, at no cost.
 """
 
 import math
@@ -21,9 +23,13 @@ from .conditions import PASSIVE_OUTSIDE, LawSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, EnergyLaw
 
 SWEEPS = 3
-"""How often joints and couplings settle what each leaves of its torque, as these move one another."""
+"""How often joints and couplings settle what each leaves of its torque, as these move one
+another.
+"""
 AHEAD = 2.0
-"""Ticks of a leader's motion that are paid for beforehand: in one a joint turns back, in two it rests."""
+"""Ticks of a leader's motion that are paid for beforehand: in one a joint turns back, in two it
+rests.
+"""
 SPENT_S = 0.1
 """Drift compensation spends what is left at such a rate that it lasts for this time, s."""
 _SLACK_NM = 1e-9
@@ -32,7 +38,9 @@ _SLACK_NM = 1e-9
 
 @compiled
 def book(now: LawInput, j: int, i: int, torque: float, step: float) -> float:
-    """Books what a leader's arm gives to a coupling; returns what it takes out, as a negative number."""
+    """Books what a leader's arm gives to a coupling; returns what it takes out, as a negative
+    number.
+    """
     now.sent[j].E_led[i] += max(torque * step, 0.0)
     taken: float = min(torque * step, 0.0)
     return taken
@@ -40,14 +48,18 @@ def book(now: LawInput, j: int, i: int, torque: float, step: float) -> float:
 
 @compiled
 def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
-    """Brings what the leader's end knows of the coupling by which peer j follows up to the present."""
+    """Brings what the leader's end knows of the coupling by which peer j follows up to the
+    present.
+    """
     at = j * now.joints + i
     sent = now.sent[j]
     observed = sent.W_led[i] if now.k > 0 else law.reserve_J
     observed += now.received[j].E_followed[i] - law.E_known[at]
     law.E_known[at] = now.received[j].E_followed[i]
     if law.by_step:  # of the period before, which is over
-        observed += book(now, j, i, law.F_led[at], now.q[i] - now.q_before[i])
+        observed += book(
+            now=now, j=j, i=i, torque=law.F_led[at], step=now.q[i] - now.q_before[i]
+        )
     sent.W_led[i] = observed
 
 
@@ -78,9 +90,9 @@ def invert_inertia(law: Any, now: LawInput) -> None:
 def lead(law: Any, now: LawInput, j: int, i: int) -> None:
     """Writes the torque that the leader's end of that coupling feels.
 
-    The controller leaves of the follower's torque what the known energy pays for in the time ahead. In it the
-    joint goes on as before, and farther by what torques of this tick add to those of the tick before, its own
-    included. A deficit is repaid by damping.
+    The controller leaves of the follower's torque what the known energy pays for in the time
+    ahead. In it the joint goes on as before, and farther by what torques of this tick add to
+    those of the tick before, its own included. A deficit is repaid by damping.
     """
     n = now.joints
     h = now.h_s
@@ -98,7 +110,8 @@ def lead(law: Any, now: LawInput, j: int, i: int) -> None:
         step = AHEAD * step + AHEAD**2 * (law.ahead[i] - step)
         for one in range(n):
             step += half * law.inverse[i * n + one] * law.change[one]
-    away = half * law.acceleration_rad_s2 - sign * step - own * sign * law.F_now[at]  # without a torque here
+    # without a torque here
+    away = half * law.acceleration_rad_s2 - sign * step - own * sign * law.F_now[at]
     if most * (away + own * most) > spare:
         if own > 0.0:
             most = max(math.sqrt(away * away + 4.0 * own * spare) - away, 0.0) / (2.0 * own)
@@ -114,8 +127,11 @@ def lead(law: Any, now: LawInput, j: int, i: int) -> None:
 
 
 @compiled
-def control_follower(law: Any, now: LawInput, j: int, i: int, force: float, price: float) -> float:
-    """Sets the velocity by which peer j is followed: its own, less what cannot be paid; returns what is left.
+def control_follower(
+    law: Any, now: LawInput, j: int, i: int, force: float, price: float
+) -> float:
+    """Sets the velocity by which peer j is followed: its own, less what cannot be paid; returns
+    what is left.
 
     `price` is what the period is expected to cost beyond the work of that velocity.
     """
@@ -134,10 +150,12 @@ def control_follower(law: Any, now: LawInput, j: int, i: int, force: float, pric
 
 @compiled
 def correct_drift(law: Any, now: LawInput, i: int, error: float, room: float) -> float:
-    """Returns the velocity that takes the goal to where the peers are, as far as couplings pay for it.
+    """Returns the velocity that takes the goal to where the peers are, as far as couplings pay
+    for it.
 
-    `room` is what they have left together. The goal moves for all peers: the work of the torque counts, by
-    steps that of the damper and the spring which answer, and what these do with the peers' velocities too.
+    `room` is what they have left together. The goal moves for all peers: the work of the torque
+    counts, by steps that of the damper and the spring which answer, and what these do with the
+    peers' velocities too.
     """
     h = now.h_s
     more = max(-law.drift_rad_s, min(law.drift_rad_s, error / now.h_s))
@@ -170,11 +188,12 @@ def afford(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
 
 @compiled
 def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: float) -> None:
-    """Books the follower's end of the coupling to peer j, and its part of what drift compensation takes.
+    """Books the follower's end of the coupling to peer j, and its part of what drift
+    compensation takes.
 
-    By steps, the torque is that of the velocity in use, and the energy too; as it is published, both are
-    those of the leader's velocity, and what the controller changes is booked apart. What drift compensation
-    gives back stays here.
+    By steps, the torque is that of the velocity in use, and the energy too; as it is published,
+    both are those of the leader's velocity, and what the controller changes is booked apart.
+    What drift compensation gives back stays here.
     """
     at = j * now.joints + i
     h = now.h_s
@@ -185,12 +204,15 @@ def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: 
     else:
         now.sent[j].E_followed[i] -= energy
     law.E_yielded[at] += force * (velocity - law.v_led[at]) * h - drift
-    now.sent[j].W_followed[i] = now.received[j].E_led[i] + law.reserve_J - law.E_moved[at] + law.E_yielded[at]
+    now.sent[j].W_followed[i] = (
+        now.received[j].E_led[i] + law.reserve_J - law.E_moved[at] + law.E_yielded[at]
+    )
 
 
 @compiled
 def charge_unpaid(law: Any, now: LawInput, i: int, spring: float) -> None:
-    """Charges what the spring and the arm got in the period before, beyond what couplings paid, to them.
+    """Charges what the spring and the arm got in the period before, beyond what couplings paid,
+    to them.
 
     What the damper takes in other periods repays that, and no more.
     """
@@ -207,8 +229,11 @@ def charge_unpaid(law: Any, now: LawInput, i: int, spring: float) -> None:
 
 
 @compiled
-def settle_follower(law: Any, now: LawInput, i: int, stretch: float, more: float, room: float) -> None:
-    """Settles torque and velocities of a joint that follows, `more` that of drift compensation, and books.
+def settle_follower(
+    law: Any, now: LawInput, i: int, stretch: float, more: float, room: float
+) -> None:
+    """Settles torque and velocities of a joint that follows, `more` that of drift compensation,
+    and books.
 
     By steps, the torque is that of velocities which pay for it; several peers share one torque.
     """
@@ -224,11 +249,18 @@ def settle_follower(law: Any, now: LawInput, i: int, stretch: float, more: float
         velocity = more
         for j in range(len(now.peers)):
             if sweep > 0:
-                law.v_led[j * n + i] = afford(law, now, j, i, force)
+                law.v_led[j * n + i] = afford(law=law, now=now, j=j, i=i, force=force)
             velocity += now.peers[j].alpha * law.v_led[j * n + i]
     for j in range(len(now.peers)):
         part = law.left[j * n + i] / room if room > 0.0 else 0.0
-        book_follower(law, now, j, i, now.peers[j].alpha * force, part * force * more * h)
+        book_follower(
+            law=law,
+            now=now,
+            j=j,
+            i=i,
+            force=now.peers[j].alpha * force,
+            drift=part * force * more * h,
+        )
     law.goal[i] += h * velocity
     law.force[i] = force
     law.paid[i] = force * velocity * h + force * law.aligned[i]
@@ -236,7 +268,9 @@ def settle_follower(law: Any, now: LawInput, i: int, stretch: float, more: float
 
 @compiled
 def follow(law: Any, now: LawInput, i: int) -> None:
-    """Moves the goal of a joint by the velocities of the peers, and writes the torque that follows it."""
+    """Moves the goal of a joint by the velocities of the peers, and writes the torque that
+    follows it.
+    """
     n = now.joints
     h = now.h_s
     K = law.K[i]
@@ -248,7 +282,8 @@ def follow(law: Any, now: LawInput, i: int) -> None:
     if now.k == 0:
         law.goal[i] = target
     way = now.q_des[i] - target
-    law.aligned[i] = 0.5 * h * (now.qd_des[i] - velocity) if way != 0.0 else 0.0  # in half a period
+    # in half a period
+    law.aligned[i] = 0.5 * h * (now.qd_des[i] - velocity) if way != 0.0 else 0.0
     stretch = law.goal[i] + way - now.q[i]
     pull = max(law.low[i], min(law.high[i], K * stretch))
     charge_unpaid(law, now, i, pull * (stretch - 0.5 * pull / K) if K > 0.0 else 0.0)
@@ -259,32 +294,38 @@ def follow(law: Any, now: LawInput, i: int) -> None:
     for j in range(len(now.peers)):
         alpha = now.peers[j].alpha
         now.sent[j].F[i] = alpha * law.force[i]
-        left = control_follower(law, now, j, i, alpha * law.force[i], alpha * price)
+        left = control_follower(
+            law=law, now=now, j=j, i=i, force=alpha * law.force[i], price=alpha * price
+        )
         law.left[j * n + i] = max(left, 0.0) * (alpha > 0.0)
         room += law.left[j * n + i]
         least = min(least, left)
     if law.drift_rad_s > 0.0 and room > 0.0 and least >= 0.0:
-        more = correct_drift(law, now, i, target - law.goal[i] - h * velocity, room)
-    settle_follower(law, now, i, stretch, more, room)
+        more = correct_drift(
+            law=law, now=now, i=i, error=target - law.goal[i] - h * velocity, room=room
+        )
+    settle_follower(law=law, now=now, i=i, stretch=stretch, more=more, room=room)
 
 
 @compiled
 class Tdpa(EnergyLaw):
-    """Time-domain passivity control with delay: each end watches the energy of its coupling, and damps.
+    """Time-domain passivity control with delay: each end watches the energy of its coupling,
+    and damps.
 
-    Every site follows by K and B towards the integral of its peers' velocities, mixed by dominance, and the
-    peers feel that torque; K = 0 and B = 0 make a site lead only. After Ryu, Artigas and Preusche (2010); of
-    several sites after Panzirsch and others (2012).
+    Every site follows by K and B towards the integral of its peers' velocities, mixed by
+    dominance, and the peers feel that torque; K = 0 and B = 0 make a site lead only. After Ryu,
+    Artigas and Preusche (2010); of several sites after Panzirsch and others (2012).
 
     Attributes:
         K: spring by which the site follows, per joint, N m/rad; 0: it follows nobody.
         B: damper by which it follows, per joint, N m s/rad.
-        acceleration_rad_s2: by which torques that are not the law's change a joint's acceleration from tick
-            to tick, as far as leaders' controllers cover it beforehand; half of the reserve covers it too.
+        acceleration_rad_s2: by which torques that are not the law's change a joint's
+            acceleration from tick to tick, as far as leaders' controllers cover it beforehand;
+            half of the reserve covers it too.
         drift_rad_s: largest velocity by which positions are made to agree again; 0: they drift.
         reserve_J: energy per joint and peer with which an end begins.
-        energy: "step": what the arm gets, torque times the step in q; "velocity": torque times velocity times
-            period, as it is published.
+        energy: "step": what the arm gets, torque times the step in q; "velocity": torque times
+            velocity times period, as it is published.
         beta: the site's torque is divided by it, dimensionless: who feels whom.
     """
 
@@ -327,8 +368,12 @@ class Tdpa(EnergyLaw):
         self.high = [0.0] * n
         self.change = [0.0] * n
         self.aligned = [0.0] * n
-        self.F_led, self.F_now, self.v_led, self.E_known = ([0.0] * (n * peers) for _ in range(4))
-        self.E_moved, self.E_yielded, self.lent, self.E_settled = ([0.0] * (n * peers) for _ in range(4))
+        self.F_led, self.F_now, self.v_led, self.E_known = (
+            [0.0] * (n * peers) for _ in range(4)
+        )
+        self.E_moved, self.E_yielded, self.lent, self.E_settled = (
+            [0.0] * (n * peers) for _ in range(4)
+        )
         self.carried, self.spring, self.force, self.paid = ([0.0] * n for _ in range(4))
         self.inverse = [0.0] * (n * n)
         self.left = [0.0] * (n * peers)
@@ -367,11 +412,15 @@ class Tdpa(EnergyLaw):
                 at = j * n + i
                 self.F_led[at] = share * self.F_now[at]
                 if not self.by_step:
-                    now.sent[j].W_led[i] += book(now, j, i, self.F_led[at], now.qd[i] * now.h_s)
+                    now.sent[j].W_led[i] += book(
+                        now=now, j=j, i=i, torque=self.F_led[at], step=now.qd[i] * now.h_s
+                    )
             now.tau[i] = self.carried[i] + (force - within) / self.beta
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """Returns the energies of both ends of all couplings, those of following up to the period before."""
+        """Returns the energies of both ends of all couplings, those of following up to the
+        period before.
+        """
         gave = []
         took = []
         observed = []
@@ -382,7 +431,9 @@ class Tdpa(EnergyLaw):
             followed = np.vstack([np.zeros(n), sent["E_followed"][:-1]])
             gave.append(np.hstack([sent["E_led"], followed]))
             settled = seen.memory["E_settled"][:, j * n : (j + 1) * n]
-            took.append(np.hstack([settled - self.reserve_J, came["E_followed"] - sent["W_led"]]))
+            took.append(
+                np.hstack([settled - self.reserve_J, came["E_followed"] - sent["W_led"]])
+            )
             observed.append(np.hstack([sent["W_led"], sent["W_followed"]]))
         port = -self.beta * sum_work(seen.tau - seen.memory["carried"], seen.q)
         return LawEnergies(
@@ -394,7 +445,9 @@ class Tdpa(EnergyLaw):
 
     def explain_no_linear_form(self) -> str:
         """Returns why it cannot be linearised."""
-        return "its controllers act by the energy observed, which is of second order in the motion"
+        return (
+            "its controllers act by the energy observed, which is of second order in the motion"
+        )
 
     def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
         """Returns that a site without K and B follows nobody."""
@@ -405,8 +458,8 @@ class Tdpa(EnergyLaw):
         text = f"couplings are passive for any delays, jitter, loss and shares, where {PASSIVE_OUTSIDE}, "
         if self.energy == "velocity":
             return StabilityCondition(True, f"{text}in books that leak tau qdd h^2 / 2 a tick")
-        beyond = f" beyond {self.acceleration_rad_s2:g} rad/s^2" if self.acceleration_rad_s2 else ""
-        paid = (
-            f"while half of reserve_J pays for what other torques change accelerations by in a tick{beyond}"
+        beyond = (
+            f" beyond {self.acceleration_rad_s2:g} rad/s^2" if self.acceleration_rad_s2 else ""
         )
+        paid = f"while half of reserve_J pays for what other torques change accelerations by in a tick{beyond}"
         return StabilityCondition(True, f"{text}{paid}")

@@ -1,17 +1,20 @@
-"""Wave variables: every pair of sites is joined by a line of some impedance, in which waves travel.
+"""Wave variables: every pair of sites is joined by a line of some impedance, in which waves
+travel.
 
-Invariant: an end takes no more energy out of a line than the other end is known to have put in, whatever
-becomes of samples (but for the reception `hold`), and puts in no more than it has, H: what it took, less the
-work that its torque did on the arm, tau times the step in q.
+Invariant: an end takes no more energy out of a line than the other end is known to have put in,
+whatever becomes of samples (but for the reception `hold`), and puts in no more than it has, H:
+what it took, less the work that its torque did on the arm, tau times the step in q.
 
 Of one line and joint, with c = sqrt(2 b) and v the wave that an end plays:
 
-    without a spring of its own (K = 0)    F = b qd - c v, pushed by -F, sends c step / h - v a tick later
-    with K and B                           qd_sd = (c v - K (q_sd - q) + B qd) / (b + B), q_sd follows,
-                                           F = K (q_sd - q) + B (qd_sd - qd), pushed by F, sends v - (c / b) F
+    without a spring of its own (K = 0)    F = b qd - c v, pushed by -F, sends c step / h - v a
+    tick later with K and B                           qd_sd = (c v - K (q_sd - q) + B qd) / (b +
+    B), q_sd follows,
+                                           F = K (q_sd - q) + B (qd_sd - qd), pushed by F, sends
+                                           v - (c / b) F
 
-As it sends what its arm did in the period that is over, its waves add up to the steps of its arm, and to
-b h qd^2 / 4 more than their work, which H lends until the arm slows down.
+As it sends what its arm did in the period that is over, its waves add up to the steps of its
+arm, and to b h qd^2 / 4 more than their work, which H lends until the arm slows down.
 """
 
 import math
@@ -29,11 +32,19 @@ from ..core.site_setup import Gains, Law
 from ..core.user_law import LawContext, LawInput
 from ..core.vectors import Array
 from ..fields import KeyProblem, NotNegative, NotNegativeJoints, Positive, PositiveJoints
-from .conditions import PASSIVE_OUTSIDE, LawSituation, LinearForm, LinearSituation, StabilityCondition
+from .conditions import (
+    PASSIVE_OUTSIDE,
+    LawSituation,
+    LinearForm,
+    LinearSituation,
+    StabilityCondition,
+)
 from .interface import DAMPING, STIFFNESS, EnergyLaw, TuningSite
 
 RECEPTIONS = ("replay", "zero", "scaled", "hold")
-"""How waves are played, by number. `hold` repeats the last wave; it is not passive, and for comparison."""
+"""How waves are played, by number. `hold` repeats the last wave; it is not passive, and for
+comparison.
+"""
 _REPLAY = 0
 _SCALED = 2
 _HOLD = 3
@@ -47,8 +58,8 @@ STAMP_FILTER_TICKS = 20.0
 def replay_wave(law: Any, at: int, fresh: float, energy: float, h: float) -> float:
     """Returns a wave that makes up for those which never came, as far as their energy allows.
 
-    Their integral is owed. It is played at its mean or slower; per unit of it at most its part of the energy
-    is spent.
+    Their integral is owed. It is played at its mean or slower; per unit of it at most its part
+    of the energy is spent.
     """
     owed = abs(law.owed_U[at])
     if owed == 0.0:
@@ -64,7 +75,8 @@ def replay_wave(law: Any, at: int, fresh: float, energy: float, h: float) -> flo
 
 @compiled
 def conceal_wave(law: Any, at: int, energy: float, h: float) -> float:
-    """Returns the wave of a tick without a new one: the last one again, as far as the known energy allows.
+    """Returns the wave of a tick without a new one: the last one again, as far as the known
+    energy allows.
 
     It is an advance on what the next sample tells: its integral counts against what is owed.
     """
@@ -72,7 +84,9 @@ def conceal_wave(law: Any, at: int, energy: float, h: float) -> float:
     held = max(-most, min(most, law.wave[at]))
     played: float = held
     if law.owed_U[at] * held > 0.0:
-        played = replay_wave(law, at, held, energy - 0.5 * held * held * h, h)
+        played = replay_wave(
+            law=law, at=at, fresh=held, energy=energy - 0.5 * held * held * h, h=h
+        )
     law.owed_U[at] -= held * h
     law.held_s[at] += h
     return played
@@ -82,7 +96,8 @@ def conceal_wave(law: Any, at: int, energy: float, h: float) -> float:
 def take_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
     """Returns the wave of line j that an end plays at a tick, and books its energy.
 
-    `missed` counts the samples between the one in use and the one before it; -1: no new one came.
+    `missed` counts the samples between the one in use and the one before it; -1: no new one
+    came.
     """
     received = now.received[j]
     sent = now.sent[j]
@@ -106,7 +121,7 @@ def take_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
         law.E_seen[at] = received.E[i]
         played = fresh
     if law.playing == _REPLAY and missed >= 0.0:
-        played = replay_wave(law, at, fresh, sent.W[i], h)
+        played = replay_wave(law=law, at=at, fresh=fresh, energy=sent.W[i], h=h)
     elif law.playing == _SCALED:
         most = math.sqrt(2.0 * max(sent.W[i] + own, 0.0) / h)
         played = max(-most, min(most, math.sqrt(law.rate[j]) * law.wave[at]))
@@ -119,7 +134,9 @@ def take_wave(law: Any, now: LawInput, j: int, i: int, missed: float) -> float:
 
 @compiled
 def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
-    """Moves what an end with a spring follows by a wave v, and answers it; returns the torque ON the arm."""
+    """Moves what an end with a spring follows by a wave v, and answers it; returns the torque
+    ON the arm.
+    """
     at = j * now.joints + i
     h = now.h_s
     b = law.impedance[at]
@@ -135,7 +152,9 @@ def follow_wave(law: Any, now: LawInput, j: int, i: int, v: float) -> float:
 
 @compiled
 def close_wave_period(law: Any, now: LawInput, i: int) -> None:
-    """Books in H what the arm got in the period before; what the springs of an end got is part of H."""
+    """Books in H what the arm got in the period before; what the springs of an end got is part
+    of H.
+    """
     H = now.to_all.H
     spring = 0.0
     for j in range(len(now.peers)):
@@ -175,31 +194,37 @@ def send_waves(law: Any, now: LawInput, i: int, ahead: float) -> None:
 
 
 def find_line(lines: Mapping[str, Any], site: str, peer: str) -> Any:
-    """Returns the impedance that a table such as {"m1-s": 18.0} has for a line, one or per joint, or None."""
+    """Returns the impedance that a table such as {"m1-s": 18.0} has for a line, one or per
+    joint, or None.
+    """
     return lines.get(f"{site}-{peer}", lines.get(f"{peer}-{site}"))
 
 
 @compiled
 class Wave(EnergyLaw):
-    """Wave variables: a line of impedance b between every two sites, whose waves carry its energy.
+    """Wave variables: a line of impedance b between every two sites, whose waves carry its
+    energy.
 
-    At an end without a spring of its own F = b qd - c v and u = c qd - v, c = sqrt(2 b), v being the wave
-    that comes and u the one that goes; an end with K and B follows by them, and with B = b reflects nothing.
-    Sites share as b_ij / sum b_ik. After Anderson and Spong (1989), Niemeyer and Slotine (1991).
+    At an end without a spring of its own F = b qd - c v and u = c qd - v, c = sqrt(2 b), v
+    being the wave that comes and u the one that goes; an end with K and B follows by them, and
+    with B = b reflects nothing. Sites share as b_ij / sum b_ik. After Anderson and Spong
+    (1989), Niemeyer and Slotine (1991).
 
     Attributes:
         b: impedance per joint, N m s/rad.
         K: spring of an end that moves its arm by one, per joint, N m/rad; 0: none.
         B: damper of such an end, per joint, N m s/rad; b matches it to the line.
-        lines: impedances of single lines, for all joints, as in { "m1-s" = 18.0 }, N m s/rad; 0: no line; b
-            of those not named. "shares": those by which sites share as their dominance factors at the start
-            say, b on the average, where these are reversible; else b.
+        lines: impedances of single lines, for all joints, as in { "m1-s" = 18.0 }, N m s/rad;
+            0: no line; b of those not named. "shares": those by which sites share as their
+            dominance factors at the start say, b on the average, where these are reversible;
+            else b.
         beta: the site's torque is divided by it, dimensionless: who feels whom.
-        reception: how waves are played if samples are late or lost. "replay": the last one is held, and what
-            was missed is made up for, as far as known energy allows; "zero": it is dropped, and positions
-            drift; "scaled": the last wave goes on, times sqrt(1 - T'), for delays that vary continuously.
-        reserve_J: energy per joint with which an end begins, and again for what it plays of each line; waves
-            are cut where it has less than half of it.
+        reception: how waves are played if samples are late or lost. "replay": the last one is
+            held, and what was missed is made up for, as far as known energy allows; "zero": it
+            is dropped, and positions drift; "scaled": the last wave goes on, times sqrt(1 -
+            T'), for delays that vary continuously.
+        reserve_J: energy per joint with which an end begins, and again for what it plays of
+            each line; waves are cut where it has less than half of it.
     """
 
     b: PositiveJoints = (10.0,)
@@ -215,7 +240,11 @@ class Wave(EnergyLaw):
         "u": {"unit": "sqrt(W)", "length": "joints", "per_peer": True},
         "U": {"unit": "sqrt(W) s", "length": "joints", "per_peer": True},
         "E": {"unit": "J", "length": "joints", "per_peer": True},
-        "W": {"unit": "J", "length": "joints", "per_peer": True},  # known and not played: for logs
+        "W": {
+            "unit": "J",
+            "length": "joints",
+            "per_peer": True,
+        },  # known and not played: for logs
         "H": {"unit": "J", "length": "joints"},  # what this end has, for logs too
     }
     remembers: ClassVar = (
@@ -257,7 +286,9 @@ class Wave(EnergyLaw):
                 for j in range(len(now.peers)):
                     c = math.sqrt(2.0 * self.impedance[j * n + i])
                     at = j * n + i
-                    now.sent[j].u[i] = c * (now.q[i] - now.q_before[i]) / now.h_s - self.played[at]
+                    now.sent[j].u[i] = (
+                        c * (now.q[i] - now.q_before[i]) / now.h_s - self.played[at]
+                    )
                 send_waves(self, now, i, 0.0)
             self.carried[i] = self.gravity * now.gravity[i]
             now.tau[i] = self.carried[i]
@@ -275,16 +306,21 @@ class Wave(EnergyLaw):
                 at = j * n + i
                 if b == 0.0:
                     continue
-                self.played[at] = take_wave(self, now, j, i, missed)
+                self.played[at] = take_wave(law=self, now=now, j=j, i=i, missed=missed)
                 if self.K[i] == 0.0:
                     force = math.sqrt(2.0 * b) * self.played[at] - b * now.qd[i]
                 else:
-                    force = follow_wave(self, now, j, i, self.played[at])
+                    force = follow_wave(law=self, now=now, j=j, i=i, v=self.played[at])
                 now.tau[i] += force / self.beta
         for i in range(n):
             if self.K[i] > 0.0:
-                applied = max(-self.tau_limit[i], min(self.tau_limit[i], now.tau[i])) - self.carried[i]
-                send_waves(self, now, i, self.beta * applied * now.qd[i] * now.h_s + self.ahead[i])
+                applied = (
+                    max(-self.tau_limit[i], min(self.tau_limit[i], now.tau[i]))
+                    - self.carried[i]
+                )
+                send_waves(
+                    self, now, i, self.beta * applied * now.qd[i] * now.h_s + self.ahead[i]
+                )
 
     def energies(self, seen: LawRecords) -> LawEnergies:
         """Returns the energy of the waves, what the end stores, and what its dampers took."""
@@ -293,22 +329,40 @@ class Wave(EnergyLaw):
         took = [peer.received["E"] - peer.sent["W"] for peer in seen.peers]
         port = -self.beta * sum_work(seen.tau - seen.memory["carried"], seen.q)
         taken = seen.memory["damped"].sum(axis=1)
-        return LawEnergies(gave, took, port, seen.to_all["H"], taken, observed, self.beta, self.gravity)
+        return LawEnergies(
+            gave=gave,
+            took=took,
+            port=port,
+            store=seen.to_all["H"],
+            taken=taken,
+            observed=observed,
+            weight=self.beta,
+            gravity=self.gravity,
+        )
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:
-        """Returns a line that joins no two sites, or rates that differ: a wave lasts for a tick."""
+        """Returns a line that joins no two sites, or rates that differ: a wave lasts for a
+        tick.
+        """
         for line in () if self.lines == "shares" else self.lines:
-            if sorted(line.split("-", 1)) not in [sorted(two) for two in permutations(rates_hz, 2)]:
+            if sorted(line.split("-", 1)) not in [
+                sorted(two) for two in permutations(rates_hz, 2)
+            ]:
                 names = ", ".join(rates_hz)
                 return KeyProblem(
-                    f"control.lines.{line}", f"joins no two sites: name them as in m1-s, of {names}"
+                    f"control.lines.{line}",
+                    f"joins no two sites: name them as in m1-s, of {names}",
                 )
         if len({*rates_hz.values()}) > 1:
-            return KeyProblem("rate_hz", "wave is for sites of one tick rate, as a wave lasts for a tick")
+            return KeyProblem(
+                "rate_hz", "wave is for sites of one tick rate, as a wave lasts for a tick"
+            )
         return None
 
     def at_shares(self, names: Sequence[str], alpha: Array) -> Any:
-        """Returns the law with its lines as numbers: b_ij = D_i alpha_ij, D_i alpha_ij = D_j alpha_ji."""
+        """Returns the law with its lines as numbers: b_ij = D_i alpha_ij, D_i alpha_ij = D_j
+        alpha_ji.
+        """
         if self.lines != "shares":
             return self
         lines: dict[str, Any] = {}
@@ -324,7 +378,9 @@ class Wave(EnergyLaw):
     def explain_idle_shares(self, at: LawSituation) -> str:
         """Returns what lines do in place of the shares, if these are not theirs."""
         here = at.names[at.site]
-        lines = np.array([self.find_impedances(here, peer)[0] * (peer != here) for peer in at.names])
+        lines = np.array(
+            [self.find_impedances(here, peer)[0] * (peer != here) for peer in at.names]
+        )
         if np.allclose(lines, at.alpha[at.site] * lines.sum(), atol=1e-6 * lines.sum()):
             return ""
         own = self.lines or find_balancing_weights(at.alpha) is not None
@@ -340,11 +396,15 @@ class Wave(EnergyLaw):
         return Gains(Law.KNOWN, known=(theta * self.gravity).tolist())
 
     def linear_form(self, at: LinearSituation) -> LinearForm | None:
-        """Returns lines as the delays that they are, in continuous time, if no wave is late or lost."""
+        """Returns lines as the delays that they are, in continuous time, if no wave is late or
+        lost.
+        """
         if any(self.K) and not all(self.K):
             return None
         here = at.names[at.site]
-        form = LinearForm(len(at.inertia), [f"q_sd_{at.names[j]}" for j in at.peers] if any(self.K) else [])
+        form = LinearForm(
+            len(at.inertia), [f"q_sd_{at.names[j]}" for j in at.peers] if any(self.K) else []
+        )
         K = np.array(self.K)
         B = np.array(self.B)
         for j in at.peers:
@@ -376,12 +436,19 @@ class Wave(EnergyLaw):
         peers = [name for name in situation.names if name != here]
         weights = [self.find_impedances(here, peer)[0] for peer in peers]
         shares = ", ".join(
-            f"{peer} {line / (sum(weights) or 1.0):.4g}" for peer, line in zip(peers, weights, strict=True)
+            f"{peer} {line / (sum(weights) or 1.0):.4g}"
+            for peer, line in zip(peers, weights, strict=True)
         )
-        text = f"lines are passive whatever delays, jitter and loss are, where {PASSIVE_OUTSIDE}"
-        return StabilityCondition(True, f"{text}; the shares of {here} are b_ij / sum b_ik, {shares}")
+        text = (
+            f"lines are passive whatever delays, jitter and loss are, where {PASSIVE_OUTSIDE}"
+        )
+        return StabilityCondition(
+            True, f"{text}; the shares of {here} are b_ij / sum b_ik, {shares}"
+        )
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """All ends are matched to their lines, masters too, so that no wave is reflected for ever."""
+        """All ends are matched to their lines, masters too, so that no wave is reflected for
+        ever.
+        """
         return {**gains, "B": gains["b"], "gravity": at.gravity}

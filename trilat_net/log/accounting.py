@@ -1,9 +1,10 @@
 """Accounts of channels: received and missing messages by number, counted live or from a log.
 
-Invariant: expected = received + missing, always. A message's number is its tick for a record, its place
-from 0 for statistics and events. Ticks between two starts of a site were not made: they are neither expected
-nor missing. Memory is bounded: of more gaps than `MAX_GAPS`, the lowest are only counted. Accounts made from
-a file decode events only, and count a later part of a log from its first message on.
+Invariant: expected = received + missing, always. A message's number is its tick for a record,
+its place from 0 for statistics and events. Ticks between two starts of a site were not made:
+they are neither expected nor missing. Memory is bounded: of more gaps than `MAX_GAPS`, the
+lowest are only counted. Accounts made from a file decode events only, and count a later part of
+a log from its first message on.
 """
 
 import math
@@ -49,7 +50,9 @@ class RangeSet:
         del self._ranges[: -self._most]
 
     def remove(self, number: int, last: int | None = None) -> bool:
-        """Removes one number, or those up to the last one of a range; returns False if it is not in."""
+        """Removes one number, or those up to the last one of a range; returns False if it is
+        not in.
+        """
         if (found := self.find(number)) is None:
             return False
         place = self._count_until(number) - 1
@@ -64,14 +67,20 @@ class RangeSet:
         return self._ranges[place] if place >= 0 and number <= self._ranges[place][1] else None
 
     def find_from(self, number: int) -> tuple[int, int] | None:
-        """Returns the first range at or above a number, cut off below it; None if there is none."""
+        """Returns the first range at or above a number, cut off below it; None if there is
+        none.
+        """
         place = max(0, self._count_until(number) - 1)
         near = self._ranges[place : place + 2]
-        return next(((max(number, first), last) for first, last in near if last >= number), None)
+        return next(
+            ((max(number, first), last) for first, last in near if last >= number), None
+        )
 
 
 MAX_GAPS = 50_000
-"""Gaps that an account keeps apart; of those before, it keeps the number of missing messages only."""
+"""Gaps that an account keeps apart; of those before, it keeps the number of missing messages
+only.
+"""
 SHOWN_GAPS = 20
 """Gaps that are named in a text."""
 
@@ -84,8 +93,8 @@ class Account:
         duplicate: messages that came though their number was there.
         reordered: messages that came after one with a higher number.
         refilled: messages from the sender's memory, after they had been missing.
-        unmade: numbers that no message has: the sender left them out, or ended before them and began anew
-            behind them.
+        unmade: numbers that no message has: the sender left them out, or ended before them and
+            began anew behind them.
         last: largest number that is known to exist, -1 before the first.
         silence_ns: the longest time between two that came, ns; 0 if they are not stamped.
     """
@@ -118,7 +127,9 @@ class Account:
         return True
 
     def refill(self, number: int) -> bool:
-        """Counts one message from the sender's memory; returns False if its number is there already."""
+        """Counts one message from the sender's memory; returns False if its number is there
+        already.
+        """
         new = self._add(number)
         self.refilled += new
         self.received += new
@@ -131,10 +142,11 @@ class Account:
             self.last = made - 1
 
     def begin_anew(self, first: int, made: int = 0) -> int:
-        """Takes the gap just below a number for not made: another start of the sender begins with it.
+        """Takes the gap just below a number for not made: another start of the sender begins
+        with it.
 
-        The start before had `made` as many messages at least; what is missing of those stays missing. Returns
-        the lowest number of those not made, the given one without any.
+        The start before had `made` as many messages at least; what is missing of those stays
+        missing. Returns the lowest number of those not made, the given one without any.
         """
         self.expect(first)
         gap = self._gaps.find(first - 1)
@@ -150,11 +162,15 @@ class Account:
         self.unmade -= last + 1 - first
 
     def give_up(self, below: int) -> None:
-        """Marks what is missing below a number as lost for good; if it comes all the same, it counts."""
+        """Marks what is missing below a number as lost for good; if it comes all the same, it
+        counts.
+        """
         self._lost_below = max(self._lost_below, below)
 
     def wanted(self, number: int = 0) -> tuple[int, int] | None:
-        """Returns the first gap at or above a number that is not given up; None if there is none."""
+        """Returns the first gap at or above a number that is not given up; None if there is
+        none.
+        """
         return self._gaps.find_from(max(number, self._lost_below))
 
     @property
@@ -180,14 +196,26 @@ class Account:
     def as_text(self, *before: "Account") -> str:
         """Returns the account in one line, for the file and for people.
 
-        It is together with those `before`, of earlier starts that counted their messages from 0 as well.
+        It is together with those `before`, of earlier starts that counted their messages from 0
+        as well.
         """
         counts = {
             name: sum(getattr(one, name) for one in (*before, self))
-            for name in ("expected", "received", "missing", "duplicate", "reordered", "refilled")
+            for name in (
+                "expected",
+                "received",
+                "missing",
+                "duplicate",
+                "reordered",
+                "refilled",
+            )
         }
         gaps = self.gap_texts(SHOWN_GAPS)
-        named = f" ({' '.join(gaps)}{' ...' if len(self._gaps) > len(gaps) else ''})" if gaps else ""
+        named = (
+            f" ({' '.join(gaps)}{' ...' if len(self._gaps) > len(gaps) else ''})"
+            if gaps
+            else ""
+        )
         silence = f", longest silence {self.silence_ns / 1e6:.1f} ms" if self.silence_ns else ""
         unmade = f", not made {self.unmade}" if self.unmade else ""
         starts = f", of {count_nouns(len(before) + 1, 'start')}" if before else ""
@@ -210,10 +238,12 @@ class Account:
 
 
 class StartGap:
-    """What one channel lacks between two starts of its sender, in whatever order others tell of it.
+    """What one channel lacks between two starts of its sender, in whatever order others tell of
+    it.
 
-    The start before may have been killed, and has then not stated what it made: it made at least what others
-    have heard of. What was `under_way` to the recorder died with it, and is taken for not made.
+    The start before may have been killed, and has then not stated what it made: it made at
+    least what others have heard of. What was `under_way` to the recorder died with it, and is
+    taken for not made.
     """
 
     def __init__(self, account: Account, under_way: int) -> None:
@@ -224,7 +254,9 @@ class StartGap:
         self._silent = self._begin = self._first = -1
 
     def begin_anew(self, first: int, made: int) -> None:
-        """The later start begins with a number; the one before stated how many messages it made, or 0."""
+        """The later start begins with a number; the one before stated how many messages it
+        made, or 0.
+        """
         if self._first < 0:
             self._first = first
             self._silent = self._begin = self._account.begin_anew(first, made)
@@ -246,7 +278,9 @@ def describe_unknown_ends(sites: Sequence[str]) -> str:
 
 
 def parse_counts(account: str) -> dict[str, int]:
-    """Returns how many messages an account's text says are "received" and "missing"; {} if it is none."""
+    """Returns how many messages an account's text says are "received" and "missing"; {} if it
+    is none.
+    """
     return {word: int(n) for word, n in re.findall(r"(received|missing) (\d{1,15})\b", account)}
 
 
@@ -263,7 +297,11 @@ class Coverage(NamedTuple):
     @property
     def share(self) -> float:
         """Share of judged ticks of the site with the least; 0 if there are no ticks at all."""
-        return min(map(self._share, self.expected), default=0.0) if any(self.expected.values()) else 0.0
+        return (
+            min(map(self._share, self.expected), default=0.0)
+            if any(self.expected.values())
+            else 0.0
+        )
 
     def _share(self, site: str) -> float:
         expected = self.expected[site]
@@ -286,7 +324,9 @@ class Coverage(NamedTuple):
 
     def to_json(self) -> dict[str, list[int]]:
         """Returns the judged ticks and all ticks of every site."""
-        return {site: [self.judged.get(site, 0), ticks] for site, ticks in self.expected.items()}
+        return {
+            site: [self.judged.get(site, 0), ticks] for site, ticks in self.expected.items()
+        }
 
 
 def _percent(share: float) -> str:
@@ -296,7 +336,9 @@ def _percent(share: float) -> str:
 
 OVERRUN = "overrun"
 LAST = "last"
-"""Kinds of events: of ticks that a site did not make, and how many others know of a start that is gone."""
+"""Kinds of events: of ticks that a site did not make, and how many others know of a start that
+is gone.
+"""
 MAX_STARTS = 64
 """Starts of a member whose events are counted apart."""
 EVENTS_NUMBERED_SINCE = 3
@@ -314,16 +356,27 @@ class SessionAccounts:
     """
 
     def __init__(
-        self, session: str, scenario: Scenario | None, *, continued: bool = False, events: bool = True
+        self,
+        session: str,
+        scenario: Scenario | None,
+        *,
+        continued: bool = False,
+        events: bool = True,
     ) -> None:
         self._session = session
         self._continued = continued
-        self._rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()} if scenario else {}
-        self._ticks = {name: scenario.ticks(name) for name in scenario.names} if scenario else {}
+        self._rates_hz = (
+            {name: site.rate_hz for name, site in scenario.sites.items()} if scenario else {}
+        )
+        self._ticks = (
+            {name: scenario.ticks(name) for name in scenario.names} if scenario else {}
+        )
         self._ends: dict[str, int] = {}
         self._numbered = SITE_CHANNELS if events else (topics.STATE, topics.LINK)
         self._accounts: dict[str, Account] = {}
-        self._starts: dict[str, dict[int, Account]] = {}  # of events, by boot: each counts from 0
+        self._starts: dict[
+            str, dict[int, Account]
+        ] = {}  # of events, by boot: each counts from 0
         self._bases: dict[str, int] = {}
         self._start_gaps: dict[tuple[str, int], StartGap] = {}
 
@@ -337,13 +390,19 @@ class SessionAccounts:
             self._accounts.setdefault(topic, Account())
 
     def take(self, topic: str, sequence: int, payload: bytes = b"") -> None:
-        """Counts a message by its sequence number; the payload of an event may state the number of ticks."""
+        """Counts a message by its sequence number; the payload of an event may state the number
+        of ticks.
+        """
         if topic not in self._accounts:
             return
         member, channel = topic.split("/")[-2:]
         event: Event | None = None
         with suppress(WireError):  # an event that cannot be read counts like any other message
-            event = decode(payload, Event, READABLE) if channel == topics.EVENT and payload else None
+            event = (
+                decode(payload, Event, READABLE)
+                if channel == topics.EVENT and payload
+                else None
+            )
         number = number_message(channel, sequence, self._rates_hz.get(member, 0))
         if event is None:
             self.count(topic, number)
@@ -353,7 +412,9 @@ class SessionAccounts:
             self._expect(member, topics.STATE, sequence + 1)
 
     def take_event(self, topic: str, number: int, event: Event) -> bool:
-        """Counts an event, and what it says of the ticks of a site; returns False if it is there already."""
+        """Counts an event, and what it says of the ticks of a site; returns False if it is
+        there already.
+        """
         starts = self._starts.setdefault(topic, {})
         if event.boot not in starts and len(starts) < MAX_STARTS:
             starts[event.boot] = Account() if starts else self._accounts[topic]
@@ -376,15 +437,21 @@ class SessionAccounts:
             rate_hz = self._rates_hz[event.member]
             for channel, gap in self._find_start_gaps(event.member, event.boot):
                 base = self._bases.get(self._topic(event.member, channel), 0)
-                gap.begin_anew(*(count_messages(channel, n, rate_hz) - base for n in (event.ticks, made)))
+                gap.begin_anew(
+                    *(count_messages(channel, n, rate_hz) - base for n in (event.ticks, made))
+                )
         elif event.kind == OVERRUN:
             for first, last in re.findall(r"(\d{1,12})-(\d{1,12})", event.command):
                 if int(first) <= int(last) < event.ticks:
                     self.leave_out(event.member, int(last) + 1, int(last) + 1 - int(first))
         elif event.kind == LAST and event.about in self._rates_hz:
-            for channel, gap in self._find_start_gaps(event.about, event.boots.get(event.about, 0)):
+            for channel, gap in self._find_start_gaps(
+                event.about, event.boots.get(event.about, 0)
+            ):
                 base = self._bases.get(self._topic(event.about, channel), 0)
-                gap.hear_of(number_message(channel, event.ticks, self._rates_hz[event.about]) - base)
+                gap.hear_of(
+                    number_message(channel, event.ticks, self._rates_hz[event.about]) - base
+                )
 
     def leave_out(self, site: str, tick: int, skipped: int) -> None:
         """Counts nothing as missing of so many ticks before one, which a site did not make."""
@@ -407,7 +474,9 @@ class SessionAccounts:
             if topic in self._accounts and (
                 known or len(self._start_gaps) < MAX_STARTS * len(self._rates_hz)
             ):
-                gap = StartGap(self._accounts[topic], count_under_way(channel, self._rates_hz[site]))
+                gap = StartGap(
+                    self._accounts[topic], count_under_way(channel, self._rates_hz[site])
+                )
                 yield channel, self._start_gaps.setdefault((topic, boot), gap)
 
     def expect(self, site: str, ticks: int) -> None:
@@ -436,14 +505,25 @@ class SessionAccounts:
     def list_gaps(self, topic: str) -> list[tuple[int, int]]:
         """Returns the missing numbers of a channel, as (first, last)."""
         base = self._bases.get(topic, 0)
-        return [(base + first, base + last) for one in self.list_starts(topic) for first, last in one.gaps]
+        return [
+            (base + first, base + last)
+            for one in self.list_starts(topic)
+            for first, last in one.gaps
+        ]
 
     def coverage(self) -> Coverage:
-        """Returns the records that are there, of the ticks that each site made, else those of the run."""
-        accounts = {site: self._accounts.get(self._topic(site, topics.STATE)) for site in self._rates_hz}
-        there = {site: account.received for site, account in accounts.items() if account is not None}
+        """Returns the records that are there, of the ticks that each site made, else those of
+        the run.
+        """
+        accounts = {
+            site: self._accounts.get(self._topic(site, topics.STATE)) for site in self._rates_hz
+        }
+        there = {
+            site: account.received for site, account in accounts.items() if account is not None
+        }
         ticks = {
-            site: min(most, self._ends.get(site, most)) - (account.unmade if account is not None else 0)
+            site: min(most, self._ends.get(site, most))
+            - (account.unmade if account is not None else 0)
             for site, most in self._ticks.items()
             for account in [accounts.get(site)]
         }
@@ -468,7 +548,9 @@ class SessionAccounts:
         return [site for site in self._rates_hz if site not in self._ends]
 
     def describe_tails(self) -> Iterator[str]:
-        """Yields a text per site whose end is unknown and whose records end before the scenario does."""
+        """Yields a text per site whose end is unknown and whose records end before the scenario
+        does.
+        """
         for site in self.unknown_ends:
             topic = self._topic(site, topics.STATE)
             account = self._accounts.get(topic)

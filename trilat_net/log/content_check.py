@@ -1,17 +1,18 @@
-"""Check of messages that no checksum covers, by their content: of a chunk that was cut off, or has no CRC.
+"""Check of messages that no checksum covers, by their content: of a chunk that was cut off, or
+has no CRC.
 
 Invariant:
-- A message is believed only if it decodes by its channel's schema, comes from its channel's member and from
-  the same start of it as the message before, has the next number of its channel, is stored under that
-  number and with its own time of sending, and was logged within its chunk and not before the message that
-  precedes it.
+- A message is believed only if it decodes by its channel's schema, comes from its channel's
+  member and from the same start of it as the message before, has the next number of its
+  channel, is stored under that number and with its own time of sending, and was logged within
+  its chunk and not before the message that precedes it.
 - Nothing is believed after the first message that fails.
-- Of a session in virtual time every message names the scenario by its boot: a chunk of a run of another
-  scenario, which includes the seed, is refused even where a checksum covers it.
+- Of a session in virtual time every message names the scenario by its boot: a chunk of a run of
+  another scenario, which includes the seed, is refused even where a checksum covers it.
 
-A log names each message four times over: by its place in the file, by its channel, by its sequence number and
-by its content. Damage that keeps all four consistent changes numbers inside a message alone, and is shorter
-than a message.
+A log names each message four times over: by its place in the file, by its channel, by its
+sequence number and by its content. Damage that keeps all four consistent changes numbers inside
+a message alone, and is shorter than a message.
 """
 
 import re
@@ -28,7 +29,12 @@ from ..scenario import Scenario
 from ..scenario.run_changes import count_skipped_ticks
 from .log_layout import CHANNEL_TYPES, MAX_TIME_NS, RECORDER_CHANNELS, SITE_CHANNELS, VIZ_ROOT
 from .mcap_records import MESSAGE_HEAD, OP_MESSAGE, UnreadableRecord, iterate_records
-from .message_identity import AnyMessage, MessageIdentity, compute_virtual_boot, identify_message
+from .message_identity import (
+    AnyMessage,
+    MessageIdentity,
+    compute_virtual_boot,
+    identify_message,
+)
 
 CDR_HEAD = b"\x00\x01"
 """First bytes of a message of a channel for viewers."""
@@ -56,8 +62,9 @@ class MessageOrigins(NamedTuple):
 def find_origins(data: bytes, most: int = _SAMPLED_MESSAGES) -> MessageOrigins:
     """Returns the origins that the first messages of an unpacked chunk imply or state.
 
-    An event states the epoch that it announces. Records and statistics state when they were sent since the
-    epoch, and are stored with the Unix time of that; a session in virtual time has the epoch 0.
+    An event states the epoch that it announces. Records and statistics state when they were
+    sent since the epoch, and are stored with the Unix time of that; a session in virtual time
+    has the epoch 0.
 
     Args:
         data: the records of the chunk.
@@ -98,7 +105,9 @@ def has_foreign_boots(about: Mapping[str, str], boots: set[tuple[str, int]]) -> 
     if about.get("driver") != VIRTUAL_DRIVER:
         return False
     digest = about.get("scenario_sha256", "")
-    return bool(boots) and all(boot != compute_virtual_boot(digest, sender) for sender, boot in boots)
+    return bool(boots) and all(
+        boot != compute_virtual_boot(digest, sender) for sender, boot in boots
+    )
 
 
 class ContentCheck:
@@ -107,10 +116,13 @@ class ContentCheck:
     Args:
         scenario: the session's scenario.
         about: metadata of the session.
-        is_continued: True for a later part of a log, whose channels do not begin with their first message.
+        is_continued: True for a later part of a log, whose channels do not begin with their
+            first message.
     """
 
-    def __init__(self, scenario: Scenario, about: Mapping[str, str], *, is_continued: bool) -> None:
+    def __init__(
+        self, scenario: Scenario, about: Mapping[str, str], *, is_continued: bool
+    ) -> None:
         self._scenario = scenario
         self._about = about
         self._session = about.get("session", "")
@@ -135,7 +147,9 @@ class ContentCheck:
         return key.member in self._scenario.sites and key.channel in SITE_CHANNELS
 
     def identify(self, payload: bytes) -> str:
-        """Returns the topic that a message belongs to by its own content; "" if it is none of the session."""
+        """Returns the topic that a message belongs to by its own content; "" if it is none of
+        the session.
+        """
         kinds: tuple[Any, ...] = tuple(CHANNEL_TYPES.values())
         for kind in kinds:
             try:
@@ -164,7 +178,8 @@ class ContentCheck:
         payload: bytes,
         span_ns: tuple[int, int],
     ) -> None:
-        """Takes note of a message that no checksum covers, if its content proves that it is the next one.
+        """Takes note of a message that no checksum covers, if its content proves that it is the
+        next one.
 
         Args:
             topic: the topic of its channel.
@@ -207,12 +222,16 @@ class ContentCheck:
         message, identity = self._decode(topic, payload)
         member = topic.split("/")[-2]
         if identity.sender != member:
-            raise UnreadableRecord(f"a message of {topic} says that {identity.sender[:40]!r} sent it")
+            raise UnreadableRecord(
+                f"a message of {topic} says that {identity.sender[:40]!r} sent it"
+            )
         boot = self._find_boot(member)
         if boot is not None and message.boot != boot:
             raise UnreadableRecord(f"a message of {topic} is of another start of {member}")
         if identity.sequence >= 0 and sequence != identity.sequence & 0xFFFFFFFF:
-            raise UnreadableRecord(f"number {identity.sequence} of {topic} is stored as {sequence}")
+            raise UnreadableRecord(
+                f"number {identity.sequence} of {topic} is stored as {sequence}"
+            )
         number = sequence if identity.number < 0 else identity.number
         self._check_number(topic, message, number)
         if isinstance(message, messages.State):
@@ -230,7 +249,9 @@ class ContentCheck:
             raise UnreadableRecord("a chunk of another run")
 
     def _find_boot(self, member: str) -> int | None:
-        """Returns the boot with which a member sends its messages; None if nothing tells it yet."""
+        """Returns the boot with which a member sends its messages; None if nothing tells it
+        yet.
+        """
         if self._about.get("driver") == VIRTUAL_DRIVER:
             return compute_virtual_boot(self._about.get("scenario_sha256", ""), member)
         channels = RECORDER_CHANNELS if member == topics.RECORDER else SITE_CHANNELS
@@ -259,14 +280,20 @@ class ContentCheck:
             raise UnreadableRecord(f"number {number} of {topic} follows number {expected - 1}")
 
     def _check_tick(self, topic: str, record: messages.State) -> None:
-        """Raises unless a record is of a tick of the run, at its nominal time, and names existing peers."""
+        """Raises unless a record is of a tick of the run, at its nominal time, and names
+        existing peers.
+        """
         site = record.site
         if not 0 <= record.tick < self._scenario.ticks(site):
             raise UnreadableRecord(f"the scenario has no tick {record.tick} of {site}")
         if record.t_ns != tick_ns(record.tick, self._scenario.sites[site].rate_hz):
             raise UnreadableRecord(f"tick {record.tick} of {topic} has another nominal time")
         peers = self._scenario.peers(site)
-        if not record.used.keys() <= set(peers) or not all(0 <= peer < len(peers) for peer, *_ in record.rx):
-            raise UnreadableRecord(f"tick {record.tick} of {topic} names a peer that does not exist")
+        if not record.used.keys() <= set(peers) or not all(
+            0 <= peer < len(peers) for peer, *_ in record.rx
+        ):
+            raise UnreadableRecord(
+                f"tick {record.tick} of {topic} names a peer that does not exist"
+            )
         if record.mode not in messages.MODES:
             raise UnreadableRecord(f"tick {record.tick} of {topic} has an unknown mode")

@@ -1,14 +1,15 @@
 """A log as data tables: a row per record, arrival, statistics message or event.
 
 Invariant:
-- Every number is the record's own, or follows from it exactly (an age is a difference of stamps), except that
-  an orientation is a unit quaternion whose sign continues from row to row: the record's rotation vector jumps
-  where it passes half a turn (see `orientations`). The column's meaning says so.
+- Every number is the record's own, or follows from it exactly (an age is a difference of
+  stamps), except that an orientation is a unit quaternion whose sign continues from row to row:
+  the record's rotation vector jumps where it passes half a turn (see `orientations`). The
+  column's meaning says so.
 - A column's name ends in its unit; a missing value is null, never a number in its place.
-- Units come from the schema, meanings from the docstrings of the message types, and of what a law sends from
-  its declaration: there is no second list.
-- A number out of range, or an arrival of a peer that a site does not have, is a `LogError` that names the
-  file (`source`).
+- Units come from the schema, meanings from the docstrings of the message types, and of what a
+  law sends from its declaration: there is no second list.
+- A number out of range, or an arrival of a peer that a site does not have, is a `LogError` that
+  names the file (`source`).
 """
 
 import dataclasses
@@ -103,7 +104,9 @@ class Column(NamedTuple):
         return np.where(self.known, self.values, np.nan)
 
     def rows(self, first: int, last: int) -> list[Any]:
-        """Returns the values of some rows as Python's own numbers and texts, None for missing ones."""
+        """Returns the values of some rows as Python's own numbers and texts, None for missing
+        ones.
+        """
         values: list[Any] = self.values[first:last].tolist()
         if self.known is None:
             return values
@@ -162,7 +165,9 @@ _COMPLETE_TEXTS = {
 
 
 class FieldDoc(NamedTuple):
-    """Documentation of a field: its unit ("" for none), its meaning, and its type in JSON Schema."""
+    """Documentation of a field: its unit ("" for none), its meaning, and its type in JSON
+    Schema.
+    """
 
     unit: str
     text: str
@@ -171,7 +176,9 @@ class FieldDoc(NamedTuple):
 
 @cache
 def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, FieldDoc]:
-    """Returns the documentation of every field of a message type, in the order of its definition."""
+    """Returns the documentation of every field of a message type, in the order of its
+    definition.
+    """
     texts = dict(_FIELD.findall(inspect.getdoc(kind) or ""))
     texts |= {name: _COMPLETE_TEXTS[name] for name in texts.keys() & _COMPLETE_TEXTS.keys()}
     properties: dict[str, dict[str, Any]] = json_schema(kind)["properties"]
@@ -183,7 +190,9 @@ def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, FieldDoc]:
     return docs
 
 
-def to_int_array(values: Iterable[int], source: str, field: str, kind: Any = np.int64) -> NDArray[Any]:
+def to_int_array(
+    values: Iterable[int], source: str, field: str, kind: Any = np.int64
+) -> NDArray[Any]:
     """Returns whole numbers as an array of type `kind`."""
     try:
         return np.fromiter(values, kind)
@@ -196,11 +205,32 @@ def _make_time_columns(
 ) -> Iterator[Column]:
     known: NDArray[np.bool_] = ~np.isnan(t_s)
     about = "nominal time since the session's epoch"
-    yield Column("t_s", t_s, "s", about, "t_ns", None if known.all() else known)
+    yield Column(
+        name="t_s",
+        values=t_s,
+        unit="s",
+        meaning=about,
+        source="t_ns",
+        known=None if known.all() else known,
+    )
     if tick is not None:
-        yield Column("tick", tick, "tick", "number of the tick", "tick")
-    yield Column("log_time_ns", log_ns, "ns", "when it came to the recorder, Unix time", "log_time")
-    yield Column("publish_time_ns", publish_ns, "ns", "when it was sent, Unix time", "publish_time")
+        yield Column(
+            name="tick", values=tick, unit="tick", meaning="number of the tick", source="tick"
+        )
+    yield Column(
+        name="log_time_ns",
+        values=log_ns,
+        unit="ns",
+        meaning="when it came to the recorder, Unix time",
+        source="log_time",
+    )
+    yield Column(
+        name="publish_time_ns",
+        values=publish_ns,
+        unit="ns",
+        meaning="when it was sent, Unix time",
+        source="publish_time",
+    )
 
 
 def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
@@ -211,14 +241,23 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
             is_pose = field in _POSES and arm.counts.shared == POSE
             for n, axis in enumerate(TASK_AXES[: PLACE if is_pose else arm.counts.shared]):
                 text = f"{docs[field].text}, along {axis}"
-                yield _make_number_column(site, field, n, f"{field}_{axis}", task[field][n >= PLACE], text)
+                yield _make_number_column(
+                    site=site,
+                    field=field,
+                    n=n,
+                    stem=f"{field}_{axis}",
+                    unit=task[field][n >= PLACE],
+                    text=text,
+                )
             if is_pose:
                 yield from _make_orientation_columns(site, field, docs[field].text)
             continue
         units = arm.joint_units(docs[field].unit)
         for n, (unit, joint) in enumerate(zip(units, arm.joint_names, strict=True)):
             text = f"{docs[field].text}, joint {n + 1}" + f", {joint}" * (arm.chain is not None)
-            yield _make_number_column(site, field, n, f"{field}{n + 1}", unit, text)
+            yield _make_number_column(
+                site=site, field=field, n=n, stem=f"{field}{n + 1}", unit=unit, text=text
+            )
     for n, (parameter, unit) in enumerate(arm.parameters):
         stem = f"theta_hat{n + 1}"
         text = f"{docs['theta_hat'].text}, parameter {n + 1}"
@@ -226,25 +265,44 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
             link, _, symbol = parameter.rpartition(".")
             stem = f"theta_hat{1 + n // LINK_PARAMETERS}_{symbol}"
             text = f"estimate of {symbol} of link {link}, about the frame of its joint"
-        yield _make_number_column(site, "theta_hat", n, stem, unit, text)
+        yield _make_number_column(
+            site=site, field="theta_hat", n=n, stem=stem, unit=unit, text=text
+        )
 
 
 def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[Column]:
-    """Yields the orientation of a pose as a quaternion; its source is the record's rotation vector."""
+    """Yields the orientation of a pose as a quaternion; its source is the record's rotation
+    vector.
+    """
     quaternions = find_quaternions(getattr(site, field)[:, PLACE:])
     for name, values in zip(QUATERNION_AXES, quaternions.T, strict=True):
         meaning = f"{text}, {name[1]} of its orientation as {_STEADY_QUATERNION}"
-        yield Column(f"{field}_{name}", np.ascontiguousarray(values), "", meaning, f"{field}[{PLACE}:{POSE}]")
+        yield Column(
+            name=f"{field}_{name}",
+            values=np.ascontiguousarray(values),
+            unit="",
+            meaning=meaning,
+            source=f"{field}[{PLACE}:{POSE}]",
+        )
 
 
 def _make_number_column(
-    site: SiteLog, field: str, n: int, stem: str, unit: str, text: str, known: NDArray[np.bool_] | None = None
+    site: SiteLog,
+    field: str,
+    n: int,
+    stem: str,
+    unit: str,
+    text: str,
+    known: NDArray[np.bool_] | None = None,
 ) -> Column:
     suffix = UNIT_SUFFIXES.get(unit, "")
-    if suffix and stem != suffix and not stem.endswith(f"_{suffix}"):  # else it is named already
+    # else it is named already
+    if suffix and stem != suffix and not stem.endswith(f"_{suffix}"):
         stem = f"{stem}_{suffix}"
     values = np.ascontiguousarray(getattr(site, field)[:, n])
-    return Column(stem, values, unit, text, f"{field}[{n}]", known)
+    return Column(
+        name=stem, values=values, unit=unit, meaning=text, source=f"{field}[{n}]", known=known
+    )
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
@@ -253,19 +311,43 @@ def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
         peer = entry.peer
         stem = f"ch_{name}" + f"_{peer}" * bool(peer) + f"_{entry.place + 1}" * (length > 1)
         suffix = UNIT_SUFFIXES.get(unit) or _to_word(unit).strip("_")
-        text = f"{name} that the law sends to {peer or 'all'}" + f", number {entry.place + 1}" * (length > 1)
+        text = (
+            f"{name} that the law sends to {peer or 'all'}"
+            + f", number {entry.place + 1}" * (length > 1)
+        )
         values = np.ascontiguousarray(site.ch[:, n])
-        yield Column(f"{stem}_{suffix}" if suffix else stem, values, unit, text, f"ch.{entry}")
+        yield Column(
+            name=f"{stem}_{suffix}" if suffix else stem,
+            values=values,
+            unit=unit,
+            meaning=text,
+            source=f"ch.{entry}",
+        )
 
 
 def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Column]:
     """Yields what somebody who holds the arm does, a column per number."""
     held: NDArray[np.bool_] = site.hand[:, 2] > 0.0
-    yield _make_number_column(site, "hand", 0, "hand_grip", "", "how firmly the arm is held, 0 to 1")
-    whose = {"number": "number of the newest message of who holds the arm", "source": "who holds the arm"}
+    yield _make_number_column(
+        site=site,
+        field="hand",
+        n=0,
+        stem="hand_grip",
+        unit="",
+        text="how firmly the arm is held, 0 to 1",
+    )
+    whose = {
+        "number": "number of the newest message of who holds the arm",
+        "source": "who holds the arm",
+    }
     for n, (name, text) in enumerate(whose.items(), 1):
         yield Column(
-            f"hand_{name}", np.clip(site.hand[:, n], -1, 2**53).astype(np.int64), "", text, f"hand[{n}]", held
+            name=f"hand_{name}",
+            values=np.clip(site.hand[:, n], -1, 2**53).astype(np.int64),
+            unit="",
+            meaning=text,
+            source=f"hand[{n}]",
+            known=held,
         )
     names = arm.joint_names if mode == "joint" else TASK_AXES[:PLACE]
     units = {"tip": ("m", "m/s"), "joint": ("rad", "rad/s"), "force": ("N", "")}[mode]
@@ -274,7 +356,15 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
     for n in range(2 * size if what == "target" else size):
         stem, unit = (what, units[0]) if n < size else (f"{what}_rate", units[1])
         meaning = f"{stem.replace('_', ' ')} of the hand, {names[n % size]}"
-        yield _make_number_column(site, "hand", 3 + n, f"hand_{stem}_{names[n % size]}", unit, meaning, held)
+        yield _make_number_column(
+            site=site,
+            field="hand",
+            n=3 + n,
+            stem=f"hand_{stem}_{names[n % size]}",
+            unit=unit,
+            text=meaning,
+            known=held,
+        )
 
 
 def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Column]:
@@ -282,12 +372,24 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
         first = (PLACE + len(QUATERNION_AXES)) * number
         for n, axis in enumerate("xyz", first):
             text = f"{axis} of the place of {body}, a body of its plant"
-            yield _make_number_column(site, "bodies", n, f"{body}_{axis}", "m", text)
+            yield _make_number_column(
+                site=site, field="bodies", n=n, stem=f"{body}_{axis}", unit="m", text=text
+            )
         first += PLACE
         quaternions = align_signs(site.bodies[:, first : first + len(QUATERNION_AXES)])
-        for n, (name, values) in enumerate(zip(QUATERNION_AXES, quaternions.T, strict=True), first):
-            text = f"orientation of {body}, a body of its plant, {name[1]} of {_STEADY_QUATERNION}"
-            yield Column(f"{body}_{name}", np.ascontiguousarray(values), "", text, f"bodies[{n}]")
+        for n, (name, values) in enumerate(
+            zip(QUATERNION_AXES, quaternions.T, strict=True), first
+        ):
+            text = (
+                f"orientation of {body}, a body of its plant, {name[1]} of {_STEADY_QUATERNION}"
+            )
+            yield Column(
+                name=f"{body}_{name}",
+                values=np.ascontiguousarray(values),
+                unit="",
+                meaning=text,
+                source=f"bodies[{n}]",
+            )
 
 
 def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
@@ -295,8 +397,12 @@ def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
     docs = read_field_docs(State)
     arm = scenario.arms[site.name]
     live = scenario.sites[site.name].find_live_hand()
-    columns = list(_make_time_columns(site.tick, site.t_s, site.log_time_ns, site.publish_time_ns))
-    columns.append(Column("mode", site.mode, "", docs["mode"].text, "mode"))
+    columns = list(
+        _make_time_columns(site.tick, site.t_s, site.log_time_ns, site.publish_time_ns)
+    )
+    columns.append(
+        Column(name="mode", values=site.mode, unit="", meaning=docs["mode"].text, source="mode")
+    )
     columns += _make_vector_columns(site, arm)
     columns += _make_sent_columns(site)
     columns += [] if live is None else _make_hand_columns(site, arm, live.mode)
@@ -308,33 +414,80 @@ def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
         age_ms = (site.t_ns - used * NS_PER_S // rate_hz) / 1e6
         source = f"used.{peer}"
         text = f"tick of the sample of {peer} in use"
-        columns.append(Column(f"used_{peer}_tick", used, "tick", text, source, known))
+        columns.append(
+            Column(
+                name=f"used_{peer}_tick",
+                values=used,
+                unit="tick",
+                meaning=text,
+                source=source,
+                known=known,
+            )
+        )
         text = f"now minus the stamp of the sample of {peer} in use"
-        columns.append(Column(f"age_{peer}_ms", age_ms, "ms", text, f"t_ns, {source}", known))
+        columns.append(
+            Column(
+                name=f"age_{peer}_ms",
+                values=age_ms,
+                unit="ms",
+                meaning=text,
+                source=f"t_ns, {source}",
+                known=known,
+            )
+        )
     for field in ("late_us", "busy_us", "sent_ns"):
         unit, text, _ = docs[field]
-        columns.append(Column(field, site.numbers(field), unit, text, field))
+        columns.append(
+            Column(
+                name=field, values=site.numbers(field), unit=unit, meaning=text, source=field
+            )
+        )
     return Table(site.name, "state", f"a tick of {site.name}", tuple(columns))
 
 
 def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
-    """Returns the samples that came to a site, a row each, in the order in which it accepted them."""
+    """Returns the samples that came to a site, a row each, in the order in which it accepted
+    them.
+    """
     counts, entries = site.arrivals
     index = entries[:, 0]
     if ((index < 0) | (index >= len(site.peers))).any():
-        raise LogError(f"{source}: a record of {site.name} lists an arrival of a peer that it does not have")
+        raise LogError(
+            f"{source}: a record of {site.name} lists an arrival of a peer that it does not have"
+        )
     row = np.repeat(np.arange(len(site)), counts)
     names = np.array(site.peers, dtype=np.object_)[index]
     delay = "the age of its stamp; in virtual time every sample arrives at the next tick"
     if live:
         delay = "its one-way delay, by the offset of the clocks in force"
     columns = (
-        *_make_time_columns(site.tick[row], site.t_s[row], site.log_time_ns[row], site.publish_time_ns[row]),
-        Column("peer", names, "", "whose sample came", "rx[][0]"),
-        Column("sample_tick", entries[:, 1].copy(), "tick", "its tick, at the peer's rate", "rx[][1]"),
-        Column("delay_us", entries[:, 2].copy(), "us", delay, "rx[][2]"),
+        *_make_time_columns(
+            site.tick[row], site.t_s[row], site.log_time_ns[row], site.publish_time_ns[row]
+        ),
+        Column(
+            name="peer", values=names, unit="", meaning="whose sample came", source="rx[][0]"
+        ),
+        Column(
+            name="sample_tick",
+            values=entries[:, 1].copy(),
+            unit="tick",
+            meaning="its tick, at the peer's rate",
+            source="rx[][1]",
+        ),
+        Column(
+            name="delay_us",
+            values=entries[:, 2].copy(),
+            unit="us",
+            meaning=delay,
+            source="rx[][2]",
+        ),
     )
-    return Table(site.name, "arrivals", f"a sample that {site.name} took in, by the tick that did", columns)
+    return Table(
+        site.name,
+        "arrivals",
+        f"a sample that {site.name} took in, by the tick that did",
+        columns,
+    )
 
 
 def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str) -> Table:
@@ -350,12 +503,30 @@ def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str
         if kind == "object":
             names: Iterable[str] = site.peers
             if field == "dropped":  # by reason, one per column name
-                names = {_to_word(reason): reason for value in values for reason in sorted(value)}.values()
+                names = {
+                    _to_word(reason): reason for value in values for reason in sorted(value)
+                }.values()
             columns += [_make_entry_column(source, field, name, values) for name in names]
         elif kind == "integer":
-            columns.append(Column(field, to_int_array(values, source, field), unit, text, field))
+            columns.append(
+                Column(
+                    name=field,
+                    values=to_int_array(values, source, field),
+                    unit=unit,
+                    meaning=text,
+                    source=field,
+                )
+            )
         else:
-            columns.append(Column(field, np.array(values, dtype=np.object_), unit, text, field))
+            columns.append(
+                Column(
+                    name=field,
+                    values=np.array(values, dtype=np.object_),
+                    unit=unit,
+                    meaning=text,
+                    source=field,
+                )
+            )
     about = f"statistics of {site.name}'s loop and links, ten times a second"
     return Table(site.name, "link", about, tuple(columns))
 
@@ -364,20 +535,23 @@ def _to_word(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", text.lower())[:31]
 
 
-def _make_entry_column(source: str, field: str, name: str, values: Sequence[Mapping[str, int]]) -> Column:
+def _make_entry_column(
+    source: str, field: str, name: str, values: Sequence[Mapping[str, int]]
+) -> Column:
     unit, text, _ = read_field_docs(LinkStats)[field]
     stem, _, ending = field.rpartition("_") if unit else (field, "", "count")
-    absent = 0 if field == "dropped" else None  # a reason for which no message was dropped is not named
+    # a reason for which no message was dropped is not named
+    absent = 0 if field == "dropped" else None
     numbers = [value.get(name, absent) for value in values]
     lowest = 0 if field in _NONE_BELOW_0 else -math.inf
     known = np.array([n is not None and n >= lowest for n in numbers], dtype=np.bool_)
     return Column(
-        f"{stem}_{_to_word(name)}_{ending}",
-        to_int_array((n or 0 for n in numbers), source, field),
-        unit,
-        f"{name}: {text.removeprefix('per peer, ')}",
-        f"{field}.{name}",
-        None if known.all() else known,
+        name=f"{stem}_{_to_word(name)}_{ending}",
+        values=to_int_array((n or 0 for n in numbers), source, field),
+        unit=unit,
+        meaning=f"{name}: {text.removeprefix('per peer, ')}",
+        source=f"{field}.{name}",
+        known=None if known.all() else known,
     )
 
 
@@ -393,20 +567,42 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
         values = [getattr(event, field) for event in events]
         if kind == "integer":
             bits = np.uint64 if field == "boot" else np.int64
-            columns.append(Column(field, to_int_array(values, source, field, bits), unit, text, field))
+            columns.append(
+                Column(
+                    name=field,
+                    values=to_int_array(values, source, field, bits),
+                    unit=unit,
+                    meaning=text,
+                    source=field,
+                )
+            )
         else:  # a map per member as JSON
-            texts = [v if isinstance(v, str) else json.dumps(v, sort_keys=True) if v else "" for v in values]
-            columns.append(Column(field, np.array(texts, dtype=np.object_), unit, text, field))
+            texts = [
+                v if isinstance(v, str) else json.dumps(v, sort_keys=True) if v else ""
+                for v in values
+            ]
+            columns.append(
+                Column(
+                    name=field,
+                    values=np.array(texts, dtype=np.object_),
+                    unit=unit,
+                    meaning=text,
+                    source=field,
+                )
+            )
     return Table(EVENTS_TABLE, "", "something that happened once", tuple(columns))
 
 
 def to_pandas_frame(table: Table) -> "pandas.DataFrame":
-    """Returns a table as a pandas data frame; what is missing is None among texts, NaN among numbers.
+    """Returns a table as a pandas data frame; what is missing is None among texts, NaN among
+    numbers.
 
     Raises:
         UsageError: pandas is not installed.
     """
-    columns = {c.name: c.rows(0, len(c.values)) if c.is_text else c.numbers() for c in table.columns}
+    columns = {
+        c.name: c.rows(0, len(c.values)) if c.is_text else c.numbers() for c in table.columns
+    }
     return import_extra("pandas", "frames", "data frames").DataFrame(columns)
 
 
@@ -421,7 +617,9 @@ def to_data_frame(table: Table) -> "polars.DataFrame":
     for column in table.columns:
         text = column.is_text
         one = pl.Series(
-            column.name, column.values.tolist() if text else column.values, pl.String if text else None
+            column.name,
+            column.values.tolist() if text else column.values,
+            pl.String if text else None,
         )
         if column.known is not None:
             one = one.zip_with(pl.Series(column.known), pl.Series([None], dtype=one.dtype))

@@ -1,6 +1,8 @@
-"""Findings of checks: what was looked at, the result in one line, and every problem with its place.
+"""Findings of checks: what was looked at, the result in one line, and every problem with its
+place.
 
-Invariant: a finding with a problem has not passed; problems beyond `MAX_LISTED_PROBLEMS` are counted only.
+Invariant: a finding with a problem has not passed; problems beyond `MAX_LISTED_PROBLEMS` are
+counted only.
 """
 
 from dataclasses import dataclass, field
@@ -14,7 +16,9 @@ MAX_LISTED_PROBLEMS = 1000
 
 
 class ProblemPlace(NamedTuple):
-    """A problem of a file, at a byte or in the chunk that begins there; None if the whole file is meant."""
+    """A problem of a file, at a byte or in the chunk that begins there; None if the whole file
+    is meant.
+    """
 
     file: str
     offset: int | None
@@ -29,12 +33,13 @@ class Finding:
     """Result of one check.
 
     Attributes:
-        check: its name: of a file "whole", "checksums", "records", "index"; of a trilat-net log also
-            "sequence", "accounts", "chain", "schema", "times", "rates", "scenario"; of an execution its
-            subject.
+        check: its name: of a file "whole", "checksums", "records", "index"; of a trilat-net log
+            also "sequence", "accounts", "chain", "schema", "times", "rates", "scenario"; of an
+            execution its subject.
         text: the result in one line.
         passed: True if it passed.
-        judged: False if it needs code from outside that nobody allowed to run; then it did not pass.
+        judged: False if it needs code from outside that nobody allowed to run; then it did not
+            pass.
         places: problems, at most `MAX_LISTED_PROBLEMS`.
         wrong: number of problems.
     """
@@ -55,7 +60,11 @@ class Finding:
 
     def summary(self) -> str:
         """Returns the first problem, and the number of others."""
-        return f"{self.places[0]}; and {self.wrong - 1} more" if self.wrong > 1 else str(self.places[0])
+        return (
+            f"{self.places[0]}; and {self.wrong - 1} more"
+            if self.wrong > 1
+            else str(self.places[0])
+        )
 
     def tell(self, sound: str) -> "Finding":
         """Takes `sound` as its text if there is no problem, else their summary; returns itself."""
@@ -64,7 +73,12 @@ class Finding:
 
     def line(self) -> dict[str, Any]:
         """Returns it as a line, ready for JSON."""
-        return {"label": self.check, "text": self.text, "passed": self.passed, "judged": self.judged}
+        return {
+            "label": self.check,
+            "text": self.text,
+            "passed": self.passed,
+            "judged": self.judged,
+        }
 
 
 class Findings(dict[str, Finding]):

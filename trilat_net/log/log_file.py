@@ -1,9 +1,10 @@
-"""The file of a log while it is written: `run.mcap.active` first, `run.mcap` once it is complete.
+"""The file of a log while it is written: `run.mcap.active` first, `run.mcap` once it is
+complete.
 
-Invariant: flushed data survives the death of the process, synced data a loss of power. Only a finished
-log bears the final name, and nothing is replaced without `force`. Disk space for the end of the file is
-reserved, so that a full disk ends the file in order, with all data given to it. Syncing runs in a thread
-unless `durable` is set.
+Invariant: flushed data survives the death of the process, synced data a loss of power. Only a
+finished log bears the final name, and nothing is replaced without `force`. Disk space for the
+end of the file is reserved, so that a full disk ends the file in order, with all data given to
+it. Syncing runs in a thread unless `durable` is set.
 """
 
 import errno
@@ -30,7 +31,9 @@ RESERVE_STEP_BYTES = 1 << 19
 
 
 class DiskReserve:
-    """Space reserved on a disk, as a file without a name in a folder there; `size` is its length, bytes."""
+    """Space reserved on a disk, as a file without a name in a folder there; `size` is its
+    length, bytes.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.size = 0
@@ -108,7 +111,9 @@ class FileSync:
         if self._trouble is not None:
             raise self._trouble
         now_ns = self._now_ns()
-        if now_ns - self._done_ns >= SYNC_PERIOD_NS and not (self._thread and self._thread.is_alive()):
+        if now_ns - self._done_ns >= SYNC_PERIOD_NS and not (
+            self._thread and self._thread.is_alive()
+        ):
             self._done_ns = now_ns
             self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
             self._thread.start()
@@ -135,16 +140,21 @@ _ELSEWHERE = "take another disk with -o"
 _ADVICE = {
     errno.ENOSPC: ("the disk is full", f"make room, or {_ELSEWHERE}"),
     errno.EDQUOT: ("your quota of the disk is used up", f"make room, or {_ELSEWHERE}"),
-    errno.EFBIG: ("the file system takes no longer file", "split the log, as in --split-size 1000"),
+    errno.EFBIG: (
+        "the file system takes no longer file",
+        "split the log, as in --split-size 1000",
+    ),
     errno.EIO: ("the disk fails", _ELSEWHERE),
     errno.EROFS: ("the disk has become read-only", _ELSEWHERE),
 }
 
 
 class LogFile:
-    """A file that is written in order and survives any end of its writer; for use in a `with` statement.
+    """A file that is written in order and survives any end of its writer; for use in a `with`
+    statement.
 
-    Written data stay in memory until `flush`, so that the file always ends at the end of a flush.
+    Written data stay in memory until `flush`, so that the file always ends at the end of a
+    flush.
 
     Args:
         path: its name once it is complete.
@@ -188,7 +198,9 @@ class LogFile:
             raise UsageError(f"{path}: cannot be written: {error.strerror}") from None
         sync_folder(path.parent)
         self._room = room or DiskReserve(path.parent)
-        self._syncing = FileSync(self._raw.fileno(), durable, now_ns or SystemClock().monotonic_ns)
+        self._syncing = FileSync(
+            self._raw.fileno(), durable, now_ns or SystemClock().monotonic_ns
+        )
         self._pending = bytearray()
         self._done = 0
         self._owed = 0
@@ -208,8 +220,9 @@ class LogFile:
         """Hands everything to the operating system, in one piece where it takes that.
 
         Raises:
-            OSError: the disk refuses. The first time, pending data have been written all the same if the
-                reserved space sufficed. The end of the file may follow, and nothing else.
+            OSError: the disk refuses. The first time, pending data have been written all the
+                same if the reserved space sufficed. The end of the file may follow, and nothing
+                else.
         """
         if self._broken and self.trouble:
             raise self.trouble
@@ -289,7 +302,8 @@ class LogFile:
         """Closes the file, whatever ended it.
 
         Raises:
-            LogRefused: the disk refused, now or as `error` says; the text states what is kept, and where.
+            LogRefused: the disk refused, now or as `error` says; the text states what is kept,
+                and where.
         """
         try:
             self.close()
@@ -301,7 +315,9 @@ class LogFile:
     def __enter__(self) -> "LogFile":
         return self
 
-    def __exit__(self, _: type[BaseException] | None, error: BaseException | None, __: object) -> None:
+    def __exit__(
+        self, _: type[BaseException] | None, error: BaseException | None, __: object
+    ) -> None:
         self.end(error)
 
     def refused(self, error: OSError) -> LogRefused:
@@ -309,11 +325,16 @@ class LogFile:
         what, advice = _ADVICE.get(error.errno or 0, (error.strerror or str(error), _ELSEWHERE))
         if self._published:
             content = _describe_content(self.path)
-            return LogRefused(f"{self.path}: {what}; the log ends there, finished, with {content}; {advice}")
+            return LogRefused(
+                f"{self.path}: {what}; the log ends there, finished, with {content}; {advice}"
+            )
         if not self.size:
             return LogRefused(f"{self.path}: {what}; nothing was written; {advice}")
-        if self.whole and self.trouble is None:  # another program has what it should replace open, on Windows
-            return LogRefused(f"{self.path}: {what}; the finished log is {self.working}: give it a name")
+        # another program has what it should replace open, on Windows
+        if self.whole and self.trouble is None:
+            return LogRefused(
+                f"{self.path}: {what}; the finished log is {self.working}: give it a name"
+            )
         return LogRefused(
             f"{self.working}: {what}, even for the end of the log; its {self.size / 1e6:.1f} MB up to the "
             f"last whole chunk are kept; {advice}; make it whole with: trilat log recover {self.working}"

@@ -1,7 +1,8 @@
 """Layout of a log: names of files, metadata and channels, the channel filter, and provenance.
 
-Invariant: a channel that the filter excludes is neither in the file nor in its accounts, and the file
-states the filter. Provenance holds versions, commit and platform, but no path, time or host name.
+Invariant: a channel that the filter excludes is neither in the file nor in its accounts, and
+the file states the filter. Provenance holds versions, commit and platform, but no path, time or
+host name.
 """
 
 import glob
@@ -49,7 +50,9 @@ def part_path(path: Path, number: int) -> Path:
 
 
 def find_parts(path: Path) -> dict[int, Path]:
-    """Returns the files of a log that are there, finished or not, by number; one without number is part 1."""
+    """Returns the files of a log that are there, finished or not, by number; one without number
+    is part 1.
+    """
     found: dict[int, Path] = {}
     for name in (path, active_path(path)):
         if name.exists():
@@ -64,7 +67,9 @@ def find_parts(path: Path) -> dict[int, Path]:
 
 @dataclass(frozen=True, slots=True)
 class ChannelFilter:
-    """Filter of channels by key expressions; an empty `include` takes all that `exclude` does not match."""
+    """Filter of channels by key expressions; an empty `include` takes all that `exclude` does
+    not match.
+    """
 
     include: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
@@ -87,7 +92,8 @@ ALL_CHANNELS = ChannelFilter()
 
 
 def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> ChannelFilter:
-    """Returns the filter for the options of a command; a leading slash, as topics have it, is ignored.
+    """Returns the filter for the options of a command; a leading slash, as topics have it, is
+    ignored.
 
     Raises:
         UsageError: a text is no key expression; it would silently match nothing.
@@ -99,12 +105,16 @@ def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> 
                     f"{option} is a key expression like 'trilat/*/m1/**' or '**/link': names, * for one of "
                     f"them, ** for any number, $* for a part of one; not {text!r}"
                 )
-    return ChannelFilter(*(tuple(text.strip("/") for text in texts) for texts in (include, exclude)))
+    return ChannelFilter(
+        *(tuple(text.strip("/") for text in texts) for texts in (include, exclude))
+    )
 
 
 def parse_filter_facts(about: Mapping[str, str]) -> ChannelFilter:
     """Returns the filter that the metadata of a session state, see `ChannelFilter.facts`."""
-    return ChannelFilter(tuple(about.get("include", "").split()), tuple(about.get("exclude", "").split()))
+    return ChannelFilter(
+        tuple(about.get("include", "").split()), tuple(about.get("exclude", "").split())
+    )
 
 
 _PACKAGES = ("numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")
@@ -117,7 +127,9 @@ def _git(*arguments: str) -> str | None:
         return None
     command = ["git", "-C", str(root), *arguments]
     try:
-        done = subprocess.run(command, capture_output=True, encoding="utf-8", check=True, timeout=10)
+        done = subprocess.run(
+            command, capture_output=True, encoding="utf-8", check=True, timeout=10
+        )
         return done.stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None

@@ -3,12 +3,12 @@
     log = open_log("run.mcap")
     log["m1"].t_s, log["m1"].q
 
-Invariant: files of every released schema version open; one that is cut off opens up to there, with
-`complete` false. Messages are decoded on access; an invalid record is an error that names the file, an
-invalid event or statistic is left out and reported (`unreadable`). Channels of other sessions and members
-are none of the log's. Measured link delays, for scenarios with `model = "trace"`, leave out what the log does
-not know: a sample counts as lost only if records cover every tick at which it could have come, up to the
-longest delay of the link.
+Invariant: files of every released schema version open; one that is cut off opens up to there,
+with `complete` false. Messages are decoded on access; an invalid record is an error that names
+the file, an invalid event or statistic is left out and reported (`unreadable`). Channels of
+other sessions and members are none of the log's. Measured link delays, for scenarios with
+`model = "trace"`, leave out what the log does not know: a sample counts as lost only if records
+cover every tick at which it could have come, up to the longest delay of the link.
 """
 
 import hashlib
@@ -72,7 +72,8 @@ M = TypeVar("M", Event, LinkStats, RecorderStats)
 
 
 class Log(Result, Mapping[str, SiteLog]):
-    """A recorded session, a mapping: `log["m1"]` is a site's part, `log.items()` has them by name.
+    """A recorded session, a mapping: `log["m1"]` is a site's part, `log.items()` has them by
+    name.
 
     Args:
         contents: the contents of its file, or of its files together.
@@ -104,23 +105,32 @@ class Log(Result, Mapping[str, SiteLog]):
         self.scenario_sha256 = hashlib.sha256(contents.scenario).hexdigest()
         try:
             self.scenario_text = contents.scenario.decode()
-            self.scenario: Scenario = parse_embedded(self.scenario_text, f"{self.source}: scenario")
+            self.scenario: Scenario = parse_embedded(
+                self.scenario_text, f"{self.source}: scenario"
+            )
         except (ScenarioError, UnicodeDecodeError) as error:
             raise LogError(f"{self.source}: its scenario cannot be read: {error}") from None
         self.sites = self.scenario.names
         self._contents = contents
         self._sites: dict[str, SiteLog] = {}
         self.unreadable: list[str] = []
-        self.events = [event for topic in self._event_topics() for event in self._read_events(topic)]
+        self.events = [
+            event for topic in self._event_topics() for event in self._read_events(topic)
+        ]
 
     def headline(self) -> str:
         """Returns the session, and how many records it has, in one line."""
         try:
-            seconds = max((float(self[name].t_s[-1]) for name in self.sites if len(self[name])), default=0.0)
+            seconds = max(
+                (float(self[name].t_s[-1]) for name in self.sites if len(self[name])),
+                default=0.0,
+            )
             records = sum(len(self[name]) for name in self.sites)
             missing = sum(map(self.missing, self.sites)) or "none"
             holds = f"{seconds:.3f} s, {count_nouns(records, 'record')}, {missing} missing"
-            holds += f"; {describe_unknown_ends(self.unknown_ends)}" if self.unknown_ends else ""
+            holds += (
+                f"; {describe_unknown_ends(self.unknown_ends)}" if self.unknown_ends else ""
+            )
             holds += "" if self.diverged_s is None else f"; DIVERGED at {self.diverged_s:.3f} s"
         except LogError:
             holds = "with records that cannot be read"
@@ -156,7 +166,9 @@ class Log(Result, Mapping[str, SiteLog]):
         ]
 
     def to_frame(self, name: str = "", kind: str = "") -> "pandas.DataFrame":
-        """Returns a table of the log as a pandas data frame, see `table`; without a name a row per site."""
+        """Returns a table of the log as a pandas data frame, see `table`; without a name a row
+        per site.
+        """
         return to_pandas_frame(self.table(name, kind)) if name else super().to_frame()
 
     __eq__ = object.__eq__  # logs are not compared record by record
@@ -182,12 +194,16 @@ class Log(Result, Mapping[str, SiteLog]):
         return self._contents.channels.get(topic) or ChannelMessages()
 
     def _decode(self, topic: str, kind: type[M]) -> list[M]:
-        """Returns the messages of a channel; those that cannot be read leave it, and are reported once."""
+        """Returns the messages of a channel; those that cannot be read leave it, and are
+        reported once.
+        """
         channel = self._channel(topic)
         readable = ChannelMessages()
         problem = ""
         messages: list[M] = []
-        for payload, *times in zip(channel.payloads, channel.log_ns, channel.publish_ns, strict=True):
+        for payload, *times in zip(
+            channel.payloads, channel.log_ns, channel.publish_ns, strict=True
+        ):
             try:
                 messages.append(decode(payload, kind, READABLE))
                 readable.add(payload, *times)
@@ -204,25 +220,33 @@ class Log(Result, Mapping[str, SiteLog]):
 
     def _read_events(self, topic: str) -> list[Event]:
         events = self._decode(topic, Event)
-        boots = {boot: n for n, boot in enumerate(dict.fromkeys(event.boot for event in events))}
+        boots = {
+            boot: n for n, boot in enumerate(dict.fromkeys(event.boot for event in events))
+        }
         return sorted(events, key=lambda event: (boots[event.boot], event.n))
 
     @cached_property
     def diverged_s(self) -> float | None:
         """When the first site left its limits, s, which ended the run; None if none did."""
-        return min((at_s for part in self.values() if (at_s := part.diverged_s) is not None), default=None)
+        return min(
+            (at_s for part in self.values() if (at_s := part.diverged_s) is not None),
+            default=None,
+        )
 
     def warn_if_diverged(self) -> None:
         """Warns the caller of the caller, in Python, of a run that diverged."""
         if self.diverged_s is not None:
             when = f"the run diverged at {self.diverged_s:.3f} s, and ends there"
-            warnings.warn(f"{when}: a joint passed its qd_limit_rad_s", RuntimeWarning, stacklevel=3)
+            warnings.warn(
+                f"{when}: a joint passed its qd_limit_rad_s", RuntimeWarning, stacklevel=3
+            )
 
     @cached_property
     def complete(self) -> bool:
         """False if the file was not finished.
 
-        Of several files all must be finished, or the last one, if no record is missing all the same.
+        Of several files all must be finished, or the last one, if no record is missing all the
+        same.
         """
         if self._contents.complete or len(self.sources) == 1:
             return self._contents.complete
@@ -234,8 +258,8 @@ class Log(Result, Mapping[str, SiteLog]):
     def executed_sites(self) -> tuple[str, ...]:
         """The sites whose records can be executed from the file.
 
-        All of them, except in an open-loop rerun: the records of its other sites were made against sites that
-        the file does not hold.
+        All of them, except in an open-loop rerun: the records of its other sites were made
+        against sites that the file does not hold.
         """
         named = self.session.get(EXECUTED_SITES_KEY) if self.driver == RERUN_DRIVER else None
         return tuple(name for name in self.sites if named is None or name in named.split())
@@ -244,7 +268,11 @@ class Log(Result, Mapping[str, SiteLog]):
     def part(self) -> int:
         """Its number among the parts of a log; 0 of several parts, and of a log without parts."""
         number = self._contents.metadata.get(PART, {}).get("index", "0")
-        return int(number) if len(self.sources) == 1 and number.isdecimal() and len(number) < 10 else 0
+        return (
+            int(number)
+            if len(self.sources) == 1 and number.isdecimal() and len(number) < 10
+            else 0
+        )
 
     @cached_property
     def accounts(self) -> dict[str, str]:
@@ -274,17 +302,23 @@ class Log(Result, Mapping[str, SiteLog]):
         return {**accounts.texts(), **written}
 
     def account(self, site: str) -> str:
-        """Returns what arrived of a site's records and what is missing; "" in an unfinished file."""
+        """Returns what arrived of a site's records and what is missing; "" in an unfinished
+        file.
+        """
         return self.accounts.get(self._topic(site, topics.STATE), "")
 
     @cached_property
     def unknown_ends(self) -> tuple[str, ...]:
-        """The sites whose event at their end never arrived: nobody knows how many ticks they made.
+        """The sites whose event at their end never arrived: nobody knows how many ticks they
+        made.
 
-        None of a part that others follow or of a log that takes no events: there it is not to be expected.
+        None of a part that others follow or of a log that takes no events: there it is not to
+        be expected.
         """
         choice = parse_filter_facts(self.session)
-        key = {site: topics.key(self.session["session"], site, topics.EVENT) for site in self.sites}
+        key = {
+            site: topics.key(self.session["session"], site, topics.EVENT) for site in self.sites
+        }
         is_part = bool(self.part) and len(self.sources) == 1
         ended = {event.member for event in self.events if event.kind == "end"}
         silent = [site for site in self.sites if site not in ended and choice.takes(key[site])]
@@ -298,7 +332,9 @@ class Log(Result, Mapping[str, SiteLog]):
 
     @cached_property
     def starts(self) -> dict[str, list[tuple[int, int]]]:
-        """Per site that joined the running session the first ticks of those starts, and their boots."""
+        """Per site that joined the running session the first ticks of those starts, and their
+        boots.
+        """
         joins = [e for e in self.events if e.kind == "join" and e.member in self.scenario.sites]
         found: dict[str, list[tuple[int, int]]] = {}
         for event in joins:
@@ -310,17 +346,23 @@ class Log(Result, Mapping[str, SiteLog]):
     def absences(self) -> dict[str, list[tuple[int, int]]]:
         """Per site the ticks before each of these starts that were not made, as (first, last).
 
-        They begin after those of which there are records, that the start before stated at its end, or that
-        others heard of.
+        They begin after those of which there are records, that the start before stated at its
+        end, or that others heard of.
         """
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 
     def _find_absences(self, site: str, starts: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        ends = [event.ticks - 1 for event in self.events if event.kind == "end" and event.member == site]
+        ends = [
+            event.ticks - 1
+            for event in self.events
+            if event.kind == "end" and event.member == site
+        ]
         made = np.array([*self[site].tick.tolist(), *ends], dtype=np.int64)
         found: list[tuple[int, int]] = []
         for first, boot in starts:
-            heard = [e.ticks for e in self.events if e.kind == LAST and e.boots.get(site) == boot]
+            heard = [
+                e.ticks for e in self.events if e.kind == LAST and e.boots.get(site) == boot
+            ]
             begin = int(made[made < first].max(initial=-1)) + 1
             known = min(first, max(heard, default=0))
             if known - begin > count_under_way(topics.STATE, self[site].rate_hz):
@@ -332,27 +374,37 @@ class Log(Result, Mapping[str, SiteLog]):
         return found
 
     def absent_ticks(self, site: str) -> int:
-        """Returns how many ticks that is for a site, and how many it left out as its records say."""
+        """Returns how many ticks that is for a site, and how many it left out as its records
+        say.
+        """
         between = sum(last - first + 1 for first, last in self.absences.get(site, ()))
         return between + self[site].skipped
 
     def expected_ticks(self, site: str) -> int:
         """Returns how many ticks of a site belong to the run.
 
-        Those that it stated at its end; of a site that others lost for good, those up to its last known one;
-        else those of the scenario; without those that it did not make between two of its starts.
+        Those that it stated at its end; of a site that others lost for good, those up to its
+        last known one; else those of the scenario; without those that it did not make between
+        two of its starts.
         """
         stated = self._stated_ticks.get(site)
         there = self[site].last_tick + 1
         if stated is None:
             kinds = ("lost", "left", "back", "admit")
-            told = [event for event in self.events if event.about == site and event.kind in kinds]
-            gone = bool(told) and max(told, key=lambda event: event.t_ns).kind in ("lost", "left")
+            told = [
+                event for event in self.events if event.about == site and event.kind in kinds
+            ]
+            gone = bool(told) and max(told, key=lambda event: event.t_ns).kind in (
+                "lost",
+                "left",
+            )
             stated = there if gone and there else self.scenario.ticks(site)
         return max(stated, there) - self.absent_ticks(site)
 
     def missing(self, site: str) -> int:
-        """Returns how many records of a site are missing: of those that it made, else up to its last one."""
+        """Returns how many records of a site are missing: of those that it made, else up to its
+        last one.
+        """
         part = self[site]
         missing = part.missing + max(0, self._stated_ticks.get(site, 0) - (part.last_tick + 1))
         return max(0, missing - self.absent_ticks(site))
@@ -375,7 +427,9 @@ class Log(Result, Mapping[str, SiteLog]):
 
     def __getitem__(self, site: str) -> SiteLog:
         if site not in self.scenario.sites:
-            raise UnknownName(f"no site {site!r} in {self.source}; it has {', '.join(self.sites)}")
+            raise UnknownName(
+                f"no site {site!r} in {self.source}; it has {', '.join(self.sites)}"
+            )
         if site not in self._sites:
             channel = self._channel(self._topic(site, topics.STATE))
             rate_hz = self.scenario.sites[site].rate_hz
@@ -386,21 +440,36 @@ class Log(Result, Mapping[str, SiteLog]):
             axes = self.scenario.arms[site].axes
             payloads = channel.payloads
             source = self.source
-            part = SiteLog(site, peers, rate_hz, payloads, source, times, layout, sent, axes)
+            part = SiteLog(
+                name=site,
+                peers=peers,
+                rate_hz=rate_hz,
+                payloads=payloads,
+                source=source,
+                times=times,
+                layout=layout,
+                channel=sent,
+                axes=axes,
+            )
             most = self.scenario.ticks(site)
             last = part.last_tick
             if last >= most:  # a tick of others is nothing to count up to
-                raise LogError(f"{self.source}: {site} has a record of tick {last}; the scenario has {most}")
+                raise LogError(
+                    f"{self.source}: {site} has a record of tick {last}; the scenario has {most}"
+                )
             self._sites[site] = part
         return self._sites[site]
 
     def changes(self, site: str) -> dict[int, list[str]]:
         """Returns the texts of the changes that a site took in, by tick, in order.
 
-        They are in its records, and in its events, which also have those whose record is missing.
+        They are in its records, and in its events, which also have those whose record is
+        missing.
         """
         named = self[site].changes()
-        events = [event for event in self.events if event.kind == "change" and event.member == site]
+        events = [
+            event for event in self.events if event.kind == "change" and event.member == site
+        ]
         recorded = set(self[site].tick.tolist()) if events else set()
         for event in events:
             if event.ticks not in recorded:
@@ -416,19 +485,25 @@ class Log(Result, Mapping[str, SiteLog]):
         named = self.changes(site).items()
         try:
             return {
-                tick: [parse_core_change(self.scenario, site, one) for one in texts] for tick, texts in named
+                tick: [parse_core_change(self.scenario, site, one) for one in texts]
+                for tick, texts in named
             }
         except ScenarioError as error:
             raise LogError(f"{self.source}: {error}") from None
 
     def shown(self, site: str) -> dict[str, Ints]:
-        """Returns the tick of each peer that a site's user was shown at its records, -1 before the first.
+        """Returns the tick of each peer that a site's user was shown at its records, -1 before
+        the first.
 
-        That is the sample in use; with `[sites.NAME.view]` the newest that had come over the view by then.
+        That is the sample in use; with `[sites.NAME.view]` the newest that had come over the
+        view by then.
         """
         part = self[site]
         every = PictureDelay(self.scenario, site).list_all(part.last_tick + 1)
-        shown = {peer: np.minimum(ticks[part.tick], self[peer].last_tick) for peer, ticks in every.items()}
+        shown = {
+            peer: np.minimum(ticks[part.tick], self[peer].last_tick)
+            for peer, ticks in every.items()
+        }
         return {**part.used, **shown}
 
     def link_stats(self, site: str) -> list[LinkStats]:
@@ -444,7 +519,9 @@ class Log(Result, Mapping[str, SiteLog]):
         return TimedMessages([stats[n] for n in order], *times)
 
     def timed_events(self) -> TimedMessages[Event]:
-        """Returns the events in the order in which they came to the recorder, with times as well."""
+        """Returns the events in the order in which they came to the recorder, with times as
+        well.
+        """
         found = self._event_topics()
         events = [event for topic in found for event in self._decode(topic, Event)]
         if not events:
@@ -452,7 +529,9 @@ class Log(Result, Mapping[str, SiteLog]):
         times = [self._channel(topic).times() for topic in found]
         log_ns, publish_ns = (np.concatenate(column) for column in zip(*times, strict=True))
         order = np.argsort(log_ns, kind="stable")
-        return TimedMessages([events[n] for n in order.tolist()], log_ns[order], publish_ns[order])
+        return TimedMessages(
+            [events[n] for n in order.tolist()], log_ns[order], publish_ns[order]
+        )
 
     def recorder_stats(self) -> list[RecorderStats]:
         """Returns the recorder's statistics of its own work, in order."""
@@ -463,8 +542,8 @@ class Log(Result, Mapping[str, SiteLog]):
 
         Args:
             name: a site, or "events".
-            kind: of a site, "state" (a row per record), "link" (its statistics) or "arrivals" (a row per
-                sample that came in).
+            kind: of a site, "state" (a row per record), "link" (its statistics) or "arrivals"
+                (a row per sample that came in).
 
         Raises:
             UnknownName: there is no such part.
@@ -480,7 +559,9 @@ class Log(Result, Mapping[str, SiteLog]):
                 return build_link_table(site, self.timed_link_stats(name), self.source)
             case "arrivals":
                 return build_arrivals_table(site, self.source, live=self.driver == "live")
-        raise UnknownName(f"no table {kind!r} of {name}; there are {', '.join(SITE_TABLE_KINDS)}")
+        raise UnknownName(
+            f"no table {kind!r} of {name}; there are {', '.join(SITE_TABLE_KINDS)}"
+        )
 
     def tables(self) -> Iterator[Table]:
         """Yields every table, one at a time: of each site, and the events."""
@@ -519,12 +600,13 @@ def open_log(
         law: files of control laws that the log names, which may run when it is executed, see
             docs/code-that-runs.md. Laws of runs that this process has made may.
         other_version: whether these may have another hash than the log names.
-        remember: whether they may run for other logs that name their hashes, with the same settings.
+        remember: whether they may run for other logs that name their hashes, with the same
+            settings.
 
     Raises:
         UsageError: `law` is none that the log names.
-        LogError: a file is missing, is no MCAP file, or no log of trilat-net; files are of different
-            sessions, or disagree on a message.
+        LogError: a file is missing, is no MCAP file, or no log of trilat-net; files are of
+            different sessions, or disagree on a message.
     """
     log = Log(merge_parts(_read_parts((source, *more), progress)))
     allow_logged_code(log.scenario, law, other_version=other_version, remember=remember)
@@ -532,7 +614,9 @@ def open_log(
 
 
 def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Log]:
-    """Returns the logs in files and folders, see `open_log`; files of one session are its parts."""
+    """Returns the logs in files and folders, see `open_log`; files of one session are its
+    parts.
+    """
     files: list[Path] = []
     for path in map(Path, sources):
         if not (found := sorted(path.glob("*.mcap")) if path.is_dir() else [path]):
@@ -544,7 +628,9 @@ def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Lo
     return [Log(merge_parts(parts)) for parts in sessions.values()]
 
 
-def _read_parts(sources: Sequence[str | Path | BinaryIO], progress: Progress | None) -> list[LogContents]:
+def _read_parts(
+    sources: Sequence[str | Path | BinaryIO], progress: Progress | None
+) -> list[LogContents]:
     files: list[tuple[BinaryIO, str]] = []
     parts: list[LogContents] = []
     with ExitStack() as stack:
@@ -555,7 +641,9 @@ def _read_parts(sources: Sequence[str | Path | BinaryIO], progress: Progress | N
             elif hasattr(one, "seek"):
                 files.append((one, "log"))
             else:
-                raise LogError(f"a log is a path, or a file opened for reading, not {one!r:.80}")
+                raise LogError(
+                    f"a log is a path, or a file opened for reading, not {one!r:.80}"
+                )
         sizes = [_measure(stream) for stream, _ in files]
         for n, (stream, name) in enumerate(files):
             with _reading(name):
@@ -569,7 +657,9 @@ def _reading(name: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise LogError(f"{name}: cannot be read: {error.strerror}{describe_unfinished(Path(name))}") from None
+        raise LogError(
+            f"{name}: cannot be read: {error.strerror}{describe_unfinished(Path(name))}"
+        ) from None
 
 
 def _measure(stream: BinaryIO) -> int:
@@ -582,9 +672,10 @@ def _measure(stream: BinaryIO) -> int:
 def read_link_delays(path: Path, link: str) -> list[TracePoint]:
     """Returns the delays of the samples of a link such as "m1->s", by their own stamps.
 
-    These are the delays of the network that carried them, as the receiver's records have them in `rx`,
-    without those that the session's scenario injected. A negative one comes of the clocks and counts as none;
-    of a sample that came twice the shorter one counts. A tick of which the sender has a record was sent.
+    These are the delays of the network that carried them, as the receiver's records have them
+    in `rx`, without those that the session's scenario injected. A negative one comes of the
+    clocks and counts as none; of a sample that came twice the shorter one counts. A tick of
+    which the sender has a record was sent.
 
     Raises:
         OSError: the file cannot be opened.
@@ -605,8 +696,13 @@ def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[Trace
     """Returns the rows of every link of a log; a scenario asks for one after the other."""
     try:
         log = open_log(path)
-        links = ((site, *link) for site in log.sites for link in enumerate(log.scenario.peers(site)))
-        return {f"{peer}->{site}": list(_iterate_delays(log, site, n, peer)) for site, n, peer in links}
+        links = (
+            (site, *link) for site in log.sites for link in enumerate(log.scenario.peers(site))
+        )
+        return {
+            f"{peer}->{site}": list(_iterate_delays(log, site, n, peer))
+            for site, n, peer in links
+        }
     except LogError as error:
         raise ValueError(str(error).removeprefix(f"{path}: ")) from None
 
@@ -629,14 +725,20 @@ def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[Trac
     for tick in sorted(ticks):
         stamp_ns = tick * NS_PER_S // rate_hz
         came = tick in delays_us
-        if came or not any(stamp_ns <= end and stamp_ns + longest_ns >= start for start, end in gaps):
+        if came or not any(
+            stamp_ns <= end and stamp_ns + longest_ns >= start for start, end in gaps
+        ):
             # the microsecond in which the stamp lies, as the core counts it
             yield stamp_ns // 1000 / 1e6, delays_us[tick] / 1e3 if came else math.inf
 
 
 def _find_gaps_ns(states: Sequence[State]) -> list[tuple[int, float]]:
-    """Returns when samples may have come unseen, ns: where records are missing, and after the last one."""
-    gaps: list[tuple[int, float]] = [(a.t_ns, b.t_ns) for a, b in pairwise(states) if b.tick != a.tick + 1]
+    """Returns when samples may have come unseen, ns: where records are missing, and after the
+    last one.
+    """
+    gaps: list[tuple[int, float]] = [
+        (a.t_ns, b.t_ns) for a, b in pairwise(states) if b.tick != a.tick + 1
+    ]
     if states and states[0].tick > 0:
         gaps.append((0, states[0].t_ns))
     return [*gaps, (states[-1].t_ns if states else 0, math.inf)]

@@ -1,8 +1,8 @@
 """Signatures of logs: Ed25519 over the digest chain of a file, in a file of its own beside it.
 
-Invariant: a log is read, never written. What is signed is what the chain covers, all messages and all that
-describes them, and not how they are packed; so a signature holds for a copy that was packed anew, and for
-nothing else. Only a file that agrees with its chain is signed.
+Invariant: a log is read, never written. What is signed is what the chain covers, all messages
+and all that describes them, and not how they are packed; so a signature holds for a copy that
+was packed anew, and for nothing else. Only a file that agrees with its chain is signed.
 """
 
 import base64
@@ -16,7 +16,10 @@ from typing import Any
 import msgspec
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from cryptography.hazmat.primitives.asymmetric.ed25519 import (
+    Ed25519PrivateKey,
+    Ed25519PublicKey,
+)
 
 from ..errors import LogError, UsageError, count_nouns
 from ..files import find_rights_of_others, open_regular, reading, refuse_existing, write_whole
@@ -37,7 +40,8 @@ class LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         format: names this format and its version.
         chain: the digests that are signed, as the log's chain states them.
-        public_key: of who signed, 32 bytes in base64; whether to trust it is the reader's matter.
+        public_key: of who signed, 32 bytes in base64; whether to trust it is the reader's
+            matter.
         signature: 64 bytes in base64.
     """
 
@@ -48,7 +52,8 @@ class LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
-    """Makes a pair of keys, PATH.key, which nobody else may read, and PATH.pub; returns their files.
+    """Makes a pair of keys, PATH.key, which nobody else may read, and PATH.pub; returns their
+    files.
 
     The command is `trilat keys pair`.
 
@@ -76,7 +81,11 @@ def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
 
 
 def sign_log(
-    path: str | Path, key_file: str | Path, *, force: bool = False, progress: Progress | None = None
+    path: str | Path,
+    key_file: str | Path,
+    *,
+    force: bool = False,
+    progress: Progress | None = None,
 ) -> Path:
     """Signs a finished log; returns the signature's file. The command is `trilat log sign`.
 
@@ -91,7 +100,9 @@ def sign_log(
     path = Path(path)
     key_file = Path(key_file)
     key = _load_key(
-        key_file, Ed25519PrivateKey, "private Ed25519 key; make a pair with: trilat keys pair NAME"
+        key_file,
+        Ed25519PrivateKey,
+        "private Ed25519 key; make a pair with: trilat keys pair NAME",
     )
     if find_rights_of_others(key_file):
         raise UsageError(f"{key_file}: can be read by others: chmod 600 {key_file}")
@@ -103,22 +114,32 @@ def sign_log(
             DigestState.OPEN: f"; make it whole first with: trilat log recover {path}",
             DigestState.ABSENT: f"; trilat log recover {path} makes a copy with one",
         }
-        raise LogError(f"{path}: is not signed: {integrity.text}{advice.get(integrity.state, '')}")
-    raw = key.public_key().public_bytes(serialization.Encoding.Raw, serialization.PublicFormat.Raw)
+        raise LogError(
+            f"{path}: is not signed: {integrity.text}{advice.get(integrity.state, '')}"
+        )
+    raw = key.public_key().public_bytes(
+        serialization.Encoding.Raw, serialization.PublicFormat.Raw
+    )
     texts = (base64.b64encode(data).decode() for data in (raw, key.sign(_signed_bytes(chain))))
-    content = msgspec.json.format(msgspec.json.encode(LogSignature(_FORMAT, dict(chain), *texts)), indent=1)
+    content = msgspec.json.format(
+        msgspec.json.encode(LogSignature(_FORMAT, dict(chain), *texts)), indent=1
+    )
     write_whole(made, content + b"\n", force=force)
     return made
 
 
-def check_signatures(paths: Sequence[Path], key_file: Path, progress: Progress | None = None) -> Finding:
+def check_signatures(
+    paths: Sequence[Path], key_file: Path, progress: Progress | None = None
+) -> Finding:
     """Checks that files are what the owner of a public key signed.
 
     Raises:
         LogError: a log cannot be read.
         UsageError: the key is none.
     """
-    key = _load_key(key_file, Ed25519PublicKey, "public Ed25519 key; trilat keys pair NAME makes NAME.pub")
+    key = _load_key(
+        key_file, Ed25519PublicKey, "public Ed25519 key; trilat keys pair NAME makes NAME.pub"
+    )
     found = Finding("signature")
     for path in paths:
         if problem := _find_problem(path, key, progress):
@@ -174,7 +195,8 @@ def _load_key(path: Path, kind: Any, wanted: str) -> Any:
     with reading(path, UsageError) as stream:
         data = stream.read(_MOST_BYTES)
     key: object = None
-    with suppress(ValueError, TypeError, UnsupportedAlgorithm):  # TypeError: it needs a password
+    # TypeError: it needs a password
+    with suppress(ValueError, TypeError, UnsupportedAlgorithm):
         if kind is Ed25519PrivateKey:
             key = serialization.load_pem_private_key(data, password=None)
         else:

@@ -1,9 +1,10 @@
-"""Writer of a session's log into one MCAP file or into parts: `run-001.mcap`, `run-002.mcap`, ...
+"""Writer of a session's log into one MCAP file or into parts: `run-001.mcap`, `run-002.mcap`,
+...
 
-Invariant (L5): a file explains itself from its first bytes on: session, scenario and schemas precede the
-first message, payloads are stored byte for byte as published, and the accounts stand at the end. Each
-part repeats session, scenario and schemas and names the part before it; a message is in exactly one part.
-The file changes between two messages, on the writing thread.
+Invariant (L5): a file explains itself from its first bytes on: session, scenario and schemas
+precede the first message, payloads are stored byte for byte as published, and the accounts
+stand at the end. Each part repeats session, scenario and schemas and names the part before it;
+a message is in exactly one part. The file changes between two messages, on the writing thread.
 """
 
 import json
@@ -68,11 +69,21 @@ class LogWriter:
         self._ended = ""  # why nothing more can be added
         self._views = None
         if views_hz:
-            self._views = VizChannels(scenario, session, epoch_unix_ns, views_hz, self._put_view)
+            self._views = VizChannels(
+                scenario=scenario,
+                session=session,
+                epoch_unix_ns=epoch_unix_ns,
+                views_hz=views_hz,
+                put=self._put_view,
+            )
         self._takers: dict[str, TakeMessage] = self._views.takers if self._views else {}
         self._last_log_ns = 0
-        self._file = McapWriter(stream, f"trilat-net {log_layout.collect_provenance()['version_trilat-net']}")
-        self._standard = StandardChannels(self._file, self._views.channels if self._views else {})
+        self._file = McapWriter(
+            stream, f"trilat-net {log_layout.collect_provenance()['version_trilat-net']}"
+        )
+        self._standard = StandardChannels(
+            self._file, self._views.channels if self._views else {}
+        )
         about = {
             "schema_version": str(VERSION),
             "session": session,
@@ -89,17 +100,27 @@ class LogWriter:
             self._file.add_metadata(log_layout.SESSION, about)
             if part:
                 self._file.add_metadata(log_layout.PART, part)
-            self._file.add_attachment(0, 0, log_layout.SCENARIO, "application/toml", scenario.text.encode())
+            self._file.add_attachment(
+                create_time=0,
+                log_time=0,
+                name=log_layout.SCENARIO,
+                media_type="application/toml",
+                data=scenario.text.encode(),
+            )
             self._channels = self._register(scenario, session, choice)
             self._file.flush()
 
     def _register(
         self, scenario: Scenario, session: str, choice: log_layout.ChannelFilter
     ) -> dict[str, int | None]:
-        """Registers the channels of the session; returns them by key, None for those that are excluded."""
+        """Registers the channels of the session; returns them by key, None for those that are
+        excluded.
+        """
         schemas = {
             name: self._file.register_schema(
-                f"trilat.{kind.__name__}.v{VERSION}", "jsonschema", json.dumps(json_schema(kind)).encode()
+                f"trilat.{kind.__name__}.v{VERSION}",
+                "jsonschema",
+                json.dumps(json_schema(kind)).encode(),
             )
             for name, kind in log_layout.CHANNEL_TYPES.items()
         }
@@ -113,7 +134,9 @@ class LogWriter:
                     about["rate_hz"] = str(scenario.sites[member].rate_hz)
                 channels[key] = None
                 if choice.takes(key):
-                    channels[key] = self._file.register_channel(f"/{key}", "msgpack", schemas[name], about)
+                    channels[key] = self._file.register_channel(
+                        f"/{key}", "msgpack", schemas[name], about
+                    )
         return channels
 
     @property
@@ -167,7 +190,13 @@ class LogWriter:
         self._last_log_ns = log_time_ns
         sent_ns = min(max(0, self._epoch_unix_ns + t_ns), log_layout.MAX_TIME_NS)
         try:
-            self._file.add_message(channel, log_time_ns, payload, sent_ns, max(0, number) & 0xFFFFFFFF)
+            self._file.add_message(
+                channel_id=channel,
+                log_time=log_time_ns,
+                data=payload,
+                publish_time=sent_ns,
+                sequence=max(0, number) & 0xFFFFFFFF,
+            )
             if message is not None and (take := self._takers.get(key)) is not None:
                 take(message, log_time_ns)
         except OSError as error:
@@ -178,7 +207,8 @@ class LogWriter:
         self._file.add_message(self._standard[topic], log_ns, data, publish_ns)
 
     def flush(self) -> None:
-        """Closes the open chunk and hands it to the operating system: a crash loses nothing before it.
+        """Closes the open chunk and hands it to the operating system: a crash loses nothing
+        before it.
 
         Raises:
             LogRefused: the disk refused.
@@ -190,8 +220,8 @@ class LogWriter:
         """Writes the accounts, the index and the end mark, once; the stream stays open.
 
         Args:
-            accounts: the accounts by topic, and other counts by name. Those of channels that the log does not
-                take are left out.
+            accounts: the accounts by topic, and other counts by name. Those of channels that
+                the log does not take are left out.
 
         Raises:
             LogRefused: the disk refused.
@@ -227,7 +257,8 @@ class LogWriter:
 _FINISHED = "the log is finished"
 
 ACCOUNTS_BYTES = 16 << 10
-"""Space for the accounts of a part, and for the messages for viewers that one message causes."""
+"""Space for the accounts of a part, and for the messages for viewers that one message causes.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,18 +291,23 @@ class LogStorage:
         return self.split_bytes is not None or self.split_ns is not None
 
     def first(self) -> tuple[int, str]:
-        """Returns the number of the part to begin with, 0 for a log without parts, and the part before it.
+        """Returns the number of the part to begin with, 0 for a log without parts, and the part
+        before it.
 
         Raises:
             UsageError: the name is taken, and not just one of `force` and `carry_on` is given.
         """
         if self.carry_on and self.force:
-            raise UsageError("--continue keeps what exists, --force replaces it; give one of them")
+            raise UsageError(
+                "--continue keeps what exists, --force replaces it; give one of them"
+            )
         there = log_layout.find_parts(self.path)
         if self.carry_on and there:
             last = max(there)
             return last + 1, there[last].name.removesuffix(log_layout.ACTIVE_SUFFIX)
-        refuse_existing(self.path, force=self.force, unfinished=log_layout.active_path(self.path))
+        refuse_existing(
+            self.path, force=self.force, unfinished=log_layout.active_path(self.path)
+        )
         if self.splits and there and not self.force:
             ways = "choose another name, carry on behind it with --continue, or replace it with --force"
             raise UsageError(f"{there[max(there)]}: exists; {ways}")
@@ -279,7 +315,8 @@ class LogStorage:
 
 
 def parse_split(option: str, unit: str, number: float | None, scale: int) -> int | None:
-    """Returns the limit of a part, as an option of a command states it in units of `scale`; None for none.
+    """Returns the limit of a part, as an option of a command states it in units of `scale`;
+    None for none.
 
     Raises:
         UsageError: a part cannot be that small or that large.
@@ -296,7 +333,8 @@ class LogParts:
 
     Args:
         storage: place and form of the log.
-        begin: begins the log in a file, with the metadata of the part ({} for a log without parts).
+        begin: begins the log in a file, with the metadata of the part ({} for a log without
+            parts).
         opened: opens a file by name; by default `LogFile`.
 
     Attributes:
@@ -313,13 +351,16 @@ class LogParts:
         begin: Callable[[Sink, Mapping[str, str]], LogWriter],
         opened: Callable[[Path], LogFile] | None = None,
     ) -> None:
-        self._opened = opened or (lambda path: LogFile(path, force=storage.force, durable=storage.durable))
+        self._opened = opened or (
+            lambda path: LogFile(path, force=storage.force, durable=storage.durable)
+        )
         self.so_far: Callable[[], Mapping[str, str]] = dict
         self._storage = storage
         self._begin_log = begin
         self._number, self._previous = storage.first()
         self._previous_digest = ""
-        if storage.force and storage.splits:  # what was left of a log would seem to belong to the new one
+        # what was left of a log would seem to belong to the new one
+        if storage.force and storage.splits:
             for number in (0, *log_layout.find_parts(storage.path)):
                 name = log_layout.part_path(storage.path, number)
                 name.unlink(missing_ok=True)
@@ -361,7 +402,9 @@ class LogParts:
         if limit.split_ns is not None and log_time_ns - self._since_ns >= limit.split_ns:
             return True
         size = writer.most_bytes + len(payload) + ACCOUNTS_BYTES
-        return limit.split_bytes is not None and writer.messages > 0 and size > limit.split_bytes
+        return (
+            limit.split_bytes is not None and writer.messages > 0 and size > limit.split_bytes
+        )
 
     @property
     def path(self) -> Path:
@@ -399,5 +442,7 @@ class LogParts:
     def __enter__(self) -> "LogParts":
         return self
 
-    def __exit__(self, _: type[BaseException] | None, error: BaseException | None, __: object) -> None:
+    def __exit__(
+        self, _: type[BaseException] | None, error: BaseException | None, __: object
+    ) -> None:
         self._file.end(error)

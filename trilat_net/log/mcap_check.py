@@ -1,8 +1,8 @@
 """Check of the bytes of an MCAP file: checksums, records, and an index that agrees with them.
 
-Invariant: each problem is reported once, with its place; its consequences are not. An index is compared
-with the records in the file, never followed. Any MCAP file is accepted. Conformance with every rule of the
-format is left to other programs (`pymcap-cli doctor`).
+Invariant: each problem is reported once, with its place; its consequences are not. An index is
+compared with the records in the file, never followed. Any MCAP file is accepted. Conformance
+with every rule of the format is left to other programs (`pymcap-cli doctor`).
 """
 
 from array import array
@@ -32,23 +32,35 @@ class FileCheck:
         counts: its bytes, chunks and messages, and the checksums that were compared.
     """
 
-    def __init__(self, file: str, scanner: mcap_records.RecordScanner, findings: Findings) -> None:
+    def __init__(
+        self, file: str, scanner: mcap_records.RecordScanner, findings: Findings
+    ) -> None:
         self.counts = Counter(bytes=scanner.size)
         self._file = file
         self._scanner = scanner
         self._findings = findings
         self._end = 0
         self._defined: dict[tuple[int, int], Any] = {}  # by opcode and number
-        self._found: dict[tuple[int, int], Any] = {}  # what an index should name: by its opcode and place
+        self._found: dict[
+            tuple[int, int], Any
+        ] = {}  # what an index should name: by its opcode and place
         self._indexed: dict[tuple[int, int], Any] = {}  # what the index names
-        self._ends: dict[int, Any] = {}  # statistics, end of the data and footer, each with its offset
+        self._ends: dict[
+            int, Any
+        ] = {}  # statistics, end of the data and footer, each with its offset
         self._unknown: set[int] = set()  # channels of messages that no record names
-        self._indexes: dict[int, int] | None = None  # of the last chunk: where the index of a channel is
-        self._entries: dict[int, array[int]] = {}  # of the last chunk: log times and places, by channel
+        self._indexes: dict[int, int] | None = (
+            None  # of the last chunk: where the index of a channel is
+        )
+        self._entries: dict[
+            int, array[int]
+        ] = {}  # of the last chunk: log times and places, by channel
         self._unreadable = False  # something unreadable may have named a channel
 
     def take(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
-        """Checks one record of the file; `data` is what a chunk holds, empty if it cannot be unpacked."""
+        """Checks one record of the file; `data` is what a chunk holds, empty if it cannot be
+        unpacked.
+        """
         self._end = frame.end + len(mcap_records.MAGIC)
         if frame.offset == len(mcap_records.MAGIC) and frame.opcode != Opcode.HEADER:
             self._add("records", frame.offset, "the first record is no header")
@@ -62,7 +74,9 @@ class FileCheck:
     def _add(self, check: str, offset: int, text: str) -> None:
         self._findings[check].add(self._file, offset, text)
 
-    def _take_content(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
+    def _take_content(
+        self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
+    ) -> None:
         match frame.opcode:
             case Opcode.CHUNK:
                 self._take_chunk(frame, content, data)
@@ -75,10 +89,14 @@ class FileCheck:
             case kind if kind in mcap_records.KINDS:
                 self._take_other(frame, content, mcap_records.parse_record(kind, content))
             case kind if kind < 0x80:
-                self._add("records", frame.offset, f"a record of kind {kind} is none of the format")
+                self._add(
+                    "records", frame.offset, f"a record of kind {kind} is none of the format"
+                )
 
     def _take_other(self, frame: mcap_records.RecordFrame, content: bytes, record: Any) -> None:
-        """Takes metadata, an attachment, or a record of the end; those of the index by what they name."""
+        """Takes metadata, an attachment, or a record of the end; those of the index by what
+        they name.
+        """
         match frame.opcode:
             case Opcode.METADATA:
                 self._found[Opcode.METADATA_INDEX, frame.offset] = frame.size, record.name
@@ -154,15 +172,23 @@ class FileCheck:
                 f"a message index of {count_nouns(len(body), 'byte')} says that it has {length}"
             )
         self._indexes[channel] = frame.offset
-        if not np.array_equal(_sort_by_place(body), _sort_by_place(self._entries.get(channel, b""))):
+        if not np.array_equal(
+            _sort_by_place(body), _sort_by_place(self._entries.get(channel, b""))
+        ):
             text = f"the index of channel {channel} in a chunk is not what is there"
             self._add("index", frame.offset, text)
 
     def finish(self) -> None:
-        """Takes the damaged parts; compares the end of a finished file with its data, and checksums there."""
+        """Takes the damaged parts; compares the end of a finished file with its data, and
+        checksums there.
+        """
         scanner = self._scanner
         if not scanner.begins:
-            self._add("whole", 0, "does not begin as an MCAP file does" if scanner.size else "is empty")
+            self._add(
+                "whole",
+                0,
+                "does not begin as an MCAP file does" if scanner.size else "is empty",
+            )
             return
         for damage in scanner.damaged:
             self._add("whole", damage.offset, str(damage))
@@ -187,7 +213,10 @@ class FileCheck:
             return
         offset, data_end = self._ends[Opcode.DATA_END]
         self.counts["crcs"] += bool(data_end.data_section_crc)
-        if data_end.data_section_crc and self._scanner.crc(0, offset) != data_end.data_section_crc:
+        if (
+            data_end.data_section_crc
+            and self._scanner.crc(0, offset) != data_end.data_section_crc
+        ):
             self._add("checksums", offset, "the CRC of the data differs")
         if footer is not None and footer.summary_crc:
             self.counts["crcs"] += 1

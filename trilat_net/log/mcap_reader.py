@@ -1,8 +1,8 @@
 """Reader of an MCAP file, chunk by chunk; contents of a trilat-net log by topic.
 
-Invariant: the reader holds one chunk at a time; what it cannot read it skips and reports. Messages of a
-log stay bytes until they are decoded. Channels for viewers (`/viz`) are skipped. A channel that would take
-the memory of all ends where its share does, and the others are read.
+Invariant: the reader holds one chunk at a time; what it cannot read it skips and reports.
+Messages of a log stay bytes until they are decoded. Channels for viewers (`/viz`) are skipped.
+A channel that would take the memory of all ends where its share does, and the others are read.
 """
 
 import math
@@ -37,14 +37,17 @@ _READ = {
 KEPT_BYTES = 64 << 20
 KEPT_RATIO = 300
 CHANNEL_SHARE = 1 / 3
-"""Messages that are kept take at most so much memory, or so many times the file's size; a channel its share.
+"""Messages that are kept take at most so much memory, or so many times the file's size; a
+channel its share.
 
 Arms at rest in virtual time pack best of all that is no bomb: 120 times.
 """
 _DECODED_BYTES = 3_000
 _LONG_BYTES = 300
 _LONG_RATIO = 24
-"""A message of a log, decoded, takes some memory, and more if it is longer than a record must be."""
+"""A message of a log, decoded, takes some memory, and more if it is longer than a record must
+be.
+"""
 _NAME_BYTES = 600
 _NAME_RATIO = 20
 """What a channel and its metadata take, likewise."""
@@ -52,7 +55,9 @@ _NAME_RATIO = 20
 Progress = Callable[[int, int], None]
 """Takes how much of something is done: (bytes so far, bytes in all)."""
 Watch = Callable[[mcap_records.RecordFrame, bytes, bytes], None]
-"""Takes a record of a file: its place, its content, and what a chunk holds (empty if it is unreadable)."""
+"""Takes a record of a file: its place, its content, and what a chunk holds (empty if it is
+unreadable).
+"""
 
 
 def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
@@ -63,7 +68,9 @@ def shift_progress(progress: Progress | None, before: int, total: int) -> Progre
 
 
 class ChannelInfo(NamedTuple):
-    """A channel as its file describes it; `schema` is the name of its messages' schema, "" for none."""
+    """A channel as its file describes it; `schema` is the name of its messages' schema, "" for
+    none.
+    """
 
     topic: str
     encoding: str
@@ -98,7 +105,8 @@ class McapReader:
         stream: the file, opened for reading.
         name: its name in errors.
         progress: called after every record of the file.
-        kept: True if the caller keeps the messages: then what they take, decoded, is limited (`KEPT_RATIO`).
+        kept: True if the caller keeps the messages: then what they take, decoded, is limited
+            (`KEPT_RATIO`).
 
     Attributes:
         metadata, attachments: what was seen of them so far, by name.
@@ -110,12 +118,18 @@ class McapReader:
         offset: first byte of the record of the file that is being read.
         complete: True once all was read, to the end mark's last byte: the file was finished.
         scanner: finds its records.
-        watch: takes every record of the file before its messages, if it is set. It goes on where the reader
-            gives up, after `MAX_DAMAGED_PARTS`, and takes a file that begins otherwise as well.
+        watch: takes every record of the file before its messages, if it is set. It goes on
+            where the reader gives up, after `MAX_DAMAGED_PARTS`, and takes a file that begins
+            otherwise as well.
     """
 
     def __init__(
-        self, stream: BinaryIO, name: str, progress: Progress | None = None, *, kept: bool = True
+        self,
+        stream: BinaryIO,
+        name: str,
+        progress: Progress | None = None,
+        *,
+        kept: bool = True,
     ) -> None:
         self.metadata: dict[str, dict[str, str]] = {}
         self.attachments: dict[str, bytes] = {}
@@ -136,7 +150,8 @@ class McapReader:
         self._ours: set[int] = set()
         self._room = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
         share = math.inf if self._room is None else CHANNEL_SHARE * self._room
-        self._shares: defaultdict[int, float] = defaultdict(lambda: share)  # what is left, by channel
+        # what is left, by channel
+        self._shares: defaultdict[int, float] = defaultdict(lambda: share)
         self._more_damage: list[mcap_records.Damage] = []
 
     @property
@@ -187,7 +202,9 @@ class McapReader:
         return data
 
     def _unpack(self, frame: mcap_records.RecordFrame, content: bytes) -> bytes:
-        """Returns the records with messages and channels in a record of the file; stores other contents."""
+        """Returns the records with messages and channels in a record of the file; stores other
+        contents.
+        """
         match frame.opcode:
             case Opcode.CHUNK:
                 data = mcap_records.unpack_chunk(content)
@@ -214,7 +231,9 @@ class McapReader:
         self._chain.add_entry(frame.opcode, content)
         return b""
 
-    def _read_records(self, data: bytes, frame: mcap_records.RecordFrame) -> Iterator[McapMessage]:
+    def _read_records(
+        self, data: bytes, frame: mcap_records.RecordFrame
+    ) -> Iterator[McapMessage]:
         find_topic = self._topics.get
         ours = self._ours
         shares = self._shares
@@ -245,7 +264,9 @@ class McapReader:
                 topic = find_topic(channel, "")
                 yield new(McapMessage, (topic, payload, log_time_ns, publish_time_ns, sequence))
             elif opcode in mcap_records.DEFINITIONS:
-                self._chain.add_records(view[chained : begin - mcap_records.RECORD_HEAD_BYTES], 0)
+                self._chain.add_records(
+                    view[chained : begin - mcap_records.RECORD_HEAD_BYTES], 0
+                )
                 chained = end
                 self._take_memory(_NAME_BYTES + _NAME_RATIO * (end - begin), frame)
                 self._define(opcode, data[begin:end])
@@ -254,11 +275,15 @@ class McapReader:
 
     def judge_digest(self) -> Integrity:
         """Returns whether the file, once it was read, agrees with its digest chain."""
-        return self._chain.judge(self.metadata, finished=self.complete, damaged=bool(self.damaged))
+        return self._chain.judge(
+            self.metadata, finished=self.complete, damaged=bool(self.damaged)
+        )
 
     @property
     def agrees_on_messages(self) -> bool:
-        """True if the messages that were read are all that the digest chain states, in its order."""
+        """True if the messages that were read are all that the digest chain states, in its
+        order.
+        """
         stated = self.metadata.get(DIGESTS, {})
         found = self._chain.facts()
         return all(stated.get(key) == found[key] for key in ("messages", "records"))
@@ -271,7 +296,14 @@ class McapReader:
         elif record.id not in self._topics:
             self._topics[record.id] = topic = record.topic
             name, encoding, data = self._schemas.get(record.schema_id, ("", "", b""))
-            info = ChannelInfo(topic, record.message_encoding, name, encoding, record.metadata, data)
+            info = ChannelInfo(
+                topic=topic,
+                encoding=record.message_encoding,
+                schema=name,
+                schema_encoding=encoding,
+                metadata=record.metadata,
+                schema_data=data,
+            )
             self.channels.setdefault(topic, info)
             if topic.startswith("/trilat/"):
                 self._ours.add(record.id)
@@ -280,7 +312,9 @@ class McapReader:
         if self._shares[channel] >= 0.0:
             self._shares[channel] = -math.inf
             topic = self._topics.get(channel, f"channel {channel}")
-            text = f"{topic[:80]} takes absurdly much for such a file; from here on it is not read"
+            text = (
+                f"{topic[:80]} takes absurdly much for such a file; from here on it is not read"
+            )
             self._more_damage.append(mcap_records.Damage(frame.offset, frame.size, text))
 
     def _take_memory(self, amount: int, frame: mcap_records.RecordFrame) -> None:
@@ -320,9 +354,13 @@ class ChannelMessages:
         self.publish_ns.append(publish_ns)
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns when the messages came and when they were sent, shape (K,) each, Unix ns below 2^63."""
+        """Returns when the messages came and when they were sent, shape (K,) each, Unix ns
+        below 2^63.
+        """
         stored = (np.array(times, dtype=np.uint64) for times in (self.log_ns, self.publish_ns))
-        log_ns, publish_ns = (np.minimum(times, _LAST_SIGNED_NS).astype(np.int64) for times in stored)
+        log_ns, publish_ns = (
+            np.minimum(times, _LAST_SIGNED_NS).astype(np.int64) for times in stored
+        )
         return log_ns, publish_ns
 
 
@@ -334,7 +372,8 @@ class LogContents:
         session, metadata: metadata of the session; all metadata, by name.
         scenario: text of the scenario.
         channels: messages, by topic.
-        complete: True if all of it is there, finished and readable throughout; a later part alone is not.
+        complete: True if all of it is there, finished and readable throughout; a later part
+            alone is not.
         ended: True if the last one was finished.
         damaged: what cannot be read, a sentence each.
         chain: agreement with the digest chain, of several files the worst.
@@ -354,7 +393,9 @@ class LogContents:
     def source(self) -> str:
         """Its name in errors."""
         more = len(self.sources) - 1
-        return self.sources[0] + (f" and {more} more {'parts' if more > 1 else 'part'}" if more else "")
+        return self.sources[0] + (
+            f" and {more} more {'parts' if more > 1 else 'part'}" if more else ""
+        )
 
 
 def read_contents(
@@ -362,8 +403,8 @@ def read_contents(
 ) -> LogContents:
     """Returns the contents of a file, called `name` in errors.
 
-    One that this program wrote just now is its `own`: however well a run that hardly moves is packed, it
-    holds no more than the run did.
+    One that this program wrote just now is its `own`: however well a run that hardly moves is
+    packed, it holds no more than the run did.
 
     Raises:
         LogError: it is no MCAP file, or no log of trilat-net.
@@ -377,17 +418,33 @@ def read_contents(
         except KeyError:
             key = topics.parse_key(topic.removeprefix("/"))
             is_ours = key is not None and key.channel in CHANNEL_TYPES
-            channel = taken[topic] = channels.setdefault(topic, ChannelMessages()) if is_ours else None
+            channel = taken[topic] = (
+                channels.setdefault(topic, ChannelMessages()) if is_ours else None
+            )
         if channel is not None:
             channel.add(payload, log_ns, publish_ns)
     _check_head(reader, name)
     session = reader.metadata[SESSION]
     damaged = [f"{name}: {damage}" for damage in reader.damaged]
-    complete = reader.complete and not damaged and reader.metadata.get(PART, {}).get("index", "1") == "1"
+    complete = (
+        reader.complete
+        and not damaged
+        and reader.metadata.get(PART, {}).get("index", "1") == "1"
+    )
     text = reader.attachments[SCENARIO]
     chain = reader.judge_digest()
     ended = reader.complete
-    return LogContents((name,), session, text, reader.metadata, channels, complete, ended, damaged, chain)
+    return LogContents(
+        sources=(name,),
+        session=session,
+        scenario=text,
+        metadata=reader.metadata,
+        channels=channels,
+        complete=complete,
+        ended=ended,
+        damaged=damaged,
+        chain=chain,
+    )
 
 
 def check_log(stream: BinaryIO, name: str) -> None:

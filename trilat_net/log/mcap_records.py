@@ -1,11 +1,12 @@
 """MCAP records in a file and in its chunks; the `mcap` package parses their content.
 
-Invariant: no number in a file is trusted. Nothing outside the file is read, a chunk is unpacked to at
-most what its size allows, and only if its head agrees with its data. Where the file makes no sense, the
-scan resumes at the next chunk that does. What makes no sense is an `UnreadableRecord` to every function.
+Invariant: no number in a file is trusted. Nothing outside the file is read, a chunk is unpacked
+to at most what its size allows, and only if its head agrees with its data. Where the file makes
+no sense, the scan resumes at the next chunk that does. What makes no sense is an
+`UnreadableRecord` to every function.
 
-A record is an opcode (1 byte), the length of its content (8 bytes) and the content; see the specification
-at mcap.dev. A chunk is a record that holds packed records.
+A record is an opcode (1 byte), the length of its content (8 bytes) and the content; see the
+specification at mcap.dev. A chunk is a record that holds packed records.
 """
 
 import os
@@ -48,7 +49,9 @@ MAX_WINDOW_BYTES = 32 << 20
 COMPRESSIONS = (b"zstd", b"lz4")
 """How a chunk may be packed, besides not at all."""
 COMPRESSION_NAME_OFFSET = 28
-"""Where in a chunk's content the name of its compression is, with its length (4 bytes) before it."""
+"""Where in a chunk's content the name of its compression is, with its length (4 bytes) before
+it.
+"""
 MAX_HEAD_BYTES = COMPRESSION_NAME_OFFSET + 4 + 32 + 8
 """A chunk's head is no longer; a name of a compression is at most 32 bytes."""
 
@@ -65,7 +68,8 @@ class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
 
 
 class ChunkHead(NamedTuple):
-    """Head of a chunk: first and last log time; of its records, unpacked, size and CRC-32 (0 for none).
+    """Head of a chunk: first and last log time; of its records, unpacked, size and CRC-32 (0
+    for none).
 
     They are packed by `compression`, and begin at `data_offset` in the chunk's content.
     """
@@ -79,7 +83,9 @@ class ChunkHead(NamedTuple):
 
 
 def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
-    """Returns the head of a chunk of `length` bytes; its first `MAX_HEAD_BYTES` suffice as content."""
+    """Returns the head of a chunk of `length` bytes; its first `MAX_HEAD_BYTES` suffice as
+    content.
+    """
     try:
         start_ns, end_ns, size, crc, letters = _FIXED_HEAD.unpack_from(content)
         (packed,) = _SIZE.unpack_from(content, _FIXED_HEAD.size + letters)
@@ -91,7 +97,14 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
         raise UnreadableRecord(
             f"a chunk of {count_nouns(length, 'byte')} says that it has {data_offset + packed}"
         )
-    return ChunkHead(start_ns, end_ns, size, crc, compression, data_offset)
+    return ChunkHead(
+        start_ns=start_ns,
+        end_ns=end_ns,
+        size=size,
+        crc=crc,
+        compression=compression,
+        data_offset=data_offset,
+    )
 
 
 def unpack_chunk(content: bytes) -> bytes:
@@ -103,7 +116,9 @@ def unpack_chunk(content: bytes) -> bytes:
         raise UnreadableRecord(text)
     data = _unpack(head, memoryview(content)[head.data_offset :])
     if len(data) != head.size:
-        raise UnreadableRecord(f"a chunk of {count_nouns(head.size, 'byte')} unpacks to {len(data)}")
+        raise UnreadableRecord(
+            f"a chunk of {count_nouns(head.size, 'byte')} unpacks to {len(data)}"
+        )
     if head.crc and zlib.crc32(data) != head.crc:
         raise UnreadableRecord("a chunk's CRC differs")
     return data
@@ -113,17 +128,29 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
     try:
         if head.compression == "zstd":
             declared = zstandard.get_frame_parameters(data).content_size
-            if declared not in (head.size, zstandard.CONTENTSIZE_UNKNOWN):  # the library would believe it
-                raise UnreadableRecord(f"a chunk of {count_nouns(head.size, 'byte')} unpacks to {declared}")
-            return zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).decompress(data, head.size)
+            # the library would believe it
+            if declared not in (
+                head.size,
+                zstandard.CONTENTSIZE_UNKNOWN,
+            ):
+                raise UnreadableRecord(
+                    f"a chunk of {count_nouns(head.size, 'byte')} unpacks to {declared}"
+                )
+            return zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).decompress(
+                data, head.size
+            )
         if head.compression == "lz4":
             # one byte more, so that one that is too long shows
-            unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=head.size + 1)
+            unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(
+                data, max_length=head.size + 1
+            )
             return unpacked
     except (zstandard.ZstdError, RuntimeError, ValueError, OverflowError, MemoryError) as error:
         raise UnreadableRecord(f"a chunk cannot be unpacked: {error}") from None
     if head.compression:
-        raise UnreadableRecord(f"a chunk is packed by {head.compression!r}, which is not supported")
+        raise UnreadableRecord(
+            f"a chunk is packed by {head.compression!r}, which is not supported"
+        )
     return bytes(data)
 
 
@@ -179,8 +206,8 @@ class RecordScanner:
         stream: the file, opened for reading; it begins at the current position.
 
     Attributes:
-        size: bytes of the file.
-        begins, ends: True if it begins as an MCAP file does, and ends as a finished one: with the end mark.
+        size: bytes of the file. begins, ends: True if it begins as an MCAP file does, and ends
+        as a finished one: with the end mark.
         finished: True once all was read, to the end of a file that was finished.
         trailing: bytes that follow its end mark, once that was read.
         damaged: parts that could not be read, so far; a torn end is none of them.
@@ -205,7 +232,9 @@ class RecordScanner:
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the place of every record, anew on every call; skips what makes no sense (`damaged`)."""
+        """Yields the place of every record, anew on every call; skips what makes no sense
+        (`damaged`).
+        """
         self.damaged = []
         self.torn = None
         self.finished = False
@@ -229,13 +258,19 @@ class RecordScanner:
             yield frame
             if frame.opcode == Opcode.FOOTER:
                 self.finished = self.read(frame.end, len(MAGIC)) == MAGIC
-                self.trailing = max(0, self.size - frame.end - len(MAGIC)) if self.finished else 0
+                self.trailing = (
+                    max(0, self.size - frame.end - len(MAGIC)) if self.finished else 0
+                )
                 if not self.finished:
-                    self.torn = Damage(frame.end, self.size - frame.end, "its last mark is cut off")
+                    self.torn = Damage(
+                        frame.end, self.size - frame.end, "its last mark is cut off"
+                    )
                 return
             sure = frame.end if frame.opcode == Opcode.CHUNK else frame.offset + 1
             offset = frame.end
-        self.torn = Damage(offset, self.size - offset, f"it is damaged in {MAX_DAMAGED_PARTS} places before")
+        self.torn = Damage(
+            offset, self.size - offset, f"it is damaged in {MAX_DAMAGED_PARTS} places before"
+        )
 
     def _resume(self, sure: int, offset: int, problem: str) -> int | None:
         """Returns where reading resumes, or None at the end of the file."""
@@ -244,14 +279,18 @@ class RecordScanner:
             first = offset if found >= offset else sure - 1
             self.damaged.append(Damage(first, found - first, problem))
         elif self.ends:
-            self.damaged.append(Damage(offset, max(0, self.size - FOOTER_BYTES - offset), problem))
+            self.damaged.append(
+                Damage(offset, max(0, self.size - FOOTER_BYTES - offset), problem)
+            )
             self.finished = True
         else:
             self.torn = Damage(offset, self.size - offset, problem)
         return found
 
     def _frame_at(self, offset: int) -> RecordFrame:
-        """Returns the record that begins at an offset; raises if it does not lie within the file."""
+        """Returns the record that begins at an offset; raises if it does not lie within the
+        file.
+        """
         head = self.read(offset, RECORD_HEAD_BYTES)
         if len(head) < RECORD_HEAD_BYTES:
             raise UnreadableRecord("the file ends within a record")
@@ -277,11 +316,15 @@ class RecordScanner:
     def _find_chunk(self, offset: int) -> int | None:
         lead = RECORD_HEAD_BYTES + COMPRESSION_NAME_OFFSET
         for at in range(offset, self.size, _SCAN_BYTES):
-            window = self.read(at, _SCAN_BYTES + lead + 8)  # holds the name of one that begins in it
+            # holds the name of one that begins in it
+            window = self.read(at, _SCAN_BYTES + lead + 8)
             for match in _COMPRESSION_NAME.finditer(window):
                 start = at + match.start() - lead
                 with suppress(UnreadableRecord):
-                    if start >= offset and (frame := self._frame_at(start)).opcode == Opcode.CHUNK:
+                    if (
+                        start >= offset
+                        and (frame := self._frame_at(start)).opcode == Opcode.CHUNK
+                    ):
                         self.head(frame)
                         return start
         return None
@@ -308,7 +351,9 @@ class RecordScanner:
 
 
 def has_right_crc(attachment: bytes) -> bool:
-    """True if the content of an attachment agrees with the checksum at its end; 0 stands for none."""
+    """True if the content of an attachment agrees with the checksum at its end; 0 stands for
+    none.
+    """
     crc = int.from_bytes(attachment[-4:], "little")
     return not crc or zlib.crc32(memoryview(attachment)[:-4]) == crc
 
@@ -319,7 +364,9 @@ def parse_record(opcode: int, content: bytes) -> Any:
         return KINDS[opcode].read(_Content(BytesIO(content)))
     except (McapError, struct.error, ValueError, OverflowError) as error:
         why = str(error) or type(error).__name__
-        raise UnreadableRecord(f"a record ({_opcode_name(opcode)}) cannot be read: {why}") from None
+        raise UnreadableRecord(
+            f"a record ({_opcode_name(opcode)}) cannot be read: {why}"
+        ) from None
 
 
 class _Content(ReadDataStream):
@@ -333,7 +380,11 @@ class _Content(ReadDataStream):
 
 
 def _opcode_name(opcode: int) -> str:
-    return Opcode(opcode).name.lower().replace("_", " ") if opcode in _OPCODES else f"kind {opcode}"
+    return (
+        Opcode(opcode).name.lower().replace("_", " ")
+        if opcode in _OPCODES
+        else f"kind {opcode}"
+    )
 
 
 _OPCODES = frozenset(Opcode)

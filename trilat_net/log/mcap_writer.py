@@ -1,10 +1,12 @@
 """Writer of an MCAP file: records into chunks, chunks into a stream, an index at the end.
 
-Invariant: the same calls give the same bytes; memory grows only by the packed index of the chunks; the
-length of the end of the file is known at any time, so that disk space for it can be reserved.
+Invariant: the same calls give the same bytes; memory grows only by the packed index of the
+chunks; the length of the end of the file is known at any time, so that disk space for it can be
+reserved.
 
-Not `mcap.writer.Writer`: it keeps a dictionary per chunk, 46 MiB an hour at ten chunks a second of twelve
-channels, and takes three times as long. The tests read this writer's files with that package.
+Not `mcap.writer.Writer`: it keeps a dictionary per chunk, 46 MiB an hour at ten chunks a second
+of twelve channels, and takes three times as long. The tests read this writer's files with that
+package.
 """
 
 import struct
@@ -31,7 +33,9 @@ _SUMMARY = (
 )
 """Records of the end of a file, in their order."""
 _COMPRESSION = "zstd"
-_OWED_ALWAYS = 512  # statistics without its counts, offsets of six groups, data end, footer, end mark
+_OWED_ALWAYS = (
+    512  # statistics without its counts, offsets of six groups, data end, footer, end mark
+)
 
 
 class Sink(Protocol):
@@ -78,7 +82,9 @@ class McapWriter:
         messages: number of messages added.
     """
 
-    def __init__(self, stream: Sink, library: str, profile: str = "", chunk_bytes: int = CHUNK_BYTES) -> None:
+    def __init__(
+        self, stream: Sink, library: str, profile: str = "", chunk_bytes: int = CHUNK_BYTES
+    ) -> None:
         self.position = 0
         self.messages = 0
         self._stream = stream
@@ -86,9 +92,13 @@ class McapWriter:
         self._chunk_bytes = chunk_bytes
         self._compressor = zstandard.ZstdCompressor()
         self._open = bytearray()
-        self._entries: dict[int, list[int]] = {}  # of the open chunk: per channel log time, offset, ...
+        self._entries: dict[
+            int, list[int]
+        ] = {}  # of the open chunk: per channel log time, offset, ...
         self._counts: dict[int, int] = {}
-        self._span_ns: tuple[int, int] | None = None  # first and last log time, once there is a chunk
+        self._span_ns: tuple[int, int] | None = (
+            None  # first and last log time, once there is a chunk
+        )
         self._summary = {opcode: bytearray() for opcode in _SUMMARY}
         self._records: Counter[Opcode] = Counter()  # in the summary, by kind
         self._chain = RunningDigest()
@@ -137,11 +147,21 @@ class McapWriter:
         return number
 
     def register_channel(
-        self, topic: str, message_encoding: str, schema_id: int, metadata: Mapping[str, str] | None = None
+        self,
+        topic: str,
+        message_encoding: str,
+        schema_id: int,
+        metadata: Mapping[str, str] | None = None,
     ) -> int:
-        """Writes a channel and returns its number; it precedes the open chunk. Schema 0 stands for none."""
+        """Writes a channel and returns its number; it precedes the open chunk. Schema 0 stands
+        for none.
+        """
         number = len(self._counts) + 1
-        body = struct.pack("<HH", number, schema_id) + pack_text(topic) + pack_text(message_encoding)
+        body = (
+            struct.pack("<HH", number, schema_id)
+            + pack_text(topic)
+            + pack_text(message_encoding)
+        )
         body += pack_text_map(metadata or {})
         self._chain.add_entry(Opcode.CHANNEL, body)
         self._put(self._add_to_summary(Opcode.CHANNEL, body))
@@ -155,7 +175,9 @@ class McapWriter:
         """Adds a message to the open chunk; times are in ns."""
         opened = self._open
         self._entries[channel_id] += (log_time, len(opened))
-        opened += _MESSAGE.pack(OP_MESSAGE, 22 + len(data), channel_id, sequence, log_time, publish_time)
+        opened += _MESSAGE.pack(
+            OP_MESSAGE, 22 + len(data), channel_id, sequence, log_time, publish_time
+        )
         opened += data
         self._counts[channel_id] += 1
         self.messages += 1
@@ -208,7 +230,9 @@ class McapWriter:
         start_ns = min(min(entries[::2]) for entries in used.values())
         end_ns = max(max(entries[::2]) for entries in used.values())
         raw = len(self._open)
-        head = _CHUNK.pack(start_ns, end_ns, raw, zlib.crc32(self._open)) + pack_text(_COMPRESSION)
+        head = _CHUNK.pack(start_ns, end_ns, raw, zlib.crc32(self._open)) + pack_text(
+            _COMPRESSION
+        )
         record = pack_record(Opcode.CHUNK, head + struct.pack("<Q", len(data)) + data)
         offset = self._put(record)
         begin = self.position
@@ -233,9 +257,15 @@ class McapWriter:
             self._close_chunk()
         self._put(pack_record(Opcode.DATA_END, struct.pack("<I", 0)))
         kinds = (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX, Opcode.CHUNK_INDEX)
-        numbers = len(self._counts), *(self._records[kind] for kind in kinds), *(self._span_ns or (0, 0))
+        numbers = (
+            len(self._counts),
+            *(self._records[kind] for kind in kinds),
+            *(self._span_ns or (0, 0)),
+        )
         head = _STATISTICS.pack(self.messages, self._records[Opcode.SCHEMA], *numbers)
-        counts = b"".join(struct.pack("<HQ", n, count) for n, count in self._counts.items() if count)
+        counts = b"".join(
+            struct.pack("<HQ", n, count) for n, count in self._counts.items() if count
+        )
         self._add_to_summary(Opcode.STATISTICS, head + struct.pack("<I", len(counts)) + counts)
         begin = self.position
         offsets = b""
@@ -244,7 +274,9 @@ class McapWriter:
             if group:
                 place = self._put(bytes(group))
                 crc = zlib.crc32(group, crc)
-                offsets += pack_record(Opcode.SUMMARY_OFFSET, struct.pack("<BQQ", opcode, place, len(group)))
+                offsets += pack_record(
+                    Opcode.SUMMARY_OFFSET, struct.pack("<BQQ", opcode, place, len(group))
+                )
         where = self._put(offsets)
         footer = _FOOTER.pack(Opcode.FOOTER, 20, begin, where, 0)[:-4]
         crc = zlib.crc32(footer, zlib.crc32(offsets, crc))

@@ -1,7 +1,8 @@
-"""Merge of the parts of a session: a recording that was split, or continued by another recorder.
+"""Merge of the parts of a session: a recording that was split, or continued by another
+recorder.
 
-Invariant: a message in several parts is taken once; parts that disagree on a message and parts of
-different sessions are refused. The order in which the parts are given does not matter.
+Invariant: a message in several parts is taken once; parts that disagree on a message and parts
+of different sessions are refused. The order in which the parts are given does not matter.
 """
 
 import hashlib
@@ -28,14 +29,19 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
     The accounts of several keep only the counts that are none of a channel, summed up.
 
     Raises:
-        LogError: they are of different sessions, or disagree on a message, or one cannot be read.
+        LogError: they are of different sessions, or disagree on a message, or one cannot be
+            read.
     """
     if len(parts) == 1:
         return parts[0]
     ours = identify_session(parts[0])
     for other in parts[1:]:
         theirs = identify_session(other)
-        differ = [f"{name} {theirs[name]}, not {ours[name]}" for name in ours if ours[name] != theirs[name]]
+        differ = [
+            f"{name} {theirs[name]}, not {ours[name]}"
+            for name in ours
+            if ours[name] != theirs[name]
+        ]
         if differ:
             session = f"the session in {parts[0].source}: {'; '.join(differ)}"
             raise LogError(f"{other.source}: is no part of {session}")
@@ -46,15 +52,18 @@ def merge_parts(parts: Sequence[LogContents]) -> LogContents:
     names = dict.fromkeys(topic for part in ordered for topic in part.channels)
     whole = all(part.ended and not part.damaged for part in parts)
     return LogContents(
-        tuple(part.source for part in ordered),
-        first.session,
-        first.scenario,
-        {**first.metadata, ACCOUNTS: _sum_other_counts(ordered)},
-        {topic: _merge_channel(topic, ordered) for topic in names},
-        whole and sorted(map(_part_index, parts)) == [*range(1, len(parts) + 1)],
-        last.ended,
-        [damage for part in ordered for damage in part.damaged],
-        max((part.chain for part in parts), key=lambda chain: list(DigestState).index(chain.state)),
+        sources=tuple(part.source for part in ordered),
+        session=first.session,
+        scenario=first.scenario,
+        metadata={**first.metadata, ACCOUNTS: _sum_other_counts(ordered)},
+        channels={topic: _merge_channel(topic, ordered) for topic in names},
+        complete=whole and sorted(map(_part_index, parts)) == [*range(1, len(parts) + 1)],
+        ended=last.ended,
+        damaged=[damage for part in ordered for damage in part.damaged],
+        chain=max(
+            (part.chain for part in parts),
+            key=lambda chain: list(DigestState).index(chain.state),
+        ),
     )
 
 
@@ -64,7 +73,9 @@ def _check_digests(parts: Sequence[LogContents]) -> None:
         stated = part.metadata.get(PART, {}).get(PREVIOUS_DIGEST_KEY)
         before = finished.get(_part_index(part) - 1)
         if stated and before is not None and before.metadata[DIGESTS].get("records") != stated:
-            raise LogError(f"{part.source}: does not follow {before.source}: that file was another one")
+            raise LogError(
+                f"{part.source}: does not follow {before.source}: that file was another one"
+            )
 
 
 def _first_time(part: LogContents) -> tuple[int, str]:
@@ -78,7 +89,8 @@ def _part_index(part: LogContents) -> int:
 
 
 def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
-    """Returns the recorders' counts that are none of a channel, as of dropped messages by reason.
+    """Returns the recorders' counts that are none of a channel, as of dropped messages by
+    reason.
 
     A recorder counts on from part to part, so that its last part has it all.
     """
@@ -93,7 +105,9 @@ def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
 
 
 def _recorder_boot(part: LogContents) -> int:
-    """Returns the boot of the recorder that wrote a part; 0 if it has no message of its own there."""
+    """Returns the boot of the recorder that wrote a part; 0 if it has no message of its own
+    there.
+    """
     kinds: dict[str, Any] = {topics.STATS: RecorderStats, topics.EVENT: Event}
     for channel, kind in kinds.items():
         topic = "/" + topics.key(part.session["session"], topics.RECORDER, channel)
@@ -108,7 +122,10 @@ def _recorder_boot(part: LogContents) -> int:
 
 def identify_session(part: LogContents) -> dict[str, str]:
     """Returns what all parts of a session have in common, and no other session has."""
-    facts = {name: part.session.get(name, "unknown") for name in ("session", "driver", "epoch_unix_ns")}
+    facts = {
+        name: part.session.get(name, "unknown")
+        for name in ("session", "driver", "epoch_unix_ns")
+    }
     return {**facts, "scenario": hashlib.sha256(part.scenario).hexdigest()[:16]}
 
 
@@ -131,7 +148,9 @@ def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
                 merged.add(payload, channel.log_ns[n], channel.publish_ns[n])
             elif merged.payloads[place] != payload:
                 names = f"{having[bisect_right(ends, place)].source} and {part.source}"
-                raise LogError(f"{names} differ: {_describe_message(topic, key)} is not the same")
+                raise LogError(
+                    f"{names} differ: {_describe_message(topic, key)} is not the same"
+                )
         places |= fresh
         ends.append(len(merged.payloads))
     return merged
@@ -150,7 +169,10 @@ def _find_keys(topic: str, channel: ChannelMessages, source: str) -> Sequence[Ha
                 events = [decode(payload, Event, READABLE) for payload in payloads]
                 # before version 3 events have no number; their content is the key
                 keys = zip(events, payloads, strict=True)
-                return [(event.boot, event.n) if event.n >= 0 else payload for event, payload in keys]
+                return [
+                    (event.boot, event.n) if event.n >= 0 else payload
+                    for event, payload in keys
+                ]
         stats = (decode(payload, RecorderStats, READABLE) for payload in payloads)
         return [(one.boot, one.t_ns) for one in stats]
     except WireError as error:

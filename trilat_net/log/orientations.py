@@ -1,17 +1,18 @@
-"""Orientations as time series without jumps: unit quaternions of consistent sign, or six numbers.
+"""Orientations as time series without jumps: unit quaternions of consistent sign, or six
+numbers.
 
-A record has an orientation as a rotation vector, axis times angle, at most half a turn long. That
-vector jumps by a whole turn where the angle passes half a turn, as for a tool that points down,
-although nothing jumps. Near half a turn its steps are up to pi / 2 times those of the motion, and no
-choice of branches is continuous for every motion of several turns. Series that leave the program are
-therefore made of one of these:
+A record has an orientation as a rotation vector, axis times angle, at most half a turn long.
+That vector jumps by a whole turn where the angle passes half a turn, as for a tool that points
+down, although nothing jumps. Near half a turn its steps are up to pi / 2 times those of the
+motion, and no choice of branches is continuous for every motion of several turns. Series that
+leave the program are therefore made of one of these:
 
-- unit quaternions w, x, y, z. Each is nearest to the one before; the first has w >= 0. A turn by a
-  small angle moves the quaternion by half of that angle.
-- six numbers, the first and the second column of the rotation matrix. They depend on the orientation
-  alone and not on the past, as observations and actions of a policy must (Y. Zhou et al., "On the
-  continuity of rotation representations in neural networks", CVPR 2019). A turn by a small angle
-  moves them by at most sqrt(2) times that angle.
+- unit quaternions w, x, y, z. Each is nearest to the one before; the first has w >= 0. A turn
+  by a small angle moves the quaternion by half of that angle.
+- six numbers, the first and the second column of the rotation matrix. They depend on the
+  orientation alone and not on the past, as observations and actions of a policy must (Y. Zhou
+  et al., "On the continuity of rotation representations in neural networks", CVPR 2019). A turn
+  by a small angle moves them by at most sqrt(2) times that angle.
 
 Invariant:
 - The rotation is that of the record, to rounding; only its numbers differ.
@@ -35,18 +36,24 @@ SIX_AXES = (*TASK_AXES[:PLACE], *MATRIX_ENTRIES)
 
 
 def split_quaternions(turns: Array) -> tuple[Array, Array]:
-    """Returns w, shape (K, 1), and x, y, z, shape (K, 3), of rotation vectors, shape (K, 3), rad."""
+    """Returns w, shape (K, 1), and x, y, z, shape (K, 3), of rotation vectors, shape (K, 3),
+    rad.
+    """
     angle = np.linalg.norm(turns, axis=1, keepdims=True)
     return np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * turns
 
 
 def find_quaternions(turns: Array) -> Array:
-    """Returns unit quaternions w, x, y, z of consistent sign, shape (K, 4), of rotation vectors, rad."""
+    """Returns unit quaternions w, x, y, z of consistent sign, shape (K, 4), of rotation
+    vectors, rad.
+    """
     return align_signs(np.hstack(split_quaternions(turns)))
 
 
 def align_signs(quaternions: Array) -> Array:
-    """Returns quaternions, shape (K, 4), with signs such that each is nearest to the one before."""
+    """Returns quaternions, shape (K, 4), with signs such that each is nearest to the one
+    before.
+    """
     dots = np.einsum("ki,ki->k", quaternions[1:], quaternions[:-1])
     signs = np.cumprod(np.where(dots < 0.0, -1.0, 1.0))
     aligned = quaternions.copy()
@@ -55,7 +62,9 @@ def align_signs(quaternions: Array) -> Array:
 
 
 def find_six_numbers(turns: Array) -> Array:
-    """Returns the first two columns of the matrices of rotation vectors, shape (..., 6), of (..., 3), rad."""
+    """Returns the first two columns of the matrices of rotation vectors, shape (..., 6), of
+    (..., 3), rad.
+    """
     rows = np.reshape(turns, (-1, 3))
     w, v = split_quaternions(rows)
     two = 2.0 * v
@@ -64,14 +73,17 @@ def find_six_numbers(turns: Array) -> Array:
     xy = 2.0 * v[:, 0] * v[:, 1]
     xz = 2.0 * v[:, 0] * v[:, 2]
     yz = 2.0 * v[:, 1] * v[:, 2]
-    columns = np.stack([1.0 - yy - zz, xy + wz, xz - wy, xy - wz, 1.0 - xx - zz, yz + wx], axis=1)
+    columns = np.stack(
+        [1.0 - yy - zz, xy + wz, xz - wy, xy - wz, 1.0 - xx - zz, yz + wx], axis=1
+    )
     return columns.reshape(*np.shape(turns)[:-1], len(MATRIX_ENTRIES))
 
 
 def expand_poses(x: Array) -> Array:
     """Returns poses with six numbers in place of their rotation vectors.
 
-    An environment observes poses so, and a hand of one's own gets the same numbers from `HandView`:
+    An environment observes poses so, and a hand of one's own gets the same numbers from
+    `HandView`:
 
     >>> import numpy as np
     >>> quarter_turn = np.array([0.5, 0.0, 0.2, 0.0, 0.0, np.pi / 2])
@@ -79,11 +91,12 @@ def expand_poses(x: Array) -> Array:
     [5, 0, 2, 0, 10, 0, -10, 0, 0]
 
     Args:
-        x: what sites share in task space: places, shape (..., 3), m, or places and rotation vectors,
-            shape (..., 6), m and rad.
+        x: what sites share in task space: places, shape (..., 3), m, or places and rotation
+            vectors, shape (..., 6), m and rad.
 
     Returns:
-        Places and the first two columns of the rotation matrices, shape (..., 9); places alone as they are.
+        Places and the first two columns of the rotation matrices, shape (..., 9); places alone
+        as they are.
     """
     if x.shape[-1] != POSE:
         return x
@@ -91,7 +104,8 @@ def expand_poses(x: Array) -> Array:
 
 
 def bring_nearer(turns: Array, references: Array) -> Array:
-    """Returns rotation vectors of the same rotations that are nearest to other ones, shape (K, 3), rad.
+    """Returns rotation vectors of the same rotations that are nearest to other ones, shape (K,
+    3), rad.
 
     They may be longer than half a turn.
     """
@@ -102,17 +116,22 @@ def bring_nearer(turns: Array, references: Array) -> Array:
 
 
 def find_steady_vectors(turns: Array) -> Array:
-    """Returns rotation vectors, shape (K, 3), rad, without jumps at half a turn; whole turns have them."""
+    """Returns rotation vectors, shape (K, 3), rad, without jumps at half a turn; whole turns
+    have them.
+    """
     quaternions = find_quaternions(turns)
     w = quaternions[:, :1]
     v = quaternions[:, 1:]
     sine = np.linalg.norm(v, axis=1, keepdims=True)
-    by_sine = np.divide(2.0 * np.arctan2(sine, w), sine, out=np.full_like(w, 2.0), where=sine > 0.0)
+    by_sine = np.divide(
+        2.0 * np.arctan2(sine, w), sine, out=np.full_like(w, 2.0), where=sine > 0.0
+    )
     return np.asarray(by_sine * v)
 
 
 class SteadyQuaternion:
-    """Sign of the quaternions of one stream: each is nearest to the one before; the first has w >= 0.
+    """Sign of the quaternions of one stream: each is nearest to the one before; the first has w
+    >= 0.
 
     The order of the four numbers is free; `w` says where w stands.
     """

@@ -1,7 +1,8 @@
 """Fields of many encoded records as arrays.
 
-Invariant: only the requested fields are decoded, and each is checked as in a complete record: type,
-length, finite values. Every function raises `WireError` for the first payload that is no such record.
+Invariant: only the requested fields are decoded, and each is checked as in a complete record:
+type, length, finite values. Every function raises `WireError` for the first payload that is no
+such record.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -35,7 +36,9 @@ _DEFAULTS = {"sent_ns": 0}
 
 
 def decode_ticks(payloads: Sequence[bytes]) -> Ints:
-    """Returns the tick of every record, shape (K,); records of every readable version are accepted."""
+    """Returns the tick of every record, shape (K,); records of every readable version are
+    accepted.
+    """
     if any(len(payload) > MAX_BYTES for payload in payloads):
         raise _explain(payloads)
     pairs = decode_ints(payloads, "v", "tick").reshape(-1, 2)
@@ -52,19 +55,28 @@ def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
 
 
 def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> dict[str, Array]:
-    """Returns vectors of every record by their fields, shape (K, length of the vector) each, in one pass.
+    """Returns vectors of every record by their fields, shape (K, length of the vector) each, in
+    one pass.
 
     Of what records of this layout leave out the length is 0.
     """
     lengths = layout.lengths()
-    if absent := {field: np.zeros((len(payloads), 0)) for field in fields if field not in lengths}:
+    if absent := {
+        field: np.zeros((len(payloads), 0)) for field in fields if field not in lengths
+    }:
         there = [field for field in fields if field in lengths]
         return absent | (decode_vectors(payloads, layout, *there) if there else {})
     counts = [lengths[field] for field in fields]
     values = chain.from_iterable(_decode_fields(payloads, *fields, layout=layout))
     if len(fields) > 1:
         values = chain.from_iterable(values)
-    rows: Array = _to_array(payloads, values, np.float64, sum(counts) * len(payloads), layout)
+    rows: Array = _to_array(
+        payloads=payloads,
+        values=values,
+        kind=np.float64,
+        count=sum(counts) * len(payloads),
+        layout=layout,
+    )
     rows = rows.reshape(-1, sum(counts))
     if not np.isfinite(rows).all():
         raise _explain(payloads, layout=layout)
@@ -82,7 +94,9 @@ def decode_strings(payloads: Sequence[bytes], field: str) -> NDArray[np.object_]
 def decode_per_peer(
     payloads: Sequence[bytes], field: str, peers: Sequence[str], absent: int
 ) -> dict[str, Ints]:
-    """Returns a field with a whole number per peer, shape (K,) each; `absent` where a record names none."""
+    """Returns a field with a whole number per peer, shape (K,) each; `absent` where a record
+    names none.
+    """
     places = [f"peer{n}" for n in range(len(peers))]
     entry = msgspec.defstruct(
         "Peers",
@@ -94,12 +108,16 @@ def decode_per_peer(
     take = attrgetter(*(f"{field}.{place}" for place in places))
     found = map(take, map(decoder.decode, payloads))
     values = found if len(peers) == 1 else chain.from_iterable(found)
-    rows = _to_array(payloads, values, np.int64, len(peers) * len(payloads)).reshape(-1, len(peers))
+    rows = _to_array(payloads, values, np.int64, len(peers) * len(payloads)).reshape(
+        -1, len(peers)
+    )
     return {peer: rows[:, n].copy() for n, peer in enumerate(peers)}
 
 
 def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
-    """Returns the arrivals: how many per record, shape (K,), and all in order as in `rx`, shape (N, 3)."""
+    """Returns the arrivals: how many per record, shape (K,), and all in order as in `rx`, shape
+    (N, 3).
+    """
     counts = np.zeros(len(payloads), dtype=np.int64)
 
     def iterate_entries() -> Iterator[int]:
@@ -111,13 +129,17 @@ def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
     return counts, _to_array(payloads, iterate_entries(), np.int64, -1).reshape(-1, 3)
 
 
-def _decode_fields(payloads: Sequence[bytes], *fields: str, layout: Layout | None = None) -> Iterator[Any]:
+def _decode_fields(
+    payloads: Sequence[bytes], *fields: str, layout: Layout | None = None
+) -> Iterator[Any]:
     take: Callable[[Any], Any] = attrgetter(*fields)
     return map(take, map(_find_decoder(fields, layout).decode, payloads))
 
 
 @cache
-def _find_decoder(fields: tuple[str, ...], layout: Layout | None) -> msgspec.msgpack.Decoder[Any]:
+def _find_decoder(
+    fields: tuple[str, ...], layout: Layout | None
+) -> msgspec.msgpack.Decoder[Any]:
     types = {field.name: field.type for field in msgspec.structs.fields(State)} | _TYPES
     for field, count in layout.lengths().items() if layout else ():
         types[field] = tuple.__class_getitem__((float,) * count)
@@ -126,13 +148,18 @@ def _find_decoder(fields: tuple[str, ...], layout: Layout | None) -> msgspec.msg
 
 def _make_decoder(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
     fields = [
-        (name, kind, _DEFAULTS[name]) if name in _DEFAULTS else (name, kind) for name, kind in types.items()
+        (name, kind, _DEFAULTS[name]) if name in _DEFAULTS else (name, kind)
+        for name, kind in types.items()
     ]
     return msgspec.msgpack.Decoder(msgspec.defstruct("Fields", fields, frozen=True, gc=False))
 
 
 def _to_array(
-    payloads: Sequence[bytes], values: Iterable[Any], kind: Any, count: int, layout: Layout | None = None
+    payloads: Sequence[bytes],
+    values: Iterable[Any],
+    kind: Any,
+    count: int,
+    layout: Layout | None = None,
 ) -> NDArray[Any]:
     try:
         return np.fromiter(values, kind, count)
@@ -141,9 +168,13 @@ def _to_array(
 
 
 def _explain(
-    payloads: Sequence[bytes], else_text: str = "a number is out of range", layout: Layout | None = None
+    payloads: Sequence[bytes],
+    else_text: str = "a number is out of range",
+    layout: Layout | None = None,
 ) -> WireError:
-    """Returns the error of the first payload that is no record, as that record alone would raise it."""
+    """Returns the error of the first payload that is no record, as that record alone would
+    raise it.
+    """
     for payload in payloads:
         try:
             decode(payload, State, READABLE, layout)

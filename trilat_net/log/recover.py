@@ -1,13 +1,15 @@
 """Recovery: makes a finished MCAP file of one that is cut off or damaged.
 
 Invariant:
-- What can be read is copied byte for byte: messages with their times and numbers, metadata, attachments.
-- What cannot be read is left out and reported. Nothing is invented: of a trilat-net log a message is
-  copied only if a valid checksum covers it or if its content proves it (`content_check`), and only from a
-  chunk that stands where it was written (`recovery_survey`).
-- No file is made that holds nothing. A log that no command opens in the end is reported as such: the new
-  file is read once more.
-- The source file is not modified. Any MCAP file is accepted; for a trilat-net log the accounts are rebuilt.
+- What can be read is copied byte for byte: messages with their times and numbers, metadata,
+  attachments.
+- What cannot be read is left out and reported. Nothing is invented: of a trilat-net log a
+  message is copied only if a valid checksum covers it or if its content proves it
+  (`content_check`), and only from a chunk that stands where it was written (`recovery_survey`).
+- No file is made that holds nothing. A log that no command opens in the end is reported as
+  such: the new file is read once more.
+- The source file is not modified. Any MCAP file is accepted; for a trilat-net log the accounts
+  are rebuilt.
 """
 
 import hashlib
@@ -74,11 +76,14 @@ class Recovery(Result):
         path, output: the source file, and the file that was made.
         finished: True if the source had been finished.
         messages: number of messages.
-        duration_s: from the first message to the last, by the times at which they were logged, s.
+        duration_s: from the first message to the last, by the times at which they were logged,
+            s.
         salvaged: messages out of a last chunk that was cut off.
         lost, lost_bytes: what was lost, a sentence each, and how many bytes could not be read.
-        missing: per site which records are not in the file, be they lost here or never recorded.
-        coverage: the records in the file and the ticks of the run; of no site if it is no trilat-net log.
+        missing: per site which records are not in the file, be they lost here or never
+            recorded.
+        coverage: the records in the file and the ticks of the run; of no site if it is no
+            trilat-net log.
         chain: agreement of the source with its digest chain; "" if it is no trilat-net log.
     """
 
@@ -128,7 +133,9 @@ class Recovery(Result):
     def facts(self) -> dict[str, str]:
         """Returns the metadata of the new file that describe the recovery."""
         listed = self.lost[:MAX_LISTED_LOSSES]
-        more = [f"and {len(self.lost) - len(listed)} more"] if len(self.lost) > len(listed) else []
+        more = (
+            [f"and {len(self.lost) - len(listed)} more"] if len(self.lost) > len(listed) else []
+        )
         return {
             "from": self.path.name,
             "finished": str(self.finished).lower(),
@@ -180,21 +187,29 @@ def recover(
     if not made.name:
         raise UsageError(f"{made}: is a directory; name a file with -o")
     if made.exists() and path.exists() and made.samefile(path):
-        raise UsageError(f"{made}: is the file itself, which is not touched; choose another name with -o")
+        raise UsageError(
+            f"{made}: is the file itself, which is not touched; choose another name with -o"
+        )
     try:
         with open_regular(path) as stream:
             return _recover(stream, Recovery(path, made), force, progress)
     except OSError as error:
         if error.filename not in (None, str(path)):
             raise describe_write_error(Path(error.filename), error) from None
-        raise LogError(f"{path}: cannot be read: {error.strerror}{describe_unfinished(path)}") from None
+        raise LogError(
+            f"{path}: cannot be read: {error.strerror}{describe_unfinished(path)}"
+        ) from None
 
 
-def _recover(stream: BinaryIO, result: Recovery, force: bool, progress: Progress | None) -> Recovery:
+def _recover(
+    stream: BinaryIO, result: Recovery, force: bool, progress: Progress | None
+) -> Recovery:
     reader = McapReader(stream, str(result.path), progress, kept=False)
     survey = RecoverySurvey(reader.scanner)
     if survey.why_empty:
-        raise NothingSaved(f"{result.path}: there is nothing in it that could be saved: {survey.why_empty}")
+        raise NothingSaved(
+            f"{result.path}: there is nothing in it that could be saved: {survey.why_empty}"
+        )
     restored = _restore_scenario(survey, result.path)
     working = result.output.with_name(result.output.name + ".recovering")
     working.unlink(missing_ok=True)
@@ -223,7 +238,9 @@ def _check_output(working: Path, result: Recovery) -> None:
 
 
 def _restore_scenario(survey: RecoverySurvey, path: Path) -> bytes:
-    """Returns the scenario of a log that lost it, if the file that was run is beside it; else b""."""
+    """Returns the scenario of a log that lost it, if the file that was run is beside it; else
+    b"".
+    """
     digest = survey.metadata.get(SESSION, {}).get("scenario_sha256", "")
     kept = survey.attachments.get(SCENARIO)
     if not digest or kept is not None:
@@ -243,7 +260,9 @@ class _FileCopy:
         is_session_log: True if anything says that it is a log of a session.
     """
 
-    def __init__(self, reader: McapReader, file: LogFile, survey: RecoverySurvey, result: Recovery) -> None:
+    def __init__(
+        self, reader: McapReader, file: LogFile, survey: RecoverySurvey, result: Recovery
+    ) -> None:
         reader.watch = self._copy
         self._reader = reader
         self._scanner = reader.scanner
@@ -257,14 +276,22 @@ class _FileCopy:
         self.is_session_log = survey.is_session_log
         self._is_empty = True  # neither a message nor metadata nor an attachment was copied
         self._reported = 0  # damaged parts that are among the losses
-        self._defined: dict[tuple[int, int], Any] = {}  # schemas and channels, by opcode and number
+        self._defined: dict[
+            tuple[int, int], Any
+        ] = {}  # schemas and channels, by opcode and number
         self._contradicted: set[int] = set()  # numbers that have two definitions
         self._new_schemas: dict[int, int] = {}
-        self._released_schemas: dict[str, int] = {}  # written anew, by the kind of their messages
+        self._released_schemas: dict[
+            str, int
+        ] = {}  # written anew, by the kind of their messages
         self._new_channels: dict[int, tuple[int, str]] = {}  # number in the new file, and topic
-        self._new_topics: dict[str, tuple[int, str]] = {}  # the same by topic, of the session's own channels
+        self._new_topics: dict[
+            str, tuple[int, str]
+        ] = {}  # the same by topic, of the session's own channels
         self._bare: list[str] = []  # topics of channels whose schema no record names
-        self._misnamed: list[str] = []  # topics of channels whose messages prove another or no definition
+        self._misnamed: list[
+            str
+        ] = []  # topics of channels whose messages prove another or no definition
         self._unnamed: Counter[int] = Counter()  # messages of channels that no record names
         self._identified: set[int] = set()  # channels whose first message was looked at
         for opcode, content in survey.definitions:
@@ -283,7 +310,13 @@ class _FileCopy:
             NothingSaved: all that the file holds is lost.
         """
         if restored:
-            self._out.add_attachment(0, 0, SCENARIO, "application/toml", restored)
+            self._out.add_attachment(
+                create_time=0,
+                log_time=0,
+                name=SCENARIO,
+                media_type="application/toml",
+                data=restored,
+            )
             self._is_empty = False
         deque(self._reader.messages(), maxlen=0)  # every record passes through `_copy`
         self._report_damaged()
@@ -291,8 +324,11 @@ class _FileCopy:
             self._take_torn(self._scanner.torn)
         self._out.flush()
         self._report_unnamed()
-        if self._is_empty and self._result.lost:  # before the end mark, which would make it a file
-            reasons = [text for text in self._result.lost if _UNOPENED not in text][:_MAX_REASONS]
+        # before the end mark, which would make it a file
+        if self._is_empty and self._result.lost:
+            reasons = [text for text in self._result.lost if _UNOPENED not in text][
+                :_MAX_REASONS
+            ]
             why = f"there is nothing in it that could be saved: {'; '.join(reasons)}"
             raise NothingSaved(f"{self._result.path}: {why}")
         self._finish()
@@ -313,7 +349,9 @@ class _FileCopy:
         self._reported = len(self._scanner.damaged)
 
     def _take(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
-        """Copies one record of the file; `data` is what a chunk holds, empty if it cannot be unpacked."""
+        """Copies one record of the file; `data` is what a chunk holds, empty if it cannot be
+        unpacked.
+        """
         opcode = frame.opcode
         if opcode == Opcode.HEADER or opcode in mcap_records.DEFINITIONS:
             return
@@ -341,7 +379,9 @@ class _FileCopy:
         self._is_empty = False
 
     def _take_attachment(self, content: bytes) -> None:
-        """Copies an attachment; one that is damaged must not get a valid checksum under its own name."""
+        """Copies an attachment; one that is damaged must not get a valid checksum under its own
+        name.
+        """
         entry = mcap_records.parse_record(Opcode.ATTACHMENT, content)
         name = entry.name
         problem = "" if mcap_records.has_right_crc(content) else "its CRC differs"
@@ -350,7 +390,13 @@ class _FileCopy:
         if problem:
             name = f"{name}{DAMAGED_SUFFIX}"
             self._result.lose(f"attachment {entry.name}: {problem}; it is kept as {name}")
-        self._out.add_attachment(entry.create_time, entry.log_time, name, entry.media_type, entry.data)
+        self._out.add_attachment(
+            create_time=entry.create_time,
+            log_time=entry.log_time,
+            name=name,
+            media_type=entry.media_type,
+            data=entry.data,
+        )
         self._is_empty = False
 
     def _pass_over(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
@@ -369,7 +415,10 @@ class _FileCopy:
         if problem := self._survey.misplaced.get(frame.offset):
             raise UnreadableRecord(problem)
         head = self._scanner.head(frame)
-        inner = [(opcode, data[begin:end]) for opcode, begin, end in mcap_records.iterate_records(data)]
+        inner = [
+            (opcode, data[begin:end])
+            for opcode, begin, end in mcap_records.iterate_records(data)
+        ]
         if not head.crc and self._content is None and self.is_session_log:
             raise UnreadableRecord(f"a chunk {_UNPROVEN}")
         if not head.crc and self._content is not None:
@@ -401,15 +450,24 @@ class _FileCopy:
             if new is None:
                 self._unnamed[number] += 1
                 return
-            self._out.add_message(new[0], log_ns, payload, publish_ns, sequence)
+            self._out.add_message(
+                channel_id=new[0],
+                log_time=log_ns,
+                data=payload,
+                publish_time=publish_ns,
+                sequence=sequence,
+            )
             self._is_empty = False
             if self._content is not None:
                 self._content.follow(new[1], sequence, log_ns, payload)
             if self._accounts is not None:
                 self._accounts.take(new[1], sequence, payload)
 
-    def _take_unproven(self, inner: Iterable[tuple[int, bytes]], span_ns: tuple[int, int]) -> None:
-        """Copies the messages of which no checksum proves anything, if all of them prove themselves.
+    def _take_unproven(
+        self, inner: Iterable[tuple[int, bytes]], span_ns: tuple[int, int]
+    ) -> None:
+        """Copies the messages of which no checksum proves anything, if all of them prove
+        themselves.
 
         Args:
             inner: records of a chunk.
@@ -453,15 +511,18 @@ class _FileCopy:
             self._contradicted.add(entry.id)
 
     def _is_plausible(self, topic: str) -> bool:
-        """True for a topic that the file can have: of a session's log none of another session's members."""
+        """True for a topic that the file can have: of a session's log none of another session's
+        members.
+        """
         is_own = topic.startswith(f"/{topics.ROOT}/")
         return self._content is None or not is_own or self._content.owns(topic)
 
     def _find_channel(self, number: int, payload: bytes) -> tuple[int, str] | None:
-        """Returns the number of a channel in the new file, and its topic; None if nothing tells what it is.
+        """Returns the number of a channel in the new file, and its topic; None if nothing tells
+        what it is.
 
-        The first message of a channel of the session decides: it names its member and its kind, where the
-        definition of a channel has no checksum in a file that was not finished.
+        The first message of a channel of the session decides: it names its member and its kind,
+        where the definition of a channel has no checksum in a file that was not finished.
         """
         known = self._new_channels.get(number)
         if known is not None and (self._content is None or number in self._identified):
@@ -475,9 +536,15 @@ class _FileCopy:
         return self._new_channels[number]
 
     def _open_channel(self, number: int) -> tuple[int, str] | None:
-        """Returns the number of a channel in the new file, and its topic; None if no record names it."""
+        """Returns the number of a channel in the new file, and its topic; None if no record
+        names it.
+        """
         known = self._defined.get((Opcode.CHANNEL, number))
-        if known is None or len(self._new_channels) >= _MAX_NUMBERS or not self._is_plausible(known.topic):
+        if (
+            known is None
+            or len(self._new_channels) >= _MAX_NUMBERS
+            or not self._is_plausible(known.topic)
+        ):
             return None
         schema = self._defined.get((Opcode.SCHEMA, known.schema_id))
         if schema is not None and schema.id not in self._new_schemas:
@@ -486,11 +553,15 @@ class _FileCopy:
         if schema is None and known.schema_id:
             self._bare.append(known.topic)
         new_schema = self._new_schemas.get(known.schema_id, 0)
-        channel = self._out.register_channel(known.topic, known.message_encoding, new_schema, known.metadata)
+        channel = self._out.register_channel(
+            known.topic, known.message_encoding, new_schema, known.metadata
+        )
         return self._keep_channel(number, channel, known.topic)
 
     def _open_again(self, topic: str) -> tuple[int, str]:
-        """Returns a channel of the session that is defined anew, as the log's writer defines it."""
+        """Returns a channel of the session that is defined anew, as the log's writer defines
+        it.
+        """
         assert self._content is not None
         kind = CHANNEL_TYPES[topic.rpartition("/")[2]]
         name = f"trilat.{kind.__name__}.v{VERSION}"
@@ -498,7 +569,9 @@ class _FileCopy:
             data = json.dumps(json_schema(kind)).encode()
             self._released_schemas[name] = self._out.register_schema(name, "jsonschema", data)
         about = self._content.describe_channel(topic)
-        channel = self._out.register_channel(topic, "msgpack", self._released_schemas[name], about)
+        channel = self._out.register_channel(
+            topic, "msgpack", self._released_schemas[name], about
+        )
         return self._keep_channel(None, channel, topic)
 
     def _keep_channel(self, number: int | None, channel: int, topic: str) -> tuple[int, str]:
@@ -529,7 +602,9 @@ class _FileCopy:
         )
 
     def _salvage(self, offset: int) -> str:
-        """Copies the records of a chunk that was cut off, block by block; returns what ended that, or ""."""
+        """Copies the records of a chunk that was cut off, block by block; returns what ended
+        that, or "".
+        """
         if self._content is None and self.is_session_log:
             return "its scenario, without which no message can be checked"
         try:
@@ -544,11 +619,15 @@ class _FileCopy:
         result = self._result
         stated = self._survey.count
         for number, count in self._unnamed.items():
-            result.lose(f"{count_nouns(count, 'message')} of channel {number}, which no record names")
+            result.lose(
+                f"{count_nouns(count, 'message')} of channel {number}, which no record names"
+            )
         for topic in self._bare:
             result.lose(f"the schema of {topic}")
         for topic in self._misnamed:
-            result.lose(f"the definition of {topic}; its messages name it, and it was made again")
+            result.lose(
+                f"the definition of {topic}; its messages name it, and it was made again"
+            )
         for number in self._contradicted:
             result.lose(f"what channel or schema {number} is: the file says it in two ways")
         survey = self._survey
@@ -560,7 +639,8 @@ class _FileCopy:
             advice = ""
             if SESSION in survey.metadata:  # which names the hash that the scenario must have
                 advice = f". If the file that was run stands beside the log as {SCENARIO}, recover puts it in"
-            result.lost.insert(0, f"{lacks}; {_UNOPENED}{advice}")  # lists show the first losses
+            # lists show the first losses
+            result.lost.insert(0, f"{lacks}; {_UNOPENED}{advice}")
         if stated is not None and self._out.messages < stated and result.lossless:
             result.lose(
                 f"{stated - self._out.messages} of the {count_nouns(stated, 'message')} that it says it has"
@@ -576,11 +656,14 @@ class _FileCopy:
             result.chain = self._judge_source()
         if accounts is not None:
             result.missing = list(accounts.missing())
-            if not (result.finished and PART in self._survey.metadata):  # else the end is in a later part
+            # else the end is in a later part
+            if not (result.finished and PART in self._survey.metadata):
                 result.missing += accounts.describe_tails()
             result.coverage = accounts.coverage()
             before = self._survey.metadata.get(ACCOUNTS, {})
-            alone = self._scanner.finished and result.lossless and PART not in self._survey.metadata
+            alone = (
+                self._scanner.finished and result.lossless and PART not in self._survey.metadata
+            )
             if alone and any(
                 parse_counts(before.get(topic, "")) not in ({}, parse_counts(text))
                 for topic, text in accounts.texts().items()
@@ -597,8 +680,8 @@ class _FileCopy:
     def _judge_source(self) -> DigestState:
         """Returns the agreement of the source with its digest chain.
 
-        A definition that is damaged among the data, and stands in the index with a checksum, changes no
-        message.
+        A definition that is damaged among the data, and stands in the index with a checksum,
+        changes no message.
         """
         state = self._reader.judge_digest().state if self._scanner.begins else DigestState.OPEN
         is_repaired = self._survey.is_redefined and self._reader.agrees_on_messages
@@ -616,8 +699,12 @@ def _split_head(content: bytes) -> tuple[int, int, int, int]:
     return number, sequence, log_ns, publish_ns
 
 
-def _make_content_check(survey: RecoverySurvey, accounts: SessionAccounts | None) -> ContentCheck | None:
-    """Returns the check of a log's messages; None of a file of another program, and without a scenario."""
+def _make_content_check(
+    survey: RecoverySurvey, accounts: SessionAccounts | None
+) -> ContentCheck | None:
+    """Returns the check of a log's messages; None of a file of another program, and without a
+    scenario.
+    """
     if accounts is None:
         return None
     scenario = parse_embedded(survey.attachments[SCENARIO].decode(), SCENARIO)

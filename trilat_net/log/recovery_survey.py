@@ -1,13 +1,14 @@
-"""First look at a damaged file: what describes it, and which of its chunks stand where they were written.
+"""First look at a damaged file: what describes it, and which of its chunks stand where they
+were written.
 
 Invariant:
 - Of two definitions of a number, the one covered by a valid checksum wins, else the first.
-- Of several sessions and scenarios in a file those count that name each other; one whose epoch contradicts
-  all messages with a checksum is of another log, and does not count. In virtual time, where the epoch is 0,
-  the boots of the messages tell.
-- A chunk whose checksum is right may still be old, of another file, or in the wrong place. In a finished file
-  the index tells, which has a checksum of its own; in a log that was not finished the times of the chunks do,
-  which never go back.
+- Of several sessions and scenarios in a file those count that name each other; one whose epoch
+  contradicts all messages with a checksum is of another log, and does not count. In virtual
+  time, where the epoch is 0, the boots of the messages tell.
+- A chunk whose checksum is right may still be old, of another file, or in the wrong place. In a
+  finished file the index tells, which has a checksum of its own; in a log that was not finished
+  the times of the chunks do, which never go back.
 """
 
 import hashlib
@@ -46,7 +47,8 @@ class RecoverySurvey:
         metadata: the last of each name; of sessions the one that names the scenario.
         attachments: the first of each name; of scenarios the one that the session names.
         count: how many messages the file states; None if no checksum covers that.
-        is_redefined: True if a definition among the data is not what the index says, which has a checksum.
+        is_redefined: True if a definition among the data is not what the index says, which has
+            a checksum.
         is_foreign_session: True if the session that the file names is not that of its messages.
         misplaced: what is wrong with chunks that are not where they were written, by offset.
         is_chunked: True if the file has chunks.
@@ -65,9 +67,14 @@ class RecoverySurvey:
         self._chunks: list[tuple[RecordFrame, ChunkHead]] = []
         self._indexes: dict[int, Any] = {}  # of chunks, by offset
         footer = scanner.footer()
-        is_covered = footer is not None and footer.summary_crc and scanner.is_summary_intact(footer)
-        summary_offset = (footer.summary_start if footer is not None and is_covered else 0) or scanner.size
-        found: dict[tuple[bool, int], list[Definition]] = defaultdict(list)  # in the summary or not
+        is_covered = (
+            footer is not None and footer.summary_crc and scanner.is_summary_intact(footer)
+        )
+        summary_offset = (
+            footer.summary_start if footer is not None and is_covered else 0
+        ) or scanner.size
+        # in the summary or not
+        found: dict[tuple[bool, int], list[Definition]] = defaultdict(list)
         self._places: dict[Definition, int] = {}  # of definitions that no checksum covers
         has_messages = False
         for frame in scanner.frames():
@@ -86,7 +93,9 @@ class RecoverySurvey:
             self.count = None
             self._indexes = {}
         self.definitions = [
-            entry for kind in mcap_records.DEFINITIONS for entry in found[True, kind] or found[False, kind]
+            entry
+            for kind in mcap_records.DEFINITIONS
+            for entry in found[True, kind] or found[False, kind]
         ]
         for kind in mcap_records.DEFINITIONS:
             for entry in found[True, kind]:
@@ -105,13 +114,17 @@ class RecoverySurvey:
         self.is_foreign_session = False
         self._judge_messages()
         self.misplaced = self._find_misplaced_chunks()
-        is_torn_chunk = scanner.torn is not None and scanner.read(scanner.torn.offset, 1) == _CHUNK_BYTE
+        is_torn_chunk = (
+            scanner.torn is not None and scanner.read(scanner.torn.offset, 1) == _CHUNK_BYTE
+        )
         self.is_chunked |= is_torn_chunk
         self.why_empty = ""
         if not (has_messages or is_torn_chunk or self.metadata or self.attachments):
             self.why_empty = "it holds no messages"
             if not scanner.begins:
-                self.why_empty = "it does not begin as an MCAP file does" if scanner.size else "it is empty"
+                self.why_empty = (
+                    "it does not begin as an MCAP file does" if scanner.size else "it is empty"
+                )
 
     def _take(self, frame: RecordFrame, content: bytes) -> None:
         record = mcap_records.parse_record(frame.opcode, content)
@@ -136,8 +149,8 @@ class RecoverySurvey:
     def _choose_session(self) -> None:
         """Chooses the session and the scenario that belong together.
 
-        A scenario that no session names counts if a checksum covers it: one of 0 covers nothing, and a page
-        that was zeroed leaves it behind.
+        A scenario that no session names counts if a checksum covers it: one of 0 covers
+        nothing, and a page that was zeroed leaves it behind.
         """
         self.attachments.pop(SCENARIO, None)
         covered = [text for text, is_covered in self._scenarios if is_covered]
@@ -155,7 +168,8 @@ class RecoverySurvey:
     def _judge_messages(self) -> None:
         """Compares the first chunks that have messages with the session that the file names.
 
-        A chunk without a checksum tells that the file is a log, but nothing against its session.
+        A chunk without a checksum tells that the file is a log, but nothing against its
+        session.
         """
         origins = MessageOrigins(set(), set())
         for frame, head in self._chunks[:_SAMPLED_CHUNKS]:
@@ -174,12 +188,13 @@ class RecoverySurvey:
             self._reject_session(session, is_renamed=False)
 
     def _reject_session(self, session: dict[str, str], *, is_renamed: bool) -> None:
-        """Leaves out a session of another log, its scenario, and its channels unless a checksum covers them.
+        """Leaves out a session of another log, its scenario, and its channels unless a checksum
+        covers them.
 
         Args:
             session: metadata of that session.
-            is_renamed: False if the session of the messages may have the same name; then the channels that
-                are left out are those that stand in the same page.
+            is_renamed: False if the session of the messages may have the same name; then the
+                channels that are left out are those that stand in the same page.
         """
         self.is_foreign_session = True
         pages = {offset // PAGE_BYTES for entry, offset in self._sessions if entry == session}
@@ -199,14 +214,20 @@ class RecoverySurvey:
             return self._find_unnamed_chunks()
         misplaced = {}
         if SESSION in self.metadata:  # files of other programs may be in any order
-            ordered = _find_longest_ordered([(head.start_ns, head.end_ns) for _, head in self._chunks])
+            ordered = _find_longest_ordered(
+                [(head.start_ns, head.end_ns) for _, head in self._chunks]
+            )
             for place, (frame, _) in enumerate(self._chunks):
                 if place not in ordered:
-                    misplaced[frame.offset] = "a chunk that is older or newer than those around it"
+                    misplaced[frame.offset] = (
+                        "a chunk that is older or newer than those around it"
+                    )
         return misplaced
 
     def _find_unnamed_chunks(self) -> dict[int, str]:
-        """Returns the chunks that the index does not name; in a file that was shifted places do not count."""
+        """Returns the chunks that the index does not name; in a file that was shifted places do
+        not count.
+        """
         unnamed = []
         left = Counter(_chunk_measures(index) for index in self._indexes.values())
         for frame, head in self._chunks:
@@ -229,7 +250,10 @@ class RecoverySurvey:
 def _names_session(data: bytes) -> bool:
     """True if an unpacked chunk defines a channel of a session."""
     records = mcap_records.iterate_records(data)
-    return any(opcode == Opcode.CHANNEL and _TOPIC_ROOT in data[begin:end] for opcode, begin, end in records)
+    return any(
+        opcode == Opcode.CHANNEL and _TOPIC_ROOT in data[begin:end]
+        for opcode, begin, end in records
+    )
 
 
 _CHUNK_BYTE = bytes([Opcode.CHUNK])
@@ -244,7 +268,8 @@ def _chunk_measures(index: Any) -> tuple[int, int, int, int]:
 
 
 def _find_longest_ordered(spans_ns: Sequence[tuple[int, int]]) -> set[int]:
-    """Returns the places of the longest sequence of spans of time of which each is later than the one before.
+    """Returns the places of the longest sequence of spans of time of which each is later than
+    the one before.
 
     That is patience sorting. Equal spans are of a chunk that stands in the file twice.
     """

@@ -1,8 +1,10 @@
-"""Digest chain of a log: SHA-256 over all messages in order, and over everything that describes them.
+"""Digest chain of a log: SHA-256 over all messages in order, and over everything that describes
+them.
 
-Invariant: the digests depend on the records of the file, not on chunks or their compression; any change of a
-message, of its times or number, of metadata, scenario, schemas or channels changes one of them. They protect
-against alteration, not against a file that was made anew: that is the task of a signature.
+Invariant: the digests depend on the records of the file, not on chunks or their compression;
+any change of a message, of its times or number, of metadata, scenario, schemas or channels
+changes one of them. They protect against alteration, not against a file that was made anew:
+that is the task of a signature.
 """
 
 import hashlib
@@ -63,7 +65,9 @@ class RunningDigest:
         self.messages += messages
 
     def add_entry(self, opcode: int, content: bytes) -> None:
-        """Adds a header, metadata, an attachment, a schema or a channel; repeated ones count once."""
+        """Adds a header, metadata, an attachment, a schema or a channel; repeated ones count
+        once.
+        """
         self._about.add(hashlib.sha256(bytes([opcode]) + content).digest())
 
     def facts(self) -> dict[str, str]:
@@ -72,7 +76,9 @@ class RunningDigest:
         digests = {"records": self._records.hexdigest(), "about": about}
         return {"algorithm": ALGORITHM, "messages": str(self.messages), **digests}
 
-    def judge(self, metadata: Mapping[str, Mapping[str, str]], *, finished: bool, damaged: bool) -> Integrity:
+    def judge(
+        self, metadata: Mapping[str, Mapping[str, str]], *, finished: bool, damaged: bool
+    ) -> Integrity:
         """Returns whether a file agrees with the chain that it states.
 
         Args:
@@ -86,23 +92,37 @@ class RunningDigest:
             return Integrity(DigestState.CHANGED, "recovered from a file that had been changed")
         if stated is None:
             if DIGESTS_KEY not in metadata.get(SESSION, {}):
-                return Integrity(DigestState.ABSENT, "no digest chain: an older program made it")
+                return Integrity(
+                    DigestState.ABSENT, "no digest chain: an older program made it"
+                )
             if not finished:
                 why = "its digest chain is not closed: the file was not finished"
                 return Integrity(DigestState.OPEN, why)
             return Integrity(DigestState.CHANGED, "its digest chain was removed")
         found = self.facts()
         if found == dict(stated):
-            since = f", since it was recovered from {recovered['from']}" if "from" in recovered else ""
+            since = (
+                f", since it was recovered from {recovered['from']}"
+                if "from" in recovered
+                else ""
+            )
             agrees = (
                 f"the digest chain agrees over {count_nouns(self.messages, 'message')} "
                 f"and all metadata{since}"
             )
             return Integrity(DigestState.INTACT, agrees)
-        if damaged and stated.get("about") == found["about"] and stated.get("messages") != found["messages"]:
-            return Integrity(DigestState.OPEN, "its digest chain cannot be compared: the file is damaged")
+        if (
+            damaged
+            and stated.get("about") == found["about"]
+            and stated.get("messages") != found["messages"]
+        ):
+            return Integrity(
+                DigestState.OPEN, "its digest chain cannot be compared: the file is damaged"
+            )
         differ = [name for key, name in _COVERED.items() if stated.get(key) != found[key]]
-        return Integrity(DigestState.CHANGED, f"changed since it was made: {' and '.join(differ)}")
+        return Integrity(
+            DigestState.CHANGED, f"changed since it was made: {' and '.join(differ)}"
+        )
 
 
 _COVERED = {

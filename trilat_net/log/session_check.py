@@ -1,8 +1,10 @@
-"""Check of a log: bytes of its files, completeness of its session, agreement with scenario and accounts.
+"""Check of a log: bytes of its files, completeness of its session, agreement with scenario and
+accounts.
 
-Invariant: one finding per check, with the places where it fails; missing messages are named range by
-range. Any MCAP file is checked for its bytes, only a trilat-net log for its content: a message against
-its own content, its scenario and the messages before it. Nothing is executed: that is the task of `verify`.
+Invariant: one finding per check, with the places where it fails; missing messages are named
+range by range. Any MCAP file is checked for its bytes, only a trilat-net log for its content: a
+message against its own content, its scenario and the messages before it. Nothing is executed:
+that is the task of `verify`.
 """
 
 import hashlib
@@ -71,7 +73,12 @@ class LogCheckResult(CheckReport):
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat log check --json`."""
         kind = "trilat" if self.ours else "mcap"
-        return {"files": self.files, "kind": kind, "sound": self.passed, "checks": self.to_rows()}
+        return {
+            "files": self.files,
+            "kind": kind,
+            "sound": self.passed,
+            "checks": self.to_rows(),
+        }
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per check."""
@@ -81,7 +88,8 @@ class LogCheckResult(CheckReport):
 
 
 def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheckResult:
-    """Checks that a log is well-formed, complete and consistent; the command is `trilat log check`.
+    """Checks that a log is well-formed, complete and consistent; the command is `trilat log
+    check`.
 
     Every byte of its file is checked, or of its parts.
 
@@ -104,7 +112,9 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
     except OSError as error:
         name = error.filename or " ".join(map(str, paths))
         raise LogError(f"{name}: cannot be read: {error.strerror}") from None
-    return LogCheckResult([path.as_posix() for path in paths], list(check.findings()), check.ours)
+    return LogCheckResult(
+        [path.as_posix() for path in paths], list(check.findings()), check.ours
+    )
 
 
 class ChannelCheck:
@@ -120,8 +130,8 @@ class ChannelCheck:
     Attributes:
         rate_hz: tick rate of the member; 0 of the recorder.
         received: number of messages, each number once.
-        boots: the member's starts.
-        first, last: number and publish time of the messages with the lowest and the highest number.
+        boots: the member's starts. first, last: number and publish time of the messages with
+        the lowest and the highest number.
     """
 
     def __init__(
@@ -200,10 +210,14 @@ class ChannelCheck:
             text = f"a message of version {message.v} in a log of version {self._version}"
             self._add("schema", offset, text)
         if identity.sender != self.member:
-            self._add("schema", offset, f"a message says that it is of {identity.sender[:40]!r}")
+            self._add(
+                "schema", offset, f"a message says that it is of {identity.sender[:40]!r}"
+            )
         if number >= 0:  # events have numbers from version 3 on
             if stored.sequence != sequence & 0xFFFFFFFF:
-                self._add("sequence", offset, f"number {sequence} is stored as {stored.sequence}")
+                self._add(
+                    "sequence", offset, f"number {sequence} is stored as {stored.sequence}"
+                )
             self._count(message, number, stored.publish_time_ns, offset)
         elif isinstance(message, messages.Event):
             self._accounts.hear(message)
@@ -217,19 +231,26 @@ class ChannelCheck:
             self._add("sequence", offset, f"more than {MAX_BOOTS} starts")
             return
         self.boots.add(message.boot)
-        if not self._in_file[message.boot].take(number):  # parts may repeat a message, a file may not
+        # parts may repeat a message, a file may not
+        if not self._in_file[message.boot].take(number):
             self._add("sequence", offset, f"number {number} is there twice")
         if isinstance(message, messages.Event):
             self.received += self._accounts.take_event(self._topic, number, message)
         else:
-            self.received += self.kind == topics.STATS or self._accounts.count(self._topic, number)
+            self.received += self.kind == topics.STATS or self._accounts.count(
+                self._topic, number
+            )
         if self.rate_hz and isinstance(message, messages.State) and message.cmd:
-            self._accounts.leave_out(self.member, message.tick, count_skipped_ticks(message.cmd))
+            self._accounts.leave_out(
+                self.member, message.tick, count_skipped_ticks(message.cmd)
+            )
         place = (number, publish_ns)
         self.first = place if self.first is None else min(self.first, place)
         self.last = place if self.last is None else max(self.last, place)
 
-    def _check_times(self, stored: McapMessage, number: int, stated_ns: int | None, offset: int) -> None:
+    def _check_times(
+        self, stored: McapMessage, number: int, stated_ns: int | None, offset: int
+    ) -> None:
         log_ns = stored.log_time_ns
         publish_ns = stored.publish_time_ns
         if log_ns < self._log_ns:
@@ -240,10 +261,14 @@ class ChannelCheck:
         if stated_ns is not None:
             sent_ns = min(max(0, self._epoch_ns + stated_ns), MAX_TIME_NS)
         if publish_ns != sent_ns:
-            self._add("times", offset, f"number {number} was sent at {sent_ns} ns, not {publish_ns}")
+            self._add(
+                "times", offset, f"number {number} was sent at {sent_ns} ns, not {publish_ns}"
+            )
         elif publish_ns > log_ns + MAX_AHEAD_NS:
             ahead_s = (publish_ns - log_ns) / NS_PER_S
-            self._add("times", offset, f"number {number} came {ahead_s:.1f} s before it was sent")
+            self._add(
+                "times", offset, f"number {number} came {ahead_s:.1f} s before it was sent"
+            )
 
 
 def _parse_number(about: Mapping[str, str], key: str) -> int:
@@ -307,7 +332,9 @@ class SessionCheck:
             elif topic.startswith(VIZ_ROOT):
                 self._views += 1
                 if message.payload[:2] != _CDR_HEAD:
-                    self._findings["schema"].add(file, reader.offset, f"{topic[:80]}: a message is no CDR")
+                    self._findings["schema"].add(
+                        file, reader.offset, f"{topic[:80]}: a message is no CDR"
+                    )
         if not begun:
             self._begin(reader)
         self._accounts = reader.metadata.get(ACCOUNTS, {})
@@ -335,8 +362,11 @@ class SessionCheck:
         self._check_scenario(reader.attachments[SCENARIO])
         if is_new:
             continued = not self._first_part
-            self._counted = SessionAccounts(about["session"], self._scenario, continued=continued)
-            for name in self._scenario.names if self._scenario else ():  # events may tell of them first
+            self._counted = SessionAccounts(
+                about["session"], self._scenario, continued=continued
+            )
+            # events may tell of them first
+            for name in self._scenario.names if self._scenario else ():
                 for channel in (topics.STATE, topics.LINK):
                     self._counted.open("/" + topics.key(about["session"], name, channel))
 
@@ -346,13 +376,21 @@ class SessionCheck:
         digest = hashlib.sha256(text).hexdigest()
         stated = about.get("scenario_sha256", "")
         if digest != stated:
-            finding.add(self._file, None, f"its SHA-256 is {digest[:16]}, the session names {stated[:16]}")
+            finding.add(
+                self._file,
+                None,
+                f"its SHA-256 is {digest[:16]}, the session names {stated[:16]}",
+            )
         try:
             self._scenario = scenario = parse_embedded(text.decode(), "scenario")
         except (ScenarioError, UnicodeDecodeError) as error:
             finding.add(self._file, None, f"cannot be read: {error}")
             return
-        facts = {"scenario": scenario.name, "seed": str(scenario.seed), "sites": " ".join(scenario.names)}
+        facts = {
+            "scenario": scenario.name,
+            "seed": str(scenario.seed),
+            "sites": " ".join(scenario.names),
+        }
         for key, value in facts.items():
             if about.get(key) != value:
                 there = about.get(key, "")[:40]
@@ -364,13 +402,23 @@ class SessionCheck:
         finding = self._findings["schema"]
         key = topics.parse_key(topic.removeprefix("/"))
         if topic.startswith(VIZ_ROOT):
-            is_cdr = (channel.encoding, channel.schema_encoding) == (cdr.ENCODING, cdr.SCHEMA_ENCODING)
+            is_cdr = (channel.encoding, channel.schema_encoding) == (
+                cdr.ENCODING,
+                cdr.SCHEMA_ENCODING,
+            )
             if not is_cdr or channel.schema_data != cdr.ROS2_SCHEMAS.get(channel.schema):
                 schema = channel.schema[:80] or "no schema"
-                finding.add(self._file, None, f"{topic[:80]}: {schema} is none of the standard ones")
+                finding.add(
+                    self._file, None, f"{topic[:80]}: {schema} is none of the standard ones"
+                )
             return None
         session = self._about["session"]
-        if key is None or key.channel not in CHANNEL_TYPES or key.session != session or key.boot:
+        if (
+            key is None
+            or key.channel not in CHANNEL_TYPES
+            or key.session != session
+            or key.boot
+        ):
             if not channel.schema:
                 finding.add(self._file, None, f"{topic[:80]}: has no schema")
             return None
@@ -384,7 +432,9 @@ class SessionCheck:
         return self.channels[topic]
 
     def findings(self) -> Iterator[Finding]:
-        """Yields the results, once all files were read; without a session only that it was taken out."""
+        """Yields the results, once all files were read; without a session only that it was
+        taken out.
+        """
         counts = self._counts
         found = self._findings
         messages = counts["messages"]
@@ -421,7 +471,9 @@ class SessionCheck:
                 continue
             for first, last in self._counted.list_gaps(topic):
                 missing += last - first + 1
-                gaps.append(f"{check.name} {first}-{last}" if last > first else f"{check.name} {first}")
+                gaps.append(
+                    f"{check.name} {first}-{last}" if last > first else f"{check.name} {first}"
+                )
             reordered += sum(account.reordered for account in self._counted.list_starts(topic))
         received = sum(check.received for check in self.channels.values())
         text = f"{count_nouns(received, 'message')} of {count_nouns(len(self.channels), 'channel')}"
@@ -442,7 +494,9 @@ class SessionCheck:
 
     @property
     def _takes_events(self) -> bool:
-        """True if the files must tell how the sites ended: all of a log that leaves no events out."""
+        """True if the files must tell how the sites ended: all of a log that leaves no events
+        out.
+        """
         session = self._about["session"]
         choice = parse_filter_facts(self._about)
         names = self._scenario.names if self._scenario else ()
@@ -474,7 +528,12 @@ class SessionCheck:
         finding = self._findings["rates"]
         texts = []
         for check in self.channels.values():
-            if check.kind != topics.STATE or check.first is None or check.last is None or not check.rate_hz:
+            if (
+                check.kind != topics.STATE
+                or check.first is None
+                or check.last is None
+                or not check.rate_hz
+            ):
                 continue
             span_ns = check.last[1] - check.first[1]
             if span_ns < _RATE_SPAN_NS:
@@ -488,7 +547,8 @@ class SessionCheck:
 
 
 def judge_integrity(log: Log) -> Integrity:
-    """Returns whether a log is as it was made: by its digest chain, its accounts and its statistics.
+    """Returns whether a log is as it was made: by its digest chain, its accounts and its
+    statistics.
 
     Raises:
         LogError: a message cannot be read.
@@ -503,13 +563,14 @@ def judge_integrity(log: Log) -> Integrity:
 def _find_unexplained(log: Log, site: str) -> str:
     """Describes a gap of a site that is none of the run's own; "" if there is none.
 
-    One of which neither the accounts nor the recorder's statistics tell is the seam of a splice, or a stretch
-    that was cut out.
+    One of which neither the accounts nor the recorder's statistics tell is the seam of a
+    splice, or a stretch that was cut out.
     """
     if log.damaged:
         return ""
     ticks = np.unique(log[site].tick)
-    stated = parse_counts(log.account(site)) if len(log.sources) == 1 else {}  # of several it is counted anew
+    # of several it is counted anew
+    stated = parse_counts(log.account(site)) if len(log.sources) == 1 else {}
     there = {"received": len(ticks), "missing": log.missing(site)}
     if not log.part and stated not in ({}, there):
         told = " and ".join(f"{stated.get(word, 0)} {word}" for word in there)

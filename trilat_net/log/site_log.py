@@ -1,7 +1,8 @@
 """One site's part of a log: its records as arrays over time, or one by one.
 
-Invariant: only what is requested is decoded; an invalid record is an error that names the site. Memory
-stays bounded for a log of any length: long sequences of records are decoded in blocks on access.
+Invariant: only what is requested is decoded; an invalid record is an error that names the site.
+Memory stays bounded for a log of any length: long sequences of records are decoded in blocks on
+access.
 """
 
 from bisect import bisect_right
@@ -35,8 +36,10 @@ BLOCK_RECORDS = 1 << 11
 """Records that are decoded together."""
 HEAVY_BYTES = 12 << 20
 HEAVY_RATIO = 10
-"""Records whose decoded form takes more than this, and than so many times their payloads, are held few at a
-time: they were made to take much."""
+"""Records whose decoded form takes more than this, and than so many times their payloads, are
+held few at a
+time: they were made to take much.
+"""
 HEAVY_BLOCK = 128
 HEAVY_BLOCKS = 8
 """Heavy records that are decoded together, and how many times that many are held."""
@@ -46,7 +49,9 @@ DecodeStates = Callable[[Sequence[bytes]], list[State]]
 
 
 def freeze(value: T) -> T:
-    """Makes arrays read-only, also those in a tuple or by name: nobody changes a log by accident."""
+    """Makes arrays read-only, also those in a tuple or by name: nobody changes a log by
+    accident.
+    """
     if isinstance(value, np.ndarray):
         value.setflags(write=False)
     elif isinstance(value, dict | tuple):
@@ -56,7 +61,8 @@ def freeze(value: T) -> T:
 
 
 def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
-    """Returns x - x_des of places, and of orientations the turn from one to the other, shape (K, m).
+    """Returns x - x_des of places, and of orientations the turn from one to the other, shape
+    (K, m).
 
     It is 0 along an axis that the site does not follow: `axes` has 0 there and 1 elsewhere.
     """
@@ -71,17 +77,24 @@ def _find_turns(turn: Array, reference: Array) -> Array:
     (a, u), (b, v) = map(split_quaternions, (turn, reference))
     w = a * b + np.sum(u * v, axis=1, keepdims=True)
     p = b * u - a * v - np.cross(u, v)
-    p *= np.where(w < 0.0, -1.0, 1.0)  # of two quaternions that turn alike that of the shorter turn
+    # of two quaternions that turn alike that of the shorter turn
+    p *= np.where(w < 0.0, -1.0, 1.0)
     sine = np.linalg.norm(p, axis=1, keepdims=True)
-    by_sine = np.divide(2.0 * np.arctan2(sine, abs(w)), sine, out=np.full_like(w, 2.0), where=sine > 0.0)
+    by_sine = np.divide(
+        2.0 * np.arctan2(sine, abs(w)), sine, out=np.full_like(w, 2.0), where=sine > 0.0
+    )
     return np.asarray(by_sine * p)
 
 
 class LazyRecords(Sequence[State]):
     """Records decoded a block at a time; the blocks used last are held, fewer of heavy records."""
 
-    def __init__(self, payloads: Sequence[bytes], decode_block: DecodeStates, *, heavy: bool = False) -> None:
-        self._size, held = (HEAVY_BLOCK, HEAVY_BLOCKS) if heavy else (BLOCK_RECORDS, MAX_DECODED_RECORDS)
+    def __init__(
+        self, payloads: Sequence[bytes], decode_block: DecodeStates, *, heavy: bool = False
+    ) -> None:
+        self._size, held = (
+            (HEAVY_BLOCK, HEAVY_BLOCKS) if heavy else (BLOCK_RECORDS, MAX_DECODED_RECORDS)
+        )
         self._payloads = payloads
         size = self._size
         self._block = lru_cache(maxsize=held if heavy else held // size)(
@@ -109,7 +122,9 @@ class LazyRecords(Sequence[State]):
 
 
 def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Sequence[State]:
-    """Returns the records of a site, in the order of their payloads: a list if they are not too many."""
+    """Returns the records of a site, in the order of their payloads: a list if they are not too
+    many.
+    """
     if len(payloads) > MAX_DECODED_RECORDS:
         return LazyRecords(payloads, decode_block)
     room = max(HEAVY_BYTES, HEAVY_RATIO * sum(map(len, payloads)))
@@ -158,9 +173,13 @@ class TimedMessages(NamedTuple, Generic[M]):
 
 
 class _RecordField(cached_property[T]):
-    """A field of every record as an array, by the attribute's name; it is decoded on first access."""
+    """A field of every record as an array, by the attribute's name; it is decoded on first
+    access.
+    """
 
-    def __init__(self, decode_column: Callable[[Sequence[bytes], str], T], meaning: str) -> None:
+    def __init__(
+        self, decode_column: Callable[[Sequence[bytes], str], T], meaning: str
+    ) -> None:
         super().__init__(lambda site: site._read(decode_column, self.attrname))
         self.__doc__ = meaning
 
@@ -187,17 +206,19 @@ class SiteLog:
         payloads: the records as published.
         source: the file's name in errors.
         times: when they came and when they were sent, Unix ns, shape (K,) each; by default 0.
-        layout: how many numbers the vectors of its records have; n joints, m shared, P parameters.
+        layout: how many numbers the vectors of its records have; n joints, m shared, P
+            parameters.
         channel: what the site's law sends to its peers.
         axes: in task space per coordinate 1 if the site follows along it, else 0.
 
     Attributes:
         payloads: the records as published, in tick order.
-        tick: their ticks, shape (K,).
-        log_time_ns, publish_time_ns: when each came, and was sent by its own stamp, shape (K,), Unix ns.
+        tick: their ticks, shape (K,). log_time_ns, publish_time_ns: when each came, and was
+        sent by its own stamp, shape (K,), Unix ns.
 
     Raises:
-        LogError: a record cannot be read; every property raises it too, for the fields that it decodes.
+        LogError: a record cannot be read; every property raises it too, for the fields that it
+            decodes.
     """
 
     def __init__(
@@ -241,9 +262,7 @@ class SiteLog:
         if not len(self):
             return f"<{self.name}: no records>"
         first_s, last_s = (self.tick[n] / self.rate_hz for n in (0, -1))
-        records = (
-            f"{count_nouns(len(self), 'record')} of {self.rate_hz} Hz, {first_s:.3f} s to {last_s:.3f} s"
-        )
+        records = f"{count_nouns(len(self), 'record')} of {self.rate_hz} Hz, {first_s:.3f} s to {last_s:.3f} s"
         return f"<{self.name}: {records}, {self.missing or 'none'} missing>"
 
     def _repr_html_(self) -> str:
@@ -254,10 +273,14 @@ class SiteLog:
         try:
             return freeze(decode_column(self.payloads, *arguments))
         except WireError as error:
-            raise LogError(f"{self._source}: a record of {self.name} cannot be read: {error}") from None
+            raise LogError(
+                f"{self._source}: a record of {self.name} cannot be read: {error}"
+            ) from None
 
     def prepare(self, *fields: str) -> None:
-        """Decodes several vectors by their names in one pass, three times as fast as one by one."""
+        """Decodes several vectors by their names in one pass, three times as fast as one by
+        one.
+        """
         if absent := [field for field in fields if field not in self.__dict__]:
             self.__dict__.update(self._read_vectors(*absent))
 
@@ -265,7 +288,9 @@ class SiteLog:
         return self._read(record_columns.decode_vectors, self.layout, *fields)
 
     def numbers(self, field: str) -> Ints:
-        """Returns a whole number of every record, shape (K,), by the name of its field in `State`."""
+        """Returns a whole number of every record, shape (K,), by the name of its field in
+        `State`.
+        """
         return self._read(record_columns.decode_ints, field)
 
     def memory(self, first: int, count: int) -> Array:
@@ -279,14 +304,18 @@ class SiteLog:
             return rows.reshape(len(self), count)
         except ValueError:  # they are of several lengths, or too short
             needed = f"{count_nouns(first + count, 'number')} in `mem`"
-            raise LogError(f"{self._source}: a record of {self.name} does not have {needed}") from None
+            raise LogError(
+                f"{self._source}: a record of {self.name} does not have {needed}"
+            ) from None
 
     def record(self, n: int) -> State:
         """Returns the record at a place, decoded and checked alone; -1 is the last one."""
         return self._decode([self.payloads[n]])[0]
 
     def _decode(self, payloads: Sequence[bytes]) -> list[State]:
-        return self._read(lambda _: [decode(payload, State, READABLE, self.layout) for payload in payloads])
+        return self._read(
+            lambda _: [decode(payload, State, READABLE, self.layout) for payload in payloads]
+        )
 
     @cached_property
     def states(self) -> Sequence[State]:
@@ -343,10 +372,18 @@ class SiteLog:
     xd = _RecordVector("Its derivative, shape (K, m).")
     wrench = _RecordVector("What tau_x amounts to there, shape (K, m), N and N m.")
     ch = _RecordVector("All that the site's law sends, shape (K, C); `sent` has it by name.")
-    hand = _RecordVector("What somebody who holds the arm does, shape (K, h), see `HandInForce`.")
-    bodies = _RecordVector("Poses of the bodies of its plant as recorded, shape (K, 7 b), m and quaternions.")
-    mem = _RecordField(record_columns.decode_strings, "Further memory of the site, shape (K,), a list each.")
-    t_ns = _RecordField(record_columns.decode_ints, "Nominal time since the epoch, shape (K,), ns.")
+    hand = _RecordVector(
+        "What somebody who holds the arm does, shape (K, h), see `HandInForce`."
+    )
+    bodies = _RecordVector(
+        "Poses of the bodies of its plant as recorded, shape (K, 7 b), m and quaternions."
+    )
+    mem = _RecordField(
+        record_columns.decode_strings, "Further memory of the site, shape (K,), a list each."
+    )
+    t_ns = _RecordField(
+        record_columns.decode_ints, "Nominal time since the epoch, shape (K,), ns."
+    )
     late_us = _RecordField(
         record_columns.decode_ints, "Wake-up minus deadline, shape (K,), us; 0 in virtual time."
     )
@@ -362,7 +399,8 @@ class SiteLog:
 
     @cached_property
     def orientation(self) -> Array:
-        """Of sites that follow orientations that of the end effector, shape (K, 4); else shape (K, 0).
+        """Of sites that follow orientations that of the end effector, shape (K, 4); else shape
+        (K, 0).
 
         Unit quaternions w, x, y, z, each nearest to the one before.
         """
@@ -380,7 +418,8 @@ class SiteLog:
 
     @cached_property
     def body_poses(self) -> Array:
-        """Poses of the bodies of its plant, shape (K, b, 7): x, y, z, m, and the unit quaternion w, x, y, z.
+        """Poses of the bodies of its plant, shape (K, b, 7): x, y, z, m, and the unit
+        quaternion w, x, y, z.
 
         Each quaternion is nearest to the one before, whichever sign the plant gave it.
         """
@@ -391,16 +430,23 @@ class SiteLog:
 
     @property
     def e(self) -> Array:
-        """Position error q - q_des, Eq. (9), shape (K, n), rad; in task space x - x_des, shape (K, m), m.
+        """Position error q - q_des, Eq. (9), shape (K, n), rad; in task space x - x_des, shape
+        (K, m), m.
 
-        The error of an orientation is the turn from the reference to the end effector, rad, at most half a
-        turn long: that of the control law, which jumps where it passes half a turn.
+        The error of an orientation is the turn from the reference to the end effector, rad, at
+        most half a turn long: that of the control law, which jumps where it passes half a turn.
         """
-        return find_task_errors(self.x, self.q_des, self.axes) if self.layout.task else self.q - self.q_des
+        return (
+            find_task_errors(self.x, self.q_des, self.axes)
+            if self.layout.task
+            else self.q - self.q_des
+        )
 
     @cached_property
     def sent(self) -> dict[str, Array]:
-        """What the law sends, shape (K, length) each: by name, as in "E", or name and peer, as in "u[m2]"."""
+        """What the law sends, shape (K, length) each: by name, as in "E", or name and peer, as
+        in "u[m2]".
+        """
         places: dict[str, list[int]] = {}
         for n, entry in enumerate(self.channel.entries(self.peers)):
             places.setdefault(entry.key, []).append(n)
@@ -418,20 +464,25 @@ class SiteLog:
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
-        """How many samples each record took in, shape (K,), and all of them as in `rx`, shape (N, 3)."""
+        """How many samples each record took in, shape (K,), and all of them as in `rx`, shape
+        (N, 3).
+        """
         return self._read(record_columns.decode_arrivals)
 
     @cached_property
     def _changes(self) -> dict[int, list[str]]:
         lists = self._read(record_columns.decode_strings, "cmd").tolist()
-        return {tick: texts for tick, texts in zip(self.tick.tolist(), lists, strict=True) if texts}
+        return {
+            tick: texts for tick, texts in zip(self.tick.tolist(), lists, strict=True) if texts
+        }
 
     def changes(self) -> dict[int, list[str]]:
         """Returns the changes that the site took in, by tick, as `cmd` names them."""
         return {tick: list(texts) for tick, texts in self._changes.items()}
 
     def age_s(self, peer: str, rate_hz: int) -> Array:
-        """Returns now minus the stamp of the sample in use of a peer with that tick rate, shape (K,), s.
+        """Returns now minus the stamp of the sample in use of a peer with that tick rate, shape
+        (K,), s.
 
         NaN stands for none, before the first sample.
         """

@@ -1,11 +1,12 @@
-"""A chunk that was cut off: its records, block by block, as far as its packed bytes can be trusted.
+"""A chunk that was cut off: its records, block by block, as far as its packed bytes can be
+trusted.
 
 Invariant:
-- A block is what the compression unpacks as one piece. Its records are taken together or not at all:
-  damage in the packed bytes of a block falsifies any part of it, and of its records perhaps some that
-  still look right.
-- Of packed bytes none is read from the first page on that holds nothing but zeros, or the same as another
-  page of the file: such a page was never written, or was written to the wrong place.
+- A block is what the compression unpacks as one piece. Its records are taken together or not at
+  all: damage in the packed bytes of a block falsifies any part of it, and of its records
+  perhaps some that still look right.
+- Of packed bytes none is read from the first page on that holds nothing but zeros, or the same
+  as another page of the file: such a page was never written, or was written to the wrong place.
 
 The checksum of a chunk covers all of its records, so it proves nothing once the end is missing.
 """
@@ -31,7 +32,9 @@ from .mcap_records import (
 )
 
 PAGE_BYTES = 4096
-"""Unit in which memory and disks keep a file: what is lost or misplaced is a number of whole pages."""
+"""Unit in which memory and disks keep a file: what is lost or misplaced is a number of whole
+pages.
+"""
 MAX_SALVAGE_BYTES = 64 << 20
 """No more of a cut chunk is read."""
 _BLOCK_HEAD_BYTES = 3
@@ -107,7 +110,8 @@ class TornChunk(NamedTuple):
 
 
 def find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
-    """Returns the offset of the first page of a part of a file that is empty or stands elsewhere in it too.
+    """Returns the offset of the first page of a part of a file that is empty or stands
+    elsewhere in it too.
 
     Without such a page that is the end of the part.
 
@@ -133,7 +137,8 @@ def find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
 
 
 def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
-    """Returns the complete records at the beginning of unpacked bytes, and the bytes that they take.
+    """Returns the complete records at the beginning of unpacked bytes, and the bytes that they
+    take.
 
     Raises:
         UnreadableRecord: there is something that is no record.
@@ -162,7 +167,9 @@ def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
 
 
 def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
-    """Yields what each complete block of a Zstandard frame unpacks to (RFC 8878, section 3.1.1.2)."""
+    """Yields what each complete block of a Zstandard frame unpacks to (RFC 8878, section
+    3.1.1.2).
+    """
     unpacker: Any = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).decompressobj()
     place = zstandard.frame_header_size(packed)
     unpacker.decompress(packed[:place])

@@ -1,1 +1,3 @@
-"""Clocks, messages, the bus, and how the members of a session find each other and agree on an epoch."""
+"""Clocks, messages, the bus, and how the members of a session find each other and agree on an
+epoch.
+"""

@@ -1,12 +1,14 @@
-"""Clients of a site: programs of an external arm (`plant = "external"`), of its dead-man switch, of a hand.
+"""Clients of a site: programs of an external arm (`plant = "external"`), of its dead-man
+switch, of a hand.
 
-Invariant: the arm sends its position as often as it likes; the torque to apply stands in the record that the
-site publishes at every tick, so the arm receives exactly what the log holds. Without a valid torque,
-`torque` returns None and the arm must brake. A record of another start of the site than the first one met is
-passed over, and so is one that is older than the newest or too far ahead; what cannot be read is a
-stranger's, and changes nothing. A hand that lives is heard, also where it rests: a thread repeats its last
-message. One whose process is gone, or hangs, is silent, and the site lets go. What acts on the arm, and what
-a hand feels, are what the site's records say.
+Invariant: the arm sends its position as often as it likes; the torque to apply stands in the
+record that the site publishes at every tick, so the arm receives exactly what the log holds.
+Without a valid torque, `torque` returns None and the arm must brake. A record of another start
+of the site than the first one met is passed over, and so is one that is older than the newest
+or too far ahead; what cannot be read is a stranger's, and changes nothing. A hand that lives is
+heard, also where it rests: a thread repeats its last message. One whose process is gone, or
+hangs, is silent, and the site lets go. What acts on the arm, and what a hand feels, are what
+the site's records say.
 
     with ArmClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as client:
         while not client.over:
@@ -42,10 +44,16 @@ FRESH_NS = 100_000_000
 AHEAD_NS = 1_000_000_000
 """A record may be so much later than the one before than the time that has passed since."""
 BRAKE_NS = 100_000_000
-"""Time of a fault, or since a dead-man switch was let go, after which the brakes are to hold the arm."""
+"""Time of a fault, or since a dead-man switch was let go, after which the brakes are to hold
+the arm.
+"""
 HEARTBEAT_S = SILENCE_NS / 4e9
 """Between two messages of a hand that rests."""
-_DOES = {TorqueKind.LIVE_TIP: "move", TorqueKind.LIVE_JOINT: "turn", TorqueKind.LIVE_FORCE: "push"}
+_DOES = {
+    TorqueKind.LIVE_TIP: "move",
+    TorqueKind.LIVE_JOINT: "turn",
+    TorqueKind.LIVE_FORCE: "push",
+}
 _STEP = 1e-6
 """Of the derivative of the arm's place, s."""
 
@@ -60,7 +68,9 @@ class SiteSender:
         number: of the newest message; -1 before the first.
     """
 
-    def __init__(self, bus: Bus, clock: Clock, session: str, site: str, channel: str, boot: int) -> None:
+    def __init__(
+        self, bus: Bus, clock: Clock, session: str, site: str, channel: str, boot: int
+    ) -> None:
         self.boot = boot
         self.number = -1
         self._clock = clock
@@ -91,7 +101,9 @@ class SiteClient:
         self._record: State | None = None
         self._came_ns = 0
         self._present = self._gone = False
-        self._records = bus.stamped(topics.key(session, site, topics.STATE), clock.monotonic_ns, bytes, 64)
+        self._records = bus.stamped(
+            topics.key(session, site, topics.STATE), clock.monotonic_ns, bytes, 64
+        )
         self._events = bus.inbox(topics.key(session, site, topics.EVENT), 256)
         self._presence = bus.presence(topics.presence_key(session, site))
 
@@ -109,7 +121,9 @@ class SiteClient:
 
     @property
     def fresh(self) -> bool:
-        """True if the newest record is of now: not before the first tick, after the run, or too old."""
+        """True if the newest record is of now: not before the first tick, after the run, or too
+        old.
+        """
         record = self.record
         if record is None or self._gone or record.mode == "diverged":
             return False
@@ -139,7 +153,11 @@ class SiteClient:
                 self._record = record
                 self._came_ns = message[1]
         for event in read_messages(self._events, Event):
-            if event.kind == "end" and self._record is not None and event.boot == self._record.boot:
+            if (
+                event.kind == "end"
+                and self._record is not None
+                and event.boot == self._record.boot
+            ):
                 self._gone = True
         for _, alive in topics.read_presence(self._presence):
             self._present = self._present or alive
@@ -147,7 +165,9 @@ class SiteClient:
 
 
 class OutsideClient(SiteClient):
-    """The connection of a program that sends to a site, under one of its keys; a context, which closes it."""
+    """The connection of a program that sends to a site, under one of its keys; a context, which
+    closes it.
+    """
 
     channel = ""
     """The last part of that key."""
@@ -156,7 +176,14 @@ class OutsideClient(SiteClient):
 
     def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
         super().__init__(bus, clock, session, site)
-        self._sender = SiteSender(bus, clock, session, site, self.channel, new_boot())
+        self._sender = SiteSender(
+            bus=bus,
+            clock=clock,
+            session=session,
+            site=site,
+            channel=self.channel,
+            boot=new_boot(),
+        )
 
     @classmethod
     def connected(
@@ -168,7 +195,8 @@ class OutsideClient(SiteClient):
             session: the session's name, by default the scenario's.
             site: the site of the arm.
             connect: the site's endpoints, as it prints them when it waits for its arm.
-            keys: folder of keys, as of --keys: an arm has those of its site, a switch those of the operator.
+            keys: folder of keys, as of --keys: an arm has those of its site, a switch those of
+                the operator.
 
         Raises:
             UsageError: an endpoint cannot be used.
@@ -180,10 +208,9 @@ class OutsideClient(SiteClient):
 class SwitchClient(OutsideClient):
     """The dead-man switch of an arm: what its program says for as long as somebody holds it.
 
-    >>> with tn.SwitchClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as switch:  # doctest: +SKIP
-    ...     while not switch.over:
-    ...         switch.send(held=button.is_pressed())  # at least every 100 ms
-    ...         time.sleep(0.02)
+    >>> with tn.SwitchClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as switch:  #
+    doctest: +SKIP ...     while not switch.over: ...
+    switch.send(held=button.is_pressed())  # at least every 100 ms ...         time.sleep(0.02)
     """
 
     channel = topics.ENABLE
@@ -195,11 +222,11 @@ class SwitchClient(OutsideClient):
 
 
 class ArmClient(OutsideClient):
-    """The connection of an arm to its site; a context, which closes it. `record` is the site's newest one.
+    """The connection of an arm to its site; a context, which closes it. `record` is the site's
+    newest one.
 
-    >>> with tn.ArmClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as client:  # doctest: +SKIP
-    ...     client.send(robot.q, robot.qd)
-    ...     tau = client.torque()
+    >>> with tn.ArmClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as client:  #
+    doctest: +SKIP ...     client.send(robot.q, robot.qd) ...     tau = client.torque()
     """
 
     channel = topics.MEASURED
@@ -216,36 +243,52 @@ class ArmClient(OutsideClient):
         Args:
             q: joint angles, rad.
             qd: joint velocities, rad/s.
-            tau_x: torque of operator and environment, N m per joint, where the arm measures it; in the
-                paper's sign: the torque ON the arm is its negative.
-            stamp_ns: when, ns on a clock of the arm's own; None: now, on this program's monotonic clock.
+            tau_x: torque of operator and environment, N m per joint, where the arm measures it;
+                in the paper's sign: the torque ON the arm is its negative.
+            stamp_ns: when, ns on a clock of the arm's own; None: now, on this program's
+                monotonic clock.
 
         Raises:
             ValueError: tau_x is not as long as q, or not finite.
         """
         measured = {"q": q, "qd": qd, "tau_x": tau_x}
         stamp = {} if stamp_ns is None else {"sent_ns": stamp_ns}
-        self._sender.send(ArmMeasurement, **{name: [*map(float, v)] for name, v in measured.items()}, **stamp)
+        self._sender.send(
+            ArmMeasurement, **{name: [*map(float, v)] for name, v in measured.items()}, **stamp
+        )
 
     def torque(self) -> tuple[float, ...] | None:
         """Returns the torque to apply now, N m per joint; None if the arm must brake.
 
-        It must before the first tick, after the run, while no record newer than `FRESH_NS` has arrived, and
-        `BRAKE_NS` after a fault began, or a dead-man switch was let go: until then its torque brings it to
-        rest.
+        It must before the first tick, after the run, while no record newer than `FRESH_NS` has
+        arrived, and `BRAKE_NS` after a fault began, or a dead-man switch was let go: until then
+        its torque brings it to rest.
         """
         if (record := self.record) is None or not self.fresh:
             return None
         shared = len(record.q_des)
         reason = record.mem[2 * shared + 1 : 2 * shared + 2]
         released = record.mode == "stopped" and reason == [LifeReason.RELEASED]
-        since_ns = record.mem[shared : shared + 1] if record.mode == "fault" or released else [record.t_ns]
+        since_ns = (
+            record.mem[shared : shared + 1]
+            if record.mode == "fault" or released
+            else [record.t_ns]
+        )
         return tuple(record.tau) if since_ns and record.t_ns - since_ns[0] < BRAKE_NS else None
 
 
 def make_hand_sender(bus: Bus, clock: Clock, session: str, site: str) -> SiteSender:
-    """Returns what sends a site the messages of a hand; its boot is above 0 and exact in a record."""
-    return SiteSender(bus, clock, session, site, topics.HAND, new_boot() % (2**32 - 1) + 1)
+    """Returns what sends a site the messages of a hand; its boot is above 0 and exact in a
+    record.
+    """
+    return SiteSender(
+        bus=bus,
+        clock=clock,
+        session=session,
+        site=site,
+        channel=topics.HAND,
+        boot=new_boot() % (2**32 - 1) + 1,
+    )
 
 
 class Hand(SiteClient):
@@ -255,7 +298,8 @@ class Hand(SiteClient):
         operator: the live hand of the scenario, as the core has it.
         place: returns where the arm is by its joint angles, in the coordinates of the target.
         source: who this is, for people.
-        repeats: whether a thread repeats its last message; without it, a program that hangs lets go.
+        repeats: whether a thread repeats its last message; without it, a program that hangs
+            lets go.
     """
 
     def __init__(
@@ -292,9 +336,11 @@ class Hand(SiteClient):
             self._ended.set()
 
     def move(self, *place_m: float) -> int:
-        """Takes hold, if it does not, and moves the target of the end effector: x, y, in space z, m.
+        """Takes hold, if it does not, and moves the target of the end effector: x, y, in space
+        z, m.
 
-        Returns the number of the message, as `hand` of the first record that follows it names it.
+        Returns the number of the message, as `hand` of the first record that follows it names
+        it.
 
         Raises:
             UsageError: the hand of this site does not do that, or a number is not finite.
@@ -325,7 +371,9 @@ class Hand(SiteClient):
 
     @property
     def number(self) -> int:
-        """Number of its newest message that the newest record follows; -1: it does not hold the arm."""
+        """Number of its newest message that the newest record follows; -1: it does not hold the
+        arm.
+        """
         hand = self.in_force
         return -1 if hand is None or hand.source != self._sender.boot else hand.number
 
@@ -337,13 +385,16 @@ class Hand(SiteClient):
 
     @property
     def pose(self) -> tuple[float, ...]:
-        """Where the arm is, by the newest record: its end effector, m, or for `turn` its joints, rad."""
+        """Where the arm is, by the newest record: its end effector, m, or for `turn` its
+        joints, rad.
+        """
         record = self._need_record()
         return tuple(map(float, self._place(record.q)))
 
     @property
     def force(self) -> tuple[float, ...]:
-        """The force of whoever holds the arm ON it, by the newest record, N; for `turn` torques, N m.
+        """The force of whoever holds the arm ON it, by the newest record, N; for `turn`
+        torques, N m.
 
         What the operator feels is the negative.
         """
@@ -380,7 +431,9 @@ class Hand(SiteClient):
     def _send(self, what: str, numbers: Sequence[float]) -> int:
         does = _DOES[self._operator.acts]
         if what != does:
-            raise UsageError(f"the hand of {self._site} can {does}, not {what}: see its mode in the scenario")
+            raise UsageError(
+                f"the hand of {self._site} can {does}, not {what}: see its mode in the scenario"
+            )
         goal = [float(one) for one in numbers]
         if not all(map(math.isfinite, goal)):
             raise UsageError(f"a hand can {does} to finite numbers, not to {goal}")

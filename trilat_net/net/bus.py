@@ -1,8 +1,9 @@
 """The bus: the Protocol of a member's network connection, and the rings in which messages wait.
 
-Invariant: an arriving message triggers no more in a site than a stamp, its reading, an append or a short
-reply; what reads it raises nothing. Messages wait in bounded rings until the loop polls them; on overflow the
-oldest is dropped, which the receiver sees in the numbers of the messages. Only the recorder takes callbacks.
+Invariant: an arriving message triggers no more in a site than a stamp, its reading, an append
+or a short reply; what reads it raises nothing. Messages wait in bounded rings until the loop
+polls them; on overflow the oldest is dropped, which the receiver sees in the numbers of the
+messages. Only the recorder takes callbacks.
 
 `zenoh_bus` implements it.
 """
@@ -53,20 +54,28 @@ class Bus(Protocol):
     """One member's connection."""
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
-        """Returns a function that publishes a payload under a key and drops it rather than wait.
+        """Returns a function that publishes a payload under a key and drops it rather than
+        wait.
 
-        A patient one waits for room, some seconds at most: for a sender without ticks that must lose nothing.
+        A patient one waits for room, some seconds at most: for a sender without ticks that must
+        lose nothing.
         """
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
         """Returns a ring of the messages that others publish under a key expression."""
 
     def stamped(
-        self, key: str, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int = RING_CAPACITY
+        self,
+        key: str,
+        now_ns: Callable[[], int],
+        read: Callable[[bytes], T],
+        capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
-        """Returns a ring whose messages are stamped by `now_ns` on arrival, and then read, in a bus thread.
+        """Returns a ring whose messages are stamped by `now_ns` on arrival, and then read, in a
+        bus thread.
 
-        `read` turns a payload into the entry (`bytes`: itself); it is short, and raises nothing.
+        `read` turns a payload into the entry (`bytes`: itself); it is short, and raises
+        nothing.
         """
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
@@ -99,17 +108,23 @@ def _compile_expression(expression: str) -> re.Pattern[str]:
     chunks = []
     for chunk in expression.split("/"):
         literals = map(re.escape, chunk.split("$*"))
-        chunks.append({"**": "(?:/[^/]+)*", "*": "/[^/]+"}.get(chunk, "/" + "[^/]*".join(literals)))
+        chunks.append(
+            {"**": "(?:/[^/]+)*", "*": "/[^/]+"}.get(chunk, "/" + "[^/]*".join(literals))
+        )
     return re.compile("".join(chunks))
 
 
 def matches_key(expression: str, key: str) -> bool:
-    """True if a key expression includes a key: `*` is one chunk, `**` any number, `$*` part of one."""
+    """True if a key expression includes a key: `*` is one chunk, `**` any number, `$*` part of
+    one.
+    """
     return _compile_expression(expression).fullmatch("/" + key) is not None
 
 
 class BoundedRing(Generic[T]):
-    """A bounded ring; on overflow it drops the oldest entry. `put` may run in another thread than `poll`."""
+    """A bounded ring; on overflow it drops the oldest entry. `put` may run in another thread
+    than `poll`.
+    """
 
     def __init__(self, capacity: int = RING_CAPACITY) -> None:
         self._entries: deque[T] = deque(maxlen=capacity)
@@ -126,7 +141,9 @@ class BoundedRing(Generic[T]):
 class StampingRing(BoundedRing[tuple[T, int]]):
     """The `StampedInbox` of every bus; `take` may run in another thread than `poll`."""
 
-    def __init__(self, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int) -> None:
+    def __init__(
+        self, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int
+    ) -> None:
         super().__init__(capacity)
         self._now_ns = now_ns
         self._read = read

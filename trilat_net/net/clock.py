@@ -1,7 +1,7 @@
 """Clocks: the only module that reads the time.
 
-Invariant (L1): code that needs the time takes a clock as an argument; times are integer nanoseconds,
-never floats.
+Invariant (L1): code that needs the time takes a clock as an argument; times are integer
+nanoseconds, never floats.
 """
 
 import platform
@@ -32,17 +32,23 @@ class SystemClock:
     """The machine's clocks."""
 
     monotonic_ns = staticmethod(time.perf_counter_ns)
-    """The same clock as `time.monotonic_ns`, but on Windows, where that one may go in steps of 16 ms."""
+    """The same clock as `time.monotonic_ns`, but on Windows, where that one may go in steps of
+    16 ms.
+    """
     unix_ns = staticmethod(time.time_ns)
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """See `Clock`. CPython sleeps to an absolute deadline of its own, so signals do not shorten it."""
+        """See `Clock`. CPython sleeps to an absolute deadline of its own, so signals do not
+        shorten it.
+        """
         rest_ns = deadline_ns - self.monotonic_ns()
         if rest_ns > 0:
             time.sleep(rest_ns * 1e-9)
 
     def identity(self) -> str:
-        """See `Clock`. On Linux: boot of the kernel and time namespace; elsewhere the machine's name."""
+        """See `Clock`. On Linux: boot of the kernel and time namespace; elsewhere the machine's
+        name.
+        """
         try:
             boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
             namespace = Path("/proc/self/ns/time").readlink().name
@@ -54,9 +60,9 @@ class SystemClock:
 class SkewedClock:
     """Another clock with an offset and a drift: test injection of another machine's clock.
 
-    It reads start + offset + (other - start) (1 + drift), where start is the other's reading when this one
-    was made. Its identity states all of it and is unique, so that a reader of a log can undo it. The wall
-    clock stays; the drift is in ns/s.
+    It reads start + offset + (other - start) (1 + drift), where start is the other's reading
+    when this one was made. Its identity states all of it and is unique, so that a reader of a
+    log can undo it. The wall clock stays; the drift is in ns/s.
     """
 
     def __init__(self, clock: Clock, offset_ns: int, drift_ppb: int) -> None:
@@ -68,7 +74,12 @@ class SkewedClock:
     def monotonic_ns(self) -> int:
         """See `Clock`."""
         passed_ns = self._clock.monotonic_ns() - self._start_ns
-        return self._start_ns + self._offset_ns + passed_ns + passed_ns * self._drift_ppb // NS_PER_S
+        return (
+            self._start_ns
+            + self._offset_ns
+            + passed_ns
+            + passed_ns * self._drift_ppb // NS_PER_S
+        )
 
     def unix_ns(self) -> int:
         """See `Clock`."""
@@ -77,7 +88,9 @@ class SkewedClock:
     def sleep_until(self, deadline_ns: int) -> None:
         """See `Clock`."""
         passed_ns = deadline_ns - self._start_ns - self._offset_ns
-        self._clock.sleep_until(self._start_ns - -passed_ns * NS_PER_S // (NS_PER_S + self._drift_ppb))
+        self._clock.sleep_until(
+            self._start_ns - -passed_ns * NS_PER_S // (NS_PER_S + self._drift_ppb)
+        )
 
     def identity(self) -> str:
         """See `Clock`."""

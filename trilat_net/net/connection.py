@@ -1,9 +1,11 @@
-"""A member's connection to the network: endpoints, mode, the opened bus; and the router process.
+"""A member's connection to the network: endpoints, mode, the opened bus; and the router
+process.
 
-Invariant: default endpoints are explicit loopback addresses, a function of session and site, so that
-separate terminals meet and two sessions on one host do not. A named endpoint replaces the defaults; values
-given both on the command line and in a file are united or refused, never chosen between. A router carries
-Zenoh traffic and prints who joins and leaves; it adds no routing of its own.
+Invariant: default endpoints are explicit loopback addresses, a function of session and site, so
+that separate terminals meet and two sessions on one host do not. A named endpoint replaces the
+defaults; values given both on the command line and in a file are united or refused, never
+chosen between. A router carries Zenoh traffic and prints who joins and leaves; it adds no
+routing of its own.
 """
 
 import ipaddress
@@ -40,15 +42,21 @@ def default_endpoint(session: str, index: int) -> str:
     return f"tcp/127.0.0.1:{port}"
 
 
-def default_endpoints(session: str, sites: Sequence[str], *, encrypted: bool = False) -> dict[str, str]:
+def default_endpoints(
+    session: str, sites: Sequence[str], *, encrypted: bool = False
+) -> dict[str, str]:
     """Returns the default endpoint of every site of a session."""
     places = {site: default_endpoint(session, index) for index, site in enumerate(sites)}
-    return {site: place.replace("tcp/", "tls/") if encrypted else place for site, place in places.items()}
+    return {
+        site: place.replace("tcp/", "tls/") if encrypted else place
+        for site, place in places.items()
+    }
 
 
 @contextmanager
 def reserve_session_endpoints(session: str, sites: Sequence[str]) -> Iterator[list[str]]:
-    """Yields endpoints for the sites of a session: the defaults, or free ones if these are taken.
+    """Yields endpoints for the sites of a session: the defaults, or free ones if these are
+    taken.
 
     Others who choose in this way get other endpoints, from here to the end of the block.
     """
@@ -70,7 +78,8 @@ def find_free_endpoints(count: int) -> list[str]:
 
 
 def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list[str]:
-    """Binds loopback ports, of which 0 stands for any, until the stack ends; returns their endpoints.
+    """Binds loopback ports, of which 0 stands for any, until the stack ends; returns their
+    endpoints.
 
     A shared one can be listened at meanwhile. Raises OSError.
     """
@@ -92,11 +101,12 @@ class Connection:
     """Endpoints and mode of a member.
 
     Attributes:
-        connect: endpoints to connect to; a client takes the first that answers. None: still to be found.
+        connect: endpoints to connect to; a client takes the first that answers. None: still to
+            be found.
         mode: peer of the other members, client of a router, or a router.
         own: Zenoh settings of a user's file, or of a member's keys.
-        keys_of: the member whose keys it has: links are encrypted, and both ends prove by certificates who
-            they are; "": none.
+        keys_of: the member whose keys it has: links are encrypted, and both ends prove by
+            certificates who they are; "": none.
         keys_end: when these keys end, in UTC; None: there are none.
     """
 
@@ -111,13 +121,16 @@ class Connection:
         """Returns endpoints as this member opens them: with keys, the defaults over TLS."""
         if not self.keys_of:
             return list(endpoints)
-        return [re.sub("^tcp/", "tls/", one) if isinstance(one, str) else one for one in endpoints]
+        return [
+            re.sub("^tcp/", "tls/", one) if isinstance(one, str) else one for one in endpoints
+        ]
 
     def open(self) -> ZenohBus:
         """Opens it; see `ZenohBus`.
 
         Raises:
-            UnknownHost: an endpoint names a host that does not resolve, which Zenoh would try for ever.
+            UnknownHost: an endpoint names a host that does not resolve, which Zenoh would try
+                for ever.
         """
         listen, connect = (self.reach(side or ()) for side in (self.listen, self.connect))
         check_hosts(find_endpoint_addresses([*listen, *connect]))
@@ -126,8 +139,8 @@ class Connection:
     def require_keys_until(self, left_s: float) -> None:
         """Refuses keys that end before a session does.
 
-        An open link outlives the end of its certificate, but no link is made again after it: a cable that is
-        pulled for six seconds would end the session then.
+        An open link outlives the end of its certificate, but no link is made again after it: a
+        cable that is pulled for six seconds would end the session then.
 
         Args:
             left_s: how long the session lasts from now on, s.
@@ -167,11 +180,12 @@ class Connection:
 def secure_connection(
     connection: Connection, keys: "MemberKeys | str | Path | None", *, insecure: bool
 ) -> Connection:
-    """Returns a connection with a member's keys, or those of a folder; else it must not be open to a network.
+    """Returns a connection with a member's keys, or those of a folder; else it must not be open
+    to a network.
 
     Raises:
-        UsageError: an endpoint is not encrypted, or reached from other machines without keys, the user's own
-            settings contradict the keys, or these cannot be used.
+        UsageError: an endpoint is not encrypted, or reached from other machines without keys,
+            the user's own settings contradict the keys, or these cannot be used.
     """
     if isinstance(keys, str | Path):
         from .member_keys import read_member_keys  # loads what makes certificates
@@ -180,7 +194,9 @@ def secure_connection(
     own = connection.own
     named = (*connection.listen, *(connection.connect or ()))
     if udp := [place for place in find_endpoint_addresses(named) if place.startswith("udp/")]:
-        raise UsageError(f"{udp[0]}: UDP loses, repeats and trusts everything: use tcp, tls or quic")
+        raise UsageError(
+            f"{udp[0]}: UDP loses, repeats and trusts everything: use tcp, tls or quic"
+        )
     if keys is not None:
         for place in find_endpoint_addresses(named):
             if not place.startswith(ENCRYPTED):
@@ -192,13 +208,20 @@ def secure_connection(
                     f"{place}: how it is encrypted comes from --keys; leave out what follows the #"
                 )
         if twice := sorted(set(own) & {"access_control", "low_pass_filter", "adminspace"}):
-            raise UsageError(f"--zenoh-config: {twice[0]}: comes from --keys; give it in one place")
-        if twice := sorted(set(own.get("transport", {}).get("link", {})) & {"tls", "protocols"}):
+            raise UsageError(
+                f"--zenoh-config: {twice[0]}: comes from --keys; give it in one place"
+            )
+        if twice := sorted(
+            set(own.get("transport", {}).get("link", {})) & {"tls", "protocols"}
+        ):
             raise UsageError(
                 f"--zenoh-config: transport/link/{twice[0]}: comes from --keys; give it in one place"
             )
         return replace(
-            connection, own=merge_settings(keys.settings, own), keys_of=keys.member, keys_end=keys.ends
+            connection,
+            own=merge_settings(keys.settings, own),
+            keys_of=keys.member,
+            keys_end=keys.ends,
         )
     mutual = own.get("transport", {}).get("link", {}).get("tls", {}).get("enable_mtls") is True
     for place in find_endpoint_addresses(connection.listen):
@@ -246,8 +269,9 @@ def resolve_member_connection(
 ) -> Connection:
     """Returns the connection of a site, a recorder or a tool; or of a router, which `routes`.
 
-    With a router, named by `--router` or by a file of mode "client", a member listens nowhere and connects to
-    nothing else. `listen_else` and `connect_else` hold where neither an option nor the file names endpoints.
+    With a router, named by `--router` or by a file of mode "client", a member listens nowhere
+    and connects to nothing else. `listen_else` and `connect_else` hold where neither an option
+    nor the file names endpoints.
 
     Raises:
         UsageError: options and file contradict each other.
@@ -256,14 +280,32 @@ def resolve_member_connection(
     if routes:
         if file.mode not in ("", "router"):
             raise UsageError(f"{file.source}: mode: {file.mode} must be router here")
-        return _join_options(listen, connect, file, "router", listen_else, ())
+        return _join_options(
+            listen=listen,
+            connect=connect,
+            file=file,
+            mode="router",
+            listen_else=listen_else,
+            connect_else=(),
+        )
     if file.mode == "router":
-        raise UsageError(f"{file.source}: mode: router is for `trilat router`; here it is peer or client")
+        raise UsageError(
+            f"{file.source}: mode: router is for `trilat router`; here it is peer or client"
+        )
     if not routers and file.mode != "client":
-        return _join_options(listen, connect, file, "peer", listen_else, connect_else)
+        return _join_options(
+            listen=listen,
+            connect=connect,
+            file=file,
+            mode="peer",
+            listen_else=listen_else,
+            connect_else=connect_else,
+        )
     where = "--router" if routers else f"{file.source}: mode: client"
     if routers and file.mode == "peer":
-        raise UsageError(f"{file.source}: mode: peer contradicts --router, which makes a client")
+        raise UsageError(
+            f"{file.source}: mode: peer contradicts --router, which makes a client"
+        )
     if listen is not None or file.endpoints("listen", "client"):
         raise UsageError(
             f"{where}: a client of a router listens nowhere; leave out the endpoints to listen at"
@@ -271,8 +313,12 @@ def resolve_member_connection(
     if routers and connect is not None:
         raise UsageError("--router: a client connects to a router only; leave out --connect")
     for endpoint in routers or ():
-        if not re.fullmatch(r"(tcp|tls|quic|udp|ws)/[^/]+:\d+([?#].*)?|unixsock-stream/.+", endpoint):
-            raise UsageError(f"--router: an endpoint is like tcp/192.0.2.1:7447, not {endpoint!r}")
+        if not re.fullmatch(
+            r"(tcp|tls|quic|udp|ws)/[^/]+:\d+([?#].*)?|unixsock-stream/.+", endpoint
+        ):
+            raise UsageError(
+                f"--router: an endpoint is like tcp/192.0.2.1:7447, not {endpoint!r}"
+            )
     chosen = _merge_endpoints(routers or connect, file, "client", ())
     if not chosen:
         raise UsageError(f"{where}: there is no router to connect to; name it with --router")
@@ -289,14 +335,19 @@ def _join_options(
 ) -> Connection:
     stated = file.endpoints("listen", mode)
     if listen is not None and stated is not None:
-        raise UsageError(f"{file.source}: listen/endpoints: given by --listen too; give them in one place")
+        raise UsageError(
+            f"{file.source}: listen/endpoints: given by --listen too; give them in one place"
+        )
     named = stated if listen is None else listen
     connected = _merge_endpoints(connect, file, mode, connect_else)
     return Connection(listen_else if named is None else named, connected, mode, file.settings)
 
 
 def _merge_endpoints(
-    named: Sequence[str] | None, file: ZenohFile, mode: ZenohMode, otherwise: Sequence[str] | None
+    named: Sequence[str] | None,
+    file: ZenohFile,
+    mode: ZenohMode,
+    otherwise: Sequence[str] | None,
 ) -> Sequence[Endpoint] | None:
     stated = file.endpoints("connect", mode)
     if named is None and stated is None:
@@ -312,13 +363,15 @@ def open_bus(
     timeout_s: float | None,
     say: Callable[[str], None],
 ) -> ZenohBus | None:
-    """Opens a connection whose `connect` is known; returns None if `stopped` before the router answers.
+    """Opens a connection whose `connect` is known; returns None if `stopped` before the router
+    answers.
 
     It waits for a router for `timeout_s`, or for ever, and says so.
 
     Raises:
         UsageError: an endpoint cannot be used.
-        UnknownHost: a host name does not resolve at the first attempt; later on it may be away for a while.
+        UnknownHost: a host name does not resolve at the first attempt; later on it may be away
+            for a while.
         SessionError: no router answered in time.
     """
     begun_ns = clock.monotonic_ns()

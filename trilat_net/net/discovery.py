@@ -1,8 +1,8 @@
 """Discovery of a session from outside: find its members, connect to it, request a change.
 
-Invariant: one way of asking who is present (`find_members`). A session name belongs to one session: a
-playback under a name that a site answers to is refused. A change is requested once, and the caller gets a
-reply or an error that names the member without one.
+Invariant: one way of asking who is present (`find_members`). A session name belongs to one
+session: a playback under a name that a site answers to is refused. A change is requested once,
+and the caller gets a reply or an error that names the member without one.
 """
 
 from collections.abc import Callable, Iterator
@@ -20,7 +20,14 @@ from .connection import Connection, default_endpoint, default_endpoints, open_bu
 from .known_sites import find_known_places
 from .membership import MemberQuery, liveliness_token
 from .messages import Event, Info
-from .requests import BACKFILL_MESSAGES, Backfill, BackfillRequest, ChangeReply, ChangeRequest, Request
+from .requests import (
+    BACKFILL_MESSAGES,
+    Backfill,
+    BackfillRequest,
+    ChangeReply,
+    ChangeRequest,
+    Request,
+)
 from .wire import decode, encode
 
 POLL_NS = 5_000_000
@@ -29,13 +36,20 @@ NAME_CHECK_S = 0.7
 """Time to look for other sites before a playback: they try to connect every half a second."""
 
 SiteNamesOf = Callable[[str], tuple[str, ...]]
-"""Returns the sites that a scenario's text names, in order; raises ScenarioError if it is none."""
+"""Returns the sites that a scenario's text names, in order; raises ScenarioError if it is none.
+"""
 
 
 def find_members(
-    bus: Bus, clock: Clock, session: str, *, stopped: Callable[[], bool], timeout_s: float | None
+    bus: Bus,
+    clock: Clock,
+    session: str,
+    *,
+    stopped: Callable[[], bool],
+    timeout_s: float | None,
 ) -> Iterator[Info]:
-    """Yields identities of members as they arrive, each again and again, until the time, if any, is over.
+    """Yields identities of members as they arrive, each again and again, until the time, if
+    any, is over.
 
     Raises:
         SessionError: the time is over, and all answers that arrived are unreadable.
@@ -43,7 +57,9 @@ def find_members(
     query = MemberQuery(bus, clock, session)
     found = False
     begun_ns = clock.monotonic_ns()
-    while not stopped() and (timeout_s is None or clock.monotonic_ns() - begun_ns < timeout_s * 1e9):
+    while not stopped() and (
+        timeout_s is None or clock.monotonic_ns() - begun_ns < timeout_s * 1e9
+    ):
         for info in query.poll():
             found = True
             yield info
@@ -67,10 +83,11 @@ def connect_to_session(
 ) -> Iterator[Bus | None]:
     """Yields a bus that reaches a session's sites, or None if `stopped`; closes it at the end.
 
-    Without endpoints to connect to (`connect` is None) it takes those of sites that are known to run on this
-    machine, if all do. Else it asks the session's first site, on this machine, for the others; if `names`
-    returns none, that site's endpoint remains. It waits for the first site, or for a router, for `timeout_s`,
-    or for as long as it takes. A recorder is announced by its boot meanwhile: then the session waits for it.
+    Without endpoints to connect to (`connect` is None) it takes those of sites that are known
+    to run on this machine, if all do. Else it asks the session's first site, on this machine,
+    for the others; if `names` returns none, that site's endpoint remains. It waits for the
+    first site, or for a router, for `timeout_s`, or for as long as it takes. A recorder is
+    announced by its boot meanwhile: then the session waits for it.
 
     Raises:
         SessionError: no site or no router answers in time.
@@ -79,7 +96,9 @@ def connect_to_session(
     with ExitStack() as stack:
 
         def connect(there: Connection) -> Bus | None:
-            bus = open_bus(there, clock, stopped, timeout_s, say)
+            bus = open_bus(
+                connection=there, clock=clock, stopped=stopped, timeout_s=timeout_s, say=say
+            )
             return None if bus is None else stack.enter_context(closing(bus))
 
         if connection.connect is None and recorder_boot is None:
@@ -89,7 +108,18 @@ def connect_to_session(
             visitor = connect(replace(connection, listen=(), connect=[first]))
             if visitor is not None and recorder_boot is not None:
                 visitor.announce(liveliness_token(session, topics.RECORDER, recorder_boot))
-            sites = _ask_for_sites(visitor, clock, session, names, stopped, timeout_s) if visitor else None
+            sites = (
+                _ask_for_sites(
+                    bus=visitor,
+                    clock=clock,
+                    session=session,
+                    names=names,
+                    stopped=stopped,
+                    timeout_s=timeout_s,
+                )
+                if visitor
+                else None
+            )
             if sites is None:
                 yield None
                 return
@@ -121,8 +151,11 @@ def _ask_for_sites(
     )
 
 
-def send_change(bus: Bus, clock: Clock, session: str, site: str, request: ChangeRequest) -> ChangeReply:
-    """Sends a request to a site of a session that runs, and returns its reply; any member may ask to stop.
+def send_change(
+    bus: Bus, clock: Clock, session: str, site: str, request: ChangeRequest
+) -> ChangeReply:
+    """Sends a request to a site of a session that runs, and returns its reply; any member may
+    ask to stop.
 
     Raises:
         SessionError: the site does not reply.
@@ -130,15 +163,25 @@ def send_change(bus: Bus, clock: Clock, session: str, site: str, request: Change
     channel = topics.STOP if request.order == "stop" else topics.SET
     reply = _ask_once(bus, clock, topics.key(session, site, channel), request)
     if reply is None:
-        whose = "" if channel == topics.STOP else "; with keys, only the operator's may ask for it"
-        raise SessionError(f"{site} gave no answer; its records show whether it made the change{whose}")
+        whose = (
+            "" if channel == topics.STOP else "; with keys, only the operator's may ask for it"
+        )
+        raise SessionError(
+            f"{site} gave no answer; its records show whether it made the change{whose}"
+        )
     try:
         answer = decode(reply, ChangeReply)
     except WireError as error:
         raise SessionError(f"the answer of {site} cannot be read: {error}") from None
     if request.order == "stop" and not answer.accepted and request.source is not UNSET:
         # A site of an older program knows no source and refuses the whole request; its arm has to stop too.
-        return send_change(bus, clock, session, site, msgspec.structs.replace(request, source=UNSET))
+        return send_change(
+            bus=bus,
+            clock=clock,
+            session=session,
+            site=site,
+            request=msgspec.structs.replace(request, source=UNSET),
+        )
     return answer
 
 
@@ -153,12 +196,16 @@ def _ask_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | Non
 
 
 def list_past_events(bus: Bus, clock: Clock, session: str, site: str) -> Iterator[Event]:
-    """Yields the events of a site that runs, from its first one on, as far as it keeps them and answers."""
+    """Yields the events of a site that runs, from its first one on, as far as it keeps them and
+    answers.
+    """
     first = 0
     made = 1
     with suppress(WireError):  # a stranger's answer
         while first < made:
-            wanted = BackfillRequest(channel="event", first=first, last=first + BACKFILL_MESSAGES - 1)
+            wanted = BackfillRequest(
+                channel="event", first=first, last=first + BACKFILL_MESSAGES - 1
+            )
             reply = _ask_once(bus, clock, topics.key(session, site, topics.PAST), wanted)
             past = None if reply is None else decode(reply, Backfill)
             if past is None or not past.payloads:
@@ -182,19 +229,25 @@ def open_playback_bus(
         UsageError: an endpoint cannot be used.
     """
     try:
-        return open_bus(connection, clock, stopped, None, say)
+        return open_bus(
+            connection=connection, clock=clock, stopped=stopped, timeout_s=None, say=say
+        )
     except UsageError:
         if not connection.listen:
             raise
         there = replace(connection, listen=(), connect=connection.listen)
-        visitor = open_bus(there, clock, stopped, 1.0, say)
+        visitor = open_bus(
+            connection=there, clock=clock, stopped=stopped, timeout_s=1.0, say=say
+        )
         if visitor is not None:
             with closing(visitor):
                 refuse_running_session(visitor, clock, session, stopped)
         raise
 
 
-def refuse_running_session(bus: Bus, clock: Clock, session: str, stopped: Callable[[], bool]) -> None:
+def refuse_running_session(
+    bus: Bus, clock: Clock, session: str, stopped: Callable[[], bool]
+) -> None:
     """Refuses a session name that a site answers to.
 
     Raises:
@@ -202,7 +255,11 @@ def refuse_running_session(bus: Bus, clock: Clock, session: str, stopped: Callab
     """
     for info in find_members(bus, clock, session, stopped=stopped, timeout_s=NAME_CHECK_S):
         if info.member != topics.RECORDER:
-            state = f"runs; {info.member} is at tick {info.ticks}" if info.running else "waits to begin"
+            state = (
+                f"runs; {info.member} is at tick {info.ticks}"
+                if info.running
+                else "waits to begin"
+            )
             raise SessionError(
                 f"session {session!r} is there already and {state}; play under another name with "
                 "--prefix or --session"

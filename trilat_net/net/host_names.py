@@ -1,6 +1,8 @@
-"""Host names of endpoints, resolved before anything connects: Zenoh would try a misspelt name for ever.
+"""Host names of endpoints, resolved before anything connects: Zenoh would try a misspelt name
+for ever.
 
-Invariant: what names no host (an address in digits, a socket file) is passed over, and nothing connects here.
+Invariant: what names no host (an address in digits, a socket file) is passed over, and nothing
+connects here.
 """
 
 import ipaddress
@@ -45,7 +47,10 @@ def _is_address(host: str) -> bool:
 def _resolve(host: str, place: str) -> None:
     try:
         socket.getaddrinfo(host, None)
-    except (OSError, UnicodeError) as error:  # UnicodeError: a part of the name is empty or too long
+    except (
+        OSError,
+        UnicodeError,
+    ) as error:  # UnicodeError: a part of the name is empty or too long
         reason = getattr(error, "strerror", None) or "it is no host name"
         raise UnknownHost(
             f"{place}: the host name {host!r} does not resolve ({reason}): correct it, or give an address"

@@ -1,7 +1,9 @@
-"""Sites that run on this machine, by a small file for each; and `trilat stop`, which therefore need not look.
+"""Sites that run on this machine, by a small file for each; and `trilat stop`, which therefore
+need not look.
 
-Invariant: a file is a hint. A site runs without it, only its user may read it, and one whose process is gone
-counts for nothing. What cannot be stopped at once is left to the command's long way.
+Invariant: a file is a hint. A site runs without it, only its user may read it, and one whose
+process is gone counts for nothing. What cannot be stopped at once is left to the command's long
+way.
 """
 
 import os
@@ -61,7 +63,12 @@ def _find_folder() -> Path:
 
 @contextmanager
 def make_site_known(
-    session: str, site: str, sites: Sequence[str], boot: int, connection: "Connection", stop: bytes
+    session: str,
+    site: str,
+    sites: Sequence[str],
+    boot: int,
+    connection: "Connection",
+    stop: bytes,
 ) -> Iterator[None]:
     """Keeps a site's file inside the block, if others need no settings of Zenoh to reach it."""
     places = connection.reach([*connection.listen, *(connection.connect or ())])
@@ -71,7 +78,9 @@ def make_site_known(
     with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
         if connection.keys_of or not connection.own:
             _find_folder().mkdir(mode=0o700, parents=True, exist_ok=True)
-            with os.fdopen(os.open(_find_folder() / f"{boot:016x}.json", _NEW_FILE, 0o600), "wb") as stream:
+            with os.fdopen(
+                os.open(_find_folder() / f"{boot:016x}.json", _NEW_FILE, 0o600), "wb"
+            ) as stream:
                 stream.write(msgspec.json.encode(known))
     try:
         yield
@@ -81,7 +90,9 @@ def make_site_known(
 
 
 def find_known_sites(session: str) -> list[KnownSite]:
-    """Returns the sites of a session that run on this machine; removes the files of those that are gone."""
+    """Returns the sites of a session that run on this machine; removes the files of those that
+    are gone.
+    """
     found = []
     machine = SystemClock().identity()
     with suppress(OSError, RuntimeError):
@@ -112,10 +123,16 @@ def list_places(known: Sequence[KnownSite]) -> list[Endpoint]:
 
 
 def find_known_places(session: str, connection: "Connection") -> list[Endpoint] | None:
-    """Returns where the sites of a session are reached, if all of them run here and as this member does."""
+    """Returns where the sites of a session are reached, if all of them run here and as this
+    member does.
+    """
     how = connection.mode, bool(connection.keys_of)
     known = [one for one in find_known_sites(session) if (one.mode, one.keyed) == how]
-    return list_places(known) if known and {one.site for one in known} == set(known[0].sites) else None
+    return (
+        list_places(known)
+        if known and {one.site for one in known} == set(known[0].sites)
+        else None
+    )
 
 
 def stop_at_once(words: Sequence[str]) -> int | list[str]:
@@ -150,7 +167,10 @@ def stop_at_once(words: Sequence[str]) -> int | list[str]:
         if _order(known, sites, given["--keys"]):
             return 0
         way = "--router" if known[0].mode == "client" else "--connect"
-        return [*words, *chain(*([way, place] for place in list_places(known) if isinstance(place, str)))]
+        return [
+            *words,
+            *chain(*([way, place] for place in list_places(known) if isinstance(place, str))),
+        ]
     except KeyboardInterrupt:
         return 130
     except Exception:  # whatever it is: the long way is tried, and says what is wrong
@@ -158,13 +178,18 @@ def stop_at_once(words: Sequence[str]) -> int | list[str]:
 
 
 def _print(text: object) -> None:
-    print("".join(letter if letter.isprintable() else "\ufffd" for letter in str(text)), flush=True)
+    print(
+        "".join(letter if letter.isprintable() else "\ufffd" for letter in str(text)),
+        flush=True,
+    )
 
 
 def _order(known: Sequence[KnownSite], sites: Sequence[str], keys: str) -> bool:
-    """Orders sites to stop, or all, until each has answered; prints the answers; true if all of them stop.
+    """Orders sites to stop, or all, until each has answered; prints the answers; true if all of
+    them stop.
 
-    Of two sessions with one name both are meant: then as many answer a question as there are of a site.
+    Of two sessions with one name both are meant: then as many answer a question as there are of
+    a site.
     """
     own: Any = AT_ONCE
     if keys:

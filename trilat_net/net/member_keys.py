@@ -1,12 +1,14 @@
-"""The keys of a session's members: made by `trilat keys new`, used by every member that is given its folder.
+"""The keys of a session's members: made by `trilat keys new`, used by every member that is
+given its folder.
 
-Invariant: a private authority signs one certificate per member, which ends after some days, and is kept
-apart. A member's folder holds its own key, which nobody else may read, its certificate, that of the
-authority, and the list of members, from which its access rules follow; nobody else may write any of it.
-Keys are made whole or not at all.
+Invariant: a private authority signs one certificate per member, which ends after some days, and
+is kept apart. A member's folder holds its own key, which nobody else may read, its certificate,
+that of the authority, and the list of members, from which its access rules follow; nobody else
+may write any of it. Keys are made whole or not at all.
 
-Keys end a day before their certificate does: no member begins with them any more, but `trilat stop` still
-connects. Every connection of Zenoh, also one that is made again, needs a certificate that holds.
+Keys end a day before their certificate does: no member begins with them any more, but `trilat
+stop` still connects. Every connection of Zenoh, also one that is made again, needs a
+certificate that holds.
 """
 
 import datetime
@@ -66,7 +68,8 @@ class MemberKeys(NamedTuple):
 def create_keys(
     folder: str | Path, members: Sequence[str], hosts: Sequence[str] = (), days: int = 30
 ) -> list[Path]:
-    """Makes an authority and a folder of keys for each member; returns the folders, as `trilat keys new`.
+    """Makes an authority and a folder of keys for each member; returns the folders, as `trilat
+    keys new`.
 
     >>> [one.name for one in tn.create_keys("keys", ["m", "s", "recorder"])]
     ['m', 's', 'recorder']
@@ -88,7 +91,9 @@ def create_keys(
     if fault := next(filter(None, faults), ""):
         raise UsageError(fault)
     if not folder.name or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
-        raise UsageError(f"{folder}: there is something already; keys are never replaced, name a new folder")
+        raise UsageError(
+            f"{folder}: there is something already; keys are never replaced, name a new folder"
+        )
     make_folder(folder.parent)
     with stage_output(folder, force=False, manifest=MEMBERS) as staged:
         staged.chmod(0o700)
@@ -103,18 +108,26 @@ def _find_name_fault(members: Sequence[Any]) -> str:
             most = f"at most {MOST_LETTERS} letters, digits, _ and -"
             letters = "" if str(name).isascii() else "; its letters are a to z and A to Z"
             return f"a member's name is {most}, and not {_AUTHORITY_FOLDER}, not {ascii(name)[:80]}{letters}"
-    return "" if 0 < len(members) == len(set(members)) else "every member is named once, and there is one"
+    return (
+        ""
+        if 0 < len(members) == len(set(members))
+        else "every member is named once, and there is one"
+    )
 
 
 def _find_host_fault(host: str) -> str:
-    """Returns why a certificate cannot be made for a host, "" if it can: no certificate is good for many."""
+    """Returns why a certificate cannot be made for a host, "" if it can: no certificate is good
+    for many.
+    """
     label = "(?!-)[A-Za-z0-9_-]{1,63}(?<!-)"
     try:
         one = not ipaddress.ip_address(host).is_unspecified
     except ValueError:
         one = bool(re.fullmatch(rf"({label}\.)*(?!\d+$){label}", host)) and len(host) <= 253
     return (
-        "" if one else f"--host: a certificate is for one host name or address, without a port, not {host!r}"
+        ""
+        if one
+        else f"--host: a certificate is for one host name or address, without a port, not {host!r}"
     )
 
 
@@ -129,7 +142,8 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
 
     Args:
         folder: the folder that `create_keys` made, with its folder `authority`.
-        members: whose certificates are renewed; none: those of all members whose folders are there.
+        members: whose certificates are renewed; none: those of all members whose folders are
+            there.
         days: how long the keys hold from now on.
 
     Returns:
@@ -153,18 +167,24 @@ def renew_keys(folder: str | Path, members: Sequence[str] = (), days: int = 30) 
             "trilat keys new"
         ) from None
     if key.public_key() != before.public_key():
-        raise UsageError(f"{folder / _AUTHORITY_FOLDER}: the private key is not that of the certificate")
+        raise UsageError(
+            f"{folder / _AUTHORITY_FOLDER}: the private key is not that of the certificate"
+        )
     present = [path.name for path in sorted(folder.iterdir()) if (path / MEMBERS).is_file()]
     chosen = list(members) or present
     if missing := [name for name in chosen if name not in present]:
-        raise UsageError(f"{folder}: holds no keys of {', '.join(missing)}; it has {', '.join(present)}")
+        raise UsageError(
+            f"{folder}: holds no keys of {', '.join(missing)}; it has {', '.join(present)}"
+        )
     ends = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=days)
     authority = _sign_authority(key, ends)
-    renewed = {name: _renew(folder / name, before, key, ends) for name in chosen}  # all of them, or none
+    # all of them, or none
+    renewed = {name: _renew(folder / name, before, key, ends) for name in chosen}
     for name, (certificate, listed) in renewed.items():
         write_whole(folder / name / AUTHORITY, _encode(authority), mode=0o600)
         write_whole(folder / name / CERTIFICATE, _encode(certificate), mode=0o600)
-        write_whole(folder / name / MEMBERS, listed, mode=0o600)  # last: it says when the keys end
+        # last: it says when the keys end
+        write_whole(folder / name / MEMBERS, listed, mode=0o600)
     write_whole(folder / _AUTHORITY_FOLDER / AUTHORITY, _encode(authority), mode=0o600)
     return [folder / name for name in chosen]
 
@@ -178,7 +198,9 @@ def _renew(
         before.verify_directly_issued_by(authority)
         listed = json.loads(_read(folder / MEMBERS))
         names = before.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
-        certificate = _sign_member(before.subject, before.public_key(), names, key, ends)
+        certificate = _sign_member(
+            subject=before.subject, own=before.public_key(), names=names, key=key, ends=ends
+        )
         return certificate, _list_members(listed["member"], listed["members"], ends)
     except UsageError:
         raise
@@ -193,7 +215,13 @@ def _make_all(folder: Path, members: Sequence[str], hosts: Sequence[str], days: 
     _write(folder / _AUTHORITY_FOLDER, authority, authority, key)
     for member in members:
         own = ec.generate_private_key(ec.SECP256R1())
-        certificate = _sign_member(_name(member), own.public_key(), _alternatives(hosts), key, ends)
+        certificate = _sign_member(
+            subject=_name(member),
+            own=own.public_key(),
+            names=_alternatives(hosts),
+            key=key,
+            ends=ends,
+        )
         _write(folder / member, authority, certificate, own)
         _put(folder / member / MEMBERS, _list_members(member, members, ends).encode())
 
@@ -203,7 +231,9 @@ def _list_members(member: str, members: Sequence[str], ends: datetime.datetime) 
     return f"{json.dumps(listed)}\n"
 
 
-def _sign_authority(key: ec.EllipticCurvePrivateKey, ends: datetime.datetime) -> x509.Certificate:
+def _sign_authority(
+    key: ec.EllipticCurvePrivateKey, ends: datetime.datetime
+) -> x509.Certificate:
     constraints = x509.BasicConstraints(ca=True, path_length=0)
     builder = _certificate(_ISSUER, key.public_key(), ends)
     return builder.add_extension(constraints, critical=True).sign(key, hashes.SHA256())
@@ -217,7 +247,9 @@ def _sign_member(
     ends: datetime.datetime,
 ) -> x509.Certificate:
     """Returns the certificate for a member's public key, signed by the key of the authority."""
-    uses = x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH])
+    uses = x509.ExtendedKeyUsage(
+        [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+    )
     builder = _certificate(subject, own, ends).add_extension(names, critical=False)
     return builder.add_extension(uses, critical=False).sign(key, hashes.SHA256())
 
@@ -229,7 +261,9 @@ def _name(common: str) -> x509.Name:
 _ISSUER = _name("trilat-net authority")
 
 
-def _certificate(subject: x509.Name, own: Any, ends: datetime.datetime) -> x509.CertificateBuilder:
+def _certificate(
+    subject: x509.Name, own: Any, ends: datetime.datetime
+) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -256,14 +290,19 @@ def _alternatives(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
 
 
 def _write(
-    folder: Path, authority: x509.Certificate, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey
+    folder: Path,
+    authority: x509.Certificate,
+    certificate: x509.Certificate,
+    key: ec.EllipticCurvePrivateKey,
 ) -> None:
     folder.mkdir(mode=0o700, parents=True)
     _put(folder / AUTHORITY, authority.public_bytes(serialization.Encoding.PEM))
     if certificate is not authority:
         _put(folder / CERTIFICATE, certificate.public_bytes(serialization.Encoding.PEM))
     private = key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
     )
     _put(folder / PRIVATE_KEY, private)
 
@@ -281,17 +320,22 @@ def _read(path: Path) -> bytes:
 
 
 def _refuse_of_others(path: Path, facts: os.stat_result) -> None:
-    """Refuses what another user can change; in a folder of many (sticky) nobody changes files of others.
+    """Refuses what another user can change; in a folder of many (sticky) nobody changes files
+    of others.
 
     On Windows these bits do not tell who may: nothing is refused.
     """
     if sys.platform == "win32":
         return
     if os.geteuid() and facts.st_uid not in (0, os.geteuid()):
-        raise UsageError(f"{path}: belongs to another user, who can change it: take keys of your own")
+        raise UsageError(
+            f"{path}: belongs to another user, who can change it: take keys of your own"
+        )
     shared = stat.S_ISDIR(facts.st_mode) and facts.st_mode & stat.S_ISVTX
     if facts.st_mode & 0o022 and not shared:
-        raise UsageError(f"{path}: others may write it, and so say who takes part: chmod go-w {path}")
+        raise UsageError(
+            f"{path}: others may write it, and so say who takes part: chmod go-w {path}"
+        )
 
 
 def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
@@ -302,21 +346,26 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
 
     Args:
         folder: the folder of one member.
-        stops: true if the keys serve to stop arms alone: they may have ended, while their certificate holds.
+        stops: true if the keys serve to stop arms alone: they may have ended, while their
+            certificate holds.
 
     Raises:
         UsageError: something is missing, has ended, or does not belong together.
     """
     folder = Path(folder)
     if (folder / _AUTHORITY_FOLDER).is_dir():
-        raise UsageError(f"{folder}: holds the keys of all; name the folder of one member, as in {folder}/m1")
+        raise UsageError(
+            f"{folder}: holds the keys of all; name the folder of one member, as in {folder}/m1"
+        )
     try:
         _refuse_of_others(folder, folder.stat())
         listed, *pems, private = map(
             _read, (folder / one for one in (MEMBERS, AUTHORITY, CERTIFICATE, PRIVATE_KEY))
         )
     except OSError as error:
-        raise UsageError(f"{error.filename}: {error.strerror}: no keys of `trilat keys new`") from None
+        raise UsageError(
+            f"{error.filename}: {error.strerror}: no keys of `trilat keys new`"
+        ) from None
     try:
         named = json.loads(listed)
         member = named["member"]
@@ -330,9 +379,18 @@ def read_member_keys(folder: str | Path, *, stops: bool = False) -> MemberKeys:
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise UsageError(f"{folder}: damaged, no keys of `trilat keys new` ({error})") from None
     except Exception as error:  # cryptography's errors have no common base
-        raise UsageError(f"{folder}: the authority has not signed this certificate ({error!r})") from None
+        raise UsageError(
+            f"{folder}: the authority has not signed this certificate ({error!r})"
+        ) from None
     last = certificate.not_valid_after_utc if stops else ends
-    if fault := _find_name_fault(members) or _find_fault(folder, member, members, certificate, key, last):
+    if fault := _find_name_fault(members) or _find_fault(
+        folder=folder,
+        member=member,
+        members=members,
+        certificate=certificate,
+        key=key,
+        ends=last,
+    ):
         raise UsageError(f"{folder}: {fault}")
     return MemberKeys(member, members, ends, _make_settings(folder.resolve(), members))
 
@@ -345,16 +403,30 @@ def _find_fault(
     key: Any,
     ends: datetime.datetime,
 ) -> str:
-    common = ", ".join(name.rfc4514_string().removeprefix("CN=") for name in certificate.subject.rdns)
+    common = ", ".join(
+        name.rfc4514_string().removeprefix("CN=") for name in certificate.subject.rdns
+    )
     begins = certificate.not_valid_before_utc
     private = folder / PRIVATE_KEY
     now = datetime.datetime.now(datetime.UTC)
     for fault, text in (
-        (find_rights_of_others(private), f"{PRIVATE_KEY} can be read by others: chmod 600 {private}"),
-        (common != member, f"the certificate is that of {common}, and {MEMBERS} names {member}"),
+        (
+            find_rights_of_others(private),
+            f"{PRIVATE_KEY} can be read by others: chmod 600 {private}",
+        ),
+        (
+            common != member,
+            f"the certificate is that of {common}, and {MEMBERS} names {member}",
+        ),
         (member not in members, f"{MEMBERS} does not list {member}"),
-        (key.public_key() != certificate.public_key(), "the private key is not that of the certificate"),
-        (begins > now, f"the certificate begins on {begins:{_DATE}}: is the clock of this machine right?"),
+        (
+            key.public_key() != certificate.public_key(),
+            "the private key is not that of the certificate",
+        ),
+        (
+            begins > now,
+            f"the certificate begins on {begins:{_DATE}}: is the clock of this machine right?",
+        ),
         (
             ends <= now,
             f"the certificate ended on {ends:{_DATE}}: {_RENEWAL}",

@@ -1,10 +1,11 @@
 """Session membership: boots, liveliness tokens, events, and who is present.
 
-Invariant: a different scenario, a running session and a second start of the same member are refused at
-the first exchange; replies of strangers are ignored and kept for the error message. A recorder may join a
-running session, and several recorders may be present. It then takes identities, epoch and boots from the
-running members, waits for those that are present and can be pinged, and not for those that left. A site
-joins late only if it `returns`: if every site of the scenario waits for its peers and aligns with them.
+Invariant: a different scenario, a running session and a second start of the same member are
+refused at the first exchange; replies of strangers are ignored and kept for the error message.
+A recorder may join a running session, and several recorders may be present. It then takes
+identities, epoch and boots from the running members, waits for those that are present and can
+be pinged, and not for those that left. A site joins late only if it `returns`: if every site of
+the scenario waits for its peers and aligns with them.
 """
 
 import hashlib
@@ -32,11 +33,19 @@ def new_boot() -> int:
     return secrets.randbits(64)
 
 
-def describe_member(member: str, boot: int, clock: Clock, scenario: str = "", **fields: object) -> Info:
-    """Returns the identity of a member on this machine, with the text of its scenario, "" for none."""
+def describe_member(
+    member: str, boot: int, clock: Clock, scenario: str = "", **fields: object
+) -> Info:
+    """Returns the identity of a member on this machine, with the text of its scenario, "" for
+    none.
+    """
     digest = hashlib.sha256(scenario.encode()).hexdigest() if scenario else ""
     about = {"member": member, "boot": boot, "scenario_sha256": digest, "scenario": scenario}
-    machine = {"host": platform.node(), "clock": clock.identity(), "fingerprint": compute_fingerprint()}
+    machine = {
+        "host": platform.node(),
+        "clock": clock.identity(),
+        "fingerprint": compute_fingerprint(),
+    }
     return msgspec.convert({**about, **machine, **fields}, Info)
 
 
@@ -53,7 +62,9 @@ def read_messages(inbox: Inbox, kind: type[M]) -> Iterator[M]:
 
 
 def read_records(inbox: Inbox, layout: Layout | None = None) -> Iterator[State]:
-    """Yields the records that wait in a ring; skips other payloads, and of a block what follows one."""
+    """Yields the records that wait in a ring; skips other payloads, and of a block what follows
+    one.
+    """
     while (message := inbox.poll()) is not None:
         with suppress(WireError):
             for payload in split_states(message[1]):
@@ -96,7 +107,9 @@ class EventPublisher:
 
 
 class MemberQuery:
-    """Asks the members of a session for their identities, again and again; notes why one is unreadable."""
+    """Asks the members of a session for their identities, again and again; notes why one is
+    unreadable.
+    """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, member: str = "*") -> None:
         self.unreadable: dict[str, str] = {}
@@ -123,7 +136,8 @@ class LateSites(NamedTuple):
     """Which sites may join a session that runs, as one of its sites knows it.
 
     Attributes:
-        returns: True if this site may: every one of the scenario waits for its peers and aligns with them.
+        returns: True if this site may: every one of the scenario waits for its peers and aligns
+            with them.
         without: sites without which the session begins, if this one leads.
     """
 
@@ -133,7 +147,8 @@ class LateSites(NamedTuple):
 
 
 class Membership:
-    """The other members of a session, as one member knows them; a recorder, without sites, learns these.
+    """The other members of a session, as one member knows them; a recorder, without sites,
+    learns these.
 
     Attributes:
         met: identities of the others, by name.
@@ -175,15 +190,21 @@ class Membership:
     def unreadable(self) -> dict[str, str]:
         """By name of a member of the session, why its answer cannot be read."""
         members = (*self._sites, topics.RECORDER)
-        return {name: reason for name, reason in self._query.unreadable.items() if name in members}
+        return {
+            name: reason for name, reason in self._query.unreadable.items() if name in members
+        }
 
     def boots(self) -> dict[str, int]:
         """Returns the boots of all members present, including its own."""
-        return {name: info.boot for name, info in self.met.items()} | {self.own.member: self.own.boot}
+        return {name: info.boot for name, info in self.met.items()} | {
+            self.own.member: self.own.boot
+        }
 
     def clocks(self) -> dict[str, str]:
         """Returns the identities of their clocks."""
-        return {name: info.clock for name, info in self.met.items()} | {self.own.member: self.own.clock}
+        return {name: info.clock for name, info in self.met.items()} | {
+            self.own.member: self.own.clock
+        }
 
     def missing(self) -> list[str]:
         """Returns the members that have not been met."""
@@ -192,7 +213,9 @@ class Membership:
         return [
             name
             for name in (*self._sites, *recorder)
-            if name != self.own.member and name not in self.met and name not in self._late.without
+            if name != self.own.member
+            and name not in self.met
+            and name not in self._late.without
         ]
 
     def begins_anew(self, name: str, boot: int) -> bool:
@@ -201,7 +224,9 @@ class Membership:
         return met is not None and met.boot != boot and str(boot) not in self.alive
 
     def running(self) -> list[Info]:
-        """Returns the sites of a running session that were met, of those that agree on its other members."""
+        """Returns the sites of a running session that were met, of those that agree on its
+        other members.
+        """
         infos = [
             info
             for _, info in sorted(self.met.items())
@@ -240,14 +265,20 @@ class Membership:
             return
         comes_late = self._late.returns and info.member != own.member
         if info.running and not invited and (not comes_late if self._sites else not info.boots):
-            raise SessionError(f"session {self._session!r} is running; {info.member} is at tick {info.ticks}")
+            raise SessionError(
+                f"session {self._session!r} is running; {info.member} is at tick {info.ticks}"
+            )
         if info.member == own.member:
             if info.boot < own.boot:
-                raise SessionError(f"there is a {own.member} in session {self._session!r} already")
+                raise SessionError(
+                    f"there is a {own.member} in session {self._session!r} already"
+                )
             return
         if self._sites and info.scenario_sha256 and info.scenario_sha256 != own.scenario_sha256:
             if info.running and not invited:
-                raise SessionError(f"session {self._session!r} runs another scenario, {info.member} says")
+                raise SessionError(
+                    f"session {self._session!r} runs another scenario, {info.member} says"
+                )
             self._refuse(info)
             return
         if info.member == topics.RECORDER and self.met.get(info.member, info).boot != info.boot:
@@ -256,7 +287,9 @@ class Membership:
             self.met[info.member] = info
 
     def _refuse(self, info: Info) -> None:
-        """Leaves the session of a leader with another scenario; as the leader, publishes a refusal."""
+        """Leaves the session of a leader with another scenario; as the leader, publishes a
+        refusal.
+        """
         own = self.own
         text = (
             f"another scenario: {info.member} has {info.scenario_sha256[:16]}, "
@@ -275,7 +308,8 @@ class Epoch(NamedTuple):
     Attributes:
         mono_ns: on this process's monotonic clock.
         unix_ns: in Unix time, as the leader read it.
-        epochs: the same instant on every member's own clock; empty for a recorder that joins late.
+        epochs: the same instant on every member's own clock; empty for a recorder that joins
+            late.
         first: the first tick of this site.
         coming: what it says who joins late, until all acknowledge its samples.
     """

@@ -1,20 +1,24 @@
-"""Offset and drift of another clock, estimated from stamps that crossed a network, and the slewed offset.
+"""Offset and drift of another clock, estimated from stamps that crossed a network, and the
+slewed offset.
 
-Invariant: stamps prove every bound, for any delays, however unequal the two directions. A message is
-never received before it was sent, so with offset = other clock - own clock
+Invariant: stamps prove every bound, for any delays, however unequal the two directions. A
+message is never received before it was sent, so with offset = other clock - own clock
 
-    offset <= (their reading on receiving) - (own reading on sending): a ceiling, when the own clock sent;
-    offset >= (their reading on sending) - (own reading on receiving): a floor, when the own clock received.
+    offset <= (their reading on receiving) - (own reading on sending): a ceiling, when the own
+    clock sent; offset >= (their reading on sending) - (own reading on receiving): a floor, when
+    the own clock received.
 
-A ceiling and a floor of one exchange t1..t4 are the classical (t2 - t1) and (t3 - t4): their mean is the
-offset, their distance the round trip, half of that the bound. Each window keeps its lowest ceiling and
-its highest floor; these may come from different exchanges, so the bound is half the shortest way out plus
-half the shortest way back. Over the windows the offset is a line; the lines through all ceilings and
-floors are admissible, and their spread now is the bound. Assumed: clocks drift apart by less than
-DRIFT_LIMIT, and over the kept windows along a line to within WANDER.
+A ceiling and a floor of one exchange t1..t4 are the classical (t2 - t1) and (t3 - t4): their
+mean is the offset, their distance the round trip, half of that the bound. Each window keeps its
+lowest ceiling and its highest floor; these may come from different exchanges, so the bound is
+half the shortest way out plus half the shortest way back. Over the windows the offset is a
+line; the lines through all ceilings and floors are admissible, and their spread now is the
+bound. Assumed: clocks drift apart by less than DRIFT_LIMIT, and over the kept windows along a
+line to within WANDER.
 
-The offset in use never steps: it is continuous and piecewise linear, reaches each new estimate within
-SLEW_NS and then follows the estimate's drift. Its bound covers the estimate's interval also on the way.
+The offset in use never steps: it is continuous and piecewise linear, reaches each new estimate
+within SLEW_NS and then follows the estimate's drift. Its bound covers the estimate's interval
+also on the way.
 """
 
 import math
@@ -44,7 +48,9 @@ class OffsetLimit(NamedTuple):
 
 
 class OffsetEstimate(NamedTuple):
-    """Another clock minus the own one at an instant of the own, and its growth, ns/s, with their limits."""
+    """Another clock minus the own one at an instant of the own, and its growth, ns/s, with
+    their limits.
+    """
 
     at_ns: int
     offset_ns: int
@@ -61,7 +67,9 @@ class OffsetEstimate(NamedTuple):
     def including(self, *limits: OffsetLimit | None) -> "OffsetEstimate":
         """Returns the same, widened to include limits that contradict it."""
         offsets = [limit.offset_ns for limit in limits if limit is not None]
-        return self._replace(low_ns=min([self.low_ns, *offsets]), high_ns=max([self.high_ns, *offsets]))
+        return self._replace(
+            low_ns=min([self.low_ns, *offsets]), high_ns=max([self.high_ns, *offsets])
+        )
 
     def bound_at(self, at_ns: int, offset_ns: int) -> int:
         """Returns the largest distance of the offset from a value at another instant, ns."""
@@ -76,8 +84,18 @@ class OffsetEstimate(NamedTuple):
 
 
 def exact_offset(offset_ns: int) -> OffsetEstimate:
-    """Returns the estimate of an offset that is exact for ever, as of two readings of one clock."""
-    return OffsetEstimate(0, offset_ns, 0.0, offset_ns, offset_ns, 0.0, 0.0)
+    """Returns the estimate of an offset that is exact for ever, as of two readings of one
+    clock.
+    """
+    return OffsetEstimate(
+        at_ns=0,
+        offset_ns=offset_ns,
+        drift=0.0,
+        low_ns=offset_ns,
+        high_ns=offset_ns,
+        drift_low=0.0,
+        drift_high=0.0,
+    )
 
 
 def format_offset(offset_ns: int, bound_ns: int) -> str:
@@ -89,8 +107,8 @@ class OffsetEstimator:
     """The ceilings and floors of one clock, and the line between them.
 
     Attributes:
-        broken: how often the limits contradicted each other, so that the older ones were dropped: a clock
-            stepped, or was slewed harder than DRIFT_LIMIT.
+        broken: how often the limits contradicted each other, so that the older ones were
+            dropped: a clock stepped, or was slewed harder than DRIFT_LIMIT.
     """
 
     def __init__(self) -> None:
@@ -106,7 +124,9 @@ class OffsetEstimator:
             self._floors.append(floor)
 
     def estimate(self, now_ns: int) -> OffsetEstimate | None:
-        """Returns the estimate now, at or after every window; None while one direction has no limit."""
+        """Returns the estimate now, at or after every window; None while one direction has no
+        limit.
+        """
         while self._ceilings and self._floors:
             lines = _Lines(self._ceilings, self._floors, now_ns)
             if lines.possible:
@@ -120,9 +140,13 @@ class OffsetEstimator:
 
 
 class _Lines:
-    """All lines under every ceiling and over every floor; times are s from now, values ns from a base."""
+    """All lines under every ceiling and over every floor; times are s from now, values ns from
+    a base.
+    """
 
-    def __init__(self, ceilings: deque[OffsetLimit], floors: deque[OffsetLimit], now_ns: int) -> None:
+    def __init__(
+        self, ceilings: deque[OffsetLimit], floors: deque[OffsetLimit], now_ns: int
+    ) -> None:
         self._now_ns = now_ns
         self._base_ns = ceilings[-1].offset_ns
         self._above_s, self._above = self._columns(ceilings)
@@ -138,34 +162,39 @@ class _Lines:
         self.possible = bool(touching >= 0.0 and self.flattest <= self.steepest)
 
     def _columns(self, limits: deque[OffsetLimit]) -> tuple[Array, Array]:
-        times = np.array([min(0, limit.at_ns - self._now_ns) for limit in limits], dtype=np.float64)
-        values = np.array([limit.offset_ns - self._base_ns for limit in limits], dtype=np.float64)
+        times = np.array(
+            [min(0, limit.at_ns - self._now_ns) for limit in limits], dtype=np.float64
+        )
+        values = np.array(
+            [limit.offset_ns - self._base_ns for limit in limits], dtype=np.float64
+        )
         return times / NS_PER_S, values
 
     def estimate(self) -> OffsetEstimate:
         """Returns the line in the middle, and the span of all lines now."""
         slope = min(max(self._slope(), self.flattest), self.steepest)
         middle = 0.5 * (
-            np.min(self._widest - slope * self._above_s) + np.max(self._lowest - slope * self._below_s)
+            np.min(self._widest - slope * self._above_s)
+            + np.max(self._lowest - slope * self._below_s)
         )
         # now lies behind every limit: the highest value is the steepest line's, the lowest the flattest's
         high = np.min(self._widest - self.steepest * self._above_s)
         low = np.max(self._lowest - self.flattest * self._below_s)
         return OffsetEstimate(
-            self._now_ns,
-            self._base_ns + round(middle),
-            slope,
-            self._base_ns + int(np.floor(low)),
-            self._base_ns + int(np.ceil(high)),
-            self.flattest - WANDER,
-            self.steepest + WANDER,
+            at_ns=self._now_ns,
+            offset_ns=self._base_ns + round(middle),
+            drift=slope,
+            low_ns=self._base_ns + int(np.floor(low)),
+            high_ns=self._base_ns + int(np.ceil(high)),
+            drift_low=self.flattest - WANDER,
+            drift_high=self.steepest + WANDER,
         )
 
     def _slope(self) -> float:
         """Returns the drift: least squares of one slope for ceilings and floors.
 
-        A window of slow messages tells little: its weight falls with its distance from the best one, which
-        depends on the slope, hence some rounds.
+        A window of slow messages tells little: its weight falls with its distance from the best
+        one, which depends on the slope, hence some rounds.
         """
         slope = 0.0
         drift_weight = _PRIOR**-2
@@ -208,7 +237,9 @@ class _SlewSegment:
 
     def at(self, at_ns: int) -> int:
         passed_ns = at_ns - self._joined_ns
-        return self._joined_offset_ns + int(passed_ns * (self._approach if passed_ns < 0 else self._drift))
+        return self._joined_offset_ns + int(
+            passed_ns * (self._approach if passed_ns < 0 else self._drift)
+        )
 
     def bound_at(self, at_ns: int) -> int:
         if self.from_ns <= at_ns <= self._joined_ns:
@@ -220,7 +251,9 @@ class SlewedOffset:
     """The offset in use over time, the other clock minus the own one."""
 
     def __init__(self, estimate: OffsetEstimate) -> None:
-        self._segment = self._before = _SlewSegment(estimate.at_ns, estimate.offset_ns, estimate)
+        self._segment = self._before = _SlewSegment(
+            estimate.at_ns, estimate.offset_ns, estimate
+        )
 
     @property
     def estimate(self) -> OffsetEstimate:
@@ -246,4 +279,8 @@ class SlewedOffset:
     def bound_at(self, at_ns: int) -> int:
         """Returns its largest error at such an instant, ns."""
         segment = self._segment
-        return segment.bound_at(at_ns) if at_ns >= segment.from_ns else self._before.bound_at(at_ns)
+        return (
+            segment.bound_at(at_ns)
+            if at_ns >= segment.from_ns
+            else self._before.bound_at(at_ns)
+        )

@@ -1,8 +1,8 @@
 """Queries: repeated over a slow network, for missed messages, and pings, which tell of clocks.
 
-Invariant: a reply counts however many queries later it arrives, as long as its query is one of the last
-QUERIES_KEPT. A member answers a ping at once, in a thread of its bus, with its clock's reading; the asker
-then knows that clock to half the round trip, however far the clocks differ.
+Invariant: a reply counts however many queries later it arrives, as long as its query is one of
+the last QUERIES_KEPT. A member answers a ping at once, in a thread of its bus, with its clock's
+reading; the asker then knows that clock to half the round trip, however far the clocks differ.
 """
 
 from collections import deque
@@ -42,7 +42,9 @@ class RepeatedQuery:
         return due
 
     def poll(self) -> tuple[int, str, bytes] | None:
-        """Returns when a query was sent, ns, and key and payload of its answer; None without. Never waits."""
+        """Returns when a query was sent, ns, and key and payload of its answer; None without.
+        Never waits.
+        """
         for asked_ns, inbox in self._open:
             if (reply := inbox.poll()) is not None:
                 return asked_ns, *reply
@@ -70,14 +72,23 @@ def answer_pings(bus: Bus, clock: Clock, session: str, info: Info) -> None:
         came_ns = clock.monotonic_ns()
         left_ns = clock.monotonic_ns()
         return encode(
-            Pong(member=info.member, boot=info.boot, clock=info.clock, came_ns=came_ns, left_ns=left_ns)
+            Pong(
+                member=info.member,
+                boot=info.boot,
+                clock=info.clock,
+                came_ns=came_ns,
+                left_ns=left_ns,
+            )
         )
 
     bus.respond(topics.key(session, info.member, topics.PING), answer)
 
 
 def answer_backfill(
-    query: Query, member: str, boot: int, find: Callable[[BackfillRequest], tuple[int, list[bytes], int]]
+    query: Query,
+    member: str,
+    boot: int,
+    find: Callable[[BackfillRequest], tuple[int, list[bytes], int]],
 ) -> int:
     """Answers a recorder's query for messages that it missed; returns how many it gets.
 
@@ -88,13 +99,19 @@ def answer_backfill(
     except WireError:
         return 0  # a stranger's: it gets no answer
     first, payloads, made = find(wanted)
-    found: dict[str, Any] = {"channel": wanted.channel, "first": first, "payloads": payloads, "made": made}
+    found: dict[str, Any] = {
+        "channel": wanted.channel,
+        "first": first,
+        "payloads": payloads,
+        "made": made,
+    }
     query.answer(encode(Backfill(member=member, boot=boot, **found)))
     return len(payloads)
 
 
 class RoundTrips:
-    """The round trips to one start of a member; its clock counts as known after `enough` that agree.
+    """The round trips to one start of a member; its clock counts as known after `enough` that
+    agree.
 
     Attributes:
         rtts_ns: the latest round trips, without the time that the member held them.
@@ -122,7 +139,10 @@ class RoundTrips:
         self.shortest_ns = min(self.shortest_ns, rtt_ns) if self.rtts_ns else rtt_ns
         self.rtts_ns.append(rtt_ns)
         self._window.append(
-            (OffsetLimit(asked_ns, pong.came_ns - asked_ns), OffsetLimit(now_ns, pong.left_ns - now_ns))
+            (
+                OffsetLimit(asked_ns, pong.came_ns - asked_ns),
+                OffsetLimit(now_ns, pong.left_ns - now_ns),
+            )
         )
         if len(self._window) < PINGS_PER_WINDOW:
             return
@@ -150,10 +170,14 @@ class Pinger:
         self._glance_until_ns = 0
 
     def poll(self, wanted: Collection[int]) -> None:
-        """Sends a ping if it is due, and takes the answers that have arrived from the boots wanted."""
+        """Sends a ping if it is due, and takes the answers that have arrived from the boots
+        wanted.
+        """
         pace_ns = PING_REST_NS if self.know(wanted) else PING_PACE_NS
         if wanted and self._query.repeat(pace_ns):
-            self._glance_until_ns = self._clock.monotonic_ns() + 2 * self.slowest_ns() + _STRAGGLE_NS
+            self._glance_until_ns = (
+                self._clock.monotonic_ns() + 2 * self.slowest_ns() + _STRAGGLE_NS
+            )
         while (reply := self._query.poll()) is not None:
             asked_ns, key, payload = reply
             now_ns = self._clock.monotonic_ns()
@@ -171,7 +195,9 @@ class Pinger:
         return all(boot in self.trips and self.trips[boot].known for boot in boots)
 
     def estimate(self, boot: int) -> OffsetEstimate:
-        """Returns the latest estimate of a member's clock; exactly the own clock without pings to it."""
+        """Returns the latest estimate of a member's clock; exactly the own clock without pings
+        to it.
+        """
         trips = self.trips.get(boot)
         return exact_offset(0) if trips is None or trips.latest is None else trips.latest
 

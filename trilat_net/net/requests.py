@@ -1,8 +1,10 @@
-"""Messages between two parties: pings, changes, backfill, external arms and their switches, hands.
+"""Messages between two parties: pings, changes, backfill, external arms and their switches,
+hands.
 
-Invariant: none of these is logged. Their effects are: a change as an event, a backfilled message as
-itself, a measurement as q and qd of the record of the tick that used it, a hand as `hand` of the records of
-the ticks in which it acts. A site uses the newest measurement at each tick, and the newest goal of a hand.
+Invariant: none of these is logged. Their effects are: a change as an event, a backfilled
+message as itself, a measurement as q and qd of the record of the tick that used it, a hand as
+`hand` of the records of the ticks in which it acts. A site uses the newest measurement at each
+tick, and the newest goal of a hand.
 """
 
 import math
@@ -26,7 +28,9 @@ class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 
 
 class Pong(Request, frozen=True, kw_only=True):
-    """A member's answer to a ping: when that came and the answer left, on a clock of this identity."""
+    """A member's answer to a ping: when that came and the answer left, on a clock of this
+    identity.
+    """
 
     member: str
     boot: U64
@@ -40,15 +44,17 @@ OrderName = Literal["", "stop", "enable", "reset"]
 
 
 class ChangeRequest(Request, frozen=True, kw_only=True):
-    """A change requested from a site, as in a scenario's timeline, from the earliest possible tick on.
+    """A change requested from a site, as in a scenario's timeline, from the earliest possible
+    tick on.
 
-    It names a link, as in "m1->s", or the site whose dominance row changes during `ramp_s`; or `stop_s`, the
-    time since the epoch, s, before which the site's last tick lies; or `mark`, a text for the log; or an
-    `order`, which the site carries out in its next tick.
+    It names a link, as in "m1->s", or the site whose dominance row changes during `ramp_s`; or
+    `stop_s`, the time since the epoch, s, before which the site's last tick lies; or `mark`, a
+    text for the log; or an `order`, which the site carries out in its next tick.
 
     Attributes:
-        source: who asks for it, for people: a noun phrase such as "the experimenter", which the site's event
-            repeats. A request without it has the bytes of a program that knows no such field.
+        source: who asks for it, for people: a noun phrase such as "the experimenter", which the
+            site's event repeats. A request without it has the bytes of a program that knows no
+            such field.
     """
 
     link: str = ""
@@ -109,10 +115,10 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
     Attributes:
         boot: the start of the arm's program, random: a site listens to one of them.
         n: number of the measurement of that start, from 0.
-        tau_x: torque of operator and environment, as a record has it: the torque ON the arm is its negative;
-            empty where it is not measured.
-        sent_ns: time of sending, ns of the program's own monotonic clock, or of measuring, on a clock of the
-            arm's; it is compared with no other clock.
+        tau_x: torque of operator and environment, as a record has it: the torque ON the arm is
+            its negative; empty where it is not measured.
+        sent_ns: time of sending, ns of the program's own monotonic clock, or of measuring, on a
+            clock of the arm's; it is compared with no other clock.
     """
 
     site: str
@@ -124,12 +130,17 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
     tau_x: Torques = []
 
     def __post_init__(self) -> None:
-        if self.tau_x and not (len(self.tau_x) == len(self.q) and all(map(math.isfinite, self.tau_x))):
-            raise ValueError(f"tau_x must be {count_nouns(len(self.q), 'finite number')}, as q is")
+        if self.tau_x and not (
+            len(self.tau_x) == len(self.q) and all(map(math.isfinite, self.tau_x))
+        ):
+            raise ValueError(
+                f"tau_x must be {count_nouns(len(self.q), 'finite number')}, as q is"
+            )
 
 
 class ArmEnable(Request, frozen=True, kw_only=True):
-    """Says that somebody holds the dead-man switch of an external arm, at least ten times a second.
+    """Says that somebody holds the dead-man switch of an external arm, at least ten times a
+    second.
 
     Attributes:
         boot: the start of the program, random: a switch is held by one of them.
@@ -146,14 +157,16 @@ class ArmEnable(Request, frozen=True, kw_only=True):
 
 
 class HandMessage(Request, frozen=True, kw_only=True):
-    """What somebody who holds an arm wants: sent when it changes, and again before `SILENCE_NS` is over.
+    """What somebody who holds an arm wants: sent when it changes, and again before `SILENCE_NS`
+    is over.
 
     Attributes:
         boot: the hand, random and above 0: an arm is held by one of them.
         source: who it is, for people.
         n: number of its goal, from 0; the same again says that nothing has changed.
         grip: false: it lets go.
-        target: where the end effector is to go, m, or the joints, rad; empty for a hand that pushes.
+        target: where the end effector is to go, m, or the joints, rad; empty for a hand that
+            pushes.
         force: the force ON the end effector, N; empty for any other hand.
         sent_ns: time of sending, ns of the program's own monotonic clock.
     """
@@ -181,7 +194,8 @@ class PeerSeen(Request, frozen=True, kw_only=True):
 
 
 class HandViewMessage(Request, frozen=True, kw_only=True):
-    """What a hand of one's own in a process of its own sees at a tick, as `HandView`, and decides by.
+    """What a hand of one's own in a process of its own sees at a tick, as `HandView`, and
+    decides by.
 
     Attributes:
         site: the site whose arm it holds.

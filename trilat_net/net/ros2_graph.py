@@ -4,10 +4,10 @@ It has a Zenoh session of its own, as a client of ROS's router (rmw_zenohd) or o
 
 Source: ros2/rmw_zenoh, docs/design.md and rmw_zenoh_cpp/src/detail (at 99a6a2bd).
 
-Invariant: every message bears an attachment of 33 bytes, since a peer aborts at one that it cannot parse. Its
-numbers begin at 1. A name of ROS has no empty part, so that no token has one either. Nothing that comes from
-ROS raises here: what bears no attachment is counted and passed over. A publisher drops a message rather than
-delay its caller.
+Invariant: every message bears an attachment of 33 bytes, since a peer aborts at one that it
+cannot parse. Its numbers begin at 1. A name of ROS has no empty part, so that no token has one
+either. Nothing that comes from ROS raises here: what bears no attachment is counted and passed
+over. A publisher drops a message rather than delay its caller.
 """
 
 import hashlib
@@ -109,7 +109,9 @@ def find_type_hash(kind: str, distro: str) -> str:
 
 
 def name_dds_type(kind: str) -> str:
-    """Returns a type as keys and tokens have it: `std_msgs::msg::dds_::String_` of `std_msgs/msg/String`."""
+    """Returns a type as keys and tokens have it: `std_msgs::msg::dds_::String_` of
+    `std_msgs/msg/String`.
+    """
     package, group, name = kind.split("/")
     return f"{package}::{group}::dds_::{name}_"
 
@@ -132,7 +134,13 @@ class GraphPlace(NamedTuple):
         return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/{self._path()}"
 
     def endpoint_token(
-        self, number: int, end: EndpointKind, name: str, kind: str, type_hash: str, qos: QualityOfService
+        self,
+        number: int,
+        end: EndpointKind,
+        name: str,
+        kind: str,
+        type_hash: str,
+        qos: QualityOfService,
     ) -> str:
         """Returns the token of one of its endpoints; its number is its own in the session."""
         about = f"{_mangle('/' + name)}/{name_dds_type(kind)}/{type_hash}/{qos.encode()}"
@@ -147,7 +155,9 @@ def _mangle(name: str) -> str:
 
 
 def find_misfit(token: str, domain: int, kind: str) -> str:
-    """Returns where a publisher, by its token, differs from a domain and a type; "" if it fits both."""
+    """Returns where a publisher, by its token, differs from a domain and a type; "" if it fits
+    both.
+    """
     _, its_domain, *_, its_type, its_hash, _ = token.split("/")
     if its_domain != str(domain):
         return f"in domain {its_domain}, and this is domain {domain}"
@@ -173,7 +183,9 @@ _MOST_REASONS = 64
 
 
 class Refusals:
-    """What came from ROS and was not taken: counted by its reason; the first of each reason is said."""
+    """What came from ROS and was not taken: counted by its reason; the first of each reason is
+    said.
+    """
 
     def __init__(self, say: Callable[[str], None]) -> None:
         self.counts: Counter[str] = Counter()
@@ -225,7 +237,8 @@ class TopicPublisher:
 
 
 class Ros2Graph:
-    """The graph of ROS as one node of it sees it; a context, which takes that node from the graph.
+    """The graph of ROS as one node of it sees it; a context, which takes that node from the
+    graph.
 
     Args:
         refusals: takes what comes and cannot be taken.
@@ -250,7 +263,13 @@ class Ros2Graph:
         distro: str = "jazzy",
     ) -> None:
         check_hosts(find_endpoint_addresses(routers))
-        self._session = open_zenoh([], routers, "client", _OWN, "no router of ROS answers at {}")
+        self._session = open_zenoh(
+            listen=[],
+            connect=routers,
+            mode="client",
+            own=_OWN,
+            silent="no router of ROS answers at {}",
+        )
         if not self.connected and self._session.info.peers_zid():
             self._session.close()
             raise UsageError(
@@ -296,10 +315,14 @@ class Ros2Graph:
         self._kept.append(declared)  # else who comes later would find nobody
         return TopicPublisher(declared, gid, self._clock, latched=qos.latched)
 
-    def subscribe(self, topic: str, kind: str, take: Callable[[bytes, Attachment], None]) -> None:
-        """Gives the messages of a topic to `take`, in a thread of Zenoh's; what that raises is refused.
+    def subscribe(
+        self, topic: str, kind: str, take: Callable[[bytes, Attachment], None]
+    ) -> None:
+        """Gives the messages of a topic to `take`, in a thread of Zenoh's; what that raises is
+        refused.
 
-        Publishers of another domain, type or definition are named by their tokens, and not heard.
+        Publishers of another domain, type or definition are named by their tokens, and not
+        heard.
         """
         self._declare(EndpointKind.SUBSCRIPTION, topic, kind, SENSOR)
         guarded = self.refusals.guard(topic, take)
@@ -311,7 +334,9 @@ class Ros2Graph:
 
         watcher = handlers.Callback(seen, indirect=False)
         everywhere = f"@ros2_lv/*/*/*/*/MP/*/*/*/{_mangle('/' + topic)}/**"
-        self._kept.append(self._session.liveliness().declare_subscriber(everywhere, watcher, history=True))
+        self._kept.append(
+            self._session.liveliness().declare_subscriber(everywhere, watcher, history=True)
+        )
 
         def heard(sample: zenoh.Sample, attachment: Attachment) -> None:
             guarded(sample.payload.to_bytes(), attachment)
@@ -320,7 +345,8 @@ class Ros2Graph:
             self._listen(topic_key(self._place.domain, topic, kind, type_hash), topic, heard)
 
     def tap(self, topic: str, take: Callable[[str, Attachment], None]) -> None:
-        """Gives the type and the attachment of every message of a topic to `take`, in a thread of Zenoh's.
+        """Gives the type and the attachment of every message of a topic to `take`, in a thread
+        of Zenoh's.
 
         It listens unseen: no subscription of it is in the graph.
         """
@@ -330,7 +356,9 @@ class Ros2Graph:
 
         self._listen(f"{self._place.domain}/{topic}/*/*", topic, heard)
 
-    def _listen(self, key: str, topic: str, take: Callable[[zenoh.Sample, Attachment], None]) -> None:
+    def _listen(
+        self, key: str, topic: str, take: Callable[[zenoh.Sample, Attachment], None]
+    ) -> None:
 
         def heard(sample: zenoh.Sample) -> None:
             attachment = parse_attachment(sample.attachment)
@@ -339,10 +367,14 @@ class Ros2Graph:
             else:
                 take(sample, attachment)
 
-        self._kept.append(self._session.declare_subscriber(key, handlers.Callback(heard, indirect=False)))
+        self._kept.append(
+            self._session.declare_subscriber(key, handlers.Callback(heard, indirect=False))
+        )
 
     def serve(self, service: str, kind: str, answer: Callable[[bytes], bytes]) -> None:
-        """Answers the requests of a service, one after another with those of others, in a thread for them."""
+        """Answers the requests of a service, one after another with those of others, in a
+        thread for them.
+        """
         key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
 
         def reply(query: zenoh.Query) -> None:
@@ -352,14 +384,22 @@ class Ros2Graph:
                     self.refusals.add(f"{service}: a request without an attachment of ROS")
                     return
                 told = asked._replace(sent_unix_ns=self._clock.unix_ns())
-                query.reply(query.key_expr, answer(query.payload.to_bytes()), attachment=told.encode())
+                query.reply(
+                    query.key_expr, answer(query.payload.to_bytes()), attachment=told.encode()
+                )
 
-        handler: Any = handlers.Callback(lambda query: self._answers.submit(reply, query), indirect=False)
+        handler: Any = handlers.Callback(
+            lambda query: self._answers.submit(reply, query), indirect=False
+        )
         self._kept.append(self._session.declare_queryable(key, handler, complete=True))
 
-    def _declare(self, end: EndpointKind, name: str, kind: str, qos: QualityOfService) -> tuple[str, bytes]:
+    def _declare(
+        self, end: EndpointKind, name: str, kind: str, qos: QualityOfService
+    ) -> tuple[str, bytes]:
         self._endpoints += 1
         type_hash = find_type_hash(kind, self._distro)
-        token = self._place.endpoint_token(self._endpoints, end, name, kind, type_hash, qos)
+        token = self._place.endpoint_token(
+            number=self._endpoints, end=end, name=name, kind=kind, type_hash=type_hash, qos=qos
+        )
         self._kept.append(self._session.liveliness().declare_token(token))
         return topic_key(self._place.domain, name, kind, type_hash), make_gid(token)

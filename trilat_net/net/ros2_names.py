@@ -14,5 +14,7 @@ def check_ros_name(name: str, what: str) -> str:
         UsageError: it is none.
     """
     if not _NAME.fullmatch(bare := name.removeprefix("/")):
-        raise UsageError(f"{what} {name!r} is no name of ROS 2: letters, digits and _ in parts between /")
+        raise UsageError(
+            f"{what} {name!r} is no name of ROS 2: letters, digits and _ in parts between /"
+        )
     return bare

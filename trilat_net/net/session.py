@@ -1,14 +1,15 @@
 """The start of a session: members meet and agree on one epoch.
 
-Invariant: one epoch for any start order. The first site of the scenario leads: once every member has replied
-consistently, it announces an epoch with the boots it is for; once all have replied `ready` in time it sends
-`start`, and otherwise announces another epoch. No member starts without `start`; a late recorder learns the
-epoch from the running members. So does a site that `returns`: it says `coming` with a first tick, and joins
-when every running site has said `admit` in time, which they do once the start before it is gone.
+Invariant: one epoch for any start order. The first site of the scenario leads: once every
+member has replied consistently, it announces an epoch with the boots it is for; once all have
+replied `ready` in time it sends `start`, and otherwise announces another epoch. No member
+starts without `start`; a late recorder learns the epoch from the running members. So does a
+site that `returns`: it says `coming` with a first tick, and joins when every running site has
+said `admit` in time, which they do once the start before it is gone.
 
-The epoch is an instant of the leader's monotonic clock. A member on another clock converts it by pings, to
-half a round trip, and is ready only when it knows all clocks it needs; wall clocks decide nothing.
-Everything is polled, on a given `Bus` and `Clock`; nothing waits.
+The epoch is an instant of the leader's monotonic clock. A member on another clock converts it
+by pings, to half a round trip, and is ready only when it knows all clocks it needs; wall clocks
+decide nothing. Everything is polled, on a given `Bus` and `Clock`; nothing waits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +19,14 @@ from ..errors import SessionError
 from . import topics
 from .bus import Bus
 from .clock import Clock
-from .membership import Epoch, EventPublisher, LateSites, Membership, liveliness_token, read_messages
+from .membership import (
+    Epoch,
+    EventPublisher,
+    LateSites,
+    Membership,
+    liveliness_token,
+    read_messages,
+)
 from .messages import Event, Info
 from .pinging import Pinger, answer_pings
 
@@ -31,7 +39,8 @@ LATE_GATHER_NS = 1_500_000_000
 
 
 class SessionJoin:
-    """The way of a member, whose subscriptions are declared, into a session; call `poll` for the epoch.
+    """The way of a member, whose subscriptions are declared, into a session; call `poll` for
+    the epoch.
 
     Attributes:
         refusal: why a running site has not admitted this one, "" if none has said so.
@@ -56,7 +65,9 @@ class SessionJoin:
         self._admitted: set[str] = set()
         self._starts: dict[str, int] = {}  # of others that were admitted meanwhile
         self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 256)
-        self.membership = Membership(bus, clock, session, publisher, sites, late)
+        self.membership = Membership(
+            bus=bus, clock=clock, session=session, publisher=publisher, sites=sites, late=late
+        )
         self.pinger = Pinger(bus, clock, session)
         self._met_ns: int | None = None  # the first member of a running session
         answer_pings(bus, clock, session, publisher.info)
@@ -77,7 +88,9 @@ class SessionJoin:
 
     @property
     def coming_at(self) -> int:
-        """The first tick that this site has said last, if it comes to a running session; else 0."""
+        """The first tick that this site has said last, if it comes to a running session; else
+        0.
+        """
         return 0 if self._coming is None else self._coming[0].ticks
 
     @property
@@ -100,7 +113,8 @@ class SessionJoin:
             self._reply_ready()
             running = membership.running()
             if running and (self._late.returns or not self._sites):
-                if self._announced is None or now_ns >= self._epoch_ns:  # else `start` may be under way
+                # else `start` may be under way
+                if self._announced is None or now_ns >= self._epoch_ns:
                     epoch = self._join_late(running, now_ns)
             elif membership.leads:
                 epoch = self._lead()
@@ -127,11 +141,18 @@ class SessionJoin:
         foreign = {info.boot for info in running if info.clock != own}
         if self._sites and not self.pinger.know(foreign):
             return None
-        places = {name: n for n, name in enumerate(self._sites)}  # ticks follow the grid of the first site
-        for info in sorted(running, key=lambda info: (info.clock != own, places.get(info.member, -1))):
+        # ticks follow the grid of the first site
+        places = {name: n for n, name in enumerate(self._sites)}
+        for info in sorted(
+            running, key=lambda info: (info.clock != own, places.get(info.member, -1))
+        ):
             if info.clock == own or self.pinger.know([info.boot]):
                 # as the clocks stand now: their drift apart since the epoch is unknown
-                offset_ns = 0 if info.clock == own else self.pinger.estimate(info.boot).offset_at(now_ns)
+                offset_ns = (
+                    0
+                    if info.clock == own
+                    else self.pinger.estimate(info.boot).offset_at(now_ns)
+                )
                 epoch = Epoch(info.epoch_mono_ns - offset_ns, info.epoch_unix_ns, info.boots)
                 if not self._sites:
                     return epoch
@@ -140,7 +161,9 @@ class SessionJoin:
         return None
 
     def _ask_to_join(self, epoch: Epoch, running: Sequence[Info], now_ns: int) -> Epoch | None:
-        """Says `coming`, again and again; returns the epoch when every running site has admitted it."""
+        """Says `coming`, again and again; returns the epoch when every running site has
+        admitted it.
+        """
         own = self._own
         rate_hz = self._late.rate_hz
         slowest_ns = self.pinger.slowest_ns()
@@ -150,9 +173,13 @@ class SessionJoin:
             if now_ns < first_ns - DECIDE_NS:
                 if not self._admitted >= {info.member for info in running}:
                     return None
-                epochs = {info.member: info.epoch_mono_ns for info in running} | {own.member: told.mono_ns}
+                epochs = {info.member: info.epoch_mono_ns for info in running} | {
+                    own.member: told.mono_ns
+                }
                 boots = {**running[0].boots, **self._starts, own.member: own.boot}
-                return told._replace(boots=boots, epochs=epochs, first=event.ticks, coming=event)
+                return told._replace(
+                    boots=boots, epochs=epochs, first=event.ticks, coming=event
+                )
         since_ns = now_ns - epoch.mono_ns
         first = first_tick_at(since_ns + EPOCH_AHEAD_NS + 2 * slowest_ns, rate_hz)
         self._attempt += 1
@@ -190,13 +217,17 @@ class SessionJoin:
                 self._starts[event.about] = event.boots[event.about]
             own = self._own
             to_own = event.about == own.member and event.boots.get(own.member) == own.boot
-            if self._coming is not None and to_own:  # a running site admits this one, or says why not
+            # a running site admits this one, or says why not
+            if self._coming is not None and to_own:
                 if event.kind == "refused":
                     self.refusal = event.text
                 elif event.kind == "admit" and event.attempt == self._attempt:
                     self._admitted.add(event.member)
             announced = self._announced
-            if announced is None or (event.attempt, event.boots) != (announced.attempt, announced.boots):
+            if announced is None or (event.attempt, event.boots) != (
+                announced.attempt,
+                announced.boots,
+            ):
                 continue
             if event.kind == "ready":
                 self._ready[event.member] = event.epoch_mono_ns
@@ -212,15 +243,19 @@ class SessionJoin:
         if self.membership.leads or (self._sites and event.member != self._sites[0]):
             return
         if not self._sites and not any(
-            info.scenario and event.boots.get(name) == info.boot for name, info in self.membership.met.items()
+            info.scenario and event.boots.get(name) == info.boot
+            for name, info in self.membership.met.items()
         ):
             return  # a recorder that has not learnt the scenario is not ready
         if event.boots.get(self._own.member) == self._own.boot:
             if not self._is_bound(event):
                 self._offered = event
                 self._reply_ready()
-        elif self._own.member in event.boots and self._sites:  # of two recorders, one joins late
-            raise SessionError(f"session {self._session!r} goes on with another {self._own.member}")
+        # of two recorders, one joins late
+        elif self._own.member in event.boots and self._sites:
+            raise SessionError(
+                f"session {self._session!r} goes on with another {self._own.member}"
+            )
 
     def _is_bound(self, event: Event) -> bool:
         """True if this member has sent `ready` to another leader, who may still send `start`."""
@@ -262,7 +297,9 @@ class SessionJoin:
             return None
         decide_ns = self._epoch_ns - DECIDE_NS - self.pinger.slowest_ns()
         if now_ns >= decide_ns or announced.boots != membership.boots() or membership.missing():
-            self._announced = None  # a member was too late, is gone, or has come: another attempt
+            self._announced = (
+                None  # a member was too late, is gone, or has come: another attempt
+            )
         elif self._ready.keys() | {self._own.member} >= set(announced.boots):
             start = self._publisher.publish(
                 "start",

@@ -1,12 +1,14 @@
 """Timing of a running site: tick deadlines, stamps, and delays and clock offset of each link.
 
-Invariant (L1): tick k is due at `k * 10^9 // rate_hz` ns after the epoch, to the nanosecond, on the leader's
-clock. A site on another clock follows by slewing, at most SLEW_LIMIT, never by a step; while the leader is
-away, along its clock as last estimated. Sites of one machine wake up in turn after that, see `find_turn_ns`.
-Measuring changes no number of a run: an impossible stamp is counted, and its sample is used.
+Invariant (L1): tick k is due at `k * 10^9 // rate_hz` ns after the epoch, to the nanosecond, on
+the leader's clock. A site on another clock follows by slewing, at most SLEW_LIMIT, never by a
+step; while the leader is away, along its clock as last estimated. Sites of one machine wake up
+in turn after that, see `find_turn_ns`. Measuring changes no number of a run: an impossible
+stamp is counted, and its sample is used.
 
-Four stamps make a round trip: own sending (t1) and the peer's arrival (t2) of the record that the peer
-echoes, the peer's sending (t3) and own arrival (t4) of the record that carries the echo.
+Four stamps make a round trip: own sending (t1) and the peer's arrival (t2) of the record that
+the peer echoes, the peer's sending (t3) and own arrival (t4) of the record that carries the
+echo.
 """
 
 from array import array
@@ -55,9 +57,11 @@ class TickSchedule:
         return self._base_ns + passed_ns + int(passed_ns * self._slew_per_ns)
 
     def steer(self, k: int, error_ns: int, drift: float) -> None:
-        """Slews towards the leader's schedule from a tick on, at or after the last one it was steered from.
+        """Slews towards the leader's schedule from a tick on, at or after the last one it was
+        steered from.
 
-        The tick is late by `error_ns` against that schedule; `drift`, ns/s, is that of the leader's clock.
+        The tick is late by `error_ns` against that schedule; `drift`, ns/s, is that of the
+        leader's clock.
         """
         self._base_ns = self.due_ns(k)
         self._from_ns = k * NS_PER_S // self._rate_hz
@@ -74,7 +78,9 @@ _FAR_NS = 1 << 62
 
 
 class SentStamps:
-    """Times of sending of the latest own records, by tick; enough for round trips of some seconds."""
+    """Times of sending of the latest own records, by tick; enough for round trips of some
+    seconds.
+    """
 
     def __init__(self, capacity: int = 1 << 14) -> None:
         self._capacity = capacity
@@ -118,8 +124,10 @@ class LinkTimingMonitor:
     """Timing of one link, at its receiving end.
 
     Attributes:
-        newest: tick of the newest sample since the last echo, and its arrival on the own clock, ns.
-        worst_ns: largest time by which a sample arrived before it was sent, since the last report.
+        newest: tick of the newest sample since the last echo, and its arrival on the own clock,
+            ns.
+        worst_ns: largest time by which a sample arrived before it was sent, since the last
+            report.
         unheard: True once the peer was found not to hear this site, until it hears it again.
     """
 
@@ -147,12 +155,16 @@ class LinkTimingMonitor:
         self._open_window()
 
     def _open_window(self) -> None:
-        self._there_ns = self._back_ns = _FAR_NS  # smallest delays of the window, with their limits
+        self._there_ns = self._back_ns = (
+            _FAR_NS  # smallest delays of the window, with their limits
+        )
         self._ceiling: OffsetLimit | None = None
         self._floor: OffsetLimit | None = None
 
     def take(self, sample: PeerSample, arrived_ns: int) -> int:
-        """Takes the stamps of one sample that arrived on the own clock; returns its one-way delay, ns."""
+        """Takes the stamps of one sample that arrived on the own clock; returns its one-way
+        delay, ns.
+        """
         offset_ns = self.offset.at(arrived_ns) if self._shared_ns is None else self._shared_ns
         sent_ns = sample.sent_ns + self._epoch_ns
         delay_ns = arrived_ns - sent_ns + offset_ns
@@ -194,7 +206,9 @@ class LinkTimingMonitor:
         return self._heard_ns - self._acknowledged_ns <= UNHEARD_NS
 
     def close(self, now_ns: int, from_ns: int) -> OffsetEstimate | None:
-        """Closes the window if it is due, and slews to the new estimate from an instant on; else None."""
+        """Closes the window if it is due, and slews to the new estimate from an instant on;
+        else None.
+        """
         estimator = self.peer.estimator
         if estimator is None:
             return None
@@ -238,7 +252,9 @@ FAULT_EVERY_NS = 1_000_000_000
 UNHEARD_NS = 200_000_000
 """A peer that is heard and acknowledges no newer sample for longer does not hear this site."""
 FIRST_BOUND_NS = 2_000_000
-"""How far the clock of a site that joins may be from what it says, besides the bound that it states."""
+"""How far the clock of a site that joins may be from what it says, besides the bound that it
+states.
+"""
 
 
 ClockNotice = dict[str, Any]
@@ -246,10 +262,12 @@ ClockNotice = dict[str, Any]
 
 
 def find_turn_ns(place: int, sites: int, rate_hz: int) -> int:
-    """Returns how long after a tick of the grid a site wakes up that is one of several on its machine.
+    """Returns how long after a tick of the grid a site wakes up that is one of several on its
+    machine.
 
-    Woken up at one instant, they would wait for one another's processors. The turns take half of a period, so
-    that a sample of the last one is still there well before the next tick of the first.
+    Woken up at one instant, they would wait for one another's processors. The turns take half
+    of a period, so that a sample of the last one is still there well before the next tick of
+    the first.
 
     Args:
         place: of the site among them, from 0.
@@ -260,14 +278,20 @@ def find_turn_ns(place: int, sites: int, rate_hz: int) -> int:
 
 
 class SiteTiming:
-    """Deadlines of a site, and timing of its links; the schedule of the leader is the session's.
+    """Deadlines of a site, and timing of its links; the schedule of the leader is the
+    session's.
 
     Attributes:
         turn_ns: how long after a tick of the grid the site wakes up, see `find_turn_ns`.
     """
 
     def __init__(
-        self, epoch_ns: int, rate_hz: int, peers: Sequence[PeerClock], leader: str, turn_ns: int = 0
+        self,
+        epoch_ns: int,
+        rate_hz: int,
+        peers: Sequence[PeerClock],
+        leader: str,
+        turn_ns: int = 0,
     ) -> None:
         self.schedule = TickSchedule(epoch_ns, rate_hz)
         self.turn_ns = turn_ns
@@ -282,7 +306,9 @@ class SiteTiming:
         self._faults_ns = [-FAULT_EVERY_NS] * len(peers)
 
     def deadline(self, k: int) -> int:
-        """Returns when the site is to wake up for tick k, on its clock, ns: on the grid, and in its turn."""
+        """Returns when the site is to wake up for tick k, on its clock, ns: on the grid, and in
+        its turn.
+        """
         return self.schedule.due_ns(k) + self.turn_ns
 
     def opening(self) -> list[ClockNotice]:
@@ -290,8 +316,11 @@ class SiteTiming:
         meters = (meter for meter in self.meters if not meter.peer.is_own)
         return [_estimate_notice(meter, 0, self._epoch_ns) for meter in meters]
 
-    def admit(self, index: int, t_ns: int, epoch_ns: int, bound_ns: int | None) -> list[ClockNotice]:
-        """Begins with another start of a peer, which joins at a time since the epoch; returns the events.
+    def admit(
+        self, index: int, t_ns: int, epoch_ns: int, bound_ns: int | None
+    ) -> list[ClockNotice]:
+        """Begins with another start of a peer, which joins at a time since the epoch; returns
+        the events.
 
         Args:
             index: the peer's.
@@ -319,7 +348,9 @@ class SiteTiming:
         return now_ns - self._epoch_ns
 
     def echo(self) -> list[tuple[int, int, int]]:
-        """Returns each peer's newest sample since the last call: (peer, tick, arrival), see `State`."""
+        """Returns each peer's newest sample since the last call: (peer, tick, arrival), see
+        `State`.
+        """
         echo = []
         for index, meter in enumerate(self.meters):
             if meter.newest is not None:
@@ -329,7 +360,9 @@ class SiteTiming:
         return echo
 
     def settle(self, k: int, now_ns: int) -> list[ClockNotice]:
-        """Estimates one clock, steers the schedule from tick k on, returns the events; ten times a second."""
+        """Estimates one clock, steers the schedule from tick k on, returns the events; ten
+        times a second.
+        """
         notices: list[ClockNotice] = []
         due_ns = self.schedule.due_ns(k)
         for _ in self.meters:  # one estimate at a time, in turn: it takes a part of a tick
@@ -372,7 +405,9 @@ def _estimate_notice(meter: LinkTimingMonitor, k: int, at_ns: int) -> ClockNotic
     name = meter.peer.name
     offset_ns = offset.at(at_ns)
     drift_bound = max(estimate.drift_high - estimate.drift, estimate.drift - estimate.drift_low)
-    told = f"{format_offset(offset_ns, offset.bound_ns)}, drift {estimate.drift / 1000:+.2f} ppm"
+    told = (
+        f"{format_offset(offset_ns, offset.bound_ns)}, drift {estimate.drift / 1000:+.2f} ppm"
+    )
     return {
         "kind": "clock",
         "text": f"clock of {name}: {told}",
@@ -393,7 +428,13 @@ def _fault_notice(meter: LinkTimingMonitor) -> ClockNotice:
     if before_ns:
         what = f"a sample came {before_ns / 1e6:.3f} ms before it was sent"
     text = f"clock of {name}: {what}; one of the two clocks has stepped"
-    return {"kind": "clock fault", "text": text, "about": name, "offset_ns": before_ns, "bound_ns": bound_ns}
+    return {
+        "kind": "clock fault",
+        "text": text,
+        "about": name,
+        "offset_ns": before_ns,
+        "bound_ns": bound_ns,
+    }
 
 
 def _hearing_notice(meter: LinkTimingMonitor, k: int) -> ClockNotice:
@@ -425,7 +466,9 @@ class LoopStats:
         self.overruns = 0
 
     def tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
-        """Counts one tick: its lateness, the computing time of the one before, and how many were not made."""
+        """Counts one tick: its lateness, the computing time of the one before, and how many
+        were not made.
+        """
         self.overruns += skipped
         if late_us > self._late_max_us:
             self._late_max_us = late_us
@@ -434,11 +477,14 @@ class LoopStats:
         self.overruns += late_us >= self._period_us
 
     def due(self, k: int, skipped: int = 0) -> bool:
-        """True at the ticks after which statistics are published; one stands for the skipped ones before."""
+        """True at the ticks after which statistics are published; one stands for the skipped
+        ones before.
+        """
         return k % self._every <= skipped
 
     def take(self, output: TickRecord, measured: Mapping[str, Any] | None = None) -> LinkStats:
-        """Returns the statistics as of a record's tick, with the timing fields that were measured if any.
+        """Returns the statistics as of a record's tick, with the timing fields that were
+        measured if any.
 
         The largest values begin anew.
         """
@@ -449,7 +495,8 @@ class LoopStats:
             for peer, used, rate_hz in zip(peers, output.used, self._rates, strict=True)
         }
         by_peer: dict[str, Any] = {
-            field: {peer: getattr(count, field) for peer, count in counts.items()} for field in _LINK_COUNTS
+            field: {peer: getattr(count, field) for peer, count in counts.items()}
+            for field in _LINK_COUNTS
         }
         stats = LinkStats(
             v=VERSION,

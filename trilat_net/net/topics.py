@@ -1,4 +1,5 @@
-"""Bus keys `trilat/<session>/<member>/<channel>`, a boot number after `alive`; and numbers of their messages.
+"""Bus keys `trilat/<session>/<member>/<channel>`, a boot number after `alive`; and numbers of
+their messages.
 
 Each record has its tick's number, and statistics are numbered by themselves.
 """
@@ -39,12 +40,16 @@ class KeyParts(NamedTuple):
 
 
 def presence_key(session: str, member: str) -> str:
-    """Returns the expression of the liveliness tokens of a member's starts; `*` stands for every one."""
+    """Returns the expression of the liveliness tokens of a member's starts; `*` stands for
+    every one.
+    """
     return f"{key(session, member, ALIVE)}/*"
 
 
 def read_presence(inbox: PresenceInbox) -> Iterator[tuple[KeyParts, bool]]:
-    """Yields the changes of presence that wait in a ring: whose token, and whether it is alive now."""
+    """Yields the changes of presence that wait in a ring: whose token, and whether it is alive
+    now.
+    """
     while (change := inbox.poll()) is not None:
         if (parts := parse_key(change[0])) is not None:
             yield parts, change[1]
@@ -78,13 +83,19 @@ def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
 
 
 def count_under_way(channel: str, rate_hz: int) -> int:
-    """Returns how many messages that a site has sent may die with it when it is killed: those of 20 ms."""
+    """Returns how many messages that a site has sent may die with it when it is killed: those
+    of 20 ms.
+    """
     return 1 if channel == LINK else rate_hz // 50
 
 
 def skipped_numbers(channel: str, tick: int, skipped: int, rate_hz: int) -> tuple[int, int]:
-    """Returns what a site does not publish that makes no ticks for so many before one, see `begin_anew`.
+    """Returns what a site does not publish that makes no ticks for so many before one, see
+    `begin_anew`.
 
-    That is the number of the message with that tick, or that stands for it, and that of the first not made.
+    That is the number of the message with that tick, or that stands for it, and that of the
+    first not made.
     """
-    return number_message(channel, tick, rate_hz), count_messages(channel, tick - skipped, rate_hz)
+    return number_message(channel, tick, rate_hz), count_messages(
+        channel, tick - skipped, rate_hz
+    )

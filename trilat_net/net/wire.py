@@ -1,9 +1,11 @@
 """Encoding and decoding of messages.
 
-Invariant: decoding never trusts its input. A payload yields a message of this schema version with finite
-numbers in range, or a `WireError` whose reason is counted; encoding refuses what decoding would.
+Invariant: decoding never trusts its input. A payload yields a message of this schema version
+with finite numbers in range, or a `WireError` whose reason is counted; encoding refuses what
+decoding would.
 
-Payloads are MessagePack maps with string keys and plain lists, as the types of `messages` and `requests`.
+Payloads are MessagePack maps with string keys and plain lists, as the types of `messages` and
+`requests`.
 """
 
 import math
@@ -36,14 +38,18 @@ from .requests import BACKFILL_BYTES, ArmMeasurement, Backfill, HandMessage, Req
 MAX_BYTES = 65_536
 MAX_INFO_BYTES = 64 * 1024 * 1024
 MAX_PAST_BYTES = 2 * MAX_BYTES
-"""Largest message; largest `Info`, which holds a whole scenario with its traces; largest `Backfill`."""
+"""Largest message; largest `Info`, which holds a whole scenario with its traces; largest
+`Backfill`.
+"""
 SAMPLE_BYTES = 2_048
 NUMBER_BYTES = 9
 """Of a sample, besides its vectors; of one of their numbers."""
 
 _Sent = LinkStats | Event | Info | RecorderStats | Request
 _KINDS: list[type[msgspec.Struct]] = [State, PeerSample, LinkStats, Event, Info, RecorderStats]
-_DECODERS = {kind: msgspec.msgpack.Decoder(kind) for kind in [*_KINDS, *Request.__subclasses__()]}
+_DECODERS = {
+    kind: msgspec.msgpack.Decoder(kind) for kind in [*_KINDS, *Request.__subclasses__()]
+}
 _LIMITS: dict[type[msgspec.Struct], int] = {Info: MAX_INFO_BYTES, Backfill: MAX_PAST_BYTES}
 _isfinite = math.isfinite
 _encode = msgspec.msgpack.Encoder().encode
@@ -56,7 +62,8 @@ def _vectors(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
     if kind is PeerSample:
         return dict.fromkeys(("q", "qd", "tau_x"), layout.shared) | {"ch": layout.sent}
     if kind is HandMessage:
-        return dict.fromkeys(("target", "force"), 0)  # its receiver knows which of them it takes
+        # its receiver knows which of them it takes
+        return dict.fromkeys(("target", "force"), 0)
     return dict.fromkeys(("q", "qd"), layout.joints) if kind is ArmMeasurement else {}
 
 
@@ -73,16 +80,35 @@ def encode_state(
 ) -> bytes:
     """Returns the payload of one record.
 
-    The arguments are the fields of `State`. Without `sent_ns`, in virtual time, it is the nominal time.
+    The arguments are the fields of `State`. Without `sent_ns`, in virtual time, it is the
+    nominal time.
 
     Raises:
         WireError: a number is not finite.
     """
-    (tick, t_ns, mode, q, qd, q_des, qd_des, tau, tau_x, theta_hat, used, rx_crc, cmd, mem, *task) = output
+    (
+        tick,
+        t_ns,
+        mode,
+        q,
+        qd,
+        q_des,
+        qd_des,
+        tau,
+        tau_x,
+        theta_hat,
+        used,
+        rx_crc,
+        cmd,
+        mem,
+        *task,
+    ) = output
     x, xd, wrench, ch, hand, bodies = task
     vectors = (q, qd, q_des, qd_des, tau, tau_x, theta_hat, mem, *task)
     # a sum is finite only if its terms are; the second check is for finite terms whose sum overflows
-    if not _isfinite(sum(map(sum, vectors))) and not all(map(_isfinite, chain.from_iterable(vectors))):
+    if not _isfinite(sum(map(sum, vectors))) and not all(
+        map(_isfinite, chain.from_iterable(vectors))
+    ):
         raise WireError("not finite", f"{site} at tick {tick}")
     fields = {
         "v": VERSION,
@@ -147,7 +173,9 @@ def encode_sample(
 
 
 def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
-    """Yields blocks of records, one record behind the other, no longer than an answer of a site's buffer."""
+    """Yields blocks of records, one record behind the other, no longer than an answer of a
+    site's buffer.
+    """
     block: list[bytes] = []
     size = 0
     for payload in payloads:
@@ -191,21 +219,28 @@ M = TypeVar("M", bound=msgspec.Struct)
 
 
 def decode(
-    payload: bytes, kind: type[M], versions: Collection[int] = (VERSION,), layout: Layout | None = None
+    payload: bytes,
+    kind: type[M],
+    versions: Collection[int] = (VERSION,),
+    layout: Layout | None = None,
 ) -> M:
-    """Returns the message of a payload, of the present schema version or of those that a file may have.
+    """Returns the message of a payload, of the present schema version or of those that a file
+    may have.
 
     Without the `layout` of its sender vectors may have any length.
 
     Raises:
-        WireError: it is oversized, malformed, of another version, not finite, or of the wrong length.
+        WireError: it is oversized, malformed, of another version, not finite, or of the wrong
+            length.
     """
     return make_decoder(kind, tuple(versions), layout)(payload)  # type: ignore[no-any-return]
 
 
 @cache
 def make_decoder(
-    kind: type[msgspec.Struct], versions: tuple[int, ...] = (VERSION,), layout: Layout | None = None
+    kind: type[msgspec.Struct],
+    versions: tuple[int, ...] = (VERSION,),
+    layout: Layout | None = None,
 ) -> Callable[[bytes], Any]:
     """Returns `decode` for one kind of message, with all that it needs at hand."""
     limit = _LIMITS.get(kind, MAX_BYTES)
@@ -218,7 +253,9 @@ def make_decoder(
 
     def read(payload: bytes) -> Any:
         if len(payload) > limit:
-            raise WireError("oversized", f"{count_nouns(len(payload), 'byte')}, at most {limit}")
+            raise WireError(
+                "oversized", f"{count_nouns(len(payload), 'byte')}, at most {limit}"
+            )
         try:
             message: Any = parse(payload)
         except (ValueError, RecursionError) as error:
@@ -233,15 +270,21 @@ def make_decoder(
             if not _isfinite(sum(map(sum, vectors))):
                 for name, vector in zip(names, vectors, strict=True):
                     if not all(map(_isfinite, vector)):
-                        number = message.n if kind in (ArmMeasurement, HandMessage) else message.tick
+                        number = (
+                            message.n if kind in (ArmMeasurement, HandMessage) else message.tick
+                        )
                         raise WireError("not finite", f"{name} of {message.site} at {number}")
         return message
 
     return read
 
 
-def make_reader(kind: type[msgspec.Struct], layout: Layout) -> Callable[[bytes], Any | WireError]:
-    """Returns a decoder that returns its error: for threads of the bus, in which nothing may be raised."""
+def make_reader(
+    kind: type[msgspec.Struct], layout: Layout
+) -> Callable[[bytes], Any | WireError]:
+    """Returns a decoder that returns its error: for threads of the bus, in which nothing may be
+    raised.
+    """
     decoder = make_decoder(kind, layout=layout)
 
     def read(payload: bytes) -> Any | WireError:
@@ -257,5 +300,9 @@ def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) ->
     for vector, (name, length) in zip(vectors, lengths.items(), strict=True):
         if (count := len(vector)) != length:
             joints = name == "q" and 1 <= count <= MAX_JOINTS  # so that reasons are few
-            reason = f"of {count_nouns(count, 'joint')}; the scenario has {length}" if joints else "malformed"
+            reason = (
+                f"of {count_nouns(count, 'joint')}; the scenario has {length}"
+                if joints
+                else "malformed"
+            )
             raise WireError(reason, f"{name} has {count_nouns(count, 'number')}, not {length}")

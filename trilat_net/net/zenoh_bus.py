@@ -1,7 +1,8 @@
 """The bus over Eclipse Zenoh; only it and `ros2_graph` import `zenoh`.
 
-Invariant: nothing here waits for the network. A publisher drops a message rather than delay its caller
-(except a patient one), queries go into a ring, and a session that cannot open yet raises an error.
+Invariant: nothing here waits for the network. A publisher drops a message rather than delay its
+caller (except a patient one), queries go into a ring, and a session that cannot open yet raises
+an error.
 """
 
 import ctypes
@@ -19,7 +20,15 @@ from zenoh import CongestionControl, Locality, Priority, handlers
 
 from ..errors import SessionError, UsageError
 from ..files import reading
-from .bus import RING_CAPACITY, BoundedRing, Inbox, PresenceInbox, QueryInbox, StampedInbox, StampingRing
+from .bus import (
+    RING_CAPACITY,
+    BoundedRing,
+    Inbox,
+    PresenceInbox,
+    QueryInbox,
+    StampedInbox,
+    StampingRing,
+)
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make_zenoh_config
 
 ASK_TIMEOUT_S = 3.0
@@ -32,11 +41,13 @@ T = TypeVar("T")
 
 
 def share_threads() -> None:
-    """Puts all of Zenoh into one pool from the first session on, not five, whose threads wake one another.
+    """Puts all of Zenoh into one pool from the first session on, not five, whose threads wake
+    one another.
 
-    One thread of it does the work. Where a connection is closed with bytes that its peer never took, closing
-    holds a thread for up to 10 s (eclipse-zenoh/zenoh#1101); the others then serve the other members.
-    Not for a router: it waits for room where it reads, and needs a thread that sends meanwhile.
+    One thread of it does the work. Where a connection is closed with bytes that its peer never
+    took, closing holds a thread for up to 10 s (eclipse-zenoh/zenoh#1101); the others then
+    serve the other members. Not for a router: it waits for room where it reads, and needs a
+    thread that sends meanwhile.
     """
     os.environ.setdefault("ZENOH_RUNTIME", ONE_POOL)
 
@@ -46,7 +57,9 @@ class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
 
 
 class _ZenohRing(Generic[T]):
-    """A ring of Zenoh's; `read` turns what it holds into an entry, or into None, which is passed over."""
+    """A ring of Zenoh's; `read` turns what it holds into an entry, or into None, which is
+    passed over.
+    """
 
     def __init__(self, source: Any, read: Callable[[Any], T | None]) -> None:
         self._source = source
@@ -64,10 +77,11 @@ class _ZenohRing(Generic[T]):
 
 
 def _handle_samples(take: Callable[[Any], None]) -> Any:
-    """Returns a handler that calls `take` in Zenoh's threads, each of which keeps its Python state.
+    """Returns a handler that calls `take` in Zenoh's threads, each of which keeps its Python
+    state.
 
-    Else CPython makes that state anew for every message, and unmaps it. A thread asks for the interpreter
-    once more than it gives it back, so its state lives as long as the process.
+    Else CPython makes that state anew for every message, and unmaps it. A thread asks for the
+    interpreter once more than it gives it back, so its state lives as long as the process.
     """
     kept = threading.local()
 
@@ -107,11 +121,14 @@ def open_zenoh(
 
     Raises:
         UsageError: an endpoint is malformed, or cannot be listened at.
-        RouterSilent: a client's router does not answer: the text `silent`, with the endpoints in place of {}.
+        RouterSilent: a client's router does not answer: the text `silent`, with the endpoints
+            in place of {}.
     """
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # logs nothing without RUST_LOG
     try:
-        return zenoh.open(zenoh.Config.from_json5(json.dumps(make_zenoh_config(listen, connect, mode, own))))
+        return zenoh.open(
+            zenoh.Config.from_json5(json.dumps(make_zenoh_config(listen, connect, mode, own)))
+        )
     except zenoh.ZError as error:
         if mode == "client" and "Unable to connect" in str(error):
             raise RouterSilent(silent.format(_endpoint_texts(connect))) from None
@@ -121,15 +138,17 @@ def open_zenoh(
                 "end the program that has it, or choose another one with --listen tcp/127.0.0.1:PORT"
             ) from None
         places = _endpoint_texts([*listen, *connect])
-        raise UsageError(f"cannot open a Zenoh session with {places}: {_first_line(error)}") from None
+        raise UsageError(
+            f"cannot open a Zenoh session with {places}: {_first_line(error)}"
+        ) from None
 
 
 class ZenohBus:
     """A `Bus` over a Zenoh session of its own, with the settings of a user's file.
 
-    It connects again and again until all endpoints answer; a client connects to the first that answers now,
-    and again if it loses it. Peers reach those that they connect to, clients and routers all that a router
-    reaches.
+    It connects again and again until all endpoints answer; a client connects to the first that
+    answers now, and again if it loses it. Peers reach those that they connect to, clients and
+    routers all that a router reaches.
 
     Raises:
         UsageError: an endpoint is malformed, or cannot be listened at.
@@ -144,7 +163,13 @@ class ZenohBus:
         own: Mapping[str, Any] | None = None,
     ) -> None:
         refused = ", or none lets this member in" if own else ""
-        self._session = open_zenoh(listen, connect, mode, own, f"no router answers at {{}}{refused}")
+        self._session = open_zenoh(
+            listen=listen,
+            connect=connect,
+            mode=mode,
+            own=own,
+            silent=f"no router answers at {{}}{refused}",
+        )
         self._kept: list[Any] = []
         self._tokens: set[str] = set()
 
@@ -172,7 +197,11 @@ class ZenohBus:
         return _ZenohRing(self._subscribe(key, handlers.RingChannel(capacity)), _read_sample)
 
     def stamped(
-        self, key: str, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int = RING_CAPACITY
+        self,
+        key: str,
+        now_ns: Callable[[], int],
+        read: Callable[[bytes], T],
+        capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
         """See `Bus`."""
         ring = StampingRing(now_ns, read, capacity)
@@ -189,7 +218,9 @@ class ZenohBus:
     def questions(self, key: str) -> QueryInbox:
         """See `Bus`; a look into a ring of our own costs a loop less than one into Zenoh's."""
         ring: BoundedRing[_ZenohQuery] = BoundedRing(64)
-        handler: Any = handlers.Callback(lambda query: ring.put(_ZenohQuery(query, key)), indirect=False)
+        handler: Any = handlers.Callback(
+            lambda query: ring.put(_ZenohQuery(query, key)), indirect=False
+        )
         self._kept.append(self._serve(key, handler))
         return ring
 
@@ -208,7 +239,9 @@ class ZenohBus:
         """See `Bus`."""
         replies = self._session.get(
             key,
-            handlers.FifoChannel(256),  # a ring forgets its answers when the last one has arrived
+            handlers.FifoChannel(
+                256
+            ),  # a ring forgets its answers when the last one has arrived
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.QueryConsolidation(zenoh.ConsolidationMode.NONE),
             timeout=ASK_TIMEOUT_S,
@@ -218,7 +251,9 @@ class ZenohBus:
             congestion_control=CongestionControl.DROP,
             priority=Priority.REAL_TIME,
         )
-        return _ZenohRing(replies, lambda reply: None if reply.ok is None else _read_sample(reply.ok))
+        return _ZenohRing(
+            replies, lambda reply: None if reply.ok is None else _read_sample(reply.ok)
+        )
 
     def announce(self, key: str) -> None:
         """See `Bus`."""
@@ -230,9 +265,13 @@ class ZenohBus:
 
         def read(sample: zenoh.Sample) -> tuple[str, bool] | None:
             token = str(sample.key_expr)  # liveliness has no locality: own tokens arrive too
-            return None if token in self._tokens else (token, sample.kind == zenoh.SampleKind.PUT)
+            return (
+                None if token in self._tokens else (token, sample.kind == zenoh.SampleKind.PUT)
+            )
 
-        tokens = self._session.liveliness().declare_subscriber(key, handlers.RingChannel(256), history=True)
+        tokens = self._session.liveliness().declare_subscriber(
+            key, handlers.RingChannel(256), history=True
+        )
         return _ZenohRing(tokens, read)
 
     def close(self) -> None:
@@ -271,7 +310,9 @@ def _parse_json5(source: str, text: str) -> object:
         ) from None
     objects: list[object] = json.loads(config.get_json("metadata"))
     if len(objects) != 1:
-        raise UsageError(f"{source}: a Zenoh configuration is one object in braces; here are {len(objects)}")
+        raise UsageError(
+            f"{source}: a Zenoh configuration is one object in braces; here are {len(objects)}"
+        )
     return objects[0]
 
 

@@ -1,22 +1,25 @@
-"""The Zenoh configuration of a session member, what each may send and hear, and checks of a user's own file.
+"""The Zenoh configuration of a session member, what each may send and hear, and checks of a
+user's own file.
 
 Invariant:
-    - Explicit endpoints only, no multicast, gossip or shared memory, so two sessions on one host never
-      meet by accident.
-    - No setting of a user's file is overruled silently: it is taken, or refused with its key, its value
-      and the value required. A setting that a session makes itself is taken if it has the session's value.
+    - Explicit endpoints only, no multicast, gossip or shared memory, so two sessions on one
+      host never meet by accident.
+    - No setting of a user's file is overruled silently: it is taken, or refused with its key,
+      its value and the value required. A setting that a session makes itself is taken if it has
+      the session's value.
     - A file is refused once, with all its settings that contradict a session.
 
-Three defaults of Zenoh do not suit a 1 kHz loop: a transmission queue of 2 batches (16 here, for bursts of
-catch-up ticks), a publisher that waits 1 ms for room (0 here: the loop never waits and the receiver counts
-drops), and `express`, which sends each message by itself; it stays off because batching makes bursts of
-thousands of small messages fit.
+Three defaults of Zenoh do not suit a 1 kHz loop: a transmission queue of 2 batches (16 here,
+for bursts of catch-up ticks), a publisher that waits 1 ms for room (0 here: the loop never
+waits and the receiver counts drops), and `express`, which sends each message by itself; it
+stays off because batching makes bursts of thousands of small messages fit.
 
-What a member may send, hear, ask and answer are rules of Zenoh's access control: everything that is not named
-is denied, at every member and at routers. A member speaks under its own name alone: its links show a
-certificate, and the name in it is the one that stands in its keys. A router carries what others said; it is
-trusted with all of it. Sizes are limited here, rates are not: Zenoh would thin out bursts, in which samples
-of ticks that are made up for arrive, and events of one tick.
+What a member may send, hear, ask and answer are rules of Zenoh's access control: everything
+that is not named is denied, at every member and at routers. A member speaks under its own name
+alone: its links show a certificate, and the name in it is the one that stands in its keys. A
+router carries what others said; it is trusted with all of it. Sizes are limited here, rates are
+not: Zenoh would thin out bursts, in which samples of ticks that are made up for arrive, and
+events of one tick.
 """
 
 import difflib
@@ -32,8 +35,9 @@ from ..files import open_regular
 from . import topics
 
 LEASE_MS = 5_000
-"""A stall shorter than this loses no connection, hence no message. A killed peer is seen at once by its
-closed connection; a silent one by the age of its samples."""
+"""A stall shorter than this loses no connection, hence no message. A killed peer is seen at
+once by its closed connection; a silent one by the age of its samples.
+"""
 
 BATCHES = 16
 BATCH_BYTES = 65_535
@@ -59,7 +63,9 @@ QUEUES = [
 
 
 CONNECT_TIMEOUT_MS = {"router": -1, "peer": -1, "client": 0}
-"""A client's session opens with its router; where that is not there yet, `open_bus` tries again."""
+"""A client's session opens with its router; where that is not there yet, `open_bus` tries
+again.
+"""
 CONNECT_EXIT_ON_FAILURE = {"router": False, "peer": False, "client": True}
 LISTEN_TIMEOUT_MS = {"router": 0, "peer": 0, "client": 0}
 """Zenoh's default, which a session leaves as it is."""
@@ -68,7 +74,13 @@ LISTEN_EXIT_ON_FAILURE = {"router": True, "peer": True, "client": True}
 
 def limit_sizes(name: str, messages: list[str], size: int) -> dict[str, Any]:
     """Returns the setting of Zenoh by which a member drops longer messages of others."""
-    return {"id": name, "flows": ["ingress"], "messages": messages, "key_exprs": ["**"], "size_limit": size}
+    return {
+        "id": name,
+        "flows": ["ingress"],
+        "messages": messages,
+        "key_exprs": ["**"],
+        "size_limit": size,
+    }
 
 
 SIZE_LIMITS = [
@@ -83,7 +95,9 @@ def make_zenoh_config(
     mode: ZenohMode = "peer",
     own: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Returns the Zenoh configuration of a session member, with the `settings` of a `ZenohFile`."""
+    """Returns the Zenoh configuration of a session member, with the `settings` of a
+    `ZenohFile`.
+    """
     tries = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
     needed: dict[str, Any] = {
         "mode": mode,
@@ -122,7 +136,9 @@ def merge_settings(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str,
     for key, value in own.items():
         under = both.get(key)
         both[key] = (
-            merge_settings(under, value) if isinstance(under, dict) and isinstance(value, dict) else value
+            merge_settings(under, value)
+            if isinstance(under, dict) and isinstance(value, dict)
+            else value
         )
     return both
 
@@ -172,35 +188,53 @@ REQUIREMENTS: Mapping[str, _Requirement] = {
         )
         for queue in QUEUES
     },
-    f"{_TX}/queue/congestion_control/drop/wait_before_drop": _exactly(0, "0: a loop never waits for room"),
+    f"{_TX}/queue/congestion_control/drop/wait_before_drop": _exactly(
+        0, "0: a loop never waits for room"
+    ),
     f"{_TX}/queue/batching/enabled": _exactly(
         True, "true: without batches a burst of catch-up ticks does not fit into the queue"
     ),
-    f"{_TX}/batch_size": _at_least(BATCH_BYTES, f"{BATCH_BYTES}: a burst of catch-up ticks must fit"),
-    f"{_TX}/lease": _at_least(LEASE_MS, f"{LEASE_MS} or more: a stall shorter than that loses no message"),
-    "transport/unicast/lowlatency": _exactly(False, "false: it sends in the loop, without a queue"),
-    "transport/shared_memory/enabled": _exactly(False, "false: a receiver that stalls would lose messages"),
+    f"{_TX}/batch_size": _at_least(
+        BATCH_BYTES, f"{BATCH_BYTES}: a burst of catch-up ticks must fit"
+    ),
+    f"{_TX}/lease": _at_least(
+        LEASE_MS, f"{LEASE_MS} or more: a stall shorter than that loses no message"
+    ),
+    "transport/unicast/lowlatency": _exactly(
+        False, "false: it sends in the loop, without a queue"
+    ),
+    "transport/shared_memory/enabled": _exactly(
+        False, "false: a receiver that stalls would lose messages"
+    ),
     "qos/publication": _UNTOUCHED,
     "qos/network": _UNTOUCHED,
     "downsampling": _UNTOUCHED,
-    "low_pass_filter": (lambda stated: stated in ([], SIZE_LIMITS), "left out: a session sets it"),
+    "low_pass_filter": (
+        lambda stated: stated in ([], SIZE_LIMITS),
+        "left out: a session sets it",
+    ),
 }
 """Requirements of a session by the path of the key in Zenoh's configuration."""
 
 _FILES = r"transport/(link/tls/\w+_(certificate|private_key)|auth/usrpwd/dictionary_file)"
-"""Keys that name files. Zenoh opens those of a connecting side late, and then retries for ever."""
+"""Keys that name files. Zenoh opens those of a connecting side late, and then retries for ever.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class ZenohFile:
-    """A user's Zenoh configuration, checked: its mode, or "", its endpoints, and its other settings."""
+    """A user's Zenoh configuration, checked: its mode, or "", its endpoints, and its other
+    settings.
+    """
 
     source: str
     mode: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
     _endpoints: Mapping[str, Any] = field(default_factory=dict)
 
-    def endpoints(self, side: Literal["listen", "connect"], mode: ZenohMode) -> list[Endpoint] | None:
+    def endpoints(
+        self, side: Literal["listen", "connect"], mode: ZenohMode
+    ) -> list[Endpoint] | None:
         """Returns its endpoints for a mode, or None without any."""
         stated = self._endpoints.get(side)
         if isinstance(stated, dict) and "locators" not in stated:
@@ -210,12 +244,15 @@ class ZenohFile:
         return list(stated) if isinstance(stated, list) else [stated]
 
 
-def check_zenoh_file(source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]) -> ZenohFile:
-    """Checks the content of a user's file; `refusal` returns Zenoh's reason for refusing settings, or "".
+def check_zenoh_file(
+    source: str, stated: object, refusal: Callable[[Mapping[str, Any]], str]
+) -> ZenohFile:
+    """Checks the content of a user's file; `refusal` returns Zenoh's reason for refusing
+    settings, or "".
 
     Raises:
-        UsageError: it is no Zenoh configuration, or contradicts requirements of a session; the message
-            has every key that does so.
+        UsageError: it is no Zenoh configuration, or contradicts requirements of a session; the
+            message has every key that does so.
     """
     if not isinstance(stated, dict):
         raise UsageError(f"{source}: a Zenoh configuration is one object in braces")
@@ -272,7 +309,9 @@ _SET_BY_MODE = (
 
 
 def _expand_mode(settings: Mapping[str, Any], value: Any) -> Any:
-    """Returns the value of a key by mode: one that is stated once is that of the file's mode, or of peers."""
+    """Returns the value of a key by mode: one that is stated once is that of the file's mode,
+    or of peers.
+    """
     return value if isinstance(value, dict) else {settings.get("mode", "peer"): value}
 
 
@@ -301,7 +340,9 @@ def _leaves(settings: Mapping[str, Any], path: tuple[str, ...]) -> Iterator[tupl
 
 
 def _find_refused_keys(
-    settings: Mapping[str, Any], refusal: Callable[[Mapping[str, Any]], str], path: tuple[str, ...]
+    settings: Mapping[str, Any],
+    refusal: Callable[[Mapping[str, Any]], str],
+    path: tuple[str, ...],
 ) -> Iterator[tuple[tuple[str, ...], str]]:
     """Yields every key that Zenoh refuses by itself, as deep as it goes, with Zenoh's reason."""
     for key, value in settings.items():
@@ -310,7 +351,11 @@ def _find_refused_keys(
         for part in reversed(here):
             alone = {part: alone}
         if reason := refusal(alone):
-            deeper = list(_find_refused_keys(value, refusal, here)) if isinstance(value, dict) else []
+            deeper = (
+                list(_find_refused_keys(value, refusal, here))
+                if isinstance(value, dict)
+                else []
+            )
             yield from deeper or [(here, reason)]
 
 
@@ -353,7 +398,14 @@ class _Role(NamedTuple):
 
 
 SITE_ROLE = _Role(
-    publishes=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.MEASURED, topics.VIEW),
+    publishes=(
+        topics.SAMPLE,
+        topics.STATE,
+        topics.LINK,
+        topics.EVENT,
+        topics.MEASURED,
+        topics.VIEW,
+    ),
     answers=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
     hears=(topics.SAMPLE, topics.LINK, topics.EVENT),
     asks=(topics.INFO, topics.PING, topics.STOP),
@@ -367,7 +419,14 @@ ROLES = {
         asks=(topics.INFO, topics.PING, topics.PAST, topics.STOP),
     ),
     OPERATOR: _Role(
-        hears=(topics.SAMPLE, topics.STATE, topics.LINK, topics.EVENT, topics.STATS, topics.VIEW),
+        hears=(
+            topics.SAMPLE,
+            topics.STATE,
+            topics.LINK,
+            topics.EVENT,
+            topics.STATS,
+            topics.VIEW,
+        ),
         asks=(topics.INFO, topics.PING, topics.PAST, topics.SET, topics.STOP),
         addresses=(topics.HAND, topics.ENABLE),
     ),
@@ -388,11 +447,15 @@ def make_access_rules(members: Sequence[str]) -> dict[str, Any]:
         relayed = [_rule(["ingress", "egress"], _EVERY, [f"{topics.ROOT}/**"])]
         own = relayed if member == ROUTER else _hold(member, ROLES.get(member, SITE_ROLE))
         kept = (rule for rule in own if rule["key_exprs"])
-        named = [{"id": f"{member} {n}", "permission": "allow", **rule} for n, rule in enumerate(kept)]
+        named = [
+            {"id": f"{member} {n}", "permission": "allow", **rule}
+            for n, rule in enumerate(kept)
+        ]
         rules += named
         policies.append({"rules": [rule["id"] for rule in named], "subjects": [member]})
     subjects = [
-        {"id": member, "cert_common_names": [member], "link_protocols": list(PROTOCOLS)} for member in members
+        {"id": member, "cert_common_names": [member], "link_protocols": list(PROTOCOLS)}
+        for member in members
     ]
     control = {"enabled": True, "default_permission": "deny", "rules": rules}
     return {
@@ -425,7 +488,9 @@ def _hold(member: str, role: _Role) -> Iterator[dict[str, Any]]:
     yield _rule(["ingress"], ["liveliness_token"], [topics.presence_key("*", member)])
     yield _rule(["ingress"], ["declare_liveliness_subscriber", "liveliness_query"], everyone)
     yield _rule(["egress"], ["put"], hears)
-    yield _rule(["egress"], ["declare_subscriber"], keys("*", (*role.publishes, *role.addresses)))
+    yield _rule(
+        ["egress"], ["declare_subscriber"], keys("*", (*role.publishes, *role.addresses))
+    )
     yield _rule(["egress"], ["query"], keys("*", role.answers))
     yield _rule(["egress"], ["declare_queryable", "reply"], keys("*", role.asks))
     yield _rule(["egress"], _ALIVE, everyone)

@@ -1,8 +1,9 @@
-"""Colours of sites, the same in every figure and on every page; widths, type and resolution of figures.
+"""Colours of sites, the same in every figure and on every page; widths, type and resolution of
+figures.
 
-Invariant: type in print is 8 pt throughout. The first three colours are the "high contrast" set of Paul Tol's
-notes on colour: safe for the colour blind and apart in lightness, also in grey print. The third is the
-slave's, however many masters there are.
+Invariant: type in print is 8 pt throughout. The first three colours are the "high contrast" set
+of Paul Tol's notes on colour: safe for the colour blind and apart in lightness, also in grey
+print. The third is the slave's, however many masters there are.
 """
 
 from collections.abc import Sequence
@@ -27,7 +28,9 @@ PAGE_IN = 7.0
 
 
 class FigureSize(NamedTuple):
-    """The measures of a figure: width, in; type of numbers at its axes and of footnotes, pt; its dpi."""
+    """The measures of a figure: width, in; type of numbers at its axes and of footnotes, pt;
+    its dpi.
+    """
 
     width_in: float
     tick_pt: float

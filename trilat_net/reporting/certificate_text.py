@@ -1,6 +1,7 @@
 """Text of a stability certificate, for the terminal and the report page.
 
-Invariant: both show the same sentences; the verdict comes first, and the listed energies add up.
+Invariant: both show the same sentences; the verdict comes first, and the listed energies add
+up.
 """
 
 from collections.abc import Iterator
@@ -39,9 +40,13 @@ def compose_certificate(found: Certificate) -> Iterator[Block]:
     premises = [*found.premises, *(() if observed is None else observed.premises)]
     rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]
     yield ""
-    yield TextTable(("premise", "", "found"), rows, styles={"holds": "green", "fails": "yellow"})
+    yield TextTable(
+        ("premise", "", "found"), rows, styles={"holds": "green", "fails": "yellow"}
+    )
     if observed is not None and observed.least:
-        least = [(name, f"{amount_j:.4g}", f"{at_s:.4g}") for name, amount_j, at_s in observed.least]
+        least = [
+            (name, f"{amount_j:.4g}", f"{at_s:.4g}") for name, amount_j, at_s in observed.least
+        ]
         yield ""
         yield TextTable(("energy of the laws", "least J", "at s"), least, align="lrr")
     if found.balance is None:
@@ -64,7 +69,8 @@ class CertificateLine(NamedTuple):
     """One sentence of a certificate.
 
     Attributes:
-        mark: "ok": it supports the run; "FAIL": it speaks against it; "open": it decides nothing; or "note".
+        mark: "ok": it supports the run; "FAIL": it speaks against it; "open": it decides
+            nothing; or "note".
     """
 
     mark: str
@@ -72,7 +78,9 @@ class CertificateLine(NamedTuple):
 
 
 def describe_certificate(found: Certificate) -> list[CertificateLine]:
-    """Returns the judgement, and then what it rests on: V, the end of the run, the balance, the roots."""
+    """Returns the judgement, and then what it rests on: V, the end of the run, the balance, the
+    roots.
+    """
     finding = found.verdict.finding
     broken = finding is StabilityFinding.BROKEN
     stable = "FAIL" if broken else _JUDGEMENT[found.stability]
@@ -86,7 +94,9 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
         lines.append((_OBSERVED[found.observed.finding], found.observed.text))
     if found.roots is not None:
         doubtful = not found.roots.exact and found.roots.verdict == "stable"
-        lines.append(("note" if doubtful else _ROOTS.get(found.roots.verdict, "note"), found.roots.text))
+        lines.append(
+            ("note" if doubtful else _ROOTS.get(found.roots.verdict, "note"), found.roots.text)
+        )
     if found.twins is not None:
         lines.append((_mark_twins(found.twins), found.twins.text))
     intact = "open" if found.evidence.reasons else "ok"
@@ -135,7 +145,9 @@ def describe_balance(balance: EnergyBalance) -> str:
 
 
 def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
-    """Returns V at the start, the energies that changed it, and V at the end, J; tiny ones are left out."""
+    """Returns V at the start, the energies that changed it, and V at the end, J; tiny ones are
+    left out.
+    """
     links = {name: x for name, x in balance.work.items() if "->" in name}
     given = {name: x for name, x in balance.work.items() if name not in links}
     if len(links) > MAX_LISTED_LINKS:
@@ -145,7 +157,10 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
     rest = balance.V - balance.V[0] - (gained - lost + balance.sampling - balance.transfer)
     entries = {
         **{f"taken: {name}": -values for name, values in balance.dissipation.items()},
-        **{f"given: {_SOURCE_NAMES.get(name, name)}": values for name, values in (given | links).items()},
+        **{
+            f"given: {_SOURCE_NAMES.get(name, name)}": values
+            for name, values in (given | links).items()
+        },
         "given: sampling of the controller": balance.sampling,
         "left by beta": -balance.transfer,
         "unexplained" if balance.judged.all() else "in gaps, or unexplained": rest,
@@ -154,6 +169,7 @@ def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
     shown = [(name, float(x[-1])) for name, x in entries.items() if np.abs(x).max() > least]
     ends = (float(x) if x > ZERO_ENERGY_J else 0.0 for x in (balance.V[0], balance.V[-1]))
     first, last = (
-        (f"V at {t_s:.4g} s", x) for t_s, x in zip((balance.t_s[0], balance.t_s[-1]), ends, strict=True)
+        (f"V at {t_s:.4g} s", x)
+        for t_s, x in zip((balance.t_s[0], balance.t_s[-1]), ends, strict=True)
     )
     return [first, *shown, last]

@@ -1,4 +1,5 @@
-"""Data of the page's interactive charts: tables of decimated columns, and charts that refer to them.
+"""Data of the page's interactive charts: tables of decimated columns, and charts that refer to
+them.
 
 Invariant:
 - Every spike of the log is on the page.
@@ -18,7 +19,12 @@ from numpy.typing import NDArray
 from ..analysis import site_signals
 from ..analysis.arm_rows import joint_positions_m
 from ..analysis.site_signals import decimate
-from ..analysis.timeline import find_mode_intervals, list_changes, list_stated_models, recorded_end_s
+from ..analysis.timeline import (
+    find_mode_intervals,
+    list_changes,
+    list_stated_models,
+    recorded_end_s,
+)
 from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
@@ -45,7 +51,9 @@ from .page_data import (
 )
 
 BUCKET_BUDGET = 48_000
-"""Buckets of all columns together: what keeps a page near a megabyte, however many sites there are."""
+"""Buckets of all columns together: what keeps a page near a megabyte, however many sites there
+are.
+"""
 _FRAMES = 400
 """Instants at which the page knows where the joints of a chain are."""
 PICTURE_SIDE = 4.0
@@ -57,7 +65,8 @@ class PageCharts(NamedTuple):
 
     Attributes:
         data: what the scripts of the page draw.
-        missing: by section, the titles of charts that are left out because the log has no value for them.
+        missing: by section, the titles of charts that are left out because the log has no value
+            for them.
     """
 
     data: PageData
@@ -84,11 +93,15 @@ class Charts:
         self._end_s = recorded_end_s(log)
         self._tables: list[ColumnTable] = []
         self._known: list[list[bool]] = []  # per table and column, whether there is any value
-        self._titles = [f"joint {title.removeprefix('joint ')}" for title in style.name_joints(log)]
+        self._titles = [
+            f"joint {title.removeprefix('joint ')}" for title in style.name_joints(log)
+        ]
         counts = max(arm.counts for arm in log.scenario.arms.values())
         self._small = counts.joints > 2
         columns_per_site = 9 * counts.joints + counts.parameters + len(log.sites)
-        self._buckets = max(100, min(1200, BUCKET_BUDGET // (columns_per_site * len(log.sites))))
+        self._buckets = max(
+            100, min(1200, BUCKET_BUDGET // (columns_per_site * len(log.sites)))
+        )
 
     def data(self) -> PageCharts:
         """Returns the data of the page, and which charts are left out."""
@@ -103,9 +116,12 @@ class Charts:
         data = PageData(
             end_s=self._end_s,
             colours=Palettes(
-                list_site_colours(log.scenario), list_site_colours(log.scenario, DARK_SITE_COLOURS)
+                list_site_colours(log.scenario),
+                list_site_colours(log.scenario, DARK_SITE_COLOURS),
             ),
-            arms=[self._arm(index, site) for index, site in enumerate(log.sites) if len(log[site])],
+            arms=[
+                self._arm(index, site) for index, site in enumerate(log.sites) if len(log[site])
+            ],
             tables=self._tables,
             charts=drawn,
             changes=[
@@ -113,7 +129,9 @@ class Charts:
                 for n, applied in enumerate(self._changes, 1)
             ],
             spans={
-                site: [ModeSpan(index, *interval) for interval in find_mode_intervals(log[site])]
+                site: [
+                    ModeSpan(index, *interval) for interval in find_mode_intervals(log[site])
+                ]
                 for index, site in enumerate(log.sites)
             },
             bounds_m=[self.factor * bound for bound in self.bounds_m],
@@ -150,7 +168,9 @@ class Charts:
         """Returns a chart over time of those series that have a value; `sites`: by default all."""
         known = [line for line in series if self._known[line.table][line.column]]
         marked = list(sites or self._log.sites)
-        return TimeChart(section=section, title=title, unit=unit, series=known, sites=marked, **options)
+        return TimeChart(
+            section=section, title=title, unit=unit, series=known, sites=marked, **options
+        )
 
     def _motion(self) -> Iterator[TimeChart]:
         log = self._log
@@ -161,11 +181,17 @@ class Charts:
         yield from self._positions()
         tables = self._tables_of(site_signals.joint_errors)
         unit = site_signals.shared_unit(log)
-        axes = style.name_shared(log) if site_signals.follows_in_task_space(log) else self._titles
-        yield from self._per_joint("errors", "tracking error", unit, tables, axes)
+        axes = (
+            style.name_shared(log) if site_signals.follows_in_task_space(log) else self._titles
+        )
+        yield from self._per_joint(
+            section="errors", title="tracking error", unit=unit, tables=tables, titles=axes
+        )
         yield from self._estimates()
         if self._twin is not None:
-            moved = {s: site_signals.operator_displacement(log, self._twin, s) for s in log.sites}
+            moved = {
+                s: site_signals.operator_displacement(log, self._twin, s) for s in log.sites
+            }
             tables = {s: self._columns(s, *columns) for s, columns in moved.items()}
             yield from self._per_joint("moved", "moved by the operators", "rad", tables)
         tables = self._tables_of(site_signals.controller_torques)
@@ -175,14 +201,21 @@ class Charts:
         self, signal: Callable[[SiteLog], NDArray[Any]], sites: list[str] | None = None
     ) -> dict[str, list[TableSeries]]:
         parts = {site: self._log[site] for site in sites or self._log.sites}
-        return {s: self._columns(s, part.tick, part.t_s, signal(part)) for s, part in parts.items()}
+        return {
+            s: self._columns(s, part.tick, part.t_s, signal(part)) for s, part in parts.items()
+        }
 
-    def _columns(self, site: str, tick: Ints, t_s: Array, values: NDArray[Any]) -> list[TableSeries]:
+    def _columns(
+        self, site: str, tick: Ints, t_s: Array, values: NDArray[Any]
+    ) -> list[TableSeries]:
         count = values.shape[1]
         if not self._small:
             table = self._table(site, tick, t_s, values)
             return [self._series(site, table, column) for column in range(count)]
-        return [self._series(site, self._table(site, tick, t_s, one[:, np.newaxis]), 0) for one in values.T]
+        return [
+            self._series(site, self._table(site, tick, t_s, one[:, np.newaxis]), 0)
+            for one in values.T
+        ]
 
     def _per_joint(
         self,
@@ -199,10 +232,14 @@ class Charts:
     def _positions(self) -> Iterator[TimeChart]:
         for site in self._log.sites:
             part = self._log[site]
-            both = np.stack([site_signals.joint_angles(part), site_signals.reference_angles(part)], axis=2)
+            both = np.stack(
+                [site_signals.joint_angles(part), site_signals.reference_angles(part)], axis=2
+            )
             for joint, name in enumerate(self._titles[: both.shape[1]]):
                 table = self._site_table(site, both[:, joint])
-                desired = TableSeries(label="desired", colour="limit", table=table, column=1, dash=True)
+                desired = TableSeries(
+                    label="desired", colour="limit", table=table, column=1, dash=True
+                )
                 series = [self._series(site, table, 0), desired]
                 yield self._chart("positions", f"{site}, {name}", "rad", series, sites=[site])
 
@@ -237,7 +274,9 @@ class Charts:
             age_ms = site_signals.sample_ages_ms(log, site)
             peers = log[site].peers
             table = self._site_table(site, age_ms)
-            series = [self._series(peer, table, n, f"{peer} → {site}") for n, peer in enumerate(peers)]
+            series = [
+                self._series(peer, table, n, f"{peer} → {site}") for n, peer in enumerate(peers)
+            ]
             lines = self._stated(site)
             drawn = np.concatenate([age_ms.ravel(), [line.value for line in lines]])
             yield self._chart(
@@ -273,11 +312,16 @@ class Charts:
             series = []
             for link in (link for link in measured if link.site == site):
                 colour = self._log.sites.index(link.peer)
-                for name, values, dash in (("age", link.age_ms, False), ("delay", link.delay_ms, True)):
+                for name, values, dash in (
+                    ("age", link.age_ms, False),
+                    ("delay", link.delay_ms, True),
+                ):
                     percent = age_and_lateness.cumulative_percent(values, x_ms)
                     if np.isfinite(percent).any():
                         label = f"{name}, {link.peer}"
-                        series.append(DistributionSeries(label, colour, dash, _packed(percent, "<f4")))
+                        series.append(
+                            DistributionSeries(label, colour, dash, _packed(percent, "<f4"))
+                        )
             yield DistributionChart(
                 section="delays",
                 title=f"delay and age on the way to {site}",
@@ -291,7 +335,10 @@ class Charts:
         log = self._log
         edges = age_and_lateness.loop_time_bin_edges(log)
         periods = sorted({1e6 / log.scenario.sites[site].rate_hz for site in log.sites})
-        titles = {"late_us": "wake-up after the deadline", "busy_us": "computing time of a tick"}
+        titles = {
+            "late_us": "wake-up after the deadline",
+            "busy_us": "computing time of a tick",
+        }
         for field, title in titles.items():
             series = [
                 HistogramSeries(
@@ -316,13 +363,19 @@ class Charts:
         arm = self._log.scenario.arms[site]
         if arm.chain is not None:
             return self._projected(index, site)
-        values = np.hstack([site_signals.joint_angles(part), site_signals.reference_angles(part)])
+        values = np.hstack(
+            [site_signals.joint_angles(part), site_signals.reference_angles(part)]
+        )
         edges = self._edges(site, np.arange(len(part)))
         table = self._site_table(site, np.hstack([values, *edges]))
-        return PlanarArm(site=site, colour=index, table=table, bodies=len(edges), links_m=list(arm.lengths_m))
+        return PlanarArm(
+            site=site, colour=index, table=table, bodies=len(edges), links_m=list(arm.lengths_m)
+        )
 
     def _edges(self, site: str, rows: NDArray[np.int64]) -> list[NDArray[np.float64]]:
-        """Returns the edges of the bodies of a site's plant in some records, shape (K, 2 P) each."""
+        """Returns the edges of the bodies of a site's plant in some records, shape (K, 2 P)
+        each.
+        """
         sizes_m = self._log.scenario.bodies_m(site).values()
         arm = self._log.scenario.arms[site]
         if not sizes_m:
@@ -333,9 +386,12 @@ class Charts:
     def _projected(self, index: int, site: str) -> ChainArm:
         part = self._log[site]
         arm = self._log.scenario.arms[site]
-        rows = np.unique(np.linspace(0, max(len(part) - 1, 0), _FRAMES).astype(np.int64))[: len(part)]
+        rows = np.unique(np.linspace(0, max(len(part) - 1, 0), _FRAMES).astype(np.int64))[
+            : len(part)
+        ]
         actual, desired = (
-            joint_positions_m(arm, q[rows]) for q in (part.q, site_signals.reference_angles(part))
+            joint_positions_m(arm, q[rows])
+            for q in (part.q, site_signals.reference_angles(part))
         )
         pictures = (
             arm_poses.project_arm_m(arm, actual),
@@ -344,8 +400,12 @@ class Charts:
         )
         points = np.stack([picture[:, 1:] for picture in pictures], axis=1) * self.factor
         edges = self._edges(site, rows)
-        table = self._store(site, part.tick[rows], np.hstack([points.reshape(len(rows), -1), *edges]))
-        return ChainArm(site=site, colour=index, table=table, bodies=len(edges), points=points.shape[2])
+        table = self._store(
+            site, part.tick[rows], np.hstack([points.reshape(len(rows), -1), *edges])
+        )
+        return ChainArm(
+            site=site, colour=index, table=table, bodies=len(edges), points=points.shape[2]
+        )
 
 
 def _packed(column: NDArray[Any], kind: str) -> str:

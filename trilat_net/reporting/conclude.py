@@ -1,6 +1,8 @@
-"""The report of a finished run: checks, figures, page, summary lines, a table with a row per site.
+"""The report of a finished run: checks, figures, page, summary lines, a table with a row per
+site.
 
-Invariant: every claim rests on an execution made just now, in another process while figures are drawn.
+Invariant: every claim rests on an execution made just now, in another process while figures are
+drawn.
 """
 
 from collections.abc import Iterator
@@ -29,7 +31,8 @@ from .summary_text import format_run_lines
 
 @dataclass(frozen=True, repr=False)
 class Conclusion(CheckReport):
-    """A finished run: its judgement, checks, a row per site, lines on links, changes, modes and clocks.
+    """A finished run: its judgement, checks, a row per site, lines on links, changes, modes and
+    clocks.
 
     `paths` are the log's files, and those that were written.
     """
@@ -81,7 +84,8 @@ def conclude(
     min_coverage: float = MIN_COVERAGE,
     png: bool = False,
 ) -> Conclusion:
-    """Verifies a log from a file, and writes page and summary, with `png` figures, into a folder that exists.
+    """Verifies a log from a file, and writes page and summary, with `png` figures, into a
+    folder that exists.
 
     Raises:
         LogError: a record cannot be read.
@@ -102,11 +106,21 @@ def conclude(
             try:
                 lines.extend(checking.result())
             except BrokenProcessPool:
-                raise RunFailed("the process that executes the log again was ended; try again") from None
+                raise RunFailed(
+                    "the process that executes the log again was ended; try again"
+                ) from None
             yield from lines
 
-        figures = write_report_figures(log, folder, twin, progress, certificate.twins) if png else []
-        made = write_report(log, folder, twin=twin, certificate=certificate, verdicts=verdicts())
+        figures = (
+            write_report_figures(
+                log=log, folder=folder, twin=twin, progress=progress, pushed=certificate.twins
+            )
+            if png
+            else []
+        )
+        made = write_report(
+            log, folder, twin=twin, certificate=certificate, verdicts=verdicts()
+        )
     heads = (*_HEADERS, f"max|e| end {shared_unit(log)}")
     table = TextTable(heads, [_site_row(log, site) for site in log.sites], align="lr")
     paths = [*map(Path, log.sources), *made, *figures]
@@ -115,13 +129,18 @@ def conclude(
 
 def _run_without_operators(log: Log) -> Log | None:
     """Returns the same run without operators; None if it would be the same, or cannot be run."""
-    broke_off = any(event.kind == "failed" for event in log.events)  # so would the twin, or hang
+    # so would the twin, or hang
+    broke_off = any(event.kind == "failed" for event in log.events)
     pushed = any(site.hands for site in log.scenario.sites.values())
     if broke_off or log.scenario.external or not pushed:
         return None
     try:
         return simulate_without_operators(log)
-    except (ScenarioError, LawFailed):  # a law from outside that may not run, or fails: the check says so
+    # a law from outside that may not run, or fails: the check says so
+    except (
+        ScenarioError,
+        LawFailed,
+    ):
         return None
 
 

@@ -1,4 +1,5 @@
-"""A picture of an episode at an instant, as an array of pixels: a panel per site, and the goal of the task.
+"""A picture of an episode at an instant, as an array of pixels: a panel per site, and the goal
+of the task.
 
 Invariant:
 - The picture is a function of the poses, the goal and the time; its size never changes.
@@ -41,7 +42,9 @@ class EpisodePicture:
         width_in = PANEL_PX * len(names) / _DPI
         self._figure = Figure(figsize=(width_in, PANEL_PX / _DPI), dpi=_DPI)
         self._canvas = FigureCanvasAgg(self._figure)
-        self._panels = dict(zip(names, self._figure.subplots(1, len(names), squeeze=False)[0], strict=True))
+        self._panels = dict(
+            zip(names, self._figure.subplots(1, len(names), squeeze=False)[0], strict=True)
+        )
         self._figure.subplots_adjust(left=0.0, right=1.0, bottom=0.0, top=1.0, wspace=0.02)
 
     def draw(
@@ -56,7 +59,8 @@ class EpisodePicture:
         Args:
             q_rad: joint angles by site, rad, shape (n,).
             bodies: poses of the bodies of plants, by site and name, shape (7,).
-            goal_m: the place that the task asks for, m; None where the goal is no place of this arm.
+            goal_m: the place that the task asks for, m; None where the goal is no place of this
+                arm.
             title: what stands in the corner of the first panel.
         """
         for number, (name, axes) in enumerate(self._panels.items()):
@@ -75,10 +79,14 @@ class EpisodePicture:
                     axes.plot(*path[0].T, color=style.REFERENCE, linewidth=0.8)
             axes.plot(*drawn.T, color=colour, linewidth=3.0, solid_capstyle="round")
             axes.plot(*drawn[1:].T, linestyle="none", marker="o", markersize=4.0, color=colour)
-            axes.plot(0.0, 0.0, linestyle="none", marker="s", markersize=6.0, color=style.REFERENCE)
+            axes.plot(
+                0.0, 0.0, linestyle="none", marker="s", markersize=6.0, color=style.REFERENCE
+            )
             if goal_m is not None and name == self._goal_site:
                 place = project_arm_m(arm, np.asarray(goal_m))
-                axes.plot(*place, marker="x", markersize=9.0, markeredgewidth=2.0, color="#bb5566")
+                axes.plot(
+                    *place, marker="x", markersize=9.0, markeredgewidth=2.0, color="#bb5566"
+                )
             axes.text(0.03, 0.97, name, transform=axes.transAxes, va="top", fontsize=9.0)
         first = next(iter(self._panels.values()))
         first.text(0.03, 0.03, title, transform=first.transAxes, va="bottom", fontsize=8.0)

@@ -1,7 +1,8 @@
 """Export of a log for other tools, in one of the formats of the folder `exports`.
 
-Invariant: a number read back is the same, bit for bit. An export describes itself: unit, meaning and source
-of every column, and its session. What can be refused is refused before anything is read or written.
+Invariant: a number read back is the same, bit for bit. An export describes itself: unit,
+meaning and source of every column, and its session. What can be refused is refused before
+anything is read or written.
 """
 
 import inspect
@@ -32,11 +33,13 @@ class ExportFormat(NamedTuple):
     """A format of exports, `FORMAT` of a file in the folder `exports`.
 
     Attributes:
-        write: writes a log to a file, or into a folder, tells how many records it has written since, and
-            returns what else is to be said, or None; its keyword-only parameters are settings.
+        write: writes a log to a file, or into a folder, tells how many records it has written
+            since, and returns what else is to be said, or None; its keyword-only parameters are
+            settings.
         ending: of the default path, after the name of the log.
         folder: whether it writes a folder.
-        extra: the module that it imports, the optional dependency that has it, and what needs it; or ().
+        extra: the module that it imports, the optional dependency that has it, and what needs
+            it; or ().
         many: whether it takes any number of logs, which `write` then gets as a list.
     """
 
@@ -54,13 +57,22 @@ class Exporter:
         path: the file or folder.
 
     Raises:
-        UsageError: no such format or setting, the place is taken and `force` is false, a package is missing.
+        UsageError: no such format or setting, the place is taken and `force` is false, a
+            package is missing.
     """
 
     def __init__(
-        self, form: str, path: Path | None, *, force: bool = False, log: Path = Path(), settings: Any = ()
+        self,
+        form: str,
+        path: Path | None,
+        *,
+        force: bool = False,
+        log: Path = Path(),
+        settings: Any = (),
     ) -> None:
-        """Without a path it is next to the log, or its first part, and named after it; `settings` by name."""
+        """Without a path it is next to the log, or its first part, and named after it;
+        `settings` by name.
+        """
         names = exports.list_export_formats()
         if form not in names:
             raise UsageError(f"--to is one of {', '.join(names)}, not {form!r}")
@@ -75,7 +87,8 @@ class Exporter:
             import_extra(*self._format.extra)
 
     def export(self, *logs: Log, progress: Progress = lambda _done, _total: None) -> str:
-        """Exports a log, or several, and returns what the format says of it; `progress` is of records.
+        """Exports a log, or several, and returns what the format says of it; `progress` is of
+        records.
 
         Raises:
             LogError: a record cannot be read.
@@ -83,7 +96,9 @@ class Exporter:
             UsageError: the place cannot be written to, or the format takes one log alone.
         """
         if len(logs) > 1 and not self._format.many:
-            raise UsageError(f"an export of this form is of one log; here are {len(logs)}, of other sessions")
+            raise UsageError(
+                f"an export of this form is of one log; here are {len(logs)}, of other sessions"
+            )
         total = sum(len(log[site]) for log in logs for site in log.sites)
         done = 0
 
@@ -97,12 +112,16 @@ class Exporter:
             return self._format.write(what, path, written, **self._settings) or ""
 
 
-def _read_settings(form: str, write: Callable[..., Any], given: dict[str, Any]) -> dict[str, Any]:
+def _read_settings(
+    form: str, write: Callable[..., Any], given: dict[str, Any]
+) -> dict[str, Any]:
     """Returns settings as the keyword-only parameters of `write` take them."""
     parameters = inspect.signature(write).parameters.values()
     known = {one.name: type(one.default) for one in parameters if one.kind is one.KEYWORD_ONLY}
     if strange := [name for name in given if name not in known]:
-        raise UsageError(f"{form} has no setting {strange[0]!r}; it has {', '.join(known) or 'none'}")
+        raise UsageError(
+            f"{form} has no setting {strange[0]!r}; it has {', '.join(known) or 'none'}"
+        )
     try:
         return {name: known[name](str(value)) for name, value in given.items()}
     except ValueError as error:
@@ -110,14 +129,20 @@ def _read_settings(form: str, write: Callable[..., Any], given: dict[str, Any]) 
 
 
 def store_tables(
-    log: Log, written: Written, place: Callable[[Table], str], store: Callable[[Table, str], Any]
+    log: Log,
+    written: Written,
+    place: Callable[[Table], str],
+    store: Callable[[Table, str], Any],
 ) -> str:
     """Stores every table at its place, and returns the description of the export as JSON."""
     tables = {}
     for table in log.tables():
         where = place(table)
         store(table, where)
-        columns = {c.name: {"unit": c.unit, "meaning": c.meaning, "source": c.source} for c in table.columns}
+        columns = {
+            c.name: {"unit": c.unit, "meaning": c.meaning, "source": c.source}
+            for c in table.columns
+        }
         tables[where] = {"row": table.about, "rows": len(table), "columns": columns}
         written(len(table) if table.kind == "state" else 0)
     facts = {
@@ -138,7 +163,9 @@ def describe_folder(log: Log, folder: Path, about: str) -> None:
 
 
 def name_inside(table: Table, name: str, separator: str) -> str:
-    """Returns the place of a table in a file: its name, and its kind if it is not the records of a site."""
+    """Returns the place of a table in a file: its name, and its kind if it is not the records
+    of a site.
+    """
     return name if table.kind in ("", "state") else f"{name}{separator}{table.kind}"
 
 

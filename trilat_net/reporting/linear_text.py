@@ -1,6 +1,8 @@
-"""A linear analysis as terminal text: equilibrium, delays, root table, verdict, delay margin and ports.
+"""A linear analysis as terminal text: equilibrium, delays, root table, verdict, delay margin
+and ports.
 
-Invariant: numbers have four digits and their units; roots that are zero by structure are counted, not listed.
+Invariant: numbers have four digits and their units; roots that are zero by structure are
+counted, not listed.
 """
 
 import math
@@ -22,7 +24,9 @@ _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
 
 
 def compose_linear(found: LinearAnalysis) -> Iterator[Block]:
-    """Yields equilibrium, delays, roots, verdict, margin and notes, then the ports, then the edges."""
+    """Yields equilibrium, delays, roots, verdict, margin and notes, then the ports, then the
+    edges.
+    """
     yield from (*describe_equilibrium(found), *describe_effective_delays(found), "")
     yield tabulate_roots(found)
     yield describe_zero_roots(found)
@@ -55,8 +59,9 @@ def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
         yield f"  all sites at ({_list_numbers(angles[0])}) rad"
         return
     for site, q, pose in zip(sites, angles, analysis.end_effectors, strict=True):
-        at = f", its end effector at ({_list_numbers(pose)}) m{' and rad' * (len(pose) > 3)}" * bool(
-            len(pose)
+        at = (
+            f", its end effector at ({_list_numbers(pose)}) m{' and rad' * (len(pose) > 3)}"
+            * bool(len(pose))
         )
         yield f"  {site.name} at ({_list_numbers(q)}) rad{at}"
 
@@ -82,7 +87,8 @@ def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
 def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
     """Returns the rightmost roots, with those of the sampled loop next to them if any differs.
 
-    Those of the sampled loop alone where ticks differ from each other: the continuous loop has mean delays.
+    Those of the sampled loop alone where ticks differ from each other: the continuous loop has
+    mean delays.
     """
     spanned = analysis.decisive.span_s is not None
     roots = analysis.decisive.roots if spanned else analysis.continuous.roots
@@ -97,7 +103,11 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
             f"{root.damping:.4g}",
             str(root.multiplicity),
         )
-        other_s = ("same", "same") if other is None else (f"{other.s.real:.4g}", f"{other.s.imag:.4g}")
+        other_s = (
+            ("same", "same")
+            if other is None
+            else (f"{other.s.real:.4g}", f"{other.s.imag:.4g}")
+        )
         rows.append((*numbers, *(other_s if differ else ()), root.words))
     computed = ("re as computed", "im as computed") if differ else ()
     heads = ("re 1/s", "im rad/s", "Hz", "damping", "modes", *computed, "what moves")
@@ -111,7 +121,9 @@ def describe_zero_roots(analysis: LinearAnalysis) -> str:
         return "no root at zero"
     are = "root is" if count == 1 else "roots are"
     free = ", joints that the task leaves free" * analysis.conditions.sites[0].layout.task
-    return f"{count} {are} zero by structure: shared poses{free}, and estimates without excitation"
+    return (
+        f"{count} {are} zero by structure: shared poses{free}, and estimates without excitation"
+    )
 
 
 def describe_linear_verdict(analysis: LinearAnalysis) -> str:
@@ -145,7 +157,10 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
         beyond = f"above {ports.resolved_hz:.3g} Hz"
         lines.append(f"  {beyond} the grid does not follow the phase of the longest delay")
     if ports.verdict == "unstable":
-        return [*lines, "  the loop without operators is unstable: not passive, and without an impedance"]
+        return [
+            *lines,
+            "  the loop without operators is unstable: not passive, and without an impedance",
+        ]
     if ports.pole.order:
         kind = "as of free masses" if ports.pole.passive else "which no passive network has"
         lines.append(f"  at zero frequency Y has a pole of order {ports.pole.order}, {kind}")
@@ -158,17 +173,24 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
         lines.append(f"    {ports.name_port(joint)} alone: {alone}")
     if ports.proof is not None:
         proof = _describe_proof(ports, ports.proof)
-        lines.append(f"  operators passive in r = {ports.speed} + Lambda e, the proof's premise: {proof}")
+        lines.append(
+            f"  operators passive in r = {ports.speed} + Lambda e, the proof's premise: {proof}"
+        )
     absolute = _describe_absolute_stability(ports)
     lines.append(f"  a passive operator in {ports.speed} per site, best weights: {absolute}")
     lines += [f"    Llewellyn, {text}" for text in _describe_two_ports(ports)]
     if ports.measured is not None:
         bands = ports.measured.below
-        found = f"not shown {_list_bands(bands)}, where they damp too little" if bands else "stable"
+        found = (
+            f"not shown {_list_bands(bands)}, where they damp too little" if bands else "stable"
+        )
         lines.append(f"  the measured operators at the masters, any at each: {found}")
     if ports.clamped_verdict == "unstable":
         clamped = ports.transparency[0].of
-        return [*lines, f"  with {clamped} clamped the loop is unstable: it has no steady impedance"]
+        return [
+            *lines,
+            f"  with {clamped} clamped the loop is unstable: it has no steady impedance",
+        ]
     return [*lines, *(f"  {_describe_transparency(ports, one)}" for one in ports.transparency)]
 
 
@@ -179,11 +201,15 @@ def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
         text += ", which is nothing for operators coupled to one another"
     if proof.passive or ports.estimates_true:
         return text
-    return f"{text}; estimates here are not true, and the proof counts the energy that they store"
+    return (
+        f"{text}; estimates here are not true, and the proof counts the energy that they store"
+    )
 
 
 def _describe_passivity(one: Passivity, unit: str = "", kind: str = "") -> str:
-    """Returns a passivity in words; with a unit, also the damping that each joint or axis lacks."""
+    """Returns a passivity in words; with a unit, also the damping that each joint or axis
+    lacks.
+    """
     if one.passive:
         return "passive"
     minima = one.minima
@@ -198,7 +224,11 @@ def _describe_passivity(one: Passivity, unit: str = "", kind: str = "") -> str:
 
 def _list_bands(bands: tuple[FrequencyBand, ...]) -> str:
     shown = [f"{band.from_hz:.3g}-{band.to_hz:.3g}" for band in bands[:_SHOWN_BANDS]]
-    more = f" and {count_nouns(len(bands) - _SHOWN_BANDS, 'range')} more" if len(bands) > _SHOWN_BANDS else ""
+    more = (
+        f" and {count_nouns(len(bands) - _SHOWN_BANDS, 'range')} more"
+        if len(bands) > _SHOWN_BANDS
+        else ""
+    )
     return f"at {', '.join(shown)} Hz{more}"
 
 
@@ -214,7 +244,11 @@ def _describe_absolute_stability(ports: PortAnalysis) -> str:
 def _describe_two_ports(ports: PortAnalysis) -> list[str]:
     failing = [one for one in ports.two_ports if one.minima.below]
     holding = len(ports.two_ports) - len(failing)
-    third = ", the third site free or clamped" if any(one.clamped for one in ports.two_ports) else ""
+    third = (
+        ", the third site free or clamped"
+        if any(one.clamped for one in ports.two_ports)
+        else ""
+    )
     every = f"every pair and {ports.kind}{third}" if not failing else "the others"
     groups: dict[tuple[object, ...], list[TwoPort]] = {}
     for one in failing:  # of arms of many joints those of one pair share a line
@@ -226,10 +260,14 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
         sites, _, clamped, minima = worst
         joints = ", ".join(str(ports.axes.get(one.joint, one.joint)) for one in group)
         bands = [b for one in group for b in one.minima.below]
-        within = f"within {min(b.from_hz for b in bands):.3g}-{max(b.to_hz for b in bands):.3g} Hz"
+        within = (
+            f"within {min(b.from_hz for b in bands):.3g}-{max(b.to_hz for b in bands):.3g} Hz"
+        )
         which = f"{' and '.join(sites)}{f', {clamped} clamped' if clamped else ''}, {ports.kind} {joints}"
         least = f"least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
-        lines.append(f"{which}: fails {_list_bands(minima.below) if len(group) == 1 else within}; {least}")
+        lines.append(
+            f"{which}: fails {_list_bands(minima.below) if len(group) == 1 else within}; {least}"
+        )
     return [*lines, *([f"{every}: holds ({holding} two-ports)"] if holding else [])]
 
 

@@ -1,4 +1,5 @@
-"""The contents of a log as text: session, missing records, sites, links, channels, accounts, files.
+"""The contents of a log as text: session, missing records, sites, links, channels, accounts,
+files.
 
 Invariant: text from the file passes `sanitize`.
 """
@@ -33,7 +34,9 @@ def compose_overview(found: FileOverview) -> Iterator[Block]:
     own = {topic: channel for topic, channel in channels.items() if topic not in views}
     yield from _compose_channels(own, session)
     if views:
-        rows = [(topic, *_counts(v), v["schema"].rpartition("/")[2]) for topic, v in views.items()]
+        rows = [
+            (topic, *_counts(v), v["schema"].rpartition("/")[2]) for topic, v in views.items()
+        ]
         yield from _table(("view, for other tools", "messages", "rate Hz", "size", "as"), rows)
     if session is not None:
         yield from _compose_accounts(session)
@@ -48,7 +51,9 @@ def _rows(*rows: tuple[str, str]) -> Iterator[Block]:
             yield MarkedText(f"[bold]{head:<9}[/bold]", sanitize(text))
 
 
-def _table(headers: Sequence[str], rows: Iterable[Sequence[object]], words: int = 1) -> Iterator[Block]:
+def _table(
+    headers: Sequence[str], rows: Iterable[Sequence[object]], words: int = 1
+) -> Iterator[Block]:
     """Yields an empty line and a table; its first columns hold words, the others numbers."""
     cells = [["-" if value is None else str(value) for value in row] for row in rows]
     yield ""
@@ -62,7 +67,9 @@ def _compose_session(facts: JsonObject, session: JsonObject) -> Iterator[Block]:
     records = sum(site["records"] for site in sites.values())
     began = f", began {session['began_utc']} UTC" if session["began_utc"] else ""
     changed = "" if scenario["as_named"] else "; NOT the text whose hash the session names"
-    finished = "finished" if all(file["finished"] for file in facts["files"]) else "not finished"
+    finished = (
+        "finished" if all(file["finished"] for file in facts["files"]) else "not finished"
+    )
     damaged = sum(len(file["damaged"]) for file in facts["files"])
     places = f"; damaged in {damaged} place{'s' * (damaged > 1)}" if damaged else ""
     silent: list[str] = session["unknown_ends"]
@@ -84,10 +91,16 @@ def _compose_sites(sites: dict[str, JsonObject]) -> Iterator[Block]:
         ticks = site["expected_ticks"] if site["made_ticks"] is None else site["made_ticks"]
         of = (site["records"], ticks, site["missing"], site["overruns"])
         rows.append((name, site["role"], site["rate_hz"], *of))
-    yield from _table(("site", "role", "rate Hz", "records", "of", "missing", "overruns"), rows, words=2)
+    yield from _table(
+        ("site", "role", "rate Hz", "records", "of", "missing", "overruns"), rows, words=2
+    )
     if any(site["late_us"] for site in sites.values()):
-        loops = [(name, *_three(s["late_us"]), *_three(s["busy_us"])) for name, s in sites.items()]
-        yield from _table(("loop", "late us p50", "p99", "max", "busy us p50", "p99", "max"), loops)
+        loops = [
+            (name, *_three(s["late_us"]), *_three(s["busy_us"])) for name, s in sites.items()
+        ]
+        yield from _table(
+            ("loop", "late us p50", "p99", "max", "busy us p50", "p99", "max"), loops
+        )
 
 
 def _compose_links(links: dict[str, JsonObject]) -> Iterator[Block]:
@@ -105,22 +118,29 @@ def _compose_links(links: dict[str, JsonObject]) -> Iterator[Block]:
     yield from _table([*headers, "late", "lost", "twice"], rows)
 
 
-def _compose_channels(channels: dict[str, JsonObject], session: JsonObject | None) -> Iterator[Block]:
+def _compose_channels(
+    channels: dict[str, JsonObject], session: JsonObject | None
+) -> Iterator[Block]:
     if not channels:
         return
     prefix = f"/trilat/{session['session']}/" if session else ""
     rows = []
     for topic, channel in channels.items():
         name = topic.removeprefix(prefix) or "(none)"
-        rows.append((name, *_counts(channel), channel["missing"], *_three(channel["between_ms"])))
+        rows.append(
+            (name, *_counts(channel), channel["missing"], *_three(channel["between_ms"]))
+        )
     yield from _table(
-        ("channel", "messages", "rate Hz", "size", "missing", "apart ms p50", "p99", "max"), rows
+        ("channel", "messages", "rate Hz", "size", "missing", "apart ms p50", "p99", "max"),
+        rows,
     )
     for topic, channel in channels.items():
         if gaps := channel["gaps"]:
             words = ", ".join(f"{a}-{b}" if b > a else str(a) for a, b in gaps[:_MOST_GAPS])
             more = (
-                f" and {count_nouns(len(gaps) - _MOST_GAPS, 'more range')}" if len(gaps) > _MOST_GAPS else ""
+                f" and {count_nouns(len(gaps) - _MOST_GAPS, 'more range')}"
+                if len(gaps) > _MOST_GAPS
+                else ""
             )
             yield f"{topic.removeprefix(prefix)} lacks {words}{more}"
 
@@ -132,7 +152,9 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
     if not accounts:
         yield "no accounts: the recording did not come to its end"
         return
-    faulty = {topic: text for topic, text in accounts.items() if _TROUBLE.search(text) or ":" in topic}
+    faulty = {
+        topic: text for topic, text in accounts.items() if _TROUBLE.search(text) or ":" in topic
+    }
     if len(accounts) > len(faulty):
         yield (
             f"the recorder accounts for {count_nouns(len(accounts) - len(faulty), 'channel')} without a fault"
@@ -143,13 +165,23 @@ def _compose_accounts(session: JsonObject) -> Iterator[Block]:
 
 def _compose_origin(session: JsonObject) -> Iterator[Block]:
     versions: dict[str, str] = session["versions"]
-    dirty = {"true": " with changes", "false": ""}.get(session["commit_dirty"] or "", " (changes unknown)")
+    dirty = {"true": " with changes", "false": ""}.get(
+        session["commit_dirty"] or "", " (changes unknown)"
+    )
     version = versions.get("trilat-net", "unknown")
-    others = ", ".join(f"{name} {version}" for name, version in versions.items() if name != "trilat-net")
+    others = ", ".join(
+        f"{name} {version}" for name, version in versions.items() if name != "trilat-net"
+    )
     yield ""
     yield from _rows(
-        ("made by", f"trilat-net {version}, commit {(session['commit'] or 'unknown')[:12]}{dirty}"),
-        ("on", f"{session['platform']}, {session['python']}, arithmetic {session['fingerprint']}"),
+        (
+            "made by",
+            f"trilat-net {version}, commit {(session['commit'] or 'unknown')[:12]}{dirty}",
+        ),
+        (
+            "on",
+            f"{session['platform']}, {session['python']}, arithmetic {session['fingerprint']}",
+        ),
         ("with", others),
         ("schema", f"version {session['schema_version']}"),
     )
@@ -157,17 +189,25 @@ def _compose_origin(session: JsonObject) -> Iterator[Block]:
 
 def _compose_file(file: JsonObject) -> Iterator[Block]:
     chunks = (
-        ", ".join(f"{count_nouns(count, 'chunk')} {name}" for name, count in file["compression"].items())
+        ", ".join(
+            f"{count_nouns(count, 'chunk')} {name}"
+            for name, count in file["compression"].items()
+        )
         or "no chunks"
     )
     ratio = file["unpacked_bytes"] / file["packed_bytes"] if file["packed_bytes"] else 1.0
     end = "finished" if file["finished"] else f"cut off at byte {file['cut_off_at_byte']}"
     part = f", part {file['part'].get('index', '?')}" if file["part"] else ""
     size = _size(file["size_bytes"])
-    yield from _rows(("file", f"{file['path']}{part}: {size}, {chunks} ({ratio:.1f} : 1), {end}"))
+    yield from _rows(
+        ("file", f"{file['path']}{part}: {size}, {chunks} ({ratio:.1f} : 1), {end}")
+    )
     for damage in file["damaged"][:_MOST_GAPS]:
         yield from _rows(
-            ("", f"byte {damage['offset']}, {count_nouns(damage['length'], 'byte')}: {damage['problem']}")
+            (
+                "",
+                f"byte {damage['offset']}, {count_nouns(damage['length'], 'byte')}: {damage['problem']}",
+            )
         )
 
 

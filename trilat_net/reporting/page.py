@@ -1,7 +1,8 @@
 """Write the report of a log: `report.html` and `summary.json`.
 
-Invariant: the page is one file with images, styles and scripts inside; it loads nothing from a network. Every
-text from a scenario or a log is escaped here, cell by cell. Empty tables are left out.
+Invariant: the page is one file with images, styles and scripts inside; it loads nothing from a
+network. Every text from a scenario or a log is escaped here, cell by cell. Empty tables are
+left out.
 """
 
 import base64
@@ -44,7 +45,9 @@ from .style import typeset
 _PAGE_DPI = 110
 _ASSETS = resources.files("trilat_net.reporting") / "assets"
 
-_WORDS: dict[str, dict[str, Any]] = tomllib.loads((_ASSETS / "report.toml").read_text(encoding="utf-8"))
+_WORDS: dict[str, dict[str, Any]] = tomllib.loads(
+    (_ASSETS / "report.toml").read_text(encoding="utf-8")
+)
 """Headings and notes of the page."""
 _CODE = re.compile(r"`([^`]+)`")
 _MOST_MODES = 200
@@ -53,7 +56,11 @@ _MOST_ALARMS = 8
 """Alarms that are shown in large."""
 _WORST = ("FAULT", "STOPPED")
 _NO_VALUE = "the log has no value to draw"
-_PREMISE_MARKS = {True: "holds", False: '<span style="color:var(--bad)">fails</span>', None: "not told"}
+_PREMISE_MARKS = {
+    True: "holds",
+    False: '<span style="color:var(--bad)">fails</span>',
+    None: "not told",
+}
 
 
 def write_report(
@@ -66,8 +73,9 @@ def write_report(
 ) -> list[Path]:
     """Writes report.html and summary.json, and returns their paths.
 
-    The certificate's pictures are made before the verdicts are read, which may still be in the making.
-    Without `twin`, the same experiment without operators, the page has no motion due to them.
+    The certificate's pictures are made before the verdicts are read, which may still be in the
+    making. Without `twin`, the same experiment without operators, the page has no motion due to
+    them.
     """
     make_folder(folder)
     facts = summarise_run(log, twin)
@@ -84,7 +92,12 @@ def write_report(
         drawn = draw_observed_energy(log, certificate.observed)
         pictures.append(("energies that the laws declare", drawn))
     if certificate.twins is not None and certificate.twins.pushes:
-        pictures.append(("what became of small pushes", draw_twins(PushedTwins(log, 0.0, certificate.twins))))
+        pictures.append(
+            (
+                "what became of small pushes",
+                draw_twins(PushedTwins(log, 0.0, certificate.twins)),
+            )
+        )
     for words, drawn in pictures:
         stream = io.BytesIO()
         drawn.savefig(stream, format="png", dpi=_PAGE_DPI)
@@ -95,7 +108,17 @@ def write_report(
     facts["checks"] = [line.line() for line in lines]
     page = folder / "report.html"
     numbers = folder / "summary.json"
-    write_whole(page, render_report(log, twin, lines, facts, section, verdict))
+    write_whole(
+        page,
+        render_report(
+            log=log,
+            twin=twin,
+            verdicts=lines,
+            facts=facts,
+            certificate=section,
+            verdict=verdict,
+        ),
+    )
     write_whole(numbers, _json(facts, indent=2) + "\n")
     return [page, numbers]
 
@@ -108,7 +131,8 @@ def render_report(
     certificate: str = "",
     verdict: str = "",
 ) -> str:
-    """Returns the page of a log, of facts from `summarise_run`; `certificate` is its section, as HTML.
+    """Returns the page of a log, of facts from `summarise_run`; `certificate` is its section,
+    as HTML.
 
     The page begins with `verdict`, as HTML too.
     """
@@ -151,7 +175,9 @@ pointer in any chart. Below, a few instants, with the path of the end effector u
 
 
 def _render_arms(log: Log, drawn: Charts) -> str:
-    """Returns the player of the arms and their pictures, and which sites have no record to draw."""
+    """Returns the player of the arms and their pictures, and which sites have no record to
+    draw.
+    """
     html = ""
     if any(len(log[site]) for site in log.sites):
         html = _ARM_PLAYER + render_arms_svg(log, drawn.bounds_m, drawn.factor)
@@ -171,7 +197,10 @@ def _sections(log: Log, drawn: Sequence[Chart], missing: Mapping[str, Sequence[s
     """
     filled = {chart.section for chart in drawn}
     chains = any(arm.chain for arm in log.scenario.arms.values())
-    absent = {"torques": explain_absent_operator(log), "timing": explain_missing_loop_times(log)}
+    absent = {
+        "torques": explain_absent_operator(log),
+        "timing": explain_missing_loop_times(log),
+    }
     html = ""
     reasons: list[str] = []
     for key, (heading, sentence) in _WORDS["charts"].items():
@@ -186,7 +215,11 @@ def _sections(log: Log, drawn: Sequence[Chart], missing: Mapping[str, Sequence[s
             reasons.append(f"{heading.lower()} ({absent[key]})")
         elif key in missing:
             reasons.append(f"{heading.lower()} ({_NO_VALUE})")
-    return html + (f'<p class="note">Not on this page: {escape("; ".join(reasons))}.</p>' if reasons else "")
+    return html + (
+        f'<p class="note">Not on this page: {escape("; ".join(reasons))}.</p>'
+        if reasons
+        else ""
+    )
 
 
 def _links(log: Log, facts: JsonObject) -> str:
@@ -211,7 +244,9 @@ def _site_css(log: Log) -> str:
             f".fill-{n} {{ background: {palette[n % len(palette)]}; fill: {palette[n % len(palette)]}; }}\n"
             for n in range(len(log.sites))
         )
-        for palette in (list_site_colours(log.scenario, some) for some in (SITE_COLOURS, DARK_SITE_COLOURS))
+        for palette in (
+            list_site_colours(log.scenario, some) for some in (SITE_COLOURS, DARK_SITE_COLOURS)
+        )
     )
     return f"{light}@media screen and (prefers-color-scheme: dark) {{\n{dark}}}"
 
@@ -235,7 +270,9 @@ def _render_check_lines(verdicts: Sequence[Finding]) -> str:
 
 
 def render_alarms(log: Log) -> str:
-    """Returns the times in which sites were in fault, stopped or held, in large; "" if none was."""
+    """Returns the times in which sites were in fault, stopped or held, in large; "" if none
+    was.
+    """
     found = list_alarms(log)
     worst = [one for one in found if one.word in _WORST] or found
     more = len(found) - len(worst[:_MOST_ALARMS])
@@ -263,15 +300,22 @@ def _render_run_facts(log: Log, facts: JsonObject) -> str:
     if facts["settle_s"] is not None:
         settled = f"every |e| below {facts['settle_below_rad']:g} {unit} from {facts['settle_s']:.3f} s on"
     dominance = "; ".join(
-        f"{site} follows " + ", ".join(f"{peer} {share:g}" for peer, share in shares.items() if share)
+        f"{site} follows "
+        + ", ".join(f"{peer} {share:g}" for peer, share in shares.items() if share)
         for site, shares in scenario.dominance.items()
     )
     return _render_facts(
         ("scenario", f"{scenario.name}, sha256 {scenario.sha256[:16]}"),
         ("driven by", _describe_driver(log)),
-        ("length", f"{scenario.duration_s:g} s; scheme {scenario.scheme}; seed {scenario.seed}"),
+        (
+            "length",
+            f"{scenario.duration_s:g} s; scheme {scenario.scheme}; seed {scenario.seed}",
+        ),
         ("records", f"{facts['records']}, {facts['missing']} missing{torn}"),
-        ("largest error at the end", f"{_format_cell(facts['max_error_end_rad'])} {unit} in the last second"),
+        (
+            "largest error at the end",
+            f"{_format_cell(facts['max_error_end_rad'])} {unit} in the last second",
+        ),
         ("settled", settled),
         ("dominance", dominance),
         ("diverged", "yes" if facts["diverged"] else "no"),
@@ -281,14 +325,31 @@ def _render_run_facts(log: Log, facts: JsonObject) -> str:
 def _render_sites(log: Log, facts: JsonObject) -> str:
     error = [f"max |e| ({shared_unit(log)})", f"max |e|, last 1 s ({shared_unit(log)})"]
     headers = ["site", "records", "missing", "q at the end (rad)", *error]
-    headers += ["settled (s)", "max |τ| (N\u00a0m)", "ticks at the limit", "moved by operators, max (rad)"]
-    motion = ("max_error_rad", "max_error_end_rad", "settle_s", "peak_tau_nm", "saturated_ticks")
+    headers += [
+        "settled (s)",
+        "max |τ| (N\u00a0m)",
+        "ticks at the limit",
+        "moved by operators, max (rad)",
+    ]
+    motion = (
+        "max_error_rad",
+        "max_error_end_rad",
+        "settle_s",
+        "peak_tau_nm",
+        "saturated_ticks",
+    )
     rows = []
     for name in log.sites:
         site: JsonObject = facts["sites"][name]
-        counts = [str(site["records"]), str(site["missing"]), _format_numbers(site["q_end_rad"])]
+        counts = [
+            str(site["records"]),
+            str(site["missing"]),
+            _format_numbers(site["q_end_rad"]),
+        ]
         cells = [*counts, *(_format_cell(site[key]) for key in motion)]
-        rows.append([_label_site(log, name), *cells, _format_numbers(site["hands_moved_max_rad"])])
+        rows.append(
+            [_label_site(log, name), *cells, _format_numbers(site["hands_moved_max_rad"])]
+        )
     many = any(len(facts["sites"][name]["q_end_rad"] or ()) > 3 for name in log.sites)
     return _render_table(headers, rows, words=[3, 9] if many else [])
 
@@ -304,18 +365,34 @@ def _render_loops(log: Log, facts: JsonObject) -> str:
         site: JsonObject = facts["sites"][name]
         values = [*(site["late_us"][key] for key in ("p50", "p99", "p99_9", "max"))]
         values += [*(site["busy_us"][key] for key in ("p50", "p99", "max")), site["overruns"]]
-        rows.append([_label_site(log, name), *("–" if v is None else f"{v:.0f}" for v in values)])
+        rows.append(
+            [_label_site(log, name), *("–" if v is None else f"{v:.0f}" for v in values)]
+        )
     return _render_table(headers, rows)
 
 
 def _render_link_ages(log: Log, facts: JsonObject) -> str:
-    headers = ["link", "stated delay", "effective, mean (ms)", "deviation", "p50", "p99", "min", "max"]
+    headers = [
+        "link",
+        "stated delay",
+        "effective, mean (ms)",
+        "deviation",
+        "p50",
+        "p99",
+        "min",
+        "max",
+    ]
     headers += ["nothing new (% of ticks)", "longest silence (ms)"]
     rows = []
     for name, link in facts["links"].items():
         first, *later = link["stated"]
-        stated = [first["link"], *(f"from {state['from_s']:g} s: {state['link']}" for state in later)]
-        ages = [link["age_ms"][key] for key in ("mean", "deviation", "p50", "p99", "min", "max")]
+        stated = [
+            first["link"],
+            *(f"from {state['from_s']:g} s: {state['link']}" for state in later),
+        ]
+        ages = [
+            link["age_ms"][key] for key in ("mean", "deviation", "p50", "p99", "min", "max")
+        ]
         cells = [*ages, _percent(link["ticks_without_new"]), link["silence_ms"]]
         text = "<br>".join(escape(typeset(words)) for words in stated)
         rows.append([_label_link(log, name), text, *map(_format_cell, cells)])
@@ -324,7 +401,14 @@ def _render_link_ages(log: Log, facts: JsonObject) -> str:
 
 def _render_link_samples(log: Log, facts: JsonObject) -> str:
     """Returns the table of the delivery of samples, with measured delays if there are any."""
-    headers = ["link", "samples sent", "missing on the way", "lost by the model", "late", "superseded"]
+    headers = [
+        "link",
+        "samples sent",
+        "missing on the way",
+        "lost by the model",
+        "late",
+        "superseded",
+    ]
     headers += ["duplicates", "of the model", "lost in all (%)", "in a row"]
     keys = ("sent", "missing", "lost", "late", "superseded", "duplicate", "copies")
     links: dict[str, JsonObject] = facts["links"]
@@ -362,8 +446,12 @@ def _render_clocks(log: Log, facts: JsonObject) -> str:
     for name, link in facts["links"].items():
         clock: JsonObject = link["clock"] or {}
         if clock and (clock["bound_max_us"] or clock["offset_us"]):
-            rows.append([_label_link(log, name), *(_format_cell(clock[key]) for key in _CLOCK_COLUMNS)])
-    return _render_table(("clock of the sender", *_CLOCK_COLUMNS.values()), rows) if rows else ""
+            rows.append(
+                [_label_link(log, name), *(_format_cell(clock[key]) for key in _CLOCK_COLUMNS)]
+            )
+    return (
+        _render_table(("clock of the sender", *_CLOCK_COLUMNS.values()), rows) if rows else ""
+    )
 
 
 def _render_changes(facts: JsonObject) -> str:
@@ -371,7 +459,11 @@ def _render_changes(facts: JsonObject) -> str:
     rows = []
     for n, changed in enumerate(facts["changes"], 1):
         tick = changed["taken_at_tick"]
-        origin = "scenario" if tick is None else f"order, taken in at tick {tick} of {changed['site']}"
+        origin = (
+            "scenario"
+            if tick is None
+            else f"order, taken in at tick {tick} of {changed['site']}"
+        )
         sentence = escape(typeset(changed["sentence"]))
         rows.append([str(n), _format_cell(changed["at_s"]), sentence, escape(origin)])
     headers = ("no.", "from (s)", "what happened", "origin")
@@ -381,15 +473,24 @@ def _render_changes(facts: JsonObject) -> str:
 def _render_modes(log: Log, facts: JsonObject) -> str:
     """Returns the table of the times in which sites held, braked or returned; "" if none did."""
     rows = [
-        [_swatch(log, name) + escape(name), span["mode"], f"{span['from_s']:.3f}", f"{span['to_s']:.3f}"]
+        [
+            _swatch(log, name) + escape(name),
+            span["mode"],
+            f"{span['from_s']:.3f}",
+            f"{span['to_s']:.3f}",
+        ]
         for name, site in facts["sites"].items()
         for span in site["modes"][:_MOST_MODES]
     ]
-    return _render_table(("site", "mode", "from (s)", "to (s)"), rows, words=[1]) if rows else ""
+    return (
+        _render_table(("site", "mode", "from (s)", "to (s)"), rows, words=[1]) if rows else ""
+    )
 
 
 def _render_certificate(certificate: Certificate) -> str:
-    cells = ((escape(p.name), _PREMISE_MARKS[p.holds], escape(p.text)) for p in certificate.premises)
+    cells = (
+        (escape(p.name), _PREMISE_MARKS[p.holds], escape(p.text)) for p in certificate.premises
+    )
     premises = "".join(
         f"<tr><th>{name}</th><th>{mark}</th><td>{text}</td></tr>" for name, mark, text in cells
     )
@@ -398,7 +499,9 @@ def _render_certificate(certificate: Certificate) -> str:
     html += f'<div class="scroll"><table class="facts">{premises}</table></div>'
     if certificate.balance is None:
         return html
-    rows = [(escape(name), f"{value:.4g}") for name, value in list_energies(certificate.balance)]
+    rows = [
+        (escape(name), f"{value:.4g}") for name, value in list_energies(certificate.balance)
+    ]
     table = f'<div class="scroll">{_render_table(("energy", "J"), rows)}</div>'
     return f'{html}{table}<p class="note">{escape(_WORDS["notes"]["certificate"])}</p>'
 
@@ -413,7 +516,10 @@ def _render_commands(log: Log) -> str:
     scenario = log.scenario
     source = Path(log.source).name
     file = source if source.endswith(".mcap") else "FILE"
-    known = scenario.name in list_shipped() and load_scenario(scenario.name).sha256 == scenario.sha256
+    known = (
+        scenario.name in list_shipped()
+        and load_scenario(scenario.name).sha256 == scenario.sha256
+    )
     which = scenario.name if known else f"./{scenario.name}.toml"
     commands = f"trilat verify {file}\ntrilat verify --virtual {file}\ntrilat sim {which}"
     hint = "as shipped" if known else f"to be saved as {scenario.name}.toml"
@@ -430,8 +536,15 @@ def _render_versions(log: Log) -> str:
     return _render_facts(
         ("commit", session.get("commit", "unknown") + changed),
         ("fingerprint of arithmetic", session.get("fingerprint", "unknown")),
-        ("platform", f"{session.get('platform', 'unknown')}, {session.get('python', 'unknown')}"),
-        *((k.removeprefix("version_"), v) for k, v in session.items() if k.startswith("version_")),
+        (
+            "platform",
+            f"{session.get('platform', 'unknown')}, {session.get('python', 'unknown')}",
+        ),
+        *(
+            (k.removeprefix("version_"), v)
+            for k, v in session.items()
+            if k.startswith("version_")
+        ),
     )
 
 
@@ -443,7 +556,9 @@ def _describe_driver(log: Log) -> str:
         return f"rerun of {source or 'a log'}: {sites.replace(' ', ', ')} executed afresh"
     epoch_ns = int(log.session.get("epoch_unix_ns", "0"))
     began = datetime.fromtimestamp(epoch_ns // 10**9, UTC)
-    return f"live, session {log.session.get('session', '')}, epoch {began:%Y-%m-%d %H:%M:%S} UTC"
+    return (
+        f"live, session {log.session.get('session', '')}, epoch {began:%Y-%m-%d %H:%M:%S} UTC"
+    )
 
 
 def _format_cell(value: float | None) -> str:
@@ -473,14 +588,22 @@ def _swatch(log: Log, name: str) -> str:
 
 
 def _render_facts(*rows: tuple[str, str]) -> str:
-    lines = "".join(f"<tr><th>{escape(key)}</th><td>{escape_text(value)}</td></tr>" for key, value in rows)
+    lines = "".join(
+        f"<tr><th>{escape(key)}</th><td>{escape_text(value)}</td></tr>" for key, value in rows
+    )
     return f'<table class="facts">{lines}</table>'
 
 
-def _render_table(headers: Sequence[str], rows: Iterable[Sequence[str]], words: Sequence[int] = ()) -> str:
-    """Returns a table of rows in HTML; `words` are the columns besides the first that hold no numbers."""
+def _render_table(
+    headers: Sequence[str], rows: Iterable[Sequence[str]], words: Sequence[int] = ()
+) -> str:
+    """Returns a table of rows in HTML; `words` are the columns besides the first that hold no
+    numbers.
+    """
     kinds = [' class="words"' if n in words else "" for n in range(len(headers))]
-    head = "".join(f"<th{kind}>{escape(text)}</th>" for kind, text in zip(kinds, headers, strict=True))
+    head = "".join(
+        f"<th{kind}>{escape(text)}</th>" for kind, text in zip(kinds, headers, strict=True)
+    )
     body = "".join(
         f"<tr>{''.join(f'<td{kind}>{cell}</td>' for kind, cell in zip(kinds, row, strict=True))}</tr>"
         for row in rows

@@ -5,11 +5,11 @@ Invariant:
   is not declared here.
 - Every field is sent, whether or not it has its default value. A script never has to guess what
   an absent field means.
-- The field `kind` names the kind of a chart or an arm. A script never infers the kind from other
-  fields.
+- The field `kind` names the kind of a chart or an arm. A script never infers the kind from
+  other fields.
 
-The tests of pages in browsers (`tests/page/whole_pages.py`) report every field that a script reads
-and that was not sent.
+The tests of pages in browsers (`tests/page/whole_pages.py`) report every field that a script
+reads and that was not sent.
 """
 
 from typing import Any, Literal
@@ -17,7 +17,9 @@ from typing import Any, Literal
 import msgspec
 
 Colour = int | Literal["limit"]
-"""Index of a site in the palette of the page, or "limit" for references, true values and limits."""
+"""Index of a site in the palette of the page, or "limit" for references, true values and
+limits.
+"""
 
 
 class ColumnTable(msgspec.Struct, frozen=True):
@@ -53,7 +55,9 @@ class HistogramSeries(msgspec.Struct, frozen=True):
 
 
 class DistributionSeries(msgspec.Struct, frozen=True):
-    """A line of a distribution: base64 of the percentages at the chart's `x`, little-endian float32."""
+    """A line of a distribution: base64 of the percentages at the chart's `x`, little-endian
+    float32.
+    """
 
     label: str
     colour: Colour
@@ -76,7 +80,8 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
     Attributes:
         section: key of the section in `report.toml`.
         sites: sites whose modes and changes are marked in the chart.
-        links: true if changes of links are marked as well, and if stated lines lie above the series.
+        links: true if changes of links are marked as well, and if stated lines lie above the
+            series.
         log: true for a logarithmic axis of values.
         zero: true if the axis of values begins at 0.
         margin: least space above the values, as a share of the largest value.
@@ -94,7 +99,9 @@ class TimeChart(msgspec.Struct, frozen=True, kw_only=True, tag="time", tag_field
     margin: float = 0.0
 
 
-class HistogramChart(msgspec.Struct, frozen=True, kw_only=True, tag="histogram", tag_field="kind"):
+class HistogramChart(
+    msgspec.Struct, frozen=True, kw_only=True, tag="histogram", tag_field="kind"
+):
     """Counts of ticks over bins of equal width on a logarithmic axis.
 
     Attributes:
@@ -110,7 +117,9 @@ class HistogramChart(msgspec.Struct, frozen=True, kw_only=True, tag="histogram",
     periods: list[float]
 
 
-class DistributionChart(msgspec.Struct, frozen=True, kw_only=True, tag="distribution", tag_field="kind"):
+class DistributionChart(
+    msgspec.Struct, frozen=True, kw_only=True, tag="distribution", tag_field="kind"
+):
     """Cumulative percentages.
 
     Attributes:
@@ -133,8 +142,8 @@ class PlanarArm(msgspec.Struct, frozen=True, kw_only=True, tag="planar", tag_fie
     """An arm of two links in the picture of the arms.
 
     Attributes:
-        table: table of the actual and the desired angles of both joints, rad, and of the edges of
-            the bodies.
+        table: table of the actual and the desired angles of both joints, rad, and of the edges
+            of the bodies.
         bodies: number of bodies of the site's plant.
         links_m: lengths of the links, m.
     """
@@ -150,8 +159,8 @@ class ChainArm(msgspec.Struct, frozen=True, kw_only=True, tag="chain", tag_field
     """A chain in the picture of the arms.
 
     Attributes:
-        table: table of the coordinates of the actual, the desired and the shadow's points in the
-            picture, and of the edges of the bodies.
+        table: table of the coordinates of the actual, the desired and the shadow's points in
+            the picture, and of the edges of the bodies.
         bodies: number of bodies of the site's plant.
         points: number of joints, with the end effector and without the base.
     """
@@ -208,7 +217,8 @@ class PageData(msgspec.Struct, frozen=True, kw_only=True):
         end_s: end of the time axis, s.
         spans: per site, the times in which the site does not follow its peers.
         arms: arms of the sites that have a record.
-        bounds_m: left, right, bottom and top of the pictures of the arms, in the units of these pictures.
+        bounds_m: left, right, bottom and top of the pictures of the arms, in the units of these
+            pictures.
     """
 
     end_s: float

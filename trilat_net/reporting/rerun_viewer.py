@@ -1,10 +1,12 @@
-"""Display of a log in the Rerun viewer, which the extra `view` installs, in a layout of its own.
+"""Display of a log in the Rerun viewer, which the extra `view` installs, in a layout of its
+own.
 
 The layout: pages, a column per site, a row per quantity; saved as a blueprint.
 
-Invariant: a finished file with standard channels is opened itself. Any other log is exported as a ROS 2 bag
-into a temporary folder first. A plot has one unit, and every curve a name. Quantities that a log lacks take
-no space. All views, names and colors are set here, none by the viewer, so that two logs look alike.
+Invariant: a finished file with standard channels is opened itself. Any other log is exported as
+a ROS 2 bag into a temporary folder first. A plot has one unit, and every curve a name.
+Quantities that a log lacks take no space. All views, names and colors are set here, none by the
+viewer, so that two logs look alike.
 """
 
 import os
@@ -24,7 +26,14 @@ from ..log.log_layout import ACTIVE_SUFFIX
 from ..log.log_reader import Log
 from ..log.ros2.cdr import JOINT_STATE, STRING, TRANSFORMS
 from ..log.ros2.robot_model import WORLD
-from ..log.ros2.ros2_messages import EVENTS, FRAMES, LINES, SENT_PREFIX, Ros2Channel, read_ros2_channels
+from ..log.ros2.ros2_messages import (
+    EVENTS,
+    FRAMES,
+    LINES,
+    SENT_PREFIX,
+    Ros2Channel,
+    read_ros2_channels,
+)
 from ..log.ros2.topic_names import DIAGNOSTICS
 from .exports.ros2 import export_ros2
 
@@ -38,7 +47,9 @@ _QUIET = {"RERUN_ANALYTICS_ENABLED": "false", "RUST_LOG": "warn"}
 
 
 class ViewerOptions(NamedTuple):
-    """How to show a log: every record instead of decimated channels, in a browser, or into a file, `.rrd`."""
+    """How to show a log: every record instead of decimated channels, in a browser, or into a
+    file, `.rrd`.
+    """
 
     full: bool = False
     web: bool = False
@@ -50,11 +61,14 @@ def open_rerun(
     opened: Callable[[], Log],
     show: ViewerOptions,
     say: Callable[[str], None],
-    run: RunCommand = lambda command, environment: subprocess.run(command, env=environment).returncode,
+    run: RunCommand = lambda command, environment: (
+        subprocess.run(command, env=environment).returncode
+    ),
 ) -> None:
     """Shows a log in its file or parts, until its viewer is closed.
 
-    The log is opened by `opened` if it has to be read; `say` prints a line, and `run` runs Rerun.
+    The log is opened by `opened` if it has to be read; `say` prints a line, and `run` runs
+    Rerun.
 
     Raises:
         UsageError: Rerun is not installed, or there is no display.
@@ -64,7 +78,9 @@ def open_rerun(
     import_extra("rerun", "view", "viewers")
     displays = {"DISPLAY", "WAYLAND_DISPLAY"} & {*os.environ}
     if show.save is None and not show.web and sys.platform == "linux" and not displays:
-        raise UsageError("there is no display here; show it in a browser with --web, or keep it with --save")
+        raise UsageError(
+            "there is no display here; show it in a browser with --web, or keep it with --save"
+        )
     with tempfile.TemporaryDirectory(prefix="trilat-view-") as folder:
         path = paths[0]
         named = Path(folder) / f"{make_application_id(paths[0])}.mcap"
@@ -88,21 +104,35 @@ def make_application_id(path: Path) -> str:
     return re.sub(r"[^A-Za-z0-9_-]", "-", stem).lstrip("-") or "log"
 
 
-def _commands(show: ViewerOptions, log: Path, layout: Path, say: Callable[[str], None]) -> list[list[str]]:
-    """Returns the arguments of one call of Rerun after the other; it listens on this machine alone."""
+def _commands(
+    show: ViewerOptions, log: Path, layout: Path, say: Callable[[str], None]
+) -> list[list[str]]:
+    """Returns the arguments of one call of Rerun after the other; it listens on this machine
+    alone.
+    """
     if show.save is not None:
         # Rerun's own `--save` of several files ends with the first that was read; the rest of the others is
         # missing (measured with 0.41: up to all of a log)
         recording = layout.with_name("log.rrd")
         return [
-            ["mcap", "convert", str(log), "--application-id", log.stem, "--output", str(recording)],
+            [
+                "mcap",
+                "convert",
+                str(log),
+                "--application-id",
+                log.stem,
+                "--output",
+                str(recording),
+            ],
             ["rrd", "merge", str(recording), str(layout), "--output", str(show.save)],
         ]
     port = _free_port()
     command = [str(log), str(layout), "--bind", _OWN, "--port", str(port)]
     if show.web:
         page = _free_port()
-        say(f"open http://{_OWN}:{page}/?url=rerun%2Bhttp%3A%2F%2F{_OWN}%3A{port}%2Fproxy; Ctrl-C ends it")
+        say(
+            f"open http://{_OWN}:{page}/?url=rerun%2Bhttp%3A%2F%2F{_OWN}%3A{port}%2Fproxy; Ctrl-C ends it"
+        )
         return [[*command, "--serve-web", "--web-viewer-port", str(page)]]
     return [command]
 
@@ -120,7 +150,9 @@ _SESSION_TOPICS = (EVENTS, LINES, FRAMES, DIAGNOSTICS)
 
 
 class PlotCurves(NamedTuple):
-    """Curves of one channel: where Rerun puts its numbers, their names in order, and which of them show."""
+    """Curves of one channel: where Rerun puts its numbers, their names in order, and which of
+    them show.
+    """
 
     entity: str
     names: tuple[str, ...]
@@ -139,17 +171,29 @@ PlotPage = list[list[CurvePlot]]
 
 _PAGES = {
     "Motion": (
-        ("joint angles and reference", "rad", (("joint_states", "position"), ("reference", "position"))),
+        (
+            "joint angles and reference",
+            "rad",
+            (("joint_states", "position"), ("reference", "position")),
+        ),
         ("error", "rad", (("error", ""),)),
         ("torque, and exogenous torque", "N m", (("joint_states", "effort"), ("tau_x", ""))),
     ),
     "Speeds, estimates": (
-        ("joint velocities", "rad/s", (("joint_states", "velocity"), ("reference", "velocity"))),
+        (
+            "joint velocities",
+            "rad/s",
+            (("joint_states", "velocity"), ("reference", "velocity")),
+        ),
         ("estimate", "kg m^2, kg m", (("theta_hat", ""),)),
         ("estimated masses", "kg", (("theta_hat", "m"),)),
         ("estimated first moments", "kg m", (("theta_hat", "mc"),)),
         ("estimated moments of inertia", "kg m^2", (("theta_hat", "I"),)),
-        ("mode: run 1, diverged 2, hold 3, brake 4, return 5", "", (("mode", ""), ("mode_number", ""))),
+        (
+            "mode: run 1, diverged 2, hold 3, brake 4, return 5",
+            "",
+            (("mode", ""), ("mode_number", "")),
+        ),
     ),
     "Links, timing": (
         ("age of samples in use, by peer", "ms", (("link_age", ""),)),
@@ -158,14 +202,17 @@ _PAGES = {
         ("largest in 100 ms", "us", (("timing", ""),)),
     ),
 }
-"""Per page its rows: quantity, unit, and parts: channel, and of joint states one of their lists, of the ten
-parameters of each link of a chain one kind."""
+"""Per page its rows: quantity, unit, and parts: channel, and of joint states one of their
+lists, of the ten parameters of each link of a chain one kind.
+"""
 _MOST_NAMES = 20
 """Curves that a legend names; of more, the pointer does."""
 
 
 class PlotLayout(NamedTuple):
-    """All pages by name, the topic of the event lines, "" without any, and whether arms are to be seen."""
+    """All pages by name, the topic of the event lines, "" without any, and whether arms are to
+    be seen.
+    """
 
     pages: dict[str, PlotPage]
     lines: str
@@ -173,9 +220,13 @@ class PlotLayout(NamedTuple):
 
 
 def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
-    """Returns the plots of standard channels: `<root>/<site>/<name>`, and of the session `<root>/log`."""
+    """Returns the plots of standard channels: `<root>/<site>/<name>`, and of the session
+    `<root>/log`.
+    """
     session = [topic for topic in channels if topic.rpartition("/")[2] in _SESSION_TOPICS]
-    roots = list(dict.fromkeys(topic.rpartition("/")[0] for topic in channels if topic not in session))
+    roots = list(
+        dict.fromkeys(topic.rpartition("/")[0] for topic in channels if topic not in session)
+    )
     pages = {
         name: [plots for what in rows if (plots := [*_row(channels, roots, *what)])]
         for name, rows in _PAGES.items()
@@ -185,7 +236,10 @@ def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
         for topic, channel in channels.items()
         if (name := topic.rpartition("/")[2]).startswith(SENT_PREFIX)
     }
-    rows = [[*_row(channels, roots, what, unit, ((name, ""),))] for name, (what, unit) in sent.items()]
+    rows = [
+        [*_row(channels=channels, roots=roots, what=what, unit=unit, parts=((name, ""),))]
+        for name, (what, unit) in sent.items()
+    ]
     pages["Sent by laws"] = rows
     lines = next((topic for topic in session if topic.endswith(f"/{LINES}")), "")
     arms = any(channel.kind == TRANSFORMS for channel in channels.values())
@@ -193,10 +247,17 @@ def build_plot_layout(channels: Ros2Channels) -> PlotLayout:
 
 
 def _row(
-    channels: Ros2Channels, roots: list[str], what: str, unit: str, parts: tuple[tuple[str, str], ...]
+    channels: Ros2Channels,
+    roots: list[str],
+    what: str,
+    unit: str,
+    parts: tuple[tuple[str, str], ...],
 ) -> Iterator[CurvePlot]:
     for root in roots:
-        found = [_curves(f"{root}/{name}", field, channels.get(f"{root}/{name}")) for name, field in parts]
+        found = [
+            _curves(f"{root}/{name}", field, channels.get(f"{root}/{name}"))
+            for name, field in parts
+        ]
         if curves := tuple(one for one in found if one is not None):
             site = root.rpartition("/")[2]
             yield CurvePlot(f"{site}: {what}" + (f" ({unit})" if unit else ""), curves)
@@ -208,17 +269,27 @@ def _curves(topic: str, field: str, channel: Ros2Channel | None) -> PlotCurves |
     axes = (axis.split(" ") for axis in channel.about.get("names", "").split("; "))
     names = tuple(" ".join(filter(None, one)) for one in product(*axes))
     if topic.endswith("/theta_hat"):
-        kinds = [name.rpartition(".")[2].rstrip("xyz_") if "." in name else "" for name in names]
-        return PlotCurves(topic, names, tuple(kind == field for kind in kinds)) if field in kinds else None
+        kinds = [
+            name.rpartition(".")[2].rstrip("xyz_") if "." in name else "" for name in names
+        ]
+        return (
+            PlotCurves(topic, names, tuple(kind == field for kind in kinds))
+            if field in kinds
+            else None
+        )
     if channel.kind != JOINT_STATE:
         prefix = f"{topic.rpartition('/')[2]} " if topic.endswith("/tau_x") else ""
-        return PlotCurves(topic, tuple(f"{prefix}{name}" for name in names), (True,) * len(names))
+        return PlotCurves(
+            topic, tuple(f"{prefix}{name}" for name in names), (True,) * len(names)
+        )
     reference = all(name.endswith("_ref") for name in names) or topic.endswith("/reference")
     if field == "effort" and reference:
         return None
     if reference:
         names = tuple(name.removesuffix("_ref") + "_ref" for name in names)
-    shown = tuple(reference or field == "position" or not name.endswith("_ref") for name in names)
+    shown = tuple(
+        reference or field == "position" or not name.endswith("_ref") for name in names
+    )
     return PlotCurves(f"{topic}/{field}", names, shown)
 
 
@@ -230,14 +301,18 @@ _TIMELINE = "message_publish_time"
 
 
 def save_blueprint(board: PlotLayout, application: str, path: Path) -> None:
-    """Writes a layout as a blueprint file; `application` is Rerun's name of the recordings that it is for.
+    """Writes a layout as a blueprint file; `application` is Rerun's name of the recordings that
+    it is for.
 
     Raises:
         UsageError: Rerun is not installed.
     """
     rrb = import_extra("rerun.blueprint", "view", "viewers")
     pages = [
-        rrb.Vertical(*(rrb.Horizontal(*(_view(rrb, plot) for plot in plots)) for plots in page), name=name)
+        rrb.Vertical(
+            *(rrb.Horizontal(*(_view(rrb, plot) for plot in plots)) for plots in page),
+            name=name,
+        )
         for name, page in board.pages.items()
     ]
     if board.arms:
@@ -264,7 +339,9 @@ def _view(rrb: Any, plot: CurvePlot) -> Any:
         origin="/",
         contents=[curves.entity for curves in plot.curves],
         overrides=overrides,
-        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop, visible=False if many else None),
+        plot_legend=rrb.PlotLegend(
+            corner=rrb.Corner2D.RightTop, visible=False if many else None
+        ),
     )
 
 
@@ -274,4 +351,6 @@ def _lines(curves: PlotCurves, first: int) -> Any:
     pale = cycle(_PALE)
     strong = cycle(_COLORS[first:] + _COLORS[:first])
     colors = [next(pale) if name.endswith("_ref") else next(strong) for name in curves.names]
-    return rr.SeriesLines(names=list(curves.names), colors=colors, visible_series=list(curves.shown))
+    return rr.SeriesLines(
+        names=list(curves.names), colors=colors, visible_series=list(curves.shown)
+    )

@@ -1,7 +1,8 @@
-"""The text of results: composed of lines and tables once, for the terminal, as plain text and as HTML.
+"""The text of results: composed of lines and tables once, for the terminal, as plain text and
+as HTML.
 
-Invariant: all three have the same blocks in the same order. Results of `studies` compose their own; those of
-the rooms below have a module here.
+Invariant: all three have the same blocks in the same order. Results of `studies` compose their
+own; those of the rooms below have a module here.
 
 Every cell of a table is text already, and all forms show the same cells in the same order.
 """
@@ -22,12 +23,16 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 _COLOURS = {"ok": "green", "warn": "yellow", "open": "yellow", "fail": "red", "FAIL": "red"}
-MARKS = {word: f"[{colour}]{word:<4}[/{colour}]" for word, colour in _COLOURS.items()} | {"note": "note"}
+MARKS = {word: f"[{colour}]{word:<4}[/{colour}]" for word, colour in _COLOURS.items()} | {
+    "note": "note"
+}
 """Of findings, by their state."""
 
 
 HASH = re.compile(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{12,64}\b")
-"""A hash in hexadecimal digits, or the beginning of one: it stays on one line, so that it can be copied."""
+"""A hash in hexadecimal digits, or the beginning of one: it stays on one line, so that it can
+be copied.
+"""
 
 
 def escape_text(text: str) -> str:
@@ -40,11 +45,12 @@ class TextTable(NamedTuple):
 
     Attributes:
         headers: one per column; all empty for a table without a header line.
-        rows: one text per column each. A shorter row leaves its last cells empty; a row of one text in a
-            wider table is the heading of a group of rows.
-        align: a letter per column, "l" for words and "r" for numbers; the last one holds for all columns
-            that follow.
-        units: one per column, appended to its header; "" for none. May be shorter than `headers`.
+        rows: one text per column each. A shorter row leaves its last cells empty; a row of one
+            text in a wider table is the heading of a group of rows.
+        align: a letter per column, "l" for words and "r" for numbers; the last one holds for
+            all columns that follow.
+        units: one per column, appended to its header; "" for none. May be shorter than
+            `headers`.
         styles: on a terminal, styles of cells by their texts, as in {"fails": "yellow"}.
     """
 
@@ -58,7 +64,9 @@ class TextTable(NamedTuple):
     def titles(self) -> list[str]:
         """The headers with their units."""
         units = [*self.units, *[""] * len(self.headers)]
-        return [f"{head} {unit}".strip() for head, unit in zip(self.headers, units, strict=False)]
+        return [
+            f"{head} {unit}".strip() for head, unit in zip(self.headers, units, strict=False)
+        ]
 
     @property
     def to_the_right(self) -> list[bool]:
@@ -66,13 +74,17 @@ class TextTable(NamedTuple):
         return [letter == "r" for letter in self.align.ljust(len(self.headers), self.align[-1])]
 
     def rich(self) -> "Table":
-        """Returns it for a Rich console: no borders, cells folded where the terminal is too narrow."""
+        """Returns it for a Rich console: no borders, cells folded where the terminal is too
+        narrow.
+        """
         from rich.table import Table
 
         table = Table(box=None, pad_edge=False, show_header=any(self.titles))
         for n, (title, right) in enumerate(zip(self.titles, self.to_the_right, strict=True)):
             cells = [row[n] for row in self.rows if n < len(row)]
-            widest = max((len(found) for cell in cells for found in HASH.findall(cell)), default=None)
+            widest = max(
+                (len(found) for cell in cells for found in HASH.findall(cell)), default=None
+            )
             side: Any = "right" if right else "left"
             # Rich narrows columns that may wrap before it looks at the least widths of the others.
             holds_hashes = widest is not None and all(len(cell) <= widest for cell in cells)
@@ -85,7 +97,9 @@ class TextTable(NamedTuple):
             )
         for row in self.rows:
             heading = "bold" if len(row) == 1 < len(self.headers) else ""
-            table.add_row(*(Text(sanitize(cell), style=self.styles.get(cell, heading)) for cell in row))
+            table.add_row(
+                *(Text(sanitize(cell), style=self.styles.get(cell, heading)) for cell in row)
+            )
         return table
 
     def markdown(self) -> str:
@@ -94,7 +108,8 @@ class TextTable(NamedTuple):
         blank = [""] * len(self.headers)
         cells = (self.titles, rule, *([*row, *blank[len(row) :]] for row in self.rows))
         return "\n".join(
-            f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |" for row in cells
+            f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |"
+            for row in cells
         )
 
     def html(self) -> str:
@@ -103,17 +118,23 @@ class TextTable(NamedTuple):
 
         def line(cells: Sequence[str], kind: str) -> str:
             pairs = zip(cells, sides, strict=False)
-            made = (f'<{kind} style="text-align:{side}">{escape_text(cell)}</{kind}>' for cell, side in pairs)
+            made = (
+                f'<{kind} style="text-align:{side}">{escape_text(cell)}</{kind}>'
+                for cell, side in pairs
+            )
             return f"<tr>{''.join(made)}</tr>"
 
         head = f"<thead>{line(self.titles, 'th')}</thead>" if any(self.titles) else ""
         return f"<table>{head}<tbody>{''.join(line(row, 'td') for row in self.rows)}</tbody></table>"
 
     def lines(self) -> list[str]:
-        """Returns its lines with columns aligned by spaces; the first holds the headers, if there are any."""
+        """Returns its lines with columns aligned by spaces; the first holds the headers, if
+        there are any.
+        """
         table = [self.titles, *self.rows] if any(self.titles) else self.rows
         widths = [
-            max((len(row[n]) for row in table if n < len(row)), default=0) for n in range(len(self.headers))
+            max((len(row[n]) for row in table if n < len(row)), default=0)
+            for n in range(len(self.headers))
         ]
         return [
             "  ".join(

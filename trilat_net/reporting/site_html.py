@@ -1,6 +1,7 @@
 """The records of a site as HTML, for notebooks: what they are, and a table of their quantities.
 
-Invariant: the table has only fields that the records of this site contain, and looking at it changes nothing.
+Invariant: the table has only fields that the records of this site contain, and looking at it
+changes nothing.
 """
 
 from collections.abc import Iterator
@@ -29,5 +30,9 @@ def _rows(site: SiteLog) -> Iterator[tuple[str, ...]]:
         for n in range(values.shape[1]):
             column = values[:, n]
             numbers = (column[0], column[-1], column.min(), column.max())
-            yield (f"{field}[{n}]", *(format_number(float(number)) for number in numbers), meaning)
+            yield (
+                f"{field}[{n}]",
+                *(format_number(float(number)) for number in numbers),
+                meaning,
+            )
             meaning = ""

@@ -1,11 +1,12 @@
-"""Style of all figures: colours per site, line styles, axes, legends, and files that are equal byte for byte.
+"""Style of all figures: colours per site, line styles, axes, legends, and files that are equal
+byte for byte.
 
-Sites beyond the palette differ by dashes. A figure over the time of a run has panels, a line per site, event
-markers, time axis and legend.
+Sites beyond the palette differ by dashes. A figure over the time of a run has panels, a line
+per site, event markers, time axis and legend.
 
-Invariant: matplotlib's global state stays unchanged. Equal figures give equal bytes: files hold no date, and
-fonts are embedded as TrueType. A run without events has figures without markers; these show hold, brake and
-return of sites and applied changes.
+Invariant: matplotlib's global state stays unchanged. Equal figures give equal bytes: files hold
+no date, and fonts are embedded as TrueType. A run without events has figures without markers;
+these show hold, brake and return of sites and applied changes.
 """
 
 import base64
@@ -62,12 +63,18 @@ _RC: Any = {
     "figure.dpi": REPORT_DPI,
     "savefig.dpi": REPORT_DPI,
 }
-_NARROW_RC: Any = {"legend.handlelength": 1.5, "legend.columnspacing": 1.0, "legend.borderaxespad": 0.2}
+_NARROW_RC: Any = {
+    "legend.handlelength": 1.5,
+    "legend.columnspacing": 1.0,
+    "legend.borderaxespad": 0.2,
+}
 
 
 @contextmanager
 def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
-    """Yields an empty figure of a size, to be drawn in the style of all figures; outside, nothing changes."""
+    """Yields an empty figure of a size, to be drawn in the style of all figures; outside,
+    nothing changes.
+    """
     sizes: Any = {f"{axis}tick.labelsize": form.tick_pt for axis in "xy"}
     with mpl.rc_context({**_RC, **sizes, **(_NARROW_RC if form.narrow else {})}):
         yield NotebookFigure(figsize=(form.width_in, height_in), layout="constrained")
@@ -83,9 +90,8 @@ class NotebookFigure(Figure):
         return drawing.getvalue()
 
     def _repr_html_(self) -> str:
-        width = round(
-            self.get_figwidth() * _NOTEBOOK_DPI / 2
-        )  # two pixels of the picture for one of the page
+        # two pixels of the picture for one of the page
+        width = round(self.get_figwidth() * _NOTEBOOK_DPI / 2)
         picture = base64.b64encode(self._repr_png_()).decode()
         return f'<img alt="figure" width="{width}" src="data:image/png;base64,{picture}">'
 
@@ -102,9 +108,11 @@ def site_colour(log: Log, site: str) -> str:
 
 
 def site_line(log: Log, site: str, width: float | None = None) -> dict[str, Any]:
-    """Returns the options of a site's line, `width` pt wide, solid until the colours are used up.
+    """Returns the options of a site's line, `width` pt wide, solid until the colours are used
+    up.
 
-    Without a width sites share a panel: later ones are thinner, so that lines on top of each other all show.
+    Without a width sites share a panel: later ones are thinner, so that lines on top of each
+    other all show.
     """
     index = log.sites.index(site)
     width = 2.0 - 1.2 * index / (len(log.sites) - 1) if width is None else width
@@ -118,7 +126,9 @@ def site_title(log: Log, site: str) -> str:
 
 
 def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws values over ticks and their times, s, each of shape (K,), decimated with all extremes."""
+    """Draws values over ticks and their times, s, each of shape (K,), decimated with all
+    extremes.
+    """
     trace = decimate(tick, t_s, values[:, np.newaxis], BUCKETS_PER_PANEL)
     axes.plot(trace.t_s, trace.values[:, 0], **options)
 
@@ -134,14 +144,25 @@ SPREAD: dict[str, Any] = {"color": FAINT, "alpha": 0.35, "linewidth": 6.0}
 
 
 def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws what is up and down all the time as a median within a band from the least to the largest."""
-    parts = [part for part in np.array_split(np.arange(len(values)), SPREAD_BUCKETS) if len(part)]
+    """Draws what is up and down all the time as a median within a band from the least to the
+    largest.
+    """
+    parts = [
+        part for part in np.array_split(np.arange(len(values)), SPREAD_BUCKETS) if len(part)
+    ]
     at_s = np.array([t_s[part].mean() for part in parts])
     low, middle, high = (
-        np.array([found(values[part]) if np.isfinite(values[part]).any() else np.nan for part in parts])
+        np.array(
+            [
+                found(values[part]) if np.isfinite(values[part]).any() else np.nan
+                for part in parts
+            ]
+        )
         for found in (np.nanmin, np.nanmedian, np.nanmax)
     )
-    axes.fill_between(at_s, low, high, color=options["color"], alpha=SPREAD["alpha"], linewidth=0.0)
+    axes.fill_between(
+        at_s, low, high, color=options["color"], alpha=SPREAD["alpha"], linewidth=0.0
+    )
     axes.plot(at_s, middle, **options)
 
 
@@ -154,14 +175,18 @@ def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> 
 
 
 def name_joints(log: Log) -> list[str]:
-    """Returns the titles of the joints: numbers, and names if all arms are chains with the same ones."""
+    """Returns the titles of the joints: numbers, and names if all arms are chains with the same
+    ones.
+    """
     arms = [log.scenario.arms[site] for site in log.sites]
     most = max(arms, key=lambda arm: arm.counts.joints)
     if most.chain is None or len({arm.joint_names for arm in arms}) > 1:
         return [f"joint {n + 1}" for n in range(most.counts.joints)]
     units = most.joint_units("rad")
     titles = [f"{n}: {name}" for n, name in enumerate(most.joint_names, 1)]
-    return [title + " (m, N)" * (unit == "m") for title, unit in zip(titles, units, strict=True)]
+    return [
+        title + " (m, N)" * (unit == "m") for title, unit in zip(titles, units, strict=True)
+    ]
 
 
 def name_shared(log: Log) -> list[str]:
@@ -189,7 +214,9 @@ def flatten_rounding(axes: Axes) -> None:
 
 
 class JointPanels(NamedTuple):
-    """Panels of a figure, one per joint in rows of `columns`, the lowest of every column, and a wide one."""
+    """Panels of a figure, one per joint in rows of `columns`, the lowest of every column, and a
+    wide one.
+    """
 
     joints: list[Axes]
     columns: int
@@ -198,17 +225,22 @@ class JointPanels(NamedTuple):
 
 
 def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
-    """Returns rows of places for a panel per joint: their numbers, and "." for a place that stays empty."""
+    """Returns rows of places for a panel per joint: their numbers, and "." for a place that
+    stays empty.
+    """
     choices = (2,) if narrow or joints == 2 else (3, 4)
     columns = min(choices, key=lambda count: (-(-joints // count), -joints % count))
     places = [str(n) if n < joints else "." for n in range(-(-joints // columns) * columns)]
     return [places[first : first + columns] for first in range(0, len(places), columns)]
 
 
-def add_joint_panels(figure: Figure, joints: int, form: FigureSize, below: str = "") -> JointPanels:
+def add_joint_panels(
+    figure: Figure, joints: int, form: FigureSize, below: str = ""
+) -> JointPanels:
     """Returns a panel per joint, and below them a wide one if it has a name.
 
-    Two joints share their axis of values; of more, each has its own, since wrists bear less than shoulders.
+    Two joints share their axis of values; of more, each has its own, since wrists bear less
+    than shoulders.
     """
     grid = arrange_joints(joints, form.narrow)
     columns = len(grid[0])
@@ -236,20 +268,30 @@ def typeset_unit(unit: str) -> str:
 
 def typeset_symbol(parameter: str) -> str:
     """Returns the name of a link's parameter with its index below: "mc_x", "Ixx"."""
-    stem, index = (parameter[:1], parameter[1:]) if parameter[0] == "I" else (parameter[:2], parameter[3:])
+    stem, index = (
+        (parameter[:1], parameter[1:])
+        if parameter[0] == "I"
+        else (parameter[:2], parameter[3:])
+    )
     return f"${stem.strip()}_{{{index}}}$" if index else f"${stem}$"
 
 
 def add_legend(figure: Figure, entries: LegendEntries, **options: Any) -> None:
     """Puts a legend of lines above the panels, see `place_legend`."""
-    place_legend(figure, [Line2D([], [], label=text, **line) for text, line in entries], **options)
+    place_legend(
+        figure, [Line2D([], [], label=text, **line) for text, line in entries], **options
+    )
 
 
 def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None:
-    """Puts handles above the panels, where they hide nothing, in as many columns as there is room for."""
+    """Puts handles above the panels, where they hide nothing, in as many columns as there is
+    room for.
+    """
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     for columns in range(min(len(handles), 6), 0, -1):
-        made = figure.legend(handles=handles, loc="outside upper center", ncols=columns, **options)
+        made = figure.legend(
+            handles=handles, loc="outside upper center", ncols=columns, **options
+        )
         if columns == 1 or made.get_window_extent(renderer).width <= figure.bbox.width:
             return
         made.remove()
@@ -275,12 +317,22 @@ def annotate_empty_panel(axes: Axes, text: str) -> None:
 
 FIGURE_FORMATS = ("pdf", "png", "svg")
 
-_FILE_RC: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "path", "svg.hashsalt": "trilat-net"}
-_UNDATED: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "png": {}, "svg": {"Date": None}}
+_FILE_RC: Any = {
+    "pdf.fonttype": 42,
+    "ps.fonttype": 42,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "trilat-net",
+}
+_UNDATED: dict[str, dict[str, Any]] = {
+    "pdf": {"CreationDate": None},
+    "png": {},
+    "svg": {"Date": None},
+}
 
 
 def write_figure(drawn: Figure, path: Path, dpi: int) -> None:
-    """Writes a figure in the format of the path's suffix, of `FIGURE_FORMATS`; `dpi` is that of a .png.
+    """Writes a figure in the format of the path's suffix, of `FIGURE_FORMATS`; `dpi` is that of
+    a .png.
 
     Raises:
         UsageError: it cannot be made.
@@ -309,7 +361,12 @@ _NUMBER: dict[str, Any] = {
     "textcoords": "offset points",
     "va": "top",
     "color": REFERENCE,
-    "bbox": {"boxstyle": "square,pad=0.05", "facecolor": "white", "edgecolor": "none", "alpha": 0.7},
+    "bbox": {
+        "boxstyle": "square,pad=0.05",
+        "facecolor": "white",
+        "edgecolor": "none",
+        "alpha": 0.7,
+    },
 }
 
 
@@ -335,8 +392,12 @@ class TimeFigure:
         self._changes = list(enumerate(list_changes(log), 1))
         self._modes = {site: find_mode_intervals(log[site]) for site in log.sites}
 
-    def trace(self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any) -> None:
-        """Draws values over the records of a site, shape (K,); `options` replace those of the site's line."""
+    def trace(
+        self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any
+    ) -> None:
+        """Draws values over the records of a site, shape (K,); `options` replace those of the
+        site's line.
+        """
         part = self.log[site]
         line = {**site_line(self.log, site, width), **options}
         plot_decimated(axes, part.tick, part.t_s, values, **line)
@@ -352,8 +413,11 @@ class TimeFigure:
             if len(row) > 2:
                 flatten_rounding(axes)
 
-    def mark(self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True) -> None:
-        """Marks a panel: shaded in the color of a site while it does not follow its peers, lines at changes.
+    def mark(
+        self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True
+    ) -> None:
+        """Marks a panel: shaded in the color of a site while it does not follow its peers,
+        lines at changes.
 
         Changes are those that the sites carried out, or of these those of one link.
         """
@@ -369,30 +433,46 @@ class TimeFigure:
             place = axes.get_xaxis_transform()
             axes.axvline(at_s, zorder=0.6, **_CHANGE)
             if numbered:
-                axes.annotate(str(n), (at_s, 1.0), xycoords=place, fontsize=self._small_pt, **_NUMBER)
+                axes.annotate(
+                    str(n), (at_s, 1.0), xycoords=place, fontsize=self._small_pt, **_NUMBER
+                )
 
     def finish(
-        self, lowest: Sequence[Axes], entries: LegendEntries, *, links: bool = False, title: str = ""
+        self,
+        lowest: Sequence[Axes],
+        entries: LegendEntries,
+        *,
+        links: bool = False,
+        title: str = "",
     ) -> None:
-        """Gives the lowest panels their time axis, the figure its legend, and explains its markers.
+        """Gives the lowest panels their time axis, the figure its legend, and explains its
+        markers.
 
         With `links`, only changes of links are marked; the title stands above the legend.
         """
         for axes in lowest:
             axes.set_xlabel("time (s)")
             axes.set_xlim(0.0, recorded_end_s(self.log))
-        add_legend(self.figure, entries, **({"title": title, "title_fontsize": 8.0} if title else {}))
+        add_legend(
+            self.figure, entries, **({"title": title, "title_fontsize": 8.0} if title else {})
+        )
         marked = [(n, c) for n, c in self._changes if c.change.link or not links]
         words = [f"{n}: {c.about} {c.text}" for n, c in marked[:MOST_EXPLAINED_CHANGES]]
         if len(marked) > MOST_EXPLAINED_CHANGES:
             words.append(f"and {len(marked) - MOST_EXPLAINED_CHANGES} more")
         letters = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
         lines = textwrap.wrap(f"Changes: {'; '.join(words)}", letters) if words else []
-        modes = {interval.meaning for intervals in self._modes.values() for interval in intervals}
+        modes = {
+            interval.meaning for intervals in self._modes.values() for interval in intervals
+        }
         if modes:
-            told = {one: " (lighter)" if one.mode is Mode.RETURN else "" for one in sorted(modes)}
+            told = {
+                one: " (lighter)" if one.mode is Mode.RETURN else "" for one in sorted(modes)
+            }
             doing = ", ".join(one.does + how for one, how in told.items())
             lines += textwrap.wrap(f"Shaded in the color of a site: it {doing}", letters)
         if lines:
             text = typeset("\n".join(lines))
-            self.figure.supxlabel(text, x=0.01, ha="left", fontsize=self._small_pt, color=REFERENCE)
+            self.figure.supxlabel(
+                text, x=0.01, ha="left", fontsize=self._small_pt, color=REFERENCE
+            )

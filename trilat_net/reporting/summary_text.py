@@ -1,10 +1,11 @@
-"""What is found of a run, as text: its summary and its metrics, the checks of its log, a recovery, a rerun.
+"""What is found of a run, as text: its summary and its metrics, the checks of its log, a
+recovery, a rerun.
 
-The summary has links, changes, modes, clocks, and messages of user laws and arms. What was measured of a
-running session, and of this machine, is here too.
+The summary has links, changes, modes, clocks, and messages of user laws and arms. What was
+measured of a running session, and of this machine, is here too.
 
-Invariant: a link with one constant delay and no loss gets no line. A dash stands for a missing number of a
-metric; if there could be one, its reason is given below.
+Invariant: a link with one constant delay and no loss gets no line. A dash stands for a missing
+number of a metric; if there could be one, its reason is given below.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -44,7 +45,13 @@ def compose_log(log: Log) -> Iterator[Block]:
     """Yields the session, a row per site, and what else there is to say of the run."""
     yield log.headline()
     rows = [
-        [row["site"], f"{row['rate_hz']}", f"{row['records']}", f"{row['missing']}", f"{row['last_s']}"]
+        [
+            row["site"],
+            f"{row['rate_hz']}",
+            f"{row['records']}",
+            f"{row['missing']}",
+            f"{row['last_s']}",
+        ]
         for row in log.to_rows()
     ]
     yield TextTable(("site", "rate Hz", "records", "missing", "until s"), rows, align="lr")
@@ -52,7 +59,8 @@ def compose_log(log: Log) -> Iterator[Block]:
 
 
 def format_run_lines(log: Log) -> list[str]:
-    """Returns the lines of a run besides its numbers: user laws, links, changes, modes and clocks.
+    """Returns the lines of a run besides its numbers: user laws, links, changes, modes and
+    clocks.
 
     Raises:
         LogError: a record names a change that is none.
@@ -70,7 +78,9 @@ def format_run_lines(log: Log) -> list[str]:
 def format_outside_lines(log: Log) -> list[str]:
     """Returns the messages about user laws and external arms, as lines of bounded length."""
     texts = (e.text[:MOST_LINE_CHARACTERS] for e in log.events if e.kind in OUTSIDE_EVENT_KINDS)
-    return _first(["".join(letter if letter.isprintable() else " " for letter in text) for text in texts])
+    return _first(
+        ["".join(letter if letter.isprintable() else " " for letter in text) for text in texts]
+    )
 
 
 def format_link_lines(log: Log) -> list[str]:
@@ -78,10 +88,14 @@ def format_link_lines(log: Log) -> list[str]:
     lines = []
     for use in (use for use in link_summary.summarise_links(log) if not use.plain):
         measured = any(state.link.measured for state in use.stated)
-        parts = [f"link {use.name}: {'' if measured else 'stated '}{format_stated_models(use.stated)}"]
+        parts = [
+            f"link {use.name}: {'' if measured else 'stated '}{format_stated_models(use.stated)}"
+        ]
         if use.one_way_us is not None and measured:
             parts.append(f"one way {_ms(use.one_way_us, 1e-3)}")
-        parts.append("no sample in use" if use.age_ms is None else f"effective {_ms(use.age_ms)}")
+        parts.append(
+            "no sample in use" if use.age_ms is None else f"effective {_ms(use.age_ms)}"
+        )
         if use.counts is not None:
             parts.append(_losses(use, use.counts))
         lines.append("; ".join(parts))
@@ -103,7 +117,9 @@ def format_mode_lines(log: Log) -> list[str]:
     lines = []
     for site in log.sites:
         if found := find_mode_intervals(log[site]):
-            words = [f"{s.meaning.did} {s.from_s:.3f}-{s.to_s:.3f} s" for s in found[:MOST_LINES]]
+            words = [
+                f"{s.meaning.did} {s.from_s:.3f}-{s.to_s:.3f} s" for s in found[:MOST_LINES]
+            ]
             more = [f"and {len(found) - MOST_LINES} more"] if len(found) > MOST_LINES else []
             lines.append(f"{site}: {', '.join([*words, *more])}")
     return lines
@@ -162,7 +178,11 @@ def _losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) ->
         "duplicates": counts.duplicate + counts.copies,
     }
     judged = max(counts.judged, 1)
-    words = [f"{name} {count} ({100 * count / judged:.3g} %)" for name, count in losses.items() if count]
+    words = [
+        f"{name} {count} ({100 * count / judged:.3g} %)"
+        for name, count in losses.items()
+        if count
+    ]
     if use.burst is not None and use.burst > 1.005:
         words.append(f"{_number(use.burst)} in a row")
     return ", ".join(words) or "nothing lost"
@@ -170,7 +190,11 @@ def _losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) ->
 
 def _first(lines: list[str]) -> list[str]:
     more = len(lines) - MOST_LINES
-    return lines if more <= 0 else [*lines[:MOST_LINES], f"and {more} more of this kind: see summary.json"]
+    return (
+        lines
+        if more <= 0
+        else [*lines[:MOST_LINES], f"and {more} more of this kind: see summary.json"]
+    )
 
 
 def compose_verification(found: LogCheckReport) -> Iterator[Block]:
@@ -209,7 +233,10 @@ def compose_recovery(found: Recovery) -> Iterator[Block]:
     if found.coverage.expected:  # else nothing tells which records there should be
         lists.append(("missing", found.missing))
     for name, lines in lists:
-        rows += [("" if n else name, text) for n, text in enumerate(lines[:_MAX_LOSSES] or ["nothing"])]
+        rows += [
+            ("" if n else name, text)
+            for n, text in enumerate(lines[:_MAX_LOSSES] or ["nothing"])
+        ]
         if len(lines) > _MAX_LOSSES:
             rows.append(("", f"and {len(lines) - _MAX_LOSSES} more; --json lists all"))
     yield TextTable(("", ""), [(f"  {name}", text) for name, text in rows])
@@ -220,9 +247,20 @@ def compose_rerun(again: Rerun) -> Iterator[Block]:
     asked = again.request
     others = f"; {', '.join(asked.recorded)} as recorded" if asked.recorded else ""
     yield f"{asked.mode}: {', '.join(asked.replaced)} executed afresh{others}"
-    for line in describe_rerun_changes(asked) or ["nothing is changed: this is the experiment of the log"]:
+    for line in describe_rerun_changes(asked) or [
+        "nothing is changed: this is the experiment of the log"
+    ]:
         yield f"  {line}"
-    headers = ("ticks", "identical", "rms e rad", "here", "max e rad", "here", "max tau N m", "here")
+    headers = (
+        "ticks",
+        "identical",
+        "rms e rad",
+        "here",
+        "max e rad",
+        "here",
+        "max tau N m",
+        "here",
+    )
     rows = []
     for effect in again.sites.values():
         cells = []
@@ -253,7 +291,9 @@ def _describe_effects(again: Rerun) -> list[str]:
                 f"{effect.site}: the first difference is at {where}: {first.field} was {was}, is {now}"
             )
         if effect.diverged_at_s is not None:
-            lines.append(f"{effect.site}: diverged at {effect.diverged_at_s:.3f} s and ends there")
+            lines.append(
+                f"{effect.site}: diverged at {effect.diverged_at_s:.3f} s and ends there"
+            )
     for link in (link for link in again.links.values() if link.differs):
         before, after = (
             f"{mean:.4g} ms old on average, {most:.4g} ms at most"
@@ -264,7 +304,9 @@ def _describe_effects(again: Rerun) -> list[str]:
 
 
 def _values(before: object, after: object) -> tuple[str, str]:
-    short = tuple(f"{value:.6g}" if isinstance(value, float) else str(value) for value in (before, after))
+    short = tuple(
+        f"{value:.6g}" if isinstance(value, float) else str(value) for value in (before, after)
+    )
     return (short[0], short[1]) if short[0] != short[1] else (repr(before), repr(after))
 
 
@@ -286,7 +328,9 @@ def compose_ping(found: Result) -> Iterator[Block]:
         rtt = member.get("rtt_us", {})
         numbers = [*(rtt.get(name) for name in ("min", "p50", "p99")), member.get("jitter_us")]
         times = ("" if number is None else f"{number:.0f}" for number in numbers)
-        rows.append([member["member"], member["host"], str(member["answers"]), *times, _clock(member)])
+        rows.append(
+            [member["member"], member["host"], str(member["answers"]), *times, _clock(member)]
+        )
     headers = ("member", "host", "answers", "rtt min", "p50", "p99", "jitter", "clock")
     yield TextTable(headers, rows, align="llrrrrrl")
     if links:
@@ -315,9 +359,28 @@ def compose_topic_delays(found: Result) -> Iterator[Block]:
         counts = one["histogram"]["counts"]
         bars = "".join(_BARS[-(-8 * count // max(counts))] for count in counts)
         numbers = [str(one["messages"]), str(one["lost"]), f"{one['rate_hz']:.1f}"]
-        rows.append([one["gid"][:8], one["type"], *numbers, *(f"{times[name]:.0f}" for name in times), bars])
+        rows.append(
+            [
+                one["gid"][:8],
+                one["type"],
+                *numbers,
+                *(f"{times[name]:.0f}" for name in times),
+                bars,
+            ]
+        )
         least = min(least, times["min"])
-    headers = ("publisher", "type", "messages", "lost", "Hz", "min", "p50", "p99", "max", "min to max")
+    headers = (
+        "publisher",
+        "type",
+        "messages",
+        "lost",
+        "Hz",
+        "min",
+        "p50",
+        "p99",
+        "max",
+        "min to max",
+    )
     yield TextTable(headers, rows, align="llrrrrrrrl")
     if least < 0.0:
         yield "delays below 0: the clock there is ahead of the one here"
@@ -350,7 +413,8 @@ def compose_benchmark(found: Result) -> Iterator[Block]:
     yield f"{name}: {needs['words']}"
     for one in facts["transports"]:
         yield MarkedText(
-            MARKS["ok" if one["good"] else "fail"], f"{one['transport']}: {_judgement(one, needs)}"
+            MARKS["ok" if one["good"] else "fail"],
+            f"{one['transport']}: {_judgement(one, needs)}",
         )
 
 
@@ -373,7 +437,9 @@ def _judgement(one: dict[str, Any], needs: dict[str, Any]) -> str:
 
 
 def compose_metrics(found: LogMetrics) -> Iterator[Block]:
-    """Yields a table per group and kind of place, statics, impedances, and reasons of missing numbers."""
+    """Yields a table per group and kind of place, statics, impedances, and reasons of missing
+    numbers.
+    """
     reasons: dict[str, list[str]] = {}
     for (group, _), members in groupby(quantities(), key=lambda one: (one.group, one.of)):
         yield from _compose_group(group, list(members), found, reasons)
@@ -390,16 +456,23 @@ def _explain_missing(what: str, why: str) -> MarkedText:
 def _compose_group(
     group: str, members: Sequence[Quantity], found: LogMetrics, reasons: dict[str, list[str]]
 ) -> Iterator[Block]:
-    """Yields a row per quantity and a column per place that apply; collects reasons of missing numbers."""
+    """Yields a row per quantity and a column per place that apply; collects reasons of missing
+    numbers.
+    """
     rows = {quantity: found.places(quantity) for quantity in members}
-    could = {q: places for q, places in rows.items() if any(one.applies for one in places.values())}
+    could = {
+        q: places for q, places in rows.items() if any(one.applies for one in places.values())
+    }
     names = [
-        name for name in next(iter(rows.values())) if any(places[name].applies for places in could.values())
+        name
+        for name in next(iter(rows.values()))
+        if any(places[name].applies for places in could.values())
     ]
     if not names:
         return
     cells = [
-        [q.name, q.unit, *(_write_metric(places[name]) for name in names)] for q, places in could.items()
+        [q.name, q.unit, *(_write_metric(places[name]) for name in names)]
+        for q, places in could.items()
     ]
     yield from _tabulate([group, "", *names], cells, words=2)
     for quantity, places in could.items():
@@ -420,7 +493,15 @@ def _compose_statics(found: LogMetrics) -> Iterator[Block]:
             when = f"{pair.from_s:.1f} - {pair.to_s:.1f} s"
             which = found.label(pair.joint)
             row = [when, which, pushed, _write_value(pair.pushed_nm)]
-            rows.append([*row, pair.holds, _write_value(pair.felt_nm), _write_metric(pair.expected_nm), off])
+            rows.append(
+                [
+                    *row,
+                    pair.holds,
+                    _write_value(pair.felt_nm),
+                    _write_metric(pair.expected_nm),
+                    off,
+                ]
+            )
         yield from _tabulate(heads, rows, words=1)
         for why in dict.fromkeys(pair.expected_nm.why for pair in found.sharing_ratios):
             if why:
@@ -428,13 +509,21 @@ def _compose_statics(found: LogMetrics) -> Iterator[Block]:
     if found.stiffness:
         rows = []
         for one in found.stiffness:
-            stiffness = _NO_NUMBER if one.stiffness_nm_rad is None else _write_value(one.stiffness_nm_rad)
+            stiffness = (
+                _NO_NUMBER
+                if one.stiffness_nm_rad is None
+                else _write_value(one.stiffness_nm_rad)
+            )
             row = [f"{one.from_s:.1f} to {one.to_s:.1f} s", found.label(one.joint), one.site]
-            rows.append([*row, _write_value(one.torque_nm), _write_value(one.angle_rad), stiffness])
+            rows.append(
+                [*row, _write_value(one.torque_nm), _write_value(one.angle_rad), stiffness]
+            )
         nm, rad, ratio = (found.unit(unit, 1) for unit in ("N m", "rad", "N m/rad"))
         joint = "axis" if found.axes else "joint"
         yield from _tabulate(
-            ("stiffness felt", joint, "by", f"{nm} more", f"{rad} further", ratio), rows, words=1
+            ("stiffness felt", joint, "by", f"{nm} more", f"{rad} further", ratio),
+            rows,
+            words=1,
         )
 
 
@@ -446,14 +535,18 @@ def _compose_impedance(found: LogMetrics) -> Iterator[Block]:
         where = f"{'along' if found.axes else 'joint'} {found.label(one.joint)}"
         what = f"{one.kind}{f' of {one.of}' if one.of else ''} at {one.at}, {where}"
         step = -(-len(one.spectrum) // _MAX_FREQUENCIES) or 1
-        for n, ratio in enumerate(one.spectrum[::step] if len(one.spectrum) > 1 else [one.ratio]):
+        for n, ratio in enumerate(
+            one.spectrum[::step] if len(one.spectrum) > 1 else [one.ratio]
+        ):
             head = ["" if n else what, found.unit(one.unit, one.joint)]
             if ratio.gain is None:
                 rows.append([*head, "", "", "", "", ratio.why])
                 continue
             numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
             error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
-            rows.append([*head, *(_write_value(value or 0.0) for value in numbers), f"+- {error}"])
+            rows.append(
+                [*head, *(_write_value(value or 0.0) for value in numbers), f"+- {error}"]
+            )
     yield from _tabulate(
         ["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""], rows, words=2
     )
@@ -467,7 +560,9 @@ def _write_value(value: float) -> str:
     return f"{value:.0f}" if value == int(value) and abs(value) < 1e6 else f"{value:.4g}"
 
 
-def _tabulate(heads: Sequence[str], rows: Iterable[Sequence[str]], words: int) -> Iterator[Block]:
+def _tabulate(
+    heads: Sequence[str], rows: Iterable[Sequence[str]], words: int
+) -> Iterator[Block]:
     """Yields a table and an empty line; its first columns hold words, the others numbers."""
     align = "l" * words + "r" * (len(heads) - words - 1) + ("r" if heads[-1] else "l")
     yield TextTable(heads, list(rows), align)

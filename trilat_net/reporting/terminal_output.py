@@ -1,9 +1,10 @@
-"""Terminal output that commands share: consoles, lines, tables, progress bar, opening of a log with warnings.
+"""Terminal output that commands share: consoles, lines, tables, progress bar, opening of a log
+with warnings.
 
-Invariants: no control characters reach a terminal, whoever wrote a text: `TextConsole` and `print_line`
-escape them; text from a file or a peer passes `sanitize` besides, which bounds its length. Library code knows
-nothing of the bar; it calls a function with (done, total). Imports only Rich at the top, so that
-`trilat --help` stays fast.
+Invariants: no control characters reach a terminal, whoever wrote a text: `TextConsole` and
+`print_line` escape them; text from a file or a peer passes `sanitize` besides, which bounds its
+length. Library code knows nothing of the bar; it calls a function with (done, total). Imports
+only Rich at the top, so that `trilat --help` stays fast.
 """
 
 import json
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
 _CONTROLS = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
 )
-"""What moves a cursor, rings, colours, or turns the direction of writing; no line ends and tabs."""
+"""What moves a cursor, rings, colours, or turns the direction of writing; no line ends and
+tabs.
+"""
 
 
 def escape_controls(text: str) -> str:
@@ -62,7 +65,9 @@ _PIPE_WIDTH = 160
 
 def sanitize(text: object, most: int = 300) -> str:
     """Returns a text for a terminal: no control characters, at most `most` letters."""
-    plain = "".join(letter if letter.isprintable() else "\ufffd" for letter in str(text)[: most + 1])
+    plain = "".join(
+        letter if letter.isprintable() else "\ufffd" for letter in str(text)[: most + 1]
+    )
     return plain if len(plain) <= most else plain[:most] + "..."
 
 
@@ -141,7 +146,8 @@ def lines_aside(aside: bool) -> Iterator[None]:
 def conclude_files(
     paths: Sequence[Path], folder: Path, *, as_json: bool = False, png: bool = False
 ) -> "tuple[Log, Conclusion]":
-    """Checks a log that was just recorded, writes its report into a folder and prints the conclusion.
+    """Checks a log that was just recorded, writes its report into a folder and prints the
+    conclusion.
 
     Interrupted, it says how to do that later.
     """
@@ -164,11 +170,19 @@ def conclude_files(
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Yields a function to call with (done, total) at any rate; it draws on a terminal, after a second."""
+    """Yields a function to call with (done, total) at any rate; it draws on a terminal, after a
+    second.
+    """
     if not err.is_interactive:
         yield lambda _done, _total: None
         return
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
     columns = (BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
     name = TextColumn("{task.description}", markup=False)
@@ -193,7 +207,8 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
-    """Returns the log in a file, or in the files that are its parts, as `open_log`, and warns of damage.
+    """Returns the log in a file, or in the files that are its parts, as `open_log`, and warns
+    of damage.
 
     Raises:
         LogError: one is missing, is no MCAP file, or no log of trilat-net.
@@ -215,7 +230,9 @@ def warn_of_damage(log: "Log") -> None:
     if log.damaged:
         rest = len(log.damaged) - _MAX_DAMAGED
         unlisted = f"and {rest} more damaged parts; " if rest > 0 else ""
-        print_note(f"{unlisted}make a whole file of everything that can be read: trilat log recover FILE")
+        print_note(
+            f"{unlisted}make a whole file of everything that can be read: trilat log recover FILE"
+        )
 
 
 def warn_user_laws(log: "Log") -> None:
@@ -223,11 +240,14 @@ def warn_user_laws(log: "Log") -> None:
     from ..scenario.code_consent import find_user_laws
 
     for law in find_user_laws(log.scenario):
-        print_note(f"executing this log runs code from outside: {law}" if law.allowed else str(law))
+        print_note(
+            f"executing this log runs code from outside: {law}" if law.allowed else str(law)
+        )
 
 
 def warn_if_unfinished(path: Path) -> None:
-    """Warns of a file that does not end as a finished one does, with the command that mends it, if one can.
+    """Warns of a file that does not end as a finished one does, with the command that mends it,
+    if one can.
 
     Raises:
         LogError: it cannot be read.

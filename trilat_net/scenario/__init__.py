@@ -1,7 +1,7 @@
 """Scenarios: experiments, typed, frozen and validated.
 
-Invariant: a scenario that loads also runs; every mistake that a person can make is refused here, with the
-path of the key and the nearest valid name.
+Invariant: a scenario that loads also runs; every mistake that a person can make is refused
+here, with the path of the key and the nearest valid name.
 """
 
 from .expect import Expect as Expect

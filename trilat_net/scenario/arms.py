@@ -1,9 +1,10 @@
-"""The arms of a scenario: the planar two-link arm by lengths and masses, or a chain of joints from a URDF.
+"""The arms of a scenario: the planar two-link arm by lengths and masses, or a chain of joints
+from a URDF.
 
-Invariant: in a scenario in which one arm is a chain all of them are, so that live, virtual and swept runs
-compute with the same leaves; the planar arm is then written as a chain of two joints in the x-y plane. How
-fast an arm may come to rest follows from what is stated: what linear algebra gives is rounded up to a
-millisecond, so that the numbers are the same on every machine.
+Invariant: in a scenario in which one arm is a chain all of them are, so that live, virtual and
+swept runs compute with the same leaves; the planar arm is then written as a chain of two joints
+in the x-y plane. How fast an arm may come to rest follows from what is stated: what linear
+algebra gives is rounded up to a millisecond, so that the numbers are the same on every machine.
 """
 
 import math
@@ -39,8 +40,10 @@ STOP_REACH_RAD = 0.05
 """A stop answers with the joint's whole effort limit at this depth, rad or m."""
 START_MARGIN_RAD = 0.15
 START_MARGIN_M = 0.02
-"""So far beyond a stop or a limit of position an arm may start: 8.6 degrees, or 2 cm of a sliding joint.
-Encoders are set to zero by hand, and arms are parked on stops that lie beyond those of their files."""
+"""So far beyond a stop or a limit of position an arm may start: 8.6 degrees, or 2 cm of a
+sliding joint. Encoders are set to zero by hand, and arms are parked on stops that lie beyond
+those of their files.
+"""
 STOP_EFFORT_NM = 100.0
 """The effort that stops are made for where a file states none."""
 PLANAR_UNITS = ("kg m^2", "kg m^2", "kg m^2", "kg m", "kg m")
@@ -58,28 +61,32 @@ _SLIDING = {"rad": "m", "rad/s": "m/s", "N m": "N"}
 class Arm(fields.Frozen, frozen=True):
     """An arm: a chain of joints from a URDF, or the two links of a planar arm.
 
-    The defaults of the planar arm are the paper's, as point masses at the link ends. The keys of one kind of
-    arm have no meaning for the other.
+    The defaults of the planar arm are the paper's, as point masses at the link ends. The keys
+    of one kind of arm have no meaning for the other.
 
     Attributes:
         l1_m: this and the others down to I2_kg_m2 are those of `ArmLinks`.
         g_m_s2: gravitational acceleration, m/s^2.
-        known: false: masses and inertias are unknown, as of a real arm that was not identified, and enter no
-            formula. Only for an arm outside of the program.
-        dead_man: true: it moves only while somebody holds its dead-man switch (`docs/external-arm.md`). Only
-            for an arm outside of the program.
-        urdf: name of the URDF that describes the arm, in `Scenario.urdf`; "": it is the planar arm.
-        base_xyz_m: place of the base in the frame that the sites share; walls and operators are there too.
+        known: false: masses and inertias are unknown, as of a real arm that was not identified,
+            and enter no formula. Only for an arm outside of the program.
+        dead_man: true: it moves only while somebody holds its dead-man switch
+            (`docs/external-arm.md`). Only for an arm outside of the program.
+        urdf: name of the URDF that describes the arm, in `Scenario.urdf`; "": it is the planar
+            arm.
+        base_xyz_m: place of the base in the frame that the sites share; walls and operators are
+            there too.
         base_rpy_rad: its orientation there: about the fixed axes x, y, z, in this order.
         base: its base link; "": the root of the file.
         tip: its end link; "": the only one that nothing hangs on.
         down: direction of gravity in the base's frame; its length does not matter.
-        payload_kg: mass fixed to the end link; without one the two keys that follow mean nothing.
+        payload_kg: mass fixed to the end link; without one the two keys that follow mean
+            nothing.
         payload_com_m: its centre of mass in the end link's frame.
         payload_inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about its centre of mass.
         armature_kg_m2: inertia of each drive as its joint has it; kg of a prismatic joint.
         stops: true: joint limits of the file are springs that an arm may run into.
-        balance_inertia: true: inertias of the file that no body has are replaced by the nearest that one has.
+        balance_inertia: true: inertias of the file that no body has are replaced by the nearest
+            that one has.
         links: masses and inertias of links in place of the file's, by the link's name.
     """
 
@@ -124,11 +131,12 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
     """What sites agree on: their joint angles, or their end effectors' places or poses.
 
     Attributes:
-        space: "joints": angle by angle; "position": the end effectors' places; "pose": and orientations.
+        space: "joints": angle by angle; "position": the end effectors' places; "pose": and
+            orientations.
         axes: along which the site follows, of x, y, z, rx, ry, rz; left out: along all.
         scale: metres that the sites share per metre of this arm.
-        posture_rad: joint angles that the arm keeps near as far as the task leaves it free; left out: its
-            start pose.
+        posture_rad: joint angles that the arm keeps near as far as the task leaves it free;
+            left out: its start pose.
         posture_rate_1_s: by how much of the way in a second.
         singular_value: least singular value of the Jacobian that is not damped.
     """
@@ -154,7 +162,8 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
         foreign = [axis for axis in self.axes if axis not in TASK_AXES[: self.shared]]
         if foreign:
             return fields.KeyProblem(
-                "axes", f"has {foreign[0]}, which belongs to a pose, and task.space is 'position'"
+                "axes",
+                f"has {foreign[0]}, which belongs to a pose, and task.space is 'position'",
             )
         if self.posture_rad and not self.posture_rate_1_s:
             return fields.KeyProblem("posture_rad", "has no effect while posture_rate_1_s is 0")
@@ -165,9 +174,17 @@ class Task(fields.Frozen, frozen=True, omit_defaults=True):
         """The task as the core has it; None of joints."""
         if not self.shared:
             return None
-        axes = tuple(float(not self.axes or name in self.axes) for name in TASK_AXES[: self.shared])
+        axes = tuple(
+            float(not self.axes or name in self.axes) for name in TASK_AXES[: self.shared]
+        )
         posture = self.posture_rad
-        return TaskSetup(axes, self.scale, posture, self.posture_rate_1_s, self.singular_value)
+        return TaskSetup(
+            axes=axes,
+            scale=self.scale,
+            posture=posture,
+            posture_rate=self.posture_rate_1_s,
+            singular_value=self.singular_value,
+        )
 
 
 class ArmModel(NamedTuple):
@@ -175,7 +192,8 @@ class ArmModel(NamedTuple):
 
     Attributes:
         theta: its true parameters: Eq. (24) for the planar arm, ten a link for a chain.
-        efforts: largest effort that its file states for each joint, N m or N; inf where it states none.
+        efforts: largest effort that its file states for each joint, N m or N; inf where it
+            states none.
         speeds: largest speed so, rad/s or m/s.
         lengths_m: of the two links of the planar arm; (0, 0) of a chain.
     """
@@ -194,13 +212,19 @@ class ArmModel(NamedTuple):
         """Name and unit of each of its parameters, in the order of theta."""
         if self.chain is None:
             return [(f"theta_{n + 1}", unit) for n, unit in enumerate(PLANAR_UNITS)]
-        return [(f"{link}.{name}", unit) for link in self.link_names for name, unit in BODY_UNITS.items()]
+        return [
+            (f"{link}.{name}", unit)
+            for link in self.link_names
+            for name, unit in BODY_UNITS.items()
+        ]
 
     def widen_stops(self, q0: Vector) -> "ArmModel":
-        """Returns the arm with each stop moved to the start pose that lies at most the margin beyond it.
+        """Returns the arm with each stop moved to the start pose that lies at most the margin
+        beyond it.
 
-        An arm that stands at rest beyond a nominal stop does not touch its real one, so that no spring
-        pushes there. Stops farther away from the start pose than that stay where they are.
+        An arm that stands at rest beyond a nominal stop does not touch its real one, so that no
+        spring pushes there. Stops farther away from the start pose than that stay where they
+        are.
 
         Args:
             q0: start pose, shape (n,).
@@ -220,14 +244,21 @@ class ArmModel(NamedTuple):
         """Returns the unit of each joint's number, of what is in `unit` for a joint that turns."""
         if self.chain is None:
             return [unit] * self.counts.joints
-        return [_SLIDING.get(unit, unit) if joint.prismatic else unit for joint in self.chain.joints]
+        return [
+            _SLIDING.get(unit, unit) if joint.prismatic else unit for joint in self.chain.joints
+        ]
 
     def end_effector(self, q: Vector) -> list[float]:
-        """Returns the end effector's place in a pose, m, one number per axis of the arm's space."""
+        """Returns the end effector's place in a pose, m, one number per axis of the arm's
+        space.
+        """
         if self.chain is None:
             (l1, l2) = self.lengths_m
             turned = q[0] + q[1]
-            return [l1 * math.cos(q[0]) + l2 * math.cos(turned), l1 * math.sin(q[0]) + l2 * math.sin(turned)]
+            return [
+                l1 * math.cos(q[0]) + l2 * math.cos(turned),
+                l1 * math.sin(q[0]) + l2 * math.sin(turned),
+            ]
         return list(place_end_effector(self._place(q), np.array(self.chain.tip_m)))
 
     def _place(self, q: Vector | Array) -> RowArray:
@@ -241,16 +272,19 @@ class ArmModel(NamedTuple):
         if self.chain is None:
             return 0.0, 0.0, q[0] + q[1]
         rows = self._place(q)
-        place_end_effector(rows, np.array(self.chain.tip_m))  # which turns the links into base axes
+        # which turns the links into base axes
+        place_end_effector(rows, np.array(self.chain.tip_m))
         return turn_between(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
 
     @property
     def reach(self) -> HandReach:
-        """A bound of the places of its end effector, which is exact for two links of a planar arm.
+        """A bound of the places of its end effector, which is exact for two links of a planar
+        arm.
 
-        Every joint, and the end effector, lies at a fixed distance from the joint before, and a sliding joint
-        at most its travel farther. The end effector is therefore no farther from the first joint than the sum
-        of all distances, and, without sliding joints, no nearer than the longest less all others.
+        Every joint, and the end effector, lies at a fixed distance from the joint before, and a
+        sliding joint at most its travel farther. The end effector is therefore no farther from
+        the first joint than the sum of all distances, and, without sliding joints, no nearer
+        than the longest less all others.
         """
         if self.chain is None:
             l1, l2 = self.lengths_m
@@ -287,7 +321,9 @@ class ArmModel(NamedTuple):
         return () if task is None else task.axes
 
     def shared_pose(self, q: Vector) -> tuple[float, ...]:
-        """Returns what a site shares of a pose: its joint angles, or its end effector's place or pose."""
+        """Returns what a site shares of a pose: its joint angles, or its end effector's place
+        or pose.
+        """
         if self.chain is None or self.chain.task is None:
             return tuple(q)
         place = np.array(self.end_effector(q)) * self.chain.task.scale
@@ -296,7 +332,9 @@ class ArmModel(NamedTuple):
         return (*place.tolist(), *self.end_turn(q))
 
     def task_jacobian(self, q: Vector) -> Array:
-        """Returns the Jacobian of what a site in task space shares, in a pose, shape (m, n), per joint."""
+        """Returns the Jacobian of what a site in task space shares, in a pose, shape (m, n),
+        per joint.
+        """
         assert self.chain is not None
         assert self.chain.task is not None
         rows = self._place(q)
@@ -321,7 +359,8 @@ class ArmModel(NamedTuple):
 
 
 def build_arm(arm: Arm, task: Task, urdf: Mapping[str, str], chains: bool) -> ArmModel:
-    """Returns the model of an arm that follows in a task; `chains`: some arm of the scenario is a chain.
+    """Returns the model of an arm that follows in a task; `chains`: some arm of the scenario is
+    a chain.
 
     Raises:
         ScenarioError: its file cannot be used; the path is that of a key below the arm's.
@@ -337,10 +376,19 @@ def build_arm(arm: Arm, task: Task, urdf: Mapping[str, str], chains: bool) -> Ar
     bodies_moved = ("link1", "link2")
     none = (math.inf, math.inf)
     if not chains:
-        return ArmModel(theta, fields.VectorCounts(), names, bodies_moved, none, none, (arm.l1_m, arm.l2_m))
+        return ArmModel(
+            theta=theta,
+            counts=fields.VectorCounts(),
+            joint_names=names,
+            link_names=bodies_moved,
+            efforts=none,
+            speeds=none,
+            lengths_m=(arm.l1_m, arm.l2_m),
+        )
     links = ((arm.m1_kg, arm.lc1_m, arm.I1_kg_m2), (arm.m2_kg, arm.lc2_m, arm.I2_kg_m2))
     bodies = [
-        (m, m * c, 0.0, 0.0, 0.0, 0.0, m * c * c + own, 0.0, 0.0, m * c * c + own) for m, c, own in links
+        (m, m * c, 0.0, 0.0, 0.0, 0.0, m * c * c + own, 0.0, 0.0, m * c * c + own)
+        for m, c, own in links
     ]
     upright = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     axis = (0.0, 0.0, 1.0)
@@ -348,7 +396,16 @@ def build_arm(arm: Arm, task: Task, urdf: Mapping[str, str], chains: bool) -> Ar
     joints, gravity = _place_base(arm, joints, (0.0, -arm.g_m_s2, 0.0))
     chain = ChainSetup(joints, gravity, (arm.l2_m, 0.0, 0.0), task=task.setup)
     counts = fields.VectorCounts.of_chain(2, task.shared)
-    return ArmModel(np.concatenate(bodies), counts, names, bodies_moved, none, none, (0.0, 0.0), chain)
+    return ArmModel(
+        theta=np.concatenate(bodies),
+        counts=counts,
+        joint_names=names,
+        link_names=bodies_moved,
+        efforts=none,
+        speeds=none,
+        lengths_m=(0.0, 0.0),
+        chain=chain,
+    )
 
 
 def read_arm(arm: Arm, urdf: Mapping[str, str]) -> UrdfChain:
@@ -365,11 +422,11 @@ def read_arm(arm: Arm, urdf: Mapping[str, str]) -> UrdfChain:
     payload = UrdfPayload(arm.payload_kg, arm.payload_com_m, arm.payload_inertia_kg_m2)
     try:
         return _read_cached(
-            urdf[arm.urdf],
-            arm.base,
-            arm.tip,
-            payload if arm.payload_kg else None,
-            tuple(arm.links.items()),
+            text=urdf[arm.urdf],
+            base=arm.base,
+            tip=arm.tip,
+            payload=payload if arm.payload_kg else None,
+            links=tuple(arm.links.items()),
             balance=arm.balance_inertia,
         )
     except ScenarioError as error:
@@ -395,7 +452,9 @@ def _read_cached(
     *,
     balance: bool,
 ) -> UrdfChain:
-    return read_urdf(text, base, tip, payload, dict(links), balance=balance)
+    return read_urdf(
+        text=text, base=base, tip=tip, payload=payload, links=dict(links), balance=balance
+    )
 
 
 def _place_base(
@@ -447,12 +506,20 @@ def _chain_model(arm: Arm, task: Task, read: UrdfChain) -> ArmModel:
         efforts=tuple(joint.effort_limit for joint in read.joints),
         speeds=tuple(joint.velocity_limit for joint in read.joints),
         lengths_m=(0.0, 0.0),
-        chain=ChainSetup(joints, gravity, read.tip_origin_m, read.tip_rotation, task.setup),
+        chain=ChainSetup(
+            joints=joints,
+            gravity_m_s2=gravity,
+            tip_m=read.tip_origin_m,
+            tip_rotation=read.tip_rotation,
+            task=task.setup,
+        ),
     )
 
 
 def _stops(lower: float, upper: float, effort: float) -> dict[str, float]:
-    """Returns the stops of a joint: springs, with a tenth of their stiffness in seconds as damping."""
+    """Returns the stops of a joint: springs, with a tenth of their stiffness in seconds as
+    damping.
+    """
     stiffness = (effort if 0.0 < effort < math.inf else STOP_EFFORT_NM) / STOP_REACH_RAD
     return {
         "lower": lower,
@@ -471,17 +538,25 @@ UNKNOWN_BRAKE_S = 0.1
 
 
 def find_rest_gains(
-    arm: ArmModel, q0: Vector, own_damping: Array, limit_nm: Vector, rate_hz: int, *, known: bool
+    arm: ArmModel,
+    q0: Vector,
+    own_damping: Array,
+    limit_nm: Vector,
+    rate_hz: int,
+    *,
+    known: bool,
 ) -> RestGains:
     """Returns how an arm comes to rest.
 
-    A joint of inertia M_ii gets B = M_ii / T. The fastest motion of all joints together then has the largest
-    eigenvalue of diag(M) M^-1 / T, which T keeps to the tick rate. Of an arm whose inertia is not known B is
-    the damping of its law, `own_damping`, N m s/rad, where that has any.
+    A joint of inertia M_ii gets B = M_ii / T. The fastest motion of all joints together then
+    has the largest eigenvalue of diag(M) M^-1 / T, which T keeps to the tick rate. Of an arm
+    whose inertia is not known B is the damping of its law, `own_damping`, N m s/rad, where that
+    has any.
 
     Args:
         arm: the arm.
-        q0: its start pose, in which the inertia of a chain counts; of a planar arm that of the stretched one.
+        q0: its start pose, in which the inertia of a chain counts; of a planar arm that of the
+            stretched one.
         own_damping: of its law, per joint, shape (n,).
         limit_nm: its largest torque.
         rate_hz: its tick rate, Hz.
@@ -504,11 +579,13 @@ def find_rest_gains(
 
 
 def add_credible_box(gains: Gains, arm: ArmModel, limit_nm: Vector, g_m_s2: float) -> Gains:
-    """Returns the gains of an adaptive law with a box for its estimates, if it has none of its own.
+    """Returns the gains of an adaptive law with a box for its estimates, if it has none of its
+    own.
 
-    What moves an arm can hold it: with T the largest torque of its joints, g the gravitational acceleration
-    and l the reach of a link, a first moment is at most T / g and a second one l T / g; masses and second
-    moments about an axis are not negative. The first estimate is always in the box.
+    What moves an arm can hold it: with T the largest torque of its joints, g the gravitational
+    acceleration and l the reach of a link, a first moment is at most T / g and a second one l T
+    / g; masses and second moments about an axis are not negative. The first estimate is always
+    in the box.
     """
     T = np.max(limit_nm)
     g = g_m_s2
@@ -528,7 +605,9 @@ def add_credible_box(gains: Gains, arm: ArmModel, limit_nm: Vector, g_m_s2: floa
         first = T / g
         second = reach * T / g
         high = np.tile([first / link, *[first] * 3, *[second] * 6], arm.counts.joints)
-        low = np.tile([0.0, *[-first] * 3, 0.0, -second, 0.0, -second, -second, 0.0], arm.counts.joints)
+        low = np.tile(
+            [0.0, *[-first] * 3, 0.0, -second, 0.0, -second, -second, 0.0], arm.counts.joints
+        )
     first_estimate = np.broadcast_to(gains.theta_hat0, high.shape)
     return gains._replace(
         low=tuple(np.minimum(low, first_estimate).tolist()),

@@ -1,10 +1,12 @@
-"""Which code from outside may run: that of one's own scenario, and for a log that whose file one names.
+"""Which code from outside may run: that of one's own scenario, and for a log that whose file
+one names.
 
 Invariant:
-- What a log or a member of a session names may run if a person names its file, and that file has the hash
-  that the log names, unless another version is asked for.
-- A permission, remembered or not, covers one class of that file with the settings of that log. A log with
-  other settings needs a permission of its own, and the refusal says which settings differ.
+- What a log or a member of a session names may run if a person names its file, and that file
+  has the hash that the log names, unless another version is asked for.
+- A permission, remembered or not, covers one class of that file with the settings of that log.
+  A log with other settings needs a permission of its own, and the refusal says which settings
+  differ.
 """
 
 import json
@@ -53,18 +55,25 @@ def list_imported_code(scenarios: "Iterable[Scenario]") -> list[ImportedCode]:
 
 
 def allow_own_code(
-    scenario: "Scenario", codes: Container[Any] | None = None, changed_from: "Scenario | None" = None
+    scenario: "Scenario",
+    codes: Container[Any] | None = None,
+    changed_from: "Scenario | None" = None,
 ) -> "Scenario":
     """Returns a scenario after its code was allowed to run.
 
     Args:
         scenario: the scenario.
-        codes: the places of the classes that a person names; None: a person wrote the whole scenario.
-        changed_from: the scenario that a person changed into this one. Code that may run there may also run
-            here, with the settings that the person has given it.
+        codes: the places of the classes that a person names; None: a person wrote the whole
+            scenario.
+        changed_from: the scenario that a person changed into this one. Code that may run there
+            may also run here, with the settings that the person has given it.
     """
-    sources = [] if changed_from is None else map(CodeKey.of, list_imported_code([changed_from]))
-    consents = {key[:2]: consent for key in sources if (consent := find_consent(key)) is not None}
+    sources = (
+        [] if changed_from is None else map(CodeKey.of, list_imported_code([changed_from]))
+    )
+    consents = {
+        key[:2]: consent for key in sources if (consent := find_consent(key)) is not None
+    }
     for key in map(CodeKey.of, list_imported_code([scenario])):
         if codes is None or key.code in codes:
             allowed_code[key] = CodeConsent(None, key.sha256)
@@ -86,12 +95,17 @@ class RememberedFile(msgspec.Struct):
 
 
 def allow_logged_code(
-    scenario: "Scenario", law: LawFiles = (), *, other_version: bool = False, remember: bool = False
+    scenario: "Scenario",
+    law: LawFiles = (),
+    *,
+    other_version: bool = False,
+    remember: bool = False,
 ) -> None:
     """Lets that code of a log run that is in files, or in remembered ones, see `open_log`.
 
     Raises:
-        UsageError: a file is none that the log names, or another version of it; or there is none.
+        UsageError: a file is none that the log names, or another version of it; or there is
+            none.
         ScenarioError: a file cannot be read, or defines no such law. Nothing has run.
     """
     files = [Path(law)] if isinstance(law, str | Path) else list(map(Path, law))
@@ -132,7 +146,9 @@ def _read_store() -> dict[str, RememberedFile]:
     An entry without settings, which earlier versions wrote, allows nothing.
     """
     with suppress(OSError, ValueError, RuntimeError):  # the last: there is no home
-        entries = msgspec.json.decode(_find_store().read_bytes(), type=dict[str, RememberedFile | str])
+        entries = msgspec.json.decode(
+            _find_store().read_bytes(), type=dict[str, RememberedFile | str]
+        )
         return {
             sha256: RememberedFile(entry) if isinstance(entry, str) else entry
             for sha256, entry in entries.items()
@@ -143,7 +159,9 @@ def _read_store() -> dict[str, RememberedFile]:
 def _allow_file(
     file: Path, named: Mapping[CodeKey, ImportedCode], *, other_version: bool
 ) -> tuple[str, list[CodeKey]]:
-    """Lets a file run as the code that has its hash, or else its name; returns its hash, and that code."""
+    """Lets a file run as the code that has its hash, or else its name; returns its hash, and
+    that code.
+    """
     source = read_code("", "--law", file.resolve())
     now = source.sha256
     stem = (source.file.parent if file.stem == "__init__" else file).stem
@@ -163,7 +181,9 @@ def _allow_file(
 
 
 def _find_store() -> Path:
-    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config", "trilat-net", "laws.json")
+    return Path(
+        os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config", "trilat-net", "laws.json"
+    )
 
 
 class LoggedUserLaw(NamedTuple):
@@ -193,7 +213,11 @@ class LoggedUserLaw(NamedTuple):
         state = f"was changed, {self.changed}" if self.changed else "is the one that ran"
         if self.allowed:
             return f"{named}{settings}; its file {state}"
-        hint = f"{self.file}{' --other-version' * bool(self.changed)} (it {state})" if self.file else "FILE"
+        hint = (
+            f"{self.file}{' --other-version' * bool(self.changed)} (it {state})"
+            if self.file
+            else "FILE"
+        )
         problem = f"{named} is code from outside, which may not run{settings}"
         problem = f"{problem} ({self.other_settings})" if self.other_settings else problem
         return f"{problem}; if you trust it: --law {hint}"
@@ -208,7 +232,8 @@ def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
             key = CodeKey.of(law)
             sites[key] = (*sites.get(key, ()), name)
             settings[key] = ", ".join(
-                f"{argument} = {describe_setting(value)}" for argument, value in law.settings.items()
+                f"{argument} = {describe_setting(value)}"
+                for argument, value in law.settings.items()
             )
     laws = []
     for key, owners in sites.items():
@@ -221,7 +246,21 @@ def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
             now = source.sha256
             file = source.file
         allowed = consent is not None and consent.sha256 == now
-        changed = "" if now in ("", key.sha256) else f"its sha256 is {now[:16]}, and was {key.sha256[:16]}"
+        changed = (
+            ""
+            if now in ("", key.sha256)
+            else f"its sha256 is {now[:16]}, and was {key.sha256[:16]}"
+        )
         other = "" if allowed else describe_new_settings(key)
-        laws.append(LoggedUserLaw(key.code, owners, settings[key], allowed, file, changed, other))
+        laws.append(
+            LoggedUserLaw(
+                code=key.code,
+                sites=owners,
+                settings=settings[key],
+                allowed=allowed,
+                file=file,
+                changed=changed,
+                other_settings=other,
+            )
+        )
     return laws

@@ -1,9 +1,11 @@
-"""Delay traces: from a CSV file, an earlier log or what `irtt` and `ping` measured, to a scenario's text.
+"""Delay traces: from a CSV file, an earlier log or what `irtt` and `ping` measured, to a
+scenario's text.
 
-Invariant: a scenario that ran does not need the file again. Times count from the trace's first point, of a
-measurement from the first sending; times and delays are whole microseconds. A sample without an answer is
-lost, and so is one that took longer than a link may. Half a round trip stands for one way, unless one way was
-measured and is asked for. Data of others is read where it is, never shipped.
+Invariant: a scenario that ran does not need the file again. Times count from the trace's first
+point, of a measurement from the first sending; times and delays are whole microseconds. A
+sample without an answer is lost, and so is one that took longer than a link may. Half a round
+trip stands for one way, unless one way was measured and is asked for. Data of others is read
+where it is, never shipped.
 
     t_s,delay_ms
     0.000,41.2
@@ -59,7 +61,9 @@ def _read_csv(path: Path) -> list[TracePoint]:
             continue
         try:
             time_text, delay_text = (cell.strip() for cell in cells)
-            rows.append((float(time_text), math.inf if delay_text == _LOST else float(delay_text)))
+            rows.append(
+                (float(time_text), math.inf if delay_text == _LOST else float(delay_text))
+            )
         except ValueError:
             raise ValueError(f"line {number}: a line is t_s,delay_ms or t_s,{_LOST}") from None
     return rows
@@ -74,7 +78,8 @@ def _is_number(cell: str) -> bool:
 
 
 def read_trace(path: Path, link: str) -> str:
-    """Returns the text of the trace in a file: a table `t_s,delay_ms`, or a log's link such as "m1->s".
+    """Returns the text of the trace in a file: a table `t_s,delay_ms`, or a log's link such as
+    "m1->s".
 
     Raises:
         ScenarioError: the file cannot be read, or holds no trace.
@@ -113,7 +118,9 @@ def format_trace(rows: Sequence[TracePoint]) -> str:
             raise ValueError(f"{where}its delay must be {bounds}, is {delay_ms:g}")
         t_us = round((t_s - rows[0][0]) * 1e6)
         if t_us <= before_us:
-            raise ValueError(f"{where}its time, {t_s:g} s, must be later than that of the point before it")
+            raise ValueError(
+                f"{where}its time, {t_s:g} s, must be later than that of the point before it"
+            )
         before_us = t_us
         points.append(f"{t_us} {_LOST if math.isinf(delay_ms) else round(delay_ms * 1e3)}")
     return ", ".join(points)
@@ -159,7 +166,8 @@ class MeasuredTrace(Result):
     """A trace from a measurement.
 
     Attributes:
-        points: times of sending from the first on, s, and delays, ms; infinite of a sample lost.
+        points: times of sending from the first on, s, and delays, ms; infinite of a sample
+            lost.
         too_long: samples that count as lost because they took longer than a link may.
         doubled: samples left out because another one has their time.
         cut: samples left out at the end because a trace has a most of points.
@@ -214,10 +222,14 @@ class MeasuredTrace(Result):
         """Returns the lines of its text."""
         facts = self.to_dict()
         lost = f"{facts['lost_percent']:.2f} % lost, {facts['lost_in_a_row']:.1f} in a row"
-        lines = [f"{count_nouns(facts['samples'], 'sample')} in {facts['span_s']:.1f} s, {lost}"]
+        lines = [
+            f"{count_nouns(facts['samples'], 'sample')} in {facts['span_s']:.1f} s, {lost}"
+        ]
         if "min_ms" in facts:
             shown = ("min", "p50", "mean", "p99", "max", "deviation")
-            lines.append("delay, ms: " + ", ".join(f"{name} {facts[f'{name}_ms']:.2f}" for name in shown))
+            lines.append(
+                "delay, ms: " + ", ".join(f"{name} {facts[f'{name}_ms']:.2f}" for name in shown)
+            )
             lines.append(f"correlation from one sample to the next: {facts['correlation']:.3f}")
         said = {
             "too_long": f"took longer than {LONGEST_MS / 1e3:g} s and count as lost",
@@ -233,14 +245,17 @@ class MeasuredTrace(Result):
 
     def write_rows(self) -> str:
         """Returns the table that a link of model "trace" reads: t_s,delay_ms."""
-        rows = (f"{t_s:.6f},{'lost' if math.isinf(ms) else f'{ms:.3f}'}" for t_s, ms in self.points)
+        rows = (
+            f"{t_s:.6f},{'lost' if math.isinf(ms) else f'{ms:.3f}'}" for t_s, ms in self.points
+        )
         return "\n".join(["t_s,delay_ms", *rows]) + "\n"
 
 
 def import_trace(
     path: str | Path, form: str, *, way: str = "", column: str = "", every_s: float = 1.0
 ) -> MeasuredTrace:
-    """Returns the trace of a file of `irtt client -o`, of `ping` or `fping`, or of a table with a head.
+    """Returns the trace of a file of `irtt client -o`, of `ping` or `fping`, or of a table with
+    a head.
 
     >>> with open("table.csv", "w") as table:
     ...     print("t_s,rtt_ms", "0.0,20", "0.1,40", sep=chr(10), file=table)
@@ -250,8 +265,8 @@ def import_trace(
     Args:
         path: the file; it may be gzipped, and text may be UTF-16.
         form: "irtt", "ping" or "csv".
-        way: one of `WAYS`; "send" and "receive" are those of irtt, whose clocks must agree then. "": half of
-            what is a round trip, as irtt, ping and a column "rtt" have it.
+        way: one of `WAYS`; "send" and "receive" are those of irtt, whose clocks must agree
+            then. "": half of what is a round trip, as irtt, ping and a column "rtt" have it.
         column: the column of delays in a table; "": the first one named like one.
         every_s: the interval of a `ping` that prints no times, as without -D or on Windows, s.
 
@@ -270,7 +285,9 @@ def import_trace(
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
     try:
-        text = decode_text(gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw, any_code_page=True)
+        text = decode_text(
+            gzip.decompress(raw) if raw[:2] == b"\x1f\x8b" else raw, any_code_page=True
+        )
     except (ValueError, EOFError, OSError) as error:
         raise ScenarioError(f"{path}: {error}") from None
     try:
@@ -321,7 +338,9 @@ def _arrange(measured: _Measured) -> MeasuredTrace:
 
 
 def _read_irtt(text: str, way: str, *_: object) -> _Measured:
-    """Reads `irtt client -o`: nanoseconds, and a status of loss in words; its `stats` count the packets."""
+    """Reads `irtt client -o`: nanoseconds, and a status of loss in words; its `stats` count the
+    packets.
+    """
     key, share = {"half": ("rtt", 0.5), "whole": ("rtt", 1.0)}.get(way or "half", (way, 1.0))
     sent: list[TracePoint] = []
     measured = json.loads(text)
@@ -343,9 +362,13 @@ def _read_ping(text: str, way: str, _: str, every_s: float) -> _Measured:
 
 
 def _read_table(text: str, way: str, column: str, _: float) -> _Measured:
-    """Reads a table whose head names columns with units, as "pub_time(ms) delay(ms)" or t_s,delay_ms."""
+    """Reads a table whose head names columns with units, as "pub_time(ms) delay(ms)" or
+    t_s,delay_ms.
+    """
     numbered = enumerate(text.splitlines(), start=1)
-    (_, head), *lines = [(n, line) for n, line in numbered if line.strip() and not line.startswith("#")]
+    (_, head), *lines = [
+        (n, line) for n, line in numbered if line.strip() and not line.startswith("#")
+    ]
     mark = next((mark for mark in (";", "\t", ",") if mark in head), None)
     cells = _split_cells(head, mark)
     time, time_s = _find_column(cells, _TIMES, "")
@@ -354,7 +377,8 @@ def _read_table(text: str, way: str, column: str, _: float) -> _Measured:
     unit_ms = delay_s * (500.0 if half else 1e3)
     sent: list[TracePoint] = []
     for number, line in lines:
-        row = _split_cells(line if mark == "," else line.replace(",", "."), mark)  # else a decimal comma
+        # else a decimal comma
+        row = _split_cells(line if mark == "," else line.replace(",", "."), mark)
         try:
             ms = math.inf if row[delay].lower() in _NO_ANSWER else unit_ms * float(row[delay])
             sent.append((float(row[time]) * time_s, ms))

@@ -1,8 +1,8 @@
 """A scenario in lines of text, and the differences between scenarios.
 
-Invariant: a difference that several sites or links share is one entry; a law of another kind and a link
-are entries as a whole. Names, titles and expectations describe an experiment and do not count as
-differences.
+Invariant: a difference that several sites or links share is one entry; a law of another kind
+and a link are entries as a whole. Names, titles and expectations describe an experiment and do
+not count as differences.
 """
 
 import math
@@ -38,9 +38,14 @@ IRREVERSIBLE_SHARES = (
 
 
 def lacks_detailed_balance(scenario: Scenario) -> bool:
-    """True if all sites exchange positions and know gravity, and no D > 0 makes D (I - alpha) symmetric."""
+    """True if all sites exchange positions and know gravity, and no D > 0 makes D (I - alpha)
+    symmetric.
+    """
     laws = [spec.control for spec in scenario.sites.values()]
-    return all(law.exchanges_positions() for law in laws) and find_balancing_weights(scenario.alpha) is None
+    return (
+        all(law.exchanges_positions() for law in laws)
+        and find_balancing_weights(scenario.alpha) is None
+    )
 
 
 def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
@@ -60,18 +65,33 @@ def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]
 
 def _list_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
-    every = (scenario.names, scenario.controls, scenario.alpha, _find_link_delays(scenario.links, rates_hz))
+    every = (
+        scenario.names,
+        scenario.controls,
+        scenario.alpha,
+        _find_link_delays(scenario.links, rates_hz),
+    )
     ticks_s = {1.0 / rate_hz for rate_hz in rates_hz.values()}
-    hold_s = 0.0 if scenario.scheme != "digital" else ticks_s.pop() if len(ticks_s) == 1 else math.nan
+    hold_s = (
+        0.0
+        if scenario.scheme != "digital"
+        else ticks_s.pop()
+        if len(ticks_s) == 1
+        else math.nan
+    )
     for n, (name, site) in enumerate(scenario.sites.items()):
         limits_nm = tuple(np.atleast_1d(site.limits.tau_limit_nm).tolist())
         gravity_nm = scenario.arms[name].largest_gravity(site.arm.g_m_s2)
-        situation = LawSituation(n, *every, limits_nm, site.rate_hz, gravity_nm=gravity_nm, hold_s=hold_s)
+        situation = LawSituation(
+            n, *every, limits_nm, site.rate_hz, gravity_nm=gravity_nm, hold_s=hold_s
+        )
         yield name, scenario.controls[n], situation
 
 
 def describe_law_conditions(scenario: Scenario) -> list[str]:
-    """Returns what the stability of the sites' laws rests on, a line for sites of whom the same holds."""
+    """Returns what the stability of the sites' laws rests on, a line for sites of whom the same
+    holds.
+    """
     owners: dict[tuple[str, StabilityCondition], list[str]] = {}
     for name, law, situation in _list_situations(scenario):
         if found := law.condition(situation):
@@ -92,11 +112,15 @@ def _describe_idle_shares(scenario: Scenario) -> list[str]:
             why = "lines stay as they are at the start, whatever the timeline says"
         if why:
             owners.setdefault(why, []).append(name)
-    return [f"dominance without effect at {', '.join(where)}: {why}" for why, where in owners.items()]
+    return [
+        f"dominance without effect at {', '.join(where)}: {why}"
+        for why, where in owners.items()
+    ]
 
 
 def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> list[str]:
-    """Returns the facts of a valid scenario and their consequences, as lines; as `trilat scenario check`.
+    """Returns the facts of a valid scenario and their consequences, as lines; as `trilat
+    scenario check`.
 
     >>> len(tn.describe_scenario("paper")) > 5
     True
@@ -106,16 +130,29 @@ def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> li
     weights = (
         "none: alpha is reducible, some site's weight is zero"
         if beta is None
-        else ", ".join(f"{name} {len(beta) * pi:.4g}" for name, pi in zip(scenario.names, beta, strict=True))
+        else ", ".join(
+            f"{name} {len(beta) * pi:.4g}"
+            for name, pi in zip(scenario.names, beta, strict=True)
+        )
     )
     words = {name: link.describe() for name, link in scenario.links.items()}
     links = [f"link {name}: {text}" for name, text in words.items()]
     return [
         f"{scenario.name}: valid, sha256 {scenario.sha256[:16]}",
         f"sites: {', '.join(scenario.names)}; {scenario.duration_s:g} s, "
-        + ", ".join(f"{count_nouns(scenario.ticks(name), 'tick')} of {name}" for name in scenario.names),
-        *(links if len(set(words.values())) > 1 else [f"every link: {next(iter(words.values()))}"]),
-        *(f"view of {name}: {one.view.describe()}" for name, one in scenario.sites.items() if one.view),
+        + ", ".join(
+            f"{count_nouns(scenario.ticks(name), 'tick')} of {name}" for name in scenario.names
+        ),
+        *(
+            links
+            if len(set(words.values())) > 1
+            else [f"every link: {next(iter(words.values()))}"]
+        ),
+        *(
+            f"view of {name}: {one.view.describe()}"
+            for name, one in scenario.sites.items()
+            if one.view
+        ),
         f"pi, the left null vector of Upsilon, sum N (beta_i = pi_i / c_i with Kd_i = c_i Kbar): {weights}",
         *([] if beta is None or np.ptp(beta) < ROW_SUM_TOLERANCE else [COUPLED_OPERATORS]),
         *([IRREVERSIBLE_SHARES] if lacks_detailed_balance(scenario) else []),
@@ -146,7 +183,9 @@ def _describe_arms(scenario: Scenario) -> list[str]:
         )
         assert model.chain is not None
         for joint, drive in zip(chain.joints, model.chain.joints, strict=True):
-            unit, effort, inertia = ("m", "N", "kg") if drive.prismatic else ("rad", "N m", "kg m^2")
+            unit, effort, inertia = (
+                ("m", "N", "kg") if drive.prismatic else ("rad", "N m", "kg m^2")
+            )
             facts = [
                 f"{joint.lower:.4g} to {joint.upper:.4g} {unit}" * (joint.lower > -math.inf),
                 f"{joint.effort_limit:.4g} {effort}" * (joint.effort_limit < math.inf),
@@ -174,7 +213,9 @@ def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
 
 
 def list_arm_notes(scenario: Scenario) -> list[str]:
-    """Returns how the arms of a run differ from what their files state, a sentence each, with the sites."""
+    """Returns how the arms of a run differ from what their files state, a sentence each, with
+    the sites.
+    """
     notes = [
         f"arm of {', '.join(owners)}: {note}"
         for arm, owners in _group_chains(scenario)
@@ -184,7 +225,9 @@ def list_arm_notes(scenario: Scenario) -> list[str]:
 
 
 def _list_start_notes(scenario: Scenario) -> list[str]:
-    """Returns which joints start beyond a stop or a limit of position, and what follows, a sentence each."""
+    """Returns which joints start beyond a stop or a limit of position, and what follows, a
+    sentence each.
+    """
     notes: list[str] = []
     for name, spec in scenario.sites.items():
         model = scenario.arms[name]
@@ -221,7 +264,9 @@ def _describe_tasks(scenario: Scenario) -> list[str]:
         if model.shares_pose:
             spec = scenario.sites[name]
             followed = np.array(model.axes) > 0.0
-            least = np.linalg.svd(model.task_jacobian(spec.q0_rad)[followed], compute_uv=False)[-1]
+            least = np.linalg.svd(model.task_jacobian(spec.q0_rad)[followed], compute_uv=False)[
+                -1
+            ]
             bound = spec.task.singular_value
             near = ", so that its inverse is damped there" if least < bound else ""
             axes = ", ".join(axis for axis, on in zip(TASK_AXES, followed, strict=False) if on)
@@ -249,7 +294,11 @@ def _describe_silences(scenario: Scenario) -> list[str]:
             if not count:
                 continue
             a_minute = 60.0 * count / scenario.duration_s
-            advice = "; a play-out (playout_ms) or a longer silence_ms lessens that" if a_minute > 1.0 else ""
+            advice = (
+                "; a play-out (playout_ms) or a longer silence_ms lessens that"
+                if a_minute > 1.0
+                else ""
+            )
             lines.append(
                 f"{name} will hold {a_minute:.3g} times a minute: {spec.on_stale.silence_ms:g} ms without a "
                 f"new sample of {peer}, outages aside{advice}"
@@ -314,20 +363,31 @@ def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]
     found = [] if len(set(names)) == 1 else [ScenarioDifference("sites", (), tuple(names))]
     tables: list[dict[str, Any]] = [msgspec.to_builtins(scenario) for scenario in scenarios]
     found += _compare_tables(
-        [{key: value for key, value in table.items() if key not in _NOT_COMPARED} for table in tables]
+        [
+            {key: value for key, value in table.items() if key not in _NOT_COMPARED}
+            for table in tables
+        ]
     )
     owners: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for site in (name for name in scenarios[0].names if all(name in other.sites for other in scenarios)):
+    for site in (
+        name for name in scenarios[0].names if all(name in other.sites for other in scenarios)
+    ):
         for row in _compare_tables([table["sites"][site] for table in tables]):
             owners.setdefault((row.key, row.values), []).append(site)
-    found += [ScenarioDifference(key, tuple(sites), values) for (key, values), sites in owners.items()]
+    found += [
+        ScenarioDifference(key, tuple(sites), values) for (key, values), sites in owners.items()
+    ]
     return found + _compare_links(scenarios)
 
 
 def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDifference]:
     if len({table.get("control", {}).get("law") for table in tables}) > 1:
-        laws = ScenarioDifference("control", (), tuple(describe_law(table["control"]) for table in tables))
-        rest = [{key: value for key, value in table.items() if key != "control"} for table in tables]
+        laws = ScenarioDifference(
+            "control", (), tuple(describe_law(table["control"]) for table in tables)
+        )
+        rest = [
+            {key: value for key, value in table.items() if key != "control"} for table in tables
+        ]
         return [laws, *_compare_tables(rest)]
     flat = [dict(flatten_table(table)) for table in tables]
     return [
@@ -339,13 +399,17 @@ def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDiffere
 
 def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
     alike: dict[tuple[str, ...], list[str]] = {}
-    common = [name for name in scenarios[0].links if all(name in other.links for other in scenarios)]
+    common = [
+        name for name in scenarios[0].links if all(name in other.links for other in scenarios)
+    ]
     for name in common:
         links = [scenario.links[name] for scenario in scenarios]
         if any(link != links[0] for link in links):
             alike.setdefault(tuple(link.describe() for link in links), []).append(name)
     return [
-        ScenarioDifference("every link" if names == common else f"link {', '.join(names)}", (), values)
+        ScenarioDifference(
+            "every link" if names == common else f"link {', '.join(names)}", (), values
+        )
         for values, names in alike.items()
     ]
 
@@ -365,7 +429,9 @@ def describe_law(control: Mapping[str, Any]) -> str:
         settings = control.get("settings", {})
         gains = ", ".join(f"{key} {describe_value(value)}" for key, value in settings.items())
         return f"{control['code']} ({gains})" if gains else str(control["code"])
-    gains = ", ".join(f"{key} {describe_value(value)}" for key, value in control.items() if key != "law")
+    gains = ", ".join(
+        f"{key} {describe_value(value)}" for key, value in control.items() if key != "law"
+    )
     return f"{control['law']} ({gains})"
 
 

@@ -1,8 +1,9 @@
-"""Distributions in place of numbers: start poses, masses, gains and operators that each seed draws.
+"""Distributions in place of numbers: start poses, masses, gains and operators that each seed
+draws.
 
-Invariant (L4): a draw is a function of the seed and of the number's dotted key, rounded to nine digits. A
-resolved scenario holds the number drawn and, under `drawn`, its distribution: another seed draws it again. A
-number that an override replaced stays as it is.
+Invariant (L4): a draw is a function of the seed and of the number's dotted key, rounded to nine
+digits. A resolved scenario holds the number drawn and, under `drawn`, its distribution: another
+seed draws it again. A number that an override replaced stays as it is.
 """
 
 import re
@@ -22,7 +23,8 @@ _MOST_ENTRIES = 64
 
 
 class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
-    """The origin of a number: one of the two distributions, or none for a pose that follows the start pose.
+    """The origin of a number: one of the two distributions, or none for a pose that follows the
+    start pose.
 
     Attributes:
         normal: mean and standard deviation.
@@ -51,7 +53,11 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
         """Returns the distribution in words."""
         if self.normal is not None:
             return f"normal, {self.normal[0]:g} with a deviation of {self.normal[1]:g}"
-        return f"uniform, {self.uniform[0]:g} to {self.uniform[1]:g}" if self.uniform else "as the start pose"
+        return (
+            f"uniform, {self.uniform[0]:g} to {self.uniform[1]:g}"
+            if self.uniform
+            else "as the start pose"
+        )
 
 
 def dotted_key(path: str) -> str:
@@ -91,7 +97,11 @@ class Draws:
         key = dotted_key(path)
         if is_distribution(value):
             origin = _read_distribution(value, path)
-        elif (known := self._known.get(key)) is not None and is_number(value) and known.value == value:
+        elif (
+            (known := self._known.get(key)) is not None
+            and is_number(value)
+            and known.value == value
+        ):
             origin = known
         else:
             return value
@@ -99,8 +109,12 @@ class Draws:
         self.drawn[key] = msgspec.structs.replace(origin, value=number)
         return number
 
-    def follow_start(self, table: TomlTable, key: str, pose: Sequence[float], path: str) -> None:
-        """Writes the start pose under a key that is absent, or that followed an earlier draw of it."""
+    def follow_start(
+        self, table: TomlTable, key: str, pose: Sequence[float], path: str
+    ) -> None:
+        """Writes the start pose under a key that is absent, or that followed an earlier draw of
+        it.
+        """
         place = dotted_key(f"{path}.{key}")
         before = self._known.get(place)
         if key in table and (before is None or table[key] != before.value):

@@ -1,4 +1,6 @@
-"""What people read of an event: its text, and for a change a sentence, also in logs of older programs."""
+"""What people read of an event: its text, and for a change a sentence, also in logs of older
+programs.
+"""
 
 from contextlib import suppress
 
@@ -12,7 +14,8 @@ def describe_event(kind: str, text: str, command: str) -> str:
     """Returns the sentence of an event for people.
 
     Sites once quoted the JSON of a change in the event's text. That text is replaced by the
-    sentence of the change, so that pages, timelines and views of old logs read as those of new ones.
+    sentence of the change, so that pages, timelines and views of old logs read as those of new
+    ones.
 
     Args:
         kind: kind of the event.

@@ -1,10 +1,11 @@
 """Laws that are imported from a user's module.
 
-Invariant: a user's law is named `law = "package.module:Law"`. The scenario holds the hash of the file that
-defines it, so a log shows if the law executed again is the one that ran. Naming a law runs nothing, not even
-the package that contains it. `import_class` is the one door to code from outside: it opens for
-`allowed_code`, if the file is still that one and defines a law of that name. A permission covers the
-arguments of the class as well: harmless code with other arguments may open another file.
+Invariant: a user's law is named `law = "package.module:Law"`. The scenario holds the hash of
+the file that defines it, so a log shows if the law executed again is the one that ran. Naming a
+law runs nothing, not even the package that contains it. `import_class` is the one door to code
+from outside: it opens for `allowed_code`, if the file is still that one and defines a law of
+that name. A permission covers the arguments of the class as well: harmless code with other
+arguments may open another file.
 """
 
 import ast
@@ -60,7 +61,9 @@ class NamedCode(Protocol):
 
 
 ANY_SETTINGS = "*"
-"""In place of settings: whatever they are. Only the workers of a study may be given such a permission."""
+"""In place of settings: whatever they are. Only the workers of a study may be given such a
+permission.
+"""
 
 
 class CodeKey(NamedTuple):
@@ -79,11 +82,17 @@ class CodeKey(NamedTuple):
     @classmethod
     def of(cls, named: NamedCode) -> "CodeKey":
         """Returns the key of a law, hand or plant of a scenario."""
-        return cls(named.code, named.source_sha256, json.dumps(named.settings, sort_keys=True, default=str))
+        return cls(
+            named.code,
+            named.source_sha256,
+            json.dumps(named.settings, sort_keys=True, default=str),
+        )
 
 
 class CodeConsent(NamedTuple):
-    """A file that may run: where it is, None for where Python finds its module; and its SHA-256."""
+    """A file that may run: where it is, None for where Python finds its module; and its
+    SHA-256.
+    """
 
     file: Path | None
     sha256: str
@@ -103,7 +112,9 @@ def find_consent(key: CodeKey) -> CodeConsent | None:
 
 @contextmanager
 def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
-    """Lets the code of a study run with any settings inside the block: a study chooses them by itself."""
+    """Lets the code of a study run with any settings inside the block: a study chooses them by
+    itself.
+    """
     widened = {key._replace(settings=ANY_SETTINGS): consent for key, consent in allowed.items()}
     added = {key: consent for key, consent in widened.items() if key not in allowed_code}
     allowed_code.update(added)
@@ -115,19 +126,34 @@ def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
 
 
 def describe_new_settings(key: CodeKey) -> str:
-    """Returns how the settings of withheld code differ from the nearest that may run; "" if none may."""
-    alike = {one.settings for one in allowed_code if one[:2] == key[:2] and one.settings != ANY_SETTINGS}
+    """Returns how the settings of withheld code differ from the nearest that may run; "" if
+    none may.
+    """
+    alike = {
+        one.settings
+        for one in allowed_code
+        if one[:2] == key[:2] and one.settings != ANY_SETTINGS
+    }
     alike |= set(remembered_settings.get((key.sha256, key.code.partition(":")[2]), ()))
-    differences = [_list_differences(json.loads(text), json.loads(key.settings)) for text in sorted(alike)]
+    differences = [
+        _list_differences(json.loads(text), json.loads(key.settings)) for text in sorted(alike)
+    ]
     nearest = min(differences, key=len, default=[])
-    return f"it was allowed with other settings, and here {', '.join(nearest)}" if nearest else ""
+    return (
+        f"it was allowed with other settings, and here {', '.join(nearest)}" if nearest else ""
+    )
 
 
 def _list_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    texts = [{key: describe_setting(value) for key, value in side.items()} for side in (before, now)]
+    texts = [
+        {key: describe_setting(value) for key, value in side.items()} for side in (before, now)
+    ]
     old, new = texts
     changed = (key for key in sorted({*old, *new}) if old.get(key) != new.get(key))
-    return [f"{key} = {new.get(key, 'its default')} (was {old.get(key, 'its default')})" for key in changed]
+    return [
+        f"{key} = {new.get(key, 'its default')} (was {old.get(key, 'its default')})"
+        for key in changed
+    ]
 
 
 LONGEST_SETTING = 300
@@ -137,7 +163,8 @@ LONGEST_SETTING = 300
 def describe_setting(value: Any) -> str:
     """Returns the value of a setting as a text without control characters.
 
-    Of a long value the beginning and the end are shown: the end of a path is what tells files apart.
+    Of a long value the beginning and the end are shown: the end of a path is what tells files
+    apart.
     """
     text = json.dumps(value, default=str)
     if len(text) <= LONGEST_SETTING:
@@ -173,7 +200,10 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
         def make(context: LawContext) -> UserLaw:
             path = f"sites.{context.site}.control"
             kind = import_class(CodeKey.of(self), f"{path}.law")
-            check_law_class_at(kind, self.code, context, sites, scheme)  # before anything of it is called
+            # before anything of it is called
+            check_law_class_at(
+                kind=kind, code=self.code, context=context, sites=sites, scheme=scheme
+            )
             declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
             if [*declared.items()] != [*self.sends.items()]:
                 raise ScenarioError(
@@ -196,7 +226,8 @@ class CodeSource(NamedTuple):
 
 
 def read_code(code: str, path: str, file: Path | None = None) -> CodeSource:
-    """Returns a law's file, or that which Python finds, of which nothing runs; errors call the key `path`.
+    """Returns a law's file, or that which Python finds, of which nothing runs; errors call the
+    key `path`.
 
     Raises:
         ScenarioError: there is no such file, or it cannot be read.
@@ -230,7 +261,11 @@ def _find_spec(module: str) -> ModuleSpec | None:
     """
     spec = None
     folders = None
-    finders = [one for one in sys.meta_path if one is PathFinder or one.__module__.startswith("__editable__")]
+    finders = [
+        one
+        for one in sys.meta_path
+        if one is PathFinder or one.__module__.startswith("__editable__")
+    ]
     parts = module.split(".")
     for depth in range(1, len(parts) + 1):
         name = ".".join(parts[:depth])
@@ -250,20 +285,26 @@ def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
 
     Raises:
         CodeWithheld: none may.
-        ScenarioError: it is not as it was when it was let, or defines no such class: nothing has run; or
-            it cannot be imported.
+        ScenarioError: it is not as it was when it was let, or defines no such class: nothing
+            has run; or it cannot be imported.
     """
     code = key.code
     module, _, name = code.partition(":")
     if (consent := find_consent(key)) is None:
         problem = f"{code} is code from outside, which may not run"
-        problem = f"{problem} ({difference})" if (difference := describe_new_settings(key)) else problem
+        problem = (
+            f"{problem} ({difference})"
+            if (difference := describe_new_settings(key))
+            else problem
+        )
         remedy = "--law FILE lets its file (in Python tn.open_log(..., law=FILE))"
         raise CodeWithheld(f"{problem}: {remedy}", path=path)
     source = read_code(code, path, consent.file)
     if source.sha256 != consent.sha256:
         problem = f"the file of {code} is not the one that the scenario names by its hash; put that one"
-        raise ScenarioError(f"{problem} there, or write {code!r} anew to take the one that is", path=path)
+        raise ScenarioError(
+            f"{problem} there, or write {code!r} anew to take the one that is", path=path
+        )
     check_class(source, code, path, method)
     folders = source.file.parents  # its own, or that of its package
     depth = min(module.count(".") + (source.file.stem == "__init__"), len(folders) - 1)
@@ -285,10 +326,12 @@ PAGES = {
 
 
 def check_class(source: CodeSource, code: str, path: str, method: str = "torque") -> None:
-    """Refuses a file that does not define a class with a method, by its syntax alone: nothing of it runs.
+    """Refuses a file that does not define a class with a method, by its syntax alone: nothing
+    of it runs.
 
     Raises:
-        ScenarioError: it is no Python, or has no such class, or that neither the method nor a base.
+        ScenarioError: it is no Python, or has no such class, or that neither the method nor a
+            base.
     """
     kind, page = PAGES[method]
     name = code.partition(":")[2]
@@ -299,7 +342,9 @@ def check_class(source: CodeSource, code: str, path: str, method: str = "torque"
     node = classes[name]
     named = {getattr(one, "name", getattr(one, "id", "")) for one in ast.walk(node)}
     if not (node.bases or node.keywords or node.decorator_list or method in named):
-        raise ScenarioError(f"{code} is no {kind}: it has no {method}; see {find_page(page)}", path=path)
+        raise ScenarioError(
+            f"{code} is no {kind}: it has no {method}; see {find_page(page)}", path=path
+        )
 
 
 def _import(module: str, sha256: str) -> Any:
@@ -311,7 +356,9 @@ def _import(module: str, sha256: str) -> Any:
 
 
 def _execute(module: str, source: CodeSource) -> Any:
-    """Returns a module of the content that was checked, and of nothing that is cached beside the file."""
+    """Returns a module of the content that was checked, and of nothing that is cached beside
+    the file.
+    """
     if source in _executed:
         return _executed[source]
     file = str(source.file)
@@ -321,7 +368,8 @@ def _execute(module: str, source: CodeSource) -> Any:
     try:
         exec(compile(source.content, file, "exec"), made.__dict__)
     finally:
-        sys.modules.pop(module, None)  # whatever a log calls it, it takes no other module's place
+        # whatever a log calls it, it takes no other module's place
+        sys.modules.pop(module, None)
         if before is not None:
             sys.modules[module] = before
     _executed[source] = made
@@ -347,7 +395,9 @@ def name_law_class(kind: type) -> str:
 
 
 def name_law_classes(value: Any) -> Any:
-    """Returns a value of a scenario as plain ones: classes by `name_law_class`, NumPy's as numbers."""
+    """Returns a value of a scenario as plain ones: classes by `name_law_class`, NumPy's as
+    numbers.
+    """
     if isinstance(value, type):
         return name_law_class(value)
     if isinstance(value, Mapping):
@@ -357,7 +407,9 @@ def name_law_classes(value: Any) -> Any:
 
 @contextmanager
 def _searching(folder: Path | None) -> Iterator[None]:
-    """Lets modules be found in a folder before all others; None: the working directory, unless it is one."""
+    """Lets modules be found in a folder before all others; None: the working directory, unless
+    it is one.
+    """
     first = str(folder or Path.cwd())
     if folder is None and first in sys.path:
         yield

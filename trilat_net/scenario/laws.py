@@ -1,6 +1,8 @@
-"""The control laws that a scenario can choose, by name: each file of the room `laws` that has one.
+"""The control laws that a scenario can choose, by name: each file of the room `laws` that has
+one.
 
-Invariant: a law is found by its file alone, whose class bears the same name; nothing else lists laws.
+Invariant: a law is found by its file alone, whose class bears the same name; nothing else lists
+laws.
 """
 
 import pkgutil
@@ -21,7 +23,9 @@ def _find_laws() -> Iterator[type[ControlLaw]]:
             yield kind
 
 
-BUILT_IN: dict[str, type[ControlLaw]] = {str(law.Settings.__struct_config__.tag): law for law in _find_laws()}
+BUILT_IN: dict[str, type[ControlLaw]] = {
+    str(law.Settings.__struct_config__.tag): law for law in _find_laws()
+}
 """The built-in laws by name."""
 LAWS: dict[str, type[LawSettings]] = {
     **{name: law.Settings for name, law in BUILT_IN.items()},

@@ -1,9 +1,11 @@
-"""Masses and inertias that a scenario supplies for links of a URDF, and the balancing of impossible ones.
+"""Masses and inertias that a scenario supplies for links of a URDF, and the balancing of
+impossible ones.
 
 Invariant:
     - A key that a scenario gives replaces the file's value; a key that it leaves out keeps it.
-    - Balancing uses sums, products, quotients and square roots in a fixed order, so that a balanced tensor
-      has the same bits on every machine. A tensor that a body can have is not changed by it.
+    - Balancing uses sums, products, quotients and square roots in a fixed order, so that a
+      balanced tensor has the same bits on every machine. A tensor that a body can have is not
+      changed by it.
 """
 
 import math
@@ -16,7 +18,9 @@ from .. import fields
 from ..core.chain import Matrix
 
 JACOBI_SWEEPS = 12
-"""Sweeps of Jacobi's method; a symmetric matrix of three rows is diagonal to rounding after six or seven."""
+"""Sweeps of Jacobi's method; a symmetric matrix of three rows is diagonal to rounding after six
+or seven.
+"""
 
 ThreeReals = Annotated[tuple[fields.Real, ...], Meta(min_length=3, max_length=3)]
 TensorEntries = Annotated[tuple[fields.Real, ...], Meta(min_length=6, max_length=6)]
@@ -27,10 +31,11 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
 
     Attributes:
         mass_kg: its mass; 0 leaves the body of the link out.
-        com_m: its centre of mass in the link's frame. Left out: as in the file, and the origin of the link's
-            frame if the file states none.
-        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass in the axes of the link's frame.
-            Left out: as in the file, and zero, as of a point, if the file states none.
+        com_m: its centre of mass in the link's frame. Left out: as in the file, and the origin
+            of the link's frame if the file states none.
+        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass in the axes of the
+            link's frame. Left out: as in the file, and zero, as of a point, if the file states
+            none.
     """
 
     mass_kg: fields.NotNegative | None = None
@@ -39,7 +44,9 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
 
     def list_keys(self) -> list[str]:
         """Returns the keys that are given."""
-        return [key for key in fields.field_names(LinkInertia) if getattr(self, key) is not None]
+        return [
+            key for key in fields.field_names(LinkInertia) if getattr(self, key) is not None
+        ]
 
 
 def fill_tensor(entries: Sequence[float]) -> Matrix:
@@ -51,11 +58,12 @@ def fill_tensor(entries: Sequence[float]) -> Matrix:
 def balance_tensor(tensor: Matrix) -> Matrix:
     """Returns the inertia tensor of the nearest mass distribution that a body can have.
 
-    With the principal moments I_1, I_2, I_3, the mass of a body has the second moments
-    s_k = (I_1 + I_2 + I_3) / 2 - I_k along its principal axes. A tensor is that of a body if no s_k is
-    negative. Negative ones become zero, which is the projection onto the cone of such distributions, and
-    the moments are composed anew: I_k = s_1 + s_2 + s_3 - s_k. The principal axes remain. If only the
-    triangle inequality failed, the largest moment remains, and the two smaller ones grow equally.
+    With the principal moments I_1, I_2, I_3, the mass of a body has the second moments s_k =
+    (I_1 + I_2 + I_3) / 2 - I_k along its principal axes. A tensor is that of a body if no s_k
+    is negative. Negative ones become zero, which is the projection onto the cone of such
+    distributions, and the moments are composed anew: I_k = s_1 + s_2 + s_3 - s_k. The principal
+    axes remain. If only the triangle inequality failed, the largest moment remains, and the two
+    smaller ones grow equally.
 
     Args:
         tensor: symmetric, kg m^2.
@@ -75,13 +83,16 @@ def balance_tensor(tensor: Matrix) -> Matrix:
             + axes[i][2] * balanced[2] * axes[j][2]
         )
 
-    return fill_tensor([entry(0, 0), entry(0, 1), entry(1, 1), entry(0, 2), entry(1, 2), entry(2, 2)])
+    return fill_tensor(
+        [entry(0, 0), entry(0, 1), entry(1, 1), entry(0, 2), entry(1, 2), entry(2, 2)]
+    )
 
 
 def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
     """Returns the principal moments of a symmetric tensor, and the principal axes as columns.
 
-    Jacobi's method, in plain arithmetic: LAPACK's routines differ in the last bit between machines.
+    Jacobi's method, in plain arithmetic: LAPACK's routines differ in the last bit between
+    machines.
     """
     a = [list(row) for row in tensor]
     axes = [[float(i == j) for j in range(3)] for i in range(3)]
@@ -94,9 +105,18 @@ def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
             cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
             sine = tangent * cosine
             for row in a:
-                row[p], row[q] = cosine * row[p] - sine * row[q], sine * row[p] + cosine * row[q]
+                row[p], row[q] = (
+                    cosine * row[p] - sine * row[q],
+                    sine * row[p] + cosine * row[q],
+                )
             for k in range(3):
-                a[p][k], a[q][k] = cosine * a[p][k] - sine * a[q][k], sine * a[p][k] + cosine * a[q][k]
+                a[p][k], a[q][k] = (
+                    cosine * a[p][k] - sine * a[q][k],
+                    sine * a[p][k] + cosine * a[q][k],
+                )
             for row in axes:
-                row[p], row[q] = cosine * row[p] - sine * row[q], sine * row[p] + cosine * row[q]
+                row[p], row[q] = (
+                    cosine * row[p] - sine * row[q],
+                    sine * row[p] + cosine * row[q],
+                )
     return [a[0][0], a[1][1], a[2][2]], axes

@@ -1,10 +1,12 @@
-"""A plant of one's own: a class that moves an arm, and what else is in its scene, from tick to tick.
+"""A plant of one's own: a class that moves an arm, and what else is in its scene, from tick to
+tick.
 
-    plant = "my_plant:Scene"            # or a table: { class = "my_plant:Scene", mass_kg = 2.0 }
+    plant = "my_plant:Scene"            # or a table: { class = "my_plant:Scene", mass_kg = 2.0
+    }
 
-Invariant: what it says of the arm is measured: it becomes q, qd and tau_x of the next tick's record, as the
-motion of an arm outside of the program does. A log therefore executes the control again exactly, without the
-plant, and judges the plant by nothing.
+Invariant: what it says of the arm is measured: it becomes q, qd and tau_x of the next tick's
+record, as the motion of an arm outside of the program does. A log therefore executes the
+control again exactly, without the plant, and judges the plant by nothing.
 """
 
 import math
@@ -48,7 +50,8 @@ class PlantContext(NamedTuple):
         q0_rad: the arm's start pose, rad, shape (n,).
         h_s: the period of a tick, s.
         seed: for what it draws: of the scenario and the site.
-        bodies_m: the bodies that it moves besides the arm, by name: sizes along x, y and z of their own, m.
+        bodies_m: the bodies that it moves besides the arm, by name: sizes along x, y and z of
+            their own, m.
     """
 
     site: str
@@ -65,14 +68,16 @@ class PlantProgram(Protocol):
     def step(self, tau: Array, h_s: float) -> Sequence[Sequence[float]]:
         """Moves on by a period under the control torque ON the joints, N m, shape (n,).
 
-        Returns q, rad, and qd, rad/s, at its end; and, if it knows it, tau_x, N m, of what touches the arm:
-        in the sign of Eq. (8), the negative of the torque ON it.
+        Returns q, rad, and qd, rad/s, at its end; and, if it knows it, tau_x, N m, of what
+        touches the arm: in the sign of Eq. (8), the negative of the torque ON it.
         """
 
     def poses(self) -> Sequence[Sequence[float]]:
-        """Returns where its bodies are now, in the order of `PlantContext.bodies_m`; asked only with any.
+        """Returns where its bodies are now, in the order of `PlantContext.bodies_m`; asked only
+        with any.
 
-        Seven numbers each: x, y, z of its middle in the arm's base frame, m, and the quaternion w, x, y, z.
+        Seven numbers each: x, y, z of its middle in the arm's base frame, m, and the quaternion
+        w, x, y, z.
         """
 
 
@@ -82,8 +87,8 @@ class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True
     Attributes:
         code: its class, as in "my_plant:Scene".
         source_sha256: hash of the file of its class.
-        bodies: what else it moves, by name: sizes of a box around it, along its own x, y and z, m; where they
-            are is recorded and drawn.
+        bodies: what else it moves, by name: sizes of a box around it, along its own x, y and z,
+            m; where they are is recorded and drawn.
         settings: the arguments of its class, by name.
     """
 
@@ -103,20 +108,33 @@ def resolve_plant(written: Any, path: str) -> Any:
     code = table.get("class")
     if not isinstance(code, str):
         raise ScenarioError("must be a class, as in 'my_plant:Scene'", path=f"{path}.class")
-    bodies = {"bodies": _check_bodies(table["bodies"], f"{path}.bodies")} if "bodies" in table else {}
+    bodies = (
+        {"bodies": _check_bodies(table["bodies"], f"{path}.bodies")}
+        if "bodies" in table
+        else {}
+    )
     if "source_sha256" in table:
         return {**table, **bodies}
     settings = {key: value for key, value in table.items() if key not in ("class", "bodies")}
-    return {"class": code, "source_sha256": read_code(code, path).sha256, "settings": settings, **bodies}
+    return {
+        "class": code,
+        "source_sha256": read_code(code, path).sha256,
+        "settings": settings,
+        **bodies,
+    }
 
 
 def _check_bodies(written: Any, path: str) -> Any:
     if not isinstance(written, Mapping) or len(written) > _MAX_BODIES:
         example = "{ box = [0.2, 0.2, 0.1] }"
-        raise ScenarioError(f"must be the sizes of at most {_MAX_BODIES} bodies, as in {example}", path=path)
+        raise ScenarioError(
+            f"must be the sizes of at most {_MAX_BODIES} bodies, as in {example}", path=path
+        )
     for name, size in written.items():
         if not _BODY_NAME.fullmatch(name):
-            raise ScenarioError(f"a body is named by a to z, 0 to 9 and _, not {name!r}", path=path)
+            raise ScenarioError(
+                f"a body is named by a to z, 0 to 9 and _, not {name!r}", path=path
+            )
         given = isinstance(size, list | tuple) and all(
             is_number(one) and 0.0 < one <= _MAX_SIZE_M for one in size
         )
@@ -134,7 +152,9 @@ class PlantPlayer:
         rate_hz: the tick rate of its site, Hz.
     """
 
-    def __init__(self, scenario: "Scenario", site: str, plant: OwnPlant, watch: Watch = call_plainly) -> None:
+    def __init__(
+        self, scenario: "Scenario", site: str, plant: OwnPlant, watch: Watch = call_plainly
+    ) -> None:
         spec = scenario.sites[site]
         path = f"sites.{site}.plant"
         self._site = site
@@ -147,9 +167,16 @@ class PlantPlayer:
                 f"{plant.code} has no poses(), which says where they are", path=f"{path}.bodies"
             )
         context = PlantContext(
-            site, scenario, spec.q0_rad, 1.0 / spec.rate_hz, scenario.draw_seed(site), plant.bodies
+            site=site,
+            scenario=scenario,
+            q0_rad=spec.q0_rad,
+            h_s=1.0 / spec.rate_hz,
+            seed=scenario.draw_seed(site),
+            bodies_m=plant.bodies,
         )
-        self._program: PlantProgram = make_instance(kind, plant.code, context, plant.settings, path=path)
+        self._program: PlantProgram = make_instance(
+            kind, plant.code, context, plant.settings, path=path
+        )
         self._bodies = len(plant.bodies)
         self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), self._ask(0, self._place))
 
@@ -207,4 +234,8 @@ def make_plant_players(scenario: "Scenario") -> dict[str, PlantPlayer]:
         ScenarioError: one cannot be made.
     """
     plants = ((name, spec.plant) for name, spec in scenario.sites.items())
-    return {name: PlantPlayer(scenario, name, one) for name, one in plants if isinstance(one, OwnPlant)}
+    return {
+        name: PlantPlayer(scenario, name, one)
+        for name, one in plants
+        if isinstance(one, OwnPlant)
+    }

@@ -1,12 +1,14 @@
-"""What `ping` printed, as probes: iputils, BSD and macOS, busybox, fping and Windows, in any language.
+"""What `ping` printed, as probes: iputils, BSD and macOS, busybox, fping and Windows, in any
+language.
 
 Invariant:
-- A probe without an answer counts as lost, also before the first answer and after the last one: sequence
-  numbers, lines about a missing answer and the number of packets in the summary tell what was sent.
-- Numbers are read and words are not, so that the language of the program does not matter. A decimal comma is
-  a decimal point.
-- Output that contradicts its own summary is refused. Where the output does not tell how the run began or
-  ended, `PingProbes` says so.
+- A probe without an answer counts as lost, also before the first answer and after the last one:
+  sequence numbers, lines about a missing answer and the number of packets in the summary tell
+  what was sent.
+- Numbers are read and words are not, so that the language of the program does not matter. A
+  decimal comma is a decimal point.
+- Output that contradicts its own summary is refused. Where the output does not tell how the run
+  began or ended, `PingProbes` says so.
 
     64 bytes from 192.0.2.5: icmp_seq=6 ttl=64 time=5.00 ms           iputils, BSD, macOS
     64 bytes from 192.0.2.5: seq=0 ttl=64 time=3.000 ms               busybox
@@ -36,11 +38,15 @@ _ROUND_TRIP = re.compile(r"[=<]\s?(\d+(?:[.,]\d+)?)\s?ms?\b")
 _STAMP = re.compile(r"\[(\d+[.,]\d+)\]")
 _HEADER = re.compile(r"ping6?\b.*\d", re.IGNORECASE)
 _COUNTS_FROM_0 = re.compile(r": \d+ \w+ \w+|=\d+\+\d+")
-"""Headers of busybox, BSD and macOS: "PING host (192.0.2.5): 56 data bytes", "PING6(56=40+8+8 bytes) ..."."""
+"""Headers of busybox, BSD and macOS: "PING host (192.0.2.5): 56 data bytes", "PING6(56=40+8+8
+bytes) ...".
+"""
 _SUMMARY = re.compile(r"\s*(\d+) [^\d,]+, (\d+)\b.*%")
 """As in "40 packets transmitted, 25 received, 37.5% packet loss, time 39000ms"."""
 
-_FPING = re.compile(r"(?:\[(\d+[.,]\d+)\] )?(\S+)\s+: \[(\d+)\], (?:\d+ bytes, (\d+(?:[.,]\d+)?) ms)?")
+_FPING = re.compile(
+    r"(?:\[(\d+[.,]\d+)\] )?(\S+)\s+: \[(\d+)\], (?:\d+ bytes, (\d+(?:[.,]\d+)?) ms)?"
+)
 _FPING_SUMMARY = re.compile(r"\S+\s+: \S+ = (\d+)/(\d+)/\d+%")
 
 _WINDOWS_REPLY = re.compile(
@@ -93,7 +99,13 @@ def read_ping(text: str, every_s: float) -> PingProbes:
     if any(_WINDOWS_REPLY.search(line) or _WINDOWS_COUNTS.match(line) for line in lines):
         return _read_windows(lines, every_s)
     if counts := next((found for line in lines if (found := _SUMMARY.match(line))), None):
-        return _arrange_probes({}, set(), 1, (int(counts[1]), int(counts[2])), every_s)
+        return _arrange_probes(
+            answers={},
+            mentioned=set(),
+            first=1,
+            counts=(int(counts[1]), int(counts[2])),
+            every_s=every_s,
+        )
     raise ValueError("no line tells of an answer, as in 'icmp_seq=1 ttl=63 time=60.6 ms'")
 
 
@@ -123,11 +135,15 @@ def _read_numbered(lines: Sequence[str], every_s: float) -> PingProbes:
             answers[number] = _Answer(_read_decimal(rtt[1]), printed_s)
     if first is None and counts is not None:
         first = 1  # as iputils counts; a number 0 shows that this one does not
-    return _arrange_probes(answers, mentioned, first, counts, every_s)
+    return _arrange_probes(
+        answers=answers, mentioned=mentioned, first=first, counts=counts, every_s=every_s
+    )
 
 
 def _unwrap_number(last: int, number: int) -> int:
-    """Returns a sequence number as if ping never counted from 0 again; `last` is the one before, or -1."""
+    """Returns a sequence number as if ping never counted from 0 again; `last` is the one
+    before, or -1.
+    """
     if last < 0:
         return number
     half = _SEQUENCE_NUMBERS // 2
@@ -154,8 +170,12 @@ def _read_fping(lines: Sequence[str], every_s: float) -> PingProbes:
         elif found := _FPING_SUMMARY.match(line):
             counts = int(found[1]), int(found[2])
     if len(hosts) > 1:
-        raise ValueError(f"it has {len(hosts)} hosts, {', '.join(sorted(hosts)[:3])}: keep the lines of one")
-    return _arrange_probes(answers, mentioned, 0, counts, every_s)
+        raise ValueError(
+            f"it has {len(hosts)} hosts, {', '.join(sorted(hosts)[:3])}: keep the lines of one"
+        )
+    return _arrange_probes(
+        answers=answers, mentioned=mentioned, first=0, counts=counts, every_s=every_s
+    )
 
 
 def _arrange_probes(
@@ -170,7 +190,8 @@ def _arrange_probes(
     Args:
         answers: the answers by number.
         mentioned: all numbers in the output, also of lines without an answer.
-        first: the number of the first probe by the header or the summary; None: the output does not tell.
+        first: the number of the first probe by the header or the summary; None: the output does
+            not tell.
         counts: packets sent and received by the summary; None: there is no summary.
         every_s: the interval between probes without times, s.
     """
@@ -182,23 +203,30 @@ def _arrange_probes(
         sent, received = counts
         end = begin + sent
         if highest >= end:
-            raise ValueError(f"its summary counts {sent} packets, but its lines reach number {highest}")
+            raise ValueError(
+                f"its summary counts {sent} packets, but its lines reach number {highest}"
+            )
         if received > len(answers):
             text = f"its summary counts {count_nouns(received, 'answer')}, but its lines have {len(answers)}"
             raise ValueError(f"{text}: it was printed with -q, or lines are missing")
     if end - begin > _MOST_PROBES:
-        raise ValueError(f"its summary counts {end - begin} packets, at most {_MOST_PROBES} are read")
+        raise ValueError(
+            f"its summary counts {end - begin} packets, at most {_MOST_PROBES} are read"
+        )
     numbers = np.arange(begin, end)
     rtt_ms = [answers[n].rtt_ms if n in answers else math.inf for n in numbers.tolist()]
     sent_s = _find_sending_times(numbers, answers, every_s).tolist()
     return PingProbes(sent_s, rtt_ms, first is not None or lowest <= 1, counts is not None)
 
 
-def _find_sending_times(numbers: NDArray[np.int64], answers: dict[int, _Answer], every_s: float) -> Array:
-    """Returns when probes were sent, s: by the times of the answers, which are on a line if all have them.
+def _find_sending_times(
+    numbers: NDArray[np.int64], answers: dict[int, _Answer], every_s: float
+) -> Array:
+    """Returns when probes were sent, s: by the times of the answers, which are on a line if all
+    have them.
 
-    Between two answers the times are interpolated; before the first and after the last answer they continue
-    at the mean interval, since `ping` prints no time of sending.
+    Between two answers the times are interpolated; before the first and after the last answer
+    they continue at the mean interval, since `ping` prints no time of sending.
     """
     known = [
         (n, answer.printed_s - answer.rtt_ms * 1e-3)
@@ -215,7 +243,9 @@ def _find_sending_times(numbers: NDArray[np.int64], answers: dict[int, _Answer],
 
 
 def _read_windows(lines: Sequence[str], every_s: float) -> PingProbes:
-    """Reads the output of Windows: a header, a line per probe, then counts; it has no sequence numbers."""
+    """Reads the output of Windows: a header, a line per probe, then counts; it has no sequence
+    numbers.
+    """
     rtt_ms: list[float] = []
     sent: int | None = None
     has_header = is_over = False
@@ -240,9 +270,13 @@ def _read_windows(lines: Sequence[str], every_s: float) -> PingProbes:
             has_header = True
         elif (has_header or rtt_ms) and not _WINDOWS_BREAK.fullmatch(line.strip()):
             if not line.endswith((".", "。")):
-                raise ValueError(f"line {n} is neither an answer nor the sentence of one that is missing")
+                raise ValueError(
+                    f"line {n} is neither an answer nor the sentence of one that is missing"
+                )
             rtt_ms.append(math.inf)
     if sent is not None and sent != len(rtt_ms):
-        raise ValueError(f"its summary counts {sent} packets, but it has lines of {len(rtt_ms)}")
+        raise ValueError(
+            f"its summary counts {sent} packets, but it has lines of {len(rtt_ms)}"
+        )
     sent_s = [n * every_s for n in range(len(rtt_ms))]
     return PingProbes(sent_s, rtt_ms, has_header or sent is not None, sent is not None)

@@ -1,8 +1,10 @@
-"""The step from an author's tables to a complete scenario: defaults, presets, and checks of keys and names.
+"""The step from an author's tables to a complete scenario: defaults, presets, and checks of
+keys and names.
 
-Invariant: what a person writes is checked in the shape in which it was written, so the path in an error
-is one that the person finds in the file. A preset is a table that an author could have written
-(`scenarios/_presets.toml` has them, each with its source); a resolved scenario holds its keys, not its name.
+Invariant: what a person writes is checked in the shape in which it was written, so the path in
+an error is one that the person finds in the file. A preset is a table that an author could have
+written (`scenarios/_presets.toml` has them, each with its source); a resolved scenario holds
+its keys, not its name.
 """
 
 import math
@@ -46,11 +48,23 @@ from .laws import LAWS
 from .link_inertia import LinkInertia
 from .operators import ENVIRONMENTS, OPERATORS, Holding, resolve_operators
 from .own_plant import resolve_plant
-from .scenario_types import GLIDE_TAU_RATE_NM_S, SITE_GROUPS, TIMELINE_KEYS, Limits, Scenario, SiteSpec
+from .scenario_types import (
+    GLIDE_TAU_RATE_NM_S,
+    SITE_GROUPS,
+    TIMELINE_KEYS,
+    Limits,
+    Scenario,
+    SiteSpec,
+)
 from .urdf import MAX_CHARACTERS
 
 _TOP = ("name", "title", "about", "assumed", "rate_hz", "duration_s", "seed", "scheme")
-_TABLES = (*SITE_GROUPS, "control", "link", *(key for key in field_names(Scenario) if key not in _TOP))
+_TABLES = (
+    *SITE_GROUPS,
+    "control",
+    "link",
+    *(key for key in field_names(Scenario) if key not in _TOP),
+)
 _SITE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 _RESERVED = ("recorder",)
 _DEFAULT_SEED = 1
@@ -62,18 +76,28 @@ _PRESETS_FILE = SHIPPED_FOLDER / "_presets.toml"
 
 GRID_ROUND_TRIPS_MS = (8, 68, 136, 272, 544, 1088)
 GRID_LOSSES_PERCENT = (0, 10, 25, 50)
-"""A grid over the ranges of Rodriguez-Seda, Lee and Spong, "Experimental Comparison Study of Control
-Architectures for Bilateral Teleoperators", IEEE Trans. Robotics 25 (2009): round trips of 8 to 1088 ms
-and losses of 0 to 50 %. The points are ours; theirs are not known to us."""
+"""A grid over the ranges of Rodriguez-Seda, Lee and Spong, "Experimental Comparison Study of
+Control Architectures for Bilateral Teleoperators", IEEE Trans. Robotics 25 (2009): round trips
+of 8 to 1088 ms and losses of 0 to 50 %. The points are ours; theirs are not known to us.
+"""
 
 
 _GRID: dict[str, dict[str, Any]] = {
-    f"rtt{rtt_ms}-loss{percent}": {"model": "constant", "delay_ms": rtt_ms / 2, "loss": percent / 100}
+    f"rtt{rtt_ms}-loss{percent}": {
+        "model": "constant",
+        "delay_ms": rtt_ms / 2,
+        "loss": percent / 100,
+    }
     for rtt_ms in GRID_ROUND_TRIPS_MS
     for percent in GRID_LOSSES_PERCENT
 }
-PRESETS: dict[str, dict[str, Any]] = {**tomllib.loads(_PRESETS_FILE.read_text(encoding="utf-8")), **_GRID}
-"""Keys of a link by the preset's name; those of the grid: half a round trip each way, single losses."""
+PRESETS: dict[str, dict[str, Any]] = {
+    **tomllib.loads(_PRESETS_FILE.read_text(encoding="utf-8")),
+    **_GRID,
+}
+"""Keys of a link by the preset's name; those of the grid: half a round trip each way, single
+losses.
+"""
 
 TRACE_KEYS = ("file", "of")
 """Keys of an author that name the source of a trace; a resolved link has the trace instead."""
@@ -105,11 +129,17 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
     rows = {}
     for name in sites:
         if name not in written:
-            raise ScenarioError("is missing: whom does this site follow?", path=f"dominance.{name}")
-        rows[name] = resolve_dominance_row(written[name], list(sites), name, f"dominance.{name}")
+            raise ScenarioError(
+                "is missing: whom does this site follow?", path=f"dominance.{name}"
+            )
+        rows[name] = resolve_dominance_row(
+            written[name], list(sites), name, f"dominance.{name}"
+        )
     links = resolve_links(tables, list(sites), folder)
     _resolve_views(sites, folder)
-    resolved = {key: _unix_lines(tables[key]) for key in _TOP if key in tables and key != "rate_hz"}
+    resolved = {
+        key: _unix_lines(tables[key]) for key in _TOP if key in tables and key != "rate_hz"
+    }
     return {
         "duration_s": 20.0,
         "seed": _DEFAULT_SEED,
@@ -126,20 +156,28 @@ def resolve_scenario(tables: TomlTable, folder: Path | None) -> TomlTable:
 
 
 def _read_urdf_files(tables: TomlTable, folder: Path | None) -> dict[str, str]:
-    """Returns the texts of the files that arms name: of the scenario itself, of `folder`, or shipped."""
+    """Returns the texts of the files that arms name: of the scenario itself, of `folder`, or
+    shipped.
+    """
     given = check_keys(tables.get("urdf", {}), list(tables.get("urdf", {})), "urdf")
     for name, text in given.items():
         if not isinstance(text, str):
             raise ScenarioError("must be the text of a URDF", path=f"urdf.{name}")
     sites = tables["sites"] if isinstance(tables["sites"], dict) else {}
-    arms = {f"sites.{name}.arm": site.get("arm") for name, site in sites.items() if isinstance(site, dict)}
+    arms = {
+        f"sites.{name}.arm": site.get("arm")
+        for name, site in sites.items()
+        if isinstance(site, dict)
+    }
     texts: dict[str, str] = {}
     for path, arm in {"arm": tables.get("arm"), **arms}.items():
         name = arm.get("urdf", "") if isinstance(arm, dict) else ""
         if not isinstance(name, str):
             raise ScenarioError("must be a file's name", path=f"{path}.urdf")
         if name and name not in texts:
-            texts[name] = _unix_lines(given[name] if name in given else _read_urdf(name, folder, path))
+            texts[name] = _unix_lines(
+                given[name] if name in given else _read_urdf(name, folder, path)
+            )
     return texts
 
 
@@ -150,17 +188,24 @@ def _read_urdf(name: str, folder: Path | None, path: str) -> str:
         with open_regular(_find_file(name, folder), encoding="utf-8") as stream:
             text: str = stream.read(MAX_CHARACTERS + 1)
         return text
-    except (OSError, ValueError) as error:  # of text that is not UTF-8, and of a name with a null
+    except (
+        OSError,
+        ValueError,
+    ) as error:  # of text that is not UTF-8, and of a name with a null
         reason = getattr(error, "strerror", None) or "not UTF-8 text"
         raise ScenarioError(f"{name} cannot be read: {reason}", path=f"{path}.urdf") from None
 
 
 def _find_file(name: str, folder: Path) -> Path:
     shipped = Path(str(SHIPPED_FOLDER / name))
-    return shipped if "/" not in name and "\\" not in name and shipped.is_file() else folder / name
+    return (
+        shipped if "/" not in name and "\\" not in name and shipped.is_file() else folder / name
+    )
 
 
-def _resolve_control(written: Any, default: TomlTable, path: str, counts: VectorCounts) -> TomlTable:
+def _resolve_control(
+    written: Any, default: TomlTable, path: str, counts: VectorCounts
+) -> TomlTable:
     """Returns a law and its gains: as written, and the rest from a default of the same law."""
     if not isinstance(written, dict):
         raise ScenarioError("must be a table", path=path)
@@ -173,21 +218,33 @@ def _resolve_control(written: Any, default: TomlTable, path: str, counts: Vector
     return expand_vectors({**inherited, **own, "law": law}, LAWS[law], counts)
 
 
-def _resolve_user_law(code: str, written: TomlTable, default: TomlTable, path: str) -> TomlTable:
+def _resolve_user_law(
+    code: str, written: TomlTable, default: TomlTable, path: str
+) -> TomlTable:
     inherited = default if default.get("law") == code else {}
     settings = {key: value for key, value in {**inherited, **written}.items() if key != "law"}
     if not re.fullmatch(CLASS_PATTERN, code):
-        raise ScenarioError(f"must be as in package.module:Law, is {code!r}", path=f"{path}.law")
+        raise ScenarioError(
+            f"must be as in package.module:Law, is {code!r}", path=f"{path}.law"
+        )
     if "settings" in settings:
         raise ScenarioError(
             "the settings of a user's law stand next to its name, as in control.gain = 5",
             path=f"{path}.settings",
         )
     if "sends" in settings:
-        raise ScenarioError("is declared by the class of the law, not here", path=f"{path}.sends")
+        raise ScenarioError(
+            "is declared by the class of the law, not here", path=f"{path}.sends"
+        )
     source = read_code(code, f"{path}.law")
     sends = msgspec.to_builtins(read_sends(source.content, source.file, code, f"{path}.law"))
-    return {"law": "own", "code": code, "source_sha256": source.sha256, "settings": settings, "sends": sends}
+    return {
+        "law": "own",
+        "code": code,
+        "source_sha256": source.sha256,
+        "settings": settings,
+        "sends": sends,
+    }
 
 
 def _unix_lines(value: Any) -> Any:
@@ -214,10 +271,13 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> Tom
         groups[name] = {}
         for group, kind in SITE_GROUPS.items():
             own = check_keys(table.get(group, {}), field_names(kind), f"{path}.{group}")
-            groups[name][group] = own if "urdf" in own else _join_group(tables.get(group, {}), own)
+            groups[name][group] = (
+                own if "urdf" in own else _join_group(tables.get(group, {}), own)
+            )
     if len(written) > MAX_SITES:
         raise ScenarioError(
-            f"has {count_nouns(len(written), 'site')}, at most {MAX_SITES} are taken", path="sites"
+            f"has {count_nouns(len(written), 'site')}, at most {MAX_SITES} are taken",
+            path="sites",
         )
     if len(written) < 2:
         raise ScenarioError(
@@ -228,13 +288,22 @@ def _resolve_sites(tables: TomlTable, draws: Draws, urdf: dict[str, str]) -> Tom
         for group in groups.values()
     )
     return {
-        name: _resolve_site(name, {**table, **groups[name]}, tables, draws, urdf, chains)
+        name: _resolve_site(
+            name=name,
+            site={**table, **groups[name]},
+            tables=tables,
+            draws=draws,
+            urdf=urdf,
+            chains=chains,
+        )
         for name, table in written.items()
     }
 
 
 def _join_group(shared: TomlTable, own: TomlTable) -> TomlTable:
-    """Returns a site's table of a group upon the one of all sites; of `links` link by link, key by key."""
+    """Returns a site's table of a group upon the one of all sites; of `links` link by link, key
+    by key.
+    """
     joined = {**shared, **own}
     shared_links = shared.get("links")
     own_links = own.get("links")
@@ -247,11 +316,18 @@ def _join_group(shared: TomlTable, own: TomlTable) -> TomlTable:
 
 
 def _resolve_site(
-    name: str, site: TomlTable, tables: TomlTable, draws: Draws, urdf: dict[str, str], chains: bool
+    name: str,
+    site: TomlTable,
+    tables: TomlTable,
+    draws: Draws,
+    urdf: dict[str, str],
+    chains: bool,
 ) -> TomlTable:
     """Returns a site's tables, complete; `chains`: the arms of the scenario are chains."""
     path = f"sites.{name}"
-    site["arm"], model = _resolve_arm(site, draws, urdf, chains, f"{path}.arm")
+    site["arm"], model = _resolve_arm(
+        site=site, draws=draws, urdf=urdf, chains=chains, path=f"{path}.arm"
+    )
     counts = model.counts if model is not None else VectorCounts()
     site = expand_vectors({"q0_rad": 0.0, "qd0_rad_s": 0.0, **site}, SiteSpec, counts)
     site["control"] = _resolve_control(
@@ -296,17 +372,19 @@ def _resolve_arm(
     armature = {key: table.pop(key) for key in ("armature_kg_m2",) if key in table}
     links = _resolve_link_inertias(table.pop("links", {}), draws, f"{path}.links")
     table = draws.draw_numbers(table, path) | ({"links": links} if links else {})
-    model = _model_arm(table, task, urdf, chains, path)
+    model = _model_arm(table=table, task_table=task, urdf=urdf, chains=chains, path=path)
     if not armature or model is None:
         return {**table, **armature}, model
     if not table.get("urdf"):
         raise ScenarioError(_OF_A_CHAIN, path=f"{path}.armature_kg_m2")
     table |= draws.draw_numbers(expand_vectors(armature, Arm, model.counts), path)
-    return table, _model_arm(table, task, urdf, chains, path)
+    return table, _model_arm(table=table, task_table=task, urdf=urdf, chains=chains, path=path)
 
 
 def _resolve_link_inertias(written: Any, draws: Draws, path: str) -> TomlTable:
-    """Returns the masses and inertias that an arm gives its links, drawn and checked one by one."""
+    """Returns the masses and inertias that an arm gives its links, drawn and checked one by
+    one.
+    """
     links: TomlTable = {}
     if not isinstance(written, dict):
         raise ScenarioError("must be a table of links", path=path)
@@ -318,7 +396,9 @@ def _resolve_link_inertias(written: Any, draws: Draws, path: str) -> TomlTable:
             given = msgspec.convert(links[name], LinkInertia)
         except msgspec.ValidationError as error:
             problem, key = split_refusal(error)
-            raise ScenarioError(reword_problem(problem), path=f"{place}.{key.strip('.')}") from None
+            raise ScenarioError(
+                reword_problem(problem), path=f"{place}.{key.strip('.')}"
+            ) from None
         if not given.list_keys():
             keys = ", ".join(field_names(LinkInertia))
             raise ScenarioError(f"is empty: give {keys}", path=place)
@@ -337,22 +417,28 @@ _OF_A_CHAIN = "belongs to an arm with a urdf, and this one is planar"
 def _model_arm(
     table: TomlTable, task_table: TomlTable, urdf: dict[str, str], chains: bool, path: str
 ) -> ArmModel | None:
-    """Returns the model of an arm; None where the table of a planar arm is refused later, at its own key."""
+    """Returns the model of an arm; None where the table of a planar arm is refused later, at
+    its own key.
+    """
     try:
         arm = msgspec.convert(table, Arm)
     except msgspec.ValidationError as error:
         if not (table.get("urdf") or chains):
             return None
         problem, place = split_refusal(error)
-        raise ScenarioError(reword_problem(problem), path=f"{path}.{place.strip('.')}") from None
+        raise ScenarioError(
+            reword_problem(problem), path=f"{path}.{place.strip('.')}"
+        ) from None
     foreign = [key for key in table if key in (ArmLinks._fields if arm.urdf else CHAIN_KEYS)]
     if foreign:
-        owner = f"belongs to the planar arm, and this one is {arm.urdf}" if arm.urdf else _OF_A_CHAIN
+        owner = (
+            f"belongs to the planar arm, and this one is {arm.urdf}"
+            if arm.urdf
+            else _OF_A_CHAIN
+        )
         raise ScenarioError(owner, path=f"{path}.{foreign[0]}")
     if placed := [key for key in BASE_KEYS if key in table and not chains]:
-        problem = (
-            "has no effect where all arms are planar and share joint angles: set task.space, or leave it out"
-        )
+        problem = "has no effect where all arms are planar and share joint angles: set task.space, or leave it out"
         raise ScenarioError(problem, path=f"{path}.{placed[0]}")
     if sum(abs(x) for x in arm.down) < 1e-6:
         raise ScenarioError("must point somewhere, is zero", path=f"{path}.down")
@@ -377,7 +463,11 @@ def _model_arm(
 def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
     law = site["control"].get("law", "adaptive")
     tables: list[tuple[TomlTable, type[Frozen], str]]
-    tables = [(site, SiteSpec, path), (site["arm"], Arm, f"{path}.arm"), (site["task"], Task, f"{path}.task")]
+    tables = [
+        (site, SiteSpec, path),
+        (site["arm"], Arm, f"{path}.arm"),
+        (site["task"], Task, f"{path}.task"),
+    ]
     tables += [(site["control"], LAWS[law], f"{path}.control")] if law in LAWS else []
     for table, kind, place in tables:
         if found := find_count_problem(table, kind, counts):
@@ -390,7 +480,8 @@ def _check_counts(site: TomlTable, counts: VectorCounts, path: str) -> None:
             owner = f"sites share {count_nouns(counts.shared, 'coordinate')}"
         if isinstance(value, list) and len(value) != wanted:
             raise ScenarioError(
-                f"has {count_nouns(len(value), 'number')}, and {owner}", path=f"{path}.limits.{key}"
+                f"has {count_nouns(len(value), 'number')}, and {owner}",
+                path=f"{path}.limits.{key}",
             )
 
 
@@ -409,7 +500,9 @@ def resolve_dominance_row(written: Any, names: list[str], site: str, path: str) 
 
 
 def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> TomlTable:
-    """Returns every link, complete, from [link] and [links]; files of traces lie in `folder`, if any may."""
+    """Returns every link, complete, from [link] and [links]; files of traces lie in `folder`,
+    if any may.
+    """
     every = [f"{j}->{i}" for i in names for j in names if i != j]
     written = check_keys(tables.get("links", {}), every, "links")
     default = resolve_link(tables.get("link", {}), {}, "link")
@@ -418,7 +511,13 @@ def resolve_links(tables: TomlTable, names: list[str], folder: Path | None) -> T
         path = f"links.{name}"
         link = resolve_link(written.get(name, {}), default, path)
         shared = "file" in default and "file" not in written.get(name, {})
-        links[name] = _complete_link(link, name, path, folder, "link" if shared else path)
+        links[name] = _complete_link(
+            link=link,
+            name=name,
+            path=path,
+            folder=folder,
+            trace_path="link" if shared else path,
+        )
     return links
 
 
@@ -445,7 +544,8 @@ def _complete_link(
 
 
 def resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
-    """Returns a link: what is written upon its base, or upon nothing if a model or a preset is named.
+    """Returns a link: what is written upon its base, or upon nothing if a model or a preset is
+    named.
 
     The file of a trace is not read yet.
     """
@@ -464,17 +564,27 @@ def resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
     valid = ("model", "preset", *field_names(DELAY_MODELS[model]), *files)
     own = check_keys(written, valid, path)
     replaced = TRACE_KEYS if "trace" in own else ("trace",) if "file" in own else ()
-    link = {**{key: value for key, value in start.items() if key not in replaced}, **own, "model": model}
+    link = {
+        **{key: value for key, value in start.items() if key not in replaced},
+        **own,
+        "model": model,
+    }
     link.pop("preset", None)
     return link
 
 
 def _read_trace_file(link: TomlTable, name: str, path: str, folder: Path | None) -> TomlTable:
-    """Returns a link with the trace of its file; of a log that of the link of its name, or of `of`."""
+    """Returns a link with the trace of its file; of a log that of the link of its name, or of
+    `of`.
+    """
     link = dict(link)
     file, of = (link.pop(key, None) for key in TRACE_KEYS)
     if ("trace" in link) == (file is not None):
-        problem = "give either trace or file" if "trace" in link else "is missing: a table or a log of delays"
+        problem = (
+            "give either trace or file"
+            if "trace" in link
+            else "is missing: a table or a log of delays"
+        )
         raise ScenarioError(problem, path=f"{path}.file")
     if file is None and of is not None:
         raise ScenarioError("names a link of the log that file names", path=f"{path}.of")
@@ -489,7 +599,9 @@ def _read_trace_file(link: TomlTable, name: str, path: str, folder: Path | None)
 
 
 def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[TomlTable]:
-    """Returns the changes, each complete in itself, checked against the sites and the change before."""
+    """Returns the changes, each complete in itself, checked against the sites and the change
+    before.
+    """
     if not isinstance(written, list):
         raise ScenarioError("must be a list of tables [[timeline]]", path="timeline")
     present = dict(links)
@@ -518,7 +630,9 @@ def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[T
     return changes
 
 
-def resolve_target(change: TomlTable, present: TomlTable, names: list[str], path: str) -> TomlTable:
+def resolve_target(
+    change: TomlTable, present: TomlTable, names: list[str], path: str
+) -> TomlTable:
     """Returns the complete link, or row of the dominance matrix, that a change leads to."""
     written = change.get("to", {})
     if "link" in change:

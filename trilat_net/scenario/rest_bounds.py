@@ -1,7 +1,9 @@
-"""What a stop can take: how long an arm moves, how fast its joints may get, and which speed its motors bear.
+"""What a stop can take: how long an arm moves, how fast its joints may get, and which speed its
+motors bear.
 
-The bounds follow from the model of the arm, the limits of its torques and the way in which it comes to rest
-(`core.resting`); docs/links.md derives them. The numbers of its equations stand beside the lines.
+The bounds follow from the model of the arm, the limits of its torques and the way in which it
+comes to rest (`core.resting`); docs/links.md derives them. The numbers of its equations stand
+beside the lines.
 
 Invariant:
 
@@ -57,7 +59,8 @@ class _ArmSamples(NamedTuple):
     Attributes:
         M: inertia, shape (poses, n, n).
         G: absolute torque of gravity, N m, shape (poses, n).
-        coriolis: largest absolute Coriolis torque of all directions of the joints, N m, shape (poses, n).
+        coriolis: largest absolute Coriolis torque of all directions of the joints, N m, shape
+            (poses, n).
     """
 
     M: Array
@@ -76,19 +79,25 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
     spec = scenario.sites[site]
     setup = scenario.setup(site)
     joints = len(spec.q0_rad)
-    speed = np.abs(np.broadcast_to(setup.qd_limit_rad_s if qd is None else qd, joints)).astype(float)
+    speed = np.abs(np.broadcast_to(setup.qd_limit_rad_s if qd is None else qd, joints)).astype(
+        float
+    )
     limit = np.broadcast_to(setup.tau_limit_nm, joints).astype(float)
     arm = _sample_planar_arm(spec.arm, speed)
     if spec.arm.urdf:
         arm = _sample_chain(scenario.arms[site], np.array(spec.q0_rad), speed)
     beyond_gravity = np.maximum(limit - arm.G, 0.0)
     shares = beyond_gravity / np.maximum(arm.coriolis, _LEAST_NM)
-    kinetic_j = max(float(0.5 * v @ M @ v) for M in arm.M for v in speed * _list_patterns(joints))
+    kinetic_j = max(
+        float(0.5 * v @ M @ v) for M in arm.M for v in speed * _list_patterns(joints)
+    )
     damping = np.broadcast_to(setup.rest.damping, joints)
     blend_j = float((0.5 * limit**2 / damping).sum()) / setup.rate_hz  # (5)
     mobility = np.linalg.inv(arm.M).diagonal(axis1=1, axis2=2).max(axis=0)
     return RestBounds(
-        rest_s=_bound_rest_time(setup, speed, limit, arm, kinetic_j + blend_j),
+        rest_s=_bound_rest_time(
+            setup=setup, speed=speed, limit=limit, arm=arm, energy_j=kinetic_j + blend_j
+        ),
         bearable=math.sqrt(float(shares.min())),  # (7)
         kinetic_j=kinetic_j,
         blend_j=blend_j,
@@ -116,7 +125,9 @@ def _bound_rest_time(
 
 
 def _list_patterns(joints: int) -> Array:
-    """Returns directions of the joints, each 1 or -1, shape (patterns, joints); the first joint's is 1."""
+    """Returns directions of the joints, each 1 or -1, shape (patterns, joints); the first
+    joint's is 1.
+    """
     rows = islice(product((1.0, -1.0), repeat=joints - 1), _PATTERNS)
     return np.array([(1.0, *row) for row in rows])
 
@@ -124,15 +135,23 @@ def _list_patterns(joints: int) -> Array:
 def _draw_poses(model: ArmModel, q0: Array) -> Array:
     """Returns poses within the stops of the joints, the start pose first, shape (poses, n)."""
     assert model.chain is not None
-    low = [joint.lower if math.isfinite(joint.lower) else -math.pi for joint in model.chain.joints]
-    high = [joint.upper if math.isfinite(joint.upper) else math.pi for joint in model.chain.joints]
+    low = [
+        joint.lower if math.isfinite(joint.lower) else -math.pi for joint in model.chain.joints
+    ]
+    high = [
+        joint.upper if math.isfinite(joint.upper) else math.pi for joint in model.chain.joints
+    ]
     drawn = np.random.default_rng(0).uniform(low, high, (_POSES, len(q0)))
     return np.vstack([q0, drawn])
 
 
 def _sample_planar_arm(arm: Arm, speed: Array) -> _ArmSamples:
-    """Returns the planar two-link arm by the paper's Eq. (2) to (5) and (24), for all angles of its elbow."""
-    a, b, c, first, second = theta_from_links(ArmLinks(*(getattr(arm, name) for name in ArmLinks._fields)))
+    """Returns the planar two-link arm by the paper's Eq. (2) to (5) and (24), for all angles of
+    its elbow.
+    """
+    a, b, c, first, second = theta_from_links(
+        ArmLinks(*(getattr(arm, name) for name in ArmLinks._fields))
+    )
     elbow = np.linspace(-math.pi, math.pi, _POSES + 1)
     across = c + b * np.cos(elbow)
     M = np.array([[a + 2.0 * b * np.cos(elbow), across], [across, np.full_like(elbow, c)]])
@@ -148,10 +167,14 @@ def _sample_planar_arm(arm: Arm, speed: Array) -> _ArmSamples:
 
 
 def _sample_chain(model: ArmModel, q0: Array, speed: Array) -> _ArmSamples:
-    """Returns a chain in its start pose and in drawn ones; friction, which only takes power, is left out."""
+    """Returns a chain in its start pose and in drawn ones; friction, which only takes power, is
+    left out.
+    """
     assert model.chain is not None
     gravity = np.array(model.chain.gravity_m_s2)
-    rows = build_chain([joint._replace(viscous=0.0, coulomb=0.0) for joint in model.chain.joints])
+    rows = build_chain(
+        [joint._replace(viscous=0.0, coulomb=0.0) for joint in model.chain.joints]
+    )
     joints = len(q0)
     still = np.zeros(joints)
     torque = np.zeros(joints)
@@ -162,13 +185,13 @@ def _sample_chain(model: ArmModel, q0: Array, speed: Array) -> _ArmSamples:
     for q in _draw_poses(model, q0):
         inertias.append(model.inertia(q))
         place_joints(rows, q)
-        propagate_motion(rows, gravity, still, still, still)
-        inverse_dynamics(rows, model.theta, still, still, torque)
+        propagate_motion(chain=rows, gravity=gravity, qd=still, v=still, a=still)
+        inverse_dynamics(chain=rows, theta=model.theta, v=still, a=still, torque=torque)
         G = torque.copy()
         coriolis = np.zeros(joints)
         for v in patterns:
-            propagate_motion(rows, gravity, v, v, still)
-            inverse_dynamics(rows, model.theta, v, still, torque)
+            propagate_motion(chain=rows, gravity=gravity, qd=v, v=v, a=still)
+            inverse_dynamics(chain=rows, theta=model.theta, v=v, a=still, torque=torque)
             coriolis = np.maximum(coriolis, np.abs(torque - G))
         gravities.append(np.abs(G))
         pushes.append(coriolis)

@@ -1,7 +1,7 @@
 """Changes of links and of dominance while a run goes on, by request or by its timeline.
 
-Invariant: a change is completed upon the state before it, and its text in a record is the whole change:
-every reader derives the same `CoreChange` from it.
+Invariant: a change is completed upon the state before it, and its text in a record is the whole
+change: every reader derives the same `CoreChange` from it.
 """
 
 import re
@@ -21,7 +21,9 @@ from .validate import check_change, check_links_memory
 
 
 class LinkTables(dict[str, dict[str, Any]]):
-    """Every link as a table: first as at the start, then as the timeline and whoever changes one has it."""
+    """Every link as a table: first as at the start, then as the timeline and whoever changes
+    one has it.
+    """
 
     def __init__(self, links: Mapping[str, LinkBase], timeline: Sequence[Change]) -> None:
         super().__init__({name: msgspec.to_builtins(link) for name, link in links.items()})
@@ -34,8 +36,11 @@ class LinkTables(dict[str, dict[str, Any]]):
             self[change.link] = change.to
 
 
-def resolve_change(scenario: Scenario, present: LinkTables, written: dict[str, Any], from_ns: int) -> Change:
-    """Returns a requested change, complete and checked, that holds from `from_ns` on, ns since the epoch.
+def resolve_change(
+    scenario: Scenario, present: LinkTables, written: dict[str, Any], from_ns: int
+) -> Change:
+    """Returns a requested change, complete and checked, that holds from `from_ns` on, ns since
+    the epoch.
 
     It is written as in a scenario's timeline, upon every link as it is at present.
 
@@ -47,7 +52,9 @@ def resolve_change(scenario: Scenario, present: LinkTables, written: dict[str, A
         raise ScenarioError("a change names either a link or, as dominance, a site")
     change["to"] = resolve_target(change, present, list(scenario.names), "change")
     if "link" in change and change["to"]["model"] == "trace":  # a record cannot hold it
-        raise ScenarioError("a link with a trace can only be given another model", path="change.to")
+        raise ScenarioError(
+            "a link with a trace can only be given another model", path="change.to"
+        )
     try:
         complete = msgspec.convert(change, Change)
     except msgspec.ValidationError as error:
@@ -64,8 +71,11 @@ def find_owner(change: Change) -> str:
     return change.site or change.dominance or change.link.partition("->")[2]
 
 
-def make_site_order(scenario: Scenario, site: str, order: SiteOrder, from_ns: int, ticks: int = 0) -> Change:
-    """Returns an order to a site, which it carries out at a tick at `from_ns`, ns since the epoch.
+def make_site_order(
+    scenario: Scenario, site: str, order: SiteOrder, from_ns: int, ticks: int = 0
+) -> Change:
+    """Returns an order to a site, which it carries out at a tick at `from_ns`, ns since the
+    epoch.
 
     Raises:
         ScenarioError: the site does not know such orders.
@@ -94,7 +104,8 @@ _ORDER_SENTENCES = {
 
 
 def describe_change(change: Change, ordered_by: str = "") -> str:
-    """Returns a change in a sentence without a full stop, as "m2 was stopped by the experimenter at 58.2 s".
+    """Returns a change in a sentence without a full stop, as "m2 was stopped by the
+    experimenter at 58.2 s".
 
     Args:
         change: an order to a site, a change of a link, or one of a row of shares.
@@ -121,7 +132,9 @@ def find_orderer(sentence: str) -> str:
 
 
 def count_skipped_ticks(texts: Sequence[str]) -> int:
-    """Returns how many ticks before its own a record says that its site did not make, by its changes."""
+    """Returns how many ticks before its own a record says that its site did not make, by its
+    changes.
+    """
     skipped = 0
     for text in texts:
         if "overrun" in text:
@@ -137,7 +150,9 @@ def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
     if change.order:
         return CoreChange(text, order=LifeOrder[change.order.upper()], skipped=change.ticks)
     if change.dominance:
-        return CoreChange(text, ramp=scenario.ramp(site, change.to, change.start_ns, change.ramp_s))
+        return CoreChange(
+            text, ramp=scenario.ramp(site, change.to, change.start_ns, change.ramp_s)
+        )
     peer = scenario.peers(site).index(change.link.partition("->")[0])
     return CoreChange(text, peer=peer, model=change.after.core(change.start_ns))
 
@@ -151,15 +166,23 @@ def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:
     try:
         change = msgspec.json.decode(text, type=Change)
     except (msgspec.DecodeError, msgspec.ValidationError) as error:
-        raise ScenarioError(f"the record names a command that is none: {error}", path=text[:80]) from None
+        raise ScenarioError(
+            f"the record names a command that is none: {error}", path=text[:80]
+        ) from None
     sites = ("", *scenario.names)
-    if change.link not in ("", *scenario.links) or change.dominance not in sites or change.site not in sites:
+    if (
+        change.link not in ("", *scenario.links)
+        or change.dominance not in sites
+        or change.site not in sites
+    ):
         raise ScenarioError(
             "the record names a command for a link or site that does not exist", path=text[:80]
         )
     named = [bool(name) for name in (change.link, change.dominance, change.site)]
     if find_owner(change) != site or sum(named) != 1 or bool(change.site) != bool(change.order):
-        raise ScenarioError(f"the record names a command that is none of {site}", path=text[:80])
+        raise ScenarioError(
+            f"the record names a command that is none of {site}", path=text[:80]
+        )
     if change.order:
         make_site_order(scenario, site, change.order, change.start_ns)
     check_change(change, "cmd")

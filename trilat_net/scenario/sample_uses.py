@@ -1,7 +1,9 @@
-"""Which samples of a peer a site uses, and which its user is shown, at its ticks, drawn as a run draws them.
+"""Which samples of a peer a site uses, and which its user is shown, at its ticks, drawn as a
+run draws them.
 
-Invariant: the draws are those of the link's key, so that what is said before a run holds in the run. What a
-user is shown is a function of scenario, seed and ticks: a log has it without a word of it.
+Invariant: the draws are those of the link's key, so that what is said before a run holds in the
+run. What a user is shown is a function of scenario, seed and ticks: a log has it without a word
+of it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,7 +27,8 @@ _BLOCK = 8192
 class LinkSchedule:
     """When the samples of a link are due, one after the other: by a row of the core's link.
 
-    Ordered changes hold from a time at which no sample had been decided, so all can stand there at once.
+    Ordered changes hold from a time at which no sample had been decided, so all can stand there
+    at once.
 
     Attributes:
         models: the link's, in the order of their first stamps.
@@ -40,7 +43,9 @@ class LinkSchedule:
                 model = model._replace(trace_first=len(points), trace_count=len(trace))
                 points += [(int(t_us), int(delay_us)) for t_us, delay_us in trace]
             placed.append(model)
-        self.models = np.array(sorted([*placed, *ordered], key=lambda one: one.from_ns), LINK_MODEL_DTYPE)
+        self.models = np.array(
+            sorted([*placed, *ordered], key=lambda one: one.from_ns), LINK_MODEL_DTYPE
+        )
         self._points = np.array([*points, *setup.outages], dtype=np.int64).reshape(-1, 2)
         row: Row = np.zeros(1, link_dtype(0))[0]
         row.rate_hz = setup.rate_hz
@@ -54,17 +59,27 @@ class LinkSchedule:
         self._block = np.empty(_BLOCK, dtype=np.int64)
 
     def draw(self, end: int) -> IntArray:
-        """Returns when the samples are due that follow those of the last call, up to one, ns; or LOST."""
+        """Returns when the samples are due that follow those of the last call, up to one, ns;
+        or LOST.
+        """
         first = int(self.row.foreseen) + 1
         due_ns = np.empty(max(0, end - first), dtype=np.int64)
         for start in range(first, end, _BLOCK):
             stop = min(start + _BLOCK, end)
-            schedule_deliveries(stop - 1, self.row, self.models, self._block, self._points)
+            schedule_deliveries(
+                sample=stop - 1,
+                link=self.row,
+                models=self.models,
+                dues=self._block,
+                points=self._points,
+            )
             due_ns[start - first : stop - first] = self._block[np.arange(start, stop) % _BLOCK]
         return due_ns
 
     def draw_releases(self, end: int, own_hz: int) -> tuple[IntArray, IntArray]:
-        """Returns those of the same samples that are not lost, and the receiver's ticks that release them."""
+        """Returns those of the same samples that are not lost, and the receiver's ticks that
+        release them.
+        """
         sample = np.arange(int(self.row.foreseen) + 1, end)
         due_ns = self.draw(end)
         stamp_ns = sample * NS_PER_S // int(self.row.rate_hz)
@@ -78,9 +93,21 @@ def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
 
 
 @lru_cache(maxsize=256)
-def draw_uses(link: LinkBase, key: int, own_hz: int, peer_hz: int, duration_s: float) -> IntArray:
-    """Returns the sample in use at every tick of a site with nothing but this link, -1 before the first."""
-    setup = LinkSetup("peer", 1.0, peer_hz, (), key, (link.core(),), (link.points,))
+def draw_uses(
+    link: LinkBase, key: int, own_hz: int, peer_hz: int, duration_s: float
+) -> IntArray:
+    """Returns the sample in use at every tick of a site with nothing but this link, -1 before
+    the first.
+    """
+    setup = LinkSetup(
+        peer="peer",
+        alpha=1.0,
+        rate_hz=peer_hz,
+        q0=(),
+        key=key,
+        models=(link.core(),),
+        traces=(link.points,),
+    )
     released = LinkSchedule(setup).draw_releases(round(duration_s * peer_hz), own_hz)
     used = _find_newest(*released, max(2, round(duration_s * own_hz)))
     used.flags.writeable = False
@@ -101,10 +128,12 @@ def count_silences(used: IntArray, own_hz: int, silence_ns: int) -> int:
 
 
 class PictureDelay:
-    """Which tick of each peer a site's user is shown: `[sites.NAME.view]`, a link beside the haptic one.
+    """Which tick of each peer a site's user is shown: `[sites.NAME.view]`, a link beside the
+    haptic one.
 
-    A peer's sample is shown from the site's first tick at or after its arrival over that link (L2), drawn by
-    a key of its own (L4), until a newer one is. Without a view the samples in use are shown.
+    A peer's sample is shown from the site's first tick at or after its arrival over that link
+    (L2), drawn by a key of its own (L4), until a newer one is. Without a view the samples in
+    use are shown.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
@@ -116,7 +145,16 @@ class PictureDelay:
             key = link_key(scenario.seed, f"view {peer}->{site}")
             rate_hz = scenario.sites[peer].rate_hz
             outages = tuple((round(a * 1e9), round(b * 1e9)) for a, b in view.outages_s)
-            setup = LinkSetup(peer, 1.0, rate_hz, (), key, (view.core(),), (view.points,), outages)
+            setup = LinkSetup(
+                peer=peer,
+                alpha=1.0,
+                rate_hz=rate_hz,
+                q0=(),
+                key=key,
+                models=(view.core(),),
+                traces=(view.points,),
+                outages=outages,
+            )
             self._links[peer] = rate_hz, LinkSchedule(setup)
         self._waiting = {peer: np.empty((2, 0), dtype=np.int64) for peer in self._links}
         self._shown = dict.fromkeys(self._links, -1)

@@ -1,7 +1,7 @@
 """Scenarios by name, by path or from a log, with overrides applied.
 
-Invariant: text from a log or a peer is not trusted: it names no file, its laws may not run, and it writes out
-what it has.
+Invariant: text from a log or a peer is not trusted: it names no file, its laws may not run, and
+it writes out what it has.
 """
 
 import re
@@ -28,18 +28,25 @@ MAX_KEY_PARTS = 32
 
 
 def list_shipped() -> list[str]:
-    """Returns the names of the scenarios that come with the package; the command is `trilat scenario list`.
+    """Returns the names of the scenarios that come with the package; the command is `trilat
+    scenario list`.
 
     >>> "paper" in tn.list_shipped()
     True
     """
     names = (entry.name for entry in SHIPPED_FOLDER.iterdir())
-    return sorted(n.removesuffix(".toml") for n in names if n.endswith(".toml") and not n.startswith("_"))
+    return sorted(
+        n.removesuffix(".toml") for n in names if n.endswith(".toml") and not n.startswith("_")
+    )
 
 
 def read_shipped(name: str) -> str:
-    """Returns the TOML text of a shipped scenario, of one that is not listed too: its name begins with _."""
-    if name not in list_shipped() and not (len(name) < 80 and (SHIPPED_FOLDER / f"{name}.toml").is_file()):
+    """Returns the TOML text of a shipped scenario, of one that is not listed too: its name
+    begins with _.
+    """
+    if name not in list_shipped() and not (
+        len(name) < 80 and (SHIPPED_FOLDER / f"{name}.toml").is_file()
+    ):
         raise ScenarioError(
             f"no scenario of that name{suggest_nearest(name, list_shipped())}; "
             f"shipped are {', '.join(list_shipped())}; a file is named by its path, as in ./mine.toml",
@@ -49,7 +56,8 @@ def read_shipped(name: str) -> str:
 
 
 def read_template() -> str:
-    """Returns the commented template of a scenario, valid as it stands; as `trilat scenario new`.
+    """Returns the commented template of a scenario, valid as it stands; as `trilat scenario
+    new`.
 
     >>> tn.load_scenario(tn.read_template()).names
     ('m1', 'm2', 's')
@@ -70,10 +78,10 @@ def load_scenario(
     ('m1', 'm2', 's')
 
     Args:
-        source: the name of a shipped scenario, a path, a TOML text of several lines, its tables, a scenario,
-            or a run or log, which has one.
-        overrides: as in `{"control.Kd": 5}` or `["control.Kd=5"]`; in a scenario a key of a group applies to
-            all (`override`).
+        source: the name of a shipped scenario, a path, a TOML text of several lines, its
+            tables, a scenario, or a run or log, which has one.
+        overrides: as in `{"control.Kd": 5}` or `["control.Kd=5"]`; in a scenario a key of a
+            group applies to all (`override`).
         duration_s: the duration, s; by default the scenario's.
         seed: the seed; by default the scenario's.
 
@@ -91,8 +99,11 @@ def load_scenario(
     if isinstance(source, Scenario):
         try:
             expanded = expand_overrides(source, parse_overrides(overrides))
-            changed = parse_scenario(source.text, source.name, expanded) if overrides else source
-            named = re.findall(r"[\w.]+:\w+", repr(list(expanded.values())))  # of laws, hands and plants
+            changed = (
+                parse_scenario(source.text, source.name, expanded) if overrides else source
+            )
+            # of laws, hands and plants
+            named = re.findall(r"[\w.]+:\w+", repr(list(expanded.values())))
             return allow_own_code(changed, named, source)
         except ScenarioError as error:
             raise ScenarioError(error.problem, path=error.path, source=source.name) from None
@@ -106,8 +117,8 @@ class ExperimentText(NamedTuple):
     """An experiment as its author wrote it.
 
     Attributes:
-        called: what a command calls it: a shipped name or a path; of one that is in no file the path at which
-            a command would look for it.
+        called: what a command calls it: a shipped name or a path; of one that is in no file the
+            path at which a command would look for it.
         folder: of the files that it names; None: it is resolved, and names none.
     """
 
@@ -136,7 +147,9 @@ def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> Experi
         return ExperimentText(f"./{source.name}.toml", source.text, None)
     if isinstance(source, Mapping):
         named = str(source.get("name", "scenario"))
-        return ExperimentText(f"./{named}.toml", tomli_w.dumps(name_law_classes(source)), Path())
+        return ExperimentText(
+            f"./{named}.toml", tomli_w.dumps(name_law_classes(source)), Path()
+        )
     if isinstance(source, str) and "\n" in source:
         return ExperimentText("./scenario.toml", source, Path())
     text, folder = read_source(source)
@@ -153,7 +166,8 @@ def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:
 
 
 def read_source(source: str | Path) -> tuple[str, Path]:
-    """Returns the TOML text of a shipped name or a path, and the folder of the files that it names.
+    """Returns the TOML text of a shipped name or a path, and the folder of the files that it
+    names.
 
     Raises:
         ScenarioError: it cannot be read.
@@ -178,7 +192,8 @@ def find_site(scenario: Scenario, name: str) -> SiteSpec:
     if name not in scenario.sites:
         hint = suggest_nearest(name, scenario.names)
         raise ScenarioError(
-            f"no site {name!r}{hint}; its sites are {', '.join(scenario.names)}", source=scenario.name
+            f"no site {name!r}{hint}; its sites are {', '.join(scenario.names)}",
+            source=scenario.name,
         )
     return scenario.sites[name]
 
@@ -205,7 +220,9 @@ def parse_scenario(
             _refuse_long_keys(text)
             try:
                 tables = tomllib.loads(text)
-            except ValueError as error:  # TOMLDecodeError is one; a number of 5000 digits is another
+            except (
+                ValueError
+            ) as error:  # TOMLDecodeError is one; a number of 5000 digits is another
                 raise ScenarioError(f"is not TOML: {error}") from None
             own, of_entries = split_entries(tables, parse_overrides(overrides))
             apply_overrides(tables, own)
@@ -221,11 +238,14 @@ def parse_scenario(
             raise ScenarioError("is nested too deep", source=source) from None
 
 
-_KEY_PART = re.compile(r"""(?P<word>[\w-]+|"[^"]*"|'[^']*')|(?P<dot>\s{0,9}\.\s{0,9})|(?P<other>.)""")
+_KEY_PART = re.compile(
+    r"""(?P<word>[\w-]+|"[^"]*"|'[^']*')|(?P<dot>\s{0,9}\.\s{0,9})|(?P<other>.)"""
+)
 
 
 def _refuse_long_keys(text: str) -> None:
-    """Refuses keys of very many parts: the time of a parser grows by more than the square of their number.
+    """Refuses keys of very many parts: the time of a parser grows by more than the square of
+    their number.
 
     Raises:
         ScenarioError: with the line of the key.
@@ -247,16 +267,21 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
     """Returns the resolved scenario of a log or a peer, which is not trusted.
 
     Raises:
-        ScenarioError: it is not valid, or names a file, or would fill the memory by its defaults.
+        ScenarioError: it is not valid, or names a file, or would fill the memory by its
+            defaults.
     """
     scenario = parse_scenario(text, source, folder=None)
     changed = (change.after for change in scenario.timeline if change.link)
-    traces = sum(len(getattr(link, "trace", "")) for link in (*scenario.links.values(), *changed))
+    traces = sum(
+        len(getattr(link, "trace", "")) for link in (*scenario.links.values(), *changed)
+    )
     if traces > len(text):
         raise ScenarioError("its traces are not written out, link by link", source=source)
     return scenario
 
 
 def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
-    """Returns the function that reads the sites' names of embedded scenarios; errors call these `source`."""
+    """Returns the function that reads the sites' names of embedded scenarios; errors call these
+    `source`.
+    """
     return lambda text: parse_embedded(text, source).names

@@ -1,8 +1,9 @@
-"""The types of a complete scenario: sites, scripted changes, itself, and the core's setup of each site.
+"""The types of a complete scenario: sites, scripted changes, itself, and the core's setup of
+each site.
 
-Invariant: keys end in their unit; symbols are the paper's. `Scenario.text` is canonical: it loads to the
-same scenario, and its SHA-256 names the experiment. A change names the time from which it holds and is
-complete in itself.
+Invariant: keys end in their unit; symbols are the paper's. `Scenario.text` is canonical: it
+loads to the same scenario, and its SHA-256 names the experiment. A change names the time from
+which it holds and is complete in itself.
 """
 
 import hashlib
@@ -51,16 +52,18 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
     """The rule for a peer whose sample in use is too old.
 
     Attributes:
-        action: "use": goes on with it; "hold": stays at the last reference; "brake": stays where the arm is;
-            "glide": begins by waiting for all peers, lets its reference come to rest when none of a peer's
-            samples came into use for a time, and aligns with its peers without a jump.
+        action: "use": goes on with it; "hold": stays at the last reference; "brake": stays
+            where the arm is; "glide": begins by waiting for all peers, lets its reference come
+            to rest when none of a peer's samples came into use for a time, and aligns with its
+            peers without a jump.
         age_ms: the age beyond which it is too old, ms; not of "glide".
         return_s: duration of the return once a fresh sample is in use, s; not of "glide".
-        silence_ms: of "glide", the time without a new sample in use after which a peer is silent, ms.
+        silence_ms: of "glide", the time without a new sample in use after which a peer is
+            silent, ms.
         align_speed_rad_s: of "glide", how fast it goes to its peers, rad/s; of a place m/s.
         align_limit_rad: of "glide", the longest way that it goes by itself, rad; of a place m.
-        on_lost: of "glide", "hold": holds while a peer is silent; "degrade": goes on without a master
-            that is, as long as the others reach each other.
+        on_lost: of "glide", "hold": holds while a peer is silent; "degrade": goes on without a
+            master that is, as long as the others reach each other.
     """
 
     action: Literal["use", "hold", "brake", "glide"] = "use"
@@ -81,7 +84,9 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
                 site_setup.StaleAction.GLIDE, silence_ns, 1, *limits, self.on_lost == "degrade"
             )
         return site_setup.StaleRule(
-            site_setup.StaleAction[self.action.upper()], round(self.age_ms * 1e6), round(self.return_s * 1e9)
+            site_setup.StaleAction[self.action.upper()],
+            round(self.age_ms * 1e6),
+            round(self.return_s * 1e9),
         )
 
 
@@ -90,21 +95,24 @@ SpeedLimits = Annotated[tuple[SpeedLimit, ...], Meta(min_length=1, max_length=MA
 
 
 GLIDE_TAU_RATE_NM_S = 1000.0
-"""Under the rule "glide" a torque changes by 1 N m a millisecond at most, as Franka's arms ask for it."""
+"""Under the rule "glide" a torque changes by 1 N m a millisecond at most, as Franka's arms ask
+for it.
+"""
 
 
 class Limits(Frozen, frozen=True):
     """The limits of a site.
 
     Attributes:
-        tau_limit_nm: largest control torque of a joint, N m; more is cut off. One number, or one per joint;
-            left out, a chain has the efforts that its file states.
-        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s; so too. Under the
-            rule "glide" the site is in fault in its place, and the run goes on.
-        tau_rate_limit_nm_s: largest change of the control torque of a joint in a second, N m/s. Left out,
-            there is none, but under the rule "glide" it is `GLIDE_TAU_RATE_NM_S`.
+        tau_limit_nm: largest control torque of a joint, N m; more is cut off. One number, or
+            one per joint; left out, a chain has the efforts that its file states.
+        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s; so
+            too. Under the rule "glide" the site is in fault in its place, and the run goes on.
+        tau_rate_limit_nm_s: largest change of the control torque of a joint in a second, N m/s.
+            Left out, there is none, but under the rule "glide" it is `GLIDE_TAU_RATE_NM_S`.
         qd_des_limit_rad_s: largest speed of the reference, rad/s; of a place m/s.
-        q_min_rad: least angle of a joint, rad; only of the rule "glide": beyond it the site is in fault.
+        q_min_rad: least angle of a joint, rad; only of the rule "glide": beyond it the site is
+            in fault.
         q_max_rad: largest angle, likewise.
     """
 
@@ -121,7 +129,9 @@ class Limits(Frozen, frozen=True):
         return site_setup.MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
             q_max=math.inf if self.q_max_rad is None else self.q_max_rad,
-            qd_des_limit=math.inf if self.qd_des_limit_rad_s is None else self.qd_des_limit_rad_s,
+            qd_des_limit=math.inf
+            if self.qd_des_limit_rad_s is None
+            else self.qd_des_limit_rad_s,
             tau_rate=math.inf if self.tau_rate_limit_nm_s is None else self.tau_rate_limit_nm_s,
         )
 
@@ -136,10 +146,10 @@ class SiteSpec(Frozen, frozen=True):
         qd0_rad_s: start velocity, rad/s.
         on_stale: its rule for a peer whose samples are too old.
         task: what it follows: joints, or its end effector.
-        plant: "simulated"; "external": an arm outside of the program, whose state is measured; or a class of
-            one's own that moves the arm.
-        view: delay, loss and order of the picture by which the site's user sees its peers, as of a link;
-            None: the user sees the samples in use. It enters no formula.
+        plant: "simulated"; "external": an arm outside of the program, whose state is measured;
+            or a class of one's own that moves the arm.
+        view: delay, loss and order of the picture by which the site's user sees its peers, as
+            of a link; None: the user sees the samples in use. It enters no formula.
     """
 
     role: Literal["master", "slave"]
@@ -157,17 +167,33 @@ class SiteSpec(Frozen, frozen=True):
     view: Link | None = None
 
     def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
-        """Returns the hand that is led while the session runs; `is_open`: one that anybody may hold."""
+        """Returns the hand that is led while the session runs; `is_open`: one that anybody may
+        hold.
+        """
         hands = (one for one in self.hands if isinstance(one, LiveHand))
         return next((one for one in hands if one.is_open or not is_open), None)
 
 
-SITE_GROUPS: dict[str, type[Frozen]] = {"arm": Arm, "limits": Limits, "on_stale": OnStale, "task": Task}
+SITE_GROUPS: dict[str, type[Frozen]] = {
+    "arm": Arm,
+    "limits": Limits,
+    "on_stale": OnStale,
+    "task": Task,
+}
 """Tables that a scenario may have for all sites, and each site for itself."""
 
 
 SiteOrder = Literal[
-    "", "stop", "enable", "reset", "overrun", "arm_silent", "arm_lost", "arm_back", "released", "held"
+    "",
+    "stop",
+    "enable",
+    "reset",
+    "overrun",
+    "arm_silent",
+    "arm_lost",
+    "arm_back",
+    "released",
+    "held",
 ]
 """What a site may be ordered, from outside (the first three) or by itself."""
 TIMELINE_KEYS = ("at_s", "link", "dominance", "to", "ramp_s")
@@ -175,10 +201,12 @@ TIMELINE_KEYS = ("at_s", "link", "dominance", "to", "ramp_s")
 
 
 class Change(Frozen, frozen=True, omit_defaults=True):
-    """One change. Exactly one of `link`, `dominance` and `site` is given; the last is of records alone.
+    """One change. Exactly one of `link`, `dominance` and `site` is given; the last is of
+    records alone.
 
     Attributes:
-        at_s: when it takes effect, s after the epoch; on a link, for samples stamped from then on.
+        at_s: when it takes effect, s after the epoch; on a link, for samples stamped from then
+            on.
         link: the link that it changes, as in "m1->s".
         dominance: the site whose dominance factors it changes.
         to: the whole link from then on, or all factors of the row.
@@ -219,9 +247,13 @@ _ABSENT: dict[str, tuple[Any, ...]] = {
     **dict.fromkeys(("timeline", "environment"), ((), [])),
     **dict.fromkeys(("expect", "drawn", "urdf", "on_stale", "task", "sends"), ({},)),
     "plant": ("simulated",),
-    **dict.fromkeys(("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad", "view"), (None,)),
+    **dict.fromkeys(
+        ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad", "view"), (None,)
+    ),
 }
-"""Keys that older scenarios lack, and their values that mean nothing; those are not in the text."""
+"""Keys that older scenarios lack, and their values that mean nothing; those are not in the
+text.
+"""
 _SLAVE = 2
 """The slave's place in a palette of colours."""
 _NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
@@ -277,7 +309,9 @@ class Scenario(Frozen, frozen=True, dict=True):
     assumed: tuple[str, ...] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Takes the text along: a default that is left out of it is known by its identity alone."""
+        """Takes the text along: a default that is left out of it is known by its identity
+        alone.
+        """
         return (*super().__reduce__(), {"text": self.text})
 
     @cached_property
@@ -306,7 +340,9 @@ class Scenario(Frozen, frozen=True, dict=True):
     @cached_property
     def alpha(self) -> Array:
         """The dominance matrix, shape (N, N), Eq. (6)."""
-        return np.array([[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names])
+        return np.array(
+            [[self.dominance[i].get(j, 0.0) for j in self.names] for i in self.names]
+        )
 
     @cached_property
     def controls(self) -> tuple[ChosenLaw, ...]:
@@ -317,7 +353,11 @@ class Scenario(Frozen, frozen=True, dict=True):
     @property
     def beta(self) -> Array | None:
         """Left null vector of Upsilon, shape (N,), sum 1, Eq. (20); None if alpha is reducible."""
-        return dominance.perron_vector(self.alpha) if dominance.is_irreducible(self.alpha) else None
+        return (
+            dominance.perron_vector(self.alpha)
+            if dominance.is_irreducible(self.alpha)
+            else None
+        )
 
     @cached_property
     def text(self) -> str:
@@ -328,13 +368,18 @@ class Scenario(Frozen, frozen=True, dict=True):
         sites = tables["sites"].values()
         for site in sites:
             _drop_unused(site["arm"])
-        for table in (tables, *sites, *(site[group] for site in sites for group in ("control", "limits"))):
+        for table in (
+            tables,
+            *sites,
+            *(site[group] for site in sites for group in ("control", "limits")),
+        ):
             for key, absent in _ABSENT.items():
                 if key in table and table[key] in absent:
                     del table[key]
         urdf = tables.pop("urdf", None)
         numbers = _NUMBERS.sub(
-            lambda one: " ".join(one[0].split()).replace("[ ", "[").replace(", ]", "]"), tomli_w.dumps(tables)
+            lambda one: " ".join(one[0].split()).replace("[ ", "[").replace(", ]", "]"),
+            tomli_w.dumps(tables),
         )
         files = tomli_w.dumps({"urdf": urdf}, multiline_strings=True) if urdf else ""
         return tomli_w.dumps(words, multiline_strings=True) + numbers + files
@@ -345,7 +390,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     def order_palette(self, colours: int) -> list[int]:
-        """Returns the places of a palette in the order of the sites; sites beyond them begin anew."""
+        """Returns the places of a palette in the order of the sites; sites beyond them begin
+        anew.
+        """
         free = list(range(colours))
         order = []
         roles = [site.role for site in self.sites.values()]
@@ -364,7 +411,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         return tuple(name for name in self.names if name != site)
 
     def _all_links(self) -> list[LinkBase]:
-        later = [link for name in self.links for _, link in scheduled_links(self.timeline, name)]
+        later = [
+            link for name in self.links for _, link in scheduled_links(self.timeline, name)
+        ]
         return [*self.links.values(), *later]
 
     @property
@@ -384,13 +433,17 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def external(self) -> tuple[str, ...]:
-        """The sites whose arms are measured: they are outside of the program, or plants of one's own."""
+        """The sites whose arms are measured: they are outside of the program, or plants of
+        one's own.
+        """
         return tuple(name for name, spec in self.sites.items() if spec.plant != "simulated")
 
     @property
     def slave(self) -> str:
         """The first site whose role is slave, else the last one."""
-        return next((name for name, spec in self.sites.items() if spec.role == "slave"), self.names[-1])
+        return next(
+            (name for name, spec in self.sites.items() if spec.role == "slave"), self.names[-1]
+        )
 
     @property
     def outside(self) -> tuple[str, ...]:
@@ -405,7 +458,9 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def sites_may_return(self) -> bool:
-        """True if a session outlives its sites: each waits for its peers, and aligns with them anew."""
+        """True if a session outlives its sites: each waits for its peers, and aligns with them
+        anew.
+        """
         return all(spec.on_stale.action == "glide" for spec in self.sites.values())
 
     def draw_seed(self, site: str) -> int:
@@ -415,17 +470,23 @@ class Scenario(Frozen, frozen=True, dict=True):
     def channel(self, site: str) -> LawChannel:
         """Returns what the law of a site sends to its peers."""
         sends: SentVectorSpecs = getattr(self.sites[site].control, "sends", {})
-        return build_channel(sends, site_setup.Layout.of_arm(self.arms[site].chain), len(self.names) - 1)
+        return build_channel(
+            sends, site_setup.Layout.of_arm(self.arms[site].chain), len(self.names) - 1
+        )
 
     def layout(self, site: str) -> site_setup.Layout:
         """Returns how many numbers the vectors of a site have."""
         live = self.sites[site].find_live_hand()
         actors = () if live is None else (live.actor,)
-        found = site_setup.Layout.of_arm(self.arms[site].chain, self.channel(site).floats, actors)
+        found = site_setup.Layout.of_arm(
+            self.arms[site].chain, self.channel(site).floats, actors
+        )
         return found._replace(bodies=7 * len(self.bodies_m(site)))
 
     def bodies_m(self, site: str) -> dict[str, tuple[float, float, float]]:
-        """Returns the bodies that a site's plant moves besides its arm: their sizes along their axes, m."""
+        """Returns the bodies that a site's plant moves besides its arm: their sizes along their
+        axes, m.
+        """
         plant = self.sites[site].plant
         return plant.bodies if isinstance(plant, OwnPlant) else {}
 
@@ -457,29 +518,40 @@ class Scenario(Frozen, frozen=True, dict=True):
             channel=self.channel(site),
             bodies=len(self.bodies_m(site)),
             limits=self.motion_limits(site),
-            rest=self._rest_gains(site) if spec.on_stale.action == "glide" else site_setup.RestGains(),
+            rest=self._rest_gains(site)
+            if spec.on_stale.action == "glide"
+            else site_setup.RestGains(),
             bit=1 << self.names.index(site),
         )
 
     def motion_limits(self, site: str) -> site_setup.MotionLimits:
-        """Returns the limits of a site's motion, with room for a start pose a little beyond a limit.
+        """Returns the limits of a site's motion, with room for a start pose a little beyond a
+        limit.
 
-        A joint that starts beyond `q_min_rad` or `q_max_rad` by no more than the margin may be there during
-        the whole run: its limit on that side lies the margin further out.
+        A joint that starts beyond `q_min_rad` or `q_max_rad` by no more than the margin may be
+        there during the whole run: its limit on that side lies the margin further out.
         """
         spec = self.sites[site]
         arm = self.arms[site]
         motion = spec.limits.motion
         start = np.array(spec.q0_rad)
-        low, high = (np.broadcast_to(limit, start.shape) for limit in (motion.q_min, motion.q_max))
+        low, high = (
+            np.broadcast_to(limit, start.shape) for limit in (motion.q_min, motion.q_max)
+        )
         margin = np.full(start.shape, START_MARGIN_RAD)
         if arm.chain is not None:
             margin = np.array([start_margin(joint) for joint in arm.chain.joints])
         if not np.any((start < low) | (start > high)):
             return motion
         return motion._replace(
-            q_min=tuple(np.where((start < low) & (start >= low - margin), low - margin, low).tolist()),
-            q_max=tuple(np.where((start > high) & (start <= high + margin), high + margin, high).tolist()),
+            q_min=tuple(
+                np.where((start < low) & (start >= low - margin), low - margin, low).tolist()
+            ),
+            q_max=tuple(
+                np.where(
+                    (start > high) & (start <= high + margin), high + margin, high
+                ).tolist()
+            ),
         )
 
     def gains(self, site: str) -> site_setup.Gains:
@@ -499,7 +571,14 @@ class Scenario(Frozen, frozen=True, dict=True):
         own: Array = np.zeros(arm.counts.joints) + gains.Kp + gains.d
         limit = spec.limits.tau_limit_nm
         known = spec.arm.known
-        return find_rest_gains(arm, spec.q0_rad, own, limit, spec.rate_hz, known=known)
+        return find_rest_gains(
+            arm=arm,
+            q0=spec.q0_rad,
+            own_damping=own,
+            limit_nm=limit,
+            rate_hz=spec.rate_hz,
+            known=known,
+        )
 
     def _link_setup(self, peer: str, site: str) -> site_setup.LinkSetup:
         name = f"{peer}->{site}"
@@ -516,32 +595,46 @@ class Scenario(Frozen, frozen=True, dict=True):
             outages=tuple((round(a * 1e9), round(b * 1e9)) for a, b in first.outages_s),
             channel=self.channel(peer),
             place=self.peers(peer).index(site),
-            speed_limit=self._speed_limit(peer) if self.sites[site].on_stale.action == "glide" else (),
+            speed_limit=self._speed_limit(peer)
+            if self.sites[site].on_stale.action == "glide"
+            else (),
             bit=1 << self.names.index(peer),
-            followed=sum(1 << n for n, share in enumerate(self.alpha[self.names.index(peer)]) if share > 0.0),
+            followed=sum(
+                1 << n
+                for n, share in enumerate(self.alpha[self.names.index(peer)])
+                if share > 0.0
+            ),
             dispensable=self.sites[peer].role == "master",
         )
 
     def _speed_limit(self, site: str) -> tuple[float, ...]:
-        """Returns the largest speed of a site's joints, rad/s; () if peers do not get their angles."""
+        """Returns the largest speed of a site's joints, rad/s; () if peers do not get their
+        angles.
+        """
         spec = self.sites[site]
         joints = self.arms[site].counts.joints
         if spec.task.space != "joints":
             return ()
         return tuple(np.broadcast_to(spec.limits.qd_limit_rad_s, joints).tolist())
 
-    def ramp(self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float) -> DominanceRamp:
+    def ramp(
+        self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float
+    ) -> DominanceRamp:
         """Returns a change of a site's dominance factors, as the core has it."""
         alpha = tuple(shares.get(peer, 0.0) for peer in self.peers(site))
         return DominanceRamp(start_ns, start_ns + round(ramp_s * 1e9), alpha)
 
     def scripted_ramps(self, site: str) -> list[DominanceRamp]:
-        """Returns the changes of a site's dominance factors on the timeline, as the core has them."""
+        """Returns the changes of a site's dominance factors on the timeline, as the core has
+        them.
+        """
         changes = [change for change in self.timeline if change.dominance == site]
         return [self.ramp(site, one.to, one.start_ns, one.ramp_s) for one in changes]
 
     def without_hands(self) -> "Scenario":
         """Returns the same experiment without operators."""
-        sites = {name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()}
+        sites = {
+            name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()
+        }
         drawn = {key: one for key, one in self.drawn.items() if ".hands." not in key}
         return msgspec.structs.replace(self, sites=sites, drawn=drawn)

@@ -1,6 +1,7 @@
 """An arm of a scenario that a program moves: where a robot is missing, or in place of one.
 
-Invariant: it has the dynamics of the arm in the scenario, Eq. (8), a planar one as a chain of two.
+Invariant: it has the dynamics of the arm in the scenario, Eq. (8), a planar one as a chain of
+two.
 """
 
 import numpy as np
@@ -38,7 +39,9 @@ class SimulatedArm:
     def __init__(self, scenario: Scenario, site: str, heavier: float = 1.0) -> None:
         find_site(scenario, site)
         spec = scenario.sites[site]
-        arm = build_arm(spec.arm, spec.task, scenario.urdf, chains=True).widen_stops(spec.q0_rad)
+        arm = build_arm(spec.arm, spec.task, scenario.urdf, chains=True).widen_stops(
+            spec.q0_rad
+        )
         assert arm.chain is not None
         self.q = np.array(spec.q0_rad)
         self.qd = np.array(spec.qd0_rad_s)
@@ -48,14 +51,24 @@ class SimulatedArm:
         self._gravity = np.array(arm.chain.gravity_m_s2)
 
     def accelerate(self, torque: ArrayLike) -> Array:
-        """Returns the accelerations under a torque ON the joints, N m, shape (n,), rad/s^2; nothing moves."""
+        """Returns the accelerations under a torque ON the joints, N m, shape (n,), rad/s^2;
+        nothing moves.
+        """
         found = np.zeros_like(self.q)
         place_joints(self._joints, self.q)
-        told = (self.theta, self._gravity, self.q, self.qd, np.asarray(torque, dtype=np.float64))
+        told = (
+            self.theta,
+            self._gravity,
+            self.q,
+            self.qd,
+            np.asarray(torque, dtype=np.float64),
+        )
         find_acceleration(self._joints, *told, found)
         return found
 
     def move(self, torque: ArrayLike, period_s: float) -> None:
-        """Moves on by a period under a torque ON the joints, N m: first the velocities, then the angles."""
+        """Moves on by a period under a torque ON the joints, N m: first the velocities, then
+        the angles.
+        """
         self.qd += period_s * self.accelerate(torque)
         self.q += period_s * self.qd

@@ -1,7 +1,8 @@
-"""Skeletons of code of one's own: a law, a hand or a plant that works, with comments, and its test.
+"""Skeletons of code of one's own: a law, a hand or a plant that works, with comments, and its
+test.
 
-Invariant: a skeleton is a file of this package, as `scenarios/_law.txt`; mylaw.py gets the class MyLaw. What
-is written runs as it is, and its test passes.
+Invariant: a skeleton is a file of this package, as `scenarios/_law.txt`; mylaw.py gets the
+class MyLaw. What is written runs as it is, and its test passes.
 """
 
 import keyword
@@ -31,7 +32,8 @@ def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes the skeleton of a hand, a program that acts as a user, as `new_law`: `trilat new hand`.
+    """Writes the skeleton of a hand, a program that acts as a user, as `new_law`: `trilat new
+    hand`.
 
     >>> [path.name for path in tn.new_hand("myhand.py")]
     ['myhand.py', 'test_myhand.py']
@@ -57,7 +59,9 @@ def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
     for one in files:
         refuse_existing(one, force=force)
     known = find_spec(module)
-    if known is not None and not (known.origin and file.exists() and file.samefile(known.origin)):
+    if known is not None and not (
+        known.origin and file.exists() and file.samefile(known.origin)
+    ):
         raise UsageError(f"{file}: Python has a module {module} already; choose another name")
     for one, template in files.items():
         text = (SHIPPED_FOLDER / template).read_text(encoding="utf-8")

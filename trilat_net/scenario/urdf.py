@@ -1,18 +1,18 @@
 """Arms from URDF: the moving bodies between a base and an end link, with their joints.
 
 Invariant:
-    - A chain that is read is physical: every moving body has mass, positive principal moments of inertia and
-      their triangle inequality.
-    - What hangs on a moving link is part of its body. A link that does not lead to the end link never makes
-      an arm unusable: if its inertia is that of no body, a note says how it counts.
-    - A link on the way to the end link whose inertia is that of no body is refused by name, unless the caller
-      balances inertias or gives that link others.
-    - The text is not trusted: no file that it names is opened, no entity is expanded, and its angles are
-      turned into matrices by `core.sincos` and sums in a fixed order, so that the numbers of a chain have the
-      same bits on every machine.
+    - A chain that is read is physical: every moving body has mass, positive principal moments
+      of inertia and their triangle inequality.
+    - What hangs on a moving link is part of its body. A link that does not lead to the end link
+      never makes an arm unusable: if its inertia is that of no body, a note says how it counts.
+    - A link on the way to the end link whose inertia is that of no body is refused by name,
+      unless the caller balances inertias or gives that link others.
+    - The text is not trusted: no file that it names is opened, no entity is expanded, and its
+      angles are turned into matrices by `core.sincos` and sums in a fixed order, so that the
+      numbers of a chain have the same bits on every machine.
 
-Units are those of URDF: kg, m, rad, N m; N along a prismatic joint. Frames: the frame of a link lies on the
-joint that moves it.
+Units are those of URDF: kg, m, rad, N m; N along a prismatic joint. Frames: the frame of a link
+lies on the joint that moves it.
 """
 
 import math
@@ -36,13 +36,16 @@ MOST_DIGITS = 100
 MAX_OFFSET_M = 100.0
 """Largest coordinate of an origin; beyond it a file is in millimetres, or wrong."""
 CONSISTENCY = 1e-9
-"""By so much of the largest principal moment of inertia the physical inequalities may fail, for rounding."""
+"""By so much of the largest principal moment of inertia the physical inequalities may fail, for
+rounding.
+"""
 LEAST_MASS_KG = 1e-9
 LEAST_MOMENT_KG_M2 = 1e-12
 """Of a body that moves; of a single link less than it counts as none."""
 
 BodyParameters = tuple[float, ...]
-"""m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the origin of a frame, in its axes."""
+"""m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the origin of a frame, in its axes.
+"""
 
 _ZERO: Three = (0.0, 0.0, 0.0)
 _UNIT: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -59,7 +62,8 @@ class UrdfPayload(NamedTuple):
     Attributes:
         mass_kg: its mass.
         com_m: its centre of mass in the frame of the end link.
-        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about its centre of mass in the axes of the end link.
+        inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about its centre of mass in the axes of the
+            end link.
     """
 
     mass_kg: float
@@ -75,10 +79,11 @@ class UrdfJoint(NamedTuple):
         link: the link that it moves.
         kind: "revolute" (continuous ones too) or "prismatic".
         axis: unit vector in the joint's frame.
-        rotation: orientation of the joint's frame in the frame of the moving link before (of the base for
-            the first one) at q = 0, row by row.
+        rotation: orientation of the joint's frame in the frame of the moving link before (of
+            the base for the first one) at q = 0, row by row.
         origin_m: its origin there.
-        inertia: the body's `BodyParameters` in the joint's frame, with all that is fixed to the link.
+        inertia: the body's `BodyParameters` in the joint's frame, with all that is fixed to the
+            link.
         lower: least position, rad or m; -inf if the file states none.
         upper: largest position; inf if the file states none.
         effort_limit: N m or N; inf if the file states none.
@@ -109,7 +114,8 @@ class UrdfChain(NamedTuple):
         base: the link that does not move.
         tip: the end link.
         joints: 1 to `MAX_JOINTS` of them, from the base on.
-        tip_rotation: orientation of the end link in the frame of the last moving link, row by row.
+        tip_rotation: orientation of the end link in the frame of the last moving link, row by
+            row.
         tip_origin_m: its origin there.
         notes: what was taken otherwise than the file may have meant, a sentence each.
     """
@@ -174,7 +180,8 @@ class _LinkBody(NamedTuple):
     Attributes:
         link: the link that states it.
         body: its parameters as they are stated, or balanced.
-        point: its parameters as a point of mass, where its moments are those of no body; else None.
+        point: its parameters as a point of mass, where its moments are those of no body; else
+            None.
         problem: why its moments are those of no body; "" if they are those of one.
     """
 
@@ -195,8 +202,9 @@ def read_urdf(
 ) -> UrdfChain:
     """Returns the arm between two links of a robot.
 
-    Links behind fixed joints are part of the moving link before. A branch that a moving link carries on
-    joints of its own (fingers) is part of it as well, at their zero position; a note says so.
+    Links behind fixed joints are part of the moving link before. A branch that a moving link
+    carries on joints of its own (fingers) is part of it as well, at their zero position; a note
+    says so.
 
     Args:
         text: the URDF document.
@@ -204,11 +212,12 @@ def read_urdf(
         tip: the end link; "": the only leaf that moves.
         payload: a body that the end link carries.
         links: masses and inertias in place of the file's, by the link's name.
-        balance: true: a stated inertia that no body has is replaced by the nearest that a body has.
+        balance: true: a stated inertia that no body has is replaced by the nearest that a body
+            has.
 
     Raises:
-        ScenarioError: the problem, with the line, link or joint; of a key of `links` with its path, as in
-            links.NAME.mass_kg.
+        ScenarioError: the problem, with the line, link or joint; of a key of `links` with its
+            path, as in links.NAME.mass_kg.
     """
     robot = _read_tree(_parse_xml(text))
     base = _check_end(robot, "base", base) or _find_base(robot)
@@ -225,7 +234,11 @@ def read_urdf(
         if edge.moves:
             carried = list(_walk_carried(robot, edge, path, notes))
             moved |= {name for name, _ in carried}
-            bodies = list(_read_bodies(robot, carried, path, inertias, notes))
+            bodies = list(
+                _read_bodies(
+                    robot=robot, carried=carried, path=path, inertias=inertias, notes=notes
+                )
+            )
             if payload is not None and n == last:
                 bodies.append(_LinkBody("payload", _read_payload(payload, path[n + 1 :])))
             joints.append(_read_joint(edge, pose, _lump_bodies(edge, bodies, notes), notes))
@@ -234,7 +247,9 @@ def read_urdf(
     return UrdfChain(base, tip, tuple(joints), *pose, tuple(notes))
 
 
-def _check_mended(robot: _Robot, links: Mapping[str, LinkInertia], moved: Collection[str]) -> None:
+def _check_mended(
+    robot: _Robot, links: Mapping[str, LinkInertia], moved: Collection[str]
+) -> None:
     """Refuses inertias of links that the robot lacks, or that no joint of the arm moves."""
     for name in links:
         if name not in robot.links:
@@ -268,7 +283,9 @@ def _joint(name: str) -> str:
 
 
 def _list_names(names: Sequence[str]) -> str:
-    return ", ".join(map(_quote, names[:8])) + (f" and {len(names) - 8} more" if len(names) > 8 else "")
+    return ", ".join(map(_quote, names[:8])) + (
+        f" and {len(names) - 8} more" if len(names) > 8 else ""
+    )
 
 
 # The document
@@ -276,11 +293,16 @@ def _list_names(names: Sequence[str]) -> str:
 
 def _parse_xml(text: str) -> Element:
     if len(text) > MAX_CHARACTERS:
-        _refuse("", f"has {count_nouns(len(text), 'character')}, at most {MAX_CHARACTERS} are read")
+        _refuse(
+            "", f"has {count_nouns(len(text), 'character')}, at most {MAX_CHARACTERS} are read"
+        )
     for word in ("<!DOCTYPE", "<!ENTITY"):
         if word in text:
             line = text.count("\n", 0, text.index(word)) + 1
-            _refuse(f"line {line}", f"{word} is not read: a robot needs no document type and no entities")
+            _refuse(
+                f"line {line}",
+                f"{word} is not read: a robot needs no document type and no entities",
+            )
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -288,7 +310,9 @@ def _parse_xml(text: str) -> Element:
     except ValueError as error:  # a character that no encoding has
         _refuse("", f"is not XML: {error}")
     for element in root.iter():
-        if "xacro" in element.tag.partition("}")[0] or any("${" in word for word in element.attrib.values()):
+        if "xacro" in element.tag.partition("}")[0] or any(
+            "${" in word for word in element.attrib.values()
+        ):
             _refuse(
                 f"<{element.tag.rpartition('}')[2][:60]}>",
                 "is xacro, a template of URDF: expand it with `xacro FILE.urdf.xacro > FILE.urdf`",
@@ -305,7 +329,9 @@ def _name_elements(root: Element, tag: str) -> dict[str, Element]:
         if not name.strip():
             _refuse(f"{tag} number {n}", "has no name")
         if name in named:
-            _refuse(f"{tag} {_quote(name)}", f"there are two of that name: give every {tag} its own")
+            _refuse(
+                f"{tag} {_quote(name)}", f"there are two of that name: give every {tag} its own"
+            )
         named[name] = element
     return named
 
@@ -319,16 +345,20 @@ def _read_tree(root: Element) -> _Robot:
         kind = element.get("type", "")
         if kind not in _KINDS:
             hint = suggest_nearest(kind, _KINDS)
-            _refuse(place, f"is of type {_quote(kind)}, must be one of {', '.join(_KINDS)}{hint}")
+            _refuse(
+                place, f"is of type {_quote(kind)}, must be one of {', '.join(_KINDS)}{hint}"
+            )
         ends = []
         for tag in ("parent", "child"):
             found = _child(element, tag, place)
             end = "" if found is None else found.get("link", "")
             if end not in links:
                 hint = suggest_nearest(end, list(links))
-                _refuse(place, f"its <{tag}> is {_link(end)}, and there is none of that name{hint}")
+                _refuse(
+                    place, f"its <{tag}> is {_link(end)}, and there is none of that name{hint}"
+                )
             ends.append(end)
-        edge = _Edge(name, kind, ends[0], ends[1], element)
+        edge = _Edge(name=name, kind=kind, parent=ends[0], child=ends[1], element=element)
         if edge.child in above:
             _refuse(
                 _link(edge.child),
@@ -341,7 +371,10 @@ def _read_tree(root: Element) -> _Robot:
     rooted = {name for top in links if top not in above for name, _ in _walk(robot, top)}
     for name in links:
         if name not in rooted:
-            _refuse(_link(name), f"hangs on itself by {_joint(above[name].name)}: joints may not form a loop")
+            _refuse(
+                _link(name),
+                f"hangs on itself by {_joint(above[name].name)}: joints may not form a loop",
+            )
     if not links:
         _refuse("", "has no links")
     return robot
@@ -352,7 +385,9 @@ def _walk(robot: _Robot, top: str) -> Iterator[tuple[str, bool]]:
     while waiting:
         name, moved = waiting.pop()
         yield name, moved
-        waiting += [(edge.child, moved or edge.kind != "fixed") for edge in reversed(robot.below[name])]
+        waiting += [
+            (edge.child, moved or edge.kind != "fixed") for edge in reversed(robot.below[name])
+        ]
 
 
 # The chain
@@ -380,7 +415,8 @@ def _find_tip(robot: _Robot, base: str) -> str:
         _refuse(_link(base), "no joint below it moves")
     if len(leaves) > 1:
         _refuse(
-            "", f"the arm may end at links {_list_names(leaves)}: name one of them, or a link before, as tip"
+            "",
+            f"the arm may end at links {_list_names(leaves)}: name one of them, or a link before, as tip",
         )
     return leaves[0]
 
@@ -390,7 +426,10 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
     name = tip
     while name != base:
         if name not in robot.above:
-            _refuse(_link(tip), f"is not below {_link(base)}: name a tip and a base that joints connect")
+            _refuse(
+                _link(tip),
+                f"is not below {_link(base)}: name a tip and a base that joints connect",
+            )
         path.append(robot.above[name])
         name = path[-1].parent
     for edge in path:
@@ -419,7 +458,9 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
 def _walk_carried(
     robot: _Robot, moving: _Edge, path: Sequence[_Edge], notes: list[str]
 ) -> Iterator[tuple[str, _Pose]]:
-    """Yields every link that a joint of the path moves, up to the next one, with its frame in its link's."""
+    """Yields every link that a joint of the path moves, up to the next one, with its frame in
+    its link's.
+    """
     on_path = {edge.name for edge in path}
     waiting = [(moving.child, _Pose())]
     while waiting:
@@ -462,11 +503,17 @@ def _read_bodies(
             advice = _advise_key(name, "inertia_kg_m2")
             _refuse(_link(name), f"its <inertial> has no <inertia>; {advice}")
         if problem:
-            notes.append(f"{_link(name)} does not lead to the end link and is left out: {problem}")
+            notes.append(
+                f"{_link(name)} does not lead to the end link and is left out: {problem}"
+            )
             continue
         if inertial.lacks:
-            notes.append(f"{_link(name)} states a mass and no inertia: a point of {inertial.mass:g} kg")
-        yield _read_body(name, pose, inertial, path, inertias, notes)
+            notes.append(
+                f"{_link(name)} states a mass and no inertia: a point of {inertial.mass:g} kg"
+            )
+        yield _read_body(
+            name=name, pose=pose, inertial=inertial, path=path, inertias=inertias, notes=notes
+        )
 
 
 def _read_body(
@@ -477,7 +524,9 @@ def _read_body(
     inertias: _Inertias,
     notes: list[str],
 ) -> _LinkBody:
-    """Returns the body of a link, balanced where that is asked for; refused if it leads to the end link."""
+    """Returns the body of a link, balanced where that is asked for; refused if it leads to the
+    end link.
+    """
     mass, centre, tensor, _ = inertial
     moments = _principal_moments(tensor)
     slack = max(LEAST_MOMENT_KG_M2, CONSISTENCY * moments[2])
@@ -487,7 +536,9 @@ def _read_body(
     if inertias.balance:
         tensor = balance_tensor(tensor)
         least, middle, most = _principal_moments(tensor)
-        notes.append(f"{_link(name)}: {problem}; balanced to {least:.4g}, {middle:.4g} and {most:.4g}")
+        notes.append(
+            f"{_link(name)}: {problem}; balanced to {least:.4g}, {middle:.4g} and {most:.4g}"
+        )
         return _LinkBody(name, _move_body(mass, centre, tensor, pose))
     given = inertias.links.get(name)
     if given is not None and given.inertia_kg_m2 is not None:
@@ -514,16 +565,23 @@ def _advise_balance(name: str, path: Sequence[_Edge]) -> str:
 def _note_given(name: str, given: LinkInertia) -> str:
     if given.mass_kg == 0.0:
         return f"{_link(name)}: the scenario leaves its mass out"
-    return f"{_link(name)}: {', '.join(given.list_keys())} of the scenario, in place of the file's"
+    return (
+        f"{_link(name)}: {', '.join(given.list_keys())} of the scenario, in place of the file's"
+    )
 
 
-def _read_joint(edge: _Edge, pose: _Pose, inertia: BodyParameters, notes: list[str]) -> UrdfJoint:
+def _read_joint(
+    edge: _Edge, pose: _Pose, inertia: BodyParameters, notes: list[str]
+) -> UrdfJoint:
     place = _joint(edge.name)
     axis = _child(edge.element, "axis", place)
     x, y, z = (1.0, 0.0, 0.0) if axis is None else _read_vector(axis, "xyz", place)
     length = math.sqrt(x * x + y * y + z * z)
     if length < 1e-6:
-        _refuse(place, "its <axis> has no length: give the direction of the joint, as in xyz='0 0 1'")
+        _refuse(
+            place,
+            "its <axis> has no length: give the direction of the joint, as in xyz='0 0 1'",
+        )
     lower, upper, effort, velocity = _read_limit(edge, place, notes)
     dynamics = _child(edge.element, "dynamics", place)
     friction = [0.0, 0.0]
@@ -532,27 +590,47 @@ def _read_joint(edge: _Edge, pose: _Pose, inertia: BodyParameters, notes: list[s
             friction[n] = _read_number(dynamics, key, place)
             if friction[n] < 0.0:
                 _refuse(
-                    place, f"its {key} is {friction[n]:g}, must not be negative: it would drive the joint"
+                    place,
+                    f"its {key} is {friction[n]:g}, must not be negative: it would drive the joint",
                 )
     kind = "prismatic" if edge.kind == "prismatic" else "revolute"
     axes = (x / length, y / length, z / length)
     return UrdfJoint(
-        edge.name, edge.child, kind, axes, *pose, inertia, lower, upper, effort, velocity, *friction
+        edge.name,
+        edge.child,
+        kind,
+        axes,
+        *pose,
+        inertia,
+        lower,
+        upper,
+        effort,
+        velocity,
+        *friction,
     )
 
 
 def _read_limit(edge: _Edge, place: str, notes: list[str]) -> tuple[float, float, float, float]:
-    """Returns least and largest position, effort and velocity; exporters write 0 for what they lack."""
+    """Returns least and largest position, effort and velocity; exporters write 0 for what they
+    lack.
+    """
     limit = _child(edge.element, "limit", place)
     values = []
     for key in ("lower", "upper", "effort", "velocity"):
         stated = limit is not None and key in limit.attrib
-        value = _read_number(limit, key, place, math.inf) if limit is not None and stated else 0.0
+        value = (
+            _read_number(limit, key, place, math.inf) if limit is not None and stated else 0.0
+        )
         values.append(math.copysign(math.inf, value) if abs(value) > MAX_QUANTITY else value)
     lower, upper, effort, velocity = values
     if min(effort, velocity) < 0.0:
-        _refuse(place, f"its limits of effort and velocity are {effort:g} and {velocity:g}, must be positive")
-    unknown = [key for key, value in (("effort", effort), ("velocity", velocity)) if value == 0.0]
+        _refuse(
+            place,
+            f"its limits of effort and velocity are {effort:g} and {velocity:g}, must be positive",
+        )
+    unknown = [
+        key for key, value in (("effort", effort), ("velocity", velocity)) if value == 0.0
+    ]
     if edge.kind == "continuous":
         lower = -math.inf
         upper = math.inf
@@ -563,7 +641,10 @@ def _read_limit(edge: _Edge, place: str, notes: list[str]) -> tuple[float, float
     if lower > upper:
         _refuse(place, f"its lower limit is {lower:g}, must be below the upper one, {upper:g}")
     if lower == upper:
-        _refuse(place, f"its limits are both {lower:g}: a joint that does not move is of type 'fixed'")
+        _refuse(
+            place,
+            f"its limits are both {lower:g}: a joint that does not move is of type 'fixed'",
+        )
     if unknown:
         notes.append(f"{place} states no limit, or 0, of {' and '.join(unknown)}: none is kept")
     return lower, upper, effort or math.inf, velocity or math.inf
@@ -599,7 +680,10 @@ def _parse_number(word: str, what: str, place: str, most: float) -> float:
 def _read_vector(element: Element, key: str, place: str, most: float = MAX_QUANTITY) -> Three:
     words = element.get(key, "").split()
     if len(words) != 3:
-        _refuse(place, f"its <{element.tag} {key}> has {count_nouns(len(words), 'number')}, must have three")
+        _refuse(
+            place,
+            f"its <{element.tag} {key}> has {count_nouns(len(words), 'number')}, must have three",
+        )
     x, y, z = (_parse_number(word, f"{element.tag} {key}", place, most) for word in words)
     return x, y, z
 
@@ -610,8 +694,13 @@ def _read_origin(parent: Element, place: str) -> _Pose:
     if origin is None:
         return _Pose()
     if unknown := origin.attrib.keys() - {"xyz", "rpy"}:
-        _refuse(place, f"its <origin> has {_quote(min(unknown))}: a frame is given by xyz and rpy alone")
-    offset = _read_vector(origin, "xyz", place, MAX_OFFSET_M) if "xyz" in origin.attrib else _ZERO
+        _refuse(
+            place,
+            f"its <origin> has {_quote(min(unknown))}: a frame is given by xyz and rpy alone",
+        )
+    offset = (
+        _read_vector(origin, "xyz", place, MAX_OFFSET_M) if "xyz" in origin.attrib else _ZERO
+    )
     angles = _read_vector(origin, "rpy", place) if "rpy" in origin.attrib else _ZERO
     (sr, cr), (sp, cp), (sy, cy) = map(_plain_sincos, angles)
     rotation = (
@@ -646,12 +735,16 @@ _POINT = fill_tensor((0.0,) * 6)
 
 
 def _read_inertial(link: Element, name: str, given: LinkInertia | None) -> _Inertial | None:
-    """Returns the inertia of a link by the scenario, and otherwise by the file; None if none is stated."""
+    """Returns the inertia of a link by the scenario, and otherwise by the file; None if none is
+    stated.
+    """
     given = given or LinkInertia()
     inertial = _child(link, "inertial", _link(name))
     if given.mass_kg == 0.0:
         for key in given.list_keys()[1:]:
-            raise ScenarioError("is of a link without mass: leave it out", path=f"{_key(name)}.{key}")
+            raise ScenarioError(
+                "is of a link without mass: leave it out", path=f"{_key(name)}.{key}"
+            )
         return None
     if inertial is None and given.mass_kg is None:
         if given.list_keys():
@@ -663,7 +756,8 @@ def _read_inertial(link: Element, name: str, given: LinkInertia | None) -> _Iner
     tensor = None
     if inertial is not None:
         mass, centre, tensor = _read_stated_inertial(inertial, name, given)
-    if given.inertia_kg_m2 is not None:  # in the axes of the link, and not in those of the <origin>
+    # in the axes of the link, and not in those of the <origin>
+    if given.inertia_kg_m2 is not None:
         centre = _Pose(_UNIT, centre.origin_m)
         tensor = fill_tensor(given.inertia_kg_m2)
     if given.com_m is not None:
@@ -703,7 +797,9 @@ def _find_mass_problem(inertial: _Inertial) -> str:
 
 
 def _read_payload(payload: UrdfPayload, fixed: Sequence[_Edge]) -> BodyParameters:
-    """Returns the payload in the frame of the last moving link, from which fixed joints lead to the tip."""
+    """Returns the payload in the frame of the last moving link, from which fixed joints lead to
+    the tip.
+    """
     pose = _Pose()
     for edge in fixed:
         pose = pose @ _read_origin(edge.element, _joint(edge.name))
@@ -721,9 +817,13 @@ def _principal_moments(tensor: Matrix) -> list[float]:
 
 
 def _find_moments_problem(moments: Sequence[float], bound: float, slack: float) -> str:
-    """Returns why principal moments of inertia, in ascending order, are those of no body, or ""."""
+    """Returns why principal moments of inertia, in ascending order, are those of no body, or
+    "".
+    """
     least, middle, most = moments
-    stated = f"its principal moments of inertia are {least:.4g}, {middle:.4g} and {most:.4g} kg m^2"
+    stated = (
+        f"its principal moments of inertia are {least:.4g}, {middle:.4g} and {most:.4g} kg m^2"
+    )
     if least < bound:
         return f"{stated}, and all must be positive"
     if most - least - middle > slack:
@@ -756,9 +856,11 @@ def _move_body(mass: float, centre: _Pose, tensor: Matrix, pose: _Pose) -> BodyP
 
 
 def _lump_bodies(edge: _Edge, bodies: Sequence[_LinkBody], notes: list[str]) -> BodyParameters:
-    """Returns the sum of bodies that one joint moves; refused unless it is a body with mass and extent.
+    """Returns the sum of bodies that one joint moves; refused unless it is a body with mass and
+    extent.
 
-    Links off the path whose moments no body has count as stated if the sum is a body, else as points.
+    Links off the path whose moments no body has count as stated if the sum is a body, else as
+    points.
     """
     place = f"{_link(edge.child)}, which {_joint(edge.name)} moves"
     if not bodies:
@@ -791,7 +893,9 @@ def _add_bodies(bodies: Sequence[BodyParameters]) -> BodyParameters:
 
 
 def _find_sum_problem(total: BodyParameters) -> str:
-    """Returns why the parameters of all that a joint moves are those of no body with extent, or ""."""
+    """Returns why the parameters of all that a joint moves are those of no body with extent, or
+    "".
+    """
     mass = total[0]
     if mass < LEAST_MASS_KG:
         return f"has {mass:g} kg with all that is fixed to it, and a body that moves needs mass"

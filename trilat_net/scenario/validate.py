@@ -1,7 +1,8 @@
-"""Validation: resolved tables become types, and what does not fit becomes an error with the key's path.
+"""Validation: resolved tables become types, and what does not fit becomes an error with the
+key's path.
 
-Invariant: what a law needs and a scenario does not give (knowledge of the arm, a number of sites) is
-refused before anything runs, with the reason.
+Invariant: what a law needs and a scenario does not give (knowledge of the arm, a number of
+sites) is refused before anything runs, with the reason.
 """
 
 import functools
@@ -57,9 +58,11 @@ OUTSIDE_LIMITS = ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_m
 
 
 def check_outside_arms(scenario: Scenario) -> None:
-    """Refuses arms outside of the program without limits, or whose sites would not hold and stop in order.
+    """Refuses arms outside of the program without limits, or whose sites would not hold and
+    stop in order.
 
-    Logs of earlier versions may lack these, so that this is asked before a session, not of every scenario.
+    Logs of earlier versions may lack these, so that this is asked before a session, not of
+    every scenario.
 
     Raises:
         ScenarioError: with the path of the first key that is missing.
@@ -85,14 +88,18 @@ def check_outside_arms(scenario: Scenario) -> None:
 
 
 def refuse_live_only(scenario: Scenario) -> None:
-    """Refuses what a live session alone has: arms outside of the program, and delays of a real network.
+    """Refuses what a live session alone has: arms outside of the program, and delays of a real
+    network.
 
     Raises:
-        ScenarioError: an arm is external, or a link is measured, which in virtual time would be one tick.
+        ScenarioError: an arm is external, or a link is measured, which in virtual time would be
+            one tick.
     """
     refuse_external_arms(scenario)
     if scenario.measured:
-        links = (f"links.{name}.model" for name, link in scenario.links.items() if link.measured)
+        links = (
+            f"links.{name}.model" for name, link in scenario.links.items() if link.measured
+        )
         raise ScenarioError(
             "is measured: that is the delay of a real network, and such a scenario runs live only; give it a "
             "model, as in link.model=constant and link.delay_ms=50",
@@ -102,7 +109,8 @@ def refuse_live_only(scenario: Scenario) -> None:
 
 
 def check_law(name: str, site: SiteSpec, sites: int) -> None:
-    """Refuses a law that a site, one of so many, cannot carry out, and an arm that contradicts its plant.
+    """Refuses a law that a site, one of so many, cannot carry out, and an arm that contradicts
+    its plant.
 
     Raises:
         ScenarioError: with the path of the key.
@@ -173,7 +181,9 @@ _CHOICES = {
 
 
 def build_scenario(resolved: TomlTable) -> Scenario:
-    """Turns resolved tables into types; wrong types and ranges become errors with the key's path."""
+    """Turns resolved tables into types; wrong types and ranges become errors with the key's
+    path.
+    """
     try:
         scenario = msgspec.convert(resolved, Scenario)
     except msgspec.ValidationError as error:
@@ -191,7 +201,9 @@ def build_scenario(resolved: TomlTable) -> Scenario:
     _check_energy_laws(scenario)
     for name, site in scenario.sites.items():
         check_law(name, site, len(scenario.sites))
-        check_sends(scenario.channel(name), scenario.layout(name).joints, f"sites.{name}.control")
+        check_sends(
+            scenario.channel(name), scenario.layout(name).joints, f"sites.{name}.control"
+        )
         _check_actors(site.hands, f"sites.{name}.hands")
         _check_hands(site, f"sites.{name}.hands")
         _check_actors(site.environment, f"sites.{name}.environment")
@@ -241,27 +253,36 @@ def _check_joint_space(scenario: Scenario) -> None:
 
 def _check_links(scenario: Scenario) -> None:
     links = {f"links.{name}": link for name, link in scenario.links.items()}
-    views = {f"sites.{name}.view": site.view for name, site in scenario.sites.items() if site.view}
+    views = {
+        f"sites.{name}.view": site.view for name, site in scenario.sites.items() if site.view
+    }
     for path, link in {**links, **views}.items():
         if found := link.find_problem():
             raise ScenarioError(found.problem, path=f"{path}.{found.key}")
         if path in views and link.measured:
-            raise ScenarioError("is 'measured', and no network carries a picture", path=f"{path}.model")
+            raise ScenarioError(
+                "is 'measured', and no network carries a picture", path=f"{path}.model"
+            )
 
 
 def _check_damping(scenario: Scenario) -> None:
     """Refuses gains that a light joint cannot take.
 
-    A torque -K qd that is held over a period h makes a single joint of inertia M swing from tick to tick from
-    K h / M = 1 on (of the second-order scheme, 2 of the digital one); of several joints the largest
-    eigenvalue of h K M^-1 counts, here in the start pose.
+    A torque -K qd that is held over a period h makes a single joint of inertia M swing from
+    tick to tick from K h / M = 1 on (of the second-order scheme, 2 of the digital one); of
+    several joints the largest eigenvalue of h K M^-1 counts, here in the start pose.
     """
     for name, model in scenario.arms.items():
         site = scenario.sites[name]
         if model.chain is None or isinstance(site.control, ImportedLaw) or not site.arm.known:
             continue
         gains = site.control.gains(model.theta)
-        damping = np.zeros(model.counts.joints) + gains.Kp + gains.d + np.divide(gains.rho, gains.width)
+        damping = (
+            np.zeros(model.counts.joints)
+            + gains.Kp
+            + gains.d
+            + np.divide(gains.rho, gains.width)
+        )
         damping += gains.Kd if site.task.space == "joints" else 0.0
         scaled = np.sqrt(damping)
         spread, modes = np.linalg.eigh(
@@ -295,7 +316,9 @@ def _check_received(scenario: Scenario) -> None:
 
 
 def _check_energy_laws(scenario: Scenario) -> None:
-    """Refuses sites of which only some keep account of energy, and what else such a law has against them."""
+    """Refuses sites of which only some keep account of energy, and what else such a law has
+    against them.
+    """
     laws = {name: site.control for name, site in scenario.sites.items()}
     for name, law in laws.items():
         if not law.books_energy:
@@ -303,15 +326,11 @@ def _check_energy_laws(scenario: Scenario) -> None:
         tag = law.tag
         for other, theirs in laws.items():
             if type(theirs) is not type(law):
-                problem = (
-                    f"{name} has {tag}, of which all sites are an end: choose {tag} here, or another there"
-                )
+                problem = f"{name} has {tag}, of which all sites are an end: choose {tag} here, or another there"
                 raise ScenarioError(problem, path=f"sites.{other}.control.law")
         rates_hz = {one: site.rate_hz for one, site in scenario.sites.items()}
         if scenario.scheme not in law.kind.schemes:
-            problem = (
-                f"is {scenario.scheme!r}, and {tag} books the torque of a tick as held: choose 'digital'"
-            )
+            problem = f"is {scenario.scheme!r}, and {tag} books the torque of a tick as held: choose 'digital'"
             raise ScenarioError(problem, path="scheme")
         if found := law.find_problem(rates_hz):
             raise ScenarioError(found.problem, path=f"sites.{name}.{found.key}")
@@ -320,11 +339,17 @@ def _check_energy_laws(scenario: Scenario) -> None:
 def _check_start_poses(scenario: Scenario) -> None:
     for name, model in scenario.arms.items():
         joints = model.chain.joints if model.chain is not None else ()
-        for n, (joint, start) in enumerate(zip(joints, scenario.sites[name].q0_rad, strict=False)):
+        for n, (joint, start) in enumerate(
+            zip(joints, scenario.sites[name].q0_rad, strict=False)
+        ):
             if not joint.lower <= start <= joint.upper:
                 unit = "m" if joint.prismatic else "rad"
                 path = f"sites.{name}.q0_rad[{n}]"
-                drawn = f", drawn with seed {scenario.seed}" if dotted_key(path) in scenario.drawn else ""
+                drawn = (
+                    f", drawn with seed {scenario.seed}"
+                    if dotted_key(path) in scenario.drawn
+                    else ""
+                )
                 raise ScenarioError(
                     f"is {start:g} {unit}{drawn}, beyond a stop of joint {model.joint_names[n]}, which moves "
                     f"from {joint.lower:g} to {joint.upper:g} {unit}: start at most "
@@ -340,7 +365,9 @@ def _check_limits(scenario: Scenario, name: str) -> None:
     limits = scenario.motion_limits(name)
     low = limits.q_min
     high = limits.q_max
-    stated = next((key for key in ("q_min_rad", "q_max_rad") if getattr(site.limits, key) is not None), "")
+    stated = next(
+        (key for key in ("q_min_rad", "q_max_rad") if getattr(site.limits, key) is not None), ""
+    )
     if stated and site.on_stale.action != "glide":
         raise ScenarioError(
             f"is kept under on_stale.action = 'glide' alone, and here that is {site.on_stale.action!r}",
@@ -394,15 +421,21 @@ def _check_task_poses(scenario: Scenario) -> None:
             )
 
 
-def _check_actors(actors: Sequence[operators.Operator | operators.Environment], path: str) -> None:
+def _check_actors(
+    actors: Sequence[operators.Operator | operators.Environment], path: str
+) -> None:
     for n, actor in enumerate(actors):
         if found := actor.find_problem():
             raise ScenarioError(found.problem, path=f"{path}[{n}].{found.key}")
 
 
 def _check_hands(site: SiteSpec, path: str) -> None:
-    """Refuses two live hands, one of an arm outside of the program, and one's own out of step with ticks."""
-    live = [n for n, hand in enumerate(site.hands) if isinstance(hand, kernel_operators.LiveHand)]
+    """Refuses two live hands, one of an arm outside of the program, and one's own out of step
+    with ticks.
+    """
+    live = [
+        n for n, hand in enumerate(site.hands) if isinstance(hand, kernel_operators.LiveHand)
+    ]
     if live and site.plant != "simulated":
         raise ScenarioError(
             "is a live hand, and the arm is outside of the program, or a plant of one's own: who holds that "
@@ -411,7 +444,8 @@ def _check_hands(site: SiteSpec, path: str) -> None:
         )
     if len(live) > 1:
         raise ScenarioError(
-            f"is a second live hand besides {path}[{live[0]}]; an arm has one", path=f"{path}[{live[1]}].kind"
+            f"is a second live hand besides {path}[{live[0]}]; an arm has one",
+            path=f"{path}[{live[1]}].kind",
         )
     for n, hand in enumerate(site.hands):
         if isinstance(hand, ProgramHand) and site.rate_hz % hand.rate_hz:
@@ -438,7 +472,9 @@ def check_links_memory(scenario: Scenario, site: str) -> None:
 
 
 def _check_stale_rules(scenario: Scenario) -> None:
-    """Refuses a rule by which a site would always hold: its links or its peers' ticks alone are too slow."""
+    """Refuses a rule by which a site would always hold: its links or its peers' ticks alone are
+    too slow.
+    """
     _check_lost(scenario)
     for name, site in scenario.sites.items():
         slowest_hz = min(scenario.sites[one].rate_hz for one in (name, *scenario.peers(name)))
@@ -450,7 +486,9 @@ def _check_stale_rules(scenario: Scenario) -> None:
             )
         for peer in scenario.peers(name):
             link = scenario.links[f"{peer}->{name}"]
-            delay_ms = max(link.playout_ms, link.delay_ms if isinstance(link, ConstantDelay) else 0.0)
+            delay_ms = max(
+                link.playout_ms, link.delay_ms if isinstance(link, ConstantDelay) else 0.0
+            )
             follows = scenario.dominance[name].get(peer, 0.0) > 0.0
             by_age = site.on_stale.action in ("hold", "brake")
             if by_age and follows and delay_ms >= site.on_stale.age_ms:
@@ -463,7 +501,9 @@ def _check_stale_rules(scenario: Scenario) -> None:
 
 def _check_lost(scenario: Scenario) -> None:
     """Refuses sites that would go on without a lost master, where that is not so of any."""
-    degrading = [name for name, site in scenario.sites.items() if site.on_stale.on_lost == "degrade"]
+    degrading = [
+        name for name, site in scenario.sites.items() if site.on_stale.on_lost == "degrade"
+    ]
     for name in degrading:
         if scenario.sites[name].on_stale.action != "glide":
             raise ScenarioError(
@@ -494,7 +534,9 @@ def check_change(change: Change, path: str) -> None:
     if not change.link:
         return
     if change.ramp_s:
-        raise ScenarioError("a link changes at once; only shares have a ramp", path=f"{path}.ramp_s")
+        raise ScenarioError(
+            "a link changes at once; only shares have a ramp", path=f"{path}.ramp_s"
+        )
     try:
         found = change.after.find_problem()
     except msgspec.ValidationError as error:
@@ -514,7 +556,9 @@ def _reword(problem: str, path: str) -> str:
 
 
 def _name_key(resolved: TomlTable, path: str) -> str:
-    """Returns `sites[...].q0_rad[0]` with the first key whose entry alone is refused at that path."""
+    """Returns `sites[...].q0_rad[0]` with the first key whose entry alone is refused at that
+    path.
+    """
     before, any_key, after = path.partition("[...]")
     if not any_key:
         return path

@@ -1,17 +1,20 @@
-"""The largest gains that an arm bears over a delay: the edge along a ray of gains, and runs that confirm it.
+"""The largest gains that an arm bears over a delay: the edge along a ray of gains, and runs
+that confirm it.
 
-    K = k m,    d + Kd = 2 zeta sqrt(k) m,    m: the largest M_ii of a joint in some poses, or less
+    K = k m,    d + Kd = 2 zeta sqrt(k) m,    m: the largest M_ii of a joint in some poses, or
+    less
 
-Alike arms follow one another over links of that delay. The edge is the least k, over the poses, at which
-small motions of the sampled loop grow. The gains have its damping, and its stiffness over the margin. They
-keep the same margin to the sampled-data limit, where a damping that is held for a tick makes the lightest
-motion swing from tick to tick; m is less of joints that share one too light. For one joint at a wall such
-edges are known: Gil, Avello, Rubio and Florez, "Stability analysis of a 1 DOF haptic interface using the
-Routh-Hurwitz criterion", IEEE Trans. Control Systems Technology 12 (2004); over delays Hulin, Preusche and
-Hirzinger, "Stability boundary for haptic rendering: influence of physical damping", IROS 2006.
+Alike arms follow one another over links of that delay. The edge is the least k, over the poses,
+at which small motions of the sampled loop grow. The gains have its damping, and its stiffness
+over the margin. They keep the same margin to the sampled-data limit, where a damping that is
+held for a tick makes the lightest motion swing from tick to tick; m is less of joints that
+share one too light. For one joint at a wall such edges are known: Gil, Avello, Rubio and
+Florez, "Stability analysis of a 1 DOF haptic interface using the Routh-Hurwitz criterion", IEEE
+Trans. Control Systems Technology 12 (2004); over delays Hulin, Preusche and Hirzinger,
+"Stability boundary for haptic rendering: influence of physical damping", IROS 2006.
 
-Invariant: a result is a function of its arguments. Friction, stops and torque limits are left out: friction
-only helps, and limits are no matter of small motions.
+Invariant: a result is a function of its arguments. Friction, stops and torque limits are left
+out: friction only helps, and limits are no matter of small motions.
 """
 
 import math
@@ -39,11 +42,17 @@ from ..scenario.laws import BUILT_IN
 from ..theory.characteristic_roots import CharacteristicRoot
 from ..theory.floquet import find_samples_in_use
 from ..theory.linear_edge import find_rightmost_root
-from ..theory.operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
+from ..theory.operating_point import (
+    Equilibrium,
+    OperatingConditions,
+    derive_operating_conditions,
+)
 from .executor import Progress, ignore_progress
 
 TUNED_LAWS = tuple(
-    name for name, law in BUILT_IN.items() if {"K", "d"} <= law.tune.keys() and not getattr(law, "sends", ())
+    name
+    for name, law in BUILT_IN.items()
+    if {"K", "d"} <= law.tune.keys() and not getattr(law, "sends", ())
 )
 """Those with a stiffness and a damping that send nothing but their motion."""
 SHARES = (0.95, 1.1)
@@ -51,19 +60,23 @@ SHARES = (0.95, 1.1)
 _PUSH = 1e-6
 _SMALL = 1.0
 _STILL = 1e-7
-"""By how much the first arm starts aside, rad or m; from which speed on motions are not small, rad/s; and
-what share of the largest speed is rounding."""
+"""By how much the first arm starts aside, rad or m; from which speed on motions are not small,
+rad/s; and what share of the largest speed is rounding.
+"""
 _SITES = {2: ("m", "s"), 3: ("m1", "m2", "s")}
 _SLACK = 0.05
 _HALF_TURN = math.pi
 _HALF_SLIDE_M = 0.5
-"""Share of a joint's range that poses leave at its ends, and half of the range of one without limits."""
+"""Share of a joint's range that poses leave at its ends, and half of the range of one without
+limits.
+"""
 _SETTLES = 4.0
 _SHORTEST_S = 2.0
 _LONGEST_S = 400.0
 _EXTENSIONS = 3
-"""By how many time constants of its slowest motion a run lasts at first, within which bounds, s; and how
-often it may go on for as long again."""
+"""By how many time constants of its slowest motion a run lasts at first, within which bounds,
+s; and how often it may go on for as long again.
+"""
 _TELLS = {EnvelopeTrend.GROWS: False, EnvelopeTrend.DECAYS: True}
 _NO_GAIN = 1e-6
 _CURVE_POINTS = 9
@@ -80,11 +93,13 @@ class ArmGains(Result):
 
     Attributes:
         age_ms: the constant age of samples that stands for the delay.
-        joints: of each m, the gains with their unit, and the error at which the effort limit is reached.
-        edge: k, 1/s^2, of the sampled loop over the delays in use, over a constant one, in continuous time
-            (None: never), and where damping swings from tick to tick; frequency, motion, pose, what bounds K.
-        runs: at the gains (share None) and at shares of the edge's k: how fast the largest speed grows (None:
-            until motions were not small), and the roots.
+        joints: of each m, the gains with their unit, and the error at which the effort limit is
+            reached.
+        edge: k, 1/s^2, of the sampled loop over the delays in use, over a constant one, in
+            continuous time (None: never), and where damping swings from tick to tick;
+            frequency, motion, pose, what bounds K.
+        runs: at the gains (share None) and at shares of the edge's k: how fast the largest
+            speed grows (None: until motions were not small), and the roots.
         agree: whether all runs do as the roots predict, and the one at the gains decays.
         line: the gains, to paste above the tables of a scenario.
         curve: delays, s, and k of the edge in the same pose, if asked for.
@@ -115,12 +130,19 @@ class ArmGains(Result):
         about = f"damping ratio {self.damping:g}, margin {self.margin:g}"
         yield f"{self.arm}: {self.sites} such arms, {self.law}, {self.rate_hz} Hz, {self.delay}, {about}"
         rows = [list(row.values()) for row in self.joints]
-        cells = [[f"{one:.4g}" if isinstance(one, float) else one or "-" for one in row] for row in rows]
+        cells = [
+            [f"{one:.4g}" if isinstance(one, float) else one or "-" for one in row]
+            for row in rows
+        ]
         yield TextTable([head.replace("_", " ") for head in self.joints[0]], cells, align="lr")
         moves = f"{CharacteristicRoot(0j, 1, tuple(edge['moves'])).words}; {edge['omega_rad_s']:.4g} rad/s"
         yield f"edge: K = {edge['k_per_s2']:.4g} /s^2 times inertia ({moves})"
-        smooth = "none" if edge["continuous_per_s2"] is None else f"{edge['continuous_per_s2']:.4g}"
-        constant = f"{edge['constant_per_s2']:.4g} with a constant delay of {self.age_ms:.4g} ms"
+        smooth = (
+            "none" if edge["continuous_per_s2"] is None else f"{edge['continuous_per_s2']:.4g}"
+        )
+        constant = (
+            f"{edge['constant_per_s2']:.4g} with a constant delay of {self.age_ms:.4g} ms"
+        )
         yield f"  {constant}; {smooth} in continuous time; the {edge['bound']} bounds K"
         yield f"  damping swings from tick to tick from {edge['limit_per_s2']:.4g} on"
         yield f"  least in the pose {', '.join(f'{q:.3g}' for q in edge['pose'])}"
@@ -150,18 +172,26 @@ def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
     if path.suffix == ".csv":
         return link, f"the delays of {path.name}"
     try:
-        delays_ms = {name: read_link_delays(path, name) for name in open_log(path).scenario.links}
+        delays_ms = {
+            name: read_link_delays(path, name) for name in open_log(path).scenario.links
+        }
     except ValueError as error:
         raise UsageError(f"--delay {text}: {error}") from None
-    longest = max(delays_ms, key=lambda name: float(np.median([ms for _, ms in delays_ms[name]])))
+    longest = max(
+        delays_ms, key=lambda name: float(np.median([ms for _, ms in delays_ms[name]]))
+    )
     return {**link, "of": longest}, f"the delays of {longest} in {path.name}"
 
 
-def _set_up_loop(arm: str | Path, link: Mapping[str, Any], law: str, more: Any, **at: Any) -> Scenario:
+def _set_up_loop(
+    arm: str | Path, link: Mapping[str, Any], law: str, more: Any, **at: Any
+) -> Scenario:
     """Returns alike arms that follow one another, without friction and with hardly any gains."""
     if law not in TUNED_LAWS:
         known = ", ".join(TUNED_LAWS)
-        raise UsageError(f"--law {law}: has no stiffness K beside a damping d of motion alone; {known} have")
+        raise UsageError(
+            f"--law {law}: has no stiffness K beside a damping d of motion alone; {known} have"
+        )
     if (sites := at.pop("sites")) not in _SITES:
         raise UsageError(f"--sites is 2 or 3, not {sites}")
     names = _SITES[sites]
@@ -171,7 +201,10 @@ def _set_up_loop(arm: str | Path, link: Mapping[str, Any], law: str, more: Any, 
         "duration_s": _SHORTEST_S,
         **at,
         "arm": {"urdf": str(arm), "tip": tip, "stops": False},
-        "control": {"law": law, **{one: _NO_GAIN for one in ("K", "d", "Kd") if one in BUILT_IN[law].tune}},
+        "control": {
+            "law": law,
+            **{one: _NO_GAIN for one in ("K", "d", "Kd") if one in BUILT_IN[law].tune},
+        },
         "limits": {"tau_limit_nm": 1e9, "qd_limit_rad_s": _SMALL},
         "link": dict(link),
         "sites": {one: {"role": "slave" if one == "s" else "master"} for one in names},
@@ -179,8 +212,13 @@ def _set_up_loop(arm: str | Path, link: Mapping[str, Any], law: str, more: Any, 
     }
     loaded = load_scenario(tables, more)
     if getattr(loaded.controls[0], "gravity", 1.0) != 1.0:
-        raise UsageError("--set control.gravity: only with exact gravity is every pose one of rest")
-    smooth = {name: re.sub(r"<dynamics\b[^>/]*", "<dynamics", text) for name, text in loaded.urdf.items()}
+        raise UsageError(
+            "--set control.gravity: only with exact gravity is every pose one of rest"
+        )
+    smooth = {
+        name: re.sub(r"<dynamics\b[^>/]*", "<dynamics", text)
+        for name, text in loaded.urdf.items()
+    }
     return msgspec.structs.replace(loaded, urdf=smooth)
 
 
@@ -192,7 +230,9 @@ def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
         middle = min(max(joint.lower, 0.0), joint.upper)
         ranges.append((max(joint.lower, middle - half), min(joint.upper, middle + half)))
     low, high = np.transpose(ranges)
-    shares = np.random.Generator(np.random.Philox(seed)).uniform(_SLACK, 1.0 - _SLACK, (count, len(low)))
+    shares = np.random.Generator(np.random.Philox(seed)).uniform(
+        _SLACK, 1.0 - _SLACK, (count, len(low))
+    )
     return np.asarray(low + (high - low) * shares)
 
 
@@ -200,7 +240,8 @@ class _GainSearch:
     """The loop of alike arms in some poses, for the gains of a ray.
 
     Attributes:
-        conditions: of the loop; `held` with the constant age `age_s` of samples, where theirs varies.
+        conditions: of the loop; `held` with the constant age `age_s` of samples, where theirs
+            varies.
         inertia: m, shape (n,).
     """
 
@@ -210,13 +251,16 @@ class _GainSearch:
         self._scenario = scenario
         self._poses = poses
         self._margin = margin
-        self._damping = damping = damping / math.sqrt(margin)  # at the edge, where K is larger by the margin
+        # at the edge, where K is larger by the margin
+        self._damping = damping = damping / math.sqrt(margin)
         self.conditions = self.held = derive_operating_conditions(scenario)
         self.rate_hz = self.held.sites[0].rate_hz
         if self.conditions.varying:
             used = find_samples_in_use(self.conditions).used.values()
             ages = np.concatenate([np.arange(len(one)) - one for one in used])
-            self.held = self.delay_by(float(np.quantile(ages, quantile, method="higher")) / self.rate_hz)
+            self.held = self.delay_by(
+                float(np.quantile(ages, quantile, method="higher")) / self.rate_hz
+            )
         self.age_s = float(self.held.age_s.max())
         # the heaviest mass is stable up to k = (2 zeta / T)^2, where the damping shall have its margin
         self._least = (2.0 * damping / self.age_s) ** 2
@@ -231,7 +275,9 @@ class _GainSearch:
             self.inertia = self.inertia * max(wanted / found[0], _FITTING_STEP) ** shares
 
     def _find_lightest(self) -> tuple[float, Array]:
-        """Returns the largest eigenvalue of m M^-1 in a pose, and the joints' shares in that motion."""
+        """Returns the largest eigenvalue of m M^-1 in a pose, and the joints' shares in that
+        motion.
+        """
         root = np.sqrt(self.inertia)
         pairs = [np.linalg.eigh(root * np.linalg.inv(M) * root[:, np.newaxis]) for M in self._M]
         values, vectors = max(pairs, key=lambda pair: float(pair[0][-1]))
@@ -243,14 +289,20 @@ class _GainSearch:
         return self.conditions._replace(age_s=same, varying=False)
 
     def at(self, k: float, softer: float = 1.0) -> Any:
-        """Returns the law at k, 1/s^2; with its stiffness divided by `softer`. Gains have four digits.
+        """Returns the law at k, 1/s^2; with its stiffness divided by `softer`. Gains have four
+        digits.
 
         What damps has the shares of the law's defaults.
         """
         law: Any = self._scenario.controls[0]
-        usual = {name: getattr(law.kind, name)[0] for name in ("d", "Kd") if name in law.kind.tune}
+        usual = {
+            name: getattr(law.kind, name)[0] for name in ("d", "Kd") if name in law.kind.tune
+        }
         D = 2.0 * self._damping * math.sqrt(k) * self.inertia / sum(usual.values())
-        gains = {"K": k / softer * self.inertia, **{name: one * D for name, one in usual.items()}}
+        gains = {
+            "K": k / softer * self.inertia,
+            **{name: one * D for name, one in usual.items()},
+        }
         rounded = {name: tuple(float(f"{x:.4g}") for x in own) for name, own in gains.items()}
         return msgspec.structs.replace(law, **rounded)
 
@@ -265,11 +317,18 @@ class _GainSearch:
         return found or CharacteristicRoot(complex(_GONE_PER_S), 1, ())
 
     def find_least(
-        self, loop: OperatingConditions, poses: Iterable[Array], start: float, *, sampled: bool = True
+        self,
+        loop: OperatingConditions,
+        poses: Iterable[Array],
+        start: float,
+        *,
+        sampled: bool = True,
     ) -> tuple[float, Array]:
-        """Returns the least k at which small motions grow in a pose, and that pose; inf if in none.
+        """Returns the least k at which small motions grow in a pose, and that pose; inf if in
+        none.
 
-        Under delays that vary they may grow, and not, and grow again: then the first steps are small.
+        Under delays that vary they may grow, and not, and grow again: then the first steps are
+        small.
         """
         edge = math.inf
         worst = self._poses[0]
@@ -279,9 +338,15 @@ class _GainSearch:
         for pose in poses:
 
             def growth(log_k: float, pose: Array = pose) -> float:
-                return self.find_root(self.at(math.exp(log_k)), pose, loop, sampled=sampled).s.real
+                return self.find_root(
+                    self.at(math.exp(log_k)), pose, loop, sampled=sampled
+                ).s.real
 
-            tried = math.log(start) + steps if edge == math.inf else [math.log(edge) - 10.0 * _EDGE_TOLERANCE]
+            tried = (
+                math.log(start) + steps
+                if edge == math.inf
+                else [math.log(edge) - 10.0 * _EDGE_TOLERANCE]
+            )
             high = next((one for one in tried if growth(one) > 0.0), None)
             if high is not None:
                 low = next((one for one in high - steps[1:] if growth(one) <= 0.0), None)
@@ -299,7 +364,9 @@ class _GainSearch:
         varies = self.conditions.varying
         delay_s = self.age_s if varies else 1e-3 * link.moments().mean_ms
         if delay_s > 0.0:  # without a delay such a loop is passive
-            continuous, _ = self.find_least(self.delay_by(delay_s), [pose], self._least, sampled=False)
+            continuous, _ = self.find_least(
+                self.delay_by(delay_s), [pose], self._least, sampled=False
+            )
         if varies:
             k, _ = self.find_least(self.conditions, [pose], 0.5 * constant)
         limit = (self._swings_per_s / (2.0 * self._damping * self._find_lightest()[0])) ** 2
@@ -319,17 +386,28 @@ class _GainSearch:
         }
 
     def trace_edge(self, pose: Array) -> list[tuple[float, float]]:
-        """Returns delays about the age, s, each with k of the sampled loop at the edge in a pose."""
+        """Returns delays about the age, s, each with k of the sampled loop at the edge in a
+        pose.
+        """
         most = max(4.0 * self.age_s * self.rate_hz, 8.0)
         ages_s = np.unique(np.round(np.geomspace(1.0, most, _CURVE_POINTS))) / self.rate_hz
-        found = [self.find_least(self.delay_by(T), [pose], (2.0 * self._damping / T) ** 2) for T in ages_s]
+        found = [
+            self.find_least(self.delay_by(T), [pose], (2.0 * self._damping / T) ** 2)
+            for T in ages_s
+        ]
         return [(float(T), k) for T, (k, _) in zip(ages_s, found, strict=True)]
 
-    def confirm(self, law: Any, share: float | None, pose: Array, push: Array) -> dict[str, Any]:
-        """Runs from a pose, the first arm pushed aside, until it is told whether small motions decay."""
+    def confirm(
+        self, law: Any, share: float | None, pose: Array, push: Array
+    ) -> dict[str, Any]:
+        """Runs from a pose, the first arm pushed aside, until it is told whether small motions
+        decay.
+        """
         predicted_per_s = self.find_root(law, pose, self.conditions).s.real
         sites = {
-            name: msgspec.structs.replace(spec, control=law, q0_rad=tuple((pose + push * (n == 0)).tolist()))
+            name: msgspec.structs.replace(
+                spec, control=law, q0_rad=tuple((pose + push * (n == 0)).tolist())
+            )
             for n, (name, spec) in enumerate(self._scenario.sites.items())
         }
         run = FusedRun(msgspec.structs.replace(self._scenario, sites=sites))
@@ -338,7 +416,9 @@ class _GainSearch:
             run.advance(end_s)
             speed = np.max([site[:, 1] for site in run.maxima], axis=0)
             t_s = np.arange(len(speed)) / BUCKETS_PER_S
-            fit = fit_envelopes(t_s, speed[:, np.newaxis], _STILL * speed.max(), falls_first=True)[0]
+            fit = fit_envelopes(
+                t_s, speed[:, np.newaxis], _STILL * speed.max(), falls_first=True
+            )[0]
             left = run.diverged_s is not None
             if left or fit.trend in _TELLS:
                 break
@@ -370,7 +450,8 @@ def tune_arm(
     curve: bool = False,
     progress: Progress = ignore_progress,
 ) -> ArmGains:
-    """Returns the largest gains with which alike arms follow one another stably; as `trilat tune`.
+    """Returns the largest gains with which alike arms follow one another stably; as `trilat
+    tune`.
 
     >>> found = tn.tune_arm("arm6.urdf", "40ms", poses=2)
     >>> found.agree, len(found.joints)
@@ -378,7 +459,8 @@ def tune_arm(
 
     Args:
         arm: path of a URDF, or the name of a shipped one.
-        delay: of each link: "40ms", a number of ms, a table t_s,delay_ms, or a log, as "measured:run.mcap".
+        delay: of each link: "40ms", a number of ms, a table t_s,delay_ms, or a log, as
+            "measured:run.mcap".
         law: p_d, pd_d or saturated_pd.
         set: overrides of the loop, as in `{"arm.armature_kg_m2": 0.1}`.
         tip: the end link; "": the only one that nothing hangs on.
@@ -396,13 +478,23 @@ def tune_arm(
         ScenarioError: the file, its tip or an override is not valid.
         UsageError: another argument is not valid.
     """
-    ranges = {"margin": (margin, 1.0, 100.0), "damping": (damping, 0.01, 10.0), "poses": (poses, 1, 1000)}
+    ranges = {
+        "margin": (margin, 1.0, 100.0),
+        "damping": (damping, 0.01, 10.0),
+        "poses": (poses, 1, 1000),
+    }
     for name, (value, low, high) in {**ranges, "quantile": (quantile, 0.0, 1.0)}.items():
         if not low <= value <= high:
             raise UsageError(f"{name} is from {low:g} to {high:g}, not {value:g}")
     link, words = _read_delay(delay)
     scenario = _set_up_loop(arm, link, law, set, sites=sites, tip=tip, rate_hz=rate_hz)
-    search = _GainSearch(scenario, _draw_poses(scenario, poses, seed), margin, damping, quantile)
+    search = _GainSearch(
+        scenario=scenario,
+        poses=_draw_poses(scenario, poses, seed),
+        margin=margin,
+        damping=damping,
+        quantile=quantile,
+    )
     edge = search.find_edge()
     pose = np.array(edge["pose"])
     found = search.at(edge["used_per_s2"], margin)
@@ -412,15 +504,28 @@ def tune_arm(
     for share, one in tried:
         progress(1 + len(runs), 1 + len(tried))
         runs.append(search.confirm(one, share, pose, push))
-    gains = {name: list(getattr(found, name)) for name in ("K", "Kd", "d") if name in found.kind.tune}
-    cells = ", ".join(f"{name} = {msgspec.json.encode(own).decode()}" for name, own in gains.items())
+    gains = {
+        name: list(getattr(found, name)) for name in ("K", "Kd", "d") if name in found.kind.tune
+    }
+    cells = ", ".join(
+        f"{name} = {msgspec.json.encode(own).decode()}" for name, own in gains.items()
+    )
     model = scenario.arms[scenario.names[0]]
     units = map("/".join, zip(model.joint_units("N m"), model.joint_units("rad"), strict=True))
     errors = map(finite_or_none, np.divide(model.efforts, gains["K"]).tolist())
     heads = ("joint", "inertia", *gains, "unit", "error_at_effort_limit")
     columns = (model.joint_names, search.inertia.tolist(), *gains.values(), units, errors)
     joints = [dict(zip(heads, row, strict=True)) for row in zip(*columns, strict=True)]
-    asked = Path(arm).name, law, sites, search.rate_hz, words, 1e3 * search.age_s, margin, damping
+    asked = (
+        Path(arm).name,
+        law,
+        sites,
+        search.rate_hz,
+        words,
+        1e3 * search.age_s,
+        margin,
+        damping,
+    )
     agree = runs[0]["stable"] is True and all(run["agrees"] for run in runs)
     line = f'control = {{ law = "{law}", {cells} }}'
     over = search.trace_edge(pose) if curve else []

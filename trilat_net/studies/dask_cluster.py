@@ -1,9 +1,9 @@
 """A Dask cluster that runs the items of a study.
 
-Invariant: an item runs only on a worker with the same program, the same arithmetic and the same versions of
-what computes. Workers are asked before anything is sent, and each checks itself before every batch, so one
-that joins later is held to the same. A user's control law is not sent along: its hash covers one file, and
-that file may import others; the worker must have it.
+Invariant: an item runs only on a worker with the same program, the same arithmetic and the same
+versions of what computes. Workers are asked before anything is sent, and each checks itself
+before every batch, so one that joins later is held to the same. A user's control law is not
+sent along: its hash covers one file, and that file may import others; the worker must have it.
 """
 
 import hashlib
@@ -64,18 +64,25 @@ class WorkerRequirements(NamedTuple):
     laws: tuple[tuple[str, str], ...] = ()
 
 
-def find_unfit(required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]) -> str:
+def find_unfit(
+    required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]
+) -> str:
     """Returns why a worker is refused, or ""."""
     here = required.identity
     named = [name for name in here if name != "commit" and identity.get(name) != here[name]]
     if named:
         named += ["commit"] if "source files" in named else []
         there, own = (
-            ", ".join(f"{name} {one.get(name, 'unknown')}" for name in named) for one in (identity, here)
+            ", ".join(f"{name} {one.get(name, 'unknown')}" for name in named)
+            for one in (identity, here)
         )
         return f"has {there}, and here is {own}; results are not mixed"
     remedy = "put the file that the scenario names into the worker's folder or PYTHONPATH"
-    return f"lacks the control law {', '.join(lacks)}, or has another file of it: {remedy}" if lacks else ""
+    return (
+        f"lacks the control law {', '.join(lacks)}, or has another file of it: {remedy}"
+        if lacks
+        else ""
+    )
 
 
 def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
@@ -102,7 +109,9 @@ def check_this_worker(required: WorkerRequirements) -> None:
         raise UsageError(f"the worker {_distributed().get_worker().address} {why}")
 
 
-def _make_probe() -> Callable[[Sequence[tuple[str, str]]], tuple[WorkerIdentity, Sequence[str]]]:
+def _make_probe() -> Callable[
+    [Sequence[tuple[str, str]]], tuple[WorkerIdentity, Sequence[str]]
+]:
 
     def probe(laws: Sequence[tuple[str, str]]) -> tuple[WorkerIdentity, Sequence[str]]:
         try:
@@ -115,7 +124,8 @@ def _make_probe() -> Callable[[Sequence[tuple[str, str]]], tuple[WorkerIdentity,
 
 
 class DaskCluster:
-    """A connection to a Dask scheduler; a context, which closes it and cancels what is under way.
+    """A connection to a Dask scheduler; a context, which closes it and cancels what is under
+    way.
 
     Raises:
         UsageError: Dask is not installed, the scheduler does not answer, or it has no worker.
@@ -127,7 +137,9 @@ class DaskCluster:
         self._alone_ns = -1
         try:
             check_hosts([address])
-            self._client = _distributed().Client(address, timeout=CONNECT_S, set_as_default=False)
+            self._client = _distributed().Client(
+                address, timeout=CONNECT_S, set_as_default=False
+            )
         except UnknownHost as unknown:
             raise UsageError(f"--on {unknown}") from None
         except (OSError, ValueError, TypeError) as error:  # TimeoutError is an OSError
@@ -150,7 +162,9 @@ class DaskCluster:
     @property
     def workers(self) -> int:
         """How many items its workers run at the same time."""
-        return sum(worker["nthreads"] for worker in self._client.scheduler_info()["workers"].values())
+        return sum(
+            worker["nthreads"] for worker in self._client.scheduler_info()["workers"].values()
+        )
 
     def require(self, laws: Sequence[ImportedCode]) -> WorkerRequirements:
         """Returns what every worker must have, and checks those that are there.
@@ -169,13 +183,20 @@ class DaskCluster:
         required = WorkerRequirements(describe_worker(), files)
         python = required.identity["Python"]
         versions = self._client.get_versions()["workers"]
-        for worker, found in versions.items():  # by Dask itself: code crosses no two versions of Python
+        for (
+            worker,
+            found,
+        ) in versions.items():  # by Dask itself: code crosses no two versions of Python
             there = ".".join(str(found["host"]["python"]).split(".")[:2])
             if there != python:
-                raise UsageError(f"the worker {worker} has Python {there}, and here is Python {python}")
+                raise UsageError(
+                    f"the worker {worker} has Python {there}, and here is Python {python}"
+                )
         for worker, answer in self._client.run(_make_probe(), files, on_error="return").items():
             if isinstance(answer, BaseException):
-                raise UsageError(f"the worker {worker} cannot be asked for its version: {answer}")
+                raise UsageError(
+                    f"the worker {worker} cannot be asked for its version: {answer}"
+                )
             if why := find_unfit(required, *answer):
                 raise UsageError(f"the worker {worker} {why}")
         return required
@@ -194,7 +215,9 @@ class DaskCluster:
         if workers or self._alone_ns < 0:
             self._alone_ns = now_ns
         elif now_ns - self._alone_ns > NO_WORKER_S * 1e9:
-            raise RunFailed(f"the cluster at {self.address} has had no worker for {NO_WORKER_S:g} s")
+            raise RunFailed(
+                f"the cluster at {self.address} has had no worker for {NO_WORKER_S:g} s"
+            )
 
     def is_worker_loss(self, error: BaseException) -> bool:
         """Returns whether an item's workers died.

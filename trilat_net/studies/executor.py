@@ -1,17 +1,25 @@
-"""The worker pool of all studies: runs a function on many items, here, in worker processes or on a cluster.
+"""The worker pool of all studies: runs a function on many items, here, in worker processes or
+on a cluster.
 
-Any `concurrent.futures.Executor` does the work: loky's processes on this machine, a Dask cluster with
-`on="tcp://SCHEDULER:8786"`.
+Any `concurrent.futures.Executor` does the work: loky's processes on this machine, a Dask
+cluster with `on="tcp://SCHEDULER:8786"`.
 
-Invariant: what runs an item enters no result. The number of items in flight is bounded. An item whose worker
-died runs again, at most `MAX_LOSSES` times in all; the last times alone, so that the item that is named is
-the one that ends its workers.
+Invariant: what runs an item enters no result. The number of items in flight is bounded. An item
+whose worker died runs again, at most `MAX_LOSSES` times in all; the last times alone, so that
+the item that is named is the one that ends its workers.
 """
 
 import textwrap
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    wait,
+)
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from itertools import islice
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -29,12 +37,16 @@ R = TypeVar("R")
 Progress = Callable[[int, int], None]
 """Called with the numbers of items done and in all."""
 Workers = str | Executor | None
-"""What runs items: a Dask scheduler's address, an executor, or None for processes of this machine."""
+"""What runs items: a Dask scheduler's address, an executor, or None for processes of this
+machine.
+"""
 
 BATCH_S = 0.4
 """The duration of a batch of items, about: at 20 ms an item its overhead is below 1 %."""
 CLUSTER_BATCH_S = 2.0
-"""The same on a cluster, where a batch costs its scheduler, its worker and this process some 20 ms in all."""
+"""The same on a cluster, where a batch costs its scheduler, its worker and this process some 20
+ms in all.
+"""
 MAX_BATCH = 400
 _SMALLEST = 16
 """The last batches are no smaller than this part of a whole one."""
@@ -63,7 +75,8 @@ def run_batch(
     required: WorkerRequirements | None,
     allowed: CodeConsents,
 ) -> _BatchResult:
-    """Runs a function on the items of a batch, in whatever worker, in which the `allowed` laws may run.
+    """Runs a function on the items of a batch, in whatever worker, in which the `allowed` laws
+    may run.
 
     Raises:
         UsageError: this worker does not meet the requirements.
@@ -93,7 +106,9 @@ class _Batch(NamedTuple):
 class _Feed(Generic[T]):
     """The items that wait, and how many of them make the next batch."""
 
-    def __init__(self, items: Iterable[T], count: int | None, workers: int, batch_s: float = BATCH_S) -> None:
+    def __init__(
+        self, items: Iterable[T], count: int | None, workers: int, batch_s: float = BATCH_S
+    ) -> None:
         self._new = enumerate(items)
         self._left = count
         self._workers = workers
@@ -109,12 +124,18 @@ class _Feed(Generic[T]):
         self._wall_s = self._wall_s + wall_s
 
     def take(self, *, idle: bool) -> list[tuple[int, T]]:
-        """Returns the next batch, [] if there is none now; items under suspicion wait until all is idle."""
+        """Returns the next batch, [] if there is none now; items under suspicion wait until all
+        is idle.
+        """
         if self._suspects:
             return [self._suspects.popleft()] if idle else []
         if self._again:
             return [self._again.popleft()]
-        size = min(MAX_BATCH, int(self._batch_s * self._runs / self._wall_s)) if self._wall_s > 0.0 else 1
+        size = (
+            min(MAX_BATCH, int(self._batch_s * self._runs / self._wall_s))
+            if self._wall_s > 0.0
+            else 1
+        )
         if self._left is not None:  # small batches at the end leave no worker idle
             share = self._left // (2 * self._workers * _BATCHES_PER_WORKER)
             size = min(size, max(share, size // _SMALLEST))
@@ -143,8 +164,10 @@ class WorkerPool:
     Args:
         executor: runs the batches; None: this process does.
         workers: how many work at the same time.
-        restart: returns a new executor after the loss of a worker broke the old one; None: there is none.
-        cluster: the cluster that the executor belongs to, and `required` what each of its workers must have.
+        restart: returns a new executor after the loss of a worker broke the old one; None:
+            there is none.
+        cluster: the cluster that the executor belongs to, and `required` what each of its
+            workers must have.
         hint: what a message about a lost worker recommends.
     """
 
@@ -172,7 +195,8 @@ class WorkerPool:
         lost: Callable[[T], R] | None = None,
         count: int | None = None,
     ) -> Iterator[tuple[int, R]]:
-        """Yields the number of every item and the function's result, in the order in which they end.
+        """Yields the number of every item and the function's result, in the order in which they
+        end.
 
         Args:
             function: of a module, so that another process can import it.
@@ -190,7 +214,9 @@ class WorkerPool:
                     result = function(item)
                 yield number, result
             return
-        feed = _Feed(items, count, self.workers, BATCH_S if self._cluster is None else CLUSTER_BATCH_S)
+        feed = _Feed(
+            items, count, self.workers, BATCH_S if self._cluster is None else CLUSTER_BATCH_S
+        )
         pending: dict[Future[_BatchResult], _Batch] = {}
         try:
             while True:
@@ -208,7 +234,10 @@ class WorkerPool:
                 future.cancel()
 
     def map(
-        self, function: Callable[[T], R], items: Sequence[T], progress: Progress = ignore_progress
+        self,
+        function: Callable[[T], R],
+        items: Sequence[T],
+        progress: Progress = ignore_progress,
     ) -> list[R]:
         """Returns the function's results in the order of the items."""
         results: dict[int, R] = {}
@@ -218,7 +247,10 @@ class WorkerPool:
         return [results[number] for number in range(len(items))]
 
     def _submit(
-        self, function: Callable[[T], R], feed: _Feed[T], pending: dict[Future[_BatchResult], _Batch]
+        self,
+        function: Callable[[T], R],
+        feed: _Feed[T],
+        pending: dict[Future[_BatchResult], _Batch],
     ) -> None:
         assert self._executor is not None
         while len(pending) < self.workers * _BATCHES_PER_WORKER:
@@ -235,7 +267,11 @@ class WorkerPool:
             pending[future] = _Batch(numbers, items, self._executor)
 
     def _collect(
-        self, future: Future[_BatchResult], batch: _Batch, feed: _Feed[T], lost: Callable[[T], R] | None
+        self,
+        future: Future[_BatchResult],
+        batch: _Batch,
+        feed: _Feed[T],
+        lost: Callable[[T], R] | None,
     ) -> Iterator[tuple[int, R]]:
         try:
             result = future.result()
@@ -267,7 +303,12 @@ class WorkerPool:
 
 @contextmanager
 def open_worker_pool(
-    jobs: int | None, on: Workers = None, *, most: int | None = None, laws: Sequence[Any] = (), hint: str = ""
+    jobs: int | None,
+    on: Workers = None,
+    *,
+    most: int | None = None,
+    laws: Sequence[Any] = (),
+    hint: str = "",
 ) -> Iterator[WorkerPool]:
     """Yields the workers of a study; those that it starts are gone afterwards.
 
@@ -275,18 +316,27 @@ def open_worker_pool(
         jobs: how many processes of this machine; None for one per core; 1: this process.
         on: what runs the items, if not processes of this machine.
         most: how many items there are: more processes are not started.
-        laws: control laws of users' own that the items need: every worker must have their files.
+        laws: control laws of users' own that the items need: every worker must have their
+            files.
         hint: what a message about a lost worker recommends.
 
     Raises:
-        UsageError: the cluster cannot be reached, one of its workers is not fit, or a library is missing.
+        UsageError: the cluster cannot be reached, one of its workers is not fit, or a library
+            is missing.
     """
     require_libraries()
     with ExitStack() as stack:
         if isinstance(on, str):
             cluster = stack.enter_context(DaskCluster(on))
             required = cluster.require(laws)
-            yield WorkerPool(cluster.executor, cluster.workers, None, cluster, required, hint)
+            yield WorkerPool(
+                executor=cluster.executor,
+                workers=cluster.workers,
+                restart=None,
+                cluster=cluster,
+                required=required,
+                hint=hint,
+            )
         elif on is not None:
             yield WorkerPool(on, getattr(on, "_max_workers", count_cores()), hint=hint)
         else:
@@ -297,7 +347,11 @@ def open_worker_pool(
                 opened: AbstractContextManager[Executor] = worker_pool(count)
                 return stack.enter_context(opened)
 
-            yield WorkerPool(start(), count, start, hint=hint) if count > 1 else WorkerPool(None, 1)
+            yield (
+                WorkerPool(start(), count, start, hint=hint)
+                if count > 1
+                else WorkerPool(None, 1)
+            )
 
 
 def check_workers(jobs: int | None, on: Workers) -> None:

@@ -1,13 +1,14 @@
-"""A Gymnasium environment: one user of an experiment acts, by what that user knows over the network.
+"""A Gymnasium environment: one user of an experiment acts, by what that user knows over the
+network.
 
 Invariant:
-- An episode is a run in virtual time and a function of the scenario, the seed and the actions; saved as a log
-  it verifies.
+- An episode is a run in virtual time and a function of the scenario, the seed and the actions;
+  saved as a log it verifies.
 - A step is a fixed number of ticks. A refused action makes no step and changes nothing.
 - Steps follow a reset and end with the episode.
-- What is observed, and when an action acts, is as of a hand of one's own (`OwnHand`), so that what is trained
-  here can hold an arm live, unchanged. Only orientations are observed as six numbers, which never jump
-  (`expand_poses`).
+- What is observed, and when an action acts, is as of a hand of one's own (`OwnHand`), so that
+  what is trained here can hold an arm live, unchanged. Only orientations are observed as six
+  numbers, which never jump (`expand_poses`).
 """
 
 import math
@@ -48,7 +49,9 @@ ENV_ID = "trilat_net/Teleoperation-v0"
 FAR = 1e6
 """Bound of what is observed where nothing tighter is known: rad, rad/s, m, N m, s."""
 MOST_DRAWS = {False: 1000, True: 100}
-"""Places that a task draws at most until one is within reach; of chains fewer, whose poses are searched."""
+"""Places that a task draws at most until one is within reach; of chains fewer, whose poses are
+searched.
+"""
 
 
 class EpisodeError(UsageError, gymnasium.error.ResetNeeded):
@@ -63,7 +66,8 @@ class Scene(NamedTuple):
         q: joint angles by site, rad, shape (n,).
         end_effector_m: place of the end effector by site, m.
         view: what the user sees.
-        bodies: the poses of the bodies of plants, by site and then name, as a record has them, shape (7,).
+        bodies: the poses of the bodies of plants, by site and then name, as a record has them,
+            shape (7,).
         can_reach: says of a site and a place, m, whether its end effector can be brought there.
         draws: places that a task may draw at most until one is within reach.
     """
@@ -96,13 +100,17 @@ class EpisodeTask(Protocol):
         """Draws the task of an episode."""
 
     def judge(self, scene: Scene) -> float | tuple[Any, ...]:
-        """Returns the reward of a step; or with it whether the task is done, as a `Judgement` or a tuple."""
+        """Returns the reward of a step; or with it whether the task is done, as a `Judgement`
+        or a tuple.
+        """
 
 
 class ReachTask:
-    """The slave's end effector is brought to a place that is drawn within its reach, and stays there.
+    """The slave's end effector is brought to a place that is drawn within its reach, and stays
+    there.
 
-    The reward of a step is minus the distance, m, times the step, s; and 1 once it was there for `stay_s`.
+    The reward of a step is minus the distance, m, times the step, s; and 1 once it was there
+    for `stay_s`.
 
     Args:
         site: whose end effector.
@@ -112,7 +120,11 @@ class ReachTask:
     """
 
     def __init__(
-        self, site: str = "s", radius_m: float = 0.3, within_m: float = 0.02, stay_s: float = 0.3
+        self,
+        site: str = "s",
+        radius_m: float = 0.3,
+        within_m: float = 0.02,
+        stay_s: float = 0.3,
     ) -> None:
         self.goal = np.zeros(2)
         self.bound = 100.0
@@ -123,7 +135,8 @@ class ReachTask:
         self._since_s = self._last_s = 0.0
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
-        """Draws a place around the start, evenly over the part of the area that the end effector can reach.
+        """Draws a place around the start, evenly over the part of the area that the end
+        effector can reach.
 
         Raises:
             UsageError: none of the places that were drawn is within reach.
@@ -169,7 +182,8 @@ class ActedHand(HandPlayer):
 
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
-    """An experiment in which one user is trained, in steps, see docs/policies.md; also called `tn.make_env`.
+    """An experiment in which one user is trained, in steps, see docs/policies.md; also called
+    `tn.make_env`.
 
     >>> bent = {f"sites.{name}.q0_rad": [0.4, 1.0] for name in ("m", "s")}
     >>> env = tn.make_env("two_sites", bent, user="m", duration_s=1)
@@ -178,7 +192,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     (1, 2)
 
     Args:
-        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
+        scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
+            scenario.
         set: overrides, as in `{"link.delay_ms": 100}`.
         user: the site whose arm is acted on.
         mode: "tip", "joint" or "force", as of a live hand; by default the scenario's.
@@ -188,11 +203,14 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         task: what is to be done; by default `leads` brings its end effector to a place.
         vary: what each episode draws, by key a list, or a pair of numbers.
         leads: the site that works.
-        render_mode: "rgb_array": `render` returns a picture of the arms and the goal; None: nothing.
-        flat: whether an observation is one array of float32 in place of a dictionary, and an action float32.
+        render_mode: "rgb_array": `render` returns a picture of the arms and the goal; None:
+            nothing.
+        flat: whether an observation is one array of float32 in place of a dictionary, and an
+            action float32.
 
     Attributes:
-        observation_names: with `flat` what each number of an observation is, as in "peer_q[1][0]".
+        observation_names: with `flat` what each number of an observation is, as in
+            "peer_q[1][0]".
 
     Raises:
         ScenarioError: the scenario or an override is not valid.
@@ -233,7 +251,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self.task: EpisodeTask = task or ReachTask(leads)
         self._base = self._prepare(load_scenario(scenario, set, duration_s=duration_s))
         if self._base.sites[user].rate_hz % rate_hz:
-            raise UsageError(f"rate_hz must divide the tick rate of {user}, {self._base.sites[user].rate_hz}")
+            raise UsageError(
+                f"rate_hz must divide the tick rate of {user}, {self._base.sites[user].rate_hz}"
+            )
         self._every = self._base.sites[user].rate_hz // rate_hz
         far = self._place(self._base).describe()
         self._most = far.limit if far.mode == "force" else self._find_reach()
@@ -253,7 +273,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._flat = flat
 
     def _prepare(self, scenario: Scenario) -> Scenario:
-        """Returns an experiment in which the user has a live hand and no other operator holds that arm."""
+        """Returns an experiment in which the user has a live hand and no other operator holds
+        that arm.
+        """
         find_site(scenario, self._user)
         find_site(scenario, self._leads)
         spec = scenario.sites[self._user]
@@ -261,16 +283,26 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         if self._mode:
             hand = replace(hand, mode=self._mode)
         sites = {**scenario.sites, self._user: replace(spec, hands=(hand,))}
-        drawn = {key: one for key, one in scenario.drawn.items() if f"{self._user}.hands" not in key}
+        drawn = {
+            key: one for key, one in scenario.drawn.items() if f"{self._user}.hands" not in key
+        }
         return replace(scenario, sites=sites, drawn=drawn)
 
     def _place(self, scenario: Scenario) -> HandSite:
         hand = scenario.sites[self._user].find_live_hand()
         assert hand is not None
-        return HandSite(scenario, self._user, hand, self._rate_hz, self._delay_s)
+        return HandSite(
+            scenario=scenario,
+            name=self._user,
+            spec=hand,
+            rate_hz=self._rate_hz,
+            delay_s=self._delay_s,
+        )
 
     def _find_reach(self) -> float:
-        """Returns how far from its base the user's end effector gets, m; or how far joints turn, rad."""
+        """Returns how far from its base the user's end effector gets, m; or how far joints
+        turn, rad.
+        """
         arm = self._base.arms[self._user]
         spec = self._base.sites[self._user]
         if self._place(self._base).spec.mode == "joint":
@@ -285,7 +317,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._actions = list[Array]()
         self._player = ActedHand(self._place(scenario), self._actions)
         self._plants = make_plant_players(scenario)
-        self._run = FusedRun(scenario, keep=1, hands={self._user: self._player}, plants=self._plants)
+        self._run = FusedRun(
+            scenario, keep=1, hands={self._user: self._player}, plants=self._plants
+        )
         self._run.plan([scenario.ticks(name) for name in scenario.names])
         self._ticks = scenario.ticks(self._user)
         self._tick_rate_hz = scenario.sites[self._user].rate_hz
@@ -294,16 +328,33 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         names = self.scenario.names
         arms = self.scenario.arms
         run = self._run
-        q = {name: row[: arms[name].counts.joints] for name, row in zip(names, run.q, strict=True)}
-        places = {name: np.array(arms[name].end_effector(row.tolist())) for name, row in q.items()}
+        q = {
+            name: row[: arms[name].counts.joints]
+            for name, row in zip(names, run.q, strict=True)
+        }
+        places = {
+            name: np.array(arms[name].end_effector(row.tolist())) for name, row in q.items()
+        }
         view = self._player.view(self._k, run.arrays(names.index(self._user)))
-        poses = {site: np.reshape(plant.state.bodies, (-1, 7)) for site, plant in self._plants.items()}
+        poses = {
+            site: np.reshape(plant.state.bodies, (-1, 7))
+            for site, plant in self._plants.items()
+        }
         bodies = {
-            site: dict(zip(self.scenario.bodies_m(site), at, strict=True)) for site, at in poses.items()
+            site: dict(zip(self.scenario.bodies_m(site), at, strict=True))
+            for site, at in poses.items()
         }
         reach = partial(self._can_reach, q)
         draws = MOST_DRAWS[arms[self._leads].chain is not None]
-        return Scene(self._k / self._tick_rate_hz, q, places, view, bodies, reach, draws)
+        return Scene(
+            t_s=self._k / self._tick_rate_hz,
+            q=q,
+            end_effector_m=places,
+            view=view,
+            bodies=bodies,
+            can_reach=reach,
+            draws=draws,
+        )
 
     def _can_reach(self, q: Mapping[str, Array], site: str, place_m: Array) -> bool:
         return can_reach(self.scenario.arms[site], q[site], place_m)
@@ -313,22 +364,38 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         parts = self._observe(scene)
         if not self._flat:
             return parts
-        return np.concatenate([np.ravel(parts[name]) for name in self._of_parts]).astype(np.float32)
+        return np.concatenate([np.ravel(parts[name]) for name in self._of_parts]).astype(
+            np.float32
+        )
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
         view = scene.view
-        own = {name: getattr(view, name) for name in ("q", "qd", "pose", "q_des", "tau_x", "target")}
-        peers = {f"peer_{x}": np.array([getattr(one, x) for one in view.peers]) for x in ("q", "qd", "tau_x")}
-        if self._base.arms[self._user].shares_pose:  # a rotation vector jumps where it passes half a turn
+        own = {
+            name: getattr(view, name)
+            for name in ("q", "qd", "pose", "q_des", "tau_x", "target")
+        }
+        peers = {
+            f"peer_{x}": np.array([getattr(one, x) for one in view.peers])
+            for x in ("q", "qd", "tau_x")
+        }
+        if self._base.arms[
+            self._user
+        ].shares_pose:  # a rotation vector jumps where it passes half a turn
             own["q_des"], peers["peer_q"] = map(expand_poses, (own["q_des"], peers["peer_q"]))
         alpha, age_s = zip(*((one.alpha, one.age_s) for one in view.peers), strict=True)
-        more = {"alpha": np.array(alpha), "age_s": np.array(age_s), "grip": np.array([view.grip])}
+        more = {
+            "alpha": np.array(alpha),
+            "age_s": np.array(age_s),
+            "grip": np.array([view.grip]),
+        }
         return {**own, **peers, **more, "goal": np.array(self.task.goal, dtype=np.float64)}
 
     def _inform(self, scene: Scene, *, succeeded: bool) -> dict[str, Any]:
         """Returns facts of a step; the first two by the names of gym-hil."""
         links = np.asarray(self._run.arrays(self.scenario.names.index(self._leads)).links)
-        shares = dict(zip(self.scenario.peers(self._leads), links["alpha"].tolist(), strict=True))
+        shares = dict(
+            zip(self.scenario.peers(self._leads), links["alpha"].tolist(), strict=True)
+        )
         others = {name: share for name, share in shares.items() if name != self._user}
         first = max(others, key=lambda name: others[name], default=self._user)
         return {
@@ -410,7 +477,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         return np.clip(values, -self._most, self._most)
 
     def render(self) -> Any:
-        """Returns a picture of the arms and of the goal, shape (height, width, 3); None without a mode.
+        """Returns a picture of the arms and of the goal, shape (height, width, 3); None without
+        a mode.
 
         Raises:
             EpisodeError: no episode has begun.
@@ -419,12 +487,20 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             return None
         if not (self._runs or self._actions):
             raise EpisodeError("there is no episode to be drawn: call reset first")
-        from ..reporting.episode_picture import EpisodePicture, is_place  # Matplotlib takes a second
+        # Matplotlib takes a second
+        from ..reporting.episode_picture import (
+            EpisodePicture,
+            is_place,
+        )
 
         if self._picture is None:
             self._picture = EpisodePicture(self.scenario, self._leads)
         scene = self._look()
-        goal = self.task.goal if is_place(self.task.goal, scene.end_effector_m[self._leads]) else None
+        goal = (
+            self.task.goal
+            if is_place(self.task.goal, scene.end_effector_m[self._leads])
+            else None
+        )
         return self._picture.draw(scene.q, scene.bodies, goal, f"t = {scene.t_s:.2f} s")
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
@@ -444,7 +520,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 def _flatten_space(parts: spaces.Dict) -> spaces.Box:
     """Returns the space of all numbers of observations, one after the other, as float32."""
     low, high = (
-        np.concatenate([np.ravel(getattr(box, end)) for box in parts.values()]).astype(np.float32)
+        np.concatenate([np.ravel(getattr(box, end)) for box in parts.values()]).astype(
+            np.float32
+        )
         for end in ("low", "high")
     )
     return spaces.Box(low, high, dtype=np.float32)

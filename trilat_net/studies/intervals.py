@@ -12,9 +12,9 @@ import numpy as np
 def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
     """Returns the 95 % score interval of a share, which has a width even if all runs agree.
 
-    Source: Wilson, "Probable inference, the law of succession, and statistical inference", J. American
-    Statistical Association 22 (1927); recommended by Brown, Cai and DasGupta, "Interval estimation for a
-    binomial proportion", Statistical Science 16 (2001).
+    Source: Wilson, "Probable inference, the law of succession, and statistical inference", J.
+    American Statistical Association 22 (1927); recommended by Brown, Cai and DasGupta,
+    "Interval estimation for a binomial proportion", Statistical Science 16 (2001).
     """
     from scipy.stats import binomtest  # takes half a second, which most commands can do without
 
@@ -25,7 +25,9 @@ def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
 
 
 class MeanInterval(NamedTuple):
-    """The mean of the numbers of several runs, and half the width of its 95 % interval by Student's t."""
+    """The mean of the numbers of several runs, and half the width of its 95 % interval by
+    Student's t.
+    """
 
     mean: float
     half: float

@@ -47,7 +47,9 @@ class LogComparison(Result):
         return f"{', '.join(self.metrics.columns)}: {count_nouns(len(self.metrics.rows), 'quantity')}"
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the differences of the experiments, the quantities of the logs, and remarks per log."""
+        """Yields the differences of the experiments, the quantities of the logs, and remarks
+        per log.
+        """
         names = {log.scenario.name for log in self.logs}
         if len(names) > 1:
             yield f"logs of different scenarios: {', '.join(sorted(names))}"
@@ -72,10 +74,18 @@ class LogComparison(Result):
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat compare --json`."""
         logs = [
-            {"name": name, "file": log.source, "scenario": log.scenario.name, "sha256": log.scenario.sha256}
+            {
+                "name": name,
+                "file": log.source,
+                "scenario": log.scenario.name,
+                "sha256": log.scenario.sha256,
+            }
             for name, log in zip(self.metrics.columns, self.logs, strict=True)
         ]
-        facts: dict[str, Any] = {"logs": logs, "differences": [one._asdict() for one in self.differences]}
+        facts: dict[str, Any] = {
+            "logs": logs,
+            "differences": [one._asdict() for one in self.differences],
+        }
         facts |= {"remarks": self.remarks, **comparison_to_json(self.metrics)}
         if self.means:
             pairs = zip(self.metrics.rows, self.means, strict=True)
@@ -95,7 +105,8 @@ class LogComparison(Result):
 
 
 def compare(*logs: str | Path | Log) -> LogComparison:
-    """Compares logs side by side, with the differences of their experiments; the command is `trilat compare`.
+    """Compares logs side by side, with the differences of their experiments; the command is
+    `trilat compare`.
 
     >>> logs = [tn.simulate("two_sites", {"control.Kd": Kd}, duration_s=0.1) for Kd in (3, 5)]
     >>> len(tn.compare(*logs).metrics.row("rms_error_rad").values)
@@ -107,7 +118,9 @@ def compare(*logs: str | Path | Log) -> LogComparison:
     """
     opened = [log if isinstance(log, Log) else open_log(log) for log in logs]
     if len(opened) < 2:
-        raise UsageError("name two logs or more; or a scenario, as in: trilat compare --tune free")
+        raise UsageError(
+            "name two logs or more; or a scenario, as in: trilat compare --tune free"
+        )
     names = name_columns([Path(log.sources[0]) for log in opened])
     remarks = {
         name: [describe_judgement(certify_run(log)), *check_final_posture(log)]
@@ -115,11 +128,15 @@ def compare(*logs: str | Path | Log) -> LogComparison:
     }
     found = compare_metrics(opened, names)
     differences = list(compare_scenarios([log.scenario for log in opened]))
-    return LogComparison(tuple(opened), found, differences, average_repeats(opened, found), remarks)
+    return LogComparison(
+        tuple(opened), found, differences, average_repeats(opened, found), remarks
+    )
 
 
 def name_columns(files: Sequence[Path]) -> list[str]:
-    """Returns a column name per log: the file's name, with as much of its path as tells them apart."""
+    """Returns a column name per log: the file's name, with as much of its path as tells them
+    apart.
+    """
     for depth in range(1, max(len(file.parts) for file in files) + 1):
         names = ["/".join(file.with_suffix("").parts[-depth:]) for file in files]
         if len(set(names)) == len(names):
@@ -128,7 +145,9 @@ def name_columns(files: Sequence[Path]) -> list[str]:
 
 
 def average_repeats(logs: Sequence[Log], found: MetricComparison) -> list[MeanInterval | None]:
-    """Returns the mean of each quantity over logs that differ in their seeds alone; [] of other logs."""
+    """Returns the mean of each quantity over logs that differ in their seeds alone; [] of other
+    logs.
+    """
     first = logs[0].scenario
     if len({log.scenario.seed for log in logs}) < len(logs):
         return []
@@ -137,8 +156,12 @@ def average_repeats(logs: Sequence[Log], found: MetricComparison) -> list[MeanIn
     return [mean_interval(row.values) for row in found.rows]
 
 
-def _tabulate_quantities(found: MetricComparison, means: Sequence[MeanInterval | None]) -> TextTable:
-    """Returns a row per quantity and a column per log; and one of the means where the logs are repeats."""
+def _tabulate_quantities(
+    found: MetricComparison, means: Sequence[MeanInterval | None]
+) -> TextTable:
+    """Returns a row per quantity and a column per log; and one of the means where the logs are
+    repeats.
+    """
     rows: list[list[str]] = []
     of_row = dict(zip(found.rows, means, strict=True)) if means else {}
     for group, members in groupby(found.rows, key=lambda row: row.quantity.group):

@@ -1,9 +1,11 @@
-"""The metrics of a run that [expect] can ask for, of a run in virtual time or of a log, and their outcomes.
+"""The metrics of a run that [expect] can ask for, of a run in virtual time or of a log, and
+their outcomes.
 
-Invariant: every metric has one definition: both sources feed the same running statistics of their sites with
-the same records, batch by batch in time order; a metric that a run cannot give is None, never a guess. Memory
-is bounded: kept are extrema, sums, the last second, and the buckets on which the judgement rests. How a run
-is cut into batches changes only the last bits of a mean. An outcome states value, limit and margin.
+Invariant: every metric has one definition: both sources feed the same running statistics of
+their sites with the same records, batch by batch in time order; a metric that a run cannot give
+is None, never a guess. Memory is bounded: kept are extrema, sums, the last second, and the
+buckets on which the judgement rests. How a run is cut into batches changes only the last bits
+of a mean. An outcome states value, limit and margin.
 """
 
 import math
@@ -18,7 +20,14 @@ from .. import process
 from ..analysis.arm_rows import build_arm_rows
 from ..analysis.metrics.log_metrics import find_quantity, measure_whole
 from ..analysis.metrics.measures import Metric
-from ..analysis.run_end import NO_BUCKETS, RunEnd, RunTrace, Stability, classify_run_end, reduce_to_buckets
+from ..analysis.run_end import (
+    NO_BUCKETS,
+    RunEnd,
+    RunTrace,
+    Stability,
+    classify_run_end,
+    reduce_to_buckets,
+)
 from ..analysis.torque_sources import list_walls, wall_force
 from ..core.site_step import Site
 from ..core.ticks import BUCKETS_PER_S, NS_PER_S, Mode, TickRecord
@@ -48,7 +57,8 @@ class RecordBatch(NamedTuple):
         e: its error against the reference, Eq. (9), shape (K, m), rad; m in task space.
         tau: control torque, shape (K, n), N m.
         tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
-        used: tick of the sample in use, -1 before the first, shape (K, P); of a compiled run none, (K, 0).
+        used: tick of the sample in use, -1 before the first, shape (K, P); of a compiled run
+            none, (K, 0).
     """
 
     t_ns: Ints
@@ -70,7 +80,7 @@ class RecordBatch(NamedTuple):
     def reduce(self, into: Array = NO_BUCKETS) -> Array:
         """Returns the buckets of a judgement with these records added, see `reduce_to_buckets`."""
         bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
-        return reduce_to_buckets(bucket, self.e, self.qd, self.q, into)
+        return reduce_to_buckets(bucket=bucket, e=self.e, qd=self.qd, q=self.q, into=into)
 
     def _part(self, first: int, last: int | None) -> "RecordBatch":
         return RecordBatch._make(column[first:last] for column in self)
@@ -84,7 +94,7 @@ def join_batches(blocks: Sequence[RecordBatch]) -> RecordBatch:
 def _make_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
     q, qd, q_des, tau, tau_x, x = vectors
     e = find_task_errors(x, q_des, axes) if x.size else q - q_des
-    return RecordBatch(t_ns, q, qd, e, tau, tau_x, used)
+    return RecordBatch(t_ns=t_ns, q=q, qd=qd, e=e, tau=tau, tau_x=tau_x, used=used)
 
 
 def run_in_batches(
@@ -124,7 +134,8 @@ def run_in_batches(
 def run_compiled_in_batches(
     scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]
 ) -> float | None:
-    """Does as `run_in_batches`, in the compiled loop, which does not say which samples are in use.
+    """Does as `run_in_batches`, in the compiled loop, which does not say which samples are in
+    use.
 
     Returns:
         when the first site left its limits, s, or None.
@@ -134,7 +145,9 @@ def run_compiled_in_batches(
     period_s = BATCH_RECORDS / max(spec.rate_hz for spec in scenario.sites.values())
     while run.ran_s < scenario.duration_s and run.diverged_s is None:
         run.advance(min(run.ran_s + period_s, scenario.duration_s))
-        for name, place, (t_ns, rows) in zip(scenario.names, columns, run.take_records(), strict=True):
+        for name, place, (t_ns, rows) in zip(
+            scenario.names, columns, run.take_records(), strict=True
+        ):
             if not len(t_ns):
                 continue
             keys = ("q", "qd", "q_des", "tau", "tau_x", "x")
@@ -145,12 +158,16 @@ def run_compiled_in_batches(
 
 
 def run_whole(scenario: Scenario) -> tuple[dict[str, RecordBatch], RunEnd]:
-    """Runs a scenario in the compiled loop; returns all records of each site, and how the run ended."""
+    """Runs a scenario in the compiled loop; returns all records of each site, and how the run
+    ended.
+    """
     kept: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
     diverged_s = run_compiled_in_batches(scenario, {name: kept[name].append for name in kept})
     records = {name: join_batches(blocks) for name, blocks in kept.items()}
     found = records.values()
-    trace = RunTrace([one.reduce() for one in found], [one.tau_x[-1] for one in found], diverged_s)
+    trace = RunTrace(
+        [one.reduce() for one in found], [one.tau_x[-1] for one in found], diverged_s
+    )
     return records, classify_run_end(scenario, trace)
 
 
@@ -166,7 +183,9 @@ class WindowStats:
 
     def __init__(self, window: ExpectWindow, scenario: Scenario, site: str) -> None:
         spec = scenario.sites[site]
-        self._from_ns, self._to_ns = (round(t_s * NS_PER_S) for t_s in (window.from_s, window.to_s))
+        self._from_ns, self._to_ns = (
+            round(t_s * NS_PER_S) for t_s in (window.from_s, window.to_s)
+        )
         self._period_ns = NS_PER_S // spec.rate_hz + 1
         self._arm = build_arm_rows(scenario, site)
         self._walls = list_walls(spec)
@@ -196,11 +215,15 @@ class WindowStats:
         if self._walls:
             tip = self._arm.place_end_effector(inside.q, inside.qd)
             t_s = inside.t_ns / NS_PER_S
-            self._add_force(np.sum([wall_force(wall, t_s, tip) for wall in self._walls], axis=0))
+            self._add_force(
+                np.sum([wall_force(wall, t_s, tip) for wall in self._walls], axis=0)
+            )
 
     def _add_force(self, force: Array) -> None:
         touching = force > 0.0
-        before = np.append(touching[0] if self._touched is None else self._touched, touching[:-1])
+        before = np.append(
+            touching[0] if self._touched is None else self._touched, touching[:-1]
+        )
         self._hits += int((touching & ~before).sum())
         self._touched = bool(touching[-1])
         self._force_sum += float(force.sum())
@@ -208,7 +231,9 @@ class WindowStats:
         self._force_peak = max(self._force_peak, float(force.max()))
 
     def figures(self) -> dict[str, Range]:
-        """Returns every quantity by its key in `Window`; none where the records end before the window."""
+        """Returns every quantity by its key in `Window`; none where the records end before the
+        window.
+        """
         if not self._records or self._seen_ns < self._to_ns - self._period_ns:
             return {}
         mean_n = self._force_sum / self._records
@@ -217,7 +242,9 @@ class WindowStats:
             **self._peaks,
             **{f"push{n}_mean_nm": push for n, push in enumerate(push_nm, 1)},
             "wall_mean_n": mean_n,
-            "wall_deviation_n": math.sqrt(max(0.0, self._force_squares / self._records - mean_n * mean_n)),
+            "wall_deviation_n": math.sqrt(
+                max(0.0, self._force_squares / self._records - mean_n * mean_n)
+            ),
             "wall_peak_n": self._force_peak,
             "wall_hits": float(self._hits),
         }
@@ -234,8 +261,10 @@ class SiteStats:
     """Statistics of one site, so far.
 
     Attributes:
-        stretches: per window of [expect] the statistics within it; None where a window is another site's.
-        apart_ns: time of the last record whose |e| was not below `synchronised_rad`; -1 before one was.
+        stretches: per window of [expect] the statistics within it; None where a window is
+            another site's.
+        apart_ns: time of the last record whose |e| was not below `synchronised_rad`; -1 before
+            one was.
         age_max_ms: per peer the largest age of the sample in use, shape (P,).
     """
 
@@ -298,7 +327,10 @@ class SiteStats:
     def link_ages(self) -> list["LinkAge"]:
         """Per peer the age of the sample in use; None where there never was one."""
         rows = zip(
-            self._age_sum_ms.tolist(), self._age_records.tolist(), self.age_max_ms.tolist(), strict=True
+            self._age_sum_ms.tolist(),
+            self._age_records.tolist(),
+            self.age_max_ms.tolist(),
+            strict=True,
         )
         return [
             LinkAge(total / records, most) if records else LinkAge(None, None)
@@ -306,7 +338,9 @@ class SiteStats:
         ]
 
     def end(self, end_ns: int) -> RecordBatch:
-        """Returns the records of the last second before `end_ns`, which is not before the last record."""
+        """Returns the records of the last second before `end_ns`, which is not before the last
+        record.
+        """
         return join_batches(self._tail).since(end_ns - _END_NS)
 
     @property
@@ -321,7 +355,9 @@ class SiteStats:
 
 
 class LinkAge(msgspec.Struct, frozen=True):
-    """Age of the sample in use on one link, over the receiver's ticks from the first one on; else None."""
+    """Age of the sample in use on one link, over the receiver's ticks from the first one on;
+    else None.
+    """
 
     mean_ms: float | None
     max_ms: float | None
@@ -330,10 +366,11 @@ class LinkAge(msgspec.Struct, frozen=True):
 class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
     """One run, measured; the docstring of `Expect` defines every metric.
 
-    `end` is its judgement. None stands for what the run cannot give: too short, or it did not come to it.
-    `end_...` is of the last second, `ages` has links "j->i", `late_samples` came too late for what their link
-    meant to do with them, `missing` counts ticks without a record, and a window has no quantities where the
-    run ended before it did. `metrics` has those of `docs/metrics.md` that are expected.
+    `end` is its judgement. None stands for what the run cannot give: too short, or it did not
+    come to it. `end_...` is of the last second, `ages` has links "j->i", `late_samples` came
+    too late for what their link meant to do with them, `missing` counts ticks without a record,
+    and a window has no quantities where the run ended before it did. `metrics` has those of
+    `docs/metrics.md` that are expected.
     """
 
     simulated_s: float
@@ -366,8 +403,13 @@ def compute_run_metrics(
     whole = len(ran) == len(tallies)
     end_ns = max((tally.last_ns for tally in ran.values()), default=0)
     found = tallies.values()
-    trace = RunTrace([one.buckets for one in found], [one.tau_x for one in found], diverged_at_s)
-    span_s = [tally.last_ns / NS_PER_S + 1.0 / scenario.sites[name].rate_hz for name, tally in ran.items()]
+    trace = RunTrace(
+        [one.buckets for one in found], [one.tau_x for one in found], diverged_at_s
+    )
+    span_s = [
+        tally.last_ns / NS_PER_S + 1.0 / scenario.sites[name].rate_hz
+        for name, tally in ran.items()
+    ]
     apart_ns = [tally.apart_ns for tally in ran.values()]
     synchronised = whole and not any(tally.apart_ns == tally.last_ns for tally in ran.values())
     ends = {name: tally.end(end_ns) for name, tally in ran.items()}
@@ -376,14 +418,20 @@ def compute_run_metrics(
         return max((getattr(tally, name) for tally in ran.values()), default=None)
 
     return RunMetrics(
-        simulated_s=max(span_s, default=0.0),  # to the end of the period that follows the last tick
+        simulated_s=max(
+            span_s, default=0.0
+        ),  # to the end of the period that follows the last tick
         end=classify_run_end(scenario, trace),
         synchronised_at_s=max(0, *apart_ns) / NS_PER_S if synchronised else None,
         peak_error_rad=largest("peak_error_rad"),
         rms_error_rad=largest("rms_error_rad"),
-        end_error_rad=max((float(np.abs(end.e).max(initial=0.0)) for end in ends.values()), default=None),
+        end_error_rad=max(
+            (float(np.abs(end.e).max(initial=0.0)) for end in ends.values()), default=None
+        ),
         end_spread_rad=_end_spread_rad(list(ends.values())) if whole else None,
-        end_pose_rad={name: tuple(tally.end(tally.last_ns).q[-1].tolist()) for name, tally in ran.items()},
+        end_pose_rad={
+            name: tuple(tally.end(tally.last_ns).q[-1].tolist()) for name, tally in ran.items()
+        },
         peak_torque_nm=largest("peak_torque_nm"),
         peak_speed_rad_s=largest("peak_speed_rad_s"),
         ages={
@@ -393,7 +441,9 @@ def compute_run_metrics(
         },
         late_samples=late_samples,
         missing=missing,
-        windows=tuple(map(_window_ranges, zip(*(tally.stretches for tally in found), strict=True))),
+        windows=tuple(
+            map(_window_ranges, zip(*(tally.stretches for tally in found), strict=True))
+        ),
     )
 
 
@@ -414,7 +464,9 @@ def _end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
     if len({end.q.shape[1] for end in ends}) > 1:  # unlike arms have no angle in common
         return None
     at_ns = ends[0].t_ns[ends[0].t_ns >= max(end.t_ns[0] for end in ends)]
-    poses: Array = np.array([end.q[np.searchsorted(end.t_ns, at_ns, side="right") - 1] for end in ends])
+    poses: Array = np.array(
+        [end.q[np.searchsorted(end.t_ns, at_ns, side="right") - 1] for end in ends]
+    )
     return float((poses.max(axis=0) - poses.min(axis=0)).max(initial=0.0))
 
 
@@ -432,7 +484,9 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
         tallies,
         diverged_at_s=diverged_at_s,
         late_samples=late_samples,
-        missing=0 if diverged_at_s is not None else sum(map(scenario.ticks, scenario.names)) - made,
+        missing=0
+        if diverged_at_s is not None
+        else sum(map(scenario.ticks, scenario.names)) - made,
     )
 
 
@@ -442,7 +496,9 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
     Raises:
         LogError: a record cannot be read.
     """
-    scenario = log.scenario if expect is None else msgspec.structs.replace(log.scenario, expect=expect)
+    scenario = (
+        log.scenario if expect is None else msgspec.structs.replace(log.scenario, expect=expect)
+    )
     made = {event.member: event.ticks for event in log.events if event.kind == "end"}
     diverged_at_s = log.diverged_s
     tallies = {name: SiteStats(scenario, name) for name in log.sites}
@@ -450,14 +506,26 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
     for name, tally in tallies.items():
         part = log[name]
         used = np.array([part.used[peer] for peer in part.peers]).T
-        tally.add(RecordBatch(part.t_ns, part.q, part.qd, part.e, part.tau, part.tau_x, used))
+        tally.add(
+            RecordBatch(
+                t_ns=part.t_ns,
+                q=part.q,
+                qd=part.qd,
+                e=part.e,
+                tau=part.tau,
+                tau_x=part.tau_x,
+                used=used,
+            )
+        )
         wanted = scenario.ticks(name) if diverged_at_s is None else made.get(name, 0)
         missing += max(0, wanted - len(part))
     found = compute_run_metrics(
         scenario,
         tallies,
         diverged_at_s=diverged_at_s,
-        late_samples=sum(sample.arrived_tick is not None for sample in find_absent_samples(log)),
+        late_samples=sum(
+            sample.arrived_tick is not None for sample in find_absent_samples(log)
+        ),
         missing=missing,
     )
     return msgspec.structs.replace(found, metrics=measure_whole(log, scenario.expect.metrics))
@@ -468,8 +536,8 @@ class ExpectationResult(msgspec.Struct, frozen=True):
 
     Attributes:
         key: the key of [expect] that asked, or a word for what every run must do.
-        margin: how far within the limit, as a fraction of the limit: 0.1 is 10 % to spare, negative is
-            beyond it. None where there is no such number.
+        margin: how far within the limit, as a fraction of the limit: 0.1 is 10 % to spare,
+            negative is beyond it. None where there is no such number.
         value: the measured number, in the unit of the limit; None where it is none.
     """
 
@@ -482,7 +550,8 @@ class ExpectationResult(msgspec.Struct, frozen=True):
 
 
 def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[ExpectationResult]:
-    """Returns an outcome for everything that is asked of a run, in the order of the keys of `Expect`.
+    """Returns an outcome for everything that is asked of a run, in the order of the keys of
+    `Expect`.
 
     A run that diverged has an outcome `stable` even where that key is absent, see `Expect`.
     """
@@ -508,18 +577,26 @@ def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[Expecta
     end = metrics.end
     if expect.stable is not None or end.diverged_at_s is not None:
         held = end.stability is (Stability.STABLE if wanted else Stability.NOT_STABLE)
-        yield ExpectationResult("stable", held, f"{end.stability}: {end.text}", str(wanted).lower())
+        yield ExpectationResult(
+            "stable", held, f"{end.stability}: {end.text}", str(wanted).lower()
+        )
 
 
 _LIMITS = tuple(key for key in field_names(Expect) if re.search("_(max|min|by)(_|$)", key))
 
 
 def _read_metric(key: str, metrics: RunMetrics) -> float | None:
-    """Returns what a limit is of; of ages that of the worst link, None if one never had a sample."""
+    """Returns what a limit is of; of ages that of the worst link, None if one never had a
+    sample.
+    """
     if not key.endswith("_ms"):
-        found: float | None = getattr(metrics, re.sub("_(max|min)", "", key).replace("_by_", "_at_"))
+        found: float | None = getattr(
+            metrics, re.sub("_(max|min)", "", key).replace("_by_", "_at_")
+        )
         return found
-    ages = [age.mean_ms if key.startswith("mean") else age.max_ms for age in metrics.ages.values()]
+    ages = [
+        age.mean_ms if key.startswith("mean") else age.max_ms for age in metrics.ages.values()
+    ]
     known = [age for age in ages if age is not None]
     choose = min if "_min_" in key else max
     return choose(known) if known and len(known) == len(ages) else None
@@ -533,7 +610,9 @@ def _compare_with_limit(key: str, measured: float | None, limit: float) -> Expec
         return ExpectationResult(key, False, "never", wanted)
     spare = measured - limit if least else limit - measured
     text = f"{measured:.4g} {unit}".rstrip()
-    return ExpectationResult(key, spare >= 0.0, text, wanted, spare / limit if limit else None, measured)
+    return ExpectationResult(
+        key, spare >= 0.0, text, wanted, spare / limit if limit else None, measured
+    )
 
 
 def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
@@ -554,7 +633,9 @@ def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
     for window, ranges in zip(expect.windows, metrics.windows, strict=True):
         for key, limits in window.asked:
             site = f" {window.site}" if window.site else ""
-            name = f"{key}{site} {window.from_s:g}-{window.to_s:g} s"  # as in wall_mean_n s 9-15 s
+            name = (
+                f"{key}{site} {window.from_s:g}-{window.to_s:g} s"  # as in wall_mean_n s 9-15 s
+            )
             yield _compare_with_range(name, ranges.get(key), limits, split_unit(key)[1])
 
 
@@ -562,7 +643,13 @@ def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[Expectati
     for key, limits in expect.metrics.items():
         value, why, _ = metrics.metrics[key]
         found = None if value is None else Range(value, value)
-        yield _compare_with_range(f"metrics.{key}", found, limits, find_quantity(key).unit, why)
+        yield _compare_with_range(
+            name=f"metrics.{key}",
+            found=found,
+            limits=limits,
+            unit=find_quantity(key).unit,
+            why=why,
+        )
 
 
 def _compare_with_range(
@@ -577,4 +664,6 @@ def _compare_with_range(
     half = 0.5 * (most - least)
     margin = spare / half if half else None
     value = found.most if found.least == found.most else None
-    return ExpectationResult(name, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, margin, value)
+    return ExpectationResult(
+        name, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, margin, value
+    )

@@ -1,7 +1,8 @@
 """Which places an arm can reach with its end effector.
 
-Invariant: a place that counts as reachable can be reached: for a planar arm by the lengths of its links, for
-a chain by a pose within its joint limits, which was found. Some reachable places of chains are not found.
+Invariant: a place that counts as reachable can be reached: for a planar arm by the lengths of
+its links, for a chain by a pose within its joint limits, which was found. Some reachable places
+of chains are not found.
 """
 
 import math
@@ -13,7 +14,9 @@ from ..core.vectors import Array
 from ..scenario.arms import ArmModel
 
 PLANAR_MARGIN = 0.01
-"""Share of a planar arm's length by which a place must lie inside its reach: no goal needs a straight arm."""
+"""Share of a planar arm's length by which a place must lie inside its reach: no goal needs a
+straight arm.
+"""
 FOUND_WITHIN_M = 1e-3
 _STEPS = 40
 _PROBE_RAD = 1e-6
@@ -51,7 +54,9 @@ def _find_pose(arm: ArmModel, q: Array, place_m: Array) -> bool:
         for joint in range(len(q)):
             moved = q.copy()
             moved[joint] += _PROBE_RAD
-            jacobian[:, joint] = (np.array(arm.end_effector(moved.tolist())) - at_m) / _PROBE_RAD
+            jacobian[:, joint] = (
+                np.array(arm.end_effector(moved.tolist())) - at_m
+            ) / _PROBE_RAD
         damped = jacobian @ jacobian.T + _DAMPING * np.eye(len(at_m))
         step = jacobian.T @ np.linalg.solve(damped, error_m)
         step *= min(1.0, _LARGEST_STEP_RAD / max(float(np.abs(step).max()), 1e-12))

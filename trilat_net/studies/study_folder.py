@@ -1,9 +1,11 @@
-"""The folder of a study: its plan, and the journal with a line per finished run, which is only appended to.
+"""The folder of a study: its plan, and the journal with a line per finished run, which is only
+appended to.
 
 A line is JSON, a tab, and the CRC-32 of study and JSON in hexadecimal digits.
 
-Invariant: by that checksum a torn line is ignored, and so is one of another study; a process that dies at any
-moment loses no earlier line and spoils no later one. A run that is in the journal is never made again.
+Invariant: by that checksum a torn line is ignored, and so is one of another study; a process
+that dies at any moment loses no earlier line and spoils no later one. A run that is in the
+journal is never made again.
 """
 
 import csv
@@ -50,7 +52,9 @@ def format_toml_value(value: Any) -> str:
     try:
         return tomli_w.dumps({"v": value}).removeprefix("v = ").removesuffix("\n")
     except TypeError:
-        raise ScenarioError(f"{value!r:.80} is no value of a scenario: those are of TOML") from None
+        raise ScenarioError(
+            f"{value!r:.80} is no value of a scenario: those are of TOML"
+        ) from None
 
 
 _VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
@@ -68,7 +72,9 @@ def build_resume_hint(*words: str) -> str:
 
 
 def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
-    """Returns rows as CSV with a line of heads: these columns, else all that rows have; None is empty."""
+    """Returns rows as CSV with a line of heads: these columns, else all that rows have; None is
+    empty.
+    """
     stream = io.StringIO()
     heads = columns or list(dict.fromkeys(key for row in rows for key in row))
     writer = csv.DictWriter(stream, heads, extrasaction="ignore", lineterminator="\n")
@@ -116,7 +122,8 @@ class RunJournal(Generic[E]):
         for line in before.split(b"\n"):
             text, tab, digits = line.rpartition(b"\t")
             if tab and digits == b"%08x" % self._checksum(text):
-                entry = msgspec.convert(json.loads(text), kind)  # unlike msgspec, json knows infinity
+                # unlike msgspec, json knows infinity
+                entry = msgspec.convert(json.loads(text), kind)
                 self.done.setdefault((entry.cell, entry.seed), entry)
         self._file = extend_file(path)
         if before and not before.endswith(b"\n"):  # a line that was torn stays torn, by itself
@@ -160,13 +167,16 @@ class RunJournal(Generic[E]):
             total: how many there will be.
             show: called with the runs that are done, and their number.
         """
-        for number, (_, entry) in enumerate(pool.each(run, tasks, count=total - done), done + 1):
+        for number, (_, entry) in enumerate(
+            pool.each(run, tasks, count=total - done), done + 1
+        ):
             self.add(entry)
             show(number, total)
 
     def _put(self, data: bytes) -> None:
         try:
-            if self._file.write(data) != len(data):  # a disk that became full takes a part, and says nothing
+            # a disk that became full takes a part, and says nothing
+            if self._file.write(data) != len(data):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise describe_write_error(self._path, error, self._remedy) from None

@@ -13,13 +13,13 @@ From pytest, one test per seed:
 
 Or all seeds in one, on all cores: `trilat_net.check("jitter", seeds=range(1, 21))`.
 
-Invariant: one command repeats a trial, and its result carries that command. An evaluation is a pure function
-of metrics and expectation; it states the measured value, the limit and the margin, held or not. A live trial
-is evaluated from its log by the same code; in addition its session must end in order and its records must
-re-execute bit for bit. Results come in the order of the trials, whatever ran them; a trial that ends its
-worker process again and again costs itself and no other. The XML follows Jenkins' `junit-10.xsd`: a suite
-per scenario, a case per run, one `failure` with everything that did not hold, an `error` for a run without a
-result.
+Invariant: one command repeats a trial, and its result carries that command. An evaluation is a
+pure function of metrics and expectation; it states the measured value, the limit and the
+margin, held or not. A live trial is evaluated from its log by the same code; in addition its
+session must end in order and its records must re-execute bit for bit. Results come in the order
+of the trials, whatever ran them; a trial that ends its worker process again and again costs
+itself and no other. The XML follows Jenkins' `junit-10.xsd`: a suite per scenario, a case per
+run, one `failure` with everything that did not hold, an `error` for a run without a result.
 """
 
 import re
@@ -59,7 +59,9 @@ from .study_folder import format_command, format_toml_value, set_options
 
 
 class TrialResult(NamedTuple):
-    """Result of a trial: an outcome per expectation, or why it came to no end; a live one has a log."""
+    """Result of a trial: an outcome per expectation, or why it came to no end; a live one has a
+    log.
+    """
 
     trial: "Trial"
     outcomes: Sequence[ExpectationResult] = ()
@@ -77,7 +79,9 @@ class TrialResult(NamedTuple):
     def failures(self) -> list[str]:
         """Unmet expectations, a sentence each."""
         missed = [outcome for outcome in self.outcomes if not outcome.held]
-        words = [f"{outcome.key}: {outcome.measured}, asked {outcome.limit}" for outcome in missed]
+        words = [
+            f"{outcome.key}: {outcome.measured}, asked {outcome.limit}" for outcome in missed
+        ]
         return [f"no result: {self.error}", *words] if self.error else words
 
 
@@ -125,7 +129,8 @@ class Trial(NamedTuple):
         """Runs the trial in virtual time.
 
         Raises:
-            AssertionError: something that is expected did not hold; it says what, and how to repeat it.
+            AssertionError: something that is expected did not hold; it says what, and how to
+                repeat it.
         """
         __tracebackhide__ = True  # pytest shows the reason, not this line
         result = self.run()
@@ -142,13 +147,14 @@ def trials(
     *,
     live: bool = False,
 ) -> list[Trial]:
-    """Returns the trials of a scenario, one per seed, ready to run, as for parameters of a test.
+    """Returns the trials of a scenario, one per seed, ready to run, as for parameters of a
+    test.
 
     >>> [str(trial) for trial in tn.trials("jitter", seeds=[1, 2])]
     ['jitter-seed1', 'jitter-seed2']
 
-    In virtual time a scenario in which nothing is random has one trial, with the first of the seeds: the
-    others would be the same run.
+    In virtual time a scenario in which nothing is random has one trial, with the first of the
+    seeds: the others would be the same run.
 
     Args:
         source: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
@@ -167,7 +173,9 @@ def trials(
     chosen = list(dict.fromkeys(seeds)) or [scenario.seed]
     for seed in chosen:
         if not 0 <= seed < 2**63:
-            raise ScenarioError(f"must be from 0 to 2^63 - 1, is {seed}", path="seed", source=called)
+            raise ScenarioError(
+                f"must be from 0 to 2^63 - 1, is {seed}", path="seed", source=called
+            )
     if not scenario.random and not live:
         del chosen[1:]
     texts = tuple(list_assignments(set) if isinstance(set, Mapping) else set)
@@ -187,7 +195,9 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
         try:
             find_quantity(key)
         except KeyError as error:
-            raise ScenarioError(error.args[0], path=f"expect.metrics.{key}", source=source) from None
+            raise ScenarioError(
+                error.args[0], path=f"expect.metrics.{key}", source=source
+            ) from None
     by_s = expect.synchronised_by_s
     if by_s is not None and by_s >= end_s:
         problem = f"must be before the end of the run at {end_s:g} s, is {by_s:g}"
@@ -207,7 +217,9 @@ def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator
             yield f"{prefix}{key}={format_toml_value(value)}"
 
 
-def evaluate_live_log(trial: Trial, log_file: Path, problems: Sequence[str], wall_s: float) -> TrialResult:
+def evaluate_live_log(
+    trial: Trial, log_file: Path, problems: Sequence[str], wall_s: float
+) -> TrialResult:
     """Returns the result of a live trial."""
     kept = log_file if log_file.exists() else None
     try:
@@ -217,7 +229,9 @@ def evaluate_live_log(trial: Trial, log_file: Path, problems: Sequence[str], wal
         result = trial.evaluate(measure_log(log, trial.scenario.expect), wall_s)
         verdict = verify(log)
     except LogError as error:
-        return TrialResult(trial, wall_s=wall_s, error="; ".join([*problems, str(error)]), log=kept)
+        return TrialResult(
+            trial, wall_s=wall_s, error="; ".join([*problems, str(error)]), log=kept
+        )
     ended = "; ".join(problems) or "ended in order"
     session = ExpectationResult("session", not problems, ended, "ends in order")
     judged = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
@@ -234,7 +248,9 @@ TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
 
 
 class ExpectationRow(NamedTuple):
-    """One expectation of one scenario: its worst outcome, in how many of its runs it held, and the mean."""
+    """One expectation of one scenario: its worst outcome, in how many of its runs it held, and
+    the mean.
+    """
 
     scenario: str
     key: str
@@ -279,15 +295,31 @@ class TrialReport(Result):
             by_key: dict[str, list[ExpectationResult]] = {}
             for outcome in (outcome for result in results for outcome in result.outcomes):
                 by_key.setdefault(outcome.key, []).append(outcome)
-            for key, outcomes in by_key.items():  # the worst is the first that failed, then by margin
+            for (
+                key,
+                outcomes,
+            ) in by_key.items():  # the worst is the first that failed, then by margin
                 worst = min(outcomes, key=lambda one: (one.held, one.margin or 0.0))
                 held = sum(one.held for one in outcomes)
                 mean = mean_interval([one.value for one in outcomes])
-                rows.append(ExpectationRow(name, key, worst, held, len(outcomes), mean))
+                rows.append(
+                    ExpectationRow(
+                        scenario=name,
+                        key=key,
+                        worst=worst,
+                        held=held,
+                        runs=len(outcomes),
+                        mean=mean,
+                    )
+                )
             if broken := [result.error for result in results if result.error]:
                 worst = ExpectationResult("a result", False, broken[0], "")
                 whole = len(results) - len(broken)
-                rows.append(ExpectationRow(name, worst.key, worst, whole, len(results)))
+                rows.append(
+                    ExpectationRow(
+                        scenario=name, key=worst.key, worst=worst, held=whole, runs=len(results)
+                    )
+                )
         return rows
 
     def failures(self) -> list[str]:
@@ -297,7 +329,9 @@ class TrialReport(Result):
             failed = [result for result in results if not result.held]
             for result in failed[:MAX_FAILURES_SHOWN]:
                 trial = result.trial
-                lines.append(f"{trial.source}, seed {trial.scenario.seed}: {'; '.join(result.failures)}")
+                lines.append(
+                    f"{trial.source}, seed {trial.scenario.seed}: {'; '.join(result.failures)}"
+                )
                 lines += [f"  {line}" for line in _repeat_lines(result)]
             if more := failed[MAX_FAILURES_SHOWN:]:
                 seeds = ", ".join(str(result.trial.scenario.seed) for result in more)
@@ -307,7 +341,9 @@ class TrialReport(Result):
     def remarks(self) -> list[str]:
         """Returns what else there is to know: what ran once, and how fast it went."""
         first = {name: results[0].trial for name, results in self.scenarios.items()}
-        once = [name for name, trial in first.items() if not (trial.scenario.random or trial.live)]
+        once = [
+            name for name, trial in first.items() if not (trial.scenario.random or trial.live)
+        ]
         changed = self.results[0].trial.overrides if self.results else ()
         remarks = [f"changed in all: {', '.join(changed)}"] if changed else []
         if once:
@@ -323,7 +359,9 @@ class TrialReport(Result):
         """Returns the table as aligned lines; the first holds the heads."""
         rows = self.rows()
         if not any(row.mean for row in rows):
-            return TextTable(TRIAL_COLUMNS, [row.cells() for row in rows], align="lllllrr").lines()
+            return TextTable(
+                TRIAL_COLUMNS, [row.cells() for row in rows], align="lllllrr"
+            ).lines()
         cells = [(*row.cells(), str(row.mean) if row.mean else "") for row in rows]
         return TextTable((*TRIAL_COLUMNS, "mean, 95 %"), cells, align="lllllrrr").lines()
 
@@ -396,7 +434,8 @@ def run_trials(
             replies = ((n, trial.run()) for n, trial in enumerate(batch))
         else:
             if not is_core_cached():
-                next(virtual.execute_virtual(batch[0].scenario))  # compiles, once for all processes
+                # compiles, once for all processes
+                next(virtual.execute_virtual(batch[0].scenario))
             queue = [batch[n] for n in longest_first]
             lost = partial(TrialResult, error=f"its worker process ended, {MAX_LOSSES} times")
             replies = (
@@ -406,7 +445,9 @@ def run_trials(
         for n, result in replies:
             results[n] = result._replace(trial=batch[n])
             done(results[n])
-    return TrialReport([results[n] for n in range(len(batch))], (clock.monotonic_ns() - start_ns) * 1e-9)
+    return TrialReport(
+        [results[n] for n in range(len(batch))], (clock.monotonic_ns() - start_ns) * 1e-9
+    )
 
 
 def check(
@@ -417,7 +458,8 @@ def check(
     jobs: int | None = None,
     on: Workers = None,
 ) -> TrialReport:
-    """Runs a scenario in virtual time, once per seed, and returns the results if all of [expect] held.
+    """Runs a scenario in virtual time, once per seed, and returns the results if all of
+    [expect] held.
 
     The command is `trilat test`.
 
@@ -429,7 +471,8 @@ def check(
         seeds: which seeds; none means the scenario's own.
         set: overrides, as in `{"link.delay_ms": 400}`.
         jobs: how many processes; None for one per core.
-        on: what runs them instead: a Dask scheduler's address, as in "tcp://10.0.0.5:8786", or an executor.
+        on: what runs them instead: a Dask scheduler's address, as in "tcp://10.0.0.5:8786", or
+            an executor.
 
     Raises:
         ScenarioError: the scenario or an override is not valid, or there is no [expect] in it.
@@ -439,7 +482,9 @@ def check(
     __tracebackhide__ = True  # pytest shows the reason, not this line
     report = run_trials(trials(source, seeds, set), jobs, on=on)
     if not report.held:
-        first = next(f"{one.trial}: {'; '.join(one.failures)}" for one in report.results if not one.held)
+        first = next(
+            f"{one.trial}: {'; '.join(one.failures)}" for one in report.results if not one.held
+        )
         raise AssertionError(f"not as expected: {first}\n{report.summary()}")
     return report
 

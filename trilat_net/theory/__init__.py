@@ -1,7 +1,9 @@
-"""The closed loop linearised about its equilibrium: roots, delay margin, stability edges, haptic ports.
+"""The closed loop linearised about its equilibrium: roots, delay margin, stability edges,
+haptic ports.
 
-Invariant: the equations are written anew in plain NumPy and share nothing with the core's leaves, so that
-roots and runs check each other; the simulation only supplies the pose at which a run settles.
+Invariant: the equations are written anew in plain NumPy and share nothing with the core's
+leaves, so that roots and runs check each other; the simulation only supplies the pose at which
+a run settles.
 
 Definitions, equations and sources are in docs/linear.md and docs/ports.md.
 """

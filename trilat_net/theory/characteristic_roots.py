@@ -1,22 +1,24 @@
-"""Characteristic roots of a nonlinear eigenproblem Delta(s) v = 0: of loops with delays, and those at zero.
+"""Characteristic roots of a nonlinear eigenproblem Delta(s) v = 0: of loops with delays, and
+those at zero.
 
-Invariant: a root solves the equation to rounding, whatever discretisation its first guess came from.
-Roots at zero that are there for every delay (shared poses, estimates without excitation) are counted, and
-never called the rightmost.
+Invariant: a root solves the equation to rounding, whatever discretisation its first guess came
+from. Roots at zero that are there for every delay (shared poses, estimates without excitation)
+are counted, and never called the rightmost.
 
-Newton's method in the form of successive linear problems: solve Delta(s) v = mu Delta'(s) v and subtract
-the smallest mu from s. It converges quadratically for simple roots, and for multiple ones with as many
-vectors, which loops of identical sites have. Ruhe, "Algorithms for the nonlinear eigenvalue problem",
-SIAM J. Numerical Analysis 10 (1973).
+Newton's method in the form of successive linear problems: solve Delta(s) v = mu Delta'(s) v and
+subtract the smallest mu from s. It converges quadratically for simple roots, and for multiple
+ones with as many vectors, which loops of identical sites have. Ruhe, "Algorithms for the
+nonlinear eigenvalue problem", SIAM J. Numerical Analysis 10 (1973).
 
-Guesses for the continuous loop come from the Chebyshev pseudospectral discretisation of the infinitesimal
-generator, whose order doubles until the wanted roots agree. Breda, Maset and Vermiglio, "Pseudospectral
-differencing methods for characteristic roots of delay differential equations", SIAM J. Scientific Computing
-27 (2005); nodes after Trefethen, "Spectral Methods in MATLAB" (2000).
+Guesses for the continuous loop come from the Chebyshev pseudospectral discretisation of the
+infinitesimal generator, whose order doubles until the wanted roots agree. Breda, Maset and
+Vermiglio, "Pseudospectral differencing methods for characteristic roots of delay differential
+equations", SIAM J. Scientific Computing 27 (2005); nodes after Trefethen, "Spectral Methods in
+MATLAB" (2000).
 
-`limit_blas_threads` keeps OpenBLAS on one thread for these small matrices: it shares products of a
-hundred rows out to all cores and busy-waits, which takes a hundred times as long if another process has a
-core.
+`limit_blas_threads` keeps OpenBLAS on one thread for these small matrices: it shares products
+of a hundred rows out to all cores and busy-waits, which takes a hundred times as long if
+another process has a core.
 """
 
 import ctypes
@@ -59,7 +61,11 @@ _INITIAL_ORDER = 12
 MAX_GENERATOR_SIZE = 1600
 """The largest discretisation: its eigenvalues take some seconds."""
 _ROOT_AGREEMENT = 1e-9
-_BLAS_SYMBOLS = ("scipy_openblas_{}_num_threads64_", "openblas_{}_num_threads64_", "openblas_{}_num_threads")
+_BLAS_SYMBOLS = (
+    "scipy_openblas_{}_num_threads64_",
+    "openblas_{}_num_threads64_",
+    "openblas_{}_num_threads",
+)
 
 
 @contextmanager
@@ -101,7 +107,8 @@ class Pencil(NamedTuple):
         A: shape (n, n).
         delays: T_k, s, shape (K,).
         Ad: A_k, shape (K, n, n).
-        E: 1 of each state that has a rate, 0 of one that the others give at once; None: all have one.
+        E: 1 of each state that has a rate, 0 of one that the others give at once; None: all
+            have one.
     """
 
     A: Array
@@ -140,17 +147,22 @@ class Pencil(NamedTuple):
 
 
 MovingPart = tuple[Pencil, tuple[str, ...], int]
-"""A loop without the states that nothing changes, or that change nothing: its characteristic equation, the
-names of its states, and the number of states left out, each with a root at zero."""
+"""A loop without the states that nothing changes, or that change nothing: its characteristic
+equation, the names of its states, and the number of states left out, each with a root at
+zero.
+"""
 
 
 def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
     """Returns the part of a loop that moves."""
-    effects = np.abs(pencil.A) + np.abs(pencil.Ad).sum(axis=0)  # of state j on the rate of state i
+    # of state j on the rate of state i
+    effects = np.abs(pencil.A) + np.abs(pencil.Ad).sum(axis=0)
     kept = list(range(len(names)))
     while True:
         inner = effects[np.ix_(kept, kept)]
-        idle = [place for n, place in enumerate(kept) if not inner[n].any() or not inner[:, n].any()]
+        idle = [
+            place for n, place in enumerate(kept) if not inner[n].any() or not inner[:, n].any()
+        ]
         if not idle:
             break
         kept.remove(idle[0])
@@ -158,7 +170,9 @@ def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
     Ad = pencil.Ad[:, rows, columns]
     acts = Ad.any(axis=(1, 2))
     E = None if pencil.E is None else pencil.E[kept]
-    moving = pencil._replace(A=pencil.A[rows, columns], delays=pencil.delays[acts], Ad=Ad[acts], E=E)
+    moving = pencil._replace(
+        A=pencil.A[rows, columns], delays=pencil.delays[acts], Ad=Ad[acts], E=E
+    )
     return moving, tuple(names[place] for place in kept), len(names) - len(kept)
 
 
@@ -187,7 +201,9 @@ class CharacteristicRoot(NamedTuple):
         for state in self.states:
             site, _, name = state.partition(".")
             sites.setdefault(name, []).append(site)
-        return "; ".join(f"{name} of {', '.join(sorted(names))}" for name, names in sites.items())
+        return "; ".join(
+            f"{name} of {', '.join(sorted(names))}" for name, names in sites.items()
+        )
 
 
 class Spectrum(NamedTuple):
@@ -199,9 +215,10 @@ class Spectrum(NamedTuple):
         drifting: number of those without a vector of their own, which grow with t.
         dropped: number of candidates that led to no root.
         order: of the discretisation that gave the candidates; 0 if none was needed.
-        span_s: the period of delays and tick rates over which they are computed, or the span of delays that
-            do not repeat, s; None if each tick is like the one before.
-        deviation_per_s: of the rightmost root, if delays do not repeat, by the parts of the span, 1/s.
+        span_s: the period of delays and tick rates over which they are computed, or the span of
+            delays that do not repeat, s; None if each tick is like the one before.
+        deviation_per_s: of the rightmost root, if delays do not repeat, by the parts of the
+            span, 1/s.
     """
 
     roots: tuple[CharacteristicRoot, ...]
@@ -219,7 +236,9 @@ class Spectrum(NamedTuple):
             return ""
         if self.deviation_per_s is None:
             return f", over the period of {self.span_s:.6g} s"
-        return f", over {self.span_s:.4g} s of the delays in use, +- {self.deviation_per_s:.1g} /s"
+        return (
+            f", over {self.span_s:.4g} s of the delays in use, +- {self.deviation_per_s:.1g} /s"
+        )
 
     @property
     def rightmost(self) -> CharacteristicRoot | None:
@@ -236,13 +255,18 @@ class Spectrum(NamedTuple):
         return "at the edge" if re >= -edge_per_s or self.drifting else "stable"
 
 
-def _solve_for_root(pencil: Pencil, first: complex, names: Sequence[str]) -> CharacteristicRoot | None:
-    """Returns the root that Newton's method finds from a first guess, 1/s, or None if it finds none."""
+def _solve_for_root(
+    pencil: Pencil, first: complex, names: Sequence[str]
+) -> CharacteristicRoot | None:
+    """Returns the root that Newton's method finds from a first guess, 1/s, or None if it finds
+    none.
+    """
     s = complex(first)
     with np.errstate(all="ignore"):
         for _ in range(_MAX_NEWTON_STEPS):
             delta, derivative = pencil.at(s)
-            if not (np.isfinite(delta).all() and np.isfinite(derivative).all()):  # exp(-s T) far to the left
+            # exp(-s T) far to the left
+            if not (np.isfinite(delta).all() and np.isfinite(derivative).all()):
                 return None
             try:
                 if pencil.E is None:
@@ -270,9 +294,11 @@ def _solve_for_root(pencil: Pencil, first: complex, names: Sequence[str]) -> Cha
 
 
 def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | None:
-    """Returns the number of vectors of a root at s, and each state's participation; None if it is no root.
+    """Returns the number of vectors of a root at s, and each state's participation; None if it
+    is no root.
 
-    Participation is the abs of the diagonal of the residue of Delta(s)^-1, which does not depend on units.
+    Participation is the abs of the diagonal of the residue of Delta(s)^-1, which does not
+    depend on units.
     """
     delta, derivative = pencil.at(s)
     if not np.isfinite(delta).all():
@@ -292,18 +318,22 @@ def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | No
 
 
 def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
-    """Returns the numbers of roots that are zero by structure, and of those among them that drift.
+    """Returns the numbers of roots that are zero by structure, and of those among them that
+    drift.
 
-    With Delta(s) = D_0 + s D_1 + s^2 D_2 + ..., the block Toeplitz matrix of D_0 ... D_(m-1) has as many
-    null vectors as there are roots at zero, each chain of them counted up to length m. When that number
-    stops rising with m all are counted; those of chains longer than 1 grow as t does.
+    With Delta(s) = D_0 + s D_1 + s^2 D_2 + ..., the block Toeplitz matrix of D_0 ... D_(m-1)
+    has as many null vectors as there are roots at zero, each chain of them counted up to length
+    m. When that number stops rising with m all are counted; those of chains longer than 1 grow
+    as t does.
     """
     counts = [0]
     for length in range(1, _LONGEST_CHAIN + 1):
         terms = [pencil.taylor(power) for power in range(length)]
         if not len(terms[0]):
             return 0, 0
-        toeplitz = np.sum([np.kron(np.eye(length, k=-power), D) for power, D in enumerate(terms)], axis=0)
+        toeplitz = np.sum(
+            [np.kron(np.eye(length, k=-power), D) for power, D in enumerate(terms)], axis=0
+        )
         values = np.linalg.svd(toeplitz, compute_uv=False)
         counts.append(int(np.sum(values <= ZERO_SHARE * values[0])))
         if counts[-1] == counts[-2]:
@@ -314,10 +344,11 @@ def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
 def refine_roots(
     pencil: Pencil, candidates: Complex, names: Sequence[str], wanted: int
 ) -> tuple[list[CharacteristicRoot], int]:
-    """Returns the rightmost `wanted` roots near some candidates, and the number of candidates dropped.
+    """Returns the rightmost `wanted` roots near some candidates, and the number of candidates
+    dropped.
 
-    Candidates are guesses of nonzero roots, shape (K,), by falling real part; after two more than wanted the
-    others are skipped, because Newton's method may change their order.
+    Candidates are guesses of nonzero roots, shape (K,), by falling real part; after two more
+    than wanted the others are skipped, because Newton's method may change their order.
     """
     found: list[CharacteristicRoot] = []
     dropped = 0
@@ -329,7 +360,9 @@ def refine_roots(
         root = _solve_for_root(pencil, complex(guess), names)
         if root is None or abs(root.s) < SAME_ROOT_TOLERANCE:
             dropped += 1
-        elif all(abs(root.s - one.s) >= SAME_ROOT_TOLERANCE * (1.0 + abs(root.s)) for one in found):
+        elif all(
+            abs(root.s - one.s) >= SAME_ROOT_TOLERANCE * (1.0 + abs(root.s)) for one in found
+        ):
             found.append(root)
     return sorted(found, key=lambda one: (-round(one.s.real, 9), one.s.imag))[:wanted], dropped
 
@@ -338,17 +371,23 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
     """Returns the part of a loop that moves."""
     Ad = np.array([term.A for term in loop.delayed]).reshape(-1, *loop.A.shape)
     delays_s = np.array([term.delay_s for term in loop.delayed])
-    moving, names, constant = extract_moving_part(Pencil(loop.A, delays_s, Ad, E=loop.E), loop.names)
+    moving, names, constant = extract_moving_part(
+        Pencil(loop.A, delays_s, Ad, E=loop.E), loop.names
+    )
     return moving, names, constant + loop.left_out
 
 
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
-    """Returns the rightmost roots of a loop; conjugate ones and multiple ones count once in `wanted`."""
+    """Returns the rightmost roots of a loop; conjugate ones and multiple ones count once in
+    `wanted`.
+    """
     with limit_blas_threads():
         pencil, names, constant = find_moving_part(loop)
         zeros, drifting = count_zero_roots(pencil)
         if not len(names):
-            return Spectrum((), constant + zeros, drifting, 0, 0)
+            return Spectrum(
+                roots=(), zeros=constant + zeros, drifting=drifting, dropped=0, order=0
+            )
         has_delays = len(pencil.delays) > 0
         order = _INITIAL_ORDER if has_delays else 0
         before = None
@@ -357,12 +396,19 @@ def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
             if pencil.E is not None:
                 matrix = _eliminate_states(matrix, pencil.E)
             values = np.linalg.eigvals(matrix).astype(np.complex128)
-            values = values[np.argsort(np.abs(values), kind="stable")][zeros:]  # the smallest stand for zeros
+            # the smallest stand for zeros
+            values = values[np.argsort(np.abs(values), kind="stable")][zeros:]
             falling = np.lexsort((np.abs(values.imag), -np.round(values.real, 9)))
             roots, dropped = refine_roots(pencil, values[falling], names, wanted)
             too_large = len(names) + 2 * order * len(pencil.delayed_states) > MAX_GENERATOR_SIZE
             if not has_delays or too_large or (before is not None and _agree(before, roots)):
-                return Spectrum(tuple(roots), constant + zeros, drifting, dropped, order)
+                return Spectrum(
+                    roots=tuple(roots),
+                    zeros=constant + zeros,
+                    drifting=drifting,
+                    dropped=dropped,
+                    order=order,
+                )
             before = roots
             order = 2 * order
 
@@ -381,7 +427,8 @@ def _agree(before: list[CharacteristicRoot], now: list[CharacteristicRoot]) -> b
 
 
 def discretise_generator(pencil: Pencil, order: int) -> Array:
-    """Returns the discretised generator of a pencil with delays, by polynomials of degree `order`.
+    """Returns the discretised generator of a pencil with delays, by polynomials of degree
+    `order`.
 
     Its states are the loop's, and the history of their delayed part at Chebyshev nodes.
     """
@@ -393,7 +440,9 @@ def discretise_generator(pencil: Pencil, order: int) -> Array:
     whole[:n, :n] = pencil.A
     # history over [-longest, 0] as a polynomial of x in [-1, 1]
     for weights, Ad in zip(
-        chebyshev_interpolation(order, 1.0 - 2.0 * pencil.delays / longest_s), pencil.Ad, strict=True
+        chebyshev_interpolation(order, 1.0 - 2.0 * pencil.delays / longest_s),
+        pencil.Ad,
+        strict=True,
     ):
         whole[:n, delayed] += weights[0] * Ad[:, delayed]
         whole[:n, n:] += np.kron(weights[1:], Ad[:, delayed])
@@ -410,7 +459,9 @@ def chebyshev_nodes(order: int) -> Array:
 
 
 def chebyshev_interpolation(order: int, x: Array) -> Array:
-    """Returns the matrix from values at the nodes to the polynomial's values at x, shape (K, M + 1)."""
+    """Returns the matrix from values at the nodes to the polynomial's values at x, shape (K, M
+    + 1).
+    """
     at_nodes = chebvander(chebyshev_nodes(order), order)
     return np.linalg.solve(at_nodes.T, chebvander(x, order).T).T.astype(np.float64)
 

@@ -1,14 +1,14 @@
 """The delay margin: the common delays of all links for which the continuous loop is stable.
 
-Invariant: crossings of the imaginary axis are searched over frequency and not over delay, so that none
-hides between two delays.
+Invariant: crossings of the imaginary axis are searched over frequency and not over delay, so
+that none hides between two delays.
 
-With one delay T on all links the loop has a root at j w where det(I - exp(-j w T) G(j w)) = 0, with
-G(j w) = the delayed rows of (j w I - A)^-1 A_d: an eigenvalue of G has modulus 1, and its phase is w T
-modulo 2 pi. A pair of roots moves to the right with rising T where that modulus falls with w, to the left
-where it rises. Chen, Gu and Nett, "A new method for computing delay margins for stability of linear delay
-systems", Systems & Control Letters 26 (1995); Cooke and van den Driessche, "On zeroes of some transcendental
-equations", Funkcialaj Ekvacioj 29 (1986).
+With one delay T on all links the loop has a root at j w where det(I - exp(-j w T) G(j w)) = 0,
+with G(j w) = the delayed rows of (j w I - A)^-1 A_d: an eigenvalue of G has modulus 1, and its
+phase is w T modulo 2 pi. A pair of roots moves to the right with rising T where that modulus
+falls with w, to the left where it rises. Chen, Gu and Nett, "A new method for computing delay
+margins for stability of linear delay systems", Systems & Control Letters 26 (1995); Cooke and
+van den Driessche, "On zeroes of some transcendental equations", Funkcialaj Ekvacioj 29 (1986).
 """
 
 import math
@@ -32,7 +32,9 @@ _LOWEST = 1e-4
 """The lowest frequency, relative to the highest at which a crossing is possible."""
 _BISECTIONS = 60
 _OUTSIDE = 1.0 + 1e-9
-"""A modulus below this may be 1 but for rounding, as that of a line without losses is at every frequency."""
+"""A modulus below this may be 1 but for rounding, as that of a line without losses is at every
+frequency.
+"""
 
 
 class AxisCrossing(NamedTuple):
@@ -41,7 +43,8 @@ class AxisCrossing(NamedTuple):
     Attributes:
         delay_s: the common delay, s.
         omega_rad_s: the frequency, rad/s.
-        pairs: number of pairs that go to the right with rising delay; negative if they go to the left.
+        pairs: number of pairs that go to the right with rising delay; negative if they go to
+            the left.
     """
 
     delay_s: float
@@ -98,7 +101,11 @@ class DelayMargin(NamedTuple):
         texts = [interval.words for interval in self.intervals]
         if texts == [""]:
             return f"stable for every common delay up to {MAX_COMMON_DELAY_S:g} s"
-        more = f", and in {count_nouns(len(texts) - _SHOWN, 'more range')}" if len(texts) > _SHOWN else ""
+        more = (
+            f", and in {count_nouns(len(texts) - _SHOWN, 'more range')}"
+            if len(texts) > _SHOWN
+            else ""
+        )
         return f"stable for common delays {', '.join(texts[:_SHOWN])}{more}"
 
 
@@ -126,13 +133,17 @@ def find_delay_margin(loop: LinearLoop) -> DelayMargin:
     for crossing in crossings:
         count += 2 * crossing.pairs if crossing.omega_rad_s else crossing.pairs
         if stable and count > 0:
-            intervals.append(DelayInterval(low.delay_s if low else 0.0, crossing.delay_s, low, crossing))
+            intervals.append(
+                DelayInterval(low.delay_s if low else 0.0, crossing.delay_s, low, crossing)
+            )
             stable = False
         elif not stable and count == 0:
             low = crossing
             stable = True
     if stable:
-        intervals.append(DelayInterval(low.delay_s if low else 0.0, MAX_COMMON_DELAY_S, low, None))
+        intervals.append(
+            DelayInterval(low.delay_s if low else 0.0, MAX_COMMON_DELAY_S, low, None)
+        )
     return DelayMargin(tuple(intervals), tuple(crossings))
 
 
@@ -147,9 +158,11 @@ def _count_unstable_roots(loop: LinearLoop) -> int:
 
 
 def find_axis_crossings(loop: LinearLoop) -> tuple[list[AxisCrossing], bool]:
-    """Returns all crossings of the imaginary axis for a common delay up to `MAX_COMMON_DELAY_S`.
+    """Returns all crossings of the imaginary axis for a common delay up to
+    `MAX_COMMON_DELAY_S`.
 
-    And whether roots are on it for every delay, as G has an eigenvalue of modulus 1 at every frequency.
+    And whether roots are on it for every delay, as G has an eigenvalue of modulus 1 at every
+    frequency.
     """
     pencil, *_ = characteristic_roots.find_moving_part(set_common_delay(loop, 1.0))
     if not len(pencil.delays):
@@ -198,7 +211,9 @@ class _FrequencySweep:
         """Returns frequencies to evaluate, rad/s, denser about the loop's own modes."""
         even = np.geomspace(_LOWEST * self._highest, self._highest, _POINTS)
         modes = self._modes[np.abs(self._modes.imag) > 0.0]
-        about = np.abs(modes.imag)[:, np.newaxis] + np.abs(modes.real)[:, np.newaxis] * np.linspace(-3, 3, 13)
+        about = np.abs(modes.imag)[:, np.newaxis] + np.abs(modes.real)[
+            :, np.newaxis
+        ] * np.linspace(-3, 3, 13)
         both = np.unique(np.concatenate([even, about.ravel()]))
         kept: Array = both[(both >= even[0]) & (both <= even[-1])]
         return kept
@@ -236,5 +251,7 @@ class _FrequencySweep:
             turns = range(int(MAX_COMMON_DELAY_S * omega / (2.0 * math.pi)) + 2)
             delays_s = [(phase + 2.0 * math.pi * turn) / omega for turn in turns]
             sign = 1 if pairs > 0 else -1
-            crossings += [AxisCrossing(d, omega, sign) for d in delays_s if 0.0 < d <= MAX_COMMON_DELAY_S]
+            crossings += [
+                AxisCrossing(d, omega, sign) for d in delays_s if 0.0 < d <= MAX_COMMON_DELAY_S
+            ]
         return crossings

@@ -1,8 +1,9 @@
-"""Equilibria of the loop: at the end of a run, nearest to a pose, or predicted by the linear loop.
+"""Equilibria of the loop: at the end of a run, nearest to a pose, or predicted by the linear
+loop.
 
-Invariant: the result solves the equations to 1e-10, or a note says that it does not. Equilibria are not
-isolated (any pose that the sites agree on may be one), so each is the nearest to a stated pose. The
-simulation supplies starting values only.
+Invariant: the result solves the equations to 1e-10, or a note says that it does not. Equilibria
+are not isolated (any pose that the sites agree on may be one), so each is the nearest to a
+stated pose. The simulation supplies starting values only.
 """
 
 from collections.abc import Iterator, Sequence
@@ -47,11 +48,14 @@ _MAX_STEP = 0.3
 _MAX_HALVINGS = 20
 _SETTLING_TICKS = 20_000
 _FLAT = 1e-8
-"""A singular value this small, relative to the largest, belongs to a direction of further equilibria."""
+"""A singular value this small, relative to the largest, belongs to a direction of further
+equilibria.
+"""
 
 
 def prolong_scenario(scenario: Scenario, duration_s: float) -> Scenario:
-    """Returns the experiment prolonged: forces present at its end stay, but for those that swing.
+    """Returns the experiment prolonged: forces present at its end stay, but for those that
+    swing.
 
     Nothing new begins.
     """
@@ -63,24 +67,33 @@ def prolong_scenario(scenario: Scenario, duration_s: float) -> Scenario:
             if getattr(actor, "end_s", 0.0) > end_s and hasattr(actor, "stiffness_nm_rad")
             else actor
             for actor in actors
-            if getattr(actor, "start_s", 0.0) <= end_s and not isinstance(actor, Chirp | Multisine)
+            if getattr(actor, "start_s", 0.0) <= end_s
+            and not isinstance(actor, Chirp | Multisine)
         )
 
     sites = {
-        name: msgspec.structs.replace(spec, hands=prolong(spec.hands), environment=prolong(spec.environment))
+        name: msgspec.structs.replace(
+            spec, hands=prolong(spec.hands), environment=prolong(spec.environment)
+        )
         for name, spec in scenario.sites.items()
     }
     timeline = tuple(change for change in scenario.timeline if change.at_s <= end_s)
-    return msgspec.structs.replace(scenario, sites=sites, timeline=timeline, duration_s=duration_s)
+    return msgspec.structs.replace(
+        scenario, sites=sites, timeline=timeline, duration_s=duration_s
+    )
 
 
 def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibrium) -> Array:
-    """Returns the accelerations and rates of estimates at a pose, in the order of the loop's states.
+    """Returns the accelerations and rates of estimates at a pose, in the order of the loop's
+    states.
 
     The derivatives of the angles are zero.
     """
     x = linear_loop.gather_site_arguments(conditions, rest)
-    states = [np.concatenate([np.zeros_like(one.qdd), one.qdd, one.estimate]) for one in conditions.rates(x)]
+    states = [
+        np.concatenate([np.zeros_like(one.qdd), one.qdd, one.estimate])
+        for one in conditions.rates(x)
+    ]
     return _select_loop_states(conditions, states)
 
 
@@ -124,8 +137,12 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
     return rest._replace(residual=float(np.abs(residual).max()))
 
 
-def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step: Array) -> Equilibrium:
-    """Returns an equilibrium shifted by a deviation of the loop's states; velocities do not count."""
+def _shift_equilibrium(
+    conditions: OperatingConditions, rest: Equilibrium, step: Array
+) -> Equilibrium:
+    """Returns an equilibrium shifted by a deviation of the loop's states; velocities do not
+    count.
+    """
     masks = linear_loop.find_loop_states(conditions)
     parts = np.split(step, np.cumsum([np.count_nonzero(mask) for mask in masks])[:-1])
     q = np.array(rest.q)
@@ -140,7 +157,9 @@ def _shift_equilibrium(conditions: OperatingConditions, rest: Equilibrium, step:
 
 
 def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
-    """Returns vectors of several lengths as the rows of one array, the shorter ones followed by zeros."""
+    """Returns vectors of several lengths as the rows of one array, the shorter ones followed by
+    zeros.
+    """
     padded = np.zeros((len(rows), max(map(len, rows))))
     for own, row in zip(padded, rows, strict=True):
         own[: len(row)] = row
@@ -148,7 +167,9 @@ def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
 
 
 def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -> None:
-    for site, x in zip(conditions.sites, linear_loop.gather_site_arguments(conditions, rest), strict=True):
+    for site, x in zip(
+        conditions.sites, linear_loop.gather_site_arguments(conditions, rest), strict=True
+    ):
         arm = place_arm(site, x[lay_out_arguments(site).q])
         if not follow_peers(site, arm, x).least > SINGULAR:
             raise ScenarioError(
@@ -159,11 +180,13 @@ def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -
 
 
 def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
-    """Returns the equilibrium that the linear loop reaches from the start poses if its other modes decay.
+    """Returns the equilibrium that the linear loop reaches from the start poses if its other
+    modes decay.
 
-    A loop with roots at zero keeps part of its history: with null vectors W' S = 0 and S V = 0 of S = A
-    + sum_k A_k, and D = I + sum_k T_k A_k, it is V (W' D V)^-1 W' (x(0) + sum_k A_k int_{-T_k}^0 x). Hale
-    and Verduyn Lunel, "Introduction to Functional Differential Equations" (1993), chapter 7.
+    A loop with roots at zero keeps part of its history: with null vectors W' S = 0 and S V = 0
+    of S = A + sum_k A_k, and D = I + sum_k T_k A_k, it is V (W' D V)^-1 W' (x(0) + sum_k A_k
+    int_{-T_k}^0 x). Hale and Verduyn Lunel, "Introduction to Functional Differential Equations"
+    (1993), chapter 7.
     """
     q = pad_rows([spec.q0_rad for spec in scenario.sites.values()])
     start = Equilibrium(q, _complete_estimates(conditions), "", 0.0)
@@ -180,18 +203,24 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
             conditions.sites, start.q - rest.q, start.theta_hat - rest.theta_hat, strict=True
         ):
             at = lay_out_arguments(site)
-            moved.append(np.concatenate([dq[: at.joints], np.zeros(at.joints), d_theta[: at.parameters]]))
+            moved.append(
+                np.concatenate([dq[: at.joints], np.zeros(at.joints), d_theta[: at.parameters]])
+            )
         deviation = _select_loop_states(conditions, moved)
         loop = linear_loop.linearise_loop(conditions, rest, every_estimate=True)
         kept = _project_on_zero_roots(loop, deviation)
         if kept is None:
             break
         rest = find_nearest_equilibrium(conditions, _shift_equilibrium(conditions, rest, kept))
-    return rest._replace(how="predicted from the start poses: what the linear loop keeps of its start")
+    return rest._replace(
+        how="predicted from the start poses: what the linear loop keeps of its start"
+    )
 
 
 def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Array | None:
-    """Returns the part of a constant deviation that stays; None if roots at zero have too few vectors."""
+    """Returns the part of a constant deviation that stays; None if roots at zero have too few
+    vectors.
+    """
     left, values, right = np.linalg.svd(loop.static_matrix)
     count = int(np.sum(values <= _FLAT * values[0]))
     if not count:
@@ -206,19 +235,24 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
-    """Returns the equilibrium of a scenario: at the end of a run, or at a pose, rad, with true estimates.
+    """Returns the equilibrium of a scenario: at the end of a run, or at a pose, rad, with true
+    estimates.
 
     Raises:
-        ScenarioError: the scenario has no linear loop, or no equilibrium near the end of its run.
+        ScenarioError: the scenario has no linear loop, or no equilibrium near the end of its
+            run.
         UsageError: the pose is not a finite angle for every joint.
     """
     conditions = derive_operating_conditions(scenario)
-    rest = _find_at_run_end(scenario, conditions) if pose is None else _take_pose(pose, conditions)
+    rest = (
+        _find_at_run_end(scenario, conditions) if pose is None else _take_pose(pose, conditions)
+    )
     return rest._replace(notes=tuple(_describe_limits(conditions, rest)))
 
 
 def predict_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Returns the equilibrium that the linear loop predicts from the start poses, without a run.
+    """Returns the equilibrium that the linear loop predicts from the start poses, without a
+    run.
 
     Raises:
         ScenarioError: the scenario has no linear loop, or no equilibrium there.
@@ -228,7 +262,8 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
 
 
 def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
-    """Returns the equilibrium of a scenario nearest to that of another one; the same if it still is one.
+    """Returns the equilibrium of a scenario nearest to that of another one; the same if it
+    still is one.
 
     Raises:
         ScenarioError: the scenario has no linear loop, or no equilibrium there.
@@ -237,16 +272,19 @@ def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
     start = rest._replace(theta_hat=_complete_estimates(conditions, rest.theta_hat))
     if (
         conditions.has_forms
-        or float(np.abs(compute_equilibrium_residual(conditions, start)).max()) <= MAX_EQUILIBRIUM_RESIDUAL
+        or float(np.abs(compute_equilibrium_residual(conditions, start)).max())
+        <= MAX_EQUILIBRIUM_RESIDUAL
     ):
         return start
     return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
 
 
 def choose_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Returns the equilibrium of a scenario: predicted if any shared pose is one, else the end of a run.
+    """Returns the equilibrium of a scenario: predicted if any shared pose is one, else the end
+    of a run.
 
-    Any shared pose is an equilibrium if no site has estimates and no operator or environment acts.
+    Any shared pose is an equilibrium if no site has estimates and no operator or environment
+    acts.
 
     Raises:
         ScenarioError: the scenario has no linear loop, or no equilibrium there.
@@ -261,8 +299,11 @@ def choose_equilibrium(scenario: Scenario) -> Equilibrium:
     return find_equilibrium(scenario)
 
 
-def _complete_estimates(conditions: OperatingConditions, theta_hat: Array | None = None) -> Array:
-    """Returns estimates, the truth if none are given; of laws that learn nothing, the law's parameters.
+def _complete_estimates(
+    conditions: OperatingConditions, theta_hat: Array | None = None
+) -> Array:
+    """Returns estimates, the truth if none are given; of laws that learn nothing, the law's
+    parameters.
 
     Of a law of one's own it is the memory, by default that at the beginning.
     """
@@ -278,7 +319,9 @@ def _complete_estimates(conditions: OperatingConditions, theta_hat: Array | None
     return pad_rows(rows)
 
 
-def _settle_memories(conditions: OperatingConditions, rest: Equilibrium, ticks: int) -> Equilibrium:
+def _settle_memories(
+    conditions: OperatingConditions, rest: Equilibrium, ticks: int
+) -> Equilibrium:
     theta_hat = rest.theta_hat.copy()
     for n, (site, x) in enumerate(
         zip(conditions.sites, linear_loop.gather_site_arguments(conditions, rest), strict=True)
@@ -293,11 +336,11 @@ def _take_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equi
     task = conditions.sites[0].layout.task
     if len(pose) != at.coordinates or not np.isfinite(pose).all():
         count = "two" if at.coordinates == 2 else str(at.coordinates)
-        numbers = f"{count_nouns(count, 'angle')} in rad" + (", one per joint" if at.coordinates != 2 else "")
+        numbers = f"{count_nouns(count, 'angle')} in rad" + (
+            ", one per joint" if at.coordinates != 2 else ""
+        )
         if task:
-            numbers = (
-                f"a place in m{' and a rotation vector in rad' * (at.coordinates > 3)} of the end effectors"
-            )
+            numbers = f"a place in m{' and a rotation vector in rad' * (at.coordinates > 3)} of the end effectors"
         raise UsageError(
             f"--pose is {numbers}, as in --pose 0.1,0.3{',...' * (at.coordinates > 2)}, not {pose}"
         )
@@ -313,11 +356,14 @@ def _take_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equi
     if conditions.has_forms:
         return rest
     rest = _settle_memories(conditions, rest, _SETTLING_TICKS)
-    return rest._replace(residual=float(np.abs(compute_equilibrium_residual(conditions, rest)).max()))
+    return rest._replace(
+        residual=float(np.abs(compute_equilibrium_residual(conditions, rest)).max())
+    )
 
 
 def reach_pose(site: SiteSetup, pose: Array) -> Array:
-    """Returns the angles, nearest to the start pose, at which a site's end effector is at a shared pose.
+    """Returns the angles, nearest to the start pose, at which a site's end effector is at a
+    shared pose.
 
     Raises:
         ScenarioError: it cannot be there along the axes that the site follows.
@@ -341,7 +387,9 @@ def reach_pose(site: SiteSetup, pose: Array) -> Array:
 
 
 def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
-    """Returns the mean of what sites share of their start poses: angles, or their end effectors' poses."""
+    """Returns the mean of what sites share of their start poses: angles, or their end
+    effectors' poses.
+    """
     conditions = derive_operating_conditions(scenario)
     count = len(conditions.sites)
     q = pad_rows([site.q0 for site in conditions.sites])
@@ -358,7 +406,11 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
     while True:
         states = run.advance_watching(until_s)
         speed_rad_s = max(float(values[-BUCKETS_PER_S:, 1].max()) for values in run.maxima)
-        if run.diverged_s is not None or speed_rad_s < EQUILIBRIUM_SPEED_RAD_S or 2.0 * until_s > most_s:
+        if (
+            run.diverged_s is not None
+            or speed_rad_s < EQUILIBRIUM_SPEED_RAD_S
+            or 2.0 * until_s > most_s
+        ):
             break
         until_s *= 2.0
     if run.diverged_s is not None:
@@ -374,9 +426,12 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
         how = f"the run still moves at {run.ran_s:.4g} s ({speed_rad_s:.2g} rad/s): the equilibrium nearest "
         how += "to the mean of its last quarter"
     laws = scenario.controls
-    if any(isinstance(law, ImportedLaw) for law in laws):  # of such a law the estimate is its memory
+    # of such a law the estimate is its memory
+    if any(isinstance(law, ImportedLaw) for law in laws):
         rows = zip(laws, theta_hat, run.memories, strict=True)
-        theta_hat = pad_rows([own if isinstance(law, ImportedLaw) else row for law, row, own in rows])
+        theta_hat = pad_rows(
+            [own if isinstance(law, ImportedLaw) else row for law, row, own in rows]
+        )
     start = Equilibrium(q, _complete_estimates(conditions, theta_hat), how, 0.0)
     start = _settle_memories(conditions, start, 1)
     return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
@@ -400,7 +455,10 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
         )
     x = linear_loop.gather_site_arguments(conditions, rest)
     for site, own in zip(conditions.sites, x, strict=True):
-        least = follow_peers(site, place_arm(site, own[lay_out_arguments(site).q]), own).least ** 0.5
+        least = (
+            follow_peers(site, place_arm(site, own[lay_out_arguments(site).q]), own).least
+            ** 0.5
+        )
         task = None if site.chain is None else site.chain.task
         if task is not None and least < task.singular_value:
             yield (

@@ -1,28 +1,31 @@
-"""Roots of the sampled loop by Floquet's theory, over the period of tick rates and delays, or a span of them.
+"""Roots of the sampled loop by Floquet's theory, over the period of tick rates and delays, or a
+span of them.
 
-    X_i[k + 1] = P_i X_i[k] + sum_j P_ij X_j[m_ij(k)],    M v = mu v over the span T,    s = ln(mu) / T
+    X_i[k + 1] = P_i X_i[k] + sum_j P_ij X_j[m_ij(k)],    M v = mu v over the span T,    s =
+    ln(mu) / T
 
 with m_ij(k) the sample of j that site i uses at its tick k, every site at its own rate.
 
-Invariant: no delay is averaged. Where delays and rates repeat after T the roots are exact; where delays are
-drawn or recorded they are those of T as though it repeated, with the deviation between its parts. Constant
-motions (shared poses, estimates without excitation), which are there for any delays, are divided out.
+Invariant: no delay is averaged. Where delays and rates repeat after T the roots are exact;
+where delays are drawn or recorded they are those of T as though it repeated, with the deviation
+between its parts. Constant motions (shared poses, estimates without excitation), which are
+there for any delays, are divided out.
 
-mu are Ritz values of a block Krylov space: Saad, "Numerical Methods for Large Eigenvalue Problems", second
-edition (2011), chapter 6.
+mu are Ritz values of a block Krylov space: Saad, "Numerical Methods for Large Eigenvalue
+Problems", second edition (2011), chapter 6.
 
 The sampled loop, linearised tick by tick: each site over a period of its own rate.
 
     X_i[k + 1] = P_i X_i[k] + sum_j P_ij X_j[m],    m the sample of j that is in use
 
-Invariant: the arm is exact between ticks under a held torque (zero-order hold); the controller runs its
-stages in their order.
+Invariant: the arm is exact between ticks under a held torque (zero-order hold); the controller
+runs its stages in their order.
 
-`second_order`: theta_k = theta_{k-1} + h/2 (f_{k-1} + f_k) with f the rate of the estimate, and the torque
-on the arm is 1.5 tau_k - 0.5 tau_{k-1}. With eta_k = theta_{k-1} + h/2 f_{k-1} that is theta_k = eta_k +
-h/2 f_k and eta_{k+1} = eta_k + h f_k. `digital`: theta_k = eta_k, eta_{k+1} = eta_k + h f_k, and the torque
-on the arm is tau_k. The memory of a law of one's own is eta: with h f = m_k - m_{k-1} it is what the law
-makes of it.
+`second_order`: theta_k = theta_{k-1} + h/2 (f_{k-1} + f_k) with f the rate of the estimate, and
+the torque on the arm is 1.5 tau_k - 0.5 tau_{k-1}. With eta_k = theta_{k-1} + h/2 f_{k-1} that
+is theta_k = eta_k + h/2 f_k and eta_{k+1} = eta_k + h f_k. `digital`: theta_k = eta_k,
+eta_{k+1} = eta_k + h f_k, and the torque on the arm is tau_k. The memory of a law of one's own
+is eta: with h f = m_k - m_{k-1} it is what the law makes of it.
 """
 
 import math
@@ -54,9 +57,11 @@ from .operating_point import Equilibrium, OperatingConditions
 
 
 def discretise_zero_order_hold(A: Array, B: Array, h_s: float) -> tuple[Array, Array]:
-    """Returns exp(A h) and int_0^h exp(A s) ds B: x' = A x + B u over a period h, s, with u held.
+    """Returns exp(A h) and int_0^h exp(A s) ds B: x' = A x + B u over a period h, s, with u
+    held.
 
-    Van Loan, "Computing integrals involving the matrix exponential", IEEE Trans. Automatic Control 23 (1978).
+    Van Loan, "Computing integrals involving the matrix exponential", IEEE Trans. Automatic
+    Control 23 (1978).
     """
     n, m = B.shape
     whole = np.zeros((n + m, n + m))
@@ -70,7 +75,8 @@ class SiteTickMap(NamedTuple):
     """One site over a period: X' = P X + Q w with the input w from its peers.
 
     Attributes:
-        P: shape (n, n); X is q, qd, eta of its estimate, and, with `second_order`, the torque before.
+        P: shape (n, n); X is q, qd, eta of its estimate, and, with `second_order`, the torque
+            before.
         Q: shape (n, inputs).
         sent: its output to peers, shape (3 m, n), see `SiteJacobian.sent`.
         names: of its states.
@@ -83,7 +89,9 @@ class SiteTickMap(NamedTuple):
 
 
 def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
-    """Returns one site over a period, from the derivatives of its rates (`differentiate_rates`)."""
+    """Returns one site over a period, from the derivatives of its rates
+    (`differentiate_rates`).
+    """
     at = jacobian.at
     rates = jacobian.rates
     h_s = 1.0 / site.rate_hz
@@ -94,7 +102,8 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     peers = np.eye(at.arguments, at.inputs.stop - at.inputs.start, -at.inputs.start)
     own = np.eye(at.arguments, n)
     own[at.states :] = 0.0
-    by_law = np.eye(at.joints) + rates.tau[:, at.external_torque]  # one of one's own may use what it feels
+    # one of one's own may use what it feels
+    by_law = np.eye(at.joints) + rates.tau[:, at.external_torque]
     inverse_inertia = np.linalg.solve(by_law.T, rates.qdd[:, at.external_torque].T).T
     trapezoid = second and site.gains.law is Law.ADAPTIVE
     zero = np.zeros((at.joints, at.joints))
@@ -123,7 +132,8 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
 
 
 class CoupledTicks(NamedTuple):
-    """The sites over a period each, and the effect of what one was on what another is a tick later.
+    """The sites over a period each, and the effect of what one was on what another is a tick
+    later.
 
     Attributes:
         S: of each site by itself, on the diagonal, shape (n, n).
@@ -141,9 +151,14 @@ class CoupledTicks(NamedTuple):
 
 
 def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledTicks:
-    """Returns what moves of the sites over a period of their own rates, and their effects on each other."""
+    """Returns what moves of the sites over a period of their own rates, and their effects on
+    each other.
+    """
     sites = differentiate_rates(conditions, rest)
-    maps = [linearise_site_tick(site, own) for site, own in zip(conditions.sites, sites, strict=True)]
+    maps = [
+        linearise_site_tick(site, own)
+        for site, own in zip(conditions.sites, sites, strict=True)
+    ]
     owners = np.repeat(np.arange(len(maps)), [len(one.P) for one in maps])
     couplings = couple_sites(conditions, rest, sites)
     effects = np.zeros((len(couplings), len(owners), len(owners)))
@@ -152,14 +167,18 @@ def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledT
     # what moves is told by the changes; the numbers of the pairs stand for their delays
     changes = block_diag(*(one.P for one in maps)) - np.eye(len(owners))
     names = [name for one in maps for name in one.names]
-    moving, kept, constant = extract_moving_part(Pencil(changes, np.arange(len(effects)), effects), names)
+    moving, kept, constant = extract_moving_part(
+        Pencil(changes, np.arange(len(effects)), effects), names
+    )
     pairs = list(couplings)
     return CoupledTicks(
-        moving.A + np.eye(len(kept)),
-        {pairs[int(n)]: effect for n, effect in zip(moving.delays, moving.Ad, strict=True)},
-        kept,
-        owners[[names.index(name) for name in kept]],
-        constant + sum(one.left_out for one in sites),
+        S=moving.A + np.eye(len(kept)),
+        effects={
+            pairs[int(n)]: effect for n, effect in zip(moving.delays, moving.Ad, strict=True)
+        },
+        names=kept,
+        owners=owners[[names.index(name) for name in kept]],
+        constant=constant + sum(one.left_out for one in sites),
     )
 
 
@@ -170,14 +189,20 @@ DRAWN_SPAN_S = 30.0
 _LEAST_SPAN_S = 0.5
 """A shorter period, or one shorter than twice the ages, is gone through several times."""
 _SLIP = 0.05
-"""Delays that repeat to this share of a tick repeat; else the nearest span does, to half a tick."""
+"""Delays that repeat to this share of a tick repeat; else the nearest span does, to half a
+tick.
+"""
 _PART_TICKS = 100
-"""Columns are scaled after so many ticks of the fastest site: they may grow a thousandfold in each."""
+"""Columns are scaled after so many ticks of the fastest site: they may grow a thousandfold in
+each.
+"""
 _COLUMNS = 8
 _MAX_COLUMNS = 240
 _RESIDUAL = 1e-9
 _LOOSE_RESIDUAL = 1e-4
-"""The largest residual of a multiplier, relative to it; the other when the columns are at an end."""
+"""The largest residual of a multiplier, relative to it; the other when the columns are at an
+end.
+"""
 _SMALLEST = 1e-7
 """Multipliers below this share of the largest are not looked for."""
 _SAME_ROOT = 1e-6
@@ -188,8 +213,10 @@ class SamplesInUse(NamedTuple):
 
     Attributes:
         span_s: its length, s.
-        used: by (i, j) the sample of j at each tick of i, counted from that with which the span begins.
-        period_s: delays and tick rates repeat after it, and after the span; None: they do not repeat.
+        used: by (i, j) the sample of j at each tick of i, counted from that with which the span
+            begins.
+        period_s: delays and tick rates repeat after it, and after the span; None: they do not
+            repeat.
     """
 
     span_s: float
@@ -198,7 +225,9 @@ class SamplesInUse(NamedTuple):
 
 
 def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
-    """Returns the samples in use over the period of delays and rates, or over a span of what is drawn."""
+    """Returns the samples in use over the period of delays and rates, or over a span of what is
+    drawn.
+    """
     rates_hz = [site.rate_hz for site in conditions.sites]
     common_hz = math.gcd(*rates_hz)
     links = [link for link, _ in conditions.links.values()] if conditions.varying else []
@@ -225,14 +254,19 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
     if period_s is not None:
         least_s = max(_LEAST_SPAN_S, 2.0 * float(conditions.age_s.max()), 2e-3 * reach_ms)
         span_s = period_s * math.ceil(least_s / period_s)
-    start_s = math.ceil((4e-3 * reach_ms + 0.1) * common_hz) / common_hz  # past what the beginning is like
+    # past what the beginning is like
+    start_s = math.ceil((4e-3 * reach_ms + 0.1) * common_hz) / common_hz
     used = {}
     for i, j in conditions.pairs:
         ticks = np.arange(round(span_s * rates_hz[i]))
         first = round(start_s * rates_hz[i])
-        used[i, j] = np.rint((ticks / rates_hz[i] - conditions.age_s[i, j]) * rates_hz[j]).astype(np.int64)
+        used[i, j] = np.rint(
+            (ticks / rates_hz[i] - conditions.age_s[i, j]) * rates_hz[j]
+        ).astype(np.int64)
         if conditions.varying:
-            whole = draw_uses(*conditions.links[i, j], rates_hz[i], rates_hz[j], start_s + span_s)
+            whole = draw_uses(
+                *conditions.links[i, j], rates_hz[i], rates_hz[j], start_s + span_s
+            )
             used[i, j] = np.maximum(whole[first + ticks], 0) - round(start_s * rates_hz[j])
     return SamplesInUse(span_s, used, period_s)
 
@@ -240,13 +274,19 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
 _Parts = list[tuple[list[tuple[int, int, int]], list[int]]]
 
 
-def _plan_parts(ticks: Sequence[int], used: Mapping[tuple[int, int], IntArray], count: int) -> _Parts:
-    """Returns the parts of a span in which every site makes so many ticks, with each site's tick after it.
+def _plan_parts(
+    ticks: Sequence[int], used: Mapping[tuple[int, int], IntArray], count: int
+) -> _Parts:
+    """Returns the parts of a span in which every site makes so many ticks, with each site's
+    tick after it.
 
-    A part is runs of ticks, a site, the first and how many, whose samples are known when their turn comes.
+    A part is runs of ticks, a site, the first and how many, whose samples are known when their
+    turn comes.
     """
     known = {
-        (i, j): np.searchsorted(np.maximum.accumulate(m), np.arange(ticks[j] + 1), side="right").tolist()
+        (i, j): np.searchsorted(
+            np.maximum.accumulate(m), np.arange(ticks[j] + 1), side="right"
+        ).tolist()
         for (i, j), m in used.items()
     }
     peers = [[j for i, j in used if i == site] for site in range(len(ticks))]
@@ -266,7 +306,8 @@ def _plan_parts(ticks: Sequence[int], used: Mapping[tuple[int, int], IntArray], 
 
 
 class _SpanMap:
-    """The linear loop over a span: an operator on columns, of each site the states at its last ticks.
+    """The linear loop over a span: an operator on columns, of each site the states at its last
+    ticks.
 
     Attributes:
         neutral: constant motions, orthonormal, shape (size, zeros).
@@ -295,16 +336,23 @@ class _SpanMap:
 
     def hold(self, X: Array) -> Array:
         """Returns columns whose states X, shape (n, columns), have always been so."""
-        return np.vstack([np.tile(X[own], (n, 1)) for own, n in zip(self._own, self._rows, strict=True)])
+        return np.vstack(
+            [np.tile(X[own], (n, 1)) for own, n in zip(self._own, self._rows, strict=True)]
+        )
 
     def advance(
         self, V: Array, *, divided: bool = True, sizes: list[Array] | None = None
     ) -> tuple[Array, list[Array]]:
-        """Returns columns after the span, and the states of each site by ticks; `sizes` get those by parts.
+        """Returns columns after the span, and the states of each site by ticks; `sizes` get
+        those by parts.
 
-        The columns are scaled, and without constant motions, unless they shall not be `divided`.
+        The columns are scaled, and without constant motions, unless they shall not be
+        `divided`.
         """
-        shapes = [(rows, len(own), V.shape[1]) for rows, own in zip(self._rows, self._own, strict=True)]
+        shapes = [
+            (rows, len(own), V.shape[1])
+            for rows, own in zip(self._rows, self._own, strict=True)
+        ]
         ends = np.cumsum([rows * n for rows, n, _ in shapes])[:-1]
         tracks = [
             np.concatenate([last.reshape(shape), np.empty((ticks, *shape[1:]))])
@@ -313,7 +361,10 @@ class _SpanMap:
         for n, (runs, stops) in enumerate(self._parts):
             for run in runs:
                 self._run_ticks(tracks, *run)
-            last = [track[at : at + shape[0]] for track, at, shape in zip(tracks, stops, shapes, strict=True)]
+            last = [
+                track[at : at + shape[0]]
+                for track, at, shape in zip(tracks, stops, shapes, strict=True)
+            ]
             V = np.concatenate([one.reshape(-1, V.shape[1]) for one in last])
             if divided:
                 V -= self.neutral @ (self.neutral.T @ V)
@@ -339,8 +390,11 @@ class _SpanMap:
             x = one
 
 
-def _find_multipliers(span: _SpanMap, n: int, wanted: int) -> tuple[Complex, Complex, NDArray[np.bool_]]:
-    """Returns the multipliers of `wanted` moduli, falling, their vectors as columns, and which are exact.
+def _find_multipliers(
+    span: _SpanMap, n: int, wanted: int
+) -> tuple[Complex, Complex, NDArray[np.bool_]]:
+    """Returns the multipliers of `wanted` moduli, falling, their vectors as columns, and which
+    are exact.
 
     Of a loop of n states; fewer if the others are too small to be told from zero.
     """
@@ -363,12 +417,19 @@ def _find_multipliers(span: _SpanMap, n: int, wanted: int) -> tuple[Complex, Com
         mu, y = np.linalg.eig(H)
         order = np.argsort(-np.abs(mu), kind="stable")
         sizes = np.abs(mu[order])
-        number = np.cumsum(np.append(0, sizes[1:] < (1.0 - _SAME_ROOT) * sizes[:-1]))  # conjugates have one
+        # conjugates have one
+        number = np.cumsum(np.append(0, sizes[1:] < (1.0 - _SAME_ROOT) * sizes[:-1]))
         order = order[(number < wanted) & (sizes > _SMALLEST * sizes[0])]
-        residual = np.linalg.norm(beyond @ y[-block.shape[1] :, order], axis=0) / np.abs(mu[order])
+        residual = np.linalg.norm(beyond @ y[-block.shape[1] :, order], axis=0) / np.abs(
+            mu[order]
+        )
         exact = residual <= (_RESIDUAL if len(H) < _MAX_COLUMNS else _LOOSE_RESIDUAL)
         if exact.all() or not new.any() or len(H) >= _MAX_COLUMNS:
-            return mu[order].astype(np.complex128), (basis @ y[:, order]).astype(np.complex128), exact
+            return (
+                mu[order].astype(np.complex128),
+                (basis @ y[:, order]).astype(np.complex128),
+                exact,
+            )
         before = np.zeros((len(beyond), len(H) - block.shape[1]))
         block, turned = np.linalg.qr(left - basis @ (basis.T @ left))
         H = np.vstack([H, np.hstack([before, turned @ beyond])])
@@ -376,12 +437,16 @@ def _find_multipliers(span: _SpanMap, n: int, wanted: int) -> tuple[Complex, Com
 
 
 def compute_sampled_spectrum(
-    conditions: OperatingConditions, rest: Equilibrium, wanted: int = 6, uses: SamplesInUse | None = None
+    conditions: OperatingConditions,
+    rest: Equilibrium,
+    wanted: int = 6,
+    uses: SamplesInUse | None = None,
 ) -> Spectrum | None:
-    """Returns the rightmost roots of the sampled loop; fewer than `wanted` where the others cannot be told.
+    """Returns the rightmost roots of the sampled loop; fewer than `wanted` where the others
+    cannot be told.
 
-    None if a law has states or waves of its own, which is linearised in continuous time alone. `uses`: the
-    samples in use, by default those of the scenario's links.
+    None if a law has states or waves of its own, which is linearised in continuous time alone.
+    `uses`: the samples in use, by default those of the scenario's links.
     """
     if conditions.has_forms:
         return None
@@ -393,7 +458,9 @@ def compute_sampled_spectrum(
     loop = couple_ticks(conditions, rest)
     deviation = None
     if not loop.names:
-        return Spectrum((), loop.constant, 0, 0, 0, span_s)
+        return Spectrum(
+            roots=(), zeros=loop.constant, drifting=0, dropped=0, order=0, span_s=span_s
+        )
     with limit_blas_threads():
         span = _SpanMap(loop, rates_hz, uses)
         mu, vectors, exact = _find_multipliers(span, len(loop.names), wanted + 1)
@@ -407,39 +474,69 @@ def compute_sampled_spectrum(
             span.advance(both[:, :: len(s)], sizes=sizes)
             grown = np.log(np.hypot(*np.transpose(sizes))) - np.cumsum(np.log(span.scales))
             bridge = grown - np.linspace(grown[0], grown[-1], len(grown))
-            deviation = math.sqrt(12.0) * float(np.std(bridge)) / uses.span_s  # of a random walk
+            # of a random walk
+            deviation = math.sqrt(12.0) * float(np.std(bridge)) / uses.span_s
         with np.errstate(all="ignore"):  # what grows this fast is not looked at to the end
-            roots = _describe_modes(s, span.advance(both, divided=False)[1], loop, rates_hz) if len(s) else []
+            roots = (
+                _describe_modes(s, span.advance(both, divided=False)[1], loop, rates_hz)
+                if len(s)
+                else []
+            )
     zeros = loop.constant + span.neutral.shape[1] + int(still.sum())
-    return Spectrum(tuple(roots[:wanted]), zeros, int(still.sum()), int((~exact).sum()), 0, span_s, deviation)
+    return Spectrum(
+        roots=tuple(roots[:wanted]),
+        zeros=zeros,
+        drifting=int(still.sum()),
+        dropped=int((~exact).sum()),
+        order=0,
+        span_s=span_s,
+        deviation_per_s=deviation,
+    )
 
 
 def _describe_modes(
     s: Complex, tracks: Sequence[Array], loop: CoupledTicks, rates_hz: Sequence[int]
 ) -> list[CharacteristicRoot]:
-    """Returns the roots of modes, with their fastest joints and the strongest frequency of the fastest.
+    """Returns the roots of modes, with their fastest joints and the strongest frequency of the
+    fastest.
 
-    A multiplier tells a frequency but for multiples of 2 pi / T. The tracks have real parts, then imaginary.
+    A multiplier tells a frequency but for multiples of 2 pi / T. The tracks have real parts,
+    then imaginary.
     """
     roots: list[CharacteristicRoot] = []
     turn = 2.0 * np.pi * rates_hz[0] / (len(tracks[0]) - 1)
-    sizes = np.abs(np.concatenate([track[0, :, : len(s)] + 1j * track[0, :, len(s) :] for track in tracks]))
-    speeds = [n for n, name in enumerate(loop.names) if re.fullmatch(r"qd\d+", name.rpartition(".")[2])]
+    sizes = np.abs(
+        np.concatenate([track[0, :, : len(s)] + 1j * track[0, :, len(s) :] for track in tracks])
+    )
+    speeds = [
+        n
+        for n, name in enumerate(loop.names)
+        if re.fullmatch(r"qd\d+", name.rpartition(".")[2])
+    ]
     for n, one in enumerate(s):
         order = sorted(speeds, key=lambda state: -sizes[state, n])
         i = int(loop.owners[order[0]])
         state = order[0] - int(np.argmax(loop.owners == i))
         hz = rates_hz[i]
-        seen = min(len(tracks[i]) - 1, 2 + int(15.0 * hz / max(1e-9, abs(one.real))))  # then rounding shows
+        # then rounding shows
+        seen = min(len(tracks[i]) - 1, 2 + int(15.0 * hz / max(1e-9, abs(one.real))))
         speed = tracks[i][:seen, state, n] + 1j * tracks[i][:seen, state, n + len(s)]
         lines = np.abs(np.fft.fft(speed * np.exp(-one * np.arange(seen) / hz)))
         offset = 2.0 * np.pi * np.fft.fftfreq(seen, 1.0 / hz)[lines.argmax()]
         omega = abs(one.imag + turn * round(offset / turn))
         root = complex(one.real, omega if omega > _SAME_ROOT else 0.0)
-        same = [k for k, known in enumerate(roots) if abs(known.s - root) <= _SAME_ROOT * (1.0 + abs(root))]
+        same = [
+            k
+            for k, known in enumerate(roots)
+            if abs(known.s - root) <= _SAME_ROOT * (1.0 + abs(root))
+        ]
         if same:
-            roots[same[0]] = roots[same[0]]._replace(multiplicity=roots[same[0]].multiplicity + 1)
+            roots[same[0]] = roots[same[0]]._replace(
+                multiplicity=roots[same[0]].multiplicity + 1
+            )
             continue
-        named = [loop.names[m] for m in order if sizes[m, n] >= NAMED_SHARE * sizes[order[0], n]]
+        named = [
+            loop.names[m] for m in order if sizes[m, n] >= NAMED_SHARE * sizes[order[0], n]
+        ]
         roots.append(CharacteristicRoot(root, 1, tuple(named)))
     return sorted(roots, key=lambda root: -root.s.real)

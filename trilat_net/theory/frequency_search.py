@@ -1,8 +1,8 @@
 """Adaptive frequency grids, the minima of curves over frequency, and the bands below a level.
 
-Invariant: values on a grid are evidence and no proof. A grid is refined where the response changes by more
-than a tenth, and about every minimum until the deepest changes by less than 1 %; features narrower than its
-steps stay hidden.
+Invariant: values on a grid are evidence and no proof. A grid is refined where the response
+changes by more than a tenth, and about every minimum until the deepest changes by less than 1
+%; features narrower than its steps stay hidden.
 """
 
 from collections.abc import Callable
@@ -64,7 +64,8 @@ class Minima(NamedTuple):
 
 
 def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array:
-    """Returns frequencies, rad/s, even on a logarithmic axis and close enough for the phase of a delay.
+    """Returns frequencies, rad/s, even on a logarithmic axis and close enough for the phase of
+    a delay.
 
     A round trip over the longest delay, T, turns the phase once in pi / T rad/s.
     """
@@ -79,7 +80,9 @@ def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array
 
 
 def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
-    """Returns the frequency up to which the grid has at least four points in a turn of a round trip, Hz."""
+    """Returns the frequency up to which the grid has at least four points in a turn of a round
+    trip, Hz.
+    """
     step_hz = (high_hz - low_hz) / _MAX_POINTS
     if 8.0 * step_hz * delay_s <= 1.0:
         return high_hz
@@ -87,7 +90,8 @@ def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
 
 
 def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
-    """Returns frequencies between which the response changes by at most a tenth, within a limit of points.
+    """Returns frequencies between which the response changes by at most a tenth, within a limit
+    of points.
 
     At a pole on the axis refinement stops when two points differ by a millionth.
     """
@@ -95,7 +99,9 @@ def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
     def find_wide(Y: Complex) -> NDArray[np.bool_]:
         size = np.linalg.norm(Y, axis=(1, 2))
         change = np.linalg.norm(np.diff(Y, axis=0), axis=(1, 2))
-        wide: NDArray[np.bool_] = change > _CHANGE * np.maximum(np.maximum(size[1:], size[:-1]), 1e-300)
+        wide: NDArray[np.bool_] = change > _CHANGE * np.maximum(
+            np.maximum(size[1:], size[:-1]), 1e-300
+        )
         return wide
 
     return _refine(response, w_rad_s, find_wide)[0]
@@ -125,23 +131,31 @@ def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
 
 
 def find_minima(
-    curve: FrequencyCurve, w_rad_s: Array, level: float = 0.0, tolerance: FrequencyCurve | None = None
+    curve: FrequencyCurve,
+    w_rad_s: Array,
+    level: float = 0.0,
+    tolerance: FrequencyCurve | None = None,
 ) -> Minima:
-    """Returns the curve with its minima resolved, and the bands below a level, from first frequencies on.
+    """Returns the curve with its minima resolved, and the bands below a level, from first
+    frequencies on.
 
-    `tolerance` is the least depth below the level, and of a minimum below its neighbours; None: zero.
+    `tolerance` is the least depth below the level, and of a minimum below its neighbours; None:
+    zero.
     """
     allowed = tolerance or (lambda w: np.zeros(len(w)))
     w_rad_s, both = _refine(
         lambda w: np.stack([curve(w), allowed(w)], axis=1), w_rad_s, _find_steps_at_minima
     )
     values, rounding = both.T
-    below = _find_bands_below(lambda w: curve(w) + allowed(w), w_rad_s, values + rounding, level)
+    below = _find_bands_below(
+        lambda w: curve(w) + allowed(w), w_rad_s, values + rounding, level
+    )
     return Minima(w_rad_s, values, below)
 
 
 def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
-    """Returns the steps at minima that are not settled: a neighbour is more than 1 % above them.
+    """Returns the steps at minima that are not settled: a neighbour is more than 1 % above
+    them.
 
     1 % of their depth, or of that of the deepest if that is more; and more than rounding.
     """
@@ -149,7 +163,9 @@ def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
     middle = values[1:-1]
     rise = np.maximum(values[:-2], values[2:]) - values[1:-1]
     low = (middle <= values[:-2]) & (middle <= values[2:])
-    low &= rise > np.maximum(_SETTLED * np.maximum(np.abs(middle), abs(values.min())), rounding[1:-1])
+    low &= rise > np.maximum(
+        _SETTLED * np.maximum(np.abs(middle), abs(values.min())), rounding[1:-1]
+    )
     minimum = np.r_[False, low, False]
     steps: NDArray[np.bool_] = minimum[1:] | minimum[:-1]
     return steps

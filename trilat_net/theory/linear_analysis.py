@@ -1,12 +1,14 @@
-"""Linear analysis of a scenario, or where a run ended: equilibrium, roots, delay margin, verdict, JSON.
+"""Linear analysis of a scenario, or where a run ended: equilibrium, roots, delay margin,
+verdict, JSON.
 
-Invariant: the verdict is that of the sampled loop, at any tick rates and delays; of the continuous loop where
-a law is linearised in continuous time alone. It holds for small motions about the equilibrium only.
+Invariant: the verdict is that of the sampled loop, at any tick rates and delays; of the
+continuous loop where a law is linearised in continuous time alone. It holds for small motions
+about the equilibrium only.
 
-Where a recorded run ended the roots are those at the log's own end pose and estimates, under the conditions
-at its end. Where delays are drawn or measured they are those over the very samples that the last quarter of
-the records has in use; mean ages serve for laws that are linearised in continuous time alone. Only twins
-are executed.
+Where a recorded run ended the roots are those at the log's own end pose and estimates, under
+the conditions at its end. Where delays are drawn or measured they are those over the very
+samples that the last quarter of the records has in use; mean ages serve for laws that are
+linearised in continuous time alone. Only twins are executed.
 """
 
 import math
@@ -31,7 +33,11 @@ from ..log.site_log import SiteLog
 from ..results import Result
 from ..scenario import Scenario, load_scenario
 from ..scenario.delay_models.kernel_delays import ConstantDelay
-from ..scenario.describe import IRREVERSIBLE_SHARES, describe_law_conditions, lacks_detailed_balance
+from ..scenario.describe import (
+    IRREVERSIBLE_SHARES,
+    describe_law_conditions,
+    lacks_detailed_balance,
+)
 from .characteristic_roots import CharacteristicRoot, Spectrum, compute_delay_spectrum
 from .delay_margin import DelayMargin, find_delay_margin
 from .equilibrium import find_equilibrium, follow_equilibrium, pad_rows
@@ -59,7 +65,8 @@ class LinearAnalysis(Result):
         rest: the equilibrium.
         loop: the linear loop there.
         continuous: roots of the delay-differential equation.
-        sampled: roots of the sampled loop; None if a law is linearised in continuous time alone.
+        sampled: roots of the sampled loop; None if a law is linearised in continuous time
+            alone.
         margin: the common delays for which the continuous loop is stable.
         scans: where stability changes along keys, of `analyse_linear_loop`.
         ports: the haptic ports of the operators, likewise; None if nobody asked.
@@ -77,7 +84,9 @@ class LinearAnalysis(Result):
 
     @property
     def end_effectors(self) -> tuple[Array, ...]:
-        """What each site shares of its pose at the equilibrium in task space; nothing in joint space."""
+        """What each site shares of its pose at the equilibrium in task space; nothing in joint
+        space.
+        """
         sites = self.conditions.sites
         if not sites[0].layout.task:
             return (np.zeros(0),) * len(sites)
@@ -98,7 +107,11 @@ class LinearAnalysis(Result):
         """Remarks on conditions, equilibrium and roots."""
         notes = [*self.conditions.notes, *self.rest.notes]
         if self.sampled is not None and self.sampled.verdict != self.continuous.verdict:
-            decides = "the tick rate decides" if self.sampled.span_s is None else "ticks and delays decide"
+            decides = (
+                "the tick rate decides"
+                if self.sampled.span_s is None
+                else "ticks and delays decide"
+            )
             notes.append(
                 f"the continuous loop is {self.continuous.verdict}, the sampled loop is "
                 f"{self.sampled.verdict}: {decides}"
@@ -147,9 +160,15 @@ class LinearAnalysis(Result):
             "as_computed": None if self.sampled is None else _spectrum_to_json(self.sampled),
             "margin": {
                 "words": self.margin.words,
-                "stable": [{"from_s": one.low_s, "to_s": one.high_s} for one in self.margin.intervals],
+                "stable": [
+                    {"from_s": one.low_s, "to_s": one.high_s} for one in self.margin.intervals
+                ],
                 "crossings": [
-                    {"delay_s": one.delay_s, "omega_rad_s": one.omega_rad_s, "pairs_to_the_right": one.pairs}
+                    {
+                        "delay_s": one.delay_s,
+                        "omega_rad_s": one.omega_rad_s,
+                        "pairs_to_the_right": one.pairs,
+                    }
                     for one in self.margin.crossings
                 ],
             },
@@ -169,7 +188,9 @@ class LinearAnalysis(Result):
         ]
 
     def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
-        """Returns the sampled root nearest to a continuous one; None if they differ by 1 % or less."""
+        """Returns the sampled root nearest to a continuous one; None if they differ by 1 % or
+        less.
+        """
         if self.sampled is None or not self.sampled.roots:
             return None
         near = min(self.sampled.roots, key=lambda one: abs(one.s - root.s))
@@ -186,9 +207,11 @@ def analyse_linear_loop(
     ports: bool = False,
     hands: Sequence[HandMatrices] = (),
 ) -> LinearAnalysis:
-    """Returns the linear analysis of a scenario; its arguments are those of `trilat_net.linear`.
+    """Returns the linear analysis of a scenario; its arguments are those of
+    `trilat_net.linear`.
 
-    `pose` is that of all sites, rad; of the measured operators, `hands`, any may hold any master.
+    `pose` is that of all sites, rad; of the measured operators, `hands`, any may hold any
+    master.
 
     Raises:
         ScenarioError: the scenario is not valid, or has no linear loop.
@@ -203,12 +226,23 @@ def analyse_linear_loop(
     loop = linearise_loop(conditions, rest)
     continuous = compute_delay_spectrum(loop, roots)
     sampled = compute_sampled_spectrum(conditions, rest, roots)
-    found = LinearAnalysis(scenario, conditions, rest, loop, continuous, sampled, find_delay_margin(loop))
+    found = LinearAnalysis(
+        scenario, conditions, rest, loop, continuous, sampled, find_delay_margin(loop)
+    )
     scans = tuple(
-        EdgeScan(key, low, high, tuple(iterate_linear_edges(scenario, key, low, high, rest)))
+        EdgeScan(
+            key,
+            low,
+            high,
+            tuple(
+                iterate_linear_edges(scenario=scenario, key=key, low=low, high=high, rest=rest)
+            ),
+        )
         for key, low, high in ranges
     )
-    return replace(found, scans=scans, ports=analyse_ports(scenario, rest, hands=hands) if ports else None)
+    return replace(
+        found, scans=scans, ports=analyse_ports(scenario, rest, hands=hands) if ports else None
+    )
 
 
 def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
@@ -240,7 +274,8 @@ _ROOTS = 2
 def certify_run(
     log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False, twins: int = TWINS
 ) -> Certificate:
-    """Returns the certificate of a log, with the roots of the loop where the run ended, and so many twins.
+    """Returns the certificate of a log, with the roots of the loop where the run ended, and so
+    many twins.
 
     See `certify`.
 
@@ -267,7 +302,9 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
         for at, age_s in mean_s.items():
             conditions.age_s[at] = age_s
         q, theta_hat = _choose_state(scenario, parts)
-        rest = follow_equilibrium(scenario, Equilibrium(q, theta_hat, "the end of the log", 0.0))
+        rest = follow_equilibrium(
+            scenario, Equilibrium(q, theta_hat, "the end of the log", 0.0)
+        )
     except ScenarioError as error:
         return _no_roots(error.problem)
     sampled = compute_sampled_spectrum(conditions, rest, _ROOTS, uses)
@@ -276,24 +313,31 @@ def find_end_pose_roots(log: Log) -> EndPoseRoots:
     verdict = decisive.verdict
     about = decisive.basis
     if sampled is None:  # a law in continuous time, whose ticks are left out
-        about = ", in continuous time" + ", of the mean ages" * bool(conditions.varying or mean_s)
+        about = ", in continuous time" + ", of the mean ages" * bool(
+            conditions.varying or mean_s
+        )
     exact = sampled is not None and sampled.deviation_per_s is None
     if root is None:
         return EndPoseRoots(verdict, None, exact, f"this rest: {verdict}, without roots")
     omega = f" at {abs(root.s.imag):.4g} rad/s" if root.s.imag else ""
-    drift = f"{decisive.drifting} of its motions keep their speed, the others " * bool(decisive.drifting)
+    drift = f"{decisive.drifting} of its motions keep their speed, the others " * bool(
+        decisive.drifting
+    )
     text = f"this rest: {verdict}, {drift}{root.s.real:+.3g} /s{omega}{about}"
     return EndPoseRoots(verdict, root.s.real, exact, text)
 
 
 def _fix_delays(log: Log) -> tuple[Scenario, SamplesInUse | None, dict[tuple[int, int], float]]:
-    """Returns the scenario that a log ran, with constant delays where its records alone know them.
+    """Returns the scenario that a log ran, with constant delays where its records alone know
+    them.
 
-    And if there are such links the samples in use in its last quarter, a missing tick's being those before,
-    and per (receiver, sender) of such a link their mean age, s.
+    And if there are such links the samples in use in its last quarter, a missing tick's being
+    those before, and per (receiver, sender) of such a link their mean age, s.
     """
     known = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
-    unknown = [one.random or one.measured or one.points is not None for one in known.links.values()]
+    unknown = [
+        one.random or one.measured or one.points is not None for one in known.links.values()
+    ]
     if not any(unknown):
         return known, None, {}
     sites = [log[name] for name in known.names]
@@ -323,9 +367,11 @@ def _no_roots(why: str) -> EndPoseRoots:
 
 
 def _choose_state(scenario: Scenario, parts: Sequence[SiteLog]) -> tuple[Array, Array]:
-    """Returns angles and estimates of all sites: at the end of those at rest, else the last quarter's mean.
+    """Returns angles and estimates of all sites: at the end of those at rest, else the last
+    quarter's mean.
 
-    Of arms that chatter at a sampled wall, it is the state of the last quarter that is deepest in it.
+    Of arms that chatter at a sampled wall, it is the state of the last quarter that is deepest
+    in it.
     """
     count = min(map(len, parts))
     rows = slice(3 * count // 4, count)
@@ -333,7 +379,8 @@ def _choose_state(scenario: Scenario, parts: Sequence[SiteLog]) -> tuple[Array, 
     if together and not all(map(_rests, parts)):
         joints = max(part.q.shape[1] for part in parts)
         q = np.stack(
-            [np.pad(part.q[rows], ((0, 0), (0, joints - part.q.shape[1]))) for part in parts], axis=1
+            [np.pad(part.q[rows], ((0, 0), (0, joints - part.q.shape[1]))) for part in parts],
+            axis=1,
         )
         deepest = find_deepest_contact(scenario, q)
         if deepest is not None:
@@ -348,5 +395,9 @@ def _rests(part: SiteLog) -> bool:
 
 
 def _end_of(part: SiteLog, values: Array) -> Array:
-    """Returns a signal at the last record of an arm at rest, else its mean over the last quarter."""
-    return np.asarray(values[-1] if _rests(part) else values[part.t_s >= 0.75 * part.t_s[-1]].mean(axis=0))
+    """Returns a signal at the last record of an arm at rest, else its mean over the last
+    quarter.
+    """
+    return np.asarray(
+        values[-1] if _rests(part) else values[part.t_s >= 0.75 * part.t_s[-1]].mean(axis=0)
+    )

@@ -2,14 +2,15 @@
 
     x'(t) = A x(t) + sum_k A_k x(t - T_k) + B u(t) + sum_k B_k u(t - T_k),    y(t) = C x(t)
 
-Invariant: x are deviations from the equilibrium, in the order of the scenario's sites; u is the torque ON
-the joints that an operator adds; y are the joint velocities. Sites that follow with their end effectors are
-coupled through what they share of their poses, `SiteRates.x`, and through its velocity.
+Invariant: x are deviations from the equilibrium, in the order of the scenario's sites; u is the
+torque ON the joints that an operator adds; y are the joint velocities. Sites that follow with
+their end effectors are coupled through what they share of their poses, `SiteRates.x`, and
+through its velocity.
 
-A chain has ten estimates a link, of which a small motion moves, and the torque shows, no more than one
-combination a joint: the gravity that was learnt. With the regressor Y_G at rest it is z = Y_G theta_hat, N m,
-and z' = -Y_G Gamma Y' r. The loop of chains has z in place of the estimates; all that is left out is constant
-or has no effect, each with a root at zero.
+A chain has ten estimates a link, of which a small motion moves, and the torque shows, no more
+than one combination a joint: the gravity that was learnt. With the regressor Y_G at rest it is
+z = Y_G theta_hat, N m, and z' = -Y_G Gamma Y' r. The loop of chains has z in place of the
+estimates; all that is left out is constant or has no effect, each with a root at zero.
 """
 
 from collections.abc import Sequence
@@ -38,7 +39,8 @@ class SiteJacobian(NamedTuple):
     Attributes:
         at: layout of the columns; of a law that learns nothing it has no estimate.
         rates: the derivatives, see `differentiate_site_rates`.
-        states: names of the states, as "q1", "qd2", "theta4"; "gravity2": the learnt gravity of joint 2.
+        states: names of the states, as "q1", "qd2", "theta4"; "gravity2": the learnt gravity of
+            joint 2.
         left_out: number of estimates that no small motion moves or shows.
     """
 
@@ -49,7 +51,9 @@ class SiteJacobian(NamedTuple):
 
     @property
     def sent(self) -> Array:
-        """What peers get by the site's own states, shape (3 m, states): x, its velocity, the torque."""
+        """What peers get by the site's own states, shape (3 m, states): x, its velocity, the
+        torque.
+        """
         rates = self.rates
         return np.vstack([rates.x, rates.xd, rates.reflected])[:, : self.at.states]
 
@@ -79,9 +83,10 @@ class LinearLoop(NamedTuple):
         B: shape (n, m).
         C: shape (p, n).
         delayed: one entry per distinct delay above zero, by rising delay.
-        left_out: number of states that no small motion moves or shows, each with a root at zero.
-        E: 1 of each state that has a rate, 0 of one that the others give at once, as a wave: 0 = A x + ...;
-            None: all have one.
+        left_out: number of states that no small motion moves or shows, each with a root at
+            zero.
+        E: 1 of each state that has a rate, 0 of one that the others give at once, as a wave: 0
+            = A x + ...; None: all have one.
     """
 
     names: tuple[str, ...]
@@ -110,7 +115,9 @@ def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) ->
         x[at.estimate] = theta_hat[: at.parameters]
         x[at.q_des] = q_des
     reflected = [one.reflected for one in conditions.rates(arguments)]
-    for i, (at, x, felt) in enumerate(zip(layouts, arguments, conditions.alpha @ reflected, strict=True)):
+    for i, (at, x, felt) in enumerate(
+        zip(layouts, arguments, conditions.alpha @ reflected, strict=True)
+    ):
         x[at.peer_torque] = felt
         others = [j for j in range(len(arguments)) if j != i]
         for place in range(at.peers):
@@ -133,15 +140,20 @@ def find_references(conditions: OperatingConditions, rest: Equilibrium) -> list[
     shared = share_poses(conditions, rest)
     if not conditions.sites[0].layout.task:
         return list(conditions.alpha @ np.array(shared))
-    return [evaluate_reference(row, own, shared) for row, own in zip(conditions.alpha, shared, strict=True)]
+    return [
+        evaluate_reference(row, own, shared)
+        for row, own in zip(conditions.alpha, shared, strict=True)
+    ]
 
 
 def differentiate_references(
     conditions: OperatingConditions, rest: Equilibrium
 ) -> dict[tuple[int, int], Array]:
-    """Returns the derivative of what site i follows by what site j shares, shape (m, m), by (i, j).
+    """Returns the derivative of what site i follows by what site j shares, shape (m, m), by (i,
+    j).
 
-    It is alpha_ij but for orientations that do not agree, which have one by the site's own pose as well.
+    It is alpha_ij but for orientations that do not agree, which have one by the site's own pose
+    as well.
     """
     found = {}
     shared = share_poses(conditions, rest)
@@ -151,7 +163,9 @@ def differentiate_references(
         if len(shared[i]) > PLACE and conditions.sites[i].layout.task:
             for peer in {i, *np.flatnonzero(row).tolist()}:
                 poses = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in shared]
-                poses[peer] = poses[peer] + 1j * site_dynamics.COMPLEX_STEP * np.eye(len(shared[peer]))
+                poses[peer] = poses[peer] + 1j * site_dynamics.COMPLEX_STEP * np.eye(
+                    len(shared[peer])
+                )
                 moved = evaluate_reference(row, poses[i], poses).imag
                 found[i, peer] = moved / site_dynamics.COMPLEX_STEP
     return found
@@ -181,7 +195,9 @@ def couple_sites(
 
 
 def find_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]:
-    """Returns which states of every site are in the loop, shape (states,) each: estimates if it learns."""
+    """Returns which states of every site are in the loop, shape (states,) each: estimates if it
+    learns.
+    """
     masks = []
     for site in conditions.sites:
         at = site_dynamics.lay_out_arguments(site)
@@ -194,9 +210,11 @@ def find_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]
 def differentiate_rates(
     conditions: OperatingConditions, rest: Equilibrium, *, every_estimate: bool = False
 ) -> list[SiteJacobian]:
-    """Returns the derivatives of the rates of every site by itself, see `differentiate_site_rates`.
+    """Returns the derivatives of the rates of every site by itself, see
+    `differentiate_site_rates`.
 
-    `every_estimate`: of chains too each estimate is a state, and not only what they say of gravity.
+    `every_estimate`: of chains too each estimate is a state, and not only what they say of
+    gravity.
     """
     x = gather_site_arguments(conditions, rest)
     references = differentiate_references(conditions, rest)
@@ -223,7 +241,9 @@ def differentiate_rates(
             effect = rates.tau[:, at.estimate]
             _, R, order = qr(effect.T, mode="economic", pivoting=True)  # its independent rows
             sizes = np.abs(np.diag(R))
-            joints = sorted(order[: int(np.sum(sizes > _DEPENDENT * max(1.0, sizes[0])))].tolist())
+            joints = sorted(
+                order[: int(np.sum(sizes > _DEPENDENT * max(1.0, sizes[0])))].tolist()
+            )
             names = tuple(f"gravity{joint + 1}" for joint in joints)
             jacobian = _replace_estimate(at, rates, effect[joints], names)
             jacobian = jacobian._replace(left_out=at.parameters - len(joints))
@@ -236,9 +256,13 @@ def _name_motion(joints: int) -> tuple[str, ...]:
 
 
 def _replace_estimate(
-    at: site_dynamics.ArgumentLayout, rates: site_dynamics.SiteRates, T: Array, names: tuple[str, ...]
+    at: site_dynamics.ArgumentLayout,
+    rates: site_dynamics.SiteRates,
+    T: Array,
+    names: tuple[str, ...],
 ) -> SiteJacobian:
-    """Returns a site's derivatives with the states z = T theta_hat, shape (m, P), in place of theta_hat.
+    """Returns a site's derivatives with the states z = T theta_hat, shape (m, P), in place of
+    theta_hat.
 
     All effects of the estimate must be combinations of z.
     """
@@ -246,7 +270,9 @@ def _replace_estimate(
 
     def convert(by: Array) -> Array:
         """Returns derivatives by the new states."""
-        return np.hstack([by[:, : at.estimate.start], by[:, at.estimate] @ shown, by[:, at.estimate.stop :]])
+        return np.hstack(
+            [by[:, : at.estimate.start], by[:, at.estimate] @ shown, by[:, at.estimate.stop :]]
+        )
 
     converted = site_dynamics.SiteRates(*map(convert, rates))
     return SiteJacobian(
@@ -259,7 +285,9 @@ def _replace_estimate(
 def linearise_loop(
     conditions: OperatingConditions, rest: Equilibrium, *, every_estimate: bool = False
 ) -> LinearLoop:
-    """Returns the loop under given conditions, linearised at an equilibrium; see `differentiate_rates`."""
+    """Returns the loop under given conditions, linearised at an equilibrium; see
+    `differentiate_rates`.
+    """
     sites = differentiate_rates(conditions, rest, every_estimate=every_estimate)
     own, ports = (
         [slice(a, b) for a, b in pairwise(np.cumsum([0, *lengths]).tolist())]
@@ -273,7 +301,9 @@ def linearise_loop(
     terms: dict[float, tuple[Array, Array]] = {}
     effects = []
     for i, (at, rates, _, _) in enumerate(sites):
-        by = np.vstack([np.eye(at.joints, at.arguments, at.qd.start), rates.qdd, rates.estimate])
+        by = np.vstack(
+            [np.eye(at.joints, at.arguments, at.qd.start), rates.qdd, rates.estimate]
+        )
         A[own[i], own[i]] = by[:, : at.states]
         B[own[i], ports[i]] = by[:, at.external_torque]
         C[ports[i], own[i]] = np.eye(at.joints, at.states, at.qd.start)
@@ -285,9 +315,13 @@ def linearise_loop(
         peer = sites[j]
         m = sites[j].at.coordinates
         late_A[own[i], own[j]] += effect @ peer.sent
-        late_B[own[i], ports[j]] += effect[:, 2 * m :] @ peer.rates.reflected[:, peer.at.external_torque]
+        late_B[own[i], ports[j]] += (
+            effect[:, 2 * m :] @ peer.rates.reflected[:, peer.at.external_torque]
+        )
     names = [
-        f"{name}.{state}" for name, one in zip(conditions.names, sites, strict=True) for state in one.states
+        f"{name}.{state}"
+        for name, one in zip(conditions.names, sites, strict=True)
+        for state in one.states
     ]
     inputs, outputs = (
         tuple(
@@ -299,7 +333,16 @@ def linearise_loop(
     )
     delayed = tuple(DelayedTerm(delay_s, *terms[delay_s]) for delay_s in sorted(terms))
     left_out = sum(one.left_out for one in sites)
-    loop = LinearLoop(tuple(names), inputs, outputs, A, B, C, delayed, left_out)
+    loop = LinearLoop(
+        names=tuple(names),
+        inputs=inputs,
+        outputs=outputs,
+        A=A,
+        B=B,
+        C=C,
+        delayed=delayed,
+        left_out=left_out,
+    )
     if every_estimate or not conditions.has_forms:
         return loop
     return add_law_forms(conditions, sites, loop)
@@ -319,13 +362,17 @@ def add_law_forms(
     count = len(loop.inputs)
     terms = {0.0: (np.zeros((size, size)), np.zeros((size, count)))}
     for delay_s, A, B in (DelayedTerm(0.0, loop.A, loop.B), *loop.delayed):
-        late_A, late_B = terms.setdefault(delay_s, (np.zeros((size, size)), np.zeros((size, count))))
+        late_A, late_B = terms.setdefault(
+            delay_s, (np.zeros((size, size)), np.zeros((size, count)))
+        )
         late_A[: len(A), : len(A)] = A
         late_B[: len(B)] = B
     E = np.ones(size)
     for i, form in enumerate(forms):
         if form is not None:
-            _add_form(conditions, sites, at, i, form, terms)
+            _add_form(
+                conditions=conditions, sites=sites, places=at, i=i, form=form, terms=terms
+            )
     for i, form in enumerate(forms):  # when all that accelerates an arm is there
         for j in form.list_receivers() if form is not None else ():
             channel = at[i, ("to", j)]
@@ -387,7 +434,9 @@ def _add_form(
             own = slice(places[i, "q"].start, places[i, "qd"].stop)
             on_arm = site.rates.external + site.rates.held
             terms[0.0][0][rows, own] += block @ on_arm[:, : site.at.qd.stop]
-            terms[0.0][1][rows, ports[i] : ports[i + 1]] += block @ on_arm[:, site.at.external_torque]
+            terms[0.0][1][rows, ports[i] : ports[i + 1]] += (
+                block @ on_arm[:, site.at.external_torque]
+            )
         elif column in ("q_des", "qd_des"):
             for j in np.flatnonzero(conditions.alpha[i]):
                 sent = places[int(j), str(column).removesuffix("_des")]

@@ -2,9 +2,10 @@
 
     (tau_k, m_k) = f(q, qd, m_{k-1}, q_des, qd_des, felt, peers, torque ON the arm)
 
-Invariant: it is asked as its site asks it, through the rows from which it gets its input, without the clamp.
-Its memory m is its own, and the torque and the angles of the tick before if it uses these. In continuous time
-m' = (m_k - m_{k-1}) / h, which the sampled loop puts back to the memory that it was.
+Invariant: it is asked as its site asks it, through the rows from which it gets its input,
+without the clamp. Its memory m is its own, and the torque and the angles of the tick before if
+it uses these. In continuous time m' = (m_k - m_{k-1}) / h, which the sampled loop puts back to
+the memory that it was.
 """
 
 from collections.abc import Sequence
@@ -25,7 +26,8 @@ from ..errors import ScenarioError
 _TICK = 1_000_000
 """The tick at which a law is asked: late, so that nothing begins."""
 _STEP = 1e-5
-"""Half the difference of an argument, relative to its size, at least 1: errors are about 1e-10."""
+"""Half the difference of an argument, relative to its size, at least 1: errors are about 1e-10.
+"""
 _STILL = 1e-14
 """A step by which memory is at rest."""
 
@@ -49,7 +51,9 @@ class NumericLaw:
     def __init__(self, setup: SiteSetup, code: str, shares: Sequence[float]) -> None:
         path = f"sites.{setup.name}.control.law"
         if setup.layout.sent:
-            raise ScenarioError(f"{code} sends vectors of its own, which are not linearised", path=path)
+            raise ScenarioError(
+                f"{code} sends vectors of its own, which are not linearised", path=path
+            )
         if setup.layout.task:
             raise ScenarioError(f"{code} is linearised between joint angles alone", path=path)
         assert setup.own is not None
@@ -70,11 +74,15 @@ class NumericLaw:
         peers = [np.r_[link.q0, rest, rest] for link in setup.links]
         arguments = np.concatenate([start, rest, self.memory, start, rest, rest, *peers, rest])
         past = np.r_[np.zeros(self._layout.joints), setup.q0]
-        self._keeps_past = not np.array_equal(self._ask(arguments, past), self._ask(arguments, past + 1e-3))
+        self._keeps_past = not np.array_equal(
+            self._ask(arguments, past), self._ask(arguments, past + 1e-3)
+        )
         if self._keeps_past:
             self.memory = np.r_[own, past]
             for name in ("tau_before", "q_before"):
-                self.names += tuple(f"{name}[{joint + 1}]" for joint in range(self._layout.joints))
+                self.names += tuple(
+                    f"{name}[{joint + 1}]" for joint in range(self._layout.joints)
+                )
 
     @property
     def _memory_at(self) -> slice:
@@ -93,7 +101,9 @@ class NumericLaw:
         return whole
 
     def settle(self, x: Array, ticks: int) -> Array:
-        """Returns its memory after so many ticks of the same arguments, or once it stays as it is."""
+        """Returns its memory after so many ticks of the same arguments, or once it stays as it
+        is.
+        """
         memory = self._memory_at
         x = x.copy()
         for _ in range(ticks):
@@ -104,7 +114,9 @@ class NumericLaw:
         return x[memory]
 
     def evaluate(self, x: Numbers) -> tuple[Numbers, Numbers]:
-        """Returns the torque and the rate of the memory; of complex columns with their derivatives."""
+        """Returns the torque and the rate of the memory; of complex columns with their
+        derivatives.
+        """
         if not np.iscomplexobj(x):
             return self._evaluate(x)
         at: Array = x.real[:, 0]
@@ -118,7 +130,9 @@ class NumericLaw:
             down[n] = value - half
             ends = [np.concatenate(self._evaluate(one)) for one in (up, down)]
             columns.append((ends[0] - ends[1]) / (up[n] - down[n]))
-        whole = np.concatenate([torque, rate])[:, np.newaxis] + 1j * (np.stack(columns, axis=1) @ x.imag)
+        whole = np.concatenate([torque, rate])[:, np.newaxis] + 1j * (
+            np.stack(columns, axis=1) @ x.imag
+        )
         return whole[: len(torque)], whole[len(torque) :]
 
     def _evaluate(self, x: Array) -> tuple[Array, Array]:
@@ -132,7 +146,9 @@ class NumericLaw:
         return torque, (now - x[memory]) * self._rate_hz
 
     def _ask(self, x: Array, past: Array) -> Array:
-        """Returns the torque and the law's own memory after a tick; `past`: torque and angles before it."""
+        """Returns the torque and the law's own memory after a tick; `past`: torque and angles
+        before it.
+        """
         a = self._arrays
         n = self._layout.joints
         s: Any = a.site[0]
@@ -145,7 +161,9 @@ class NumericLaw:
         a.links["used"] = _TICK - 1
         for j, link in enumerate(a.links):
             first = start + 3 * n * (1 + j)
-            link["q"][:], link["qd"][:], link["tau_x"][:] = np.split(x[first : first + 3 * n], 3)
+            link["q"][:], link["qd"][:], link["tau_x"][:] = np.split(
+                x[first : first + 3 * n], 3
+            )
         if a.chain is None:
             two_link_stages.update_errors(s)  # with the regressor, which gravity is taken from
         else:

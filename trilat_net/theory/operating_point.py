@@ -1,11 +1,11 @@
 """The operating point of the linear loop: conditions at the end of a run, and the equilibrium.
 
-Invariant: a linear loop has one set of numbers, those in force at the end of the run. Earlier or random
-values are reported in a note; values that cannot be known beforehand are refused.
+Invariant: a linear loop has one set of numbers, those in force at the end of the run. Earlier
+or random values are reported in a note; values that cannot be known beforehand are refused.
 
-A link has an effective delay (L2): the age of its samples at the ticks that use them. With a constant delay
-and equal rates it is max(1, ceil(T / h)) ticks; in all other cases it is averaged over the same random draws
-as a run makes.
+A link has an effective delay (L2): the age of its samples at the ticks that use them. With a
+constant delay and equal rates it is max(1, ceil(T / h)) ticks; in all other cases it is
+averaged over the same random draws as a run makes.
 """
 
 import math
@@ -39,7 +39,8 @@ class Equilibrium(NamedTuple):
 
     Attributes:
         q: joint angles, shape (N, n), rad; of arms with fewer joints followed by zeros.
-        theta_hat: estimates, shape (N, P), so as well; of a law that knows gravity what it assumes.
+        theta_hat: estimates, shape (N, P), so as well; of a law that knows gravity what it
+            assumes.
         how: the way it was found, in words.
         residual: the largest remaining acceleration, rad/s^2, or rate of an estimate.
         notes: remarks on it.
@@ -82,24 +83,34 @@ class OperatingConditions(NamedTuple):
     links: Mapping[tuple[int, int], tuple[LinkBase, int]] = MappingProxyType({})
 
     def find_forms(self, inertia: Sequence[Array] = ()) -> list[LinearForm | None]:
-        """Returns what laws add to their gains in small motions, with the inertia of their arms."""
+        """Returns what laws add to their gains in small motions, with the inertia of their
+        arms.
+        """
         forms: list[LinearForm | None] = []
         for n, law in enumerate(self.laws):
             M = inertia[n] if inertia else np.eye(self.sites[n].layout.joints)
-            situation = LinearSituation(n, self.names, self.laws, self.alpha, M)
+            situation = LinearSituation(
+                site=n, names=self.names, laws=self.laws, alpha=self.alpha, inertia=M
+            )
             forms.append(law.linear_form(situation))
         return forms
 
     @property
     def pairs(self) -> list[tuple[int, int]]:
-        """Who follows whom, as (i, j): by a dominance factor, or since a law of one's own sees every peer."""
-        sees = np.array([isinstance(site.own, NumericLaw) for site in self.sites])[:, np.newaxis]
+        """Who follows whom, as (i, j): by a dominance factor, or since a law of one's own sees
+        every peer.
+        """
+        sees = np.array([isinstance(site.own, NumericLaw) for site in self.sites])[
+            :, np.newaxis
+        ]
         linked = (self.alpha != 0.0) | (sees & ~np.eye(len(self.alpha), dtype=bool))
         return [(int(i), int(j)) for i, j in zip(*np.nonzero(linked), strict=True)]
 
     @property
     def has_forms(self) -> bool:
-        """True if a law has states of its own, or sends more than samples have: then time is continuous."""
+        """True if a law has states of its own, or sends more than samples have: then time is
+        continuous.
+        """
         return any(form is not None for form in self.find_forms())
 
     @property
@@ -109,21 +120,29 @@ class OperatingConditions(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """True if the sampled loop alone tells what the tick does: digital controllers, sampled actors.
+        """True if the sampled loop alone tells what the tick does: digital controllers, sampled
+        actors.
 
         Or what ages do that vary and are not drawn.
         """
         known = self.varying and not any(link.random for link, _ in self.links.values())
         digital = self.sites[0].scheme is Scheme.DIGITAL
-        return known or digital or any(actor.sampled for site in self.sites for actor in site.actors)
+        return (
+            known
+            or digital
+            or any(actor.sampled for site in self.sites for actor in site.actors)
+        )
 
     def rates(self, x: Sequence[Array]) -> list[SiteRates]:
         """Returns the rates of every site at its own arguments, see `evaluate_site_rates`."""
         return [evaluate_site_rates(site, own) for site, own in zip(self.sites, x, strict=True)]
 
 
-def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) -> OperatingConditions:
-    """Returns the conditions at the end of a run; `own_laws`: the code of imported laws may run.
+def derive_operating_conditions(
+    scenario: Scenario, *, own_laws: bool = True
+) -> OperatingConditions:
+    """Returns the conditions at the end of a run; `own_laws`: the code of imported laws may
+    run.
 
     Raises:
         ScenarioError: a law has no linear loop, an arm is external, or a link is measured.
@@ -131,7 +150,8 @@ def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) ->
     gains = _find_linear_gains(scenario, own_laws=own_laws)
     notes: list[str] = []
     sites = tuple(
-        _select_final_actors(scenario, name, notes)._replace(gains=gains[name]) for name in scenario.names
+        _select_final_actors(scenario, name, notes)._replace(gains=gains[name])
+        for name in scenario.names
     )
     alpha = _final_dominance(scenario, sites, notes)
     age_s = np.zeros_like(alpha)
@@ -140,14 +160,20 @@ def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) ->
     sites = tuple(_make_own_law(scenario, site, alpha) for site in sites)
     codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
     for code in filter(None, dict.fromkeys(codes)):
-        owners = ", ".join(name for name, one in zip(scenario.names, codes, strict=True) if one == code)
-        notes.append(f"{code} of {owners} is differentiated numerically, its memory too: central differences")
+        owners = ", ".join(
+            name for name, one in zip(scenario.names, codes, strict=True) if one == code
+        )
+        notes.append(
+            f"{code} of {owners} is differentiated numerically, its memory too: central differences"
+        )
     notes += [law.linear_note for law in laws if law.linear_note]
     conditions = OperatingConditions(sites, alpha, age_s, (), laws=laws)
     pairs = conditions.pairs
     if conditions.has_forms:
         pairs = [(i, j) for i in range(len(alpha)) for j in range(len(alpha)) if i != j]
-        notes.append("a law here has states or waves of its own: it is linearised in continuous time alone")
+        notes.append(
+            "a law here has states or waves of its own: it is linearised in continuous time alone"
+        )
     links = {}
     for i, j in pairs:
         peer = scenario.names[j]
@@ -168,7 +194,9 @@ def derive_operating_conditions(scenario: Scenario, *, own_laws: bool = True) ->
         )
     if any(site.on_stale.action is not StaleAction.USE for site in sites):
         notes.append("rules for stale peers are left out: no peer counts as stale")
-    return conditions._replace(notes=tuple(dict.fromkeys(notes)), varying=bool(varying), links=links)
+    return conditions._replace(
+        notes=tuple(dict.fromkeys(notes)), varying=bool(varying), links=links
+    )
 
 
 def is_constant_link(link: LinkBase) -> bool:
@@ -223,13 +251,17 @@ def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBas
             source=scenario.name,
         )
     if link != scenario.links[name]:
-        notes.append(f"link {name} changes during the run: taken as it is at the end, {link.describe()}")
+        notes.append(
+            f"link {name} changes during the run: taken as it is at the end, {link.describe()}"
+        )
     if link.outages_s:
         notes.append(f"the outages of link {name} are left out")
     return link
 
 
-def compute_effective_delay(scenario: Scenario, peer: str, site: str, link: LinkBase) -> EffectiveDelay:
+def compute_effective_delay(
+    scenario: Scenario, peer: str, site: str, link: LinkBase
+) -> EffectiveDelay:
     """Returns the age of a peer's samples at the ticks of a site that use them.
 
     Raises:
@@ -243,17 +275,31 @@ def compute_effective_delay(scenario: Scenario, peer: str, site: str, link: Link
         delay_us = max(round(model.location), model.playout_us)
         age_s = max(1, -(-delay_us * own_hz // 1_000_000)) / own_hz
         return EffectiveDelay(age_s, age_s, age_s)
-    duration_s = min(scenario.duration_s, 2.0 + 2e-6 * model.location) if constant else scenario.duration_s
-    used = draw_uses(link, link_key(scenario.seed, f"{peer}->{site}"), own_hz, peer_hz, duration_s)
+    duration_s = (
+        min(scenario.duration_s, 2.0 + 2e-6 * model.location)
+        if constant
+        else scenario.duration_s
+    )
+    used = draw_uses(
+        link=link,
+        key=link_key(scenario.seed, f"{peer}->{site}"),
+        own_hz=own_hz,
+        peer_hz=peer_hz,
+        duration_s=duration_s,
+    )
     if used[-1] < 0:
-        raise ScenarioError("no sample of it ever comes", path=f"links.{peer}->{site}", source=scenario.name)
+        raise ScenarioError(
+            "no sample of it ever comes", path=f"links.{peer}->{site}", source=scenario.name
+        )
     first = int(np.argmax(used >= 0))
     now_ns = np.arange(first, len(used)) * NS_PER_S // own_hz
     ages_s = (now_ns - used[first:] * NS_PER_S // peer_hz) * 1e-9
     return EffectiveDelay(float(ages_s.mean()), float(ages_s.min()), float(ages_s.max()))
 
 
-def _final_dominance(scenario: Scenario, sites: tuple[SiteSetup, ...], notes: list[str]) -> Array:
+def _final_dominance(
+    scenario: Scenario, sites: tuple[SiteSetup, ...], notes: list[str]
+) -> Array:
     alpha = scenario.alpha.copy()
     end_ns = round(scenario.duration_s * 1e9)
     for i, site in enumerate(sites):
@@ -278,15 +324,29 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
         actor.acts in (TorqueKind.HAND, TorqueKind.TASK_HAND) and actor.move_end_s > end_s
         for actor in present
     ):
-        notes.append(f"an operator at {name} still moves at the end: taken to be at the end of that motion")
+        notes.append(
+            f"an operator at {name} still moves at the end: taken to be at the end of that motion"
+        )
     if any(actor.acts in _PERIODIC for actor in present):
-        notes.append(f"an operator at {name} still swings at the end: left out, its torque has no mean")
-    scripted = [actor for actor in present if actor.acts in SCRIPTED_KINDS and actor.acts not in _PERIODIC]
+        notes.append(
+            f"an operator at {name} still swings at the end: left out, its torque has no mean"
+        )
+    scripted = [
+        actor
+        for actor in present
+        if actor.acts in SCRIPTED_KINDS and actor.acts not in _PERIODIC
+    ]
     constant = [actor._replace(a=_scripted_torque(actor, end_s)) for actor in scripted]
     if any(any(actor.a) for actor in constant):
-        notes.append(f"a scripted torque acts on {name} at the end: taken to stay as it is then")
+        notes.append(
+            f"a scripted torque acts on {name} at the end: taken to stay as it is then"
+        )
     own = (actor._replace(move_end_s=end_s) for actor in present if actor.acts in OWN_KINDS)
-    others = (actor for actor in present if actor.acts not in (*SCRIPTED_KINDS, *OWN_KINDS, *LIVE_KINDS))
+    others = (
+        actor
+        for actor in present
+        if actor.acts not in (*SCRIPTED_KINDS, *OWN_KINDS, *LIVE_KINDS)
+    )
     return setup._replace(actors=(*others, *own, *constant))
 
 

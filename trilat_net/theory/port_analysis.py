@@ -1,14 +1,16 @@
-"""Port analysis of a scenario's teleoperator: passivity, absolute stability, transparency, also as JSON.
+"""Port analysis of a scenario's teleoperator: passivity, absolute stability, transparency, also
+as JSON.
 
-Invariant: operators and environments are off, and their torque at the equilibrium stays as a constant, so
-that a held pose can be analysed too. An unstable loop has no steady oscillations: nothing but its
-instability counts. Every result holds for the analysed band.
+Invariant: operators and environments are off, and their torque at the equilibrium stays as a
+constant, so that a held pose can be analysed too. An unstable loop has no steady oscillations:
+nothing but its instability counts. Every result holds for the analysed band.
 
-Sites that follow in task space have ports at their end effectors, along the followed axes: the same loop in
-other coordinates. With J the Jacobian of a site's followed axes at rest and N a basis of the joint motions
-that leave them alone, x = J q and z = N' q stand in place of q, so that a force F on the end effector is the
-torque J' F and its velocity is x'. A port is numbered as its coordinate, 1 to 3 a place, 4 to 6 turns, and
-its position's state is called "q" with that number, as a joint's is.
+Sites that follow in task space have ports at their end effectors, along the followed axes: the
+same loop in other coordinates. With J the Jacobian of a site's followed axes at rest and N a
+basis of the joint motions that leave them alone, x = J q and z = N' q stand in place of q, so
+that a force F on the end effector is the torque J' F and its velocity is x'. A port is numbered
+as its coordinate, 1 to 3 a place, 4 to 6 turns, and its position's state is called "q" with
+that number, as a joint's is.
 """
 
 from collections.abc import Mapping, Sequence
@@ -49,8 +51,12 @@ from .port_response import QUOTED_AT_HZ, Transparency, measure_transparency
 from .site_dynamics import follow_peers, lay_out_arguments, place_arm
 
 
-def freeze_external_torques(conditions: OperatingConditions, rest: Equilibrium) -> OperatingConditions:
-    """Returns the conditions with the torque of operators and environments constant as at the equilibrium."""
+def freeze_external_torques(
+    conditions: OperatingConditions, rest: Equilibrium
+) -> OperatingConditions:
+    """Returns the conditions with the torque of operators and environments constant as at the
+    equilibrium.
+    """
     x = gather_site_arguments(conditions, rest)
     sites = []
     for site, rates in zip(conditions.sites, conditions.rates(x), strict=True):
@@ -66,13 +72,19 @@ def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -
     return use_end_effector_ports(frozen, rest, linearise_loop(frozen, rest))
 
 
-def build_proof_output(conditions: OperatingConditions, loop: LinearLoop) -> port_response.LoopOutput | None:
-    """Returns the output r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)), Eq. (6), (9), (10).
+def build_proof_output(
+    conditions: OperatingConditions, loop: LinearLoop
+) -> port_response.LoopOutput | None:
+    """Returns the output r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)), Eq. (6),
+    (9), (10).
 
-    In task space it is J r, with places in q's stead. None if a site has another law than the paper's, which
-    has no r, and where orientations are followed, or axes that a peer leaves free: there is no proof.
+    In task space it is J r, with places in q's stead. None if a site has another law than the
+    paper's, which has no r, and where orientations are followed, or axes that a peer leaves
+    free: there is no proof.
     """
-    if any(site.gains.law is not Law.ADAPTIVE or site.gains.absolute for site in conditions.sites):
+    if any(
+        site.gains.law is not Law.ADAPTIVE or site.gains.absolute for site in conditions.sites
+    ):
         return None
     if conditions.sites[0].layout.task and conditions.sites[0].layout.shared > PLACE:
         return None
@@ -82,7 +94,9 @@ def build_proof_output(conditions: OperatingConditions, loop: LinearLoop) -> por
     for i, site in enumerate(conditions.sites):
         Lambda = np.broadcast_to(site.gains.Lambda, site.layout.shared)
         for row, joint in zip(
-            port_response.find_site_ports(loop, site.name), list_followed_axes(site), strict=True
+            port_response.find_site_ports(loop, site.name),
+            list_followed_axes(site),
+            strict=True,
         ):
             C[row, loop.names.index(f"{site.name}.q{joint}")] += Lambda[joint - 1]
             for j in np.flatnonzero(conditions.alpha[i]):
@@ -132,15 +146,17 @@ class PortAnalysis(NamedTuple):
         joints: the same for each joint alone, no operator at the others.
         proof: passivity with respect to r = qd + Lambda e; None if the law has no r.
         beta: the weights of the sites in that, shape (N,), sum N.
-        estimates_true: True if all estimates at the equilibrium are true; otherwise the proof counts the
-            energy that they store, which a linear loop cannot show.
-        absolute: the least eigenvalue under the best weights; stable with any passive operators where it is
-            not negative.
+        estimates_true: True if all estimates at the equilibrium are true; otherwise the proof
+            counts the energy that they store, which a linear loop cannot show.
+        absolute: the least eigenvalue under the best weights; stable with any passive operators
+            where it is not negative.
         two_ports: Llewellyn's criterion for every pair of sites.
         transparency: at each site, with one other site free and clamped.
         clamped_verdict: of the roots with that other site clamped.
-        axes: names of the ports' numbers in task space, whose ports are forces along them; {}: joints.
-        measured: with measured hands at the masters, see `check_against_hands`; None if there are none.
+        axes: names of the ports' numbers in task space, whose ports are forces along them; {}:
+            joints.
+        measured: with measured hands at the masters, see `check_against_hands`; None if there
+            are none.
     """
 
     scenario: Scenario
@@ -182,7 +198,9 @@ class PortAnalysis(NamedTuple):
     def impedance_unit(self, number: int = 0) -> str:
         """Returns the unit of an impedance at the ports of a number; 0: at all of them."""
         turns = not self.axes or max(self.axes) > PLACE
-        units = {"N s/m" if self.axes and port <= PLACE else "N m s/rad" for port in [number] if port}
+        units = {
+            "N s/m" if self.axes and port <= PLACE else "N m s/rad" for port in [number] if port
+        }
         return " and ".join(units or (["N s/m"] if self.axes else []) + ["N m s/rad"] * turns)
 
 
@@ -195,8 +213,8 @@ def analyse_ports(
 ) -> PortAnalysis:
     """Returns the analysis of a scenario's ports at an equilibrium, over a band, Hz.
 
-    The site `of` is free and clamped for the others' transparency; None: the slave, or the last site. Of
-    `hands` any may hold any master.
+    The site `of` is free and clamped for the others' transparency; None: the slave, or the last
+    site. Of `hands` any may hold any master.
 
     Raises:
         ScenarioError: the scenario has no linear loop.
@@ -204,14 +222,18 @@ def analyse_ports(
     """
     low, high = band_hz
     if not 0.0 < low < high:
-        raise UsageError(f"a band goes from a frequency to a higher one, not from {low:g} to {high:g} Hz")
+        raise UsageError(
+            f"a band goes from a frequency to a higher one, not from {low:g} to {high:g} Hz"
+        )
     conditions = derive_operating_conditions(scenario)
     loop = linearise_teleoperator(conditions, rest)
     of = of or scenario.slave
     sites = port_response.list_port_sites(loop)
     delay_s = port_response.find_longest_delay_s(loop)
     Y = port_response.build_admittance(loop)
-    w_rad_s = frequency_search.refine_frequencies(Y, frequency_search.build_frequency_grid(*band_hz, delay_s))
+    w_rad_s = frequency_search.refine_frequencies(
+        Y, frequency_search.build_frequency_grid(*band_hz, delay_s)
+    )
     Y = frequency_search.cache_response(Y, w_rad_s)
     return PortAnalysis(
         scenario=scenario,
@@ -241,7 +263,13 @@ def analyse_ports(
         ),
         clamped_verdict=compute_delay_spectrum(port_response.clamp_site(loop, of), 1).verdict,
         axes=name_ports(conditions),
-        measured=check_against_hands(Y, w_rad_s, *_place_hands(scenario, conditions, rest, loop, hands)),
+        measured=check_against_hands(
+            Y,
+            w_rad_s,
+            *_place_hands(
+                scenario=scenario, conditions=conditions, rest=rest, loop=loop, hands=hands
+            ),
+        ),
     )
 
 
@@ -279,32 +307,45 @@ def _place_hands(
 def _find_owners(loop: LinearLoop) -> NDArray[np.int64]:
     sites = port_response.list_port_sites(loop)
     return np.array(
-        [sites.index(port_response.parse_port_site(port)) for port in loop.inputs], dtype=np.int64
+        [sites.index(port_response.parse_port_site(port)) for port in loop.inputs],
+        dtype=np.int64,
     )
 
 
-def _check_proof(conditions: OperatingConditions, loop: LinearLoop, w_rad_s: Array) -> Passivity | None:
+def _check_proof(
+    conditions: OperatingConditions, loop: LinearLoop, w_rad_s: Array
+) -> Passivity | None:
     output = build_proof_output(conditions, loop)
     beta = compute_proof_weights(conditions)[_find_owners(loop)]
     if output is None or not (beta > 0.0).all():
         return None
     return check_passivity(
-        lambda w: port_response.evaluate_transfer(loop, port_response.to_imaginary_axis(w), output),
+        lambda w: port_response.evaluate_transfer(
+            loop, port_response.to_imaginary_axis(w), output
+        ),
         w_rad_s,
         beta,
     )
 
 
-def _check_two_ports(loop: LinearLoop, Y: port_response.PortResponse, w_rad_s: Array) -> tuple[TwoPort, ...]:
+def _check_two_ports(
+    loop: LinearLoop, Y: port_response.PortResponse, w_rad_s: Array
+) -> tuple[TwoPort, ...]:
     two_ports = []
     for pair in combinations(port_response.list_port_sites(loop), 2):
         others = [site for site in port_response.list_port_sites(loop) if site not in pair]
         for clamped in ("", *others) if len(others) == 1 else ("",):
             fixed = port_response.find_site_ports(loop, clamped) if clamped else []
             for joint, places in port_response.group_ports_by_joint(loop).items():
-                keep = [port for port in places if port_response.parse_port_site(loop.inputs[port]) in pair]
+                keep = [
+                    port
+                    for port in places
+                    if port_response.parse_port_site(loop.inputs[port]) in pair
+                ]
                 if len(keep) == len(pair):
-                    two_ports.append(TwoPort(pair, joint, clamped, _check_llewellyn(Y, keep, fixed, w_rad_s)))
+                    two_ports.append(
+                        TwoPort(pair, joint, clamped, _check_llewellyn(Y, keep, fixed, w_rad_s))
+                    )
     return tuple(two_ports)
 
 
@@ -329,15 +370,22 @@ def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
         "pole_at_zero": {"order": ports.pole.order, "passive": ports.pole.passive},
         "passive_qd": _passivity_to_json(ports.velocity),
         "passive_qd_of_joint": {
-            ports.axes.get(joint, str(joint)): _passivity_to_json(one) for joint, one in ports.joints.items()
+            ports.axes.get(joint, str(joint)): _passivity_to_json(one)
+            for joint, one in ports.joints.items()
         },
         "passive_r": None if ports.proof is None else _passivity_to_json(ports.proof),
         "beta": ports.beta.tolist(),
         "estimates_true": ports.estimates_true,
         "absolute": _minima_to_json(ports.absolute),
-        "measured_operators": None if ports.measured is None else _minima_to_json(ports.measured),
+        "measured_operators": None
+        if ports.measured is None
+        else _minima_to_json(ports.measured),
         "llewellyn": [
-            {"sites": list(one.sites), "joint": ports.axes.get(one.joint, one.joint), "clamped": one.clamped}
+            {
+                "sites": list(one.sites),
+                "joint": ports.axes.get(one.joint, one.joint),
+                "clamped": one.clamped,
+            }
             | _minima_to_json(one.minima)
             for one in ports.two_ports
         ],
@@ -350,7 +398,10 @@ def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
 
 
 def _passivity_to_json(one: Passivity) -> dict[str, Any]:
-    return {**_minima_to_json(one.minima), "lacking_nm_s_rad": finite_or_none(one.lacking_nm_s_rad)}
+    return {
+        **_minima_to_json(one.minima),
+        "lacking_nm_s_rad": finite_or_none(one.lacking_nm_s_rad),
+    }
 
 
 def _minima_to_json(one: frequency_search.Minima) -> dict[str, Any]:
@@ -387,7 +438,9 @@ def list_followed_axes(site: SiteSetup) -> list[int]:
 
 
 def name_ports(conditions: OperatingConditions) -> dict[int, str]:
-    """Returns what the ports of each number are called: the axes of a task, or {} for the joints."""
+    """Returns what the ports of each number are called: the axes of a task, or {} for the
+    joints.
+    """
     if not conditions.sites[0].layout.task:
         return {}
     followed = sorted({n for site in conditions.sites for n in list_followed_axes(site)})
@@ -397,7 +450,9 @@ def name_ports(conditions: OperatingConditions) -> dict[int, str]:
 def use_end_effector_ports(
     conditions: OperatingConditions, rest: Equilibrium, loop: LinearLoop
 ) -> LinearLoop:
-    """Returns a loop with ports at the end effectors, if its sites follow with them; else the loop."""
+    """Returns a loop with ports at the end effectors, if its sites follow with them; else the
+    loop.
+    """
     if not conditions.sites[0].layout.task:
         return loop
     blocks = []
@@ -413,7 +468,9 @@ def use_end_effector_ports(
         free = null_space(J)
         T = np.vstack([J, free.T])
         inverse = np.hstack([np.linalg.pinv(J), free])
-        estimates = [name for name in loop.names if name.startswith(f"{site.name}.")][2 * at.joints :]
+        estimates = [name for name in loop.names if name.startswith(f"{site.name}.")][
+            2 * at.joints :
+        ]
         rest_of_site = np.eye(len(estimates))
         blocks.append(block_diag(T, T, rest_of_site))
         inverses.append(block_diag(inverse, inverse, rest_of_site))
@@ -427,8 +484,13 @@ def use_end_effector_ports(
     back = block_diag(*inverses)
     J = block_diag(*ports)
     numbers = [(site.name, n) for site in conditions.sites for n in list_followed_axes(site)]
-    inputs, outputs = (tuple(f"{site}.{kind}{n}" for site, n in numbers) for kind in ("tau", "qd"))
-    delayed = tuple(term._replace(A=change @ term.A @ back, B=change @ term.B @ J.T) for term in loop.delayed)
+    inputs, outputs = (
+        tuple(f"{site}.{kind}{n}" for site, n in numbers) for kind in ("tau", "qd")
+    )
+    delayed = tuple(
+        term._replace(A=change @ term.A @ back, B=change @ term.B @ J.T)
+        for term in loop.delayed
+    )
     return loop._replace(
         names=tuple(names),
         inputs=inputs,

@@ -1,19 +1,21 @@
 """Frequency response of the loop at its haptic ports, free or with a site clamped.
 
-Invariant: torque is ON the joint, so that torque times velocity is the power that the operator puts in. A
-clamp's torque counts as any torque on the joint: a law that reflects force reflects it too. Frequencies
-inside are rad/s; those for people are Hz and carry it in their names.
+Invariant: torque is ON the joint, so that torque times velocity is the power that the operator
+puts in. A clamp's torque counts as any torque on the joint: a law that reflects force reflects
+it too. Frequencies inside are rad/s; those for people are Hz and carry it in their names.
 
-Source: impedance and admittance of ports after Hogan, "Impedance control: an approach to manipulation", ASME
-J. Dynamic Systems, Measurement, and Control 107 (1985); teleoperators as networks of them after Hannaford, "A
-design framework for teleoperators with kinesthetic feedback", IEEE Trans. Robotics and Automation 5 (1989).
+Source: impedance and admittance of ports after Hogan, "Impedance control: an approach to
+manipulation", ASME J. Dynamic Systems, Measurement, and Control 107 (1985); teleoperators as
+networks of them after Hannaford, "A design framework for teleoperators with kinesthetic
+feedback", IEEE Trans. Robotics and Automation 5 (1989).
 
-Transparency compares an impedance with another site free and clamped: along one joint, torque over
-velocity, N m s/rad, with no torque of the operator on the other joints. Means are taken on a logarithmic
-frequency axis over a named band. Transmitted impedance after Lawrence, "Stability and transparency in
-bilateral teleoperation", IEEE Trans. Robotics and Automation 9 (1993). The difference of both ends is the
-Z-width of Hashtrudi-Zaad and Salcudean, "Analysis and evaluation of stability and performance robustness
-for teleoperation control architectures", ICRA (2000); the ratio is our own measure (docs/ports.md).
+Transparency compares an impedance with another site free and clamped: along one joint, torque
+over velocity, N m s/rad, with no torque of the operator on the other joints. Means are taken on
+a logarithmic frequency axis over a named band. Transmitted impedance after Lawrence, "Stability
+and transparency in bilateral teleoperation", IEEE Trans. Robotics and Automation 9 (1993). The
+difference of both ends is the Z-width of Hashtrudi-Zaad and Salcudean, "Analysis and evaluation
+of stability and performance robustness for teleoperation control architectures", ICRA (2000);
+the ratio is our own measure (docs/ports.md).
 """
 
 import math
@@ -44,7 +46,8 @@ class LoopOutput(NamedTuple):
 
     Attributes:
         C: shape (p, n).
-        delayed: pairs of a delay, s, and the output matrix of the state so long ago, shape (p, n).
+        delayed: pairs of a delay, s, and the output matrix of the state so long ago, shape (p,
+            n).
     """
 
     C: Array
@@ -52,7 +55,9 @@ class LoopOutput(NamedTuple):
 
     def at(self, s: Complex) -> Complex:
         """Returns C + sum_k C_k e^{-s T_k}, shape (F, p, n)."""
-        total: Complex = np.broadcast_to(self.C.astype(np.complex128), (len(s), *self.C.shape)).copy()
+        total: Complex = np.broadcast_to(
+            self.C.astype(np.complex128), (len(s), *self.C.shape)
+        ).copy()
         for delay_s, C in self.delayed:
             total += np.exp(-s * delay_s)[:, np.newaxis, np.newaxis] * C
         return total
@@ -62,7 +67,8 @@ class PoleAtZero(NamedTuple):
     """The pole of the response at zero frequency: Y(s) ~ residue / s + higher powers of 1 / s.
 
     Attributes:
-        order: the highest power of 1 / s; 0: there is no pole, and a constant torque gives no endless growth.
+        order: the highest power of 1 / s; 0: there is no pole, and a constant torque gives no
+            endless growth.
         residue: shape (p, m): growth of velocity under a constant torque, rad/s^2 per N m.
     """
 
@@ -71,7 +77,9 @@ class PoleAtZero(NamedTuple):
 
     @property
     def passive(self) -> bool:
-        """True if a passive network may have it: single, its residue symmetric and not negative."""
+        """True if a passive network may have it: single, its residue symmetric and not
+        negative.
+        """
         asymmetry = np.abs(self.residue - self.residue.T).max(initial=0.0)
         size = np.abs(self.residue).max(initial=0.0)
         if self.order > 1 or asymmetry > _NEGLIGIBLE * size:
@@ -79,10 +87,14 @@ class PoleAtZero(NamedTuple):
         return bool(np.linalg.eigvalsh(self.residue).min(initial=0.0) >= -_NEGLIGIBLE * size)
 
 
-def evaluate_transfer(loop: LinearLoop, s: Complex, output: LoopOutput | None = None) -> Complex:
-    """Returns C(s) (s - A - sum_k A_k e^{-s T_k})^{-1} (B + sum_k B_k e^{-s T_k}), shape (F, p, m).
+def evaluate_transfer(
+    loop: LinearLoop, s: Complex, output: LoopOutput | None = None
+) -> Complex:
+    """Returns C(s) (s - A - sum_k A_k e^{-s T_k})^{-1} (B + sum_k B_k e^{-s T_k}), shape (F, p,
+    m).
 
-    Without an output C(s) is the loop's own, its joint velocities, which makes this Y(s), rad/s per N m.
+    Without an output C(s) is the loop's own, its joint velocities, which makes this Y(s), rad/s
+    per N m.
     """
     output = LoopOutput(loop.C) if output is None else output
     response = np.zeros((len(s), len(output.C), loop.B.shape[1]), np.complex128)
@@ -100,7 +112,8 @@ def evaluate_transfer(loop: LinearLoop, s: Complex, output: LoopOutput | None = 
 
 
 def build_admittance(loop: LinearLoop) -> PortResponse:
-    """Returns Y(j w): velocity of each joint per torque of an operator at each joint, rad/s per N m.
+    """Returns Y(j w): velocity of each joint per torque of an operator at each joint, rad/s per
+    N m.
 
     The loop's outputs must be the velocities of the joints of its inputs, in order.
     """
@@ -134,12 +147,16 @@ def find_site_ports(loop: LinearLoop, site: str) -> list[int]:
     """
     ports = [n for n, name in enumerate(loop.inputs) if parse_port_site(name) == site]
     if not ports:
-        raise UsageError(f"no site {site!r} at the ports; there are {', '.join(list_port_sites(loop))}")
+        raise UsageError(
+            f"no site {site!r} at the ports; there are {', '.join(list_port_sites(loop))}"
+        )
     return ports
 
 
 def group_ports_by_joint(loop: LinearLoop) -> dict[int, list[int]]:
-    """Returns the places of every joint by its number, one per site that has it, in the order of sites."""
+    """Returns the places of every joint by its number, one per site that has it, in the order
+    of sites.
+    """
     places: dict[int, list[int]] = {}
     for place, name in enumerate(loop.inputs):
         places.setdefault(int(name.rpartition("tau")[2]), []).append(place)
@@ -157,17 +174,22 @@ def find_longest_delay_s(loop: LinearLoop) -> float:
 
 
 def find_pole_at_zero(loop: LinearLoop) -> PoleAtZero:
-    """Returns the pole of the response at zero, by Cauchy's integral along a small circle about it.
+    """Returns the pole of the response at zero, by Cauchy's integral along a small circle about
+    it.
 
-    Common poses at which the arms can rest, and estimates without excitation, are roots of the loop at
-    zero. Most are no poles of Y: a resting arm has no velocity. A loop without friction has one: Y(s) ~
-    1 / (m s). Roots within `ZERO_ROOT_RADIUS_PER_S` count as at zero.
+    Common poses at which the arms can rest, and estimates without excitation, are roots of the
+    loop at zero. Most are no poles of Y: a resting arm has no velocity. A loop without friction
+    has one: Y(s) ~ 1 / (m s). Roots within `ZERO_ROOT_RADIUS_PER_S` count as at zero.
     """
-    turn = np.exp(2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS)[:, np.newaxis, np.newaxis]
+    turn = np.exp(2j * math.pi * np.arange(_CIRCLE_POINTS) / _CIRCLE_POINTS)[
+        :, np.newaxis, np.newaxis
+    ]
     values = evaluate_transfer(loop, ZERO_ROOT_RADIUS_PER_S * turn[:, 0, 0])
     parts = [(values * turn**power).mean(axis=0).real for power in range(1, _HIGHEST_POWER + 1)]
     size = _NEGLIGIBLE * np.abs(values).max(initial=0.0)
-    powers = [power for power, part in enumerate(parts, 1) if np.abs(part).max(initial=0.0) > size]
+    powers = [
+        power for power, part in enumerate(parts, 1) if np.abs(part).max(initial=0.0) > size
+    ]
     residue = parts[0] * ZERO_ROOT_RADIUS_PER_S if 1 in powers else np.zeros_like(parts[0])
     return PoleAtZero(max(powers, default=0), residue)
 
@@ -186,7 +208,9 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
     kept = [n for n in range(len(loop.names)) if n not in removed]
     terms = [DelayedTerm(0.0, loop.A, loop.B), *loop.delayed]
     if any(term.B[np.ix_(speeds, ports)].any() for term in loop.delayed):
-        raise UsageError(f"clamped sites that reflect force onto each other have no finite answer: {site}")
+        raise UsageError(
+            f"clamped sites that reflect force onto each other have no finite answer: {site}"
+        )
     inverse = np.linalg.inv(loop.B[np.ix_(speeds, ports)])
     sums: dict[float, DelayedTerm] = {}
 
@@ -207,13 +231,13 @@ def clamp_site(loop: LinearLoop, site: str) -> LinearLoop:
         for delay_s, A, B in sorted(sums.values(), key=lambda term: term.delay_s)
     ]
     return LinearLoop(
-        tuple(loop.names[n] for n in kept),
-        tuple(loop.inputs[n] for n in others),
-        tuple(loop.outputs[n] for n in others),
-        now.A,
-        now.B,
-        loop.C[np.ix_(others, kept)],
-        tuple(term for term in late if term.A.any() or term.B.any()),
+        names=tuple(loop.names[n] for n in kept),
+        inputs=tuple(loop.inputs[n] for n in others),
+        outputs=tuple(loop.outputs[n] for n in others),
+        A=now.A,
+        B=now.B,
+        C=loop.C[np.ix_(others, kept)],
+        delayed=tuple(term for term in late if term.A.any() or term.B.any()),
         E=None if loop.E is None else loop.E[kept],
     )
 
@@ -263,7 +287,9 @@ class Transparency(NamedTuple):
 
     @property
     def difference_nm_s_rad(self) -> float:
-        """Mean size of Z_clamped - Z_free over the band, on logarithmic axes; zero if they are one."""
+        """Mean size of Z_clamped - Z_free over the band, on logarithmic axes; zero if they are
+        one.
+        """
         apart = self.clamped - self.free
         return self._mean(apart) if apart.all() else 0.0
 
@@ -272,7 +298,8 @@ class Transparency(NamedTuple):
         x = np.log(self.w_rad_s)
         at = np.log(2.0 * np.pi * frequency_hz)
         free, clamped = (
-            float(np.exp(np.interp(at, x, np.log(np.abs(Z))))) for Z in (self.free, self.clamped)
+            float(np.exp(np.interp(at, x, np.log(np.abs(Z)))))
+            for Z in (self.free, self.clamped)
         )
         return free, clamped
 
@@ -304,6 +331,13 @@ def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparen
     )
     joints = [int(loop.inputs[port].rpartition("tau")[2]) for port in places]
     return tuple(
-        Transparency(at, of, joint, w_rad_s, 1.0 / free[:, n, n], 1.0 / clamped[:, n, n])
+        Transparency(
+            at=at,
+            of=of,
+            joint=joint,
+            w_rad_s=w_rad_s,
+            free=1.0 / free[:, n, n],
+            clamped=1.0 / clamped[:, n, n],
+        )
         for n, joint in enumerate(joints)
     )

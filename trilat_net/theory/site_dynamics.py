@@ -1,11 +1,13 @@
-"""One site as a continuous system: derivatives of arm, control law and estimates, and their Jacobian.
+"""One site as a continuous system: derivatives of arm, control law and estimates, and their
+Jacobian.
 
-Invariant: plain NumPy on `textbook_arm`, nothing of the compiled core. Where a law has
-branches (a wall, the bounds of an estimate) the real part decides, so that a complex step yields the Jacobian
-of the branch in force.
+Invariant: plain NumPy on `textbook_arm`, nothing of the compiled core. Where a law has branches
+(a wall, the bounds of an estimate) the real part decides, so that a complex step yields the
+Jacobian of the branch in force.
 
-Complex step: f'(x) = Im f(x + i h) / h with h = 1e-30, exact to rounding because nothing is subtracted.
-Squire and Trapp, "Using complex variables to estimate derivatives of real functions", SIAM Review 40 (1998).
+Complex step: f'(x) = Im f(x + i h) / h with h = 1e-30, exact to rounding because nothing is
+subtracted. Squire and Trapp, "Using complex variables to estimate derivatives of real
+functions", SIAM Review 40 (1998).
 """
 
 from collections.abc import Iterator
@@ -23,7 +25,9 @@ from .textbook_arm import Following, PlacedChain, follow_in_task, follow_joints,
 
 COMPLEX_STEP = 1e-30
 SWITCHING_TOLERANCE = 1e-9
-"""A wall this near, m, or an estimate this near to an end of its box, is at its switching point."""
+"""A wall this near, m, or an estimate this near to an end of its box, is at its switching
+point.
+"""
 
 
 class ArgumentLayout:
@@ -32,16 +36,18 @@ class ArgumentLayout:
     Args:
         joints: length of each part but the estimate and what comes from peers.
         parameters: length of the estimate.
-        shared: length of what comes from peers, of each of its three parts; 0: as many as there are joints.
+        shared: length of what comes from peers, of each of its three parts; 0: as many as there
+            are joints.
         peers: of a law of one's own, which sees each peer by itself too, how many there are.
 
     Attributes:
         q, qd: joint positions, and velocities.
-        estimate: the estimate, theta_hat.
-        q_des, qd_des: the reference, q_id, in task space a pose, see `textbook_arm`; and its derivative.
+        estimate: the estimate, theta_hat. q_des, qd_des: the reference, q_id, in task space a
+        pose, see `textbook_arm`; and its derivative.
         peer_torque: the exogenous torque of the peers; in task space their force.
         external_torque: torque that an operator adds ON the joints.
-        inputs: what comes from peers: the reference, its derivative, and their torque; then that of each.
+        inputs: what comes from peers: the reference, its derivative, and their torque; then
+            that of each.
         coordinates: length of each part that comes from peers.
         states: length of a site's state: q, qd and theta_hat.
         arguments: length of the whole argument.
@@ -68,7 +74,9 @@ class ArgumentLayout:
 
 
 def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
-    """Returns the layout of the arguments of a site's rates; memory of a law of one's own is its estimate."""
+    """Returns the layout of the arguments of a site's rates; memory of a law of one's own is
+    its estimate.
+    """
     if isinstance(site.own, NumericLaw):
         return ArgumentLayout(site.layout.joints, len(site.own.memory), 0, len(site.links))
     return ArgumentLayout(site.layout.joints, site.layout.parameters, site.layout.shared)
@@ -76,7 +84,11 @@ def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
 
 def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
     """Returns the arm of a site in the poses q, shape (n, ...)."""
-    return PlacedArm(site.g_m_s2, site.lengths_m, q) if site.chain is None else PlacedChain(site.chain, q)
+    return (
+        PlacedArm(site.g_m_s2, site.lengths_m, q)
+        if site.chain is None
+        else PlacedChain(site.chain, q)
+    )
 
 
 class SiteRates(NamedTuple):
@@ -86,7 +98,8 @@ class SiteRates(NamedTuple):
         qdd: joint accelerations, shape (n, ...), rad/s^2.
         estimate: the derivative of theta_hat, shape (P, ...).
         tau: the torque of the control law, unclamped, shape (n, ...), N m.
-        external: the torque of operators and environments that act continuously, shape (n, ...), N m.
+        external: the torque of operators and environments that act continuously, shape (n,
+            ...), N m.
         held: the torque of those that are sampled and held, shape (n, ...), N m.
         x: what peers get of the pose, shape (m, ...): the angles, or place and orientation, see
             `textbook_arm.Following`.
@@ -123,7 +136,8 @@ def share_own_pose(site: SiteSetup, q: Numbers) -> Numbers:
 
 
 def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
-    """Returns the rates of a site, with the actors in force: Eq. (8)-(13), (15), or those of known gravity.
+    """Returns the rates of a site, with the actors in force: Eq. (8)-(13), (15), or those of
+    known gravity.
 
     x is laid out as `lay_out_arguments` says, shape (arguments, ...).
     """
@@ -134,16 +148,29 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     external = x[at.external_torque] + _sum_actors(site, arm, x, sampled=False)
     held = _sum_actors(site, arm, x, sampled=True)
     if isinstance(site.own, NumericLaw):
-        tau, estimate = site.own.evaluate(np.concatenate([x[: at.inputs.stop], external + held]))
+        tau, estimate = site.own.evaluate(
+            np.concatenate([x[: at.inputs.stop], external + held])
+        )
     else:
         tau, estimate = _evaluate_law(site, arm, following, x)
     qdd = arm.joint_acceleration(_as_columns(site.theta, qd), qd, tau + external + held)
     reflected = following.from_joints(external + held)
-    return SiteRates(qdd, estimate, tau, external, held, following.x, following.xd, reflected)
+    return SiteRates(
+        qdd=qdd,
+        estimate=estimate,
+        tau=tau,
+        external=external,
+        held=held,
+        x=following.x,
+        xd=following.xd,
+        reflected=reflected,
+    )
 
 
 def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
-    """Returns the derivatives of the rates at x by a complex step, a column per entry of x each."""
+    """Returns the derivatives of the rates at x by a complex step, a column per entry of x
+    each.
+    """
     stepped = x[:, np.newaxis] + 1j * COMPLEX_STEP * np.eye(len(x))
     return SiteRates(*(rate.imag / COMPLEX_STEP for rate in evaluate_site_rates(site, stepped)))
 
@@ -183,9 +210,17 @@ def _evaluate_law(
         r = qd + Lambda * q
         led = _as_columns(gains.Kp, q) * (x[at.qd_des] + Lambda * x[at.q_des])
         pull = pull - led
-    tau = arm.required_torque(estimate, qd, v, a) - _as_columns(gains.Kp, q) * r - following.to_joints(pull)
-    rho, width, known = (_as_columns(gain, q) for gain in (gains.rho, gains.width, gains.friction))
-    tau = tau - rho * r / np.sqrt(r * r + width * width) - (1.0 - known) * arm.friction_torque(v)
+    tau = (
+        arm.required_torque(estimate, qd, v, a)
+        - _as_columns(gains.Kp, q) * r
+        - following.to_joints(pull)
+    )
+    rho, width, known = (
+        _as_columns(gain, q) for gain in (gains.rho, gains.width, gains.friction)
+    )
+    tau = (
+        tau - rho * r / np.sqrt(r * r + width * width) - (1.0 - known) * arm.friction_torque(v)
+    )
     Y = arm.regressor_matrix(qd, v, a)
     rate = -_as_columns(gains.Gamma, q) * multiply_columns(np.swapaxes(Y, 0, 1), r)
     return tau, np.where(_is_at_bound(site, estimate, rate), 0.0, rate)
@@ -199,7 +234,9 @@ def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
     return down | up
 
 
-def _sum_actors(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers, *, sampled: bool) -> Numbers:
+def _sum_actors(
+    site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers, *, sampled: bool
+) -> Numbers:
     """Returns the torque of the actors in force on the arm, shape (n, ...), N m."""
     at = lay_out_arguments(site)
     q = x[at.q]
@@ -211,8 +248,11 @@ def _sum_actors(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers, *, sa
     return total
 
 
-def _actor_torque(arm: PlacedArm | PlacedChain, actor: TorqueSource, q: Numbers, qd: Numbers) -> Numbers:
-    """Returns the torque of one actor: an operator's motion has ended, a scripted torque is constant, `a`.
+def _actor_torque(
+    arm: PlacedArm | PlacedChain, actor: TorqueSource, q: Numbers, qd: Numbers
+) -> Numbers:
+    """Returns the torque of one actor: an operator's motion has ended, a scripted torque is
+    constant, `a`.
 
     One of an own kind stays as it is at `move_end_s`.
     """
@@ -230,7 +270,9 @@ def _actor_torque(arm: PlacedArm | PlacedChain, actor: TorqueSource, q: Numbers,
     velocity = multiply_columns(J, qd)
     if actor.acts in OWN_KINDS:
         at_tip = actor.acts is TorqueKind.OWN_TIP
-        seen = (np.moveaxis(one, 0, -1) for one in ((position, velocity) if at_tip else (q, qd)))
+        seen = (
+            np.moveaxis(one, 0, -1) for one in ((position, velocity) if at_tip else (q, qd))
+        )
         effort = np.moveaxis(actor.model.effort(np.array(actor.move_end_s), *seen), -1, 0)
         return multiply_columns(np.swapaxes(J, 0, 1), effort) if at_tip else effort
     if actor.acts is TorqueKind.TASK_HAND:
@@ -256,7 +298,9 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
         unbounded = site.gains._replace(low=-np.inf, high=np.inf)
         free_rate = evaluate_site_rates(site._replace(gains=unbounded), x).estimate
         estimate = x[at.estimate]
-        ends = np.stack([np.broadcast_to(end, estimate.shape) for end in (site.gains.low, site.gains.high)])
+        ends = np.stack(
+            [np.broadcast_to(end, estimate.shape) for end in (site.gains.low, site.gains.high)]
+        )
         near = (np.abs(ends - estimate) < SWITCHING_TOLERANCE).any(axis=0)
         near &= np.abs(rate) <= SWITCHING_TOLERANCE
         near &= ~_is_at_bound(site, estimate, free_rate) & (np.asarray(site.gains.Gamma) > 0)

@@ -1,9 +1,12 @@
-"""A chain of joints in plain NumPy and how it follows; the planar arm is `analysis.arm_rows.PlacedArm`.
+"""A chain of joints in plain NumPy and how it follows; the planar arm is
+`analysis.arm_rows.PlacedArm`.
 
-Invariant: independent of the compiled core, and analytic in every argument but where a chain meets a stop
-(there the real part decides), so that a complex step gives derivatives exact to rounding.
+Invariant: independent of the compiled core, and analytic in every argument but where a chain
+meets a stop (there the real part decides), so that a complex step gives derivatives exact to
+rounding.
 
-Vectors have their components on the first axis and any number of columns behind it: shape (n,) or (n, B).
+Vectors have their components on the first axis and any number of columns behind it: shape (n,)
+or (n, B).
 
 Of a spatial vector the linear half comes first, at the origin of the link's own frame. With the
 Jacobian J_i of link i, its velocities V_i = J_i qd and W_i = J_i v, and its acceleration
@@ -11,12 +14,13 @@ A_i = X A_p + S a + V_i x (S v), gravity included, link i needs
 
     f_i = I A_i + 1/2 (V_i x* I W_i + W_i x* I V_i - I (V_i x W_i))
 
-which is linear in its ten parameters: f_i = F_i pi_i. So Y = (J_1' F_1 ... J_n' F_n), Eq. (12), and
-M = sum_i J_i' I_i J_i. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors.
+which is linear in its ten parameters: f_i = F_i pi_i. So Y = (J_1' F_1 ... J_n' F_n), Eq. (12),
+and M = sum_i J_i' I_i J_i. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial
+vectors.
 
-Following in task space is that of `analysis.following.find_task_reference`, with psi = -k (q - posture); a
-force F at the end effector is the torque J' F, and a torque tau there is the force A^-1 J tau. Sources stand
-in `core.task_space` and docs/laws.md.
+Following in task space is that of `analysis.following.find_task_reference`, with psi = -k (q -
+posture); a force F at the end effector is the torque J' F, and a torque tau there is the force
+A^-1 J tau. Sources stand in `core.task_space` and docs/laws.md.
 """
 
 from collections.abc import Sequence
@@ -116,14 +120,16 @@ class PlacedChain:
             J[:, i] += S.reshape(6, *(1,) * len(columns))
             place_m = place_m + multiply_columns(R_base, p)
             R_base = _multiply(R_base, R)
-            self._links.append(PlacedLink(X, S, J, R_base, place_m))
+            self._links.append(PlacedLink(X=X, S=S, J=J, R_base=R_base, place_m=place_m))
 
     def _per_joint(self, name: str) -> Numbers:
         values = np.array([getattr(joint, name) for joint in self._chain.joints])
         return values.reshape(-1, *(1,) * (self._q.ndim - 1))
 
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-        """Returns Y(q, qd, v, a) of the links alone, without drives, shape (n, 10 n, ...), Eq. (12)."""
+        """Returns Y(q, qd, v, a) of the links alone, without drives, shape (n, 10 n, ...), Eq.
+        (12).
+        """
         parts = []
         gravity = np.array([*self._chain.gravity_m_s2, 0.0, 0.0, 0.0])
         A = -np.multiply.outer(gravity, np.ones(self._q.shape[1:]))
@@ -138,12 +144,16 @@ class PlacedChain:
                 np.einsum("pab,b...->ap...", _INERTIA_UNITS, motion)
                 for motion in (A, V, W, multiply_columns(V_x, W))
             )
-            F = I_A - 0.5 * (_multiply(V_x.swapaxes(0, 1), I_W) + _multiply(W_x.swapaxes(0, 1), I_V) + I_VW)
+            F = I_A - 0.5 * (
+                _multiply(V_x.swapaxes(0, 1), I_W) + _multiply(W_x.swapaxes(0, 1), I_V) + I_VW
+            )
             parts.append(_multiply(J.swapaxes(0, 1), F))
         return np.concatenate(parts, axis=1)
 
     def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-        """Returns M(q) a + C(q, qd) v + G(q) with the drives' inertia and friction at v, shape (n, ...)."""
+        """Returns M(q) a + C(q, qd) v + G(q) with the drives' inertia and friction at v, shape
+        (n, ...).
+        """
         friction = self.friction_torque(v)
         body = multiply_columns(self.regressor_matrix(qd, v, a), theta)
         torque: Numbers = body + self._per_joint("armature_kg_m2") * a + friction
@@ -152,7 +162,9 @@ class PlacedChain:
     def friction_torque(self, v: Numbers) -> Numbers:
         """Returns the torque of the joints' friction at speeds v, shape (n, ...), N m."""
         x = v / COULOMB_SPEED
-        return self._per_joint("viscous") * v + self._per_joint("coulomb") * x / np.sqrt(1.0 + x * x)
+        return self._per_joint("viscous") * v + self._per_joint("coulomb") * x / np.sqrt(
+            1.0 + x * x
+        )
 
     def gravity_torque(self, theta: Numbers) -> Numbers:
         """Returns G(q), shape (n, ...), N m."""
@@ -162,7 +174,8 @@ class PlacedChain:
     def inertia_matrix(self, theta: Numbers) -> Numbers:
         """Returns M(q) with the drives' inertia, shape (n, n, ...)."""
         M = np.multiply.outer(
-            np.diag([joint.armature_kg_m2 for joint in self._chain.joints]), np.ones(self._q.shape[1:])
+            np.diag([joint.armature_kg_m2 for joint in self._chain.joints]),
+            np.ones(self._q.shape[1:]),
         )
         for i, link in enumerate(self._links):
             own = theta[LINK_PARAMETERS * i : LINK_PARAMETERS * (i + 1)]
@@ -196,7 +209,9 @@ class PlacedChain:
 
     def end_effector_orientation(self) -> Numbers:
         """Returns the orientation of the end effector in the base, shape (3, 3, ...)."""
-        turned: Numbers = np.einsum("ab...,bc->ac...", self._links[-1].R_base, self._chain.tip_rotation)
+        turned: Numbers = np.einsum(
+            "ab...,bc->ac...", self._links[-1].R_base, self._chain.tip_rotation
+        )
         return turned
 
     def position_jacobian(self) -> Numbers:
@@ -204,20 +219,24 @@ class PlacedChain:
         return self.pose_jacobian()[:3]
 
     def pose_jacobian(self) -> Numbers:
-        """Returns the Jacobian of the end effector's velocity and turning, base axes, shape (6, n, ...)."""
+        """Returns the Jacobian of the end effector's velocity and turning, base axes, shape (6,
+        n, ...).
+        """
         return self._carry_to_tip(self._links[-1].J)
 
     def pose_jacobian_rate(self, qd: Numbers) -> Numbers:
         """Returns the derivative of that Jacobian along qd, shape (6, n, ...).
 
-        Of column k in the frame of the last link it is X (V_k x S_k) - V x (X S_k); the frame turns with it.
+        Of column k in the frame of the last link it is X (V_k x S_k) - V x (X S_k); the frame
+        turns with it.
         """
         V_last = multiply_columns(self._links[-1].J, qd)
         rate = np.zeros(self._links[-1].J.shape, np.result_type(self._links[-1].J, qd))
         for k, (X, S, J, _, _) in enumerate(self._links):
             rate = _multiply(X, rate)
             rate[:, k] += multiply_columns(
-                _cross_motion(multiply_columns(J, qd)), np.multiply.outer(S, np.ones(qd.shape[1:]))
+                _cross_motion(multiply_columns(J, qd)),
+                np.multiply.outer(S, np.ones(qd.shape[1:])),
             )
         rate = self._carry_to_tip(rate - _multiply(_cross_motion(V_last), self._links[-1].J))
         turning = build_cross_matrix(multiply_columns(self._links[-1].R_base, V_last[3:]))
@@ -233,7 +252,9 @@ class PlacedChain:
 
 
 def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
-    """Returns a link's orientation, shape (3, 3, ...), and origin in the frame of the link before."""
+    """Returns a link's orientation, shape (3, 3, ...), and origin in the frame of the link
+    before.
+    """
     at_rest = np.array(joint.rotation)
     axis = np.array(joint.axis)
     ones = np.ones(np.shape(q))
@@ -247,7 +268,9 @@ def _place_joint(joint: ChainJoint, q: Numbers) -> tuple[Numbers, Numbers]:
 
 
 SINGULAR = 1e-9
-"""A pose whose lower bound of the Jacobian's least squared singular value is below this is singular."""
+"""A pose whose lower bound of the Jacobian's least squared singular value is below this is
+singular.
+"""
 _SMALL = 1e-4
 """Squares below this are small: four terms of a series are exact."""
 
@@ -268,7 +291,8 @@ def rotation_from_vector(vector: Numbers) -> Numbers:
 
 
 def vector_from_rotation(R: Numbers) -> Numbers:
-    """Returns the rotation vector of a rotation matrix, shape (3, ...), at most half a turn long.
+    """Returns the rotation vector of a rotation matrix, shape (3, ...), at most half a turn
+    long.
 
     By the quaternion, from its largest part (Shepperd, 1978).
     """
@@ -290,7 +314,9 @@ def vector_from_rotation(R: Numbers) -> Numbers:
         ]
     )
     sizes = np.array([forms[n, n].real for n in range(4)])
-    quaternion = np.take_along_axis(forms, sizes.argmax(axis=0)[np.newaxis, np.newaxis], axis=0)[0]
+    quaternion = np.take_along_axis(
+        forms, sizes.argmax(axis=0)[np.newaxis, np.newaxis], axis=0
+    )[0]
     quaternion = quaternion / np.sqrt(np.sum(quaternion * quaternion, axis=0))
     quaternion = np.where(quaternion[0].real < 0.0, -quaternion, quaternion)
     w = quaternion[0]
@@ -313,7 +339,8 @@ def turn_from(other: Numbers, R: Numbers) -> Numbers:
 
 
 def evaluate_reference(shares: Array, own: Numbers, shared: Sequence[Numbers]) -> Numbers:
-    """Returns the pose that a site follows, as it shares its own: of places the mean by shares, Eq. (6).
+    """Returns the pose that a site follows, as it shares its own: of places the mean by shares,
+    Eq. (6).
 
     Of orientations it is the own one less the sum of alpha_ij Log(R_i R_j').
 
@@ -322,18 +349,25 @@ def evaluate_reference(shares: Array, own: Numbers, shared: Sequence[Numbers]) -
         own: what the site shares of its own pose, shape (m, ...).
         shared: of each site what it shares.
     """
-    followed = [(share, pose) for share, pose in zip(shares.tolist(), shared, strict=True) if share]
+    followed = [
+        (share, pose) for share, pose in zip(shares.tolist(), shared, strict=True) if share
+    ]
     places = sum(share * pose[:PLACE] for share, pose in followed)
     if len(own) == PLACE:
         return np.asarray(places)
     R = rotation_from_vector(own[PLACE:])
-    apart = sum(share * turn_from(rotation_from_vector(pose[PLACE:]), R) for share, pose in followed)
+    apart = sum(
+        share * turn_from(rotation_from_vector(pose[PLACE:]), R) for share, pose in followed
+    )
     reference = _multiply(rotation_from_vector(-np.asarray(apart)), R)
-    return np.concatenate([np.asarray(places) + 0.0 * own[:PLACE], vector_from_rotation(reference)])
+    return np.concatenate(
+        [np.asarray(places) + 0.0 * own[:PLACE], vector_from_rotation(reference)]
+    )
 
 
 class Following(NamedTuple):
-    """How a site follows, in a state: of joint space the angles, else the end effector along its axes.
+    """How a site follows, in a state: of joint space the angles, else the end effector along
+    its axes.
 
     Attributes:
         x: what it shares of its pose, shape (m, ...).
@@ -342,9 +376,11 @@ class Following(NamedTuple):
         ed: their velocity less that of the reference.
         v: reference velocity of the joints, shape (n, ...).
         a: its derivative.
-        J: Jacobian of the followed axes, shape (m, n, ...); None in joint space, where it is one.
+        J: Jacobian of the followed axes, shape (m, n, ...); None in joint space, where it is
+            one.
         A: J J' with its damping, shape (m, m, ...).
-        least: lower bound of the square of the Jacobian's least singular value, undamped; inf in joint space.
+        least: lower bound of the square of the Jacobian's least singular value, undamped; inf
+            in joint space.
     """
 
     x: Numbers
@@ -358,25 +394,33 @@ class Following(NamedTuple):
     least: float = np.inf
 
     def to_joints(self, force: Numbers) -> Numbers:
-        """Returns the torque of the joints that a force on the coordinates amounts to, shape (n, ...)."""
+        """Returns the torque of the joints that a force on the coordinates amounts to, shape
+        (n, ...).
+        """
         return force if self.J is None else multiply_columns(self.J.swapaxes(0, 1), force)
 
     def from_joints(self, torque: Numbers) -> Numbers:
-        """Returns the force on the coordinates that a torque of the joints amounts to, shape (m, ...)."""
+        """Returns the force on the coordinates that a torque of the joints amounts to, shape
+        (m, ...).
+        """
         if self.J is None or self.A is None:
             return torque
         return solve_columns(self.A, multiply_columns(self.J, torque))
 
 
-def follow_joints(Lambda: Numbers, q: Numbers, qd: Numbers, q_des: Numbers, qd_des: Numbers) -> Following:
+def follow_joints(
+    Lambda: Numbers, q: Numbers, qd: Numbers, q_des: Numbers, qd_des: Numbers
+) -> Following:
     """Returns how a site follows joint by joint, Eq. (9), (10)."""
     e = q - q_des
     ed = qd - qd_des
-    return Following(q, qd, e, ed, -Lambda * e, -Lambda * ed)
+    return Following(x=q, xd=qd, e=e, ed=ed, v=-Lambda * e, a=-Lambda * ed)
 
 
 def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
-    """Returns what a site shares of its pose: place and rotation vector, or the place, shape (m, ...)."""
+    """Returns what a site shares of its pose: place and rotation vector, or the place, shape
+    (m, ...).
+    """
     place = task.scale * arm.end_effector_position()
     if len(task.axes) == PLACE:
         return place
@@ -392,7 +436,9 @@ def follow_in_task(
     x_des: Numbers,
     xd_des: Numbers,
 ) -> Following:
-    """Returns how a site follows with its end effector; in a singular pose A and what needs it are NaN."""
+    """Returns how a site follows with its end effector; in a singular pose A and what needs it
+    are NaN.
+    """
     assert site.chain is not None
     assert site.chain.task is not None
     task = site.chain.task
@@ -401,7 +447,9 @@ def follow_in_task(
     one = (1,) * (q.ndim - 1)
     axes = np.array(task.axes).reshape(m, *one)
     scales = np.array([task.scale] * PLACE + [1.0] * PLACE)[:m].reshape(m, 1, *one)
-    whole, whole_rate = (scales * J[:m] for J in (arm.pose_jacobian(), arm.pose_jacobian_rate(qd)))
+    whole, whole_rate = (
+        scales * J[:m] for J in (arm.pose_jacobian(), arm.pose_jacobian_rate(qd))
+    )
     xd = multiply_columns(whole, qd)
     e = x - x_des
     if m > PLACE:
@@ -415,12 +463,20 @@ def follow_in_task(
     posture = np.array(task.posture or site.q0).reshape(-1, *one)
     psi = -task.posture_rate * (q - posture)
     psi_d = -task.posture_rate * qd
-    v, a = find_task_reference(J, Jd, partial(solve_columns, A), (psi, psi_d), (Lambda * e, Lambda * ed))
-    return Following(x, xd, e, ed, v, a, J, A, least)
+    v, a = find_task_reference(
+        J=J,
+        Jd=Jd,
+        solve=partial(solve_columns, A),
+        posture=(psi, psi_d),
+        error=(Lambda * e, Lambda * ed),
+    )
+    return Following(x=x, xd=xd, e=e, ed=ed, v=v, a=a, J=J, A=A, least=least)
 
 
 def _damp(task: TaskSetup, J: Numbers) -> tuple[Numbers, float]:
-    """Returns J J', damped if the pose is nearly singular, and what decides it, 1 / trace((J J')^-1)."""
+    """Returns J J', damped if the pose is nearly singular, and what decides it, 1 / trace((J
+    J')^-1).
+    """
     m = len(task.axes)
     one = (1,) * (J.ndim - 2)
     followed = [n for n, on in enumerate(task.axes) if on]

@@ -29,9 +29,19 @@ LYAPUNOV = {
 }
 """Unequal shares and Kd, upon `free`."""
 
-JITTER = {"link.model": "uniform", "link.delay_ms": 200.0, "link.half_width_ms": 50.0, "duration_s": 3.0}
+JITTER = {
+    "link.model": "uniform",
+    "link.delay_ms": 200.0,
+    "link.half_width_ms": 50.0,
+    "duration_s": 3.0,
+}
 
-EXPERT = {"dominance.m1.m2": 0.0, "dominance.m1.s": 1.0, "dominance.s.m1": 1.0, "dominance.s.m2": 0.0}
+EXPERT = {
+    "dominance.m1.m2": 0.0,
+    "dominance.m1.s": 1.0,
+    "dominance.s.m1": 1.0,
+    "dominance.s.m2": 0.0,
+}
 """m1 and s follow each other, and m2 follows both."""
 
 RICH = """
@@ -134,7 +144,11 @@ class _Run:
 
     def __init__(self, name: str, overrides: Mapping[str, Any]) -> None:
         known = name in TEXTS
-        scenario = parse_scenario(TEXTS[name], name, overrides) if known else load_scenario(name, overrides)
+        scenario = (
+            parse_scenario(TEXTS[name], name, overrides)
+            if known
+            else load_scenario(name, overrides)
+        )
         self.log = trilat_net.simulate(scenario)
 
     @cached_property

@@ -59,7 +59,9 @@ def test_every_run_is_certified(name: str, picks: dict[str, int], duration_s: fl
     found = certify(trilat_net.simulate(scenario))
     told = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert FALSE_RECORDS_TEXT not in told["text"] or "tells which" in told["text"]
-    assert all(line.text and "nan" not in line.text.split() for line in describe_certificate(found))
+    assert all(
+        line.text and "nan" not in line.text.split() for line in describe_certificate(found)
+    )
     assert found.passed is (describe_certificate(found)[0].mark == "ok")
     if found.balance is not None:
         (_, first), *between, (_, last) = list_energies(found.balance)

@@ -27,7 +27,11 @@ from trilat_net.analysis.certificate.energy_balance import (
     compute_site_energies,
 )
 from trilat_net.analysis.certificate.premises import explain_no_functional
-from trilat_net.analysis.certificate.stability_certificate import Certificate, StabilityFinding, certify
+from trilat_net.analysis.certificate.stability_certificate import (
+    Certificate,
+    StabilityFinding,
+    certify,
+)
 from trilat_net.analysis.metrics.log_metrics import LogMetrics, compute_log_metrics
 from trilat_net.scenario import load_scenario, parse_scenario
 
@@ -43,11 +47,15 @@ def of_largest_v(b: EnergyBalance) -> float:
 
 def order(name: str, fine_hz: int = 1000, **overrides: object) -> float:
     rates = fine_hz // 2, fine_hz
-    coarse, fine = (of_largest_v(runs.run(name, {**overrides, "rate_hz": hz}).balance) for hz in rates)
+    coarse, fine = (
+        of_largest_v(runs.run(name, {**overrides, "rate_hz": hz}).balance) for hz in rates
+    )
     return float(np.log2(coarse / fine))
 
 
-@pytest.mark.parametrize("name", ["paper", pytest.param("free", marks=pytest.mark.long), "asymmetric"])
+@pytest.mark.parametrize(
+    "name", ["paper", pytest.param("free", marks=pytest.mark.long), "asymmetric"]
+)
 def test_the_balance_closes_to_2e_5_with_order_two(name: str) -> None:
     assert of_largest_v(runs.run(name, {"duration_s": 2.0, "rate_hz": 1000}).balance) <= 2e-5
     assert order(name, duration_s=2.0) == pytest.approx(2.0, abs=0.1)
@@ -84,7 +92,8 @@ def test_what_sampling_leaves_is_of_order_two_across_a_jump() -> None:
     """Arms that brake: e and its derivative jump at once, and the torque that is held is that of before."""
     cut = {"link.loss": 1.0, "on_stale.action": "brake", "duration_s": 1.0}
     rest = [
-        float(np.abs(runs.run("free", {**cut, "rate_hz": hz}).balance.unexplained).max()) for hz in (200, 400)
+        float(np.abs(runs.run("free", {**cut, "rate_hz": hz}).balance.unexplained).max())
+        for hz in (200, 400)
     ]
     assert np.log2(rest[0] / rest[1]) == pytest.approx(2.0, abs=0.2)
 
@@ -93,7 +102,9 @@ def test_what_sampling_leaves_is_of_order_two_across_a_jump() -> None:
     ("key", "limit", "term"),
     [("tau_rate_limit_nm_s", 100.0, "torque limit"), ("qd_des_limit_rad_s", 0.5, "rule")],
 )
-def test_what_limit_of_torque_rate_or_reference_takes_is_booked(key: str, limit: float, term: str) -> None:
+def test_what_limit_of_torque_rate_or_reference_takes_is_booked(
+    key: str, limit: float, term: str
+) -> None:
     b = runs.run("paper", {"duration_s": 2.0, "rate_hz": 1000, f"limits.{key}": limit}).balance
     assert np.abs(b.work[term]).max() > 0.01 * b.V.max()
     assert np.abs(b.unexplained).max() <= 5e-6 * b.scale
@@ -116,7 +127,9 @@ def test_a_wall_that_gives_energy_closes_to_1e_4() -> None:
 def test_everything_at_once_closes_to_1e_4_at_500_hz() -> None:
     b = runs.run("rich").balance
     assert of_largest_v(b) <= 1e-4
-    assert all(np.abs(x).max() > 1e-4 * b.scale for name, x in b.work.items() if name not in _SILENT)
+    assert all(
+        np.abs(x).max() > 1e-4 * b.scale for name, x in b.work.items() if name not in _SILENT
+    )
 
 
 _SILENT = ("m2->m1", "m1->m2", "m2->s")
@@ -125,7 +138,10 @@ _SILENT = ("m2->m1", "m1->m2", "m2->s")
 TERMS = [
     *[("rich", "parts", name) for name in ("kinetic", "parameter", "position", "delay")],
     *[("rich", "dissipation", name) for name in ("damping", "disagreement")],
-    *[("rich", "work", name) for name in ("hands", "walls", "shares", "rule", "torque limit", "estimates")],
+    *[
+        ("rich", "work", name)
+        for name in ("hands", "walls", "shares", "rule", "torque limit", "estimates")
+    ],
     *[("rich", "work", name) for name in ("s->m1", "s->m2")],
     ("free", "work", "m1->m2"),
 ]
@@ -183,9 +199,13 @@ def test_it_converges_to_the_functional_along_the_exact_solution() -> None:
         k = round(t * 1000)
         assert float(ours.V[k]) == pytest.approx(_exact_v(exact, t), abs=3e-4)
         taken, given = _exact_integrals(exact, t)
-        assert sum(float(x[k]) for x in ours.dissipation.values()) == pytest.approx(taken, abs=3e-4)
+        assert sum(float(x[k]) for x in ours.dissipation.values()) == pytest.approx(
+            taken, abs=3e-4
+        )
         assert float(ours.work["hands"][k]) == pytest.approx(given, abs=3e-4)
-        assert _exact_v(exact, t) - _exact_v(exact, 0.0) + taken - given == pytest.approx(0.0, abs=1e-7)
+        assert _exact_v(exact, t) - _exact_v(exact, 0.0) + taken - given == pytest.approx(
+            0.0, abs=1e-7
+        )
 
 
 def _gauss(f, a: float, b: float, edges: list[float]) -> float:
@@ -212,7 +232,9 @@ def _exact_v(exact: DelayEquations, t: float) -> float:
     e = q - exact.alpha @ _delayed(exact, at)[:, 0, :2]
     r = qd + exact.Lambda * e
     v = np.einsum("ki,kij,kj->", r, inertia(exact.theta, q), r)
-    v += ((estimate - exact.theta) ** 2 / exact.Gamma).sum() + (exact.Lambda * exact.Kd * e**2).sum()
+    v += ((estimate - exact.theta) ** 2 / exact.Gamma).sum() + (
+        exact.Lambda * exact.Kd * e**2
+    ).sum()
 
     def moving(times: np.ndarray) -> np.ndarray:
         speeds = np.stack([exact.past(s)[:, 2:4] for s in times], axis=1)
@@ -237,7 +259,12 @@ def _exact_integrals(exact: DelayEquations, t: float) -> tuple[float, float]:
 
 def test_a_closed_group_is_balanced_by_itself() -> None:
     """m1 and m2 follow each other alone; s follows both and has no part in their balance."""
-    pair = {"dominance.m1.m2": 1.0, "dominance.m1.s": 0.0, "dominance.m2.m1": 1.0, "dominance.m2.s": 0.0}
+    pair = {
+        "dominance.m1.m2": 1.0,
+        "dominance.m1.s": 0.0,
+        "dominance.m2.m1": 1.0,
+        "dominance.m2.s": 0.0,
+    }
     energies = runs.run("free", {**pair, "duration_s": 1.5, "rate_hz": 500}).energies
     group = compute_energy_balance({site: energies[site] for site in ("m1", "m2")})
     assert group.beta == pytest.approx(np.ones((len(group.t_s), 2)))
@@ -264,7 +291,9 @@ def check_six(duration_s: float) -> LogMetrics:
     for site, energy in found.energies.items():
         own = metrics.sites[site]
         learnt = own["theta_energy_last_j"].value - own["theta_energy_first_j"].value
-        assert learnt == pytest.approx(np.ptp(energy.parts.parameter[[0, -1]]) * np.sign(learnt), rel=1e-6)
+        assert learnt == pytest.approx(
+            np.ptp(energy.parts.parameter[[0, -1]]) * np.sign(learnt), rel=1e-6
+        )
         assert own["unaccounted_j"].value <= 1e-6
     return metrics
 
@@ -274,12 +303,18 @@ def test_energy_of_six_joints_closes_with_the_base_parameters() -> None:
     estimates = metrics.estimates["s"].base
     assert estimates is not None
     assert len(estimates.parameter) == 36
-    assert metrics.sites["s"]["unphysical_links"].value == estimates.consistent_last.count(False)
+    assert metrics.sites["s"]["unphysical_links"].value == estimates.consistent_last.count(
+        False
+    )
 
 
 @pytest.mark.long
 def test_energy_of_seven_joints_closes() -> None:
-    text = six_joints(10.0, 200.0).replace("arm6", "arm7").replace("[0.2, 0.2, 0.2, 0.05, 0.05, 0.05]", "0.2")
+    text = (
+        six_joints(10.0, 200.0)
+        .replace("arm6", "arm7")
+        .replace("[0.2, 0.2, 0.2, 0.05, 0.05, 0.05]", "0.2")
+    )
     text = text.replace("[10, 10, 10, 2, 2, 2]", "8").replace("[2, 2, 2, 0.5, 0.5, 0.5]", "1.5")
     for pose in ("0.5, 0.2]", "0.1, 0.0]", "0.3, 0.1]"):
         text = text.replace(pose, f"{pose[:-1]}, 0.4]")
@@ -296,10 +331,14 @@ def test_energy_of_ten_seconds_of_six_joints_closes() -> None:
 def test_premises_name_joints_at_limits_and_at_stops() -> None:
     found = certify(rough_log())
     premises = {premise.name: premise for premise in found.premises}
-    assert premises["torque"].holds is premises["stops"].holds is premises["hands"].holds is False
+    assert (
+        premises["torque"].holds is premises["stops"].holds is premises["hands"].holds is False
+    )
     assert "s (shoulder_lift)" in premises["torque"].text
     assert "m2 (elbow)" in premises["stops"].text
-    assert found.verdict.finding in (StabilityFinding.DID_NOT_RISE, StabilityFinding.ROSE), found.verdict.text
+    assert found.verdict.finding in (StabilityFinding.DID_NOT_RISE, StabilityFinding.ROSE), (
+        found.verdict.text
+    )
 
 
 def test_every_term_of_a_rough_arm_is_needed() -> None:
@@ -350,7 +389,9 @@ def test_it_closes_with_order_two() -> None:
 
 def test_it_closes_with_links_that_jitter_box_and_torque_limit() -> None:
     jitter = judge(**{"link.model": "uniform", "link.delay_ms": 60, "link.half_width_ms": 30})
-    box = judge(**{"control.law": "adaptive_box", "control.theta_low": -0.3, "control.theta_high": 1.2})
+    box = judge(
+        **{"control.law": "adaptive_box", "control.theta_low": -0.3, "control.theta_high": 1.2}
+    )
     limit = judge(**{"limits.tau_limit_nm": 25.0})
     for found in (jitter, box, limit):
         assert share(found) <= BAR
@@ -374,7 +415,9 @@ def test_damping_near_a_singular_pose_fails_a_premise() -> None:
 def test_an_axis_that_only_one_follows_dissipates() -> None:
     """The arm of seven joints begins beside the plane of its masters, which cannot leave it."""
     q0 = [0.3, -0.3, 0.0, -1.6, 0.0, 1.4, 0.0]
-    log = trilat_net.simulate(load_scenario("unlike_arms", {"duration_s": 1.0, "sites.s.q0_rad": q0}))
+    log = trilat_net.simulate(
+        load_scenario("unlike_arms", {"duration_s": 1.0, "sites.s.q0_rad": q0})
+    )
     found = certify(log)
     assert found.verdict.finding is StabilityFinding.COVERED, found.verdict.text
     assert share(found) <= BAR
@@ -397,7 +440,11 @@ def test_following_an_axis_that_peers_leave_free_fails() -> None:
 
 
 def test_orientations_have_no_v_and_it_says_why() -> None:
-    text = planar_task(duration_s=0.1).replace("position", "pose").replace("[8.0, 5.0, 1.0]", "5.0")
+    text = (
+        planar_task(duration_s=0.1)
+        .replace("position", "pose")
+        .replace("[8.0, 5.0, 1.0]", "5.0")
+    )
     assert "orientations" in explain_no_functional(parse_scenario(text))
 
 
@@ -406,7 +453,11 @@ def test_false_records_break_the_balance() -> None:
     log = trilat_net.simulate(parse_scenario(planar_task(duration_s=1.0)))
     energies = compute_site_energies(log)
     motion = energies["s"].motion
-    assert np.abs(motion.records.tau - motion.law_torque(np.arange(len(motion.r)))).max() <= 1e-9
-    wrong = dataclasses.replace(motion, constants=motion.constants._replace(Kd=1.01 * motion.constants.Kd))
+    assert (
+        np.abs(motion.records.tau - motion.law_torque(np.arange(len(motion.r)))).max() <= 1e-9
+    )
+    wrong = dataclasses.replace(
+        motion, constants=motion.constants._replace(Kd=1.01 * motion.constants.Kd)
+    )
     assert np.abs(wrong.records.tau - wrong.law_torque(np.arange(len(motion.r)))).max() > 1e-3
     assert compute_energy_balance(energies).V.max() > 1.0

@@ -40,7 +40,9 @@ def moving(
 ) -> AlignedRecords:
     vectors = [random.normal(size=(rows, 2)) for _ in range(6)]
     yes = np.ones(rows, dtype=np.bool_)
-    return AlignedRecords(site, RATE_HZ, first, yes, yes, *vectors, random.normal(size=(rows, 5)), used)
+    return AlignedRecords(
+        site, RATE_HZ, first, yes, yes, *vectors, random.normal(size=(rows, 5)), used
+    )
 
 
 class Situation:
@@ -55,8 +57,12 @@ class Situation:
             for name, pair in zip(("a", "b"), zip(before, after, strict=True), strict=True)
         }
         self.track = moving(random, "s", used, 2, NOW)
-        self.views = [view_delayed_peer(self.track, PeerTrajectory(peer)) for peer in self.peers]
-        self.track.q_des[:] = sum(a * v.seen.q for a, v in zip(self.alpha, self.views, strict=True))
+        self.views = [
+            view_delayed_peer(self.track, PeerTrajectory(peer)) for peer in self.peers
+        ]
+        self.track.q_des[:] = sum(
+            a * v.seen.q for a, v in zip(self.alpha, self.views, strict=True)
+        )
         alpha = np.tile(self.alpha, (2, 1))
         self.shares = DominanceHistory(alpha, np.zeros((2, 2)), alpha[:1])
 
@@ -64,8 +70,12 @@ class Situation:
     def motion(self) -> SiteMotion:
         peers = dict(zip(("a", "b"), self.views, strict=True))
         none = np.zeros_like(self.track.q)
-        tip = PlanarArmRows(np.zeros(5), 0.0, (1.0, 1.0)).place_end_effector(self.track.q, self.track.qd)
-        return SiteMotion(self.track, EQ, self.shares, peers, TorqueSplit(tip, none, none, none, none))
+        tip = PlanarArmRows(np.zeros(5), 0.0, (1.0, 1.0)).place_end_effector(
+            self.track.q, self.track.qd
+        )
+        return SiteMotion(
+            self.track, EQ, self.shares, peers, TorqueSplit(tip, none, none, none, none)
+        )
 
     def v(self, row: int) -> float:
         return float(evaluate_functional(self.motion).total[row])
@@ -124,7 +134,9 @@ def test_a_step_of_shares_works_what_it_changes_in_v(seed: int, share: float) ->
     stepped, kept = (Situation(seed, (5, 9), (6, 10)) for _ in range(2))
     after = np.array([share, 1.0 - share])
     stepped.shares.alpha[1] = after
-    stepped.track.q_des[1] = sum(a * v.seen.q[1] for a, v in zip(after, stepped.views, strict=True))
+    stepped.track.q_des[1] = sum(
+        a * v.seen.q[1] for a, v in zip(after, stepped.views, strict=True)
+    )
     amount = dominance_change_work(stepped.motion).total[0]
     assert float(amount) == pytest.approx(stepped.v(1) - kept.v(1), rel=1e-9, abs=1e-9)
 
@@ -142,14 +154,18 @@ def test_slow_change_of_delay_gives_missing_term_of_theorem(seed: int) -> None:
     one = view_delayed_peer(site.track, PeerTrajectory(peer))
     later = PeerTrajectory(peer).at(one.stamp_s - np.array([0.0, grown_s]))
     site.views[0] = one._replace(seen=later)
-    site.track.q_des[1] = sum(a * v.seen.q[1] for a, v in zip(site.alpha, site.views, strict=True))
+    site.track.q_des[1] = sum(
+        a * v.seen.q[1] for a, v in zip(site.alpha, site.views, strict=True)
+    )
     booked = float(link_work(site.motion, 0).total[0])
     e, qd, q = site.track.e[1], site.track.qd[1], site.track.q[1]
     r = qd + EQ.Lambda * e
     c2 = np.cos(q[1])
     M = np.array([[3 + 2 * c2, 1 + c2], [1 + c2, 1.0]])
     missing = 0.5 * EQ.Kd @ speed**2 + (EQ.Lambda * EQ.Kd * e + EQ.Lambda * (M @ r)) @ speed
-    assert booked == pytest.approx(float(site.alpha[0] * grown_s * missing), rel=1e-4, abs=1e-11)
+    assert booked == pytest.approx(
+        float(site.alpha[0] * grown_s * missing), rel=1e-4, abs=1e-11
+    )
 
 
 def test_a_box_that_holds_the_truth_only_takes() -> None:

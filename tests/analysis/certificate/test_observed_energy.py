@@ -133,7 +133,12 @@ def test_energy_of_lines_observers_and_tanks_is_never_below_zero(law: str) -> No
     assert found.finding is ObservedFinding.PASSIVE
     assert all(premise.holds for premise in found.premises)
     assert found.residual_j <= 1e-12 * found.largest_j
-    assert {one.name for one in found.least} >= {"line m->s", "line s->m", "store of s", "taken by s"}
+    assert {one.name for one in found.least} >= {
+        "line m->s",
+        "line s->m",
+        "store of s",
+        "taken by s",
+    }
     given = next(one for one in found.curves if one.name == "given by m")
     work = -(log["m"].tau[:-1] * np.diff(log["m"].q, axis=0)).sum()
     assert given.energy_j[-1] == pytest.approx(work, rel=1e-9)
@@ -151,11 +156,18 @@ def test_a_figure_shows_them_over_time() -> None:
 @pytest.mark.long
 def test_jolt_beyond_reserve_leaves_observer_negative_and_certificate_says_so() -> None:
     """Sites that start apart; the reserve of a scenario that names none covers that."""
-    changes = {"control.law": "tdpa", "scheme": "digital", "duration_s": 1.0, "sites.s.q0_rad": [0.8, 0.5]}
+    changes = {
+        "control.law": "tdpa",
+        "scheme": "digital",
+        "duration_s": 1.0,
+        "sites.s.q0_rad": [0.8, 0.5],
+    }
     changes |= {"sites.m.control.K": 0.0, "sites.m.control.B": 0.0}
     covered = certify(simulate_scenario(load_scenario("two_sites", changes)))
     assert covered.observed.finding is ObservedFinding.PASSIVE
-    found = certify(simulate_scenario(load_scenario("two_sites", {**changes, "control.reserve_J": 0.0})))
+    found = certify(
+        simulate_scenario(load_scenario("two_sites", {**changes, "control.reserve_J": 0.0}))
+    )
     assert found.observed.finding is ObservedFinding.NEGATIVE
     known = next(one for one in found.observed.least if one.name == "known at s of m")
     assert known.amount_j < -1e-7
@@ -181,17 +193,27 @@ def test_torque_that_the_limit_cuts_is_booked_as_cut(law: str) -> None:
     log = simulate_scenario(pair(LAWS[law], clamped=True, duration_s=6.0, limits=limits))
     found = observe_energies(log)
     assert found.finding is ObservedFinding.PASSIVE
-    assert next(one for one in found.premises if one.name == "torque").text.startswith("cut off at m")
+    assert next(one for one in found.premises if one.name == "torque").text.startswith(
+        "cut off at m"
+    )
     assert np.abs(log["m"].tau).max() == 1.5
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("law", ["wave", pytest.param("tdpa", marks=pytest.mark.long)])
 @pytest.mark.parametrize(
-    "link", [pytest.param(CONSTANT, id="constant", marks=pytest.mark.long), pytest.param(JITTER, id="jitter")]
+    "link",
+    [
+        pytest.param(CONSTANT, id="constant", marks=pytest.mark.long),
+        pytest.param(JITTER, id="jitter"),
+    ],
 )
 def test_torques_with_weights_keep_the_weighted_energy(law: str, link: dict[str, Any]) -> None:
-    shares = {"m1": {"m2": 0.1, "s": 0.9}, "m2": {"m1": 0.4, "s": 0.6}, "s": {"m1": 0.8, "m2": 0.2}}
+    shares = {
+        "m1": {"m2": 0.1, "s": 0.9},
+        "m2": {"m1": 0.4, "s": 0.6},
+        "s": {"m1": 0.8, "m2": 0.2},
+    }
     control = {**LAWS[law], **FOLLOWER}
     sites = {"m1": {"hands": [hand(0.3)]}, "m2": {"hands": [hand(-0.3)]}, "s": {}}
     for name, beta in (("m2", 0.5), ("s", 1.5)):
@@ -204,8 +226,12 @@ def test_torques_with_weights_keep_the_weighted_energy(law: str, link: dict[str,
 
 @pytest.mark.parametrize("mem", [[], [0.0] * 4])
 def test_a_record_without_the_laws_memory_is_told(mem: list[float]) -> None:
-    data = recorded("two_sites", {"control.law": "tanks", "duration_s": 0.1, "scheme": "digital"})
-    broken = edited(data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r)
+    data = recorded(
+        "two_sites", {"control.law": "tanks", "duration_s": 0.1, "scheme": "digital"}
+    )
+    broken = edited(
+        data, record=lambda r: {**r, "mem": mem} if (r["site"], r["tick"]) == ("s", 40) else r
+    )
     assert observe_energies(opened(data)).curves
     with pytest.raises(LogError, match="a record of s does not have"):
         observe_energies(opened(broken))

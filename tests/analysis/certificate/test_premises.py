@@ -35,19 +35,39 @@ def test_all_hold_in_free_motion() -> None:
 @pytest.mark.parametrize(
     ("name", "overrides", "says"),
     [
-        ("law", {"sites__m2__control__law": "p_d"}, "m2: law p_d, for which there is no such V"),
-        ("parameters", {"control__Gamma": [1.0, 1.0, 1.0, 0.0, 0.0]}, "not learnt, and not known"),
+        (
+            "law",
+            {"sites__m2__control__law": "p_d"},
+            "m2: law p_d, for which there is no such V",
+        ),
+        (
+            "parameters",
+            {"control__Gamma": [1.0, 1.0, 1.0, 0.0, 0.0]},
+            "not learnt, and not known",
+        ),
         (
             "parameters",
             {"control__law": "adaptive_box", "control__theta_high": 1.9},
             "theta is outside of the box",
         ),
-        ("Kd", {"sites__s__control__Kd": [1.0, 3.0]}, "no beta exists: m1 (3, 3), m2 (3, 3), s (1, 3)"),
+        (
+            "Kd",
+            {"sites__s__control__Kd": [1.0, 3.0]},
+            "no beta exists: m1 (3, 3), m2 (3, 3), s (1, 3)",
+        ),
         ("Kd", {"control__Kd": 0.0}, "some Kd is zero"),
         ("shares", runs.EXPERT, "nobody of m1, s follows m2, whose beta is 0"),
-        ("delays", {"link__model": "uniform", "link__half_width_ms": 30.0}, "the age of the sample in"),
+        (
+            "delays",
+            {"link__model": "uniform", "link__half_width_ms": 30.0},
+            "the age of the sample in",
+        ),
         ("delays", {"sites__m1__rate_hz": 100}, "varies"),
-        ("delays", LATE, "m1->s"),  # ages before a first sample do not count, but it must not be late
+        (
+            "delays",
+            LATE,
+            "m1->s",
+        ),  # ages before a first sample do not count, but it must not be late
         (
             "following",
             {"on_stale__action": "hold", "on_stale__age_ms": 150.0, **CUT},
@@ -92,7 +112,9 @@ def test_what_rounding_gives_is_not_given(apart_rad: float, says: str) -> None:
     known = {"control__theta_hat0": [3.0, 1.0, 1.0, 2.0, 1.0], "control__Gamma": 0.0}
     starts = {f"sites__{name}__q0_rad": [0.3, 0.4] for name in ("m2", "s")}
     damper = {"sites__m1__environment": [{"kind": "viscous", "damping_nm_s_rad": [3.0, 3.0]}]}
-    found = premises(sites__m1__q0_rad=[0.3 + apart_rad, 0.4], **known, **starts, **damper)["hands"]
+    found = premises(sites__m1__q0_rad=[0.3 + apart_rad, 0.4], **known, **starts, **damper)[
+        "hands"
+    ]
     assert found.text.startswith(says)
     assert found.holds is (apart_rad < 1e-3)
 
@@ -102,7 +124,9 @@ SAMPLED = {f"{SITE}.0.sampled": True, "rate_hz": 200, "duration_s": 8.0}
 
 
 def run(**changes: object) -> Log:
-    return trilat_net.simulate("windup", {**SAMPLED, **{k.replace("__", "."): v for k, v in changes.items()}})
+    return trilat_net.simulate(
+        "windup", {**SAMPLED, **{k.replace("__", "."): v for k, v in changes.items()}}
+    )
 
 
 def premise(log: Log) -> Premise | None:
@@ -112,8 +136,15 @@ def premise(log: Log) -> Premise | None:
 def damper(b: float, **more: object) -> list[dict[str, object]]:
     """The wall of `windup`, and a damper of the arm."""
     wall = load_scenario("windup").sites["s"].environment[0]
-    place = {"point_m": list(wall.point_m), "normal": list(wall.normal), "stiffness_n_m": wall.stiffness_n_m}
-    return [{"kind": "wall", "sampled": True, **place}, {"kind": "viscous", "damping_nm_s_rad": b, **more}]
+    place = {
+        "point_m": list(wall.point_m),
+        "normal": list(wall.normal),
+        "stiffness_n_m": wall.stiffness_n_m,
+    }
+    return [
+        {"kind": "wall", "sampled": True, **place},
+        {"kind": "viscous", "damping_nm_s_rad": b, **more},
+    ]
 
 
 def test_a_sampled_wall_gives_half_k_dx_squared_a_tick() -> None:
@@ -124,8 +155,11 @@ def test_a_sampled_wall_gives_half_k_dx_squared_a_tick() -> None:
     inside = (depth[:-1] > 0.0) & (depth[1:] > 0.0)
     leaves = (depth[:-1] > 0.0) & (depth[1:] == 0.0)
     gives = 0.5 * wall.stiffness_n_m * float((np.diff(x)[inside] ** 2).sum())
-    gives += wall.stiffness_n_m * float((depth[:-1] * -np.diff(x) - 0.5 * depth[:-1] ** 2)[leaves].sum())
-    enters = (depth[:-1] == 0.0) & (depth[1:] > 0.0)  # the spring is there, and nobody pressed it
+    gives += wall.stiffness_n_m * float(
+        (depth[:-1] * -np.diff(x) - 0.5 * depth[:-1] ** 2)[leaves].sum()
+    )
+    # the spring is there, and nobody pressed it
+    enters = (depth[:-1] == 0.0) & (depth[1:] > 0.0)
     gives += 0.5 * wall.stiffness_n_m * float((depth[1:][enters] ** 2).sum())
     found = find_wall_energies(log)[0]
     assert found.site == "s"
@@ -171,7 +205,9 @@ def most_given(v: Array, ticks: int, K: float, B: float, *, differenced: bool = 
     ends = np.hstack([parts, after])
     dt = 1.0 / parts.shape[1]
     steps = (0.5 * dt * (ends[:, 1:] + ends[:, :-1])).sum(axis=1)
-    taken = (dt / 3.0 * (ends[:, 1:] ** 2 + ends[:, 1:] * ends[:, :-1] + ends[:, :-1] ** 2)).sum()
+    taken = (
+        dt / 3.0 * (ends[:, 1:] ** 2 + ends[:, 1:] * ends[:, :-1] + ends[:, :-1] ** 2)
+    ).sum()
     speed = np.append(0.0, steps[:-1]) if differenced else parts[:, 0]
     return float((0.5 * K * steps**2 - B * speed * steps).sum() / taken)
 
@@ -184,12 +220,16 @@ def test_damping_by_the_sampled_speed_gives_energy() -> None:
     assert most_given(square, ticks, 2.0, 1.0, differenced=True) == pytest.approx(2.0, rel=0.02)
     harmonics = np.pi * (2.0 * np.arange(20) + 1.0)
     c, s = np.ones(20) / np.sqrt(20.0), 1.0 / harmonics / np.linalg.norm(1.0 / harmonics)
-    many = (c[:, None] * np.cos(harmonics[:, None] * t) - s[:, None] * np.sin(harmonics[:, None] * t)).sum(0)
+    many = (
+        c[:, None] * np.cos(harmonics[:, None] * t)
+        - s[:, None] * np.sin(harmonics[:, None] * t)
+    ).sum(0)
     assert most_given(many, ticks, 0.0, 1.0) == pytest.approx(3.1, abs=0.1)
     for _ in range(50):
         straight = rng.normal(size=ticks)
         assert most_given(straight, ticks, 2.0, 1.0) <= 1.5
         slow = (
-            np.sin(np.pi * rng.uniform(0.0, 1.0) * t + rng.uniform(0.0, 6.0)) * np.sin(np.pi * t / ticks) ** 2
+            np.sin(np.pi * rng.uniform(0.0, 1.0) * t + rng.uniform(0.0, 6.0))
+            * np.sin(np.pi * t / ticks) ** 2
         )
         assert most_given(slow, ticks, 2.0, 1.0) <= 1.0

@@ -4,13 +4,19 @@ import numpy as np
 import pytest
 
 from tests.analysis.certificate import runs
-from trilat_net.analysis.certificate.running_energy import EnergyCourse, RecordWindow, RunningEnergy
+from trilat_net.analysis.certificate.running_energy import (
+    EnergyCourse,
+    RecordWindow,
+    RunningEnergy,
+)
 from trilat_net.log.log_reader import Log
 
 BLOCK = 60
 
 
-def courses(log: Log, *, late: int = 0, without: frozenset[int] = frozenset()) -> list[EnergyCourse]:
+def courses(
+    log: Log, *, late: int = 0, without: frozenset[int] = frozenset()
+) -> list[EnergyCourse]:
     """V of a log whose records come block by block, at its last site later; that lacks some."""
     windows = {site: RecordWindow(log.scenario, site, kept_s=4.0) for site in log.sites}
     running = RunningEnergy(log.scenario, windows)
@@ -23,7 +29,9 @@ def courses(log: Log, *, late: int = 0, without: frozenset[int] = frozenset()) -
             for record in reversed(records):  # out of order
                 if site != log.sites[-1] or record.tick not in without:
                     windows[site].take(record)
-        if (course := running.advance({site: windows[site].newest for site in log.sites})) is not None:
+        if (
+            course := running.advance({site: windows[site].newest for site in log.sites})
+        ) is not None:
             found.append(course)
     assert running.reason == ""
     return found
@@ -52,7 +60,8 @@ def test_v_without_some_records_is_that_of_an_incomplete_log() -> None:
     whole = runs.run("rich").balance
     course = joined(courses(log, without=gap))
     rows = np.searchsorted(whole.t_s, course.t_s - 1e-9)
-    far = (course.t_s < 1.3) | (course.t_s > 2.2)  # the gap and the samples of it that are in use
+    # the gap and the samples of it that are in use
+    far = (course.t_s < 1.3) | (course.t_s > 2.2)
     assert np.abs(course.V - whole.V[rows])[far].max() < 1e-6 * np.abs(whole.V).max()
     assert np.isfinite(course.V).all()
 

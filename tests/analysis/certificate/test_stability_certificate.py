@@ -8,7 +8,11 @@ import pytest
 
 import trilat_net
 from tests.analysis import logs
-from trilat_net.analysis.certificate.premises import NO_COMMON_TIME, NO_PERIOD, find_unjudged_spans
+from trilat_net.analysis.certificate.premises import (
+    NO_COMMON_TIME,
+    NO_PERIOD,
+    find_unjudged_spans,
+)
 from trilat_net.analysis.certificate.stability_certificate import StabilityFinding, certify
 from trilat_net.analysis.run_end import EndBehaviour
 from trilat_net.errors import LogError
@@ -29,15 +33,25 @@ def test_every_released_version_is_certified(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("d", "motion", "passed"), [(0.2, EndBehaviour.DIVERGED, False), (3.0, EndBehaviour.DECAYS, True)]
+    ("d", "motion", "passed"),
+    [(0.2, EndBehaviour.DIVERGED, False), (3.0, EndBehaviour.DECAYS, True)],
 )
 def test_a_law_without_a_functional_is_judged_by_growth_alone(
     d: float, motion: EndBehaviour, passed: bool
 ) -> None:
-    law = {"control.law": "p_d", "control.K": 10.0, "control.d": d, "duration_s": 20.0, "rate_hz": 100}
+    law = {
+        "control.law": "p_d",
+        "control.K": 10.0,
+        "control.d": d,
+        "duration_s": 20.0,
+        "rate_hz": 100,
+    }
     found = certify(trilat_net.simulate(load_scenario("free", law)))
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
-    assert found.verdict.text == "V cannot be judged: m1, m2, s: law p_d, for which there is no such V"
+    assert (
+        found.verdict.text
+        == "V cannot be judged: m1, m2, s: law p_d, for which there is no such V"
+    )
     assert found.end.behaviour is motion
     assert found.passed is passed
 
@@ -46,19 +60,27 @@ def outside(log: Log, *, known: bool) -> Log:
     """The same records, of a slave that is outside of the program."""
     spec = log.scenario.sites["s"]
     arm = msgspec.structs.replace(spec.arm, known=known)
-    sites = {**log.scenario.sites, "s": msgspec.structs.replace(spec, plant="external", arm=arm)}
+    sites = {
+        **log.scenario.sites,
+        "s": msgspec.structs.replace(spec, plant="external", arm=arm),
+    }
     log.scenario = msgspec.structs.replace(log.scenario, sites=sites)
     return log
 
 
 def still_free() -> Log:
-    return logs.rewritten(runs.run("free", {"duration_s": 2.0, "rate_hz": 200}).log, lambda _: True)
+    return logs.rewritten(
+        runs.run("free", {"duration_s": 2.0, "rate_hz": 200}).log, lambda _: True
+    )
 
 
 def test_an_arm_whose_theta_nobody_knows_has_no_v() -> None:
     found = certify(outside(still_free(), known=False))
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
-    assert found.verdict.text == "V cannot be judged: s: nobody knows the arm's theta, and V is made of it"
+    assert (
+        found.verdict.text
+        == "V cannot be judged: s: nobody knows the arm's theta, and V is made of it"
+    )
 
 
 def test_an_external_arm_is_judged_where_theta_explains_its_motion() -> None:
@@ -68,7 +90,10 @@ def test_an_external_arm_is_judged_where_theta_explains_its_motion() -> None:
     change = lambda s: logs.replaced(s, qd=[1.1 * x for x in s.qd]) if s.site == "s" else s  # noqa: E731
     found = certify(outside(logs.rewritten(still_free(), change=change), known=True))
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
-    assert "the arm of s, outside of the program, does not move as its theta says" in found.verdict.text
+    assert (
+        "the arm of s, outside of the program, does not move as its theta says"
+        in found.verdict.text
+    )
 
 
 def test_records_with_none_beside_them_are_no_period() -> None:
@@ -91,16 +116,21 @@ def test_a_period_too_long_for_the_gains_is_not_judged() -> None:
 
 def test_gaps_are_left_out_and_told_of() -> None:
     whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 200, "link.delay_ms": 150.0}).log
-    log = logs.rewritten(whole, lambda state: not (state.site == "m1" and 200 <= state.tick < 240))
+    log = logs.rewritten(
+        whole, lambda state: not (state.site == "m1" and 200 <= state.tick < 240)
+    )
     found = certify(log)
     assert found.balance is not None
     assert found.verdict.finding is StabilityFinding.COVERED
-    assert found.verdict.text.startswith("covered by the theorem, as far as the log tells: V did not rise: ")
+    assert found.verdict.text.startswith(
+        "covered by the theorem, as far as the log tells: V did not rise: "
+    )
     assert "not judged: 0.995 to 1.35 s" in found.verdict.text
     given = sum(np.abs(x).max() for x in found.balance.work.values())
     assert given <= 1e-6  # nobody is said to have given what changed in the gap
     assert runs.relative(found.balance) <= 1e-3
-    assert find_unjudged_spans(found.balance) == [pytest.approx((0.995, 1.35))]  # s looks back by 150 ms
+    # s looks back by 150 ms
+    assert find_unjudged_spans(found.balance) == [pytest.approx((0.995, 1.35))]
 
 
 def test_a_gap_that_hides_what_happened_is_no_broken_balance() -> None:
@@ -108,7 +138,9 @@ def test_a_gap_that_hides_what_happened_is_no_broken_balance() -> None:
     whole = runs.run("free", {"duration_s": 4.0, "rate_hz": 100}).log
     for site in whole.sites:
         found = certify(
-            logs.rewritten(whole, lambda s, site=site: not (s.site == site and 25 <= s.tick < 225))
+            logs.rewritten(
+                whole, lambda s, site=site: not (s.site == site and 25 <= s.tick < 225)
+            )
         )
         assert found.verdict.finding is not StabilityFinding.BROKEN
 

@@ -39,7 +39,9 @@ def made(**overrides: object) -> Log:
 def test_free_motion_is_covered() -> None:
     found = certify(made())
     assert found.verdict.finding is StabilityFinding.COVERED
-    assert found.verdict.text.startswith("covered by the theorem: V did not rise: 29.78 J at 0 s, 12")
+    assert found.verdict.text.startswith(
+        "covered by the theorem: V did not rise: 29.78 J at 0 s, 12"
+    )
     assert found.bounded_by_v
     assert found.stability is Stability.OPEN
     assert not found.passed
@@ -48,13 +50,18 @@ def test_free_motion_is_covered() -> None:
 def test_hands_are_told_of_and_excused() -> None:
     found = runs.run("paper", {"duration_s": 12.5, "rate_hz": 100}).certificate
     assert found.verdict.finding is StabilityFinding.COVERED
-    assert "covered by the theorem: V rose by no more than the hands gave: 24 J" in found.verdict.text
+    assert (
+        "covered by the theorem: V rose by no more than the hands gave: 24 J"
+        in found.verdict.text
+    )
 
 
 def test_outside_and_yet_not_risen() -> None:
     found = runs.run("wall").certificate
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
-    assert found.verdict.text.startswith("outside the theorem (hands), yet V rose by no more than the hands")
+    assert found.verdict.text.startswith(
+        "outside the theorem (hands), yet V rose by no more than the hands"
+    )
     assert found.bounded_by_v
 
 
@@ -67,12 +74,17 @@ def test_a_rise_is_named_with_time_amount_and_giver() -> None:
     assert sum(rise.causes.values()) >= rise.amount
     assert all("->" in cause for cause in rise.causes)
     share = 100.0 * rise.amount / found.balance.V.max()
-    assert f"V rose by {rise.amount:.3g} J ({share:.3g} % of its largest value) " in found.verdict.text
+    assert (
+        f"V rose by {rise.amount:.3g} J ({share:.3g} % of its largest value) "
+        in found.verdict.text
+    )
     assert f"from {rise.from_s:.4g} to {rise.at_s:.4g} s" in found.verdict.text
 
 
 def test_kd_of_different_shape_makes_v_rise() -> None:
-    found = certify(made(sites__m1__control__Kd=[0.1, 30.0], sites__m2__control__Kd=[30.0, 0.1]))
+    found = certify(
+        made(sites__m1__control__Kd=[0.1, 30.0], sites__m2__control__Kd=[30.0, 0.1])
+    )
     assert found.verdict.finding is StabilityFinding.ROSE
     assert found.verdict.rise is not None
     assert list(found.verdict.rise.causes) == ["what beta does not cancel"]
@@ -108,14 +120,18 @@ def test_record_that_was_changed_breaks_it_where_delays_vary_too() -> None:
     log = runs.run("free", {**runs.JITTER, "duration_s": 2.0, "rate_hz": 500}).log
     late = lambda s: s.site == "m2" and s.tick >= 500  # noqa: E731
     found = certify(
-        logs.rewritten(log, change=lambda s: logs.replaced(s, q=[x + 0.01 for x in s.q]) if late(s) else s)
+        logs.rewritten(
+            log, change=lambda s: logs.replaced(s, q=[x + 0.01 for x in s.q]) if late(s) else s
+        )
     )
     assert found.verdict.finding is StabilityFinding.BROKEN
 
 
 def test_hands_that_were_erased_break_the_balance() -> None:
     log = runs.run("paper", {"duration_s": 11.5, "rate_hz": 100}).log
-    found = certify(logs.rewritten(log, change=lambda s: msgspec.structs.replace(s, tau_x=[0.0, 0.0])))
+    found = certify(
+        logs.rewritten(log, change=lambda s: msgspec.structs.replace(s, tau_x=[0.0, 0.0]))
+    )
     assert found.verdict.finding is StabilityFinding.BROKEN
     assert "the energy of m1 does not add up" in found.verdict.text
 
@@ -169,7 +185,11 @@ def test_a_site_without_weight_converges_after_those_that_it_follows() -> None:
 
 
 def test_site_without_weight_is_left_to_growth_where_more_fails() -> None:
-    hand = {"sites.m2.hands": [{"kind": "pulse", "start_s": 0.2, "end_s": 5.0, "peak_nm": [1.0, 1.0]}]}
+    hand = {
+        "sites.m2.hands": [
+            {"kind": "pulse", "start_s": 0.2, "end_s": 5.0, "peak_nm": [1.0, 1.0]}
+        ]
+    }
     found = runs.run("free", {**SHORT, **runs.EXPERT, **hand, "duration_s": 1.0}).certificate
     assert found.verdict.finding is StabilityFinding.DID_NOT_RISE
     assert not found.bounded_by_v
@@ -212,7 +232,9 @@ def test_only_what_is_accepted_passes_besides_a_stable_run(
 
 
 def test_a_broken_balance_is_never_accepted() -> None:
-    found = tampered(lambda s: msgspec.structs.replace(s, q=[1.05 * x for x in s.q]) if s.tick > 375 else s)
+    found = tampered(
+        lambda s: msgspec.structs.replace(s, q=[1.05 * x for x in s.q]) if s.tick > 375 else s
+    )
     assert found.verdict.finding is StabilityFinding.BROKEN
     assert not found.accepts(("bounded", "open"))
 
@@ -221,7 +243,9 @@ def test_an_unstable_rest_leaves_a_run_open() -> None:
     roots = EndPoseRoots("unstable", 0.012, True, "this rest: unstable, +0.012 /s")
     assert replace(still(), roots=roots).stability is Stability.OPEN
     assert roots.text in replace(still(), roots=roots).reasons
-    assert not replace(still(), roots=roots._replace(exact=False)).passed  # a doubt, if no proof
+    assert not replace(
+        still(), roots=roots._replace(exact=False)
+    ).passed  # a doubt, if no proof
     assert replace(still(), roots=roots._replace(verdict="stable")).passed
 
 
@@ -231,7 +255,9 @@ def test_v_that_rises_at_the_end_is_named() -> None:
     t_s, V = balance.t_s, balance.unsupplied
 
     def growth(added: np.ndarray) -> list[str]:
-        changed = replace(balance, parts={**balance.parts, "kinetic": balance.parts["kinetic"] + added})
+        changed = replace(
+            balance, parts={**balance.parts, "kinetic": balance.parts["kinetic"] + added}
+        )
         return find_growth(changed, 1e-3)
 
     assert growth(np.zeros(len(V))) == []
@@ -267,12 +293,18 @@ def test_seven_tenths_of_a_second_less_leave_a_run_open(cut: range) -> None:
     taken = taken_apart(recorded("free", RUN)).without_chain()
     topics, accounts = taken.topics(), taken.metadata("trilat.accounts")
     own = "/trilat/free/s/state"
-    taken.messages = [m for m in taken.messages if topics[m.channel] != own or m.sequence not in cut]
-    accounts[own] = accounts[own].replace("received 3000, missing 0", "received 2965, missing 35")
+    taken.messages = [
+        m for m in taken.messages if topics[m.channel] != own or m.sequence not in cut
+    ]
+    accounts[own] = accounts[own].replace(
+        "received 3000, missing 0", "received 2965, missing 35"
+    )
     certificate = found(taken.bytes())
     assert certificate.stability is Stability.OPEN
     assert not certificate.passed
-    assert any("records are missing: judged s 2965 of 3000 ticks" in why for why in certificate.reasons)
+    assert any(
+        "records are missing: judged s 2965 of 3000 ticks" in why for why in certificate.reasons
+    )
     assert not certificate.accepts(("bounded",))
     assert certificate.accepts(("open",))
     assert found(taken.bytes(), min_coverage=0.9).passed

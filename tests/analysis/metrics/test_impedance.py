@@ -22,7 +22,12 @@ def noise(seed: int) -> np.ndarray:
 
 
 def strongest(
-    drive: np.ndarray, x: np.ndarray, y: np.ndarray, usable: np.ndarray, rate_hz: int, least: float
+    drive: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    usable: np.ndarray,
+    rate_hz: int,
+    least: float,
 ) -> FrequencyResponse:
     return estimate_responses(drive, x, y, usable, rate_hz, least)[0]
 
@@ -142,14 +147,20 @@ def closed_form_impedance(frequency_hz: float, c2: float) -> complex:
 
 
 CHIRP = {"kind": "chirp", "peak_nm": [1.0, 0.0], "from_hz": 0.5, "to_hz": 4.5, "sweep_s": 4.0}
-MULTISINE = {"kind": "multisine", "amplitude_nm": [0.3, 0.0], "frequencies_hz": [0.5, 1.25, 2.0, 3.0, 4.0]}
+MULTISINE = {
+    "kind": "multisine",
+    "amplitude_nm": [0.3, 0.0],
+    "frequencies_hz": [0.5, 1.25, 2.0, 3.0, 4.0],
+}
 
 
 @pytest.mark.parametrize(("hand", "lines"), [(CHIRP, 15), (MULTISINE, 5)])
 def test_an_impedance_is_measured_over_frequency(hand: dict[str, object], lines: int) -> None:
     """At every line within 2 % and two random errors of the closed form; those of a chirp are larger."""
     log = simulated("two_sites", {**shaken(), "sites.m.hands": [hand]})
-    found = next(one for one in compute_log_metrics(log).responses if (one.at, one.joint) == ("m", 1))
+    found = next(
+        one for one in compute_log_metrics(log).responses if (one.at, one.joint) == ("m", 1)
+    )
     c2 = math.cos(float(log["m"].q[:, 1].mean()))
     assert len(found.spectrum) == lines
     for line in found.spectrum:

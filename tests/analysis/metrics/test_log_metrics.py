@@ -72,7 +72,9 @@ def test_busy_and_uneven_sites_are_measured() -> None:
 
 def test_gap_and_late_begin_leave_numbers_and_are_counted() -> None:
     log = simulated("free", {"duration_s": 3.0, "rate_hz": 200})
-    torn = logs.rewritten(log, lambda s: not (s.site == "m1" and 200 <= s.tick < 240), finished=False)
+    torn = logs.rewritten(
+        log, lambda s: not (s.site == "m1" and 200 <= s.tick < 240), finished=False
+    )
     found = told(torn)
     assert found["sites"]["m1"]["missing"] == 40.0
     assert found["sites"]["m1"]["unaccounted_j"] < 1e-3
@@ -113,7 +115,11 @@ def test_numbers_beyond_all_physics_are_no_numbers_and_no_error(size: float) -> 
     grown = logs.rewritten(
         log,
         change=lambda s: logs.replaced(
-            s, **{name: [size if s.tick % 3 else -size] * 2 for name in ("q", "qd", "tau", "tau_x")}
+            s,
+            **{
+                name: [size if s.tick % 3 else -size] * 2
+                for name in ("q", "qd", "tau", "tau_x")
+            },
         ),
     )
     assert told(grown)["sites"]["m"]["mechanical_j"] is None
@@ -126,7 +132,12 @@ def test_loops_are_told_of_where_a_clock_was_read() -> None:
     assert found["late_max_us"] == 199.0
     assert found["busy_p99_us"] == 7.0
     assert found["overruns"] == 0.0
-    assert told(simulated("free", {"duration_s": 1.0, "rate_hz": 200}))["sites"]["m1"]["late_max_us"] is None
+    assert (
+        told(simulated("free", {"duration_s": 1.0, "rate_hz": 200}))["sites"]["m1"][
+            "late_max_us"
+        ]
+        is None
+    )
 
 
 def test_the_docs_have_a_line_for_every_quantity() -> None:
@@ -137,7 +148,11 @@ def test_the_docs_have_a_line_for_every_quantity() -> None:
 
 def test_row_is_largest_of_places_or_their_sum() -> None:
     log = pair(
-        lambda site, _: {"tau": [3.0 if site == "m" else 4.0, 0.0], "q": [0.1, 0.0], "q_des": [0.0, 0.0]}
+        lambda site, _: {
+            "tau": [3.0 if site == "m" else 4.0, 0.0],
+            "q": [0.1, 0.0],
+            "q_des": [0.0, 0.0],
+        }
     )
     found = compare_metrics([log, log], ["a", "b"])
     assert found.columns == ("a", "b")
@@ -196,7 +211,9 @@ def test_the_share_of_ticks_at_the_limit() -> None:
 def test_chatter_is_the_mean_step_of_the_torque() -> None:
     """A torque that changes sides every tick, and one that never does."""
     log = pair(lambda _, t_s: {"tau": [0.5 * (-1.0) ** round(1000.0 * t_s), 3.0]})
-    assert compute_log_metrics(log).sites["m"]["chatter_nm"].value == pytest.approx(1.0, rel=1e-12)
+    assert compute_log_metrics(log).sites["m"]["chatter_nm"].value == pytest.approx(
+        1.0, rel=1e-12
+    )
     still = pair(lambda _, __: {"tau": [7.0, 3.0]})
     assert compute_log_metrics(still).sites["m"]["chatter_nm"].value == 0.0
 
@@ -206,7 +223,9 @@ ANCHORED = {
     "rate_hz": 50,
     "duration_s": 20.0,
     "sites.m2.hands": [],
-    "sites.m1.hands": [{"kind": "recorded", "points": [[2.0, 0.0, 0.0], [3.0, 5.0, 5.0], [60.0, 5.0, 5.0]]}],
+    "sites.m1.hands": [
+        {"kind": "recorded", "points": [[2.0, 0.0, 0.0], [3.0, 5.0, 5.0], [60.0, 5.0, 5.0]]}
+    ],
 }
 
 
@@ -237,13 +256,17 @@ def test_a_hand_feels_what_the_shares_say() -> None:
     """5 N m on the slave: 4.79 N m at the expert, 16.4 N m at the trainee, 5.00 with equal shares."""
     found = compute_log_metrics(simulated("force_sharing", SLOW))
     assert [pair.pushed + pair.holds for pair in found.sharing_ratios] == ["sm1", "sm2", "sm2"]
-    assert [pair.felt_nm for pair in found.sharing_ratios] == pytest.approx([4.79, 16.4, 5.0], rel=0.02)
+    assert [pair.felt_nm for pair in found.sharing_ratios] == pytest.approx(
+        [4.79, 16.4, 5.0], rel=0.02
+    )
     assert [pair.pushed_nm for pair in found.sharing_ratios] == [pytest.approx(5.0)] * 3
     assert [pair.joint for pair in found.sharing_ratios] == [1, 1, 1]
     # beta = (0.444, 0.130, 0.426), Eq. (20): 1 - a23 a32, 1 - a13 a31, 1 - a12 a21
     beta = (1.0 - 0.2 * 0.2, 1.0 - 0.9 * 0.8, 1.0 - 0.1 * 0.8)
     expected = [pair.expected_nm.value for pair in found.sharing_ratios]
-    assert expected == pytest.approx([5.0 * beta[2] / beta[0], 5.0 * beta[2] / beta[1], 5.0], rel=1e-6)
+    assert expected == pytest.approx(
+        [5.0 * beta[2] / beta[0], 5.0 * beta[2] / beta[1], 5.0], rel=1e-6
+    )
     assert found.run["sharing_off"].value <= 0.01
 
 
@@ -271,7 +294,10 @@ def test_where_gravity_is_learnt_nothing_is_expected() -> None:
 def test_arms_that_move_share_nothing() -> None:
     found = compute_log_metrics(simulated("contact", {"duration_s": 1.0, "rate_hz": 100}))
     assert found.static_windows.value is None
-    assert found.run["sharing_off"].why == "no second in which all sites rest under torques that stand"
+    assert (
+        found.run["sharing_off"].why
+        == "no second in which all sites rest under torques that stand"
+    )
 
 
 LEARNS = 'control = { law = "adaptive", Gamma = [1.0, 1.0, 2.0, 0.0, 0.0] }'
@@ -290,7 +316,9 @@ def test_distance_energy_and_slope_of_estimates_that_move_straight() -> None:
     measured = compute_log_metrics(pair(motion, seconds=6.0, more=LEARNS))
     found, learnt = measured.sites["s"], measured.estimates["s"]
     assert found["theta_error_first"].value == pytest.approx(13.0)
-    assert found["theta_energy_first_j"].value == pytest.approx(0.5 * (9.0 + 16.0 + 144.0 / 2.0))
+    assert found["theta_energy_first_j"].value == pytest.approx(
+        0.5 * (9.0 + 16.0 + 144.0 / 2.0)
+    )
     end_s = 6.0 - 1.0 / 200
     last = [3.0 + 0.1 * end_s, 4.0 + 0.2 * end_s, 12.0 - 0.2 * end_s]
     assert found["theta_error_last"].value == pytest.approx(math.hypot(*last))
@@ -309,7 +337,11 @@ def test_a_law_that_learns_nothing_says_so() -> None:
 
 def test_without_a_truth_estimates_are_given_and_not_judged() -> None:
     log = simulated("free", {"duration_s": 1.0, "rate_hz": 100})
-    changes = {"sites.s.plant": "external", "sites.s.arm.known": False, "sites.s.control.theta_hat0": THETA}
+    changes = {
+        "sites.s.plant": "external",
+        "sites.s.arm.known": False,
+        "sites.s.control.theta_hat0": THETA,
+    }
     measured = compute_log_metrics(under(log, changes))
     assert measured.estimates["s"].theta is None
     assert measured.estimates["s"].last == log["s"].theta_hat[-1].tolist()

@@ -66,4 +66,6 @@ def test_a_measure_gives_the_quantities_that_it_declares(name: str) -> None:
     view = RunView(trilat_net.simulate(name, {"duration_s": 0.2}))
     for one in list_measures():
         for place in view.places(one.of):
-            assert set(one.measure(view, place)) == {quantity.key for quantity in one.quantities}
+            assert set(one.measure(view, place)) == {
+                quantity.key for quantity in one.quantities
+            }

@@ -21,7 +21,9 @@ def test_work_of_spring_is_exact_and_independent_of_way() -> None:
     """int -K q dq = K (q_0^2 - q_1^2) / 2."""
     q = np.cumsum(np.random.default_rng(1).normal(size=(50, 2)), axis=0)
     K = np.array([3.0, 7.0])
-    assert trapezoid_work(-K * q, q).sum() == pytest.approx(0.5 * float((K * (q[0] ** 2 - q[-1] ** 2)).sum()))
+    assert trapezoid_work(-K * q, q).sum() == pytest.approx(
+        0.5 * float((K * (q[0] ** 2 - q[-1] ** 2)).sum())
+    )
 
 
 def test_work_of_torque_that_is_held_is_torque_times_way() -> None:
@@ -38,7 +40,9 @@ def test_ports_make_up_the_mechanical_energy_to_second_order(scheme: str) -> Non
         found = compute_log_metrics(log).sites
         for site in log.sites:
             change = _mechanical(log, site)
-            assert found[site]["mechanical_j"].value == pytest.approx(change[-1] - change[0], abs=1e-9)
+            assert found[site]["mechanical_j"].value == pytest.approx(
+                change[-1] - change[0], abs=1e-9
+            )
         rests.append(found["m1"]["unaccounted_j"].value)
     assert rests[0] < 1e-3
     assert math.log2(rests[0] / rests[1]) == pytest.approx(2.0, abs=0.3)
@@ -86,7 +90,9 @@ def test_periods_without_both_records_are_left_out() -> None:
 
     whole = pair(motion)
     torn = rewritten(whole, lambda state: not (state.site == "m" and 100 <= state.tick < 200))
-    assert compute_log_metrics(whole).sites["m"]["controller_j"].value == pytest.approx(2.0 * 799 / 200)
+    assert compute_log_metrics(whole).sites["m"]["controller_j"].value == pytest.approx(
+        2.0 * 799 / 200
+    )
     assert compute_log_metrics(torn).sites["m"]["controller_j"].value == pytest.approx(
         2.0 * (799 - 101) / 200
     )
@@ -115,7 +121,10 @@ def test_the_energy_of_a_delay_between_sinusoids(apart: float) -> None:
 
     def motion(site: str, t_s: float) -> dict[str, list[float]]:
         sign = apart if site == "s" else 1.0
-        wave = {"q": [sign * A * math.sin(w * t_s), 0.0], "qd": [sign * A * w * math.cos(w * t_s), 0.0]}
+        wave = {
+            "q": [sign * A * math.sin(w * t_s), 0.0],
+            "qd": [sign * A * w * math.cos(w * t_s), 0.0],
+        }
         return {**wave, "tau": [0.0, 0.0], "tau_x": [0.0, 0.0]}
 
     seconds = 10.0
@@ -135,12 +144,15 @@ def test_delays_are_what_port_has_beyond_law_without_them(law: str) -> None:
         part, spec = log[site], log.scenario.sites[site]
         shares = log.scenario.dominance[site]
         e, ed = (
-            getattr(part, name) - sum(share * getattr(log[peer], name) for peer, share in shares.items())
+            getattr(part, name)
+            - sum(share * getattr(log[peer], name) for peer, share in shares.items())
             for name in ("q", "qd")
         )
         torque = LAWS[law](spec, part, e, ed)
         prompt = float(np.trapezoid((torque * part.qd).sum(axis=1), part.t_s))
-        late = sum(found.links[f"{peer}->{site}"]["delay_j"].value for peer in shares if shares[peer])
+        late = sum(
+            found.links[f"{peer}->{site}"]["delay_j"].value for peer in shares if shares[peer]
+        )
         given = found.sites[site]["controller_j"].value
         scale = float(np.trapezoid(np.abs((torque * part.qd).sum(axis=1)), part.t_s))
         assert prompt + late == pytest.approx(given, abs=2e-4 * scale)
@@ -178,7 +190,9 @@ def test_direct_force_reflection_counts_the_force_that_comes_late() -> None:
 
 
 def test_a_law_of_somebodys_own_is_not_judged() -> None:
-    log = simulated("free", {"duration_s": 0.2, "rate_hz": 100, "control.law": "tests.laws:Adaptive"})
+    log = simulated(
+        "free", {"duration_s": 0.2, "rate_hz": 100, "control.law": "tests.laws:Adaptive"}
+    )
     said = compute_log_metrics(log).links["m1->s"]["delay_j"]
     assert said.value is None
     assert "tests.laws:Adaptive does not say which part" in said.why

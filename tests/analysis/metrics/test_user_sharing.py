@@ -66,8 +66,12 @@ def test_effort_of_a_hand_counts_by_its_share() -> None:
     """|tau|^2 is 13 and 2; the shares of m1 add up to 200 x 0.75 + (75 - 0.5 x 49.5) + 100 x 0.25."""
     found = compute_log_metrics(prescribed())
     shares = 150.0 + 50.25 + 25.0
-    assert found.sites["m1"]["authority_effort_nm2_s"].value == pytest.approx(13.0 * shares / 200.0)
-    assert found.sites["m2"]["authority_effort_nm2_s"].value == pytest.approx(2.0 * (400.0 - shares) / 200.0)
+    assert found.sites["m1"]["authority_effort_nm2_s"].value == pytest.approx(
+        13.0 * shares / 200.0
+    )
+    assert found.sites["m2"]["authority_effort_nm2_s"].value == pytest.approx(
+        2.0 * (400.0 - shares) / 200.0
+    )
     assert not found.sites["s"]["authority_effort_nm2_s"].applies
 
 
@@ -81,7 +85,9 @@ def test_what_cancels_is_the_smaller_of_opposed_torques() -> None:
 
 def test_three_users_cancel_up_to_the_torque_that_remains() -> None:
     """Of 3, -1 and 2 N m at joint 1 and 2, 1 and -3 at joint 2 the sums are 4 and 0: 1 and 3 N m cancel."""
-    text = TRIO.replace("[sites.s]", '[sites.m3]\nrole = "master"\n[sites.s]').replace("RAMP", "0.5")
+    text = TRIO.replace("[sites.s]", '[sites.m3]\nrole = "master"\n[sites.s]').replace(
+        "RAMP", "0.5"
+    )
     text = text.replace("[[timeline]]", "m3 = { s = 1.0 }\n[[timeline]]")
     found = compute_log_metrics(pushed(trilat_net.simulate(parse_scenario(text)))).run
     assert found["internal_rms_nm"].value == pytest.approx(3.0)
@@ -99,10 +105,14 @@ def test_a_takeover_lasts_until_the_larger_share() -> None:
 
 
 def test_a_step_of_shares_takes_over_at_once() -> None:
-    assert compute_log_metrics(prescribed(ramp_s=0.0)).run["takeover_s"].value == pytest.approx(0.0, abs=1e-9)
+    assert compute_log_metrics(prescribed(ramp_s=0.0)).run["takeover_s"].value == pytest.approx(
+        0.0, abs=1e-9
+    )
 
 
-@pytest.mark.parametrize(("tick", "jump"), [(200, 4.0), (250, 4.0), (300, 4.0), (199, 0.25), (302, 0.25)])
+@pytest.mark.parametrize(
+    ("tick", "jump"), [(200, 4.0), (250, 4.0), (300, 4.0), (199, 0.25), (302, 0.25)]
+)
 def test_a_jump_counts_while_shares_change(tick: int, jump: float) -> None:
     """A step of 4 mrad among those of 1 mrad: of the ramp from tick 200 to 300, or of the rest."""
     found = compute_log_metrics(prescribed(steps={tick: 4e-3})).run["lead_jump"]
@@ -111,7 +121,9 @@ def test_a_jump_counts_while_shares_change(tick: int, jump: float) -> None:
 
 def test_two_sites_have_no_users_who_share() -> None:
     found = compute_log_metrics(trilat_net.simulate("two_sites", {"duration_s": 0.1})).run
-    assert {found[key].applies for key in ("internal_share", "takeovers", "lead_jump")} == {False}
+    assert {found[key].applies for key in ("internal_share", "takeovers", "lead_jump")} == {
+        False
+    }
 
 
 def test_shares_are_identified_from_motion() -> None:
@@ -125,9 +137,8 @@ def test_shares_are_identified_from_motion() -> None:
         if state.site in rates:
             return msgspec.structs.replace(state, qd=rates[state.site](state.tick))
         if min(state.used.values()) < 0:
-            return msgspec.structs.replace(
-                state, qd=[0.5, 0.5]
-            )  # the users are not heard yet: does not count
+            # the users are not heard yet: does not count
+            return msgspec.structs.replace(state, qd=[0.5, 0.5])
         first, second = (np.array(rates[peer](state.used[peer])) for peer in ("m1", "m2"))
         return msgspec.structs.replace(state, qd=(0.6 * first + 0.4 * second).tolist())
 
@@ -138,7 +149,9 @@ def test_shares_are_identified_from_motion() -> None:
 
 
 def test_users_who_move_alike_are_not_told_apart() -> None:
-    log = rewritten(prescribed(), change=lambda state: msgspec.structs.replace(state, qd=[1.0, 0.5]))
+    log = rewritten(
+        prescribed(), change=lambda state: msgspec.structs.replace(state, qd=[1.0, 0.5])
+    )
     assert "move alike" in compute_log_metrics(log).sites["m1"]["motion_share"].why
 
 

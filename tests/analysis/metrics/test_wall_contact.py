@@ -36,7 +36,10 @@ def test_force_depth_and_hits_of_a_swing() -> None:
     force = []
     for t_s in log["s"].t_s.tolist():
         pose = swinging("s", t_s)
-        depth, inward = 2.0 * math.cos(pose["q"][0]) - 1.9, -2.0 * math.sin(pose["q"][0]) * pose["qd"][0]
+        depth, inward = (
+            2.0 * math.cos(pose["q"][0]) - 1.9,
+            -2.0 * math.sin(pose["q"][0]) * pose["qd"][0],
+        )
         force.append(max(0.0, 1000.0 * depth + 20.0 * inward) if depth > 0.0 else 0.0)
     mean = sum(force) / len(force)
     assert found["force_mean_n"].value == pytest.approx(mean, rel=1e-9)
@@ -45,7 +48,9 @@ def test_force_depth_and_hits_of_a_swing() -> None:
     assert found["force_peak_n"].value == pytest.approx(max(force), rel=1e-9)
     assert found["depth_max_m"].value == pytest.approx(0.1, rel=1e-4)
     assert found["hits"].value == 8.0
-    assert found["contact_share"].value == pytest.approx(sum(one > 0.0 for one in force) / len(force))
+    assert found["contact_share"].value == pytest.approx(
+        sum(one > 0.0 for one in force) / len(force)
+    )
 
 
 def test_who_touches_from_the_first_record_on_has_not_hit() -> None:
@@ -60,8 +65,12 @@ def test_who_touches_from_the_first_record_on_has_not_hit() -> None:
 def test_a_contact_that_began_in_a_gap_is_no_hit() -> None:
     """Nobody knows since when it touches; and no number comes from records that are not there."""
     whole = pair(swinging, more=WALL)
-    torn = rewritten(whole, lambda state: not (state.site == "s" and 120 <= state.tick % 200 < 140))
-    before, after = (compute_log_metrics(log).walls["s/1"]["hits"].value for log in (whole, torn))
+    torn = rewritten(
+        whole, lambda state: not (state.site == "s" and 120 <= state.tick % 200 < 140)
+    )
+    before, after = (
+        compute_log_metrics(log).walls["s/1"]["hits"].value for log in (whole, torn)
+    )
     assert (before, after) == (8.0, 4.0)
 
 

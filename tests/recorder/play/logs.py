@@ -40,7 +40,9 @@ def event(site: str, n: int) -> bytes:
     return encode(Event(member=site, boot=BOOT, kind="mode", text=f"{site} {n}", n=n))
 
 
-def write(path: Path, messages: Iterable[tuple[str, int, int, int]], session: str = "paper") -> Path:
+def write(
+    path: Path, messages: Iterable[tuple[str, int, int, int]], session: str = "paper"
+) -> Path:
     """Writes a log of events.
 
     Args:

@@ -28,8 +28,12 @@ def gathered(given: Messages, kept: MessageBatch | None = None) -> BatchBuilder:
 def test_every_payload_stays_with_its_channel_and_number(given: Messages) -> None:
     """And what is there twice, as in two parts of one session, is there once."""
     block = gathered(given).ordered()
-    assert sorted(message[1:] for message in block.messages()) == sorted({message[1:] for message in given})
-    assert [block.payload(n) for n in range(len(block))] == [message[3] for message in block.messages()]
+    assert sorted(message[1:] for message in block.messages()) == sorted(
+        {message[1:] for message in given}
+    )
+    assert [block.payload(n) for n in range(len(block))] == [
+        message[3] for message in block.messages()
+    ]
 
 
 @given(messages, st.integers(1, 7))
@@ -45,6 +49,9 @@ def test_pieces_and_bytes_of_their_own_are_the_whole(given: Messages, size: int)
 @given(messages, messages)
 def test_ordered_messages_may_be_ordered_again_with_more(one: Messages, two: Messages) -> None:
     """For messages whose numbers ascend in the file, as they come of a log that misses nothing."""
-    rising = [(t_ns, channel, n, payload + b".") for n, (t_ns, channel, _, payload) in enumerate(one + two)]
+    rising = [
+        (t_ns, channel, n, payload + b".")
+        for n, (t_ns, channel, _, payload) in enumerate(one + two)
+    ]
     again = gathered(rising[len(one) :], gathered(rising[: len(one)]).ordered())
     assert list(again.ordered().messages()) == list(gathered(rising).ordered().messages())

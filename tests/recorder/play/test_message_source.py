@@ -29,13 +29,17 @@ def joined(blocks: list[MessageBatch]) -> list[PlayedMessage]:
     return [message for block in blocks for message in block.messages()]
 
 
-def sorted_in(messages: list[PlayedMessage], *how: int, **limits: int) -> tuple[list[PlayedMessage], int]:
+def sorted_in(
+    messages: list[PlayedMessage], *how: int, **limits: int
+) -> tuple[list[PlayedMessage], int]:
     found = list(sort_messages(messages, *how, **limits))
     return joined([batch for batch, _ in found]), sum(strays for _, strays in found)
 
 
 @given(
-    steps=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 2), st.integers(0, 30)), max_size=60),
+    steps=st.lists(
+        st.tuples(st.integers(0, 9), st.integers(0, 2), st.integers(0, 30)), max_size=60
+    ),
     step_ns=st.integers(1, 20),
 )
 def test_messages_within_the_horizon_are_put_in_order(
@@ -67,7 +71,10 @@ def test_messages_beyond_the_memory_limit_are_given_early() -> None:
     """A file that says that everything was sent at once."""
     given = [(0, 0, n, bytes(100)) for n in range(1000)]
     assert sorted_in(given, limit_bytes=20_000) == (given, 0)
-    assert max(len(batch) for batch, _ in sort_messages(given, limit_bytes=20_000)) <= 20_000 // 100
+    assert (
+        max(len(batch) for batch, _ in sort_messages(given, limit_bytes=20_000))
+        <= 20_000 // 100
+    )
 
 
 @contextmanager
@@ -119,7 +126,10 @@ def _killed(source: MessageSource, _path: Path) -> None:
     ],
 )
 def test_what_the_process_cannot_read_is_an_error_here(
-    happens: Callable[[MessageSource, Path], None], error: type[Exception], says: str, tmp_path: Path
+    happens: Callable[[MessageSource, Path], None],
+    error: type[Exception],
+    says: str,
+    tmp_path: Path,
 ) -> None:
     path = write(tmp_path / "run.mcap", [("m1", 0, 0, 0)])
     header, _ = preload_messages([path], PlaySelection(), 0)

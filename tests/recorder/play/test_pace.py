@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.play.player import LATENESS_LIMIT_US, SPIN_NS, LatenessHistogram, Pace, parse_rate, wait_until
+from recorder.play.player import (
+    LATENESS_LIMIT_US,
+    SPIN_NS,
+    LatenessHistogram,
+    Pace,
+    parse_rate,
+    wait_until,
+)
 from trilat_net.errors import UsageError
 
 from .clocks import LookedAt
@@ -18,7 +25,9 @@ paces = st.builds(Pace, st.integers(0, 10**15), times, rates)
 
 
 @given(paces, times, times)
-def test_what_is_later_in_the_log_is_never_due_earlier(pace: Pace, one: int, other: int) -> None:
+def test_what_is_later_in_the_log_is_never_due_earlier(
+    pace: Pace, one: int, other: int
+) -> None:
     assert (pace.due_ns(min(one, other))) <= pace.due_ns(max(one, other))
 
 
@@ -29,16 +38,25 @@ def test_deadline_is_origin_and_what_passed_by_rate(pace: Pace, t_ns: int) -> No
     if math.isinf(pace.rate):
         assert passed_ns == 0
     else:
-        assert passed_ns * pace.rate == pytest.approx(t_ns - pace.start_ns, rel=1e-9, abs=pace.rate)
+        assert passed_ns * pace.rate == pytest.approx(
+            t_ns - pace.start_ns, rel=1e-9, abs=pace.rate
+        )
 
 
 @given(paces, st.integers(0, 10**13), times)
-def test_the_next_round_is_the_same_by_so_much_later(pace: Pace, length_ns: int, t_ns: int) -> None:
+def test_the_next_round_is_the_same_by_so_much_later(
+    pace: Pace, length_ns: int, t_ns: int
+) -> None:
     later_ns = pace.due_ns(pace.start_ns + length_ns) - pace.origin_ns
     assert pace.later(length_ns).due_ns(t_ns) == pace.due_ns(t_ns) + later_ns
 
 
-@given(st.integers(0, 10**6), st.integers(0, 10**6), st.sampled_from([0, SPIN_NS]), st.integers(0, 200_000))
+@given(
+    st.integers(0, 10**6),
+    st.integers(0, 10**6),
+    st.sampled_from([0, SPIN_NS]),
+    st.integers(0, 200_000),
+)
 def test_waiting_ends_at_the_deadline_or_at_once(
     now_ns: int, due_ns: int, spin_ns: int, oversleep_ns: int
 ) -> None:
@@ -55,7 +73,8 @@ def test_waiting_ends_at_the_deadline_or_at_once(
 
 
 @pytest.mark.parametrize(
-    ("text", "rate"), [("1", 1.0), ("0.5", 0.5), ("1e3", 1000.0), ("0", math.inf), ("max", math.inf)]
+    ("text", "rate"),
+    [("1", 1.0), ("0.5", 0.5), ("1e3", 1000.0), ("0", math.inf), ("max", math.inf)],
 )
 def test_rates(text: str, rate: float) -> None:
     assert parse_rate(text) == rate
@@ -63,7 +82,9 @@ def test_rates(text: str, rate: float) -> None:
 
 @pytest.mark.parametrize("text", ["-1", "nan", "inf", "", "fast", "1e-4", "1001", "1e-300"])
 def test_what_is_no_rate_is_refused_with_what_would_be(text: str) -> None:
-    with pytest.raises(UsageError, match=r"rate is how much faster than it was, from 0\.001 to 1000, or"):
+    with pytest.raises(
+        UsageError, match=r"rate is how much faster than it was, from 0\.001 to 1000, or"
+    ):
         parse_rate(text)
 
 

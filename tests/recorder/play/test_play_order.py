@@ -8,7 +8,9 @@ from recorder.play.batch import order_for_play
 
 Messages = list[tuple[int, int, int]]
 messages = st.lists(
-    st.tuples(st.integers(-50, 50), st.integers(0, 3), st.integers(0, 12)), min_size=0, max_size=40
+    st.tuples(st.integers(-50, 50), st.integers(0, 3), st.integers(0, 12)),
+    min_size=0,
+    max_size=40,
 )
 
 
@@ -38,7 +40,9 @@ def test_none_is_due_late_and_early_only_for_later_numbers(given: Messages) -> N
     order, due_ns = ordered(given)
     for place, due in zip(order, due_ns, strict=True):
         t_ns, channel, number = given[place]
-        behind = [t for n, (t, c, k) in enumerate(given) if c == channel and (k, n) >= (number, place)]
+        behind = [
+            t for n, (t, c, k) in enumerate(given) if c == channel and (k, n) >= (number, place)
+        ]
         assert due == min(behind) <= t_ns
 
 

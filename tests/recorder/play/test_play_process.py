@@ -10,7 +10,13 @@ from pathlib import Path
 import pytest
 
 from recorder.play.message_source import MessageSource
-from recorder.play.play_process import LINGER_NS, Playback, PlaybackSummary, PlayOptions, map_key_to_session
+from recorder.play.play_process import (
+    LINGER_NS,
+    Playback,
+    PlaybackSummary,
+    PlayOptions,
+    map_key_to_session,
+)
 from recorder.play.player import PlayProgress
 from recorder.play.session_reader import PlaySelection, preload_messages
 from tests.net.local_bus import LocalNetwork
@@ -56,7 +62,9 @@ class Hall:
         self.watcher: Bus = self.network.join()
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
             self.watcher.tap(topics.key(self.options.session, "*", channel), self._hear)
-        self.presence = self.watcher.presence(topics.key(self.options.session, "*", topics.ALIVE) + "/*")
+        self.presence = self.watcher.presence(
+            topics.key(self.options.session, "*", topics.ALIVE) + "/*"
+        )
 
     def _hear(self, key: str, payload: bytes) -> None:
         self.heard.setdefault("/".join(key.split("/")[2:]), []).append(payload)
@@ -101,7 +109,11 @@ class Scribe:
             event = decode(payload, Event)
             if event.kind == "end" and stores:
                 said = Event(
-                    member=topics.RECORDER, boot=RECORDER_BOOT, kind="stored", text="", about=event.member
+                    member=topics.RECORDER,
+                    boot=RECORDER_BOOT,
+                    kind="stored",
+                    text="",
+                    about=event.member,
                 )
                 publish(encode(said))
 
@@ -112,20 +124,30 @@ def test_every_payload_comes_in_the_order_of_its_channel(log_file: Path) -> None
     hall = Hall(log_file)
     outcome = hall.play()
     assert hall.heard == session_payloads(log_file)
-    assert outcome.counts == {f"/trilat/paper/{key}": len(found) for key, found in hall.heard.items()}
+    assert outcome.counts == {
+        f"/trilat/paper/{key}": len(found) for key, found in hall.heard.items()
+    }
     assert (outcome.rounds, outcome.cut, outcome.strays, outcome.recorders) == (1, 0, 0, 0)
     assert outcome.lateness is not None
     assert outcome.took_s == pytest.approx(0.3, abs=0.01)
 
 
 @pytest.mark.parametrize(("rate", "start_ns"), [(1.0, None), (2.0, 50_000_000)])
-def test_who_asks_finds_a_session_that_runs(log_file: Path, rate: float, start_ns: int | None) -> None:
+def test_who_asks_finds_a_session_that_runs(
+    log_file: Path, rate: float, start_ns: int | None
+) -> None:
     hall = Hall(log_file, PlayOptions(SESSION, rate), PlaySelection(start_ns=start_ns))
     rings: list[Inbox] = []
     begun: list[int] = []
-    hall.acts = {1: lambda: begun.append(hall.clock.now_ns), 300: lambda: rings.append(hall.ask("*", "info"))}
+    hall.acts = {
+        1: lambda: begun.append(hall.clock.now_ns),
+        300: lambda: rings.append(hall.ask("*", "info")),
+    }
     hall.play()
-    infos = {info.member: info for info in (decode(payload, Info) for _, payload in drained(rings[0]))}
+    infos = {
+        info.member: info
+        for info in (decode(payload, Info) for _, payload in drained(rings[0]))
+    }
     boots = {name: virtual_boot(hall.facts.scenario, name) for name in ("m1", "m2", "s")}
     assert {name: info.boot for name, info in infos.items()} == boots
     for name, info in infos.items():
@@ -137,7 +159,9 @@ def test_who_asks_finds_a_session_that_runs(log_file: Path, rate: float, start_n
         assert 0 < info.ticks <= TICKS, name
         lead_ns = (start_ns or 0) / rate
         assert info.epoch_mono_ns == pytest.approx(begun[0] - lead_ns, abs=50_000)
-        assert info.epoch_unix_ns - info.epoch_mono_ns == pytest.approx(5_000_000_000_000, abs=50_000)
+        assert info.epoch_unix_ns - info.epoch_mono_ns == pytest.approx(
+            5_000_000_000_000, abs=50_000
+        )
 
 
 def test_the_sites_tokens_stand_while_it_plays(log_file: Path) -> None:
@@ -154,7 +178,9 @@ def test_pings_are_answered_at_once(log_file: Path) -> None:
     hall = Hall(log_file)
     pongs: list[Pong] = []
     hall.acts = {
-        5: lambda: pongs.extend(decode(payload, Pong) for _, payload in drained(hall.ask("*", topics.PING)))
+        5: lambda: pongs.extend(
+            decode(payload, Pong) for _, payload in drained(hall.ask("*", topics.PING))
+        )
     }
     hall.play()
     assert {pong.member: pong.boot for pong in pongs} == hall.facts.boots
@@ -168,13 +194,19 @@ def test_past_is_told_as_far_as_it_has_been_played(log_file: Path) -> None:
         for first, last in ((0, 9), (40, 1000), (290, 299)):
             wanted = BackfillRequest(channel="state", first=first, last=last)
             rings.append(hall.ask("m2", topics.PAST, encode(wanted)))
-        rings.append(hall.ask("s", topics.PAST, encode(BackfillRequest(channel="link", first=0, last=99))))
+        rings.append(
+            hall.ask(
+                "s", topics.PAST, encode(BackfillRequest(channel="link", first=0, last=99))
+            )
+        )
         rings.append(hall.ask("s", topics.PAST, b"garbage"))
 
     hall.acts = {200: ask}
     outcome = hall.play()
     published = session_payloads(log_file)
-    early, later, unplayed, links = (decode(drained(ring)[0][1], Backfill) for ring in rings[:4])
+    early, later, unplayed, links = (
+        decode(drained(ring)[0][1], Backfill) for ring in rings[:4]
+    )
     assert early.payloads == published["m2/state"][:10]
     assert (early.member, early.boot, early.first) == ("m2", hall.facts.boots["m2"], 0)
     assert later.first == 40
@@ -183,7 +215,9 @@ def test_past_is_told_as_far_as_it_has_been_played(log_file: Path) -> None:
     assert (unplayed.first, unplayed.payloads) == (290, [])
     assert links.payloads == published["s/link"][: links.made]
     assert drained(rings[4]) == []
-    assert outcome.refilled == sum(len(past.payloads) for past in (early, later, unplayed, links))
+    assert outcome.refilled == sum(
+        len(past.payloads) for past in (early, later, unplayed, links)
+    )
 
 
 def test_recorder_that_comes_in_middle_learns_when_tick_0_was(log_file: Path) -> None:
@@ -196,7 +230,9 @@ def test_recorder_that_comes_in_middle_learns_when_tick_0_was(log_file: Path) ->
     joining: list[SessionJoin] = []
 
     def come() -> None:
-        joining.append(SessionJoin(bus, hall.clock, SESSION, EventPublisher(bus, SESSION, info), ()))
+        joining.append(
+            SessionJoin(bus, hall.clock, SESSION, EventPublisher(bus, SESSION, info), ())
+        )
 
     def join() -> None:
         if joining and not epochs:
@@ -223,9 +259,15 @@ def test_it_stays_until_recorder_has_everything_or_for_while(
 
 
 def test_a_log_is_played_in_its_own_name(log_file: Path) -> None:
-    hall = Hall(log_file, PlayOptions("other"), PlaySelection(ChannelFilter(exclude=("**/link",))))
+    hall = Hall(
+        log_file, PlayOptions("other"), PlaySelection(ChannelFilter(exclude=("**/link",)))
+    )
     hall.play()
-    wanted = {key: found for key, found in session_payloads(log_file).items() if not key.endswith("link")}
+    wanted = {
+        key: found
+        for key, found in session_payloads(log_file).items()
+        if not key.endswith("link")
+    }
     assert hall.heard == wanted
     assert {decode(payload, State).site for payload in hall.heard["m1/state"]} == {"m1"}
 
@@ -249,14 +291,21 @@ def test_it_shows_where_it_is_twice_a_second(tmp_path: Path) -> None:
 def test_a_session_that_is_there_already_is_refused() -> None:
     network, clock = LocalNetwork(), LookedAt()
     visitor, there = network.join(), network.join()
-    there.respond(topics.key("other", "m1", topics.INFO), lambda _: encode(told("m1", RECORDER_BOOT)))
+    there.respond(
+        topics.key("other", "m1", topics.INFO), lambda _: encode(told("m1", RECORDER_BOOT))
+    )
     there.respond(topics.key(SESSION, "nobody", topics.INFO), lambda _: b"garbage")
     there.respond(
-        topics.key(SESSION, "recorder", topics.INFO), lambda _: encode(told("recorder", RECORDER_BOOT))
+        topics.key(SESSION, "recorder", topics.INFO),
+        lambda _: encode(told("recorder", RECORDER_BOOT)),
     )
     refuse_running_session(visitor, clock, SESSION, lambda: False)
-    there.respond(topics.key(SESSION, "m1", topics.INFO), lambda _: encode(told("m1", RECORDER_BOOT)))
-    with pytest.raises(SessionError, match="session 'replay-paper' is there already and waits to begin"):
+    there.respond(
+        topics.key(SESSION, "m1", topics.INFO), lambda _: encode(told("m1", RECORDER_BOOT))
+    )
+    with pytest.raises(
+        SessionError, match="session 'replay-paper' is there already and waits to begin"
+    ):
         refuse_running_session(visitor, clock, SESSION, lambda: False)
 
 

@@ -10,7 +10,14 @@ from hypothesis import strategies as st
 
 from recorder.play.batch import BatchBuilder, MessageBatch
 from recorder.play.message_source import MessageSource
-from recorder.play.player import CUT_NS, LOOP_PAUSE_NS, SERVICE_EVERY_NS, Pace, Player, PlayProgress
+from recorder.play.player import (
+    CUT_NS,
+    LOOP_PAUSE_NS,
+    SERVICE_EVERY_NS,
+    Pace,
+    Player,
+    PlayProgress,
+)
 from recorder.play.session_reader import SessionHeader
 from recorder.play.site_stand_ins import PlayedHistory
 from trilat_net.scenario import load_scenario
@@ -95,7 +102,11 @@ class Stage:
 
 
 @pytest.mark.parametrize("low_cpu", [False, True])
-@given(given=messages, rate=st.sampled_from([0.5, 1.0, 4.0, math.inf]), cuts=st.lists(st.integers(0, 60)))
+@given(
+    given=messages,
+    rate=st.sampled_from([0.5, 1.0, 4.0, math.inf]),
+    cuts=st.lists(st.integers(0, 60)),
+)
 def test_every_message_is_published_once_in_order_at_its_deadline(
     given: list[tuple[int, int]], rate: float, cuts: list[int], low_cpu: bool
 ) -> None:
@@ -148,9 +159,9 @@ def test_rounds_follow_each_other_with_the_same_messages() -> None:
     assert stage.player.rounds == 3
     round_ns = 7 * MS + LOOP_PAUSE_NS
     due_ns = [pace.due_ns(t * MS) + n * round_ns for n in range(3) for t in (0, 5, 7)][:7]
-    assert [heard - due for (heard, _, _), due in zip(stage.heard, due_ns, strict=True)] == pytest.approx(
-        [0] * 7, abs=10_000
-    )
+    assert [
+        heard - due for (heard, _, _), due in zip(stage.heard, due_ns, strict=True)
+    ] == pytest.approx([0] * 7, abs=10_000)
     assert stage.memory.chunk(0, 0, 9) == (0, [b"\0"])
 
 
@@ -170,7 +181,9 @@ def test_other_tasks_have_their_turn_even_without_time_left() -> None:
     stage.play(math.inf)
     looked = [ns for ns, _ in stage.looks]
     assert len(looked) >= 10
-    assert max(later - earlier for earlier, later in pairwise(looked)) <= SERVICE_EVERY_NS + 2 * MS
+    assert (
+        max(later - earlier for earlier, later in pairwise(looked)) <= SERVICE_EVERY_NS + 2 * MS
+    )
     quiet = Stage(given_at_once([(0, 0), (60, 0)]))
     quiet.play()
     assert len(quiet.looks) >= 40

@@ -23,10 +23,16 @@ def test_everything_that_sites_published_is_read_byte_for_byte(log_file: Path) -
     played: dict[str, list[bytes]] = {topic: [] for topic in facts.topics}
     for _, channel, _, payload in block.messages():
         played[facts.topics[channel]].append(payload)
-    published = {topic: found for topic, found in payloads(log_file).items() if topic.startswith("/trilat/")}
+    published = {
+        topic: found
+        for topic, found in payloads(log_file).items()
+        if topic.startswith("/trilat/")
+    }
     assert played == published
     assert facts.session == "paper"
-    assert facts.boots == {name: virtual_boot(facts.scenario, name) for name in ("m1", "m2", "s")}
+    assert facts.boots == {
+        name: virtual_boot(facts.scenario, name) for name in ("m1", "m2", "s")
+    }
     assert facts.torn == {}
 
 
@@ -71,7 +77,9 @@ def test_parts_of_one_session_are_one_log(tmp_path: Path) -> None:
     one = write(tmp_path / "1.mcap", [("m1", 0, 0, 0), ("m1", 2, 20, 20)])
     two = write(tmp_path / "2.mcap", [("m1", 1, 10, 30), ("m1", 2, 20, 30), ("m1", 3, 40, 40)])
     facts, block = loaded(one, two)
-    assert [payload for _, _, _, payload in block.messages()] == [event("m1", n) for n in range(4)]
+    assert [payload for _, _, _, payload in block.messages()] == [
+        event("m1", n) for n in range(4)
+    ]
     assert facts.boots == {"m1": BOOT}
     other = write(tmp_path / "3.mcap", [("m1", 0, 0, 0)], "other")
     with pytest.raises(LogError, match=r"3\.mcap: is of another session than .*1\.mcap"):
@@ -97,7 +105,10 @@ def test_beyond_the_limit_a_log_is_read_while_it_plays(log_file: Path) -> None:
 @pytest.mark.parametrize(
     ("selection", "problem"),
     [
-        (PlaySelection(start_ns=5 * 10**9), r"start=5 s: is beyond the end; .* from 0\.000 s to 0\.299 s"),
+        (
+            PlaySelection(start_ns=5 * 10**9),
+            r"start=5 s: is beyond the end; .* from 0\.000 s to 0\.299 s",
+        ),
         (PlaySelection(stop_ns=-(10**9)), r"stop -1 s: is before the beginning"),
         (
             PlaySelection(ChannelFilter(include=("a/b",))),
@@ -113,6 +124,9 @@ def test_where_nothing_can_be_played_the_choice_is_told(
 
 
 def test_message_whose_stamp_is_nonsense_is_played_when_it_came(tmp_path: Path) -> None:
-    path = write(tmp_path / "run.mcap", [("m1", 0, 0, 0), ("m1", 1, 10**9, 5), ("s", 2**63 - 1, -(10**9), 7)])
+    path = write(
+        tmp_path / "run.mcap",
+        [("m1", 0, 0, 0), ("m1", 1, 10**9, 5), ("s", 2**63 - 1, -(10**9), 7)],
+    )
     _, block = loaded(path)
     assert block.times_ns.tolist() == [0, 5_000_000, 7_000_000]

@@ -38,7 +38,11 @@ def test_what_is_excluded_is_not_whatever_is_included() -> None:
 
 def test_a_duration_counts_from_the_start_or_from_tick_0() -> None:
     window = parse_selection((), (), 2.0, None, 0.5, "log")
-    assert (window.start_ns, window.stop_ns, window.time) == (2_000_000_000, 2_500_000_000, "log")
+    assert (window.start_ns, window.stop_ns, window.time) == (
+        2_000_000_000,
+        2_500_000_000,
+        "log",
+    )
     window = parse_selection((), (), None, None, 0.5, "publish")
     assert (window.start_ns, window.stop_ns) == (None, 500_000_000)
 

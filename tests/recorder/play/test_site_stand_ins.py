@@ -11,7 +11,9 @@ from trilat_net.net.requests import BACKFILL_BYTES, BACKFILL_MESSAGES
 CHANNEL, OTHER = 3, 4
 
 
-def remembered(numbers: list[int], played: int, size: int = 1, kept_ns: int | None = None) -> PlayedHistory:
+def remembered(
+    numbers: list[int], played: int, size: int = 1, kept_ns: int | None = None
+) -> PlayedHistory:
     memory = PlayedHistory(kept_ns)
     gathering = BatchBuilder()
     for place, number in enumerate(numbers):
@@ -56,7 +58,9 @@ def test_it_answers_records_from_a_number_to_the_next_gap(
 
 
 @given(st.integers(0, 150), st.integers(0, 150), st.integers(0, 150), st.sampled_from([1, 900]))
-def test_where_nothing_is_missing_it_answers_as_a_site(count: int, first: int, more: int, size: int) -> None:
+def test_where_nothing_is_missing_it_answers_as_a_site(
+    count: int, first: int, more: int, size: int
+) -> None:
     """Messages of 2 bytes, and of 1800, of which fewer fit an answer."""
     ring = ChannelBuffer(200, 400_000)
     for number in range(count):

@@ -16,7 +16,13 @@ from trilat_net.core.vectors import Array
 from trilat_net.errors import UsageError
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import load_scenario
-from trilat_net.studies.bench import BenchResults, bench_plan, plan_bench, prepare_bench_folder, run_bench
+from trilat_net.studies.bench import (
+    BenchResults,
+    bench_plan,
+    plan_bench,
+    prepare_bench_folder,
+    run_bench,
+)
 from trilat_net.studies.bench.bench_plan import (
     KNOWLEDGE,
     LINKS,
@@ -45,7 +51,11 @@ from trilat_net.studies.bench.bench_run import BenchRunItem, find_least_energy, 
 from trilat_net.studies.measure_run import RecordBatch
 from trilat_net.studies.study_folder import encode_csv
 from trilat_net.studies.tuning import plan_tuning
-from trilat_net.studies.tuning.candidate import CandidateClass, load_tuning_scenario, measure_candidate
+from trilat_net.studies.tuning.candidate import (
+    CandidateClass,
+    load_tuning_scenario,
+    measure_candidate,
+)
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
 
 LEVEL = {"laws": ["p_d"], "study": "round-trips"}
@@ -53,11 +63,17 @@ LEVEL = {"laws": ["p_d"], "study": "round-trips"}
 
 def asked(**more: Any) -> BenchPlan:
     """Two cells of two sites, one of them with two seeds."""
-    return plan_bench(**{**LEVEL, "tasks": ["free"], "links": ["rtt8", "rtt68-loss25"], "seeds": 2, **more})
+    return plan_bench(
+        **{**LEVEL, "tasks": ["free"], "links": ["rtt8", "rtt68-loss25"], "seeds": 2, **more}
+    )
 
 
 def files(results: BenchResults) -> list[str]:
-    return [build_bench_page(results, "trilat bench"), encode_csv(results.to_rows()), encode_runs(results)]
+    return [
+        build_bench_page(results, "trilat bench"),
+        encode_csv(results.to_rows()),
+        encode_runs(results),
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +82,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> BenchResults:
     return run_bench(folder, jobs=1)
 
 
-def test_an_interrupted_suite_goes_on_to_the_same_bytes(whole: BenchResults, tmp_path: Path) -> None:
+def test_an_interrupted_suite_goes_on_to_the_same_bytes(
+    whole: BenchResults, tmp_path: Path
+) -> None:
     folder, made = prepare_bench_folder(asked(), tmp_path / "parts"), []
 
     def stop(done: int, _total: int) -> None:
@@ -155,7 +173,9 @@ def test_a_wall_that_is_hardly_touched_masks_the_numbers() -> None:
     assert run.wall_n is not None
     assert run.wall_n < LEAST_CONTACT_N
     assert run.stiffness_n_m is None
-    results = BenchResults(BenchPlan("round-trips", [cell], [("p_d", "level")]), {(cell.key, 1): run})
+    results = BenchResults(
+        BenchPlan("round-trips", [cell], [("p_d", "level")]), {(cell.key, 1): run}
+    )
     assert results.places[0].mean("error_rad") is None
     assert "no contact" in build_bench_page(results, "trilat bench")
 
@@ -165,33 +185,42 @@ def test_what_is_not_stable_stays_so_over_twice_the_length() -> None:
     run = run_bench_task(BenchRunItem(with_gains(cell, K=60.0, d=0.5), 1))
     assert run.stability is Stability.NOT_STABLE
     assert run.behaviour is EndBehaviour.DIVERGED or run.length_s >= 40.0
-    assert run_bench_task(BenchRunItem(with_gains(cell, K=10.0, d=4.0), 1)).stability is Stability.STABLE
+    assert (
+        run_bench_task(BenchRunItem(with_gains(cell, K=10.0, d=4.0), 1)).stability
+        is Stability.STABLE
+    )
 
 
 def batch(t_ns: Array, qd: Array, tau_x: Array) -> RecordBatch:
     """Records of one joint."""
     zero = np.zeros((len(t_ns), 1))
-    return RecordBatch(t_ns, zero, qd[:, None], zero, zero, tau_x[:, None], np.zeros((len(t_ns), 0), int))
+    return RecordBatch(
+        t_ns, zero, qd[:, None], zero, zero, tau_x[:, None], np.zeros((len(t_ns), 0), int)
+    )
 
 
 def test_least_energy_is_that_of_outside_until_any_instant() -> None:
     """It puts in 3 J in the first second, takes out 5 J in the second, and puts in 4 J more."""
     t_ns = np.arange(3001) * 1_000_000
     power = np.select([t_ns < 1e9, t_ns < 2e9], [3.0, -5.0], 4.0)
-    assert find_least_energy({"s": batch(t_ns, np.full(3001, 2.0), -power / 2.0)}) == pytest.approx(
-        -2.0, abs=0.01
-    )
+    assert find_least_energy(
+        {"s": batch(t_ns, np.full(3001, 2.0), -power / 2.0)}
+    ) == pytest.approx(-2.0, abs=0.01)
     assert find_least_energy({"s": batch(t_ns, np.ones(3001), np.zeros(3001))}) == 0.0
 
 
 def test_a_longer_run_refutes_or_confirms() -> None:
     cell = asked(links=["rtt8"]).cells[0]
-    judged = [(Stability.STABLE, Stability.STABLE, False), (Stability.NOT_STABLE, Stability.NOT_STABLE, True)]
+    judged = [
+        (Stability.STABLE, Stability.STABLE, False),
+        (Stability.NOT_STABLE, Stability.NOT_STABLE, True),
+    ]
     for longer, stability, confirmed in judged:
         run = make_run(cell, 1, stability=Stability.NOT_STABLE, length_s=40.0)
         again = make_run(cell, 1, stability=longer, length_s=100.0, to_s=100.0)
         results = BenchResults(
-            BenchPlan("round-trips", [cell], [("p_d", "level")]), {(one.cell, 1): one for one in (run, again)}
+            BenchPlan("round-trips", [cell], [("p_d", "level")]),
+            {(one.cell, 1): one for one in (run, again)},
         )
         (found,) = results.runs
         assert (found.stability, found.confirmed) == (stability, confirmed)
@@ -224,7 +253,11 @@ def test_no_user_is_without_friction(base: str) -> None:
 
 
 def test_a_run_lasts_for_forty_round_trips() -> None:
-    assert [build_settings("two", "free", link)["duration_s"] for link in LINKS if "loss" not in link] == [
+    assert [
+        build_settings("two", "free", link)["duration_s"]
+        for link in LINKS
+        if "loss" not in link
+    ] == [
         pytest.approx(max(20.0, 40.0 * trip_s))
         for trip_s in (0.008, 0.068, 0.136, 0.272, 0.544, 1.088, 0.0, 0.0, 0.6, 0.0)
     ]
@@ -238,28 +271,41 @@ def test_shared_slave_errs_by_its_distance_from_mean_by_dominance() -> None:
     log = trilat_net.simulate(plan.cells[0].build(1).scenario)
     t_s, (m1, m2, s) = log["s"].t_s, (log[name].q for name in ("m1", "m2", "s"))
     a = np.interp(t_s, [7.0, 9.0], [0.75, 0.25])[:, None]
-    assert run.error_rad == pytest.approx(np.sqrt(np.mean((s - a * m1 - (1.0 - a) * m2) ** 2)), rel=1e-9)
+    assert run.error_rad == pytest.approx(
+        np.sqrt(np.mean((s - a * m1 - (1.0 - a) * m2) ** 2)), rel=1e-9
+    )
 
 
 def make_run(cell: BenchCell, seed: int, **more: Any) -> BenchRun:
-    facts = {"stability": Stability.STABLE, "behaviour": EndBehaviour.CONVERGED, "text": "", **more}
+    facts = {
+        "stability": Stability.STABLE,
+        "behaviour": EndBehaviour.CONVERGED,
+        "text": "",
+        **more,
+    }
     return BenchRun(cell.name, cell.inputs, seed, True, "", **facts)
 
 
 def place(*errors: float | None) -> BenchPlace:
     cell = asked().cells[1]
-    return BenchPlace(cell, [make_run(cell, n, error_rad=error) for n, error in enumerate(errors)])
+    return BenchPlace(
+        cell, [make_run(cell, n, error_rad=error) for n, error in enumerate(errors)]
+    )
 
 
 def test_intervals_over_twenty_seeds_are_those_of_scipy() -> None:
     errors = tuple(0.3 + 0.01 * (7 * n % 20) for n in range(20))
     found: Any = place(*errors).mean("error_rad")
     low, high = stats.t.interval(0.95, 19, np.mean(errors), stats.sem(errors))
-    assert (found.mean - found.half, found.mean + found.half) == pytest.approx((low, high), rel=1e-12)
+    assert (found.mean - found.half, found.mean + found.half) == pytest.approx(
+        (low, high), rel=1e-12
+    )
     share = stats.binomtest(20, 20).proportion_ci(method="wilson")
     assert place(*errors).interval == pytest.approx((share.low, share.high), rel=1e-12)
     assert place(*errors[:19]).interval is None
-    assert place(*errors[:19]).mean("error_rad") == pytest.approx(np.mean(errors[:19]), rel=1e-12)
+    assert place(*errors[:19]).mean("error_rad") == pytest.approx(
+        np.mean(errors[:19]), rel=1e-12
+    )
     assert place(0.31, None).mean("error_rad") is None
 
 
@@ -269,7 +315,9 @@ FULL = plan_bench("full", tasks=["handover", "outage"], links=["rtt272"])
 @pytest.mark.parametrize("cell", FULL.cells, ids=lambda cell: f"{cell.task}/{cell.law}")
 def test_every_law_fits_every_task_in_which_it_runs(cell: BenchCell) -> None:
     found = cell.build(1)
-    assert {site.control.__struct_config__.tag for site in found.scenario.sites.values()} == {cell.law}
+    assert {site.control.__struct_config__.tag for site in found.scenario.sites.values()} == {
+        cell.law
+    }
     assert len(found.scenario.names) == (2 if cell.form == "two" else 3)
     assert np.allclose(found.scenario.alpha.sum(axis=1), 1.0)
 
@@ -279,7 +327,9 @@ def test_every_link_fits_both_forms() -> None:
         for form, base in (("three", "_bench_three"), ("two", "_bench_two")):
             scenario = load_scenario(base, build_settings(form, "outage", link))
             cut = [name for name, one in scenario.links.items() if one.outages_s]
-            assert sorted(cut) == sorted(name for name in scenario.links if "s" in name.split("->"))
+            assert sorted(cut) == sorted(
+                name for name in scenario.links if "s" in name.split("->")
+            )
 
 
 def test_gains_of_all_studies_are_there_and_within_their_ranges() -> None:
@@ -291,7 +341,10 @@ def test_gains_of_all_studies_are_there_and_within_their_ranges() -> None:
                     kept = gains[form, law, round_trip_ms].gains
                     knobs = {knob.name: knob for knob in SEARCH_SPACES[law].knobs}
                     assert kept.keys() in (knobs.keys(), {}.keys())
-                    assert all(knobs[key].low <= value <= knobs[key].high for key, value in kept.items())
+                    assert all(
+                        knobs[key].low <= value <= knobs[key].high
+                        for key, value in kept.items()
+                    )
 
 
 @pytest.mark.long
@@ -300,7 +353,9 @@ def test_kept_gains_are_the_least_error_that_keeps_the_margin(tmp_path: Path) ->
     assert [one.round_trip_ms for one in found] == list(TUNED_ROUND_TRIPS_MS)
     settings = name_settings(build_settings("level", "contact", "rtt272"))
     (search,) = plan_tuning("_bench_two", settings, laws=["p_d"], budget=8).run(1).found
-    places = [n for n, score in enumerate(search.scores) if score.outcome is CandidateClass.SETTLED]
+    places = [
+        n for n, score in enumerate(search.scores) if score.outcome is CandidateClass.SETTLED
+    ]
     places.sort(key=lambda n: search.scores[n].error_rad or 0.0)
     assert (found[1].settled, found[1].tried) == (len(places), 8)
     later = load_tuning_scenario("_bench_two", [*settings, "link.delay_ms=204"])
@@ -313,12 +368,20 @@ def test_kept_gains_are_the_least_error_that_keeps_the_margin(tmp_path: Path) ->
     assert (found[1].gains, found[1].passed) == (search.tried[first], places.index(first))
     write_gains(found[:2], tmp_path / "gains.json")
     write_gains(found[1:], tmp_path / "gains.json")
-    assert sorted(map(str, read_gains(tmp_path / "gains.json").values())) == sorted(map(str, found))
+    assert sorted(map(str, read_gains(tmp_path / "gains.json").values())) == sorted(
+        map(str, found)
+    )
     assert find_stale(found) == []
 
 
 def test_gains_are_those_of_the_next_longer_round_trip() -> None:
-    assert [choose_round_trip(ms) for ms in (0.0, 68.0, 69.0, 600.0, 5000.0)] == [68, 68, 272, 1088, 1088]
+    assert [choose_round_trip(ms) for ms in (0.0, 68.0, 69.0, 600.0, 5000.0)] == [
+        68,
+        68,
+        272,
+        1088,
+        1088,
+    ]
 
 
 def test_gains_of_another_law_or_scenario_are_stale() -> None:
@@ -335,7 +398,10 @@ def test_gains_of_another_law_or_scenario_are_stale() -> None:
         ({"tasks": ["handover"]}, "no task 'handover' in it"),
         ({"links": ["rtt9"]}, "no link 'rtt9' in it; did you mean"),
         ({"seeds": 0}, "seeds is how many, 1 to 1000, not 0"),
-        ({"study": "full", "laws": ["smith"], "tasks": ["handover"]}, "handover asks for two users"),
+        (
+            {"study": "full", "laws": ["smith"], "tasks": ["handover"]},
+            "handover asks for two users",
+        ),
     ],
 )
 def test_what_cannot_be_asked_is_refused(more: dict[str, Any], words: str) -> None:
@@ -345,11 +411,15 @@ def test_what_cannot_be_asked_is_refused(more: dict[str, Any], words: str) -> No
 
 
 @pytest.mark.long
-def test_folder_takes_more_of_suite_and_nothing_from_elsewhere(whole: BenchResults, tmp_path: Path) -> None:
+def test_folder_takes_more_of_suite_and_nothing_from_elsewhere(
+    whole: BenchResults, tmp_path: Path
+) -> None:
     first = run_bench(prepare_bench_folder(asked(links=["rtt8"]), tmp_path / "one"), jobs=1)
     made: list[int] = []
     more = run_bench(
-        prepare_bench_folder(asked(), tmp_path / "one"), jobs=1, progress=lambda done, _: made.append(done)
+        prepare_bench_folder(asked(), tmp_path / "one"),
+        jobs=1,
+        progress=lambda done, _: made.append(done),
     )
     assert made == [2, 3]
     assert more.runs == whole.runs
@@ -358,10 +428,15 @@ def test_folder_takes_more_of_suite_and_nothing_from_elsewhere(whole: BenchResul
     cell = asked().cells[0]
     other = cell._replace(tuned=msgspec.structs.replace(cell.tuned, gains=gains))
     changed = BenchPlan("round-trips", [other], [])
-    assert run_bench(prepare_bench_folder(changed, tmp_path / "one"), jobs=1).runs[0] != first.runs[0]
+    assert (
+        run_bench(prepare_bench_folder(changed, tmp_path / "one"), jobs=1).runs[0]
+        != first.runs[0]
+    )
     origin = tmp_path / "one" / "origin.json"
     origin.write_text(origin.read_text().replace("numpy", "numpi"))
-    with pytest.raises(UsageError, match="results are not mixed: choose another folder with out"):
+    with pytest.raises(
+        UsageError, match="results are not mixed: choose another folder with out"
+    ):
         prepare_bench_folder(asked(), tmp_path / "one")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").touch()

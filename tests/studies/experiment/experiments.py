@@ -41,7 +41,10 @@ def write_protocol(
 ) -> Path:
     """Writes it; `more` follows its task, and `first` is the first user's share of the slave."""
     file = folder / "short.toml"
-    text = TEXT.format(users=users, task=task, design="fixed" if "m2" in users else "williams") + more
+    text = (
+        TEXT.format(users=users, task=task, design="fixed" if "m2" in users else "williams")
+        + more
+    )
     if "contact" in task:
         text = text.replace("sites.s = { ", f"sites.s = {{ environment = [{WALL}], ")
     text = text.replace("{ m1 = 0.7, m2 = 0.3 }", f"{{ m1 = {first}, m2 = {1.0 - first:.1f} }}")

@@ -48,7 +48,9 @@ def test_a_median_is_that_of_kaplan_and_meier(times_s: list[float]) -> None:
     if 2 * len(completed) <= len(times_s):
         assert math.isinf(median)
         return
-    sample = stats.CensoredData(uncensored=completed, right=[LIMIT_S] * (len(times_s) - len(completed)))
+    sample = stats.CensoredData(
+        uncensored=completed, right=[LIMIT_S] * (len(times_s) - len(completed))
+    )
     survival = stats.ecdf(sample).sf
     at_median = survival.quantiles[np.searchsorted(-survival.probabilities, -0.5 - 1e-12)]
     if len(times_s) % 2:
@@ -60,7 +62,10 @@ def test_a_median_is_that_of_kaplan_and_meier(times_s: list[float]) -> None:
 def test_the_limit_is_never_averaged() -> None:
     """Whatever the limit was, medians and signs are the same."""
     rows = rows_of({"near": {"P1": [5, 6, 7]}, "far": {"P1": [9.0, 30.0, 40.0]}})
-    other = [{**row, "completion_s": row["completion_s"] if row["succeeded"] else 99.0} for row in rows]
+    other = [
+        {**row, "completion_s": row["completion_s"] if row["succeeded"] else 99.0}
+        for row in rows
+    ]
     assert find_unit_medians(rows) == find_unit_medians(other)
     (near, far) = summarise_times(rows, LIMIT_S)
     assert (near.median, near.censored) == (6.0, 0)
@@ -100,7 +105,9 @@ def test_an_interval_may_be_open_above() -> None:
 
 def test_signs_use_censored_times_and_no_more() -> None:
     slow = {f"P{n}": [15.0 + n, 40.0, 40.0] for n in range(8)}
-    rows = rows_of({"fast": {f"P{n}": [8.0 + n, 9.0 + n, 30.0] for n in range(8)}, "slow": slow})
+    rows = rows_of(
+        {"fast": {f"P{n}": [8.0 + n, 9.0 + n, 30.0] for n in range(8)}, "slow": slow}
+    )
     (found,) = compare_times(rows)
     assert (found.number, found.longer, found.shorter) == (8, 8, 0)
     assert found.p == pytest.approx(2.0 * 0.5**8)
@@ -118,7 +125,12 @@ def test_ties_and_the_difference_of_measured_medians() -> None:
 
 
 def test_all_comparisons_are_corrected_together() -> None:
-    rows = rows_of({name: {f"P{n}": [x + n] for n in range(8)} for name, x in (("a", 1), ("b", 2), ("c", 3))})
+    rows = rows_of(
+        {
+            name: {f"P{n}": [x + n] for n in range(8)}
+            for name, x in (("a", 1), ("b", 2), ("c", 3))
+        }
+    )
     found = compare_times(rows)
     assert [(one.first, one.second) for one in found] == [*combinations("abc", 2)]
     assert [one.p_holm for one in found] == [3.0 * one.p for one in found if one.p is not None]
@@ -126,10 +138,15 @@ def test_all_comparisons_are_corrected_together() -> None:
 
 def test_open_markers_stand_on_the_limit() -> None:
     rows = rows_of({"near": {"P1": [5.0, 6.0]}, "far": {"P1": [9.0, 30.0]}})
-    for figure in (draw_times(rows, LIMIT_S), draw_learning(rows, "completion_s", limit_s=LIMIT_S)):
+    for figure in (
+        draw_times(rows, LIMIT_S),
+        draw_learning(rows, "completion_s", limit_s=LIMIT_S),
+    ):
         (axes,) = figure.axes
         hollow = [
-            line for line in axes.lines if line.get_markerfacecolor() == "white" and len(line.get_xdata())
+            line
+            for line in axes.lines
+            if line.get_markerfacecolor() == "white" and len(line.get_xdata())
         ]
         assert hollow
         assert {float(y) for line in hollow for y in np.asarray(line.get_ydata())} == {LIMIT_S}

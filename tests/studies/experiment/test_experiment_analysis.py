@@ -56,19 +56,27 @@ def test_everything_is_written_and_named(folder: Path, tmp_path: Path) -> None:
         rows = list(csv.DictReader(stream))
     assert {row["measure"] for row in rows} == set(found.means)
     first = next(row for row in rows if row["measure"] == "completion_s")
-    assert float(first["interval_low"]) < float(first["difference"]) < float(first["interval_high"])
+    assert (
+        float(first["interval_low"])
+        < float(first["difference"])
+        < float(first["interval_high"])
+    )
 
 
 def test_methods_paragraph_has_delays_as_measured(folder: Path) -> None:
     found = tn.analyse_experiment(folder)
-    assert found.methods.startswith("The data of 2 participants were analysed; 0 more were excluded.")
+    assert found.methods.startswith(
+        "The data of 2 participants were analysed; 0 more were excluded."
+    )
     assert "far (delay 200 ms)" in found.methods
     assert tn.open_experiment(folder).plan.digest in found.methods
     assert found.methods in found.summary()
 
 
 def test_who_is_excluded_is_said_with_the_reason(folder: Path, tmp_path: Path) -> None:
-    found = tn.analyse_experiment(folder, tmp_path / "there", exclude={"P2": "stopped in block 2"})
+    found = tn.analyse_experiment(
+        folder, tmp_path / "there", exclude={"P2": "stopped in block 2"}
+    )
     assert found.methods.startswith(
         "The data of 1 participant were analysed; 1 more was excluded (P2: stopped in block 2)."
     )
@@ -81,7 +89,8 @@ def test_users_within_pairs_have_a_mixed_model(tmp_path: Path) -> None:
     pytest.importorskip("statsmodels", reason="is in the extra stats")
     file = write_protocol(tmp_path, '["m1", "m2"]', REACH.replace("6.0", "1.0"))
     file.write_text(
-        file.read_text(encoding="utf-8").replace("participants = 2", "participants = 6"), encoding="utf-8"
+        file.read_text(encoding="utf-8").replace("participants = 2", "participants = 6"),
+        encoding="utf-8",
     )
     found = tn.analyse_experiment(tn.run_experiment(file, tmp_path / "out", jobs=1).folder)
     assert {model.measure for model in found.fit_models()} == {"force_mean_n", "force_peak_n"}
@@ -93,9 +102,13 @@ def test_users_within_pairs_have_a_mixed_model(tmp_path: Path) -> None:
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One pair of synthetic participants whose time is short for the second condition."""
     where = tmp_path_factory.mktemp("pair")
-    file = write_protocol(where, '["m1", "m2"]', REACH.replace("timeout_s = 6.0", "timeout_s = 1.2"))
+    file = write_protocol(
+        where, '["m1", "m2"]', REACH.replace("timeout_s = 6.0", "timeout_s = 1.2")
+    )
     forms = 'questionnaires = [{ name = "tlx" }, { name = "agency", after = "experiment" }]\n'
-    file.write_text(file.read_text(encoding="utf-8").replace("[set]", f"{forms}[set]"), encoding="utf-8")
+    file.write_text(
+        file.read_text(encoding="utf-8").replace("[set]", f"{forms}[set]"), encoding="utf-8"
+    )
     return tn.run_experiment(file, where / "out", jobs=1).folder
 
 
@@ -117,7 +130,12 @@ def test_one_pair_has_every_measure_and_no_test(pair: Path, tmp_path: Path) -> N
     """What the lesson explains is there, whatever its value, and the paragraph claims no more."""
     found = tn.analyse_experiment(pair, tmp_path / "there")
     text = found.summary()
-    for measure in ("force_mean_user1_n", "internal_share", "first_effort_share", "first_work_j"):
+    for measure in (
+        "force_mean_user1_n",
+        "internal_share",
+        "first_effort_share",
+        "first_work_j",
+    ):
         assert measure in text
     assert "first_taken_j" in text
     assert "tlx: no number, because nobody has answered it" in text
@@ -133,7 +151,9 @@ def test_measure_of_one_value_is_shown(folder: Path) -> None:
     assert "succeeded, mean over participants" in found.summary()
 
 
-def answer(experiment: Experiment, cell: str, number: int, who: str, form: str, values: list[Any]) -> None:
+def answer(
+    experiment: Experiment, cell: str, number: int, who: str, form: str, values: list[Any]
+) -> None:
     items = [one for one in experiment.plan.protocol.questionnaires if one.name == form]
     answers = find_form(items[0]).read(values)
     with experiment.open_notes() as notes:
@@ -159,9 +179,14 @@ def test_missing_answers_are_counted_and_not_averaged(pair: Path, tmp_path: Path
         ("tlx", "far", 12, 4, 2, 2),
         ("agency", "", 4, 1, 1, 1),
     ]
-    assert "tlx, far: 4 of 12 answers are missing; 2 of 2 have no score for that reason" in found.summary()
+    assert (
+        "tlx, far: 4 of 12 answers are missing; 2 of 2 have no score for that reason"
+        in found.summary()
+    )
     assert "7 of 28 answers are missing" in found.methods
-    with (experiment.write_tables().parent / "questionnaires.csv").open(encoding="utf-8") as stream:
+    with (experiment.write_tables().parent / "questionnaires.csv").open(
+        encoding="utf-8"
+    ) as stream:
         values = [row["value"] for row in csv.DictReader(stream)]
     assert values.count("") == 7
 

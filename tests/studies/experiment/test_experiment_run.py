@@ -16,7 +16,11 @@ import pytest
 import trilat_net as tn
 from tests.json_outline import is_documented
 from trilat_net.errors import UsageError
-from trilat_net.studies.experiment.experiment_run import Experiment, begin_experiment, list_log_problems
+from trilat_net.studies.experiment.experiment_run import (
+    Experiment,
+    begin_experiment,
+    list_log_problems,
+)
 from trilat_net.studies.experiment.tasks import place_slave
 
 from .experiments import REACH, TRACK, write_protocol
@@ -38,7 +42,10 @@ def test_every_trial_has_a_log_that_verifies(done: Experiment) -> None:
         assert tn.verify(log).passed
         assert hashlib.sha256(path.read_bytes()).hexdigest() == row["log_sha256"]
         assert done.plan.digest in log.scenario.about
-        assert log.scenario.links["s->m1"].delay_ms == {"near": 0.0, "far": 200.0}[row["condition"]]
+        assert (
+            log.scenario.links["s->m1"].delay_ms
+            == {"near": 0.0, "far": 200.0}[row["condition"]]
+        )
 
 
 def test_trial_ends_where_its_task_is_done(done: Experiment) -> None:
@@ -49,13 +56,17 @@ def test_trial_ends_where_its_task_is_done(done: Experiment) -> None:
     number = done.plan.trials[0].target
     angle = 0.5 * np.pi * ((number // 2 + 2 * (number % 2)) % 4)
     target_m += 0.1 * np.array([np.cos(angle), np.sin(angle)])
-    off_m = np.array([np.linalg.norm(log.scenario.arms["s"].end_effector(q) - target_m) for q in log["s"].q])
+    off_m = np.array(
+        [np.linalg.norm(log.scenario.arms["s"].end_effector(q) - target_m) for q in log["s"].q]
+    )
     ended_s = log["s"].t_s[-1] - 0.1
     inside = off_m <= 0.025
     dwelt = (log["s"].t_s <= ended_s) & (log["s"].t_s >= ended_s - 0.2 + 1.0 / log["s"].rate_hz)
     assert row["succeeded"] == 1
     assert inside[dwelt].all()
-    assert row["error_end_mm"] == pytest.approx(1e3 * off_m[log["s"].t_s <= ended_s][-1], abs=2.0)
+    assert row["error_end_mm"] == pytest.approx(
+        1e3 * off_m[log["s"].t_s <= ended_s][-1], abs=2.0
+    )
 
 
 def test_tables_are_tidy(done: Experiment) -> None:
@@ -81,8 +92,12 @@ def test_delay_makes_reaching_slower(done: Experiment) -> None:
 
 def test_same_protocol_gives_the_same_bytes(done: Experiment, tmp_path: Path) -> None:
     again = tn.run_experiment(write_protocol(tmp_path), tmp_path / "out", jobs=1)
-    assert [row["log_sha256"] for row in again.to_rows()] == [row["log_sha256"] for row in done.to_rows()]
-    assert (again.folder / "trials.csv").read_bytes() == (done.folder / "trials.csv").read_bytes()
+    assert [row["log_sha256"] for row in again.to_rows()] == [
+        row["log_sha256"] for row in done.to_rows()
+    ]
+    assert (again.folder / "trials.csv").read_bytes() == (
+        done.folder / "trials.csv"
+    ).read_bytes()
 
 
 @pytest.mark.parametrize(("users", "task"), [('["m1", "m2"]', REACH), ('["m1"]', TRACK)])
@@ -121,7 +136,9 @@ def test_folder_of_another_plan_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="holds something"):
         begin_experiment(tmp_path / "short.toml", tmp_path / "out")
     file = begun.folder / "protocol.toml"
-    file.write_text(file.read_text(encoding="utf-8").replace("trials = 2", "trials = 3"), encoding="utf-8")
+    file.write_text(
+        file.read_text(encoding="utf-8").replace("trials = 2", "trials = 3"), encoding="utf-8"
+    )
     with pytest.raises(UsageError, match="its protocol was changed after it began"):
         tn.open_experiment(begun.folder)
     with pytest.raises(UsageError, match="holds no experiment"):
@@ -149,4 +166,6 @@ def test_killed_experiment_goes_on_whole(done: Experiment, kills: int, tmp_path:
     assert numbers == list(range(1, 9))
     journal = (folder / "trials.journal").read_bytes().split(b"\n")
     assert len([line for line in journal if b'"cell"' in line and b"\t" in line]) == 8
-    assert [row["log_sha256"] for row in found.to_rows()] == [row["log_sha256"] for row in done.to_rows()]
+    assert [row["log_sha256"] for row in found.to_rows()] == [
+        row["log_sha256"] for row in done.to_rows()
+    ]

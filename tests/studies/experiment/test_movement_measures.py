@@ -49,7 +49,9 @@ def test_movement_lasts_while_speed_is_above_its_threshold() -> None:
     speed = np.concatenate([np.zeros(30), _minimum_jerk(0.8, 1000.0), np.zeros(100)])
     tau = np.linspace(0.0, 1.0, 100_001)
     above = tau[16.0 * tau**2 * (1.0 - tau) ** 2 >= 0.05]
-    assert movement_time_s(speed, 1000.0) == pytest.approx(0.8 * (above[-1] - above[0]), abs=2e-3)
+    assert movement_time_s(speed, 1000.0) == pytest.approx(
+        0.8 * (above[-1] - above[0]), abs=2e-3
+    )
 
 
 def test_path_of_a_circle() -> None:
@@ -79,7 +81,9 @@ def _published() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         np.array([[540.0, 592.0], [227.0, 592.0]] * 10),
         np.array([[227.0, 592.0], [540.0, 592.0]] * 10),
     )
-    ends = np.column_stack([np.array(text.split(), dtype=float) for text in (SELECTED, HEIGHTS)])
+    ends = np.column_stack(
+        [np.array(text.split(), dtype=float) for text in (SELECTED, HEIGHTS)]
+    )
     return starts, targets, ends, np.array(TIMES_MS.split(), dtype=float) / 1e3
 
 
@@ -96,7 +100,9 @@ def test_throughput_depends_on_no_frame_and_no_unit() -> None:
     starts, targets, ends, times_s = _published()
     angle = 0.7
     turn = 2.5e-4 * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    turned = measure_throughput(*(points @ turn.T + 3.0 for points in (starts, targets, ends)), times_s)
+    turned = measure_throughput(
+        *(points @ turn.T + 3.0 for points in (starts, targets, ends)), times_s
+    )
     plain = measure_throughput(starts, targets, ends, times_s)
     assert turned.bits_s == pytest.approx(plain.bits_s, rel=1e-9)
     assert turned.width_m == pytest.approx(2.5e-4 * plain.width_m, rel=1e-9)
@@ -115,13 +121,19 @@ def test_useful_forces_oppose_each_other_nowhere() -> None:
     internal = find_internal_force(first, second)
     assert ((first - internal) * (second + internal) >= 0.0).all()
     smaller = np.minimum(np.abs(first), np.abs(second))
-    np.testing.assert_array_equal(np.abs(internal), np.where(first * second < 0.0, smaller, 0.0))
+    np.testing.assert_array_equal(
+        np.abs(internal), np.where(first * second < 0.0, smaller, 0.0)
+    )
 
 
 def test_users_who_oppose_each_other_move_nothing() -> None:
     push, rest = np.full((101, 1), 3.0), np.zeros((101, 1))
     against = measure_pair(push, -push, rest, 100.0)
-    assert (against.internal_rms_n, against.useful_rms_n, against.internal_share) == (3.0, 0.0, 1.0)
+    assert (against.internal_rms_n, against.useful_rms_n, against.internal_share) == (
+        3.0,
+        0.0,
+        1.0,
+    )
     together = measure_pair(push, 2.0 * push, np.full((101, 1), 0.5), 100.0)
     assert together.internal_share == 0.0
     assert together.first_effort_share == pytest.approx(1.0 / 5.0)
@@ -178,7 +190,11 @@ def test_ratings_out_of_range_are_refused_by_name() -> None:
 def test_usability_score_has_its_example_and_its_ends() -> None:
     """Brooke (1996), from memory: contributions of 22 times 2.5."""
     assert sus_score([5, 4, 2, 1, 2, 3, 2, 4, 5, 2]) == 55.0
-    assert (sus_score([5, 1] * 5), sus_score([1, 5] * 5), sus_score([3] * 10)) == (100.0, 0.0, 50.0)
+    assert (sus_score([5, 1] * 5), sus_score([1, 5] * 5), sus_score([3] * 10)) == (
+        100.0,
+        0.0,
+        50.0,
+    )
     with pytest.raises(UsageError, match="answer 4 = 6"):
         sus_score([1, 2, 3, 6, 1, 1, 1, 1, 1, 1])
     with pytest.raises(UsageError, match="SUS has 10"):

@@ -11,7 +11,12 @@ import pytest
 import trilat_net as tn
 from trilat_net.errors import UsageError
 from trilat_net.scenario import load_scenario
-from trilat_net.studies.experiment.protocol import Protocol, list_orders, plan_experiment, read_protocol
+from trilat_net.studies.experiment.protocol import (
+    Protocol,
+    list_orders,
+    plan_experiment,
+    read_protocol,
+)
 from trilat_net.studies.experiment.questionnaires import Questionnaire, find_form
 from trilat_net.studies.experiment.trial_run import ExperimentTrial
 
@@ -20,7 +25,13 @@ LIVE = {"sites.m1.hands": [{"kind": "live"}], "sites.m2.hands": [{"kind": "live"
 
 def make_protocol(**keys: Any) -> Protocol:
     conditions = {"near": {"link.delay_ms": 0}, "far": {"link.delay_ms": 300}}
-    given = {"name": "study", "scenario": "paper", "set": LIVE, "conditions": conditions, "participants": 4}
+    given = {
+        "name": "study",
+        "scenario": "paper",
+        "set": LIVE,
+        "conditions": conditions,
+        "participants": 4,
+    }
     return msgspec.convert({**given, **keys}, Protocol)
 
 
@@ -72,7 +83,9 @@ def test_every_trial_has_its_place_and_seed() -> None:
     plan = plan_experiment(make_protocol(practice=1, trials=3))
     assert len(plan.trials) == 4 * 2 * 4
     assert [one.number for one in plan.trials] == list(range(1, 33))
-    assert len({one.seed for one in plan.trials}) == len({one.file for one in plan.trials}) == 32
+    assert (
+        len({one.seed for one in plan.trials}) == len({one.file for one in plan.trials}) == 32
+    )
     assert sum(one.practice for one in plan.trials) == 8
     assert [one.before for one in plan.trials[:8]] == list(range(8))
     blocks = [[one.target for one in plan.trials[n : n + 4]] for n in range(0, 32, 4)]
@@ -84,7 +97,10 @@ def test_every_trial_has_its_place_and_seed() -> None:
 
 def test_pairs_hold_two_masters() -> None:
     plan = plan_experiment(make_protocol(users=["m1", "m2"]))
-    assert [one.group for one in plan.trials[:: len(plan.trials) // 2]] == [("P1", "P2"), ("P3", "P4")]
+    assert [one.group for one in plan.trials[:: len(plan.trials) // 2]] == [
+        ("P1", "P2"),
+        ("P3", "P4"),
+    ]
 
 
 def test_digest_knows_what_was_planned() -> None:
@@ -97,7 +113,10 @@ def test_digest_knows_what_was_planned() -> None:
 @pytest.mark.parametrize(
     ("keys", "problem"),
     [
-        ({"participants": 3}, "a williams design of 2 conditions has 2 orders: the number of participants"),
+        (
+            {"participants": 3},
+            "a williams design of 2 conditions has 2 orders: the number of participants",
+        ),
         (
             {"users": ["m1", "m2"], "participants": 5},
             "5 participants make no pairs: their number must be even",
@@ -107,19 +126,40 @@ def test_digest_knows_what_was_planned() -> None:
         ({"users": ["s"]}, "has no live hand, so nobody can hold it"),
         ({"participants": ["A", "A"]}, "two participants have one pseudonym"),
         ({"force_limit_n": {"P9": 5.0}}, "force_limit_n: there is no participant P9"),
-        ({"force_limit_n": {"P1": 50.0}}, "condition near: .*50 N: the live hand at m1 has a limit of 40 N"),
+        (
+            {"force_limit_n": {"P1": 50.0}},
+            "condition near: .*50 N: the live hand at m1 has a limit of 40 N",
+        ),
         ({"catch": {"condition": "nowhere"}}, "catch.condition: there is no condition nowhere"),
-        ({"questionnaires": [{"name": "tlx"}, {"name": "tlx"}]}, "two questionnaires have one name"),
-        ({"questionnaires": [{"name": "mine"}]}, "mine has no items; those that ship are tlx, sus, agency"),
-        ({"questionnaires": [{"name": "sus", "items": {"a": "A?"}}]}, "give your own another name"),
+        (
+            {"questionnaires": [{"name": "tlx"}, {"name": "tlx"}]},
+            "two questionnaires have one name",
+        ),
+        (
+            {"questionnaires": [{"name": "mine"}]},
+            "mine has no items; those that ship are tlx, sus, agency",
+        ),
+        (
+            {"questionnaires": [{"name": "sus", "items": {"a": "A?"}}]},
+            "give your own another name",
+        ),
         (
             {"questionnaires": [{"name": "mine", "items": {"a": "A?"}, "most": 1}]},
             "a scale has 2 to 101 numbers",
         ),
         ({"foreperiod_s": [2.0, 1.0]}, "foreperiod_s is from the shorter to the longer time"),
-        ({"task": {"kind": "reach", "handover_s": 2.0}}, "a handover and users .* need two users"),
-        ({"task": {"kind": "track", "apart_m": 0.1}}, "who are shown different targets need two users"),
-        ({"training": {"lead": {"near": [1.0, 0.0]}}}, "training.lead: is a pair .* of near, far"),
+        (
+            {"task": {"kind": "reach", "handover_s": 2.0}},
+            "a handover and users .* need two users",
+        ),
+        (
+            {"task": {"kind": "track", "apart_m": 0.1}},
+            "who are shown different targets need two users",
+        ),
+        (
+            {"training": {"lead": {"near": [1.0, 0.0]}}},
+            "training.lead: is a pair .* of near, far",
+        ),
         (
             {
                 "users": ["m1", "m2"],
@@ -143,7 +183,9 @@ def test_digest_knows_what_was_planned() -> None:
         ),
     ],
 )
-def test_all_that_is_wrong_is_named_before_anybody_sits_down(keys: dict[str, Any], problem: str) -> None:
+def test_all_that_is_wrong_is_named_before_anybody_sits_down(
+    keys: dict[str, Any], problem: str
+) -> None:
     with pytest.raises(UsageError, match=problem):
         plan_experiment(make_protocol(**keys))
 
@@ -151,10 +193,19 @@ def test_all_that_is_wrong_is_named_before_anybody_sits_down(keys: dict[str, Any
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("name = 3", "Expected `str`, got `int` - at `\\$.name`; the keys of a protocol are name, scenario"),
-        ("name = 'a'\nscenario = 'paper'\nconditions = {}\ntrails = 3", "unknown field `trails`"),
+        (
+            "name = 3",
+            "Expected `str`, got `int` - at `\\$.name`; the keys of a protocol are name, scenario",
+        ),
+        (
+            "name = 'a'\nscenario = 'paper'\nconditions = {}\ntrails = 3",
+            "unknown field `trails`",
+        ),
         ("name =", "is no TOML"),
-        ("name = 'a'\nscenario = 'paper'\nconditions = {}\nparticipants = ['../x']", "matching regex"),
+        (
+            "name = 'a'\nscenario = 'paper'\nconditions = {}\nparticipants = ['../x']",
+            "matching regex",
+        ),
     ],
 )
 def test_file_that_is_no_protocol_is_refused(text: str, problem: str, tmp_path: Path) -> None:
@@ -173,7 +224,9 @@ def test_template_is_a_protocol(tmp_path: Path) -> None:
 
 
 def test_catch_trials_are_a_share_of_every_other_block() -> None:
-    plan = plan_experiment(make_protocol(trials=10, practice=2, catch={"condition": "near", "share": 0.2}))
+    plan = plan_experiment(
+        make_protocol(trials=10, practice=2, catch={"condition": "near", "share": 0.2})
+    )
     of = {
         (group, block): [one for one in plan.trials if (one.group, one.block) == (group, block)]
         for group, block in {(one.group, one.block) for one in plan.trials}
@@ -192,7 +245,9 @@ def test_participant_who_bears_less_has_a_weaker_hand() -> None:
     protocol = make_protocol(force_limit_n={"P2": 7.0})
     plan = plan_experiment(protocol)
     for planned in plan.trials:
-        trial = ExperimentTrial(protocol, plan.scenarios[planned.condition], planned, plan.digest)
+        trial = ExperimentTrial(
+            protocol, plan.scenarios[planned.condition], planned, plan.digest
+        )
         assert trial.scenario.sites["m1"].hands[0].force_limit_n == (
             7.0 if planned.group == ("P2",) else 40.0
         )
@@ -215,7 +270,11 @@ def test_people_are_asked_around_their_trials() -> None:
 
 def test_shipped_questionnaires_have_their_published_scores() -> None:
     forms = {name: find_form(Questionnaire(name=name)) for name in ("tlx", "sus", "agency")}
-    assert {name: len(form.items) for name, form in forms.items()} == {"tlx": 6, "sus": 10, "agency": 4}
+    assert {name: len(form.items) for name, form in forms.items()} == {
+        "tlx": 6,
+        "sus": 10,
+        "agency": 4,
+    }
     assert forms["tlx"].score(forms["tlx"].read([10.0, 20.0, 30.0, 40.0, 50.0, 60.0])) == 35.0
     assert forms["sus"].score(forms["sus"].read([5.0, 1.0] * 5)) == 100.0
     assert forms["agency"].score(forms["agency"].read([3.0, -3.0, 1.0, 1.0])) == 0.5

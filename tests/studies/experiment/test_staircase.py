@@ -23,7 +23,9 @@ STAIRS = '\n[staircase]\nkey = "control.K"\nstandard = 100.0\nstart = 80.0\n'
 def write_stairs(folder: Path, trials: int, more: str = "") -> Path:
     file = write_protocol(folder, task=SHORT, more=STAIRS + more)
     text = file.read_text(encoding="utf-8")
-    file.write_text(text.replace("trials = 2", f"trials = {trials}\npractice = 1"), encoding="utf-8")
+    file.write_text(
+        text.replace("trials = 2", f"trials = {trials}\npractice = 1"), encoding="utf-8"
+    )
     return file
 
 
@@ -31,7 +33,21 @@ def test_difference_falls_after_two_right_and_rises_after_wrong() -> None:
     stairs = Staircase("link.delay_ms", 80.0, factor=2.0)
     right = [True, True, True, False, True, True, True, True, False, False, True, True]
     found = stairs.list_differences(right)
-    assert found == [80.0, 80.0, 40.0, 40.0, 80.0, 80.0, 40.0, 40.0, 20.0, 40.0, 80.0, 80.0, 40.0]
+    assert found == [
+        80.0,
+        80.0,
+        40.0,
+        40.0,
+        80.0,
+        80.0,
+        40.0,
+        40.0,
+        20.0,
+        40.0,
+        80.0,
+        80.0,
+        40.0,
+    ]
     # It turns at 40 (up), 80 (down), 20 (up) and 80 (down); the first two do not count.
     assert stairs.find_threshold(right) == pytest.approx(np.sqrt(20.0 * 80.0))
     assert stairs.find_threshold(right[:-1]) is None  # the odd one is left out with them
@@ -47,7 +63,9 @@ def test_it_settles_where_levitt_says(down: int) -> None:
         right: list[bool] = []
         for pair in range(200):
             difference = stairs.list_differences(right)[-1]
-            right.append(stairs.draw_choice(difference, 1 + pair % 2, 1000 * seed + pair) == 1 + pair % 2)
+            right.append(
+                stairs.draw_choice(difference, 1 + pair % 2, 1000 * seed + pair) == 1 + pair % 2
+            )
         found.append(np.log(stairs.find_threshold(right)))
     settles = np.sqrt(2.0) * 10.0 * norm.ppf(0.5 ** (1.0 / down)) if down > 1 else None
     if settles is None:  # an even chance is no difference at all
@@ -59,7 +77,9 @@ def test_it_settles_where_levitt_says(down: int) -> None:
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Experiment:
     folder = tmp_path_factory.mktemp("stairs")
-    return tn.run_experiment(write_stairs(folder, 10, "deviation = 30.0\n"), folder / "out", jobs=1)
+    return tn.run_experiment(
+        write_stairs(folder, 10, "deviation = 30.0\n"), folder / "out", jobs=1
+    )
 
 
 def assert_values_are_those_of_the_rule(experiment: Experiment) -> None:
@@ -75,7 +95,10 @@ def assert_values_are_those_of_the_rule(experiment: Experiment) -> None:
             values = {row["phase"]: find_stiffness(experiment, row) for row in pair}
             assert values == {"standard": 100.0, "comparison": 100.0 + differences[n]}
             assert {row["difference"] for row in pair} == {differences[n]}
-            assert len({experiment.plan.trials[row["trial_number"] - 1].target for row in pair}) == 1
+            assert (
+                len({experiment.plan.trials[row["trial_number"] - 1].target for row in pair})
+                == 1
+            )
 
 
 def find_stiffness(experiment: Experiment, row: dict[str, Any]) -> float:
@@ -91,14 +114,23 @@ def test_choices_and_threshold_are_in_the_tables(done: Experiment) -> None:
     second = {row["trial"] % 2: row["phase"] for row in done.to_rows()[1:3]}
     first = done.list_answers()[0]
     assert first["questionnaire"] == "choice"
-    assert (first["value"] == 1 + (second[1] == "comparison")) == bool(done.to_rows()[1]["right"])
+    assert (first["value"] == 1 + (second[1] == "comparison")) == bool(
+        done.to_rows()[1]["right"]
+    )
     analysis, stairs = tn.analyse_experiment(done.folder), done.plan.protocol.staircase
     assert stairs is not None
-    found = {(row["participant"], row["condition"]): row["threshold_K"] for row in analysis.threshold_rows}
-    for who, block in itertools.groupby(done.to_rows(), lambda row: (row["participant"], row["condition"])):
+    found = {
+        (row["participant"], row["condition"]): row["threshold_K"]
+        for row in analysis.threshold_rows
+    }
+    for who, block in itertools.groupby(
+        done.to_rows(), lambda row: (row["participant"], row["condition"])
+    ):
         right = [bool(row["right"]) for row in list(block)[1::2]]
         assert found.get(who) == stairs.find_threshold(right)
-    assert "control.K was adapted in a two-interval forced choice against 100" in analysis.methods
+    assert (
+        "control.K was adapted in a two-interval forced choice against 100" in analysis.methods
+    )
     assert "70.7 % right" in analysis.methods
 
 
@@ -123,14 +155,24 @@ def test_people_choose_after_each_pair(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("was", "now", "wrong"),
     [
-        ('"link.delay_ms" = 200', '"control.K" = 1', "staircase.key: control.K is set by condition far too"),
-        ("trials = 2", "trials = 3", "a staircase is of pairs, their number must be even, is 3"),
+        (
+            '"link.delay_ms" = 200',
+            '"control.K" = 1',
+            "staircase.key: control.K is set by condition far too",
+        ),
+        (
+            "trials = 2",
+            "trials = 3",
+            "a staircase is of pairs, their number must be even, is 3",
+        ),
         ('users = ["m1"]', 'users = ["m1", "m2"]', "staircase: is of one user, who answers"),
         ("start = 80.0", "start = -1", "staircase.start"),
         ("standard = 100.0", "standard = -1e9", "condition near: .*control.K"),
     ],
 )
-def test_staircase_that_cannot_be_is_refused(was: str, now: str, wrong: str, tmp_path: Path) -> None:
+def test_staircase_that_cannot_be_is_refused(
+    was: str, now: str, wrong: str, tmp_path: Path
+) -> None:
     file = write_stairs(tmp_path, 2)
     text = file.read_text(encoding="utf-8")
     assert was in text

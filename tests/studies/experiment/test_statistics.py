@@ -51,8 +51,15 @@ def draw(
 ) -> list[Row]:
     """Rows of participants in pairs, with one mean a condition, and deviations of pairs and users."""
     rng = np.random.default_rng(seed)
-    base = np.repeat(rng.normal(0.0, of_pair, number // 2), 2) + rng.normal(0.0, of_user, number)
-    return tidy({f"c{n}": base + effect + rng.normal(0.0, 1.0, number) for n, effect in enumerate(effects)})
+    base = np.repeat(rng.normal(0.0, of_pair, number // 2), 2) + rng.normal(
+        0.0, of_user, number
+    )
+    return tidy(
+        {
+            f"c{n}": base + effect + rng.normal(0.0, 1.0, number)
+            for n, effect in enumerate(effects)
+        }
+    )
 
 
 def test_paired_comparison_has_the_published_numbers() -> None:
@@ -75,7 +82,9 @@ def test_signed_ranks_have_the_published_probability() -> None:
 
 def test_holm_corrects_as_r_does() -> None:
     """R: p.adjust(c(0.01, 0.04, 0.03, 0.02), "holm") is 0.04 0.06 0.06 0.06."""
-    assert correct_holm([0.01, 0.04, None, 0.03, 0.02]) == pytest.approx([0.04, 0.06, None, 0.06, 0.06])
+    assert correct_holm([0.01, 0.04, None, 0.03, 0.02]) == pytest.approx(
+        [0.04, 0.06, None, 0.06, 0.06]
+    )
     assert correct_holm([0.9, 0.8]) == [1.0, 1.0]
     assert correct_holm([]) == []
 
@@ -88,7 +97,9 @@ def test_more_trials_are_not_more_participants() -> None:
 
 def test_what_a_pair_shares_is_counted_once() -> None:
     rows = [{**row, "pair": row["participant"] // 2} for row in draw(1, 12, [0.0, 1.0])]
-    (users,), (pairs,) = (compare_conditions(rows, "time_s", unit=u) for u in ("participant", "pair"))
+    (users,), (pairs,) = (
+        compare_conditions(rows, "time_s", unit=u) for u in ("participant", "pair")
+    )
     assert (users.number, pairs.number) == (12, 6)
     assert users.difference == pytest.approx(pairs.difference)
 
@@ -112,16 +123,22 @@ def test_what_numbers_cannot_tell_is_none() -> None:
     (same,) = compare_conditions(tidy({"a": [0.1, 0.2, 0.3], "b": [0.4, 0.5, 0.6]}), "time_s")
     assert (same.t, same.p, same.p_holm, same.p_wilcoxon) == (None, None, None, None)
     assert same.interval == pytest.approx((0.3, 0.3))
-    (none,) = compare_conditions([*tidy({"a": [1.0]}), {**tidy({"b": [2.0]})[0], "participant": 9}], "time_s")
+    (none,) = compare_conditions(
+        [*tidy({"a": [1.0]}), {**tidy({"b": [2.0]})[0], "participant": 9}], "time_s"
+    )
     assert (none.number, none.difference) == (0, None)
 
 
 def test_rows_that_are_not_tidy_say_what_is_missing() -> None:
     with pytest.raises(UsageError, match="a row without condition"):
         average_trials([{"participant": 1, "time_s": 2.0}], "time_s")
-    with pytest.raises(UsageError, match="no trial has a number for error_m; the rows have time_s, trial"):
+    with pytest.raises(
+        UsageError, match="no trial has a number for error_m; the rows have time_s, trial"
+    ):
         average_trials(tidy(SLEEP), "error_m")
-    with pytest.raises(UsageError, match=r"time_s = 'fast' \(participant 0, condition a, trial 0\)"):
+    with pytest.raises(
+        UsageError, match=r"time_s = 'fast' \(participant 0, condition a, trial 0\)"
+    ):
         average_trials(tidy({"a": ["fast"]}), "time_s")
     with pytest.raises(UsageError, match="give a finite number"):
         average_trials(tidy({"a": [np.inf]}), "time_s")
@@ -136,7 +153,9 @@ def test_intervals_of_a_condition_are_of_student_and_bootstrap() -> None:
     expected = stats.t.interval(0.95, 9, loc=0.75, scale=stats.sem(SLEEP["first"]))
     assert first.interval == pytest.approx(expected)
     assert second.bootstrap[0] < second.mean < second.bootstrap[1]
-    assert (second.mean - second.bootstrap[0]) == pytest.approx(second.mean - second.interval[0], rel=0.25)
+    assert (second.mean - second.bootstrap[0]) == pytest.approx(
+        second.mean - second.interval[0], rel=0.25
+    )
     (alone,) = summarise_conditions(tidy({"a": [2.0]}), "time_s")
     assert alone == ("a", 1, 2.0, None, None, None, 0)
 
@@ -188,7 +207,9 @@ def test_mixed_model_of_three_conditions_is_the_analysis_of_variance() -> None:
     assert model.freedom == 15 * 2
     error = np.sqrt(2.0 * (rest**2).sum() / model.freedom / 16)
     assert [one.error for one in model.effects] == pytest.approx([error, error], rel=1e-3)
-    assert model.variances["residual"] == pytest.approx((rest**2).sum() / model.freedom, rel=1e-3)
+    assert model.variances["residual"] == pytest.approx(
+        (rest**2).sum() / model.freedom, rel=1e-3
+    )
     assert model.reference == "c0"
 
 
@@ -202,7 +223,9 @@ def test_mixed_model_finds_the_variances_that_were_drawn() -> None:
 @pytest.mark.usefixtures("statsmodels")
 def test_mixed_model_takes_participants_who_lack_a_condition() -> None:
     rows = [
-        row for row in draw(6, 24, [0.0, 2.0], of_pair=1.0) if row["participant"] or row["condition"] == "c0"
+        row
+        for row in draw(6, 24, [0.0, 2.0], of_pair=1.0)
+        if row["participant"] or row["condition"] == "c0"
     ]
     model = fit_mixed_model(rows, "time_s")
     assert model.freedom == 22
@@ -224,7 +247,9 @@ def test_mixed_model_refuses_rows_without_one_pair_each() -> None:
         fit_mixed_model(tidy({"a": [1.0, 2.0]}), "time_s")
 
 
-def test_mixed_model_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mixed_model_without_its_package_names_the_extra(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setitem(sys.modules, "statsmodels.formula.api", None)
     hint = f"mixed models need statsmodels: {format_extra_install('stats')}"
     with pytest.raises(UsageError, match=re.escape(hint)):
@@ -260,8 +285,12 @@ def test_least_number_is_the_first_with_enough_power() -> None:
         find_least_number(0.1, most=100)
 
 
-@pytest.mark.parametrize(("number", "effect", "trials", "own"), [(34, 0.5, 1, 0.0), (12, 0.8, 4, 0.6)])
-def test_simulated_power_agrees_with_the_formula(number: int, effect: float, trials: int, own: float) -> None:
+@pytest.mark.parametrize(
+    ("number", "effect", "trials", "own"), [(34, 0.5, 1, 0.0), (12, 0.8, 4, 0.6)]
+)
+def test_simulated_power_agrees_with_the_formula(
+    number: int, effect: float, trials: int, own: float
+) -> None:
     (found,) = simulate_power(
         {"near": 0.0, "far": effect},
         number,
@@ -277,14 +306,18 @@ def test_simulated_power_agrees_with_the_formula(number: int, effect: float, tri
 
 
 def test_correction_costs_power_and_keeps_its_order() -> None:
-    found = simulate_power({"a": 0.0, "b": 0.0, "c": 1.0}, 12, trial_deviation=0.8, repetitions=150, seed=3)
+    found = simulate_power(
+        {"a": 0.0, "b": 0.0, "c": 1.0}, 12, trial_deviation=0.8, repetitions=150, seed=3
+    )
     assert [(one.first, one.second) for one in found] == [("a", "b"), ("a", "c"), ("b", "c")]
     assert all(one.found_holm <= one.found for one in found)
     assert found[0].found_holm < 0.1 < 0.5 < found[1].found_holm
 
 
 def test_without_effect_p_is_uniform_and_families_keep_alpha() -> None:
-    runs = [compare_conditions(draw(seed, 10, [0.0, 0.0, 0.0]), "time_s") for seed in range(300)]
+    runs = [
+        compare_conditions(draw(seed, 10, [0.0, 0.0, 0.0]), "time_s") for seed in range(300)
+    ]
     for n in range(3):
         assert stats.kstest([run[n].p for run in runs], "uniform").pvalue > 0.01
     families = sum(min(one.p_holm for one in run) < 0.05 for run in runs)
@@ -359,17 +392,27 @@ def test_methods_paragraph_leaves_out_what_is_not_given() -> None:
         ({"conditions": {"near": {"loss_percent": 1}}}, "condition near has no delay"),
     ],
 )
-def test_methods_paragraph_refuses_what_a_referee_would_ask(changed: dict[str, Any], says: str) -> None:
+def test_methods_paragraph_refuses_what_a_referee_would_ask(
+    changed: dict[str, Any], says: str
+) -> None:
     facts = {key: value for key, value in {**FACTS, **changed}.items() if value is not None}
     with pytest.raises(UsageError, match=says):
         write_methods(facts)
 
 
 def test_every_participant_is_drawn_under_every_condition() -> None:
-    rows = [row for row in draw(9, 6, [0.0, 1.0, 2.0]) if row["participant"] != 4 or row["condition"] != "c1"]
+    rows = [
+        row
+        for row in draw(9, 6, [0.0, 1.0, 2.0])
+        if row["participant"] != 4 or row["condition"] != "c1"
+    ]
     figure = draw_conditions(rows, "time_s")
     (axes,) = figure.axes
-    shown = {(float(x), float(y)) for line in axes.lines for x, y in zip(*line.get_data(), strict=True)}
+    shown = {
+        (float(x), float(y))
+        for line in axes.lines
+        for x, y in zip(*line.get_data(), strict=True)
+    }
     for n, (name, each) in enumerate(average_trials(rows, "time_s").items()):
         assert axes.get_xticklabels()[n].get_text() == f"{name}\nn = {len(each)}"
         assert {(float(n), mean) for mean in each.values()} <= shown

@@ -44,11 +44,17 @@ def place_rows(log: Log) -> Array:
 
 def find_appearance_s(done: Experiment, planned: PlannedTrial) -> float:
     plan = done.plan
-    return ExperimentTrial(plan.protocol, plan.scenarios[planned.condition], planned, plan.digest).appears_s
+    return ExperimentTrial(
+        plan.protocol, plan.scenarios[planned.condition], planned, plan.digest
+    ).appears_s
 
 
 def find_end_s(done: Experiment, row: dict[str, Any]) -> float:
-    return find_appearance_s(done, done.plan.trials[row["trial_number"] - 1]) + row["completion_s"] + 1e-9
+    return (
+        find_appearance_s(done, done.plan.trials[row["trial_number"] - 1])
+        + row["completion_s"]
+        + 1e-9
+    )
 
 
 def test_force_at_a_wall_is_held_for_the_dwell(tmp_path: Path) -> None:
@@ -68,7 +74,9 @@ def test_who_leaves_the_corridor_has_failed_at_once(tmp_path: Path) -> None:
     done, rows = run(tmp_path, PAIR, f"{REACH}\ncorridor_m = 0.012")
     assert any(not row["succeeded"] for row in rows)
     for row, log in zip(rows, open_logs(done), strict=True):
-        start, target = (np.array([row[f"{name}_x_m"], row[f"{name}_y_m"]]) for name in ("start", "target"))
+        start, target = (
+            np.array([row[f"{name}_x_m"], row[f"{name}_y_m"]]) for name in ("start", "target")
+        )
         way, ended_s = (target - start) / np.linalg.norm(target - start), find_end_s(done, row)
         off = place_rows(log)[log["s"].t_s <= ended_s] - start
         along = np.clip(off @ way, 0.0, np.linalg.norm(target - start))
@@ -107,7 +115,9 @@ def test_users_shown_two_targets_settle_by_their_shares(tmp_path: Path) -> None:
     goal = TrackTrial(apart_m=0.1).begin(np.zeros(2), 0, 1)
     apart = goal.place(1.0, 0) - goal.place(1.0, 1)
     assert apart.tolist() == pytest.approx([0.1, 0.0])
-    assert goal.place(1.0).tolist() == pytest.approx((goal.place(1.0, 1) + 0.5 * apart).tolist())
+    assert goal.place(1.0).tolist() == pytest.approx(
+        (goal.place(1.0, 1) + 0.5 * apart).tolist()
+    )
 
 
 def test_authority_moves_from_the_expert_trial_by_trial(tmp_path: Path) -> None:
@@ -140,18 +150,24 @@ def test_what_was_learnt_is_before_less_after(tmp_path: Path) -> None:
         phases[row["condition"], row["phase"]].append(row["error_rms_mm"])
     for gain in found.gain_rows:
         before, after, later = (
-            np.mean(phases[gain["condition"], phase]) for phase in ("before", "after", "retention")
+            np.mean(phases[gain["condition"], phase])
+            for phase in ("before", "after", "retention")
         )
         assert gain["gain_after_error_rms_mm"] == pytest.approx(before - after)
         assert gain["gain_retention_error_rms_mm"] == pytest.approx(before - later)
     assert len(found.gain_rows) == 2
     assert {row["phase"] for row in found.rows} == {"after"}
     assert found.means["gain_after_error_rms_mm"][0].number == 1
-    assert "the expert's part of the authority went from 0.9 to 0.1 (near), 0.5 to 0.5 (far)" in found.methods
+    assert (
+        "the expert's part of the authority went from 0.9 to 0.1 (near), 0.5 to 0.5 (far)"
+        in found.methods
+    )
 
 
 def test_a_force_counts_only_while_it_is_held() -> None:
-    goal = ContactTrial(force_n=5.0, tolerance_n=1.0, dwell_s=0.5, timeout_s=2.0).begin(np.zeros(2), 0, 1)
+    goal = ContactTrial(force_n=5.0, tolerance_n=1.0, dwell_s=0.5, timeout_s=2.0).begin(
+        np.zeros(2), 0, 1
+    )
     at = np.zeros(2)
     assert goal.judge(0.0, at, 5.9) is None
     assert goal.judge(0.4, at, 6.1) is None
@@ -170,7 +186,10 @@ def test_force_at_the_slave_is_that_of_the_wall(tmp_path: Path) -> None:
     tau_x = -build_arm_rows(scenario, "s").place_end_effector(q, 0.0 * q).J[0].T @ force
     judge = TrialJudge(ExperimentTrial(plan.protocol, scenario, plan.trials[0], plan.digest))
     judge.goal.appears_s, judge.goal.force_n = 0.0, 5.0
-    assert all(judge.take(t_s, q[0].tolist(), tau_x.tolist()) is None for t_s in np.linspace(0.0, 0.9, 10))
+    assert all(
+        judge.take(t_s, q[0].tolist(), tau_x.tolist()) is None
+        for t_s in np.linspace(0.0, 0.9, 10)
+    )
     outcome = judge.take(1.0, q[0].tolist(), tau_x.tolist())
     assert outcome is not None
     assert outcome.succeeded

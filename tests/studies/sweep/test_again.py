@@ -27,7 +27,9 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
     return run_sweep(prepare_sweep_folder(sweep, path / "o"), 1).results
 
 
-def test_command_of_cell_makes_its_numbers_bit_for_bit(results: SweepResults, tmp_path: Path) -> None:
+def test_command_of_cell_makes_its_numbers_bit_for_bit(
+    results: SweepResults, tmp_path: Path
+) -> None:
     assert any(row["diverged_s"] is not None for row in results.rows)
     assert any(row["extended"] for row in results.rows)
     for row in results.rows:
@@ -49,7 +51,9 @@ def test_command_of_cell_makes_its_numbers_bit_for_bit(results: SweepResults, tm
         assert (note, row["command"]) == ("", command)
 
 
-def test_where_the_scenario_has_changed_the_rows_own_is_named(results: SweepResults, tmp_path: Path) -> None:
+def test_where_the_scenario_has_changed_the_rows_own_is_named(
+    results: SweepResults, tmp_path: Path
+) -> None:
     source = Path(results.plan.written.called)
     row = results.rows[-1]
     source.write_text(SHORT.replace("0.3, -0.2", "0.3, -0.3"))
@@ -61,7 +65,10 @@ def test_where_the_scenario_has_changed_the_rows_own_is_named(results: SweepResu
     assert (tmp_path / "cell-5-seed-1.toml").read_text() == row["scenario"]
     words = shlex.split(command)
     trilat(*words[1:], cwd=tmp_path)
-    assert classify_log_end(open_log(tmp_path / "cell-5-seed-1.mcap")).end_error_rad == row["end_error_rad"]
+    assert (
+        classify_log_end(open_log(tmp_path / "cell-5-seed-1.mcap")).end_error_rad
+        == row["end_error_rad"]
+    )
     source.rename(source.with_suffix(".away"))
     assert "or not here" in build_reproduce_command(results, row, tmp_path)[1]
     source.with_suffix(".away").rename(source)

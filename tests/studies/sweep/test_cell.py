@@ -38,7 +38,9 @@ def test_an_entry_holds_the_text_that_was_judged(tmp_path: Path, judge: Judge) -
 
 
 def test_command_of_cell_runs_its_scenario_for_so_long(tmp_path: Path, judge: Judge) -> None:
-    plan = asked(tmp_path, "link.loss=0.1", "duration_s=0.25", laws=["p_d"], over=["link.delay_ms=0,20"])
+    plan = asked(
+        tmp_path, "link.loss=0.1", "duration_s=0.25", laws=["p_d"], over=["link.delay_ms=0,20"]
+    )
     run_cell(CellItem(plan, plan.cell(1), 1))
     words = shlex.split(build_sim_command(plan, plan.cell(1).overrides, 1, 0.25, "a b.mcap"))
     assert words[:3] == ["trilat", "sim", str(tmp_path / "trio.toml")]
@@ -54,13 +56,17 @@ def test_a_task_makes_the_same_entry_in_another_process(tmp_path: Path) -> None:
     task = CellItem(plan, plan.cell(3), 1)
     sent = pickle.loads(pickle.dumps(task))
     assert run_cell(sent) == run_cell(task)
-    assert parse_scenario(apply_diff(run_cell(sent).scenario, plan.base.text)).sites["s"].control.K
+    assert (
+        parse_scenario(apply_diff(run_cell(sent).scenario, plan.base.text)).sites["s"].control.K
+    )
 
 
 def test_a_cell_that_is_no_scenario_is_named(tmp_path: Path) -> None:
     plan = asked(tmp_path)
     cell = plan.cell(7)._replace(overrides=("link.delay_ms=60", "control.Kd=-1"))
-    with pytest.raises(ScenarioError, match=r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd"):
+    with pytest.raises(
+        ScenarioError, match=r"cell 7 \(link.delay_ms=60, control.Kd=-1\): .*Kd"
+    ):
         run_cell(CellItem(plan, cell, 1))
 
 
@@ -74,7 +80,9 @@ def test_a_text_is_found_again_whatever_it_was_compared_with(text: str, base: st
     assert apply_diff(json.loads(json.dumps(parts)), base) == text
 
 
-@given(text=texts, line=st.integers(0, 10), other=st.text(alphabet="xy", min_size=1, max_size=5))
+@given(
+    text=texts, line=st.integers(0, 10), other=st.text(alphabet="xy", min_size=1, max_size=5)
+)
 def test_a_line_that_was_changed_is_all_that_differs(text: str, line: int, other: str) -> None:
     lines = text.split("\n")
     lines[line % len(lines)] = other

@@ -23,9 +23,17 @@ from trilat_net.studies.sweep.stability_map import (
     trace_closed_form,
     trace_linear_analysis,
 )
-from trilat_net.studies.sweep.sweep_plan import format_override, format_override_value, plan_sweep
+from trilat_net.studies.sweep.sweep_plan import (
+    format_override,
+    format_override_value,
+    plan_sweep,
+)
 from trilat_net.studies.sweep.sweep_results import SweepResults
-from trilat_net.theory.linear_edge import GrowthColumn, compute_growth_column, iterate_linear_edges
+from trilat_net.theory.linear_edge import (
+    GrowthColumn,
+    compute_growth_column,
+    iterate_linear_edges,
+)
 
 from .maps import KEYS, rows
 
@@ -33,16 +41,23 @@ OVER = ("link.delay_ms=0:400:100", "control.d=0.2:2.2:0.5")
 
 
 def results(**axes: tuple[object, ...]) -> SweepResults:
-    over = [*OVER, *(f"{key.replace('__', '.')}={','.join(map(str, some))}" for key, some in axes.items())]
+    over = [
+        *OVER,
+        *(f"{key.replace('__', '.')}={','.join(map(str, some))}" for key, some in axes.items()),
+    ]
     return SweepResults(plan_sweep("p_d_margin", over=over), list(rows(**axes)))
 
 
 def test_every_panel_has_its_own_lines() -> None:
     """Play-out of 400 ms asks for d = 2 whatever the delay."""
-    made = build_stability_map(results(link__playout_ms=(0.0, 400.0)), ("trilat sweep",), linearly=False)
+    made = build_stability_map(
+        results(link__playout_ms=(0.0, 400.0)), ("trilat sweep",), linearly=False
+    )
     (direct,), (played,) = made.lines
     y = made.plane.y
-    assert np.allclose([direct.crossings(n, y) for n in range(1, 5)], [[0.5], [1.0], [1.5], [2.0]])
+    assert np.allclose(
+        [direct.crossings(n, y) for n in range(1, 5)], [[0.5], [1.0], [1.5], [2.0]]
+    )
     assert np.allclose([played.crossings(n, y) for n in range(5)], 2.0)
     assert made.remarks == ()
 
@@ -52,7 +67,8 @@ def test_lines_depend_on_neither_runs_nor_processes() -> None:
     everything = results()
     one = replace(everything, rows=[row for row in everything.rows if row["cell"] != 7])
     (closed, rooted), (again, other) = (
-        build_stability_map(some, (), jobs).lines[0] for some, jobs in ((everything, 1), (one, 2))
+        build_stability_map(some, (), jobs).lines[0]
+        for some, jobs in ((everything, 1), (one, 2))
     )
     assert (closed.rank, rooted.rank) == (0, 1)
     assert np.array_equal(closed.spare, again.spare)
@@ -98,7 +114,9 @@ def test_a_strip_has_no_lines() -> None:
 
 def test_place_of_panel_is_cell_of_plan() -> None:
     """What lines are drawn for is what runs: every cell's scenario, with every law."""
-    asked = plan_sweep("p_d_margin", over=[*OVER, "link.playout_ms=0,400"], laws=("p_d", "pd_d"))
+    asked = plan_sweep(
+        "p_d_margin", over=[*OVER, "link.playout_ms=0,400"], laws=("p_d", "pd_d")
+    )
     made = []
     for law, row in product(("p_d", "pd_d"), rows(link__playout_ms=(0.0, 400.0))):
         made.append({**row, "law": law})
@@ -110,7 +128,9 @@ def test_place_of_panel_is_cell_of_plan() -> None:
         cell = asked.cell(n)
         playout = cell.values[2]
         (panel,) = (
-            p for p in drawn.panels if p.settings == (("law", cell.law), ("link.playout_ms", playout))
+            p
+            for p in drawn.panels
+            if p.settings == (("law", cell.law), ("link.playout_ms", playout))
         )
         at = panel_scenarios(asked, panel, drawn.x.key, drawn.y.key)
         delay, damping = cell.values[:2]
@@ -154,20 +174,29 @@ def test_line_of_p_d_is_half_of_stiffness_times_delay() -> None:
 
 
 def test_a_law_without_a_condition_has_no_line() -> None:
-    assert trace_closed_form(lambda x, _: load_scenario("free", {"link.delay_ms": x}), DELAY, DAMPING) is None
+    assert (
+        trace_closed_form(
+            lambda x, _: load_scenario("free", {"link.delay_ms": x}), DELAY, DAMPING
+        )
+        is None
+    )
 
 
 def test_condition_that_nothing_of_map_changes_has_no_line() -> None:
     assert (
         trace_closed_form(
-            lambda x, _: load_scenario(P_D, {"link.delay_ms": x, "control.d": 9.0}), DELAY, DAMPING
+            lambda x, _: load_scenario(P_D, {"link.delay_ms": x, "control.d": 9.0}),
+            DELAY,
+            DAMPING,
         )
         is None
     )
 
 
 @given(st.floats(-50.0, 50.0), st.floats(1.0, 3.0), st.sampled_from([-1.0, 1.0]))
-def test_a_condition_is_met_where_it_has_nothing_to_spare(root: float, power: float, sign: float) -> None:
+def test_a_condition_is_met_where_it_has_nothing_to_spare(
+    root: float, power: float, sign: float
+) -> None:
     def condition(value: float) -> StabilityCriterion:
         gap = value - root
         return spare(sign * float(np.sign(gap)) * abs(gap) ** power)
@@ -211,7 +240,9 @@ def test_a_column_may_be_crossed_again_and_again() -> None:
 
 
 @given(st.lists(st.floats(0.01, 0.99), min_size=1, max_size=6), st.sampled_from([-1.0, 1.0]))
-def test_column_is_crossed_at_its_edges_however_near_they_are(shares: list[float], sign: float) -> None:
+def test_column_is_crossed_at_its_edges_however_near_they_are(
+    shares: list[float], sign: float
+) -> None:
     side = PlaneAxis("y", tuple(map(float, range(len(shares) + 1))), "y")
     edges = {n: n + share for n, share in enumerate(shares)}
     column = grows([sign * (-1.0) ** n for n in range(len(shares) + 1)], edges)
@@ -222,7 +253,9 @@ def test_column_is_crossed_at_its_edges_however_near_they_are(shares: list[float
 
 def test_nothing_that_moves_is_not_infinitely_stable_and_no_crossing() -> None:
     side = PlaneAxis("y", (0.0, 1.0, 2.0), "y")
-    line, _ = trace_linear_analysis([grows([-np.inf, 1.0, -1.0]), grows([np.nan, 1.0, -1.0])], side)
+    line, _ = trace_linear_analysis(
+        [grows([-np.inf, 1.0, -1.0]), grows([np.nan, 1.0, -1.0])], side
+    )
     assert line is not None
     assert line.crossings(0, side) == line.crossings(1, side) == [1.5]
 
@@ -247,9 +280,13 @@ def excess(scenario: Scenario) -> float:
 
 
 @given(GAIN, GAIN, DELAY_MS)
-def test_equal_sites_ask_for_half_of_stiffness_times_delay(K: float, d: float, delay_ms: int) -> None:
+def test_equal_sites_ask_for_half_of_stiffness_times_delay(
+    K: float, d: float, delay_ms: int
+) -> None:
     """Three sites with equal shares: the least eigenvalue of alpha is -1/2."""
-    one = load_scenario("p_d_margin", {"control.K": K, "control.d": d, "link.delay_ms": delay_ms})
+    one = load_scenario(
+        "p_d_margin", {"control.K": K, "control.d": d, "link.delay_ms": delay_ms}
+    )
     assert excess(one) == pytest.approx(d - 0.5 * K * delay_ms / 1e3, abs=1e-9)
 
 
@@ -261,7 +298,8 @@ def test_two_sites_are_judged_by_sign_of_general_condition(
     settings: dict[str, Any] = {}
     for name, K, d in zip(names, (K1, K2), (d1, d2), strict=True):
         settings |= {
-            f"sites.{name}.control.{key}": value for key, value in (("law", "p_d"), ("K", K), ("d", d))
+            f"sites.{name}.control.{key}": value
+            for key, value in (("law", "p_d"), ("K", K), ("d", d))
         }
     settings |= {f"links.{names[0]}->{names[1]}.delay_ms": there_ms}
     settings |= {f"links.{names[1]}->{names[0]}.delay_ms": back_ms}
@@ -272,7 +310,9 @@ def test_two_sites_are_judged_by_sign_of_general_condition(
 
 def test_of_two_equal_sites_both_conditions_are_one() -> None:
     """N = 2: abs(lambda_min) = 1, d = K T."""
-    one = load_scenario("p_d_margin_two", {"control.d": 2.0, "control.K": 10.0, "link.delay_ms": 200.0})
+    one = load_scenario(
+        "p_d_margin_two", {"control.d": 2.0, "control.K": 10.0, "link.delay_ms": 200.0}
+    )
     assert excess(one) == pytest.approx(0.0, abs=1e-12)
 
 
@@ -280,7 +320,9 @@ def test_digital_scheme_rests_on_gravity_learnt_slower_than_tick_allows() -> Non
     settings = {"scheme": "digital", "link.delay_ms": 0.0, "rate_hz": 100, "control.Gamma": 1.0}
     assert excess(load_scenario("paper", settings)) == pytest.approx(1.0 - 9.81**2 / 100)
     gravity = {**settings, "control.Gamma": [9.0, 9.0, 9.0, 1.0, 1.0]}
-    assert excess(load_scenario("paper", gravity)) == pytest.approx(excess(load_scenario("paper", settings)))
+    assert excess(load_scenario("paper", gravity)) == pytest.approx(
+        excess(load_scenario("paper", settings))
+    )
 
 
 @pytest.mark.parametrize(
@@ -292,7 +334,10 @@ def test_digital_scheme_rests_on_gravity_learnt_slower_than_tick_allows() -> Non
         ("p_d_margin", {"control.K": [10.0, 5.0]}),
         ("p_d_margin", {"sites.s.control.law": "p_d", "sites.s.control.K": 5.0}),
         ("p_d_margin", {"links.m1->s.delay_ms": 100.0}),
-        ("p_d_margin", {"link.model": "uniform", "link.delay_ms": 200.0, "link.half_width_ms": 50.0}),
+        (
+            "p_d_margin",
+            {"link.model": "uniform", "link.delay_ms": 200.0, "link.half_width_ms": 50.0},
+        ),
         ("p_d_margin", {"link.loss": 0.5}),
         ("p_d_margin", {"on_stale.action": "hold"}),
         ("p_d_margin", {"control.law": "pd_d"}),
@@ -300,12 +345,16 @@ def test_digital_scheme_rests_on_gravity_learnt_slower_than_tick_allows() -> Non
         ("contact", {}),
     ],
 )
-def test_where_its_premises_do_not_hold_a_condition_says_nothing(name: str, settings: dict[str, Any]) -> None:
+def test_where_its_premises_do_not_hold_a_condition_says_nothing(
+    name: str, settings: dict[str, Any]
+) -> None:
     assert evaluate_criterion(load_scenario(name, settings)) is None
 
 
 def test_play_out_counts_as_delay() -> None:
-    assert excess(load_scenario("p_d_margin", {"link.playout_ms": 400.0})) == pytest.approx(1.1 - 2.0)
+    assert excess(load_scenario("p_d_margin", {"link.playout_ms": 400.0})) == pytest.approx(
+        1.1 - 2.0
+    )
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,8 @@ from .maps import KEYS, Row, by_the_line, rows
 BRIEF = {"link.delay_ms": 0.0, "rate_hz": 200, "duration_s": 12.0}
 CALM = load_scenario("p_d_margin", {**BRIEF, "control.d": 4.0})
 WILD = load_scenario(
-    "p_d_margin", {**BRIEF, "control.d": 0.2, "link.delay_ms": 500.0, "limits.qd_limit_rad_s": 12.0}
+    "p_d_margin",
+    {**BRIEF, "control.d": 0.2, "link.delay_ms": 500.0, "limits.qd_limit_rad_s": 12.0},
 )
 
 
@@ -112,7 +113,8 @@ def test_cells_are_beside_an_edge_as_many_on_either_side() -> None:
         near = [
             one
             for one in every
-            if (abs(one[KEYS[0]] - delay), round(abs(one[KEYS[1]] - d), 9)) in ((100, 0.0), (0, 0.5))
+            if (abs(one[KEYS[0]] - delay), round(abs(one[KEYS[1]] - d), 9))
+            in ((100, 0.0), (0, 0.5))
         ]
         assert any(stable(one) is not stable(row) for one in near)
 
@@ -125,7 +127,9 @@ def test_cells_are_spread_over_the_edge() -> None:
 
 def test_undecided_cells_are_not_run_and_edge_is_beyond_them() -> None:
     def band(delay_ms: float, d: float, *_: Any) -> CellClass:
-        return CellClass.UNDECIDED if abs(d - 5e-3 * delay_ms) < 0.3 else by_the_line(delay_ms, d)
+        return (
+            CellClass.UNDECIDED if abs(d - 5e-3 * delay_ms) < 0.3 else by_the_line(delay_ms, d)
+        )
 
     found = choose_cells_near_edges(list(rows(band)), KEYS, 3)
     assert [stable(row) for row in found] == [True] * 3 + [False] * 3
@@ -135,7 +139,11 @@ def test_undecided_cells_are_not_run_and_edge_is_beyond_them() -> None:
 
 def test_another_seed_or_law_is_no_neighbour() -> None:
     def by(row: Row) -> Row:
-        side = CellClass.CONVERGED if (row["seed"], row["law"]) == (1, "p_d") else CellClass.DIVERGED
+        side = (
+            CellClass.CONVERGED
+            if (row["seed"], row["law"]) == (1, "p_d")
+            else CellClass.DIVERGED
+        )
         return {**row, "verdict": side.value}
 
     many = [by(row) for row in rows(seeds=2)] + [by({**row, "law": "pd_d"}) for row in rows()]
@@ -151,7 +159,8 @@ def test_long_cells_are_passed_over_for_the_next_ones() -> None:
     """Stable cells right at the edge ran long: those a step further are taken."""
     edge = {row["cell"] for row in choose_cells_near_edges(list(rows()), KEYS, 4)}
     late = [
-        lasting(row, lambda row: 160.0 if stable(row) and row["cell"] in edge else 20.0) for row in rows()
+        lasting(row, lambda row: 160.0 if stable(row) and row["cell"] in edge else 20.0)
+        for row in rows()
     ]
     found = [row for row in choose_cells_near_edges(late, KEYS, 2) if stable(row)]
     assert len(found) == 2
@@ -177,7 +186,9 @@ def test_the_table_tells_both_verdicts_and_where_the_log_is(tmp_path: Path) -> N
 @pytest.mark.live
 @pytest.mark.long
 @pytest.mark.parametrize("scenario", [CALM, WILD], ids=["calm", "wild"])
-def test_a_session_over_zenoh_has_the_verdict_of_virtual_time(scenario: Scenario, tmp_path: Path) -> None:
+def test_a_session_over_zenoh_has_the_verdict_of_virtual_time(
+    scenario: Scenario, tmp_path: Path
+) -> None:
     from rich.console import Console
 
     from sites.demo_session import run_demo

@@ -12,7 +12,11 @@ from trilat_net.errors import UsageError
 from trilat_net.reporting.appearance import make_print_size
 from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep
 from trilat_net.studies.sweep.map_page import draw_stability_map, tabulate_edges
-from trilat_net.studies.sweep.stability_map import StabilityMap, build_plane, build_stability_map
+from trilat_net.studies.sweep.stability_map import (
+    StabilityMap,
+    build_plane,
+    build_stability_map,
+)
 from trilat_net.studies.sweep.sweep_plan import build_sweep_command, plan_from_json, plan_sweep
 from trilat_net.studies.sweep.sweep_results import SweepResults, read_results
 from trilat_net.theory.linear_edge import compute_growth_column
@@ -22,14 +26,20 @@ from .quick import asked
 
 DELAYS_MS = (200.0, 250.0)
 DAMPINGS = (0.8, 1.0, 1.2, 1.4)
-NEAR_REST = ("sites.m1.q0_rad=[0.101,0.2]", "sites.m2.q0_rad=[0.1,0.2]", "sites.s.q0_rad=[0.1,0.2]")
+NEAR_REST = (
+    "sites.m1.q0_rad=[0.101,0.2]",
+    "sites.m2.q0_rad=[0.1,0.2]",
+    "sites.s.q0_rad=[0.1,0.2]",
+)
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> SweepResults:
     """P+d near its edge; the arms start so close together that the motion is small."""
     over = {KEYS[0]: DELAYS_MS, KEYS[1]: DAMPINGS}
-    plan = plan_sweep("p_d_margin", [*NEAR_REST, "duration_s=40", "rate_hz=200"], over=over, judge="twins")
+    plan = plan_sweep(
+        "p_d_margin", [*NEAR_REST, "duration_s=40", "rate_hz=200"], over=over, judge="twins"
+    )
     folder = prepare_sweep_folder(plan, tmp_path_factory.mktemp("exponents") / "o")
     run_sweep(folder, 1)
     return read_results(folder.path)
@@ -44,7 +54,10 @@ def test_an_exponent_is_the_real_part_of_the_rightmost_root(results: SweepResult
     """Within 2 % or 2e-3 /s, whichever is larger; some grow and some do not."""
     for delay_ms in DELAYS_MS:
         column = [row for row in results.rows if row[KEYS[0]] == delay_ms]
-        scenarios = [results.plan.scenario(f"link.delay_ms={delay_ms}", f"control.d={d}") for d in DAMPINGS]
+        scenarios = [
+            results.plan.scenario(f"link.delay_ms={delay_ms}", f"control.d={d}")
+            for d in DAMPINGS
+        ]
         roots = compute_growth_column(scenarios, KEYS[1], DAMPINGS).growth_per_s
         assert min(roots) < -0.01
         assert max(roots) > 0.01
@@ -109,5 +122,7 @@ def test_verdicts_and_exponents_are_not_mixed_in_a_folder(tmp_path: Path) -> Non
 
 
 def test_the_command_of_a_map_names_its_judge(tmp_path: Path) -> None:
-    assert build_sweep_command(asked(tmp_path, judge="twins"), "--map").endswith(" --judge twins --map")
+    assert build_sweep_command(asked(tmp_path, judge="twins"), "--map").endswith(
+        " --judge twins --map"
+    )
     assert "--judge" not in build_sweep_command(asked(tmp_path))

@@ -16,7 +16,11 @@ from trilat_net.log.log_layout import collect_provenance
 from trilat_net.studies import study_folder as folders
 from trilat_net.studies.study_folder import RunJournal
 from trilat_net.studies.sweep.sweep_cell import CellRun
-from trilat_net.studies.sweep.sweep_run import PLAN_FILE, open_sweep_folder, prepare_sweep_folder
+from trilat_net.studies.sweep.sweep_run import (
+    PLAN_FILE,
+    open_sweep_folder,
+    prepare_sweep_folder,
+)
 
 from .quick import DAMPING, SHORT, asked, outcome_of
 
@@ -47,7 +51,11 @@ def test_the_same_sweep_goes_on_in_its_folder(begun: Path) -> None:
     [
         (["control.Kp=2"], {}, ("another scenario", "trio (sha256 ")),
         (["control.Kd=3"], {}, ("other settings", "there none, here control.Kd=3")),
-        ([], {"over": [DAMPING]}, ("other axes", "there link.delay_ms=0:40:20, control.Kd=1:4:1, here")),
+        (
+            [],
+            {"over": [DAMPING]},
+            ("other axes", "there link.delay_ms=0:40:20, control.Kd=1:4:1, here"),
+        ),
         ([], {"seeds": 3}, ("other seeds", "there 1..1, here 1..3")),
         ([], {"seeds": [5, 1]}, ("other seeds", "here 5, 1")),
         ([], {"laws": ["adaptive"]}, ("other laws", "there none, here adaptive")),
@@ -63,11 +71,15 @@ def test_another_sweep_is_refused_with_what_differs(
 
 
 def test_a_scenario_that_was_edited_since_is_refused(begun: Path) -> None:
-    (begun.parent / "trio.toml").write_text(SHORT.replace("delay_ms = 50.0", "delay_ms = 50.0 # ms"))
+    (begun.parent / "trio.toml").write_text(
+        SHORT.replace("delay_ms = 50.0", "delay_ms = 50.0 # ms")
+    )
     assert "another text of the scenario" in refused(begun)
 
 
-def test_another_arithmetic_or_program_is_refused(begun: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_arithmetic_or_program_is_refused(
+    begun: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(folders, "compute_fingerprint", lambda: "0" * 16)
         words = f"another kind of arithmetic: there {compute_fingerprint()}, here 0000"
@@ -88,9 +100,16 @@ def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(None, "no sweep was begun there"), ("{", "is not JSON"), ("[]", "is no plan"), ("{}", "is no plan")],
+    [
+        (None, "no sweep was begun there"),
+        ("{", "is not JSON"),
+        ("[]", "is no plan"),
+        ("{}", "is no plan"),
+    ],
 )
-def test_a_folder_without_a_plan_is_refused(tmp_path: Path, content: str | None, words: str) -> None:
+def test_a_folder_without_a_plan_is_refused(
+    tmp_path: Path, content: str | None, words: str
+) -> None:
     if content is not None:
         (tmp_path / PLAN_FILE).write_text(content)
     with pytest.raises(UsageError, match=words):
@@ -102,12 +121,20 @@ NAME = "the sweep"
 
 def entry(cell: int, seed: int = 1) -> CellRun:
     return CellRun(
-        cell, seed, bool(cell % 2), "p_d", "ab" * 32, ((0, 4), f"é = {cell}"), outcome_of(str(cell))
+        cell,
+        seed,
+        bool(cell % 2),
+        "p_d",
+        "ab" * 32,
+        ((0, 4), f"é = {cell}"),
+        outcome_of(str(cell)),
     )
 
 
 def opened(path: Path, sweep: str) -> RunJournal[CellRun]:
-    return RunJournal(path, sweep, CellRun, folders.build_resume_hint("sweep", "--resume", str(path.parent)))
+    return RunJournal(
+        path, sweep, CellRun, folders.build_resume_hint("sweep", "--resume", str(path.parent))
+    )
 
 
 def written(path: Path, entries: list[CellRun], sweep: str = NAME) -> bytes:
@@ -137,7 +164,9 @@ def path(tmp_path: Path) -> Path:
 
 def test_what_is_written_is_read_number_for_number(path: Path) -> None:
     odd = msgspec.structs.replace(
-        FIVE[0], cell=9, outcome=msgspec.structs.replace(FIVE[0].outcome, peak_error_rad=math.inf)
+        FIVE[0],
+        cell=9,
+        outcome=msgspec.structs.replace(FIVE[0].outcome, peak_error_rad=math.inf),
     )
     written(path, [*FIVE, odd])
     assert read(path) == [*FIVE, odd]
@@ -169,7 +198,9 @@ def test_a_byte_that_is_wrong_loses_its_line_alone(
     kept = read(path)
     line = five[:at].count(b"\n")
     lost = {line, line + 1} if five[at : at + 1] == b"\n" else {line}
-    assert [one for one in FIVE if one.cell not in lost] == [one for one in kept if one.cell not in lost]
+    assert [one for one in FIVE if one.cell not in lost] == [
+        one for one in kept if one.cell not in lost
+    ]
     assert all(one in FIVE for one in kept)
 
 

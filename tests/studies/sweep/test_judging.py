@@ -27,7 +27,10 @@ RUNS: dict[str, tuple[str, dict[str, Any]]] = {
     "converged": ("two_sites", {"duration_s": 20.0}),
     "decaying": ("free", {"duration_s": 8.0}),
     "growing": ("p_d_margin", {"control.d": 0.7, "duration_s": 15.0}),
-    "diverged": ("p_d_margin", {"control.d": 0.2, "duration_s": 20.0, "limits.qd_limit_rad_s": 5.0}),
+    "diverged": (
+        "p_d_margin",
+        {"control.d": 0.2, "duration_s": 20.0, "limits.qd_limit_rad_s": 5.0},
+    ),
     "short": ("free", {"duration_s": 0.3}),
     "rates": ("free", {"duration_s": 4.0, "sites.s.rate_hz": 300, "sites.m1.rate_hz": 30}),
 }
@@ -67,7 +70,9 @@ def test_the_word_and_the_numbers_are_those_of_a_log(run: str) -> None:
         ("contact", {"duration_s": 60.0, "sites.m.control.k_f": 0.2}, CellClass.CONVERGED),
     ],
 )
-def test_what_the_scenarios_are_known_to_do(name: str, changes: dict[str, Any], verdict: CellClass) -> None:
+def test_what_the_scenarios_are_known_to_do(
+    name: str, changes: dict[str, Any], verdict: CellClass
+) -> None:
     """The figures of these scenarios, from an independent implementation, stand in their texts."""
     assert judged(load_scenario(name, changes)).verdict is verdict
 
@@ -93,13 +98,17 @@ def test_what_is_not_plain_goes_on_and_is_longer_run() -> None:
     whole = judged(load_scenario("p_d_margin", {**changes, "duration_s": found.ran_s}))
     totals = FusedRun(scenario)  # those of the scenario's own duration
     totals.advance(4.0)
-    assert msgspec.structs.replace(whole, extended=found.extended, **totals.totals._asdict()) == found
+    assert (
+        msgspec.structs.replace(whole, extended=found.extended, **totals.totals._asdict())
+        == found
+    )
 
 
 def test_slow_trend_of_run_with_chance_in_it_decides_nothing() -> None:
     """Arms 3.7 rad apart that swing at 7 rad/s; the certificate's word is kept beside the verdict."""
     found = judged(
-        load_scenario("jitter", {"control.d": 0.08, "seed": 5, "duration_s": 20.0}), longest_s=160.0
+        load_scenario("jitter", {"control.d": 0.08, "seed": 5, "duration_s": 20.0}),
+        longest_s=160.0,
     )
     assert found.verdict is not CellClass.CONVERGED
     assert found.end_speed_rad_s > 5.0
@@ -121,13 +130,22 @@ def test_few_per_cent_beside_edge_word_is_right(d: float) -> None:
     assert found.verdict is (CellClass.DIVERGED if d < 0.97 else CellClass.CONVERGED)
 
 
-@pytest.mark.parametrize(("d", "verdict"), [(0.93, CellClass.UNDECIDED), (1.0, CellClass.CONVERGED)])
-def test_what_hardly_moves_beside_an_unstable_rest_is_undecided(d: float, verdict: CellClass) -> None:
+@pytest.mark.parametrize(
+    ("d", "verdict"), [(0.93, CellClass.UNDECIDED), (1.0, CellClass.CONVERGED)]
+)
+def test_what_hardly_moves_beside_an_unstable_rest_is_undecided(
+    d: float, verdict: CellClass
+) -> None:
     """Arms 1e-3 rad apart: by their speed they rest, and the rightmost root is +0.002 /s or -0.02 /s."""
     starts = {
-        f"sites.{name}.q0_rad": [-0.6, 1.8 + off] for name, off in (("m1", 1e-3), ("m2", 0), ("s", -1e-3))
+        f"sites.{name}.q0_rad": [-0.6, 1.8 + off]
+        for name, off in (("m1", 1e-3), ("m2", 0), ("s", -1e-3))
     }
-    found = judged(load_scenario("p_d_margin", {"control.d": d, "rate_hz": 50, "duration_s": 40.0, **starts}))
+    found = judged(
+        load_scenario(
+            "p_d_margin", {"control.d": d, "rate_hz": 50, "duration_s": 40.0, **starts}
+        )
+    )
     assert found.verdict is verdict
 
 
@@ -142,7 +160,9 @@ def test_a_run_that_diverges_says_when() -> None:
 def test_a_cell_and_a_trial_see_no_roots() -> None:
     """The limit that docs/definitions.md states: arms that start at one pose stay, however unstable it is."""
     together = {f"sites.{name}.q0_rad": [0.2, 0.3] for name in ("m1", "m2", "s")}
-    scenario = load_scenario("p_d_margin", {**together, "control.d": 0.5, "rate_hz": 100, "duration_s": 5.0})
+    scenario = load_scenario(
+        "p_d_margin", {**together, "control.d": 0.5, "rate_hz": 100, "duration_s": 5.0}
+    )
     assert classify_cell(scenario.text, 5.0).verdict is CellClass.CONVERGED
     assert measure_virtual_run(scenario).end.stability is Stability.STABLE
     found = certify_run(trilat_net.simulate(scenario))

@@ -15,9 +15,20 @@ from trilat_net.studies.sweep.sweep_run import JOURNAL_FILE
 
 from .quick import SHORT
 
-OPTIONS = ("--over", "control.Kd=1:4:0.1", "--over", "link.loss=0,0.1", "--seeds", "2", "--longest", "8")
+OPTIONS = (
+    "--over",
+    "control.Kd=1:4:0.1",
+    "--over",
+    "link.loss=0,0.1",
+    "--seeds",
+    "2",
+    "--longest",
+    "8",
+)
 RUNS = 31 * 3
-LONGER = SHORT.replace("rate_hz = 100", "rate_hz = 500").replace("duration_s = 0.5", "duration_s = 8.0")
+LONGER = SHORT.replace("rate_hz = 100", "rate_hz = 500").replace(
+    "duration_s = 0.5", "duration_s = 8.0"
+)
 
 
 def lines(results: Path) -> int:
@@ -48,7 +59,11 @@ def stopped(folder: Path, number: int, count: int, *arguments: str) -> tuple[int
 
 def keys(journal: Path) -> list[tuple[int, int]]:
     """The runs whose lines are whole, as often as they stand there."""
-    whole = [line for line in journal.read_bytes().splitlines() if re.fullmatch(rb"{.*}\t[0-9a-f]{8}", line)]
+    whole = [
+        line
+        for line in journal.read_bytes().splitlines()
+        if re.fullmatch(rb"{.*}\t[0-9a-f]{8}", line)
+    ]
     found = [msgspec.json.decode(line.partition(b"\t")[0]) for line in whole]
     return [(one["cell"], one["seed"]) for one in found]
 

@@ -70,7 +70,11 @@ def test_a_place_has_its_edge_beside_theory() -> None:
 @pytest.mark.usefixtures("by_the_line", "without_roots")
 def test_seeds_are_places_of_their_own_where_anything_is_random() -> None:
     lossy = search_margins(asked("link.loss=0,0.1", seeds=2), WITHIN, 1)
-    assert [(one.cell.values, one.seed) for one in lossy] == [((0.0,), 1), ((0.1,), 1), ((0.1,), 2)]
+    assert [(one.cell.values, one.seed) for one in lossy] == [
+        ((0.0,), 1),
+        ((0.1,), 1),
+        ((0.1,), 2),
+    ]
 
 
 @pytest.mark.long
@@ -79,7 +83,10 @@ def test_the_number_of_processes_changes_nothing() -> None:
     brief = ["duration_s=1.0", "rate_hz=100"]
     within = WITHIN._replace(tolerance=0.2)
     wanted = plan_sweep(
-        "p_d_margin", brief, over=["link.delay_ms=100,400", format_range_axis(within)], longest_s=1.0
+        "p_d_margin",
+        brief,
+        over=["link.delay_ms=100,400", format_range_axis(within)],
+        longest_s=1.0,
     )
     assert search_margins(wanted, within, 1) == search_margins(wanted, within, 2)
 
@@ -122,14 +129,20 @@ def test_the_facts_are_json_and_name_the_command() -> None:
     margins = SweepMargins(asked(), WITHIN, [found(StableInterval(0.49, 0.492, False, True))])
     told = json.loads(json.dumps(margins.to_dict(), allow_nan=False))
     assert told["command"] == margins.command
-    assert told["command"].endswith("--over link.delay_ms=100,200 --margin control.d=0.2:3 --tolerance 0.005")
+    assert told["command"].endswith(
+        "--over link.delay_ms=100,200 --margin control.d=0.2:3 --tolerance 0.005"
+    )
     (place,) = told["places"]
     assert place.pop("link.delay_ms") == 100.0
     assert is_documented("sweep --margin", told)
-    assert place["edges"] == [{"low": 0.49, "high": 0.492, "stable_below": False, "sharp": True}]
+    assert place["edges"] == [
+        {"low": 0.49, "high": 0.492, "stable_below": False, "sharp": True}
+    ]
 
 
-@pytest.mark.parametrize("text", ["control.d", "control.d=1:1", "=1:2", "control.d=a:b", "d=0:inf"])
+@pytest.mark.parametrize(
+    "text", ["control.d", "control.d=1:1", "=1:2", "control.d=a:b", "d=0:inf"]
+)
 def test_what_is_no_range_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"along reads KEY=FROM:TO"):
         parse_search_range(text)
@@ -143,7 +156,9 @@ def test_a_range_is_read_as_it_is_written() -> None:
 
 
 @given(st.floats(0.25, 2.95), st.booleans(), st.sampled_from([0.05, 0.005, 1e-4]))
-def test_an_edge_is_enclosed_to_the_tolerance(edge: float, above: bool, tolerance: float) -> None:
+def test_an_edge_is_enclosed_to_the_tolerance(
+    edge: float, above: bool, tolerance: float
+) -> None:
     asked = []
 
     def stable(value: float) -> bool:
@@ -157,11 +172,15 @@ def test_an_edge_is_enclosed_to_the_tolerance(edge: float, above: bool, toleranc
     assert span.stable_below is not above
     assert span.sharp
     assert found.runs == len(asked) == len(set(asked))
-    assert found.runs <= SCAN_POINTS + 1 + math.log2(2.8 / (SCAN_POINTS - 1) / (0.2 * tolerance))
+    assert found.runs <= SCAN_POINTS + 1 + math.log2(
+        2.8 / (SCAN_POINTS - 1) / (0.2 * tolerance)
+    )
 
 
 @given(st.floats(0.35, 2.8), st.floats(0.001, 0.1), st.booleans())
-def test_what_stays_undecided_is_the_interval_that_is_given(edge: float, width: float, above: bool) -> None:
+def test_what_stays_undecided_is_the_interval_that_is_given(
+    edge: float, width: float, above: bool
+) -> None:
     def stable(value: float) -> bool | None:
         return None if abs(value - edge) < width else (value > edge) is above
 
@@ -199,7 +218,9 @@ def test_whole_numbers_are_narrowed_to_neighbours(edge: float) -> None:
         return value > edge
 
     (span,) = search_key_margin(stable, 20.0, 300.0, 1e-9, whole=True).spans
-    assert (span.low, span.high) == (math.floor(edge), math.floor(edge) + 1) or edge == round(edge)
+    assert (span.low, span.high) == (math.floor(edge), math.floor(edge) + 1) or edge == round(
+        edge
+    )
 
 
 def test_an_edge_near_nothing_ends_all_the_same() -> None:

@@ -15,7 +15,9 @@ AXIS = {"link.delay_ms": [20, 200]}
 
 
 def swept(folder: Path, **more: object) -> SweepResults:
-    return trilat_net.sweep("two_sites", AXIS, ["duration_s=0.5"], metrics=KEYS, out=folder, jobs=1, **more)
+    return trilat_net.sweep(
+        "two_sites", AXIS, ["duration_s=0.5"], metrics=KEYS, out=folder, jobs=1, **more
+    )
 
 
 def of_run(log: Log, key: str) -> float | None:
@@ -33,7 +35,12 @@ def test_metrics_of_a_cell_are_those_of_its_log(tmp_path: Path) -> None:
 
 def test_numbers_of_every_row_are_metrics_of_their_keys(tmp_path: Path) -> None:
     (row,) = trilat_net.sweep(
-        "contact", ["link.delay_ms=20"], ["duration_s=12"], longest_s=12, out=tmp_path / "o", jobs=1
+        "contact",
+        ["link.delay_ms=20"],
+        ["duration_s=12"],
+        longest_s=12,
+        out=tmp_path / "o",
+        jobs=1,
     ).rows
     log = trilat_net.simulate("contact", {"duration_s": 12, "link.delay_ms": 20})
     for key in ("rms_error_rad", "walls_j", "force_peak_n"):
@@ -51,7 +58,12 @@ def test_metrics_are_kept_with_results_of_a_resumed_sweep(tmp_path: Path) -> Non
 
 def test_seeds_give_a_metric_its_mean_and_interval(tmp_path: Path) -> None:
     trilat_net.sweep(
-        "jitter", ["link.loss=0,0.2"], ["duration_s=0.3"], seeds=3, metrics=KEYS[:2], out=tmp_path / "o"
+        "jitter",
+        ["link.loss=0,0.2"],
+        ["duration_s=0.3"],
+        seeds=3,
+        metrics=KEYS[:2],
+        out=tmp_path / "o",
     )
     pandas = pytest.importorskip("pandas")
     places = pandas.read_csv(tmp_path / "o" / "places.csv")
@@ -62,7 +74,23 @@ def test_seeds_give_a_metric_its_mean_and_interval(tmp_path: Path) -> None:
 
 
 def test_a_metric_that_is_none_is_refused_with_the_nearest(tmp_path: Path) -> None:
-    done = trilat("sweep", "two_sites", "--over", "link.delay_ms=20,200", "--metric", "settle", cwd=tmp_path)
+    done = trilat(
+        "sweep",
+        "two_sites",
+        "--over",
+        "link.delay_ms=20,200",
+        "--metric",
+        "settle",
+        cwd=tmp_path,
+    )
     done.refuses("--metric", "settle", "settle_s", "docs/metrics.md")
-    done = trilat("sweep", "two_sites", "--margin", "control.d=0.1:3", "--metric", "settle_s", cwd=tmp_path)
+    done = trilat(
+        "sweep",
+        "two_sites",
+        "--margin",
+        "control.d=0.1:3",
+        "--metric",
+        "settle_s",
+        cwd=tmp_path,
+    )
     done.refuses("--metric is of a sweep")

@@ -29,7 +29,9 @@ from .maps import DAMPINGS, DELAYS_MS, by_the_line, drawn, rows
 
 SPARE = np.array(DAMPINGS)[:, np.newaxis] - 5e-3 * np.array(DELAYS_MS)
 EXACT = MapLine("$d$", "d = 5 T", "the condition", SPARE, 0)
-HALF = MapLine("half", "half of it", "half of the condition", SPARE + 2.5e-3 * np.array(DELAYS_MS), 1)
+HALF = MapLine(
+    "half", "half of it", "half of the condition", SPARE + 2.5e-3 * np.array(DELAYS_MS), 1
+)
 
 
 @pytest.fixture
@@ -40,10 +42,13 @@ def chart() -> StabilityMap:
     )
 
 
-def test_the_folder_has_a_picture_a_vector_and_a_page(chart: StabilityMap, tmp_path: Path) -> None:
+def test_the_folder_has_a_picture_a_vector_and_a_page(
+    chart: StabilityMap, tmp_path: Path
+) -> None:
     paths = write_map(chart, tmp_path)
     assert [path.name for path in paths] == ["map.png", "map.svg", "map.pdf", "map.md"]
-    assert int.from_bytes(paths[0].read_bytes()[16:20], "big") == 1050  # 3.5 in, 300 pixels to the inch
+    # 3.5 in, 300 pixels to the inch
+    assert int.from_bytes(paths[0].read_bytes()[16:20], "big") == 1050
     assert paths[1].read_text().startswith("<?xml")
 
 
@@ -73,7 +78,14 @@ def test_counts_are_of_all_runs() -> None:
 def test_an_edge_stands_beside_each_line_with_its_difference() -> None:
     plane = drawn()
     table = tabulate_edges(plane, plane.panels[0], (EXACT, HALF))
-    heads = ["delay (ms)", "edge of d (N m s/rad)", "stable is", "d = 5 T", "difference", "half of it"]
+    heads = [
+        "delay (ms)",
+        "edge of d (N m s/rad)",
+        "stable is",
+        "d = 5 T",
+        "difference",
+        "half of it",
+    ]
     assert table.headers == (*heads, "difference")
     assert [row[0] for row in table.rows] == ["100", "200", "300", "400"]
     for row in table.rows:
@@ -88,7 +100,9 @@ def test_an_edge_stands_beside_each_line_with_its_difference() -> None:
 
 def test_a_line_that_is_not_there_has_no_difference() -> None:
     plane = drawn()
-    table = tabulate_edges(plane, plane.panels[0], (EXACT._replace(spare=np.full((5, 5), np.nan)),))
+    table = tabulate_edges(
+        plane, plane.panels[0], (EXACT._replace(spare=np.full((5, 5), np.nan)),)
+    )
     assert all(row[-2:] == ("-", "-") for row in table.rows)
 
 
@@ -131,7 +145,9 @@ def test_a_place_reaches_half_way_to_the_next() -> None:
 
 def test_classes_are_apart_in_lightness() -> None:
     """Grey print: luminance after Rec. 709; white stands for undecided, and is hatched besides."""
-    light = [float(np.dot(to_rgb(CLASS_COLOURS[v]), (0.2126, 0.7152, 0.0722))) for v in CELL_CLASSES]
+    light = [
+        float(np.dot(to_rgb(CLASS_COLOURS[v]), (0.2126, 0.7152, 0.0722))) for v in CELL_CLASSES
+    ]
     assert min(abs(a - b) for n, a in enumerate(light) for b in light[:n]) > 0.09
     assert rgb_to_hsv(to_rgb(CLASS_COLOURS[CellClass.UNDECIDED]))[1] == 0.0
 
@@ -173,7 +189,9 @@ def test_every_panel_has_a_title_and_shares_one_label(panels: int, width_in: flo
     plane = drawn(rate_hz=tuple(float(n) for n in range(1, panels + 1)))
     made = figure(plane, width_in, (LINE,))
     assert made.get_figwidth() == width_in
-    assert [axes.get_title() for axes in made.axes if axes.collections] == [p.title for p in plane.panels]
+    assert [axes.get_title() for axes in made.axes if axes.collections] == [
+        p.title for p in plane.panels
+    ]
     labels = [made.get_supxlabel(), *(axes.get_xlabel() for axes in made.axes)]
     assert [text for text in labels if text] == ["delay (ms)"]
 
@@ -200,7 +218,13 @@ def test_uneven_values_are_named_one_by_one() -> None:
     uneven = plane._replace(x=plane.x._replace(values=(8, 68, 136, 272, 1088)))
     made = figure(uneven)
     made.canvas.draw()
-    assert [text.get_text() for text in made.axes[0].get_xticklabels()] == ["8", "68", "136", "272", "1088"]
+    assert [text.get_text() for text in made.axes[0].get_xticklabels()] == [
+        "8",
+        "68",
+        "136",
+        "272",
+        "1088",
+    ]
 
 
 FIXED = ("p_d: K 10, gravity 1", "adaptive: Lambda 1, Kp 1, Kd 3, Gamma 1, theta_hat0 0")
@@ -210,7 +234,9 @@ FIXED = ("p_d: K 10, gravity 1", "adaptive: Lambda 1, Kp 1, Kd 3, Gamma 1, theta
 @pytest.mark.parametrize("width_in", [3.5, 7.0])
 def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -> None:
     plane = drawn(link__playout_ms=panels)
-    figure = draw_stability_map(plane, [()] * len(plane.panels), make_print_size(width_in), FIXED)
+    figure = draw_stability_map(
+        plane, [()] * len(plane.panels), make_print_size(width_in), FIXED
+    )
     figure.draw_without_rendering()
     (caption,) = figure.texts[:1]
     box = caption.get_window_extent()
@@ -240,7 +266,9 @@ def test_a_caption_covers_no_label(panels: tuple[float, ...], width_in: float) -
         (["control.K=1,2", "control.d=1,2", "control.gravity=0,1"], [], ["p_d: none"]),
     ],
 )
-def test_gains_that_were_not_swept_are_named(axes: list[str], laws: list[str], texts: list[str]) -> None:
+def test_gains_that_were_not_swept_are_named(
+    axes: list[str], laws: list[str], texts: list[str]
+) -> None:
     found = describe_fixed_gains(plan_sweep("p_d_margin", over=axes, laws=laws))
     assert len(found) == len(texts)
     for one, text in zip(found, texts, strict=True):

@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from tests.laws import Adaptive
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
-from trilat_net.studies.sweep.sweep_plan import SweepPlan, list_axes, parse_axis, plan_from_json, plan_sweep
+from trilat_net.studies.sweep.sweep_plan import (
+    SweepPlan,
+    list_axes,
+    parse_axis,
+    plan_from_json,
+    plan_sweep,
+)
 
 from .quick import SHORT, asked
 
@@ -31,7 +37,9 @@ def cube(tmp_path_factory: pytest.TempPathFactory) -> SweepPlan:
     return asked(tmp_path_factory.mktemp("cube"), over=over, laws=["p_d", "adaptive"])
 
 
-@given(places=st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(0, 1), st.integers(0, 1)))
+@given(
+    places=st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(0, 1), st.integers(0, 1))
+)
 def test_cells_are_numbered_row_by_row(cube: SweepPlan, places: tuple[int, ...]) -> None:
     law, delay, pose, order = places
     number = ((law * 3 + delay) * 2 + pose) * 2 + order
@@ -44,12 +52,20 @@ def test_cells_are_numbered_row_by_row(cube: SweepPlan, places: tuple[int, ...])
 VALUES = st.lists(st.floats(0.0, 1e3), min_size=1, max_size=4, unique=True)
 
 
-@given(delays=VALUES, counts=st.lists(st.integers(0, 50), min_size=1, unique=True), as_array=st.booleans())
+@given(
+    delays=VALUES,
+    counts=st.lists(st.integers(0, 50), min_size=1, unique=True),
+    as_array=st.booleans(),
+)
 def test_values_by_key_are_the_axes_that_texts_are(
     delays: list[float], counts: list[int], as_array: bool
 ) -> None:
     given = [np.array(one) if as_array else one for one in (delays, counts)]
-    over = {"link.delay_ms": given[0], "control.d": given[1], "link.order": ["newest", "in_order"]}
+    over = {
+        "link.delay_ms": given[0],
+        "control.d": given[1],
+        "link.order": ["newest", "in_order"],
+    }
     first, second, third = map(parse_axis, list_axes(over))
     assert [first.value(n) for n in range(len(delays))] == delays
     assert [second.value(n) for n in range(len(counts))] == counts
@@ -66,13 +82,17 @@ def test_laws_by_key_are_classes_and_vectors_are_single_values() -> None:
 
 
 @given(number=st.integers(0, 23), seed=st.integers(1, 3))
-def test_a_cell_is_what_its_overrides_make_of_the_scenario(cube: SweepPlan, number: int, seed: int) -> None:
+def test_a_cell_is_what_its_overrides_make_of_the_scenario(
+    cube: SweepPlan, number: int, seed: int
+) -> None:
     scenario = cube.scenario(*cube.cell(number).overrides, f"seed={seed}")
     delay_ms, pose, order = cube.cell(number).values
     assert {link.delay_ms for link in scenario.links.values()} == {delay_ms}
     assert {link.order for link in scenario.links.values()} == {order}
     assert (scenario.sites["s"].q0_rad, scenario.seed) == ((pose, 0.1), seed)
-    assert {spec.control.__struct_config__.tag for spec in scenario.sites.values()} == {cube.cell(number).law}
+    assert {spec.control.__struct_config__.tag for spec in scenario.sites.values()} == {
+        cube.cell(number).law
+    }
 
 
 def test_there_is_no_cell_beyond_the_last(cube: SweepPlan) -> None:
@@ -121,18 +141,26 @@ def test_an_undecided_cell_may_run_eight_times_as_long(tmp_path: Path) -> None:
     assert asked(tmp_path, longest_s=0.5).longest_s == 0.5
     assert plan_sweep("paper", ["duration_s=80000"]).longest_s == 86_400.0
     for longest_s in (0.4, 1e6, float("nan")):
-        assert "from its 0.5 s to 86400 s" in refused(str(tmp_path / "trio.toml"), longest_s=longest_s)
+        assert "from its 0.5 s to 86400 s" in refused(
+            str(tmp_path / "trio.toml"), longest_s=longest_s
+        )
 
 
 @pytest.mark.parametrize(
     ("over", "words"),
     [
-        (["link.delay=0:1:1"], ("p_d_margin: link.delay: unknown key", "did you mean 'delay_ms'?")),
+        (
+            ["link.delay=0:1:1"],
+            ("p_d_margin: link.delay: unknown key", "did you mean 'delay_ms'?"),
+        ),
         (["sites.q.rate_hz=1,2"], ("no such site", "m1, m2, s")),
         (["links.m1-s.delay_ms=1,2"], ("did you mean 'm1->s'?",)),
         (["link.order=newest,in_ordr"], ("'in_ordr'", "'newest' or 'in_order'")),
         (["control.d=-1:1:0.5"], ("d[0]", ">= 0")),
-        (["sites.s.environment.0.stiffness_n_m=1,2"], ("sites.s.environment.0: no such entry",)),
+        (
+            ["sites.s.environment.0.stiffness_n_m=1,2"],
+            ("sites.s.environment.0: no such entry",),
+        ),
         (["link.delay_ms=0,1", "link.delay_ms=2,3"], ("link.delay_ms: is swept twice",)),
     ],
 )
@@ -178,7 +206,9 @@ def test_a_law_that_cannot_be_swept_is_refused(laws: list[str], words: tuple[str
 def test_axis_that_swept_law_has_not_is_refused_with_law() -> None:
     problem = refused("p_d_margin", over=["control.d=1,2"], laws=["p_d", "adaptive"])
     assert "control.d: with law adaptive: unknown key" in problem
-    assert "is swept twice" in refused("p_d_margin", over=["control.law=p_d,pd_d"], laws=["p_d"])
+    assert "is swept twice" in refused(
+        "p_d_margin", over=["control.law=p_d,pd_d"], laws=["p_d"]
+    )
 
 
 decimals = st.decimals(-1000, 1000, places=4)
@@ -192,7 +222,12 @@ def axis_refused(text: str) -> str:
     return str(error.value)
 
 
-@given(first=decimals, step=steps, count=st.integers(1, 300), beyond=st.decimals(0, Decimal("0.9"), places=2))
+@given(
+    first=decimals,
+    step=steps,
+    count=st.integers(1, 300),
+    beyond=st.decimals(0, Decimal("0.9"), places=2),
+)
 def test_a_range_is_whole_steps_from_its_first_value(
     first: Decimal, step: Decimal, count: int, beyond: Decimal
 ) -> None:
@@ -292,7 +327,9 @@ def test_overrides_may_need_what_is_swept(overrides: list[str], laws: list[str])
         assert again.scenario(*again.cell(number).overrides).sha256 == scenario.sha256
         assert {link.delay_ms for link in scenario.links.values()} == {cell.values[0]}  # type: ignore[attr-defined]
         if laws:
-            assert {spec.control.__struct_config__.tag for spec in scenario.sites.values()} == {cell.law}
+            assert {spec.control.__struct_config__.tag for spec in scenario.sites.values()} == {
+                cell.law
+            }
 
 
 def test_an_axis_of_models_needs_no_widths() -> None:

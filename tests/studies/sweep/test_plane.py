@@ -24,7 +24,9 @@ from .maps import DAMPINGS, DELAYS_MS, KEYS, P_D, by_the_line, drawn, rows
 
 
 @given(st.permutations(range(50)), st.integers(0, 2**16))
-def test_every_run_is_counted_once_in_whatever_order_they_come(order: list[int], chance: int) -> None:
+def test_every_run_is_counted_once_in_whatever_order_they_come(
+    order: list[int], chance: int
+) -> None:
     random = np.random.default_rng(chance)
     made = list(rows(lambda *_: CELL_CLASSES[random.integers(4)], seeds=2))
     found = build_plane([made[n] for n in order], KEYS, P_D)
@@ -38,7 +40,12 @@ def test_every_run_is_counted_once_in_whatever_order_they_come(order: list[int],
 
 
 def test_the_share_is_of_decided_runs() -> None:
-    verdicts = (CellClass.CONVERGED, CellClass.BOUNDED, CellClass.UNDECIDED, CellClass.CONVERGED)
+    verdicts = (
+        CellClass.CONVERGED,
+        CellClass.BOUNDED,
+        CellClass.UNDECIDED,
+        CellClass.CONVERGED,
+    )
     found = drawn(lambda *place: verdicts[place[-1] - 1], seeds=4)
     assert np.allclose(found.panels[0].share, 2.0 / 3.0)
     assert found.seeds == 4
@@ -57,7 +64,9 @@ def test_words_and_further_axes_make_panels() -> None:
         "in order, playout 400 ms",
     ]
     assert found.panels[1].settings == (("link.order", "newest"), ("link.playout_ms", 400.0))
-    assert {int(panel.counts.sum()) for panel in found.panels} == {len(DELAYS_MS) * len(DAMPINGS)}
+    assert {int(panel.counts.sum()) for panel in found.panels} == {
+        len(DELAYS_MS) * len(DAMPINGS)
+    }
 
 
 def test_an_axis_of_words_is_never_drawn() -> None:
@@ -68,7 +77,9 @@ def test_an_axis_of_words_is_never_drawn() -> None:
 
 
 def test_a_single_axis_is_a_strip() -> None:
-    found = build_plane([row for row in rows() if row["control.d"] == 0.7], ["link.delay_ms"], P_D)
+    found = build_plane(
+        [row for row in rows() if row["control.d"] == 0.7], ["link.delay_ms"], P_D
+    )
     assert (found.y.key, found.y.values) == ("", (0.0,))
     assert found.panels[0].counts.shape == (1, 5, 4)
 
@@ -89,7 +100,9 @@ def test_uneven_values_are_drawn_one_apart(values: tuple[float, ...], even: bool
 def test_no_runs_no_numbers_and_too_many_panels_are_refused() -> None:
     with pytest.raises(UsageError, match="no cell has run"):
         build_plane([], KEYS, P_D)
-    with pytest.raises(UsageError, match=r"needs an axis of numbers, and link\.order has words only"):
+    with pytest.raises(
+        UsageError, match=r"needs an axis of numbers, and link\.order has words only"
+    ):
         build_plane(list(rows(link__order=("newest", "in_order"))), ["link.order"], P_D)
     with pytest.raises(UsageError, match=r"at most 12 panels, and rate_hz would make 13"):
         drawn(rate_hz=tuple(range(13)))
@@ -119,7 +132,9 @@ def test_edges_separate_all_that_was_decided(column: tuple[CellClass, ...]) -> N
     found = up(column)
     side = [verdict.stable for verdict in column]
     decided = [(d, one) for d, one in zip(DAMPINGS, side, strict=True) if one is not None]
-    changes = [(a, b) for (a, one), (b, other) in itertools.pairwise(decided) if one is not other]
+    changes = [
+        (a, b) for (a, one), (b, other) in itertools.pairwise(decided) if one is not other
+    ]
     assert [(edge.low, edge.high) for edge in found] == changes
     for edge in found:
         assert edge.stable_below is (side[DAMPINGS.index(edge.low)])
@@ -135,7 +150,9 @@ def test_of_several_runs_the_majority_decides_and_a_draw_nothing() -> None:
     three = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 3 else YES, seeds=3)
     assert find_map_edges(three, three.panels[0]) == find_map_edges(drawn(), drawn().panels[0])
     draw = drawn(lambda x, y, seed: by_the_line(x, y) if seed < 2 or y > 1.0 else YES, seeds=2)
-    assert all(edge.low > 1.0 or edge.high > 1.0 for _, edge in find_map_edges(draw, draw.panels[0]))
+    assert all(
+        edge.low > 1.0 or edge.high > 1.0 for _, edge in find_map_edges(draw, draw.panels[0])
+    )
 
 
 @pytest.mark.parametrize(

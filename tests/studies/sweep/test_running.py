@@ -9,7 +9,11 @@ from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep, sweep_cell
 from trilat_net.studies.sweep.sweep_cell import CellClass
 from trilat_net.studies.sweep.sweep_plan import plan_sweep
-from trilat_net.studies.sweep.sweep_results import RESULTS_FILE, describe_sweep_plan, summarize_sweep
+from trilat_net.studies.sweep.sweep_results import (
+    RESULTS_FILE,
+    describe_sweep_plan,
+    summarize_sweep,
+)
 from trilat_net.studies.sweep.sweep_run import (
     DurationEstimate,
     estimate_sweep,
@@ -31,8 +35,12 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> Judge:
 def test_results_are_the_same_bytes_whatever_the_number_of_processes(tmp_path: Path) -> None:
     """The judge of the package, in this process and in two others."""
     sweep = asked(tmp_path, "link.loss=0.2", seeds=2, over=[DELAYS])
-    alone, others = (run_sweep(prepare_sweep_folder(sweep, tmp_path / str(jobs)), jobs) for jobs in (1, 2))
-    assert (alone.folder.path / RESULTS_FILE).read_bytes() == (others.folder.path / RESULTS_FILE).read_bytes()
+    alone, others = (
+        run_sweep(prepare_sweep_folder(sweep, tmp_path / str(jobs)), jobs) for jobs in (1, 2)
+    )
+    assert (alone.folder.path / RESULTS_FILE).read_bytes() == (
+        others.folder.path / RESULTS_FILE
+    ).read_bytes()
     assert [row["cell"] for row in others.results.rows] == [0, 0, 1, 1, 2, 2]
     assert (alone.runs, others.jobs) == (6, 2)
 
@@ -92,7 +100,9 @@ def test_the_runs_of_an_estimate_are_not_made_again(tmp_path: Path, judge: Judge
     assert estimate_sweep(sweep, [(n, 1) for n in range(12)], 1) == DurationEstimate(0, 0.0, [])
 
 
-def test_an_estimate_counts_seeds_where_something_is_random(tmp_path: Path, judge: Judge) -> None:
+def test_an_estimate_counts_seeds_where_something_is_random(
+    tmp_path: Path, judge: Judge
+) -> None:
     assert estimate_sweep(asked(tmp_path, seeds=10), jobs=1).runs == 12
     assert estimate_sweep(asked(tmp_path, "link.loss=0.1", seeds=10), jobs=1).runs == 120
     assert judge.texts
@@ -102,9 +112,16 @@ def test_enormous_sweep_is_refused_with_its_count_and_its_time(judge: Judge) -> 
     over = ["link.delay_ms=0:9999:1", "control.d=0.1:20:0.1"]
     sweep = plan_sweep("p_d_margin", over=over)
     with pytest.raises(UsageError) as error:
-        refuse_oversized_sweep(sweep, estimate_sweep(sweep, jobs=2)._replace(seconds=90_000.0), jobs=2)
+        refuse_oversized_sweep(
+            sweep, estimate_sweep(sweep, jobs=2)._replace(seconds=90_000.0), jobs=2
+        )
     assert error.value.exit_code == 2
-    for word in ("2000000 cells (10000 x 200)", "25 h on 2 cores", "larger steps", "yes runs it"):
+    for word in (
+        "2000000 cells (10000 x 200)",
+        "25 h on 2 cores",
+        "larger steps",
+        "yes runs it",
+    ):
         assert word in str(error.value)
     many = DurationEstimate(1_000_001, 60.0, [])
     with pytest.raises(UsageError, match="would take about 60 s"):
@@ -117,7 +134,9 @@ def test_a_cell_that_cannot_run_is_named(tmp_path: Path, judge: Judge) -> None:
     """The ends of both axes are fine alone and together; a pair between them is not."""
     sweep = asked(tmp_path, over=["link.loss=0.1,0.7,0.2", "link.loss_burst=5,1.5,6"])
     folder = prepare_sweep_folder(sweep, tmp_path / "o")
-    with pytest.raises(ScenarioError, match=r"cell 4 \(link.loss=0.7, link.loss_burst=1.5\): .*too short"):
+    with pytest.raises(
+        ScenarioError, match=r"cell 4 \(link.loss=0.7, link.loss_burst=1.5\): .*too short"
+    ):
         run_sweep(folder, 1)
     with folder.journal() as journal:
         assert sorted(journal.done) == [(n, 1) for n in range(4)]
@@ -126,7 +145,11 @@ def test_a_cell_that_cannot_run_is_named(tmp_path: Path, judge: Judge) -> None:
 
 def test_the_opening_names_axes_laws_and_seeds(tmp_path: Path) -> None:
     sweep = asked(
-        tmp_path, over=["control.Kd=0.2:3:0.1", DELAYS], laws=["pd_d", "adaptive"], seeds=10, longest_s=1.0
+        tmp_path,
+        over=["control.Kd=0.2:3:0.1", DELAYS],
+        laws=["pd_d", "adaptive"],
+        seeds=10,
+        longest_s=1.0,
     )
     assert describe_sweep_plan(sweep) == [
         "trio: 174 cells (29 x 3 x laws pd_d, adaptive), 10 seeds each where anything is random",
@@ -136,14 +159,18 @@ def test_the_opening_names_axes_laws_and_seeds(tmp_path: Path) -> None:
     ]
 
 
-def test_a_summary_counts_every_run_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_summary_counts_every_run_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
     sweep = asked(tmp_path, over=["link.loss=0:0.9:0.05"], seeds=8)
     results = run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results
     first, *others = summarize_sweep(results)
     assert first.startswith(f"{1 + 18 * 8} runs of 19 cells: ")
     counts = [int(part.split()[0]) for part in first.partition(": ")[2].split(", ")]
-    assert counts == [sum(row["verdict"] == verdict for row in results.rows) for verdict in CellClass]
+    assert counts == [
+        sum(row["verdict"] == verdict for row in results.rows) for verdict in CellClass
+    ]
     assert sum(counts) == len(results.rows)
     text = "\n".join(others)
     assert "undecided after 0.5 s and continued, the longest to 4 s" in text

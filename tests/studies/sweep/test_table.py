@@ -49,10 +49,14 @@ def test_what_is_read_is_what_was_run(swept: tuple[Path, SweepResults, Judge]) -
     for row in again.rows:
         assert again.outcome(row) == judge(row["scenario"], 4.0)
         assert f"seed = {row['seed']}" in row["scenario"]
-        assert f'order = "{row["link.order"]}"' in row["scenario"] or row["link.order"] == "newest"
+        assert (
+            f'order = "{row["link.order"]}"' in row["scenario"] or row["link.order"] == "newest"
+        )
 
 
-def test_rows_are_in_the_order_of_cells_and_seeds(swept: tuple[Path, SweepResults, Judge]) -> None:
+def test_rows_are_in_the_order_of_cells_and_seeds(
+    swept: tuple[Path, SweepResults, Judge],
+) -> None:
     _, results, _ = swept
     assert [(row["cell"], row["seed"]) for row in results.rows] == [
         (cell, seed) for cell in range(8) for seed in ((1, 2) if cell % 4 >= 2 else (1,))
@@ -110,7 +114,9 @@ def test_the_request_stands_beside_the_table(swept: tuple[Path, SweepResults, Ju
     assert set(facts["versions"]) == {"version_trilat-net", "version_numba", "version_numpy"}
 
 
-def test_a_sweep_needs_no_optional_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sweep_needs_no_optional_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("pandas", "polars", "pyarrow"):
         monkeypatch.setitem(sys.modules, name, None)
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
@@ -119,7 +125,9 @@ def test_a_sweep_needs_no_optional_package(tmp_path: Path, monkeypatch: pytest.M
     assert len(read_results(tmp_path / "o").rows) == 3
 
 
-def test_a_very_long_scenario_is_read_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_very_long_scenario_is_read_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
     plan = asked(tmp_path, over=[DELAYS])
     rows = list(run_sweep(prepare_sweep_folder(plan, tmp_path / "o"), 1).results.rows)
@@ -135,9 +143,19 @@ def test_ten_thousand_scenarios_take_little_room(tmp_path: Path) -> None:
     entries = []
     for number in range(sweep.cells):
         delay, damping = sweep.cell(number).values
-        text = base.replace("delay_ms = 200.0", f"delay_ms = {delay}").replace("1.1", f"{damping}")
+        text = base.replace("delay_ms = 200.0", f"delay_ms = {delay}").replace(
+            "1.1", f"{damping}"
+        )
         entries.append(
-            CellRun(number, 1, False, "p_d", f"{number:064x}", diff_lines(text, base), outcome_of(text))
+            CellRun(
+                number,
+                1,
+                False,
+                "p_d",
+                f"{number:064x}",
+                diff_lines(text, base),
+                outcome_of(text),
+            )
         )
     table = encode_results(sweep, build_result_rows(sweep, entries))
     assert len(entries) == 10_000
@@ -186,7 +204,9 @@ def test_a_damaged_table_is_refused(
     damage: Callable[[str], str], word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
-    folder = run_sweep(prepare_sweep_folder(asked(tmp_path, over=[DELAYS]), tmp_path / "o"), 1).folder.path
+    folder = run_sweep(
+        prepare_sweep_folder(asked(tmp_path, over=[DELAYS]), tmp_path / "o"), 1
+    ).folder.path
     table = folder / "results.csv"
     table.write_text(damage(table.read_text()))
     with pytest.raises(UsageError, match=word) as error:
@@ -198,7 +218,9 @@ def test_a_damaged_table_is_refused(
 def points(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[GridPoint]:
     monkeypatch.setattr(sweep_cell, "classify_cell", Judge())
     sweep = asked(tmp_path, over=["link.loss=0:0.5:0.1", DELAYS], seeds=12)
-    return collect_grid_points(run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results)
+    return collect_grid_points(
+        run_sweep(prepare_sweep_folder(sweep, tmp_path / "o"), 1).results
+    )
 
 
 def test_every_run_is_counted_once(points: list[GridPoint]) -> None:
@@ -212,11 +234,15 @@ def test_every_run_is_counted_once(points: list[GridPoint]) -> None:
         assert place.interval == wilson_interval(converged, converged + bounded + diverged)
 
 
-def test_they_stand_in_a_file_where_there_are_seeds(points: list[GridPoint], tmp_path: Path) -> None:
+def test_they_stand_in_a_file_where_there_are_seeds(
+    points: list[GridPoint], tmp_path: Path
+) -> None:
     with (tmp_path / "o" / GRID_POINTS_FILE).open(newline="") as stream:
         lines = list(csv.DictReader(stream))
     for line, place in zip(lines, points, strict=True):
-        row = {name: float(text) if text and name != "law" else None for name, text in line.items()}
+        row = {
+            name: float(text) if text and name != "law" else None for name, text in line.items()
+        }
         assert tuple(row[verdict.value] for verdict in CellClass) == place.counts
         assert (row["link.loss"], row["link.delay_ms"]) == place.values
         assert (row["stable_share_low"], row["stable_share_high"]) == place.interval
@@ -228,9 +254,16 @@ def test_they_stand_in_a_file_where_there_are_seeds(points: list[GridPoint], tmp
 
 @pytest.mark.parametrize(
     ("successes", "runs", "low", "high"),
-    [(81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605), (0, 20, 0.0, 0.1611), (1, 29, 0.0061, 0.1718)],
+    [
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    ],
 )
-def test_intervals_are_those_of_a_published_table(successes: int, runs: int, low: float, high: float) -> None:
+def test_intervals_are_those_of_a_published_table(
+    successes: int, runs: int, low: float, high: float
+) -> None:
     """Newcombe, Statistics in Medicine 17 (1998), table I, the score method without continuity correction."""
     assert wilson_interval(successes, runs) == pytest.approx((low, high), abs=5.1e-5)
 

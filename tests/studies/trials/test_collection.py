@@ -48,7 +48,9 @@ def agree(one: RunMetrics, other: RunMetrics) -> None:
             for link in a:
                 assert a[link].max_ms == b[link].max_ms
                 assert (a[link].mean_ms is None) == (b[link].mean_ms is None)
-                assert a[link].mean_ms is None or a[link].mean_ms == pytest.approx(b[link].mean_ms)
+                assert a[link].mean_ms is None or a[link].mean_ms == pytest.approx(
+                    b[link].mean_ms
+                )
         else:
             assert a == b, field
 
@@ -89,7 +91,10 @@ def test_the_figures_are_what_their_definitions_say() -> None:
 
 
 def test_what_never_came_together_has_no_time_of_it() -> None:
-    assert measure_virtual_run(scenario(**{"expect.synchronised_rad": 1e-6})).synchronised_at_s is None
+    assert (
+        measure_virtual_run(scenario(**{"expect.synchronised_rad": 1e-6})).synchronised_at_s
+        is None
+    )
 
 
 def test_a_link_without_samples_has_no_age() -> None:
@@ -109,7 +114,10 @@ def test_every_missing_record_of_a_log_is_counted() -> None:
     whole = recorded("free")
     assert measure_log(opened(whole)).missing == 0
     assert measure_log(opened(edited(whole, record=without("s", {3, 4, 100})))).missing == 3
-    assert measure_log(opened(edited(whole, record=without("s", set(range(60, 120)))))).missing == 60
+    assert (
+        measure_log(opened(edited(whole, record=without("s", set(range(60, 120)))))).missing
+        == 60
+    )
     assert measure_log(opened(edited(whole, record=lambda _: None))).missing == 360
     none = measure_log(opened(edited(whole, record=without("s", set(range(120))))))
     assert none.missing == 120
@@ -140,10 +148,19 @@ def tallied(rows: RecordBatch, cuts: list[int]) -> SiteStats:
 
 
 @given(seed=st.integers(0, 1000), cuts=st.lists(st.integers(0, TALLIED), max_size=12))
-def test_the_cut_into_blocks_changes_no_statistics_of_a_site(seed: int, cuts: list[int]) -> None:
+def test_the_cut_into_blocks_changes_no_statistics_of_a_site(
+    seed: int, cuts: list[int]
+) -> None:
     rows = records(seed)
     cut, whole = tallied(rows, cuts), tallied(rows, [])
-    for figure in ("records", "peak_error_rad", "peak_torque_nm", "peak_speed_rad_s", "apart_ns", "last_ns"):
+    for figure in (
+        "records",
+        "peak_error_rad",
+        "peak_torque_nm",
+        "peak_speed_rad_s",
+        "apart_ns",
+        "last_ns",
+    ):
         assert getattr(cut, figure) == getattr(whole, figure)
     assert cut.age_max_ms.tolist() == whole.age_max_ms.tolist()
     assert cut.buckets.tolist() == whole.buckets.tolist()
@@ -162,7 +179,9 @@ def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
     assert tally.peak_error_rad == error.max()
     assert tally.peak_torque_nm == np.abs(rows.tau).max()
     assert tally.peak_speed_rad_s == np.abs(rows.qd).max()
-    assert tally.rms_error_rad == pytest.approx(max(np.sqrt(np.mean(error[:, j] ** 2)) for j in (0, 1)))
+    assert tally.rms_error_rad == pytest.approx(
+        max(np.sqrt(np.mean(error[:, j] ** 2)) for j in (0, 1))
+    )
     apart = [t for t, e in zip(rows.t_ns, error, strict=True) if e.max() >= 1.0]
     assert tally.apart_ns == (apart[-1] if apart else -1)
     assert tally.end(tally.last_ns).t_ns.tolist() == rows.t_ns[-100:].tolist()
@@ -171,7 +190,11 @@ def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
     assert tally.age_max_ms[1] == pytest.approx(max(ages))
     for bucket, row in enumerate(tally.buckets):
         inside = rows.t_ns // BUCKET_NS == bucket
-        peaks = (error[inside].max(axis=0), np.abs(rows.qd[inside]).max(axis=0), rows.q[inside][-1])
+        peaks = (
+            error[inside].max(axis=0),
+            np.abs(rows.qd[inside]).max(axis=0),
+            rows.q[inside][-1],
+        )
         assert row.tolist() == np.concatenate(peaks).tolist()
 
 
@@ -225,7 +248,9 @@ def rows(seed: int) -> RecordBatch:
     rng = np.random.default_rng(seed)
     vectors = rng.normal(size=(5, RECORDS, 2))
     vectors[0] = [-0.6, 1.8] + 0.02 * vectors[0]
-    return RecordBatch(np.arange(RECORDS) * 10_000_000, *vectors, np.zeros((RECORDS, 1), dtype=np.int64))
+    return RecordBatch(
+        np.arange(RECORDS) * 10_000_000, *vectors, np.zeros((RECORDS, 1), dtype=np.int64)
+    )
 
 
 def stretched(records: RecordBatch, cuts: list[int], **window: Any) -> dict[str, Any]:
@@ -253,7 +278,9 @@ def test_what_lies_outside_of_the_window_leaves_no_trace(seed: int, outside: sli
     assert stretched(bent, []) == stretched(records, [])
 
 
-@pytest.mark.parametrize(("to_s", "known"), [(1.5, True), (2.0, True), (2.01, False), (5.0, False)])
+@pytest.mark.parametrize(
+    ("to_s", "known"), [(1.5, True), (2.0, True), (2.01, False), (5.0, False)]
+)
 def test_a_window_that_the_records_do_not_fill_tells_nothing(to_s: float, known: bool) -> None:
     assert bool(stretched(rows(1), [], to_s=to_s)) == known
 
@@ -293,11 +320,20 @@ def test_a_run_and_its_log_have_the_same_windows(log: Log) -> None:
 
 
 def test_a_window_of_all_sites_has_the_largest_of_them(log: Log) -> None:
-    everywhere = {"from_s": 0.5, "to_s": 1.5, "error_peak_rad": [0.0, 1.0], "torque_peak_nm": [0.0, 1.0]}
+    everywhere = {
+        "from_s": 0.5,
+        "to_s": 1.5,
+        "error_peak_rad": [0.0, 1.0],
+        "torque_peak_nm": [0.0, 1.0],
+    }
     (found,) = measure_virtual_run(windowed(expect={"windows": [everywhere]})).windows
     inside = {name: (log[name].t_s >= 0.5) & (log[name].t_s < 1.5) for name in log.sites}
-    assert found["error_peak_rad"].most == max(np.abs(log[n].e[k]).max() for n, k in inside.items())
-    assert found["torque_peak_nm"].least == max(np.abs(log[n].tau[k]).max() for n, k in inside.items())
+    assert found["error_peak_rad"].most == max(
+        np.abs(log[n].e[k]).max() for n, k in inside.items()
+    )
+    assert found["torque_peak_nm"].least == max(
+        np.abs(log[n].tau[k]).max() for n, k in inside.items()
+    )
 
 
 def test_a_run_that_ended_before_measures_nothing() -> None:
@@ -306,15 +342,25 @@ def test_a_run_that_ended_before_measures_nothing() -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, RANDOM, {"sites.m2.rate_hz": 90, "sites.s.rate_hz": 333}, {"limits.qd_limit_rad_s": 0.3}],
+    [
+        {},
+        RANDOM,
+        {"sites.m2.rate_hz": 90, "sites.s.rate_hz": 333},
+        {"limits.qd_limit_rad_s": 0.3},
+    ],
     ids=["plain", "random", "rates", "diverged"],
 )
 def test_the_compiled_loop_gives_the_records_of_the_ticks(changes: dict[str, Any]) -> None:
     asked = scenario(**changes)
     ticked: dict[str, list[RecordBatch]] = {name: [] for name in asked.names}
     looped: dict[str, list[RecordBatch]] = {name: [] for name in asked.names}
-    diverged_at_s, _ = run_in_batches(asked, {name: taken.append for name, taken in ticked.items()})
-    assert run_compiled_in_batches(asked, {n: taken.append for n, taken in looped.items()}) == diverged_at_s
+    diverged_at_s, _ = run_in_batches(
+        asked, {name: taken.append for name, taken in ticked.items()}
+    )
+    assert (
+        run_compiled_in_batches(asked, {n: taken.append for n, taken in looped.items()})
+        == diverged_at_s
+    )
     for name in asked.names:
         one, other = join_batches(ticked[name]), join_batches(looped[name])
         for field in ("t_ns", "q", "qd", "e", "tau", "tau_x"):
@@ -323,7 +369,11 @@ def test_the_compiled_loop_gives_the_records_of_the_ticks(changes: dict[str, Any
 
 def test_any_metric_may_be_expected_of_run_and_log() -> None:
     """Equal to what `trilat compare` has of the whole run; what has no number does not hold, and says why."""
-    asked = {"chatter_nm": [0.0, 1e-9], "rms_error_rad": [0.0, 10.0], "theta_error_last": [0.0, 1.0]}
+    asked = {
+        "chatter_nm": [0.0, 1e-9],
+        "rms_error_rad": [0.0, 10.0],
+        "theta_error_last": [0.0, 1.0],
+    }
     scenario = load_scenario("contact", {**CHANGES, "expect": {"metrics": asked}})
     log = trilat_net.simulate(scenario)
     compared = trilat_net.compare(log, log).metrics
@@ -338,11 +388,19 @@ def test_any_metric_may_be_expected_of_run_and_log() -> None:
 @pytest.mark.parametrize(
     ("metrics", "said"),
     [
-        ({"chater_nm": [0, 1]}, "expect.metrics.chater_nm: no metric 'chater_nm'; did you mean 'chatter_nm'"),
-        ({"chatter_nm": [2, 1]}, r"expect.metrics.chatter_nm: must be \[least, most\], is \[2, 1\]"),
+        (
+            {"chater_nm": [0, 1]},
+            "expect.metrics.chater_nm: no metric 'chater_nm'; did you mean 'chatter_nm'",
+        ),
+        (
+            {"chatter_nm": [2, 1]},
+            r"expect.metrics.chatter_nm: must be \[least, most\], is \[2, 1\]",
+        ),
         ({"chatter_nm": 1}, "expect.metrics"),
     ],
 )
-def test_an_expected_metric_that_cannot_be_is_refused(metrics: dict[str, Any], said: str) -> None:
+def test_an_expected_metric_that_cannot_be_is_refused(
+    metrics: dict[str, Any], said: str
+) -> None:
     with pytest.raises(ScenarioError, match=said):
         trilat_net.trials("free", set={"expect": {"metrics": metrics}})

@@ -47,7 +47,9 @@ def only(expect: Expect, **changes: Any) -> ExpectationResult:
 
 def test_every_key_that_asks_is_answered_and_no_other() -> None:
     tables = {"windows", "metrics"}
-    assert READINGS.keys() | OTHERS.keys() | TOLERANCES | tables == set(Expect.__struct_fields__)
+    assert READINGS.keys() | OTHERS.keys() | TOLERANCES | tables == set(
+        Expect.__struct_fields__
+    )
     assert evaluate_expectations(Expect(), CALM) == []
     for key, value in {**READINGS, **OTHERS}.items():
         assert only(Expect(**{key: value})).key.split(".")[0] == key
@@ -63,7 +65,9 @@ def test_a_limit_holds_just_where_the_figure_is_within_it(key: str, limit: float
     assert outcome.held == (measured >= limit if "_min_" in key else measured <= limit)
     if limit:
         assert outcome.margin is not None
-        assert outcome.margin == pytest.approx(abs(measured - limit) / limit * (1 if outcome.held else -1))
+        assert outcome.margin == pytest.approx(
+            abs(measured - limit) / limit * (1 if outcome.held else -1)
+        )
 
 
 @pytest.mark.parametrize("key", READINGS)
@@ -107,9 +111,9 @@ def test_stable_asks_for_the_judgement_and_open_is_neither(
     wanted = Stability.STABLE if stable else Stability.NOT_STABLE
     assert outcome.held is (stability is wanted)
     assert outcome.measured == f"{stability}: {end.text}"
-    assert only(Expect(stable=True), end=CALM.end._replace(reasons=("a reason",))).measured.startswith(
-        "open: "
-    )
+    assert only(
+        Expect(stable=True), end=CALM.end._replace(reasons=("a reason",))
+    ).measured.startswith("open: ")
 
 
 @pytest.mark.parametrize("stable", [None, True, False])
@@ -131,8 +135,13 @@ def test_a_pose_is_met_within_its_tolerance_in_every_joint(off: float, within: f
 
 
 def test_every_site_with_pose_has_outcome_of_its_own() -> None:
-    outcomes = evaluate_expectations(Expect(end_pose_rad={"m1": (0.1, 0.2), "s": (0.5, 0.2)}), CALM)
-    assert [(o.key, o.held) for o in outcomes] == [("end_pose_rad.m1", True), ("end_pose_rad.s", False)]
+    outcomes = evaluate_expectations(
+        Expect(end_pose_rad={"m1": (0.1, 0.2), "s": (0.5, 0.2)}), CALM
+    )
+    assert [(o.key, o.held) for o in outcomes] == [
+        ("end_pose_rad.m1", True),
+        ("end_pose_rad.s", False),
+    ]
     assert not only(Expect(end_pose_rad={"s": (0.1, 0.2)}), end_pose_rad={}).held
 
 
@@ -142,7 +151,11 @@ def test_gaps_are_counted() -> None:
     assert evaluate_expectations(Expect(no_gaps=False), CALM) == []
 
 
-SPANS = {"error_peak_rad": Range(0.5, 0.5), "speed_peak_rad_s": Range(2.0, 2.0), "q1_rad": Range(-0.2, 0.4)}
+SPANS = {
+    "error_peak_rad": Range(0.5, 0.5),
+    "speed_peak_rad_s": Range(2.0, 2.0),
+    "q1_rad": Range(-0.2, 0.4),
+}
 
 
 def window(**limits: Any) -> Expect:
@@ -167,7 +180,9 @@ def test_window_that_run_did_not_reach_does_not_hold() -> None:
 
 
 def test_a_window_names_units_and_all_sites() -> None:
-    asked = ExpectWindow(from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0), speed_peak_rad_s=(0.0, 1.0))
+    asked = ExpectWindow(
+        from_s=0.0, to_s=1.0, error_peak_rad=(0.0, 1.0), speed_peak_rad_s=(0.0, 1.0)
+    )
     outcomes = evaluate_expectations(Expect(windows=(asked,)), figures(windows=(SPANS,)))
     assert [o.key for o in outcomes] == ["error_peak_rad 0-1 s", "speed_peak_rad_s 0-1 s"]
     assert [o.limit for o in outcomes] == ["0 to 1 rad", "0 to 1 rad/s"]
@@ -200,15 +215,20 @@ def held(three: bool, d: float, stable: bool, **link: object) -> bool:
         "link": link or {"delay_ms": 200.0},
         "expect": {"stable": stable},
     }
-    scenario: Scenario = load_scenario("free", changes) if three else parse_scenario(TWO, "two", changes)
+    scenario: Scenario = (
+        load_scenario("free", changes) if three else parse_scenario(TWO, "two", changes)
+    )
     (outcome,) = evaluate_expectations(scenario.expect, measure_virtual_run(scenario))
     return outcome.held
 
 
 @pytest.mark.parametrize(
-    ("three", "below", "above"), [pytest.param(True, 0.9, 1.3, marks=pytest.mark.long), (False, 1.8, 2.5)]
+    ("three", "below", "above"),
+    [pytest.param(True, 0.9, 1.3, marks=pytest.mark.long), (False, 1.8, 2.5)],
 )
-def test_the_verdict_changes_at_the_margin_of_theory(three: bool, below: float, above: float) -> None:
+def test_the_verdict_changes_at_the_margin_of_theory(
+    three: bool, below: float, above: float
+) -> None:
     assert held(three, below, stable=False)
     assert not held(three, below, stable=True)
     assert held(three, above, stable=True)

@@ -6,20 +6,37 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from trilat_net.studies.measure_run import ExpectationResult
-from trilat_net.studies.trials import MAX_FAILURES_SHOWN, TrialReport, encode_junit_xml, format_margin
+from trilat_net.studies.trials import (
+    MAX_FAILURES_SHOWN,
+    TrialReport,
+    encode_junit_xml,
+    format_margin,
+)
 
 from .results import result
 
 
 def outcome(margin: float, key: str = "rms_error_max_rad") -> ExpectationResult:
-    return ExpectationResult(key, margin >= 0.0, f"{0.1 * (1 - margin):.4g} rad", "≤ 0.1 rad", margin)
+    return ExpectationResult(
+        key, margin >= 0.0, f"{0.1 * (1 - margin):.4g} rad", "≤ 0.1 rad", margin
+    )
 
 
 def test_row_shows_worst_of_its_runs_and_how_many_held() -> None:
-    report = TrialReport([result(n, outcome(m)) for n, m in enumerate((0.5, -0.2, 0.1, -0.1))], 4.0)
+    report = TrialReport(
+        [result(n, outcome(m)) for n, m in enumerate((0.5, -0.2, 0.1, -0.1))], 4.0
+    )
     (row,) = report.rows()
     assert (row.worst.margin, row.held, row.runs) == (-0.2, 2, 4)
-    assert row.cells() == ("FAIL", "quick.toml", "rms_error_max_rad", "≤ 0.1 rad", "0.12 rad", "-20 %", "2/4")
+    assert row.cells() == (
+        "FAIL",
+        "quick.toml",
+        "rms_error_max_rad",
+        "≤ 0.1 rad",
+        "0.12 rad",
+        "-20 %",
+        "2/4",
+    )
     assert not report.held
 
 
@@ -32,7 +49,9 @@ def test_what_failed_comes_before_the_smallest_margin() -> None:
 
 
 def test_every_failed_run_is_named_first_ones_with_commands() -> None:
-    report = TrialReport([result(n, outcome(-0.1)) for n in range(1, MAX_FAILURES_SHOWN + 4)], 1.0)
+    report = TrialReport(
+        [result(n, outcome(-0.1)) for n in range(1, MAX_FAILURES_SHOWN + 4)], 1.0
+    )
     lines = report.failures()
     for seed in range(1, MAX_FAILURES_SHOWN + 1):
         assert f"  again: trilat test quick.toml --seeds {seed}" in lines
@@ -44,7 +63,9 @@ def test_every_failed_run_is_named_first_ones_with_commands() -> None:
 
 
 def test_a_run_without_a_result_fails_and_says_why() -> None:
-    report = TrialReport([result(1, outcome(0.5)), result(2, error="its process ended with code -9")], 1.0)
+    report = TrialReport(
+        [result(1, outcome(0.5)), result(2, error="its process ended with code -9")], 1.0
+    )
     assert not report.held
     assert [(row.key, row.held, row.runs) for row in report.rows()] == [
         ("rms_error_max_rad", 1, 1),
@@ -61,7 +82,9 @@ def test_what_held_is_told_without_failures() -> None:
 
 
 def test_scenarios_of_one_name_are_told_apart() -> None:
-    report = TrialReport([result(1, outcome(0.5), source=name) for name in ("a.toml", "b/a.toml")], 1.0)
+    report = TrialReport(
+        [result(1, outcome(0.5), source=name) for name in ("a.toml", "b/a.toml")], 1.0
+    )
     assert [row.scenario for row in report.rows()] == ["a.toml", "b/a.toml"]
 
 
@@ -109,7 +132,12 @@ def document(report: TrialReport) -> Xml.Element:
 
 def mixed() -> TrialReport:
     return TrialReport(
-        [result(1, GOOD, BAD), result(2, GOOD), result(3, error="lost"), result(1, GOOD, source="b.toml")],
+        [
+            result(1, GOOD, BAD),
+            result(2, GOOD),
+            result(3, error="lost"),
+            result(1, GOOD, source="b.toml"),
+        ],
         2.0,
     )
 
@@ -158,5 +186,7 @@ def test_properties_say_what_was_run() -> None:
 @given(text=st.text())
 def test_any_text_is_escaped_or_replaced(text: str) -> None:
     failed = ExpectationResult("stable", False, text, text)
-    root = document(TrialReport([result(1, failed, error=text or "x", source=text or "x")], 1.0))
+    root = document(
+        TrialReport([result(1, failed, error=text or "x", source=text or "x")], 1.0)
+    )
     assert len(list(root.iter("testcase"))) == 1

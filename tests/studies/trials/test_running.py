@@ -19,7 +19,8 @@ from .results import TOO_MUCH, quick
 
 def facts(results: list[TrialResult]) -> list[tuple[int, list[tuple[str, str]], float]]:
     return [
-        (r.trial.scenario.seed, [(o.key, o.measured) for o in r.outcomes], r.simulated_s) for r in results
+        (r.trial.scenario.seed, [(o.key, o.measured) for o in r.outcomes], r.simulated_s)
+        for r in results
     ]
 
 
@@ -55,7 +56,9 @@ print(len(trilat_net.check(sys.argv[1], seeds=[1, 2, 3], jobs=2).results), "held
 
 
 @pytest.mark.long
-def test_it_works_in_a_script_without_a_guarded_main_part(quick_file: Path, tmp_path: Path) -> None:
+def test_it_works_in_a_script_without_a_guarded_main_part(
+    quick_file: Path, tmp_path: Path
+) -> None:
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     assert printed(script, quick_file, cwd=tmp_path) == "3 held\n"
@@ -77,12 +80,18 @@ def printed(script: Path, *arguments: str | Path, cwd: Path) -> str:
     return done.stdout
 
 
-TICKS = {name: sum(map(load_scenario(name).ticks, load_scenario(name).names)) for name in list_shipped()}
+TICKS = {
+    name: sum(map(load_scenario(name).ticks, load_scenario(name).names))
+    for name in list_shipped()
+}
 
 
 @pytest.mark.parametrize(
     ("most", "left_out", "least"),
-    [(45_000, {"seven_joints", "unlike_arms"}, 3), pytest.param(10**9, set(), 7, marks=pytest.mark.long)],
+    [
+        (45_000, {"seven_joints", "unlike_arms"}, 3),
+        pytest.param(10**9, set(), 7, marks=pytest.mark.long),
+    ],
 )
 def test_every_shipped_scenario_expects_something_and_it_holds(
     most: int, left_out: set[str], least: int
@@ -95,17 +104,23 @@ def test_every_shipped_scenario_expects_something_and_it_holds(
     assert report.held, report.summary()
 
 
-RECIPE = textwrap.dedent(str(trilat_net.studies.trials.__doc__).split("per seed:\n")[1].split("\nOr all")[0])
+RECIPE = textwrap.dedent(
+    str(trilat_net.studies.trials.__doc__).split("per seed:\n")[1].split("\nOr all")[0]
+)
 
 
 @pytest.mark.long
-def test_recipe_gives_test_per_seed_that_fails_with_figures(quick_file: Path, tmp_path: Path) -> None:
+def test_recipe_gives_test_per_seed_that_fails_with_figures(
+    quick_file: Path, tmp_path: Path
+) -> None:
     """The same lines on a scenario that holds, and on one that does not."""
     assert len(RECIPE.strip().splitlines()) <= 10
     for good in (True, False):
         source = tmp_path / f"scenario_{good}.toml"
         source.write_text(
-            quick_file.read_text().replace("max_ms = 100.0", f"max_ms = {100.0 if good else 1.0}")
+            quick_file.read_text().replace(
+                "max_ms = 100.0", f"max_ms = {100.0 if good else 1.0}"
+            )
         )
         (tmp_path / f"test_{good}.py").write_text(RECIPE.replace('"jitter"', repr(str(source))))
     done = subprocess.run(
@@ -118,7 +133,11 @@ def test_recipe_gives_test_per_seed_that_fails_with_figures(quick_file: Path, tm
     )
     assert done.returncode == 1, done.stdout + done.stderr
     cases = list(Xml.parse(tmp_path / "out.xml").iter("testcase"))
-    failed = {(case.get("classname"), case.get("name")) for case in cases if case.find("failure") is not None}
+    failed = {
+        (case.get("classname"), case.get("name"))
+        for case in cases
+        if case.find("failure") is not None
+    }
     assert len(cases) == 10
     assert failed == {("test_False", f"test_jitter[quick-seed{seed}]") for seed in range(1, 6)}
     assert "mean_age_max_ms: " in done.stdout

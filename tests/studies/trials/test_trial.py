@@ -61,7 +61,10 @@ def test_a_trial_that_holds_returns_what_held(quick_file: Path) -> None:
     result = trilat_net.trials(quick_file)[0].check()
     assert result.held
     assert result.simulated_s == 0.5
-    assert [outcome.key for outcome in result.outcomes] == ["peak_error_max_rad", "mean_age_max_ms"]
+    assert [outcome.key for outcome in result.outcomes] == [
+        "peak_error_max_rad",
+        "mean_age_max_ms",
+    ]
 
 
 def test_a_failed_trial_says_by_how_much(quick_file: Path) -> None:
@@ -80,7 +83,9 @@ def test_a_failed_trial_says_by_how_much(quick_file: Path) -> None:
 words = st.sampled_from(["it's", "a b", '"x"', "", "=", "é", "true", "a\nb\t"])
 values = st.one_of(st.integers(-5, 5), st.floats(-1e3, 1e3), st.booleans(), words)
 tables = st.dictionaries(
-    st.sampled_from(["a", "b.c", "d.e-f"]), st.one_of(values, st.lists(values, max_size=3)), max_size=3
+    st.sampled_from(["a", "b.c", "d.e-f"]),
+    st.one_of(values, st.lists(values, max_size=3)),
+    max_size=3,
 )
 
 
@@ -95,7 +100,12 @@ def test_the_command_line_means_the_same_overrides(overrides: dict[str, Any]) ->
 
 def test_a_table_as_an_override_is_told_key_by_key() -> None:
     (trial,) = trilat_net.trials(quick(), set=CONSTANT)
-    assert shlex.split(trial.again)[-4:] == ["--set", 'link.model="constant"', "--set", "link.delay_ms=60"]
+    assert shlex.split(trial.again)[-4:] == [
+        "--set",
+        'link.model="constant"',
+        "--set",
+        "link.delay_ms=60",
+    ]
 
 
 def test_a_scenario_in_memory_is_called_by_a_file_name() -> None:
@@ -119,17 +129,26 @@ def written(folder: Path, data: bytes) -> Path:
     return path
 
 
-def test_session_that_ended_in_order_is_judged_by_its_records(trial: Trial, tmp_path: Path) -> None:
+def test_session_that_ended_in_order_is_judged_by_its_records(
+    trial: Trial, tmp_path: Path
+) -> None:
     log = written(tmp_path, recorded("free"))
     result = evaluate_live_log(trial, log, [], 1.0)
     assert result.held
-    assert [o.key for o in result.outcomes] == ["peak_error_max_rad", "no_gaps", "session", "executed again"]
+    assert [o.key for o in result.outcomes] == [
+        "peak_error_max_rad",
+        "no_gaps",
+        "session",
+        "executed again",
+    ]
     assert result.log == log
     assert result.simulated_s == pytest.approx(0.12)
 
 
 def test_a_problem_of_the_session_fails_it(trial: Trial, tmp_path: Path) -> None:
-    result = evaluate_live_log(trial, written(tmp_path, recorded("free")), ["s was killed by SIGKILL"], 1.0)
+    result = evaluate_live_log(
+        trial, written(tmp_path, recorded("free")), ["s was killed by SIGKILL"], 1.0
+    )
     assert [o.key for o in result.outcomes if not o.held] == ["session"]
     assert "SIGKILL" in result.failures[0]
 
@@ -144,7 +163,11 @@ def test_missing_records_fail_it(trial: Trial, tmp_path: Path) -> None:
 
 def test_record_that_is_not_what_its_inputs_give_fails_it(trial: Trial, tmp_path: Path) -> None:
     def bent(record: dict) -> dict:  # type: ignore[type-arg]
-        return {**record, "tau": [0.0, 1.0]} if (record["site"], record["tick"]) == ("s", 50) else record
+        return (
+            {**record, "tau": [0.0, 1.0]}
+            if (record["site"], record["tick"]) == ("s", 50)
+            else record
+        )
 
     log = written(tmp_path, edited(recorded("free"), record=bent))
     assert [o.key for o in evaluate_live_log(trial, log, [], 1.0).outcomes if not o.held] == [

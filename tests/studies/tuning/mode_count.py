@@ -24,7 +24,11 @@ def count_growing(M: Array, K: Array, d: Array, delay_ticks: int, h_s: float) ->
     zero, one = np.zeros((n, n)), np.eye(n)
     held = np.block([[zero, one, zero], [zero, zero, np.linalg.inv(M)], [np.zeros((n, 3 * n))]])
     whole = expm(held * h_s)
-    Phi, Gamma, F = whole[: 2 * n, : 2 * n], whole[: 2 * n, 2 * n :], np.hstack([-np.diag(K), -np.diag(d)])
+    Phi, Gamma, F = (
+        whole[: 2 * n, : 2 * n],
+        whole[: 2 * n, 2 * n :],
+        np.hstack([-np.diag(K), -np.diag(d)]),
+    )
     P = np.block([[Phi + 1.5 * Gamma @ F, -0.5 * Gamma], [F, zero]])
     Q, S = np.vstack([1.5 * Gamma @ np.diag(K), np.diag(K)]), np.eye(n, 3 * n)
 

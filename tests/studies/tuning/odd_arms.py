@@ -33,7 +33,9 @@ def write_arm(pieces: Sequence[Piece], payload: str = "") -> str:
         before, end = f"l{n}", f"{one.length} 0 0"
     if payload:
         parts.append(f'<link name="tool">{payload}</link><joint name="fixed" type="fixed">')
-        parts.append(f'<parent link="{before}"/><child link="tool"/><origin xyz="{end}"/></joint>')
+        parts.append(
+            f'<parent link="{before}"/><child link="tool"/><origin xyz="{end}"/></joint>'
+        )
     return "\n".join([*parts, "</robot>"])
 
 
@@ -52,8 +54,12 @@ ODD_ARMS = {
     "one joint": write_arm([SHOULDER]),
     "slide": write_arm([SLIDE]),
     "slide and elbow": write_arm([SLIDE, ELBOW]),
-    "light wrist": write_arm([SHOULDER, ELBOW, Piece("1 0 0", 0.02, 0.05), Piece("0 1 0", 0.01, 0.03)]),
+    "light wrist": write_arm(
+        [SHOULDER, ELBOW, Piece("1 0 0", 0.02, 0.05), Piece("0 1 0", 0.01, 0.03)]
+    ),
     "payload": write_arm([SHOULDER, ELBOW], body(20.0, "0 0 0")),
-    "off-axis tool": write_arm([SHOULDER, ELBOW, Piece("1 0 0", 0.3, 0.1)], body(0.5, "0 0.2 0.1")),
+    "off-axis tool": write_arm(
+        [SHOULDER, ELBOW, Piece("1 0 0", 0.3, 0.1)], body(0.5, "0 0.2 0.1")
+    ),
 }
 """By name, arms that are unlike those of makers."""

@@ -34,12 +34,18 @@ ARMS = ("arm6.urdf", "arm7.urdf", *MAKERS, *ODD_ARMS)
 DELAYS = ("0", "20ms", "100ms", "jitter")
 
 
-def write_jitter(path: Path, swing_ms: float = 15.0, jitter_ms: float = 3.0, every_s: float = 0.01) -> Path:
+def write_jitter(
+    path: Path, swing_ms: float = 15.0, jitter_ms: float = 3.0, every_s: float = 0.01
+) -> Path:
     """A trace of 2 s about 40 ms: a queue that fills and empties, and what is drawn anew in intervals."""
     chance = random.Random(3)
     rows = []
     for n in range(round(2.0 / every_s)):
-        delay_ms = 40.0 + swing_ms * math.sin(math.pi * n * every_s) + chance.uniform(-jitter_ms, jitter_ms)
+        delay_ms = (
+            40.0
+            + swing_ms * math.sin(math.pi * n * every_s)
+            + chance.uniform(-jitter_ms, jitter_ms)
+        )
         rows.append(f"{every_s * n:.2f},{delay_ms:.3f}")
     path.write_text("\n".join(["t_s,delay_ms", *rows]), encoding="utf-8")
     return path
@@ -112,7 +118,9 @@ def test_the_edge_of_one_joint_is_that_of_its_equation(one_joint: Path) -> None:
     M = 3.0 * 0.5**2 / 3.0
     assert gains(found, "inertia") == pytest.approx([M], rel=1e-6)
     assert gains(found, "K") == pytest.approx([k * M / 2.0], rel=1e-2)
-    assert gains(found, "d") == pytest.approx(2.0 * 0.7 * np.sqrt(gains(found, "K") * M), rel=2e-3)
+    assert gains(found, "d") == pytest.approx(
+        2.0 * 0.7 * np.sqrt(gains(found, "K") * M), rel=2e-3
+    )
 
 
 @pytest.mark.parametrize("name", ["slide", pytest.param("arm6.urdf", marks=pytest.mark.long)])
@@ -156,7 +164,9 @@ def test_the_edge_falls_with_the_delay(one_joint: Path) -> None:
 
 
 def test_beyond_some_rate_the_delay_alone_counts(one_joint: Path) -> None:
-    slow, fast, faster = (tune_arm(one_joint, "50ms", poses=1, rate_hz=hz) for hz in (20, 500, 2000))
+    slow, fast, faster = (
+        tune_arm(one_joint, "50ms", poses=1, rate_hz=hz) for hz in (20, 500, 2000)
+    )
     assert fast.edge["bound"] == faster.edge["bound"] == "delay"
     assert gains(faster, "K") == pytest.approx(gains(fast, "K"), rel=1e-2)
     assert slow.edge["bound"] == "tick rate"
@@ -165,7 +175,9 @@ def test_beyond_some_rate_the_delay_alone_counts(one_joint: Path) -> None:
 @pytest.mark.long
 def test_with_enough_damping_no_delay_bounds_the_stiffness(one_joint: Path) -> None:
     """No root of one joint crosses at any delay where d^2 >= 2 K M."""
-    bounded, free = (tune_arm(one_joint, "50ms", poses=1, damping=ratio) for ratio in (0.95, 1.05))
+    bounded, free = (
+        tune_arm(one_joint, "50ms", poses=1, damping=ratio) for ratio in (0.95, 1.05)
+    )
     assert bounded.edge["bound"] == "delay"
     assert free.edge["continuous_per_s2"] is None
     assert free.edge["bound"] == "tick rate"
@@ -200,7 +212,11 @@ def test_over_slow_jitter_growth_begins_more_than_once(one_joint: Path, tmp_path
     found = tune_arm(one_joint, write_jitter(tmp_path / "jitter.csv", 0.0, 20.0, 0.05), poses=1)
     assert found.agree
     assert [run["stable"] for run in found.runs] == [True, False, False]
-    assert found.edge["used_per_s2"] == found.edge["constant_per_s2"] < 0.5 * found.edge["k_per_s2"]
+    assert (
+        found.edge["used_per_s2"]
+        == found.edge["constant_per_s2"]
+        < 0.5 * found.edge["k_per_s2"]
+    )
 
 
 def test_delays_are_taken_from_a_log(one_joint: Path) -> None:
@@ -270,7 +286,10 @@ def test_the_command_draws_and_prints(one_joint: Path, tmp_path: Path) -> None:
 
 REFUSED = {
     "no such file": (("--arm", "none.urdf"), "none.urdf cannot be read"),
-    "no delay": (("--delay", "soon"), "--delay reads 40ms, measured:run.mcap or a table t_s,delay_ms"),
+    "no delay": (
+        ("--delay", "soon"),
+        "--delay reads 40ms, measured:run.mcap or a table t_s,delay_ms",
+    ),
     "too long a delay": (("--delay", "20s"), "delay_ms"),
     "no such log": (("--delay", "measured:none.mcap"), "none.mcap"),
     "a trace without points": (("--delay", "empty.csv"), "has no points"),
@@ -285,11 +304,15 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("kind", REFUSED)
-def test_bad_input_is_refused_with_what_is_right(kind: str, one_joint: Path, tmp_path: Path) -> None:
+def test_bad_input_is_refused_with_what_is_right(
+    kind: str, one_joint: Path, tmp_path: Path
+) -> None:
     more, fact = REFUSED[kind]
     (tmp_path / "empty.csv").write_text("t_s,delay_ms\n", encoding="utf-8")
     words = {"--arm": one_joint.name, "--delay": "40ms", **dict([more])}
-    trilat("tune", *(word for pair in words.items() for word in pair), cwd=tmp_path).refuses(fact)
+    trilat("tune", *(word for pair in words.items() for word in pair), cwd=tmp_path).refuses(
+        fact
+    )
 
 
 def test_python_names_its_arguments(one_joint: Path) -> None:

@@ -24,13 +24,15 @@ from trilat_net.studies.tuning.candidate import (
 from .experiments import trio
 
 PULSE = 'sites.m1.hands=[{kind = "pulse", start_s = 0.2, end_s = 0.8, peak_nm = [3.0, 0.0]}]'
-WALL = (
-    'sites.s.environment=[{kind = "wall", point_m = [1.5, 0.0], normal = [-1.0, 0.0], stiffness_n_m = 99.0}]'
-)
+WALL = 'sites.s.environment=[{kind = "wall", point_m = [1.5, 0.0], normal = [-1.0, 0.0], stiffness_n_m = 99.0}]'
 
 
 def hand(
-    site: str, to: tuple[float, float], K: tuple[float, float], start: float = 0.0, end: float = 9.0
+    site: str,
+    to: tuple[float, float],
+    K: tuple[float, float],
+    start: float = 0.0,
+    end: float = 9.0,
 ) -> str:
     return (
         f'sites.{site}.hands=[{{kind = "spring", to_rad = {list(to)}, stiffness_nm_rad = {list(K)}, '
@@ -43,7 +45,9 @@ def at_end(scenario: Scenario) -> np.ndarray:
 
 
 @given(a=st.floats(0.05, 0.95), b=st.floats(0.05, 0.95), c=st.floats(0.05, 0.95))
-def test_without_hands_it_is_where_linear_consensus_comes_to(a: float, b: float, c: float) -> None:
+def test_without_hands_it_is_where_linear_consensus_comes_to(
+    a: float, b: float, c: float
+) -> None:
     """x' = (alpha - I) x, by the matrix exponential."""
     rows = [
         f"dominance={{m1 = {{m2 = {a!r}, s = {1 - a!r}}}, m2 = {{m1 = {b!r}, s = {1 - b!r}}}, "
@@ -60,9 +64,8 @@ def test_without_hands_it_is_where_linear_consensus_comes_to(a: float, b: float,
 @given(K1=st.floats(1.0, 300.0), K2=st.floats(1.0, 300.0), x=st.floats(-1.0, 1.0))
 def test_hands_take_it_where_stiff_arms_rest(K1: float, K2: float, x: float) -> None:
     """K_i (x_i - q_i) = k (q_i - sum_j alpha_ij q_j) with k far above K, solved as it stands."""
-    scenario = trio(
-        hand("m1", (x, 0.0), (K1, K1)), hand("m2", (x + 0.01, 0.0), (K2, K2))
-    )  # alike enough to be no conflict
+    # alike enough to be no conflict
+    scenario = trio(hand("m1", (x, 0.0), (K1, K1)), hand("m2", (x + 0.01, 0.0), (K2, K2)))
     K = np.diag([K1, K2, 0.0])
     matrix = K + 1e7 * (np.eye(3) - scenario.alpha)
     rest = np.linalg.solve(matrix, K @ [x, x + 0.01, 0.0])
@@ -82,7 +85,9 @@ def test_a_hand_moves_it_along_a_minimum_jerk_path() -> None:
     """Half way in the middle; the spring's target in `box`-like moves is checked in the core."""
     scenario = trio(
         'sites.m1.hands=[{kind = "spring", from_rad = [0.0, 0.0], to_rad = [1.0, 2.0], '
-        "move_start_s = 0.5, move_end_s = 1.5, stiffness_nm_rad = 50.0}]".replace("50.0", "[50.0, 50.0]")
+        "move_start_s = 0.5, move_end_s = 1.5, stiffness_nm_rad = 50.0}]".replace(
+            "50.0", "[50.0, 50.0]"
+        )
     )
     path = compute_consensus_pose(scenario, np.array([0.4, 0.75, 1.0, 1.6]))
     quarter = 10 * 0.25**3 - 15 * 0.25**4 + 6 * 0.25**5
@@ -109,14 +114,25 @@ def test_two_hands_that_disagree_are_refused_with_the_site() -> None:
 @pytest.mark.parametrize(
     ("setting", "word"),
     [
-        ("link.model=measured", "links.m2->m1.model: is measured: that is the delay of a real network"),
-        ("task.space=position", "task.space: laws are compared by the distance of joint angles"),
-        ("sites.m2.plant=external", "sites.m2.plant: is external: that arm is outside of the program"),
+        (
+            "link.model=measured",
+            "links.m2->m1.model: is measured: that is the delay of a real network",
+        ),
+        (
+            "task.space=position",
+            "task.space: laws are compared by the distance of joint angles",
+        ),
+        (
+            "sites.m2.plant=external",
+            "sites.m2.plant: is external: that arm is outside of the program",
+        ),
     ],
 )
 def test_a_scenario_without_common_angles_is_refused(setting: str, word: str) -> None:
     with pytest.raises(ScenarioError) as refused:
-        check_comparable(load_scenario("free", [setting, 'task.axes=["x", "y"]'][: 1 + ("task" in setting)]))
+        check_comparable(
+            load_scenario("free", [setting, 'task.axes=["x", "y"]'][: 1 + ("task" in setting)])
+        )
     assert word in str(refused.value)
 
 
@@ -135,7 +151,13 @@ def test_two_closed_groups_have_no_common_pose() -> None:
         check_comparable(parse_scenario(text))
 
 
-FIRM = ("control.law=pd_d", "control.K=20.0", "control.d=9.0", "control.Kd=0.5", "duration_s=4.0")
+FIRM = (
+    "control.law=pd_d",
+    "control.K=20.0",
+    "control.d=9.0",
+    "control.Kd=0.5",
+    "duration_s=4.0",
+)
 
 
 def scored(scenario: Scenario, alone: Scenario | None = None) -> CandidateScore:
@@ -147,7 +169,12 @@ def test_error_and_effort_are_the_sums_that_the_docs_print() -> None:
     found = scored(scenario)
     run = trajectories(scenario)
     q, tau = run.stack("q"), run.stack("tau")
-    a, b, c = 0.2, 0.5, 0.6  # shares of the first peers: beta = (1 - s->.. ) by the paper's minors
+    # shares of the first peers: beta = (1 - s->.. ) by the paper's minors
+    a, b, c = (
+        0.2,
+        0.5,
+        0.6,
+    )
     beta = np.array([1.0 - (1.0 - b) * (1.0 - c), 1.0 - (1.0 - a) * c, 1.0 - a * b])
     pose = beta @ q[:, 0] / beta.sum()
     inner, outer = 2.0 * 9.81 * np.cos(q[..., 0]), 9.81 * np.cos(q[..., 0] + q[..., 1])
@@ -155,13 +182,17 @@ def test_error_and_effort_are_the_sums_that_the_docs_print() -> None:
     assert found.error_rad == pytest.approx(np.sqrt(np.mean((q - pose) ** 2)), rel=1e-9)
     assert found.effort_nm == pytest.approx(np.sqrt(np.mean((tau - gravity) ** 2)), rel=1e-9)
     assert found.spread_rad == pytest.approx(np.sqrt(np.mean(q.var(axis=0))), rel=1e-9)
-    assert found.pose_rad == pytest.approx(np.sqrt(np.mean((q.mean(axis=0) - pose) ** 2)), rel=1e-9)
+    assert found.pose_rad == pytest.approx(
+        np.sqrt(np.mean((q.mean(axis=0) - pose) ** 2)), rel=1e-9
+    )
     e = np.abs(q - run.stack("q_des")).max(axis=(0, 2))
     assert found.settled_s == pytest.approx(0.01 * np.flatnonzero(e >= 0.01)[-1])
 
 
 def test_arms_that_start_together_and_know_gravity_do_nothing() -> None:
-    still = trio("control.law=p_d", *(f"sites.{name}.q0_rad=[0.2, 0.3]" for name in ("m1", "m2", "s")))
+    still = trio(
+        "control.law=p_d", *(f"sites.{name}.q0_rad=[0.2, 0.3]" for name in ("m1", "m2", "s"))
+    )
     found = scored(still)
     assert found.outcome is CandidateClass.SETTLED
     assert found.error_rad == pytest.approx(0.0, abs=1e-12)
@@ -182,7 +213,13 @@ def test_hanging_arms_have_strayed_and_err_by_the_fall() -> None:
 
 def test_arms_that_sink_slowly_drift_before_they_hang() -> None:
     """Damping holds them up for a while: 5 % of gravity, some 1.5 N m, against 100 N m s/rad."""
-    sinking = (*FIRM, "rate_hz=1000", "control.d=100.0", "control.K=400.0", "control.gravity=0.95")
+    sinking = (
+        *FIRM,
+        "rate_hz=1000",
+        "control.d=100.0",
+        "control.K=400.0",
+        "control.gravity=0.95",
+    )
     found = scored(trio(*sinking, "duration_s=15.0"))
     assert 0.02 < (found.pose_rad or 0.0) < 0.15
     assert found.outcome is CandidateClass.OSCILLATED
@@ -198,15 +235,21 @@ def test_what_diverged_has_no_error() -> None:
 
 def test_sites_of_other_rates_are_compared_at_one_instant() -> None:
     """A slave at a quarter of the rate moves the score by its coarser steps, and no more."""
-    alike, mixed = (scored(trio(*FIRM, "rate_hz=400", *more)) for more in ((), ("sites.s.rate_hz=100",)))
+    alike, mixed = (
+        scored(trio(*FIRM, "rate_hz=400", *more)) for more in ((), ("sites.s.rate_hz=100",))
+    )
     assert mixed.spread_rad == pytest.approx(alike.spread_rad, rel=0.1)
     assert mixed.effort_nm == pytest.approx(alike.effort_nm, rel=0.2)
 
 
 def test_with_a_twin_the_pose_is_the_twins() -> None:
-    push = 'sites.m1.hands=[{kind = "pulse", start_s = 0.2, end_s = 1.2, peak_nm = [20.0, 0.0]}]'
+    push = (
+        'sites.m1.hands=[{kind = "pulse", start_s = 0.2, end_s = 1.2, peak_nm = [20.0, 0.0]}]'
+    )
     pushed, alone = trio(*FIRM, push), trio(*FIRM)
     both = scored(pushed, alone)
     assert both.pose_rad == scored(alone).pose_rad
     assert both.spread_rad == scored(pushed).spread_rad
-    assert both.error_rad == pytest.approx(np.hypot(both.spread_rad or 0.0, both.pose_rad or 0.0))
+    assert both.error_rad == pytest.approx(
+        np.hypot(both.spread_rad or 0.0, both.pose_rad or 0.0)
+    )

@@ -72,17 +72,23 @@ def test_arms_that_stand_need_no_word() -> None:
 
 
 def test_arms_that_hang_are_named() -> None:
-    (line,) = check_final_posture(simulate(trio(*FIRM, "control.gravity=0.0", "duration_s=15.0")))
+    (line,) = check_final_posture(
+        simulate(trio(*FIRM, "control.gravity=0.0", "duration_s=15.0"))
+    )
     assert line.startswith("m1, m2, s hang at the end")
 
 
 def test_arms_that_sank_are_told_how_far() -> None:
-    (line,) = check_final_posture(simulate(trio(*FIRM, "control.gravity=0.8", "duration_s=2.0")))
+    (line,) = check_final_posture(
+        simulate(trio(*FIRM, "control.gravity=0.8", "duration_s=2.0"))
+    )
     assert "from where a weightless consensus would stand: they sank, or drifted" in line
 
 
 def test_arms_that_were_pushed_did_not_sink() -> None:
-    push = 'sites.m1.hands=[{kind = "pulse", start_s = 0.1, end_s = 1.5, peak_nm = [40.0, 0.0]}]'
+    push = (
+        'sites.m1.hands=[{kind = "pulse", start_s = 0.1, end_s = 1.5, peak_nm = [40.0, 0.0]}]'
+    )
     assert check_final_posture(simulate(trio(*FIRM, push))) == []
 
 
@@ -94,7 +100,10 @@ def test_a_site_that_diverged_is_named() -> None:
 def test_arms_that_began_hanging_do_not_fall() -> None:
     down = (-1.5707963, 0.0)
     scenario = trio(*FIRM)
-    sites = {name: msgspec.structs.replace(spec, q0_rad=down) for name, spec in scenario.sites.items()}
+    sites = {
+        name: msgspec.structs.replace(spec, q0_rad=down)
+        for name, spec in scenario.sites.items()
+    }
     assert check_final_posture(simulate(msgspec.structs.replace(scenario, sites=sites))) == []
 
 

@@ -43,12 +43,16 @@ def searched(law: str, budget: int, seed: int, score: object = bowl) -> Candidat
 
 @settings(max_examples=40)
 @given(law=LAWS, budget=BUDGETS, seed=SEEDS, score=st.sampled_from([bowl, lost]))
-def test_every_law_gets_its_budget_within_its_ranges(law: str, budget: int, seed: int, score: object) -> None:
+def test_every_law_gets_its_budget_within_its_ranges(
+    law: str, budget: int, seed: int, score: object
+) -> None:
     search = searched(law, budget, seed, score)
     assert len(search.tried) == len(search.scores) == budget
     for gains in search.tried:
         assert list(gains) == [knob.name for knob in SEARCH_SPACES[law].knobs]
-        assert all(knob.low <= gains[knob.name] <= knob.high for knob in SEARCH_SPACES[law].knobs)
+        assert all(
+            knob.low <= gains[knob.name] <= knob.high for knob in SEARCH_SPACES[law].knobs
+        )
 
 
 @settings(max_examples=20)
@@ -60,11 +64,15 @@ def test_the_seed_decides_all(law: str, budget: int, seed: int) -> None:
 
 @settings(max_examples=20)
 @given(law=LAWS, budget=BUDGETS, seed=SEEDS)
-def test_the_first_half_samples_every_slice_of_every_range(law: str, budget: int, seed: int) -> None:
+def test_the_first_half_samples_every_slice_of_every_range(
+    law: str, budget: int, seed: int
+) -> None:
     """What makes a Latin hypercube of it (McKay, Beckman and Conover 1979)."""
     first = CandidateSearch(SEARCH_SPACES[law], budget, seed, Objective.ERROR).ask(0)
     for knob in SEARCH_SPACES[law].knobs:
-        share = np.log([gains[knob.name] / knob.low for gains in first]) / math.log(knob.high / knob.low)
+        share = np.log([gains[knob.name] / knob.low for gains in first]) / math.log(
+            knob.high / knob.low
+        )
         counts, _ = np.histogram(share, bins=len(first), range=(0.0, 1.0))
         assert np.abs(counts - 1).sum() <= 2  # four digits may carry one across an edge
 
@@ -80,7 +88,9 @@ def test_laws_with_as_many_gains_begin_at_the_same_places() -> None:
 @pytest.mark.parametrize("law", ["p_d", "adaptive"])
 def test_refinement_comes_nearer_than_the_hypercube_of_all(law: str) -> None:
     """On a bowl whose bottom is known: 0 at gains of 1."""
-    refined = [min(s.error_rad or 0.0 for s in searched(law, 64, seed).scores) for seed in range(10)]
+    refined = [
+        min(s.error_rad or 0.0 for s in searched(law, 64, seed).scores) for seed in range(10)
+    ]
     spread = [
         min(
             bowl(gains).error_rad or 0.0
@@ -99,7 +109,9 @@ def score(outcome: CandidateClass, error_rad: float, effort_nm: float) -> Candid
     return CandidateScore(outcome, error_rad, error_rad, 0.0, effort_nm, error_rad, 0.0)
 
 
-SCORES = st.lists(st.builds(score, st.sampled_from(list(CandidateClass)), NUMBERS, NUMBERS), max_size=30)
+SCORES = st.lists(
+    st.builds(score, st.sampled_from(list(CandidateClass)), NUMBERS, NUMBERS), max_size=30
+)
 
 
 @given(points=POINTS)
@@ -113,7 +125,9 @@ def test_nothing_that_competes_is_better_than_point_of_front(
 
 
 @given(points=POINTS)
-def test_what_is_left_out_is_dominated_or_a_double(points: list[tuple[float, float] | None]) -> None:
+def test_what_is_left_out_is_dominated_or_a_double(
+    points: list[tuple[float, float] | None],
+) -> None:
     kept = set(find_pareto_front(points))
     held = [points[n] for n in kept]
     for n, point in enumerate(points):

@@ -38,7 +38,9 @@ def test_a_candidate_changes_its_law_at_every_site_alone(law: str, scenario: str
         return
     scheme = ["scheme=digital"] if law in HELD else []
     experiment = load_tuning_scenario(scenario, ["limits.tau_limit_nm=60", *scheme])
-    found = experiment.with_gains(SEARCH_SPACES[law], ModelInformation(0.95), MIDDLE[law]).scenario
+    found = experiment.with_gains(
+        SEARCH_SPACES[law], ModelInformation(0.95), MIDDLE[law]
+    ).scenario
     for name, site in found.sites.items():
         assert site.control.__struct_config__.tag == ("adaptive" if law == "known" else law)
         assert site.limits == experiment.scenario.sites[name].limits
@@ -58,18 +60,27 @@ def test_sites_with_their_own_control_are_changed_one_by_one() -> None:
     found: TuningScenario = load_tuning_scenario("contact").with_gains(
         SEARCH_SPACES["p_d"], ModelInformation(), {"K": 31.2, "d": 7.1}
     )
-    assert [text.partition("=")[0] for text in found.overrides] == ["sites.m.control", "sites.s.control"]
+    assert [text.partition("=")[0] for text in found.overrides] == [
+        "sites.m.control",
+        "sites.s.control",
+    ]
     free: TuningScenario = load_tuning_scenario("free").with_gains(
         SEARCH_SPACES["p_d"], ModelInformation(), {"K": 31.2, "d": 7.1}
     )
-    assert free.command == "trilat sim free --set 'control={law = \"p_d\", K = 31.2, d = 7.1, gravity = 1}'"
+    assert (
+        free.command
+        == "trilat sim free --set 'control={law = \"p_d\", K = 31.2, d = 7.1, gravity = 1}'"
+    )
 
 
 def test_the_same_quantity_has_the_same_range_in_every_law() -> None:
     ranges: dict[str, set[tuple[str, float, float]]] = {}
     for space in SEARCH_SPACES.values():
-        for knob in space.knobs if space.law != "adaptive_kinematics" else ():  # of the place, in N s/m
-            ranges.setdefault(knob.name.partition("_")[0], set()).add((knob.unit, knob.low, knob.high))
+        # of the place, in N s/m
+        for knob in space.knobs if space.law != "adaptive_kinematics" else ():
+            ranges.setdefault(knob.name.partition("_")[0], set()).add(
+                (knob.unit, knob.low, knob.high)
+            )
     assert all(len(found) == 1 for found in ranges.values())
     assert ranges["d"] == {("N m s/rad", *next(iter(ranges["Kp"]))[1:])}
 
@@ -101,10 +112,14 @@ def test_joints_share_a_gain_by_the_inertia_of_pinocchio() -> None:
 
 @pytest.mark.parametrize("scheme", ["second_order", "digital"])
 @pytest.mark.parametrize("armature_kg_m2", [0.0, 0.001, 0.2])
-def test_every_choice_within_ranges_is_one_that_arms_can_take(armature_kg_m2: float, scheme: str) -> None:
+def test_every_choice_within_ranges_is_one_that_arms_can_take(
+    armature_kg_m2: float, scheme: str
+) -> None:
     state, *_ = chain_references()["arm6"].states
     small = {"law": "p_d", "K": 1.0, "d": 1e-3}
-    experiment = six(state, scheme=scheme, control=small, **{"arm.armature_kg_m2": armature_kg_m2})
+    experiment = six(
+        state, scheme=scheme, control=small, **{"arm.armature_kg_m2": armature_kg_m2}
+    )
     others = ("p_f", "sync", "adaptive_kinematics", "lee_spong")
     for space in SEARCH_SPACES.values():  # for two sites; for planar arms; K T_max has no range
         if space.law not in others and (scheme == "digital" or space.law not in HELD):
@@ -121,7 +136,13 @@ def test_the_usual_laws_take_any_number_of_sites() -> None:
     [
         ("adaptiv", ["no law 'adaptiv'", "did you mean 'adaptive'"]),
         ("pdd", ["no law 'pdd'", "did you mean 'pd_d'"]),
-        ("", ["no law ''", "tuned are adaptive, known, adaptive_box, adaptive_kinematics, adaptive_robust"]),
+        (
+            "",
+            [
+                "no law ''",
+                "tuned are adaptive, known, adaptive_box, adaptive_kinematics, adaptive_robust",
+            ],
+        ),
         ("tests.laws:Adaptive", ["tests.laws:Adaptive has no search ranges", "tune = {"]),
         ("own", ["no law 'own'"]),
     ],
@@ -133,9 +154,13 @@ def test_what_cannot_be_tuned_is_refused(law: str, facts: list[str]) -> None:
 
 
 def test_force_reflection_is_refused_for_three_sites_with_the_reason() -> None:
-    with pytest.raises(ScenarioError, match="between one master and one slave; this has 3 sites, 2 of them"):
+    with pytest.raises(
+        ScenarioError, match="between one master and one slave; this has 3 sites, 2 of them"
+    ):
         select_search_spaces(["p_d", "p_f"], load_scenario("free"))
-    assert [space.law for space in select_search_spaces(["p_f"], load_scenario("contact"))] == ["p_f"]
+    assert [space.law for space in select_search_spaces(["p_f"], load_scenario("contact"))] == [
+        "p_f"
+    ]
 
 
 SHARES = st.floats(50.0, 150.0)
@@ -155,7 +180,8 @@ def test_the_box_holds_the_truth_strictly_inside(percent: float) -> None:
 def test_all_candidates_know_one_share_of_gravity_no_inertia(percent: float) -> None:
     scenario = trio()
     prior = np.array(build_model_information(percent).prior(scenario, "m1"))
-    truth = np.array([2.0, 1.0])  # (m1 lc1 + m2 l1, m2 lc2) of point masses at the ends, Eq. (24)
+    # (m1 lc1 + m2 l1, m2 lc2) of point masses at the ends, Eq. (24)
+    truth = np.array([2.0, 1.0])
     assert (prior[:3] == 0.0).all()
     assert prior[3:] == pytest.approx(truth * percent / 100.0)
 

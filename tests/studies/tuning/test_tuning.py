@@ -10,7 +10,11 @@ import pytest
 from trilat_net.errors import ScenarioError, UsageError
 from trilat_net.scenario import load_scenario
 from trilat_net.studies.tuning import TuningResult, plan_tuning
-from trilat_net.studies.tuning.candidate import CandidateClass, CandidateScore, measure_candidate
+from trilat_net.studies.tuning.candidate import (
+    CandidateClass,
+    CandidateScore,
+    measure_candidate,
+)
 from trilat_net.studies.tuning.search_space import SEARCH_SPACES
 from trilat_net.studies.tuning.tuning_plan import CandidateSearch, Objective, find_pareto_front
 from trilat_net.studies.tuning.tuning_report import tabulate_front, tabulate_laws, write_tuning
@@ -48,16 +52,20 @@ def test_clamp_and_all_but_law_are_same_for_every_candidate(found: TuningResult)
             scenario = found.candidate(one, place).scenario
             limits = tuple(site.limits for site in scenario.sites.values())
             starts = tuple(
-                (site.q0_rad, site.arm, site.rate_hz, site.hands) for site in scenario.sites.values()
+                (site.q0_rad, site.arm, site.rate_hz, site.hands)
+                for site in scenario.sites.values()
             )
-            shared.add((limits, starts, scenario.seed, scenario.duration_s, repr(scenario.links)))
+            shared.add(
+                (limits, starts, scenario.seed, scenario.duration_s, repr(scenario.links))
+            )
     assert len(shared) == 1
     assert next(iter(shared))[0][0].tau_limit_nm == 60.0
 
 
 def test_a_front_is_dominated_by_no_law(found: TuningResult) -> None:
     points = {
-        one.space.law: [found.plan.objective.point(score) for score in one.scores] for one in found.found
+        one.space.law: [found.plan.objective.point(score) for score in one.scores]
+        for one in found.found
     }
     every = [point for law in points.values() for point in law if point is not None]
     for one in found.found:
@@ -77,7 +85,10 @@ def test_a_points_command_runs_what_was_measured(found: TuningResult) -> None:
             words = shlex.split(found.candidate(one, place).command)
             assert words[:2] == ["trilat", "sim"]
             assert words[3::2] == ["--set"] * (len(words[3:]) // 2)
-            assert measure_candidate(load_scenario(words[2], words[4::2]).text, None) == one.scores[place]
+            assert (
+                measure_candidate(load_scenario(words[2], words[4::2]).text, None)
+                == one.scores[place]
+            )
 
 
 def test_printed_gains_are_measured_and_never_searched(found: TuningResult) -> None:
@@ -94,7 +105,9 @@ def test_runs_that_failed_are_in_the_facts_and_counted(tmp_path: Path) -> None:
     """A speed limit that nothing keeps: no front, and no silence about it."""
     found = asked(tmp_path, "limits.qd_limit_rad_s=0.001", laws=["p_d"], budget=4).run(jobs=1)
     law = found.to_dict()["laws"]["p_d"]
-    assert law["outcomes"] == {word.value: 4 * (word is CandidateClass.DIVERGED) for word in CandidateClass}
+    assert law["outcomes"] == {
+        word.value: 4 * (word is CandidateClass.DIVERGED) for word in CandidateClass
+    }
     assert law["front"] == []
     assert [one["outcome"] for one in law["candidates"]] == ["diverged"] * 4
     assert found.at_edge(found.found[0]) == []
@@ -103,7 +116,9 @@ def test_runs_that_failed_are_in_the_facts_and_counted(tmp_path: Path) -> None:
 def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
     """Gravity is told for half of what it is: no law that only knows it can stand, some that learn it can."""
     settings = ("duration_s=10.0", "control.Kd=1")
-    found = asked(tmp_path, *settings, laws=["adaptive", "pd_d"], budget=8, gravity_percent=50.0).run(jobs=1)
+    found = asked(
+        tmp_path, *settings, laws=["adaptive", "pd_d"], budget=8, gravity_percent=50.0
+    ).run(jobs=1)
     learns, knows = found.found
     assert knows.front == []
     assert knows.outcomes[CandidateClass.STRAYED] >= 1
@@ -123,14 +138,18 @@ def test_hanging_arms_are_on_no_front_of_a_real_search(tmp_path: Path) -> None:
         ({"laws": ["p_dd"]}, "no law 'p_dd' to tune; did you mean"),
     ],
 )
-def test_what_cannot_be_asked_is_refused(tmp_path: Path, settings: dict[str, object], words: str) -> None:
+def test_what_cannot_be_asked_is_refused(
+    tmp_path: Path, settings: dict[str, object], words: str
+) -> None:
     with pytest.raises(UsageError) as refused:
         asked(tmp_path, **settings)
     assert words in str(refused.value)
 
 
 def test_a_search_that_would_take_days_is_refused() -> None:
-    with pytest.raises(ScenarioError, match="duration_s: a candidate would take 259200000 ticks"):
+    with pytest.raises(
+        ScenarioError, match="duration_s: a candidate would take 259200000 ticks"
+    ):
         plan_tuning("free", ["duration_s=86400"])
 
 
@@ -147,7 +166,8 @@ def with_front(law: str, gains: dict[str, float], points: int) -> CandidateSearc
     search = CandidateSearch(SEARCH_SPACES[law], 6, 1, Objective.ERROR)
     outcomes = [CandidateClass.SETTLED] * points + [CandidateClass.OPEN] * (6 - points)
     scores = [
-        CandidateScore(one, 1.0 / n, 0.1, 0.1, float(n), None, 0.0) for n, one in enumerate(outcomes, 1)
+        CandidateScore(one, 1.0 / n, 0.1, 0.1, float(n), None, 0.0)
+        for n, one in enumerate(outcomes, 1)
     ]
     search.tell([gains] * 6, scores)
     return search
@@ -172,7 +192,11 @@ def test_the_folder_holds_the_result(written: Path) -> None:
     assert result["procedure"]["candidates_per_law"] == 6
     assert result["scenario"]["tau_limit_nm"] == {"m1": 60.0, "m2": 60.0, "s": 60.0}
     for law in ("p_d", "known"):
-        assert len(result["laws"][law]["candidates"]) == sum(result["laws"][law]["outcomes"].values()) == 6
+        assert (
+            len(result["laws"][law]["candidates"])
+            == sum(result["laws"][law]["outcomes"].values())
+            == 6
+        )
         for point in result["laws"][law]["front"]:
             assert point["command"].startswith("trilat sim ")
             assert point["outcome"] == "settled"
@@ -180,14 +204,18 @@ def test_the_folder_holds_the_result(written: Path) -> None:
 
 def test_the_figure_is_a_vector_one_column_wide(written: Path) -> None:
     """3.5 in are 252 pt, and 700 pixels at 200 to the inch."""
-    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", (written / "front.pdf").read_bytes())
+    box = re.search(
+        rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", (written / "front.pdf").read_bytes()
+    )
     assert box is not None
     assert float(box[1]) == pytest.approx(252.0)
     header = (written / "front.png").read_bytes()[16:20]
     assert int.from_bytes(header, "big") == 700
 
 
-def test_the_page_tells_procedure_search_and_commands(found: TuningResult, written: Path) -> None:
+def test_the_page_tells_procedure_search_and_commands(
+    found: TuningResult, written: Path
+) -> None:
     text = (written / "front.md").read_text()
     assert "every law is told gravity exactly" in text
     assert "torques clamped at 60 N m" in text
@@ -209,4 +237,6 @@ def test_a_long_front_is_shortened_to_points_with_both_ends(found: TuningResult)
     shown = [row[0].rstrip("*") for row in tabulate_front(found, one, 3).rows]
     assert shown == ["adaptive 1", "adaptive 3", "adaptive 5"]
     assert len(tabulate_front(found, one).rows) == 5
-    assert tabulate_front(found, with_front("adaptive", found.found[0].tried[0], 0), 3).rows == []
+    assert (
+        tabulate_front(found, with_front("adaptive", found.found[0].tried[0], 0), 3).rows == []
+    )

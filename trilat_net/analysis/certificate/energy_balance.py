@@ -1,8 +1,8 @@
 """Energy balance of each site, and of a group of sites together under the weights beta.
 
-Invariant: V_i - V_i(0) + dissipation + transfer - work vanishes for every site, without any weights; V -
-V(0) + dissipation - work vanishes for the weighted sum, whatever the operators do. A log that violates it
-was not produced by the equations that it claims.
+Invariant: V_i - V_i(0) + dissipation + transfer - work vanishes for every site, without any
+weights; V - V(0) + dissipation - work vanishes for the weighted sum, whatever the operators do.
+A log that violates it was not produced by the equations that it claims.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,7 +15,14 @@ from ...core.site_setup import Scheme
 from ...core.vectors import Array
 from ...log.log_reader import Log
 from ...scenario import Scenario
-from ..aligned import AlignedRecords, Bools, DelayedPeer, PeerTrajectory, align_records, view_delayed_peer
+from ..aligned import (
+    AlignedRecords,
+    Bools,
+    DelayedPeer,
+    PeerTrajectory,
+    align_records,
+    view_delayed_peer,
+)
 from ..dominance_history import DominanceHistory, compute_lyapunov_weights, trace_dominance
 from ..torque_sources import split_torque
 from . import energy_terms
@@ -26,7 +33,8 @@ MIN_PERIODS = 10
 ZERO_ENERGY_J = 1e-12
 """What rounding may leave of no energy at all."""
 EXTERNAL_SOURCES = ("hands", "walls", "stops")
-"""The sources of work that are outside of the loop: operator, environment, and stops of joints."""
+"""The sources of work that are outside of the loop: operator, environment, and stops of joints.
+"""
 
 
 @dataclass(frozen=True)
@@ -50,7 +58,10 @@ class SiteEnergy:
     @cached_property
     def judged(self) -> Bools:
         """True if a period follows from records alone, shape (K - 1,)."""
-        known = [self.motion.records.known_periods, *(view.known for view in self.followed.values())]
+        known = [
+            self.motion.records.known_periods,
+            *(view.known for view in self.followed.values()),
+        ]
         return np.asarray(np.logical_and.reduce(known))
 
     @cached_property
@@ -70,17 +81,24 @@ class SiteEnergy:
     def followed(self) -> dict[str, DelayedPeer]:
         """The peers that ever have a share, as the site sees them."""
         views = enumerate(self.motion.peers.items())
-        return {peer: view for j, (peer, view) in views if self.motion.dominance.alpha[:, j].any()}
+        return {
+            peer: view for j, (peer, view) in views if self.motion.dominance.alpha[:, j].any()
+        }
 
     @property
     def largest_age_s(self) -> float:
         """The largest age of a sample in use, s; 0 if none came into use."""
         ages_s = [self.motion.records.t_s - view.stamp_s for view in self.followed.values()]
-        return max((float(np.nanmax(age_s)) for age_s in ages_s if np.isfinite(age_s).any()), default=0.0)
+        return max(
+            (float(np.nanmax(age_s)) for age_s in ages_s if np.isfinite(age_s).any()),
+            default=0.0,
+        )
 
     @property
     def begin_s(self) -> float:
-        """The first tick at which everything in transit follows from records, s; infinite without one."""
+        """The first tick at which everything in transit follows from records, s; infinite
+        without one.
+        """
         seen = [view.seen.known & view.now.known for view in self.followed.values()]
         rows = np.flatnonzero(np.logical_and.reduce(seen))
         return float(self.motion.records.t_s[rows[0]]) if len(rows) else np.inf
@@ -89,20 +107,25 @@ class SiteEnergy:
     def uncertainty(self) -> float:
         """How far the energies may be off by what happens within a period, J.
 
-        The trapezoid rule by the second differences of all powers, summed; sampling and operators by the
-        products of the changes of r and of a torque: if these add up, the period is long for these gains.
-        With too few periods for second differences all is uncertain.
+        The trapezoid rule by the second differences of all powers, summed; sampling and
+        operators by the products of the changes of r and of a torque: if these add up, the
+        period is long for these gains. With too few periods for second differences all is
+        uncertain.
         """
         signed = [(1.0, self.transfer), *((1.0, one) for one in self.dissipation.values())]
         signed += [(-1.0, one) for one in self.work.values()]
         if self.judged.sum() < MIN_PERIODS:
-            return float(sum(np.abs(one.left).sum() + np.abs(one.right).sum() for _, one in signed))
+            return float(
+                sum(np.abs(one.left).sum() + np.abs(one.right).sum() for _, one in signed)
+            )
         power = np.sum([sign * one.left for sign, one in signed], axis=0)
         records = self.motion.records
         ends = self.motion.ends
         coupled = 0.0
         for torque in (records.tau, records.tau_x):
-            together = records.h_s * ((ends.r_right - ends.r_left) * np.diff(torque, axis=0)).sum(axis=1)
+            together = records.h_s * (
+                (ends.r_right - ends.r_left) * np.diff(torque, axis=0)
+            ).sum(axis=1)
             coupled += 2.0 * float(np.abs(_accumulate(together, self.judged)).max())
         return float(np.abs(np.diff(power[self.judged], 2)).sum()) / 6.0 + coupled
 
@@ -113,7 +136,8 @@ def _accumulate(amounts: Array, judged: Bools | None = None) -> Array:
 
 
 def compute_site_energies(log: Log) -> dict[str, SiteEnergy]:
-    """Returns the energies of a log's sites, each of which has a functional; {} if at no time all are known.
+    """Returns the energies of a log's sites, each of which has a functional; {} if at no time
+    all are known.
 
     Raises:
         LogError: a record names a change that is none.
@@ -132,7 +156,8 @@ def derive_site_energies(
 ) -> dict[str, SiteEnergy]:
     """Returns the energies of sites over some of their records, each of which has a functional.
 
-    `pasts` reach back to the samples that were in use then; `dominance` gives a site's factors at times, s.
+    `pasts` reach back to the samples that were in use then; `dominance` gives a site's factors
+    at times, s.
     """
     energies = {}
     constants = {site: energy_terms.derive_site_constants(scenario, site) for site in records}
@@ -140,27 +165,29 @@ def derive_site_energies(
     common = tuple(np.prod(axes, axis=0).tolist()) if axes else ()
     for site, own in records.items():
         motion = SiteMotion(
-            own,
-            constants[site],
-            dominance(site, own.t_s),
-            {peer: view_delayed_peer(own, pasts[peer]) for peer in own.used},
-            split_torque(own, scenario),
-            Scheme[scenario.scheme.upper()],
-            common,
+            records=own,
+            constants=constants[site],
+            dominance=dominance(site, own.t_s),
+            peers={peer: view_delayed_peer(own, pasts[peer]) for peer in own.used},
+            torque=split_torque(own, scenario),
+            scheme=Scheme[scenario.scheme.upper()],
+            common=common,
         )
         energies[site] = SiteEnergy(
-            motion,
-            energy_terms.evaluate_functional(motion),
-            energy_terms.compute_dissipation(motion),
-            energy_terms.compute_transfer(motion, np.array(common or 1.0)),
-            energy_terms.compute_work(motion),
-            energy_terms.compute_sampling_work(motion),
+            motion=motion,
+            parts=energy_terms.evaluate_functional(motion),
+            dissipation=energy_terms.compute_dissipation(motion),
+            transfer=energy_terms.compute_transfer(motion, np.array(common or 1.0)),
+            work=energy_terms.compute_work(motion),
+            sampling=energy_terms.compute_sampling_work(motion),
         )
     return energies
 
 
 def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
-    """Returns the ticks of the fastest site from when every V_i is known to the end of the records, s."""
+    """Returns the ticks of the fastest site from when every V_i is known to the end of the
+    records, s.
+    """
     records = [energy.motion.records for energy in energies.values()]
     times = max(records, key=lambda own: own.rate_hz).t_s
     begin_s = max(energy.begin_s for energy in energies.values())
@@ -171,9 +198,11 @@ def find_common_times(energies: Mapping[str, SiteEnergy]) -> Array:
 
 @dataclass(frozen=True)
 class EnergyBalance:
-    """The functional of a group of sites over time, at the ticks of its fastest; shape (T,) and J by default.
+    """The functional of a group of sites over time, at the ticks of its fastest; shape (T,) and
+    J by default.
 
-    Dissipation, work and transfer count in judged periods alone, from the beginning to the tick.
+    Dissipation, work and transfer count in judged periods alone, from the beginning to the
+    tick.
 
     Attributes:
         t_s: the ticks, s.
@@ -226,21 +255,28 @@ class EnergyBalance:
 
     @property
     def external(self) -> dict[str, Array]:
-        """That work by its sources, of those that did any: hands, walls and stops, shape (T,), J."""
+        """That work by its sources, of those that did any: hands, walls and stops, shape (T,),
+        J.
+        """
         names = [name for name in EXTERNAL_SOURCES if name in self.work]
         return {name: self.work[name] for name in names if self.work[name].any()}
 
     @cached_property
     def scale(self) -> float:
-        """The energy that residuals are compared with: the largest V, or the largest work if more, J."""
+        """The energy that residuals are compared with: the largest V, or the largest work if
+        more, J.
+        """
         return max(float(np.abs(x).max()) for x in (self.V, *self.work.values()))
 
     def _over_judged(self, values: Array) -> Array:
         return _accumulate(np.diff(values), self.judged)
 
 
-def compute_energy_balance(energies: Mapping[str, SiteEnergy], *, ones: bool = False) -> EnergyBalance:
-    """Returns the balance of a group of sites, in scenario order, of which none follows a site outside.
+def compute_energy_balance(
+    energies: Mapping[str, SiteEnergy], *, ones: bool = False
+) -> EnergyBalance:
+    """Returns the balance of a group of sites, in scenario order, of which none follows a site
+    outside.
 
     With `ones` every site weighs the same, as in the paper; then it need not close.
     """
@@ -262,7 +298,9 @@ def compute_energy_balance(energies: Mapping[str, SiteEnergy], *, ones: bool = F
             sums[key] = sums[key] + values if key in sums else values
         columns.append(_resample(times, records.t_s, left))
         sites[site] = _resample(times, records.t_s, left * energy.parts.total)
-        unjudged += np.abs(_resample(times, records.t_s, _accumulate((~energy.judged).astype(np.float64))))
+        unjudged += np.abs(
+            _resample(times, records.t_s, _accumulate((~energy.judged).astype(np.float64)))
+        )
     judged: Bools = np.diff(unjudged) == 0.0
 
     def of_kind(kind: str) -> dict[str, Array]:
@@ -274,23 +312,24 @@ def compute_energy_balance(energies: Mapping[str, SiteEnergy], *, ones: bool = F
         }
 
     return EnergyBalance(
-        times,
-        np.stack(columns, axis=1),
-        sites,
-        {name: sums["parts", name] for name in FunctionalParts._fields},
-        of_kind("dissipation"),
-        of_kind("work"),
-        of_kind("sampling")[""],
-        of_kind("transfer")[""],
-        judged,
+        t_s=times,
+        beta=np.stack(columns, axis=1),
+        sites=sites,
+        parts={name: sums["parts", name] for name in FunctionalParts._fields},
+        dissipation=of_kind("dissipation"),
+        work=of_kind("work"),
+        sampling=of_kind("sampling")[""],
+        transfer=of_kind("transfer")[""],
+        judged=judged,
     )
 
 
 def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str, str], Array]:
     """Returns what a site adds to the balance at its own ticks, by kind and name.
 
-    Its weight is `left` at every tick, shape (K,), and `right` at the end of every period, before a step. A
-    change of the weight itself does work on V_i, booked as `shares`: along a ramp, and at a step.
+    Its weight is `left` at every tick, shape (K,), and `right` at the end of every period,
+    before a step. A change of the weight itself does work on V_i, booked as `shares`: along a
+    ramp, and at a step.
     """
 
     def weigh(one: Increment) -> Array:
@@ -302,7 +341,10 @@ def _weigh_site(energy: SiteEnergy, left: Array, right: Array) -> dict[tuple[str
     weighted |= {("dissipation", name): weigh(one) for name, one in energy.dissipation.items()}
     weighted |= {("work", name): weigh(one) for name, one in energy.work.items()}
     weighted["work", "shares"] = weighted["work", "shares"] + _accumulate(reweighted)
-    return weighted | {("sampling", ""): weigh(energy.sampling), ("transfer", ""): weigh(energy.transfer)}
+    return weighted | {
+        ("sampling", ""): weigh(energy.sampling),
+        ("transfer", ""): weigh(energy.transfer),
+    }
 
 
 def _resample(times: Array, t_s: Array, values: Array) -> Array:
@@ -313,7 +355,9 @@ def _resample(times: Array, t_s: Array, values: Array) -> Array:
 def _trace_weights(
     energies: Mapping[str, SiteEnergy], records: AlignedRecords, *, ones: bool
 ) -> tuple[Array, Array]:
-    """Returns beta at a site's ticks, shape (K, N), and at the ends of its periods, before a step there."""
+    """Returns beta at a site's ticks, shape (K, N), and at the ends of its periods, before a
+    step there.
+    """
     Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
     constant = all(energy.motion.dominance.constant for energy in energies.values())
     solved: dict[bytes, Array] = {}  # by dominance matrix
@@ -333,8 +377,11 @@ def _trace_weights(
     return solve(records.t_s, 0.0), solve(records.t_s[:-1], records.h_s)
 
 
-def _interpolate_dominance(energies: Mapping[str, SiteEnergy], t_s: Array, ahead_s: float = 0.0) -> Array:
-    """Returns the dominance matrix of a group at times, s, shape (T, N, N), without the sites outside of it.
+def _interpolate_dominance(
+    energies: Mapping[str, SiteEnergy], t_s: Array, ahead_s: float = 0.0
+) -> Array:
+    """Returns the dominance matrix of a group at times, s, shape (T, N, N), without the sites
+    outside of it.
 
     A ramp in progress is followed for `ahead_s` more.
     """
@@ -350,7 +397,8 @@ def _interpolate_dominance(energies: Mapping[str, SiteEnergy], t_s: Array, ahead
             if peer in energies:
                 factor = dominance.alpha[row, j] + later_s * dominance.rate[row, j]
                 alpha[:, i, names.index(peer)] = factor
-    return np.clip(alpha, 0.0, 1.0)  # between its last tick and its end a ramp is followed too far
+    # between its last tick and its end a ramp is followed too far
+    return np.clip(alpha, 0.0, 1.0)
 
 
 def find_dominance_matrices(energies: Mapping[str, SiteEnergy]) -> Array:

@@ -1,17 +1,18 @@
 """The corrected functional V_i of a site, and every term that changes it, in J.
 
-Invariant: V_i = 1/2 ( r'M r + (theta_hat - theta)' Gamma^-1 (theta_hat - theta) + e' Lambda Kd e + sum_j
-alpha_ij int qd_j' Kd qd_j ds ), the integral from the stamp of the sample in use to now: the paper's Eq.
-(16) with the integral that its Eq. (22) needs (docs/errata.md). With |x|^2 = x'Kd x, V_i' = -r'Kp r - 1/2
-sum_j alpha_ij |qd_i - qd_j(t - T)|^2 - 1/2 |qd_i|^2 + 1/2 sum_j alpha_ij |qd_j|^2: the first two terms
-dissipate, the last two are transferred between sites and cancel under beta. In task space e and qd_j are
-those of end effectors and r is that of the task (`following`); docs/certificate.md says what else changes.
+Invariant: V_i = 1/2 ( r'M r + (theta_hat - theta)' Gamma^-1 (theta_hat - theta) + e' Lambda Kd
+e + sum_j alpha_ij int qd_j' Kd qd_j ds ), the integral from the stamp of the sample in use to
+now: the paper's Eq. (16) with the integral that its Eq. (22) needs (docs/errata.md). With |x|^2
+= x'Kd x, V_i' = -r'Kp r - 1/2 sum_j alpha_ij |qd_i - qd_j(t - T)|^2 - 1/2 |qd_i|^2 + 1/2 sum_j
+alpha_ij |qd_j|^2: the first two terms dissipate, the last two are transferred between sites and
+cancel under beta. In task space e and qd_j are those of end effectors and r is that of the task
+(`following`); docs/certificate.md says what else changes.
 
-Within a sample period a term is a trapezoid, with an error of second order in the period, followed by an
-exact jump at its end; a jump of e is divided among links, changes of dominance and the rule for stale
-peers. Operator and environment do work on r = qd + Lambda e, not on qd: the theorem requires passivity
-with respect to r. A site has a functional if its control law is the paper's and theta of its arm is
-known.
+Within a sample period a term is a trapezoid, with an error of second order in the period,
+followed by an exact jump at its end; a jump of e is divided among links, changes of dominance
+and the rule for stale peers. Operator and environment do work on r = qd + Lambda e, not on qd:
+the theorem requires passivity with respect to r. A site has a functional if its control law is
+the paper's and theta of its arm is known.
 """
 
 from collections.abc import Mapping
@@ -41,14 +42,15 @@ class SiteConstants(NamedTuple):
     """Constants of a site; vectors per joint have shape (n,), per parameter (P,).
 
     Attributes:
-        arm: the arm, of true parameters.
-        Lambda, Kp, Kd: gains, 1/s and N m s/rad; in task space Lambda and Kd (N s/m) have shape (m,).
+        arm: the arm, of true parameters. Lambda, Kp, Kd: gains, 1/s and N m s/rad; in task
+        space Lambda and Kd (N s/m) have shape (m,).
         Gamma: adaptation gain.
         low, high: limits of the estimates.
         tau_limit: largest torque of a joint, N m, shape () or (n,).
-        axes: per coordinate of the task 1 if the site follows along it, else 0, and Lambda and Kd are 0;
-            () in joint space.
-        rho, width: largest robust torque of each joint, N m, and the r at which it is 0.71 of that, rad/s.
+        axes: per coordinate of the task 1 if the site follows along it, else 0, and Lambda and
+            Kd are 0; () in joint space.
+        rho, width: largest robust torque of each joint, N m, and the r at which it is 0.71 of
+        that, rad/s.
         friction: share of the joints' friction that the law compensates.
         tau_rate: largest rate of the torque of a joint, N m/s, shape () or (n,).
     """
@@ -74,7 +76,9 @@ class SiteConstants(NamedTuple):
 
     @property
     def weighing_Kd(self) -> Array:  # noqa: N802 - the paper's symbol
-        """Kd as the weights of V see it: NaN along an axis that the site does not follow, shape (m,)."""
+        """Kd as the weights of V see it: NaN along an axis that the site does not follow, shape
+        (m,).
+        """
         return np.where(np.array(self.axes) == 0.0, np.nan, self.Kd) if self.axes else self.Kd
 
     def robust_torque(self, r: Array) -> Array:
@@ -83,8 +87,12 @@ class SiteConstants(NamedTuple):
 
     @property
     def unknown_friction(self) -> Array:
-        """The share of friction that the law does not compensate, of joints that have any, shape (n,)."""
-        share: Array = (1.0 - self.friction) * (self.arm.friction(np.ones((1, len(self.Kp))))[0] != 0.0)
+        """The share of friction that the law does not compensate, of joints that have any,
+        shape (n,).
+        """
+        share: Array = (1.0 - self.friction) * (
+            self.arm.friction(np.ones((1, len(self.Kp))))[0] != 0.0
+        )
         return share
 
     @property
@@ -113,12 +121,13 @@ def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
 
 
 class PeriodEnds(NamedTuple):
-    """The ends of every period, shape (K - 1, n); `right` is before the jump, `middle` half-way through it.
+    """The ends of every period, shape (K - 1, n); `right` is before the jump, `middle` half-way
+    through it.
 
     Attributes:
         following: True if the site followed its peers at both ends, shape (K - 1,).
-        link: per peer the jump of e by the age of its sample, shape (peers, K - 1, n), rad; in task space, as
-            all of e, (peers, K - 1, m), m.
+        link: per peer the jump of e by the age of its sample, shape (peers, K - 1, n), rad; in
+            task space, as all of e, (peers, K - 1, m), m.
         dominance: the jump of e by a step of dominance factors, rad.
         rule: the jump of e by the rule for stale peers, rad.
         r_left, r_right, r_middle: r = qd + Lambda e, rad/s.
@@ -140,13 +149,16 @@ class PeriodEnds(NamedTuple):
 
 @dataclass(frozen=True)
 class SiteMotion:
-    """Motion of a site and all that acts on it, over K rows: what its energies are computed from.
+    """Motion of a site and all that acts on it, over K rows: what its energies are computed
+    from.
 
     Attributes:
-        dominance, peers: its factors for its peers, and these as the site sees them, in the same order.
+        dominance, peers: its factors for its peers, and these as the site sees them, in the
+        same order.
         torque: ON its arm.
         scheme: whether it holds tau_k, or extrapolates the torque.
-        common: per coordinate 1 if all sites follow along it, else 0; () if they follow along all.
+        common: per coordinate 1 if all sites follow along it, else 0; () if they follow along
+            all.
     """
 
     records: AlignedRecords
@@ -166,32 +178,47 @@ class SiteMotion:
 
     @cached_property
     def r(self) -> Array:
-        """The sliding variable qd + Lambda e, Eq. (10), shape (K, n), rad/s; in task space qd - v."""
-        return self.records.qd - self.follows.reference(slice(None), self.records.e, self.records.ed)[0]
+        """The sliding variable qd + Lambda e, Eq. (10), shape (K, n), rad/s; in task space qd -
+        v.
+        """
+        return (
+            self.records.qd
+            - self.follows.reference(slice(None), self.records.e, self.records.ed)[0]
+        )
 
     @cached_property
     def Yr(self) -> Array:  # noqa: N802 - the paper's symbol
         """Y'r of Eq. (15), shape (K, P)."""
         at = self.records
         v, a = self.follows.reference(slice(None), at.e, at.ed)
-        return self.constants.arm.gradient(at.q, at.qd, v, a, self.r)
+        return self.constants.arm.gradient(q=at.q, qd=at.qd, v=v, a=a, r=self.r)
 
     @cached_property
     def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
         """Y'r with which the scheme advances the estimate over a period, shape (K - 1, P)."""
-        return self.Yr[:-1] if self.scheme is Scheme.DIGITAL else 0.5 * (self.Yr[:-1] + self.Yr[1:])
+        return (
+            self.Yr[:-1]
+            if self.scheme is Scheme.DIGITAL
+            else 0.5 * (self.Yr[:-1] + self.Yr[1:])
+        )
 
     def law_torque(self, rows: Ints) -> Array:
         """Returns tau of Eq. (13), without its limit, in some rows, shape (K, n), N m."""
-        return self.control_torque(rows, self.records.e[rows], self.records.ed[rows], self.r[rows])
+        return self.control_torque(
+            rows, self.records.e[rows], self.records.ed[rows], self.r[rows]
+        )
 
     def control_torque(self, rows: Ints, e: Array, ed: Array, r: Array) -> Array:
-        """Returns tau of Eq. (13) with these errors in place of the recorded ones, without its limit."""
+        """Returns tau of Eq. (13) with these errors in place of the recorded ones, without its
+        limit.
+        """
         at = self.records
         c = self.constants
         v, a = self.follows.reference(rows, e, ed)
         model = c.arm.law_torque(at.theta_hat[rows], at.q[rows], at.qd[rows], v, a)
-        found: Array = model - c.Kp * r - self.follows.push(rows, c.Kd * ed) - c.robust_torque(r)
+        found: Array = (
+            model - c.Kp * r - self.follows.push(rows, c.Kd * ed) - c.robust_torque(r)
+        )
         return found - (1.0 - c.friction) * c.arm.friction(v)
 
     @property
@@ -202,13 +229,16 @@ class SiteMotion:
 
     @cached_property
     def nearest_torques(self) -> tuple[Array, Array]:
-        """The least and the largest torque that a row may have, by its limit and its rate, (K, n), N m."""
+        """The least and the largest torque that a row may have, by its limit and its rate, (K,
+        n), N m.
+        """
         at = self.records
         c = self.constants
         low = np.broadcast_to(-c.tau_limit, at.tau.shape).copy()
         high = -low
         if np.any(np.isfinite(c.tau_rate)):
-            before = np.vstack([np.zeros(at.tau.shape[1]), at.tau[:-1]])  # the first tick has none before it
+            # the first tick has none before it
+            before = np.vstack([np.zeros(at.tau.shape[1]), at.tau[:-1]])
             most = np.broadcast_to(at.h_s * c.tau_rate, at.tau.shape).copy()
             most[0] = most[0] if at.first == 0 else np.inf
             low = np.maximum(low, before - most)
@@ -217,7 +247,9 @@ class SiteMotion:
 
     @cached_property
     def cut(self) -> Bools:
-        """True for each torque at its limit, or as far from the one before as it may be, shape (K, n)."""
+        """True for each torque at its limit, or as far from the one before as it may be, shape
+        (K, n).
+        """
         low, high = self.nearest_torques
         c = self.constants
         tau = self.records.tau
@@ -229,8 +261,9 @@ class SiteMotion:
     def ends(self) -> PeriodEnds:
         """The ends of its periods.
 
-        While the site follows its peers, the smooth course of its reference is Eq. (6) with every stamp
-        moving at rate one. Otherwise the rule decides: the trapezoid rule on the recorded derivative.
+        While the site follows its peers, the smooth course of its reference is Eq. (6) with
+        every stamp moving at rate one. Otherwise the rule decides: the trapezoid rule on the
+        recorded derivative.
         """
         at = self.records
         views = list(self.peers.values())
@@ -238,7 +271,9 @@ class SiteMotion:
         following = at.follows[:-1] & at.follows[1:]
         here = following[:, np.newaxis]
         left = at.follows[:-1, np.newaxis]
-        before, after, rate = (x[:, :, np.newaxis] for x in (alpha.before, alpha.alpha[1:], alpha.rate[:-1]))
+        before, after, rate = (
+            x[:, :, np.newaxis] for x in (alpha.before, alpha.alpha[1:], alpha.rate[:-1])
+        )
         kept_q = np.sum([before[:, j] * v.kept.q for j, v in enumerate(views)], axis=0)
         rates = [before[:, j] * v.kept.qd + rate[:, j] * v.kept.q for j, v in enumerate(views)]
         qd_des_left = at.qd_des[:-1]
@@ -266,7 +301,9 @@ class SiteMotion:
 
 
 class FunctionalParts(NamedTuple):
-    """V_i of a site by its four parts in the order of the module's docstring, each of shape (K,), J."""
+    """V_i of a site by its four parts in the order of the module's docstring, each of shape
+    (K,), J.
+    """
 
     kinetic: Array
     parameter: Array
@@ -290,17 +327,23 @@ def evaluate_functional(site: SiteMotion) -> FunctionalParts:
         kinetic=0.5 * (r * c.arm.multiply_inertia(at.q, r)).sum(axis=1),
         parameter=0.5 * (off**2 / c.Gamma[c.adapts]).sum(axis=1),
         position=0.5 * (c.Lambda * c.Kd * at.e**2).sum(axis=1),
-        delay=np.sum([a * x for a, x in zip(site.dominance.alpha.T, in_transit, strict=True)], axis=0),
+        delay=np.sum(
+            [a * x for a, x in zip(site.dominance.alpha.T, in_transit, strict=True)], axis=0
+        ),
     )
 
 
 def _energy_in_transit(c: SiteConstants, view: DelayedPeer) -> Array:
-    """Returns 1/2 int qd_j' Kd qd_j ds from the stamp of the sample in use to now, shape (K,), J."""
+    """Returns 1/2 int qd_j' Kd qd_j ds from the stamp of the sample in use to now, shape (K,),
+    J.
+    """
     return 0.5 * ((view.now.squares - view.seen.squares) @ c.Kd)
 
 
 class Increment(NamedTuple):
-    """An amount of energy per period, shape (K - 1,), J: the two ends of a trapezoid, and a jump after it."""
+    """An amount of energy per period, shape (K - 1,), J: the two ends of a trapezoid, and a
+    jump after it.
+    """
 
     left: Array
     right: Array
@@ -312,9 +355,13 @@ class Increment(NamedTuple):
         return self.left + self.right + self.jump
 
 
-def _trapezoid(site: SiteMotion, left: Array, right: Array, jump: Array | None = None) -> Increment:
+def _trapezoid(
+    site: SiteMotion, left: Array, right: Array, jump: Array | None = None
+) -> Increment:
     half_s = 0.5 * site.records.h_s
-    return Increment(half_s * left, half_s * right, np.zeros(len(left)) if jump is None else jump)
+    return Increment(
+        half_s * left, half_s * right, np.zeros(len(left)) if jump is None else jump
+    )
 
 
 def _jump(amount: Array) -> Increment:
@@ -328,8 +375,8 @@ def _nothing(site: SiteMotion) -> Increment:
 def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     """Returns what a site dissipates: r'Kp r, and 1/2 sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2.
 
-    And r'(friction(qd) - friction(qd - r)) of joints with friction; r times a robust torque; and along axes
-    that not all sites follow what they do not give back to each other.
+    And r'(friction(qd) - friction(qd - r)) of joints with friction; r times a robust torque;
+    and along axes that not all sites follow what they do not give back to each other.
     """
     at = site.records
     c = site.constants
@@ -340,8 +387,13 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     for j, view in enumerate(site.peers.values()):
         left = left + 0.5 * alpha.alpha[:-1, j] * _norm(c, rate[:-1] - view.seen.qd[:-1])
         right = right + 0.5 * alpha.before[:, j] * _norm(c, rate[1:] - view.kept.qd)
-    damping = ((r * (c.Kp * r + c.robust_torque(r))).sum(axis=1) for r in (ends.r_left, ends.r_right))
-    found = {"damping": _trapezoid(site, *damping), "disagreement": _trapezoid(site, left, right)}
+    damping = (
+        (r * (c.Kp * r + c.robust_torque(r))).sum(axis=1) for r in (ends.r_left, ends.r_right)
+    )
+    found = {
+        "damping": _trapezoid(site, *damping),
+        "disagreement": _trapezoid(site, left, right),
+    }
     if not all(site.common):
         found["open axes"] = compute_transfer(site, 1.0 - np.array(site.common))
     friction = [
@@ -352,7 +404,8 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
 
 
 def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
-    """Returns int 1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2: what a site gives to those that follow it.
+    """Returns int 1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2: what a site gives to those that
+    follow it.
 
     That is along the axes of weight 1, and not along those of weight 0.
     """
@@ -381,39 +434,53 @@ def compute_work(site: SiteMotion) -> dict[str, Increment]:
         "hands": torque_work(site, torque.operator_now, torque.operator_held),
         "walls": torque_work(site, torque.environment_now, torque.environment_held),
         **({"stops": torque_work(site, stops, np.zeros_like(stops))} if stops.any() else {}),
-        **{f"{peer}->{site.records.site}": link_work(site, j) for j, peer in enumerate(site.peers)},
+        **{
+            f"{peer}->{site.records.site}": link_work(site, j)
+            for j, peer in enumerate(site.peers)
+        },
         "shares": dominance_change_work(site),
         "rule": stale_rule_work(site),
         "torque limit": torque_limit_work(site),
         "estimates": estimate_work(site),
-        **({"friction": unknown_friction_work(site)} if site.constants.unknown_friction.any() else {}),
+        **(
+            {"friction": unknown_friction_work(site)}
+            if site.constants.unknown_friction.any()
+            else {}
+        ),
         **({"singular poses": singular_pose_work(site)} if site.constants.axes else {}),
     }
 
 
 def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
-    """Returns the work int r' tau_h of a torque ON the arm, one of the present and one held, (K, n), N m."""
+    """Returns the work int r' tau_h of a torque ON the arm, one of the present and one held,
+    (K, n), N m.
+    """
     left = (site.ends.r_left * (now[:-1] + held[:-1])).sum(axis=1)
     return _trapezoid(site, left, (site.ends.r_right * (now[1:] + held[:-1])).sum(axis=1))
 
 
 def link_work(site: SiteMotion, j: int) -> Increment:
-    """Returns the work of the link from peer j: the exact change of V where the age of its sample changes.
+    """Returns the work of the link from peer j: the exact change of V where the age of its
+    sample changes.
 
-    With s' in place of s + h at the end of a period: (Lambda M r + Lambda Kd e)' de, with r and e half-way
-    through the jump and de what this link adds to it, less 1/2 alpha_ij int qd_j' Kd qd_j ds from s + h to
-    s'. For an age that varies smoothly this is the integral of the theorem's missing term with dT/dt.
+    With s' in place of s + h at the end of a period: (Lambda M r + Lambda Kd e)' de, with r and
+    e half-way through the jump and de what this link adds to it, less 1/2 alpha_ij int qd_j' Kd
+    qd_j ds from s + h to s'. For an age that varies smoothly this is the integral of the
+    theorem's missing term with dT/dt.
     """
     view = list(site.peers.values())[j]
     stored = 0.5 * (view.kept.squares - view.seen.squares[1:]) @ site.constants.Kd
-    return _jump(_energy_of_jump(site, site.ends.link[j]) + site.dominance.before[:, j] * stored)
+    return _jump(
+        _energy_of_jump(site, site.ends.link[j]) + site.dominance.before[:, j] * stored
+    )
 
 
 def dominance_change_work(site: SiteMotion) -> Increment:
-    """Returns the work of a change of dominance, without that of beta: what a ramp or a step adds to V_i.
+    """Returns the work of a change of dominance, without that of beta: what a ramp or a step
+    adds to V_i.
 
-    1/2 sum_j alpha_ij' int qd_j' Kd qd_j ds + qd_i' Kd sum_j alpha_ij' q_j(t - T_ij): the second because ed,
-    and with it the damping, contains the ramp.
+    1/2 sum_j alpha_ij' int qd_j' Kd qd_j ds + qd_i' Kd sum_j alpha_ij' q_j(t - T_ij): the
+    second because ed, and with it the damping, contains the ramp.
     """
     at = site.records
     c = site.constants
@@ -429,7 +496,9 @@ def dominance_change_work(site: SiteMotion) -> Increment:
         kept = 0.5 * (view.now.squares[1:] - view.kept.squares) @ c.Kd
         followed_rate = np.where(ends.following, rate, 0.0)
         left = left + rate * stored[:-1]
-        left = left + followed_rate * (at.shared_rate[:-1] * c.Kd * view.seen.q[:-1]).sum(axis=1)
+        left = left + followed_rate * (at.shared_rate[:-1] * c.Kd * view.seen.q[:-1]).sum(
+            axis=1
+        )
         right = right + rate * kept
         right = right + followed_rate * (at.shared_rate[1:] * c.Kd * view.kept.q).sum(axis=1)
         jump = jump + (alpha.alpha[1:, j] - alpha.before[:, j]) * stored[1:]
@@ -437,7 +506,9 @@ def dominance_change_work(site: SiteMotion) -> Increment:
 
 
 def stale_rule_work(site: SiteMotion) -> Increment:
-    """Returns the work of the rule for stale peers: all that moves the reference while it is not Eq. (6)."""
+    """Returns the work of the rule for stale peers: all that moves the reference while it is
+    not Eq. (6).
+    """
     at = site.records
     alpha = site.dominance
     ends = site.ends
@@ -451,12 +522,15 @@ def stale_rule_work(site: SiteMotion) -> Increment:
     left = (rate[:-1] * site.constants.Kd * (ends.qd_des_left - seen)).sum(axis=1)
     right = (rate[1:] * site.constants.Kd * (ends.qd_des_right - kept)).sum(axis=1)
     return _trapezoid(
-        site, *(np.where(ruled, x, 0.0) for x in (left, right, _energy_of_jump(site, ends.rule)))
+        site,
+        *(np.where(ruled, x, 0.0) for x in (left, right, _energy_of_jump(site, ends.rule))),
     )
 
 
 def torque_limit_work(site: SiteMotion) -> Increment:
-    """Returns the work of what limits, or a rest, kept from the arm: int r' (tau - tau of Eq. (13))."""
+    """Returns the work of what limits, or a rest, kept from the arm: int r' (tau - tau of Eq.
+    (13)).
+    """
     at = site.records
     cut = np.flatnonzero(site.cut.any(axis=1) | site.rests)
     power = np.zeros(len(at.known))
@@ -466,7 +540,9 @@ def torque_limit_work(site: SiteMotion) -> Increment:
 
 
 def unknown_friction_work(site: SiteMotion) -> Increment:
-    """Returns the work -int r' friction(v) of the share of friction that the law does not compensate."""
+    """Returns the work -int r' friction(v) of the share of friction that the law does not
+    compensate.
+    """
     at = site.records
     c = site.constants
     ends = site.ends
@@ -478,7 +554,8 @@ def unknown_friction_work(site: SiteMotion) -> Increment:
 
 
 def singular_pose_work(site: SiteMotion) -> Increment:
-    """Returns the work of the damping near singular poses: int r'M(a - v') - (J r - x' - Lambda e)'Kd ed.
+    """Returns the work of the damping near singular poses: int r'M(a - v') - (J r - x' - Lambda
+    e)'Kd ed.
 
     Both are zero where J J+ = I.
     """
@@ -500,7 +577,8 @@ def singular_pose_work(site: SiteMotion) -> Increment:
 
 
 def measure_torque_error(site: SiteMotion) -> Array:
-    """Returns by how much recorded torques differ from Eq. (13) within its limits, shape (K,), N m.
+    """Returns by how much recorded torques differ from Eq. (13) within its limits, shape (K,),
+    N m.
 
     The largest of all joints; 0 where there is no record, or where the site rests.
     """
@@ -511,20 +589,27 @@ def measure_torque_error(site: SiteMotion) -> Array:
 
 
 def estimate_work(site: SiteMotion) -> Increment:
-    """Returns the work of estimates that do not follow Eq. (15): held in their box, fixed, or at rest.
+    """Returns the work of estimates that do not follow Eq. (15): held in their box, fixed, or
+    at rest.
 
-    The box lessens 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta) where it holds the truth; a
-    parameter that is not adapted leaves r' Y (theta_hat - theta) without its counterpart.
+    The box lessens 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta) where it holds the
+    truth; a parameter that is not adapted leaves r' Y (theta_hat - theta) without its
+    counterpart.
     """
     at = site.records
     c = site.constants
     off = at.theta_hat - c.theta
     still = np.concatenate([[False], (np.diff(off, axis=0) == 0.0).all(axis=1)]) & site.rests
-    at_edge = ((at.theta_hat <= c.low) | (at.theta_hat >= c.high))[1:] & c.adapts & ~still[1:, np.newaxis]
+    at_edge = (
+        ((at.theta_hat <= c.low) | (at.theta_hat >= c.high))[1:]
+        & c.adapts
+        & ~still[1:, np.newaxis]
+    )
     wrong = (off != 0.0) & (~c.adapts | still[:, np.newaxis])
     if not (at_edge.any() or wrong.any()):
         return _nothing(site)
-    held = np.diff(off, axis=0) + at.h_s * c.Gamma * site.mean_Yr  # what the box kept the estimate from
+    # what the box kept the estimate from
+    held = np.diff(off, axis=0) + at.h_s * c.Gamma * site.mean_Yr
     with np.errstate(divide="ignore", invalid="ignore"):
         amount = np.where(at_edge, 0.5 * (off[:-1] + off[1:]) * held / c.Gamma, 0.0).sum(axis=1)
     power = np.where(wrong, site.Yr * off, 0.0).sum(axis=1)
@@ -532,11 +617,13 @@ def estimate_work(site: SiteMotion) -> Increment:
 
 
 def compute_sampling_work(site: SiteMotion) -> Increment:
-    """Returns the work of the scheme: of the torque that is held in place of Eq. (13), of its step of (15).
+    """Returns the work of the scheme: of the torque that is held in place of Eq. (13), of its
+    step of (15).
 
-    int r' (u - tau), with u = tau_k of `digital` or the extrapolated one of `second_order`, and tau straight
-    to its value before the jump; and the scheme's step of the estimate in place of the trapezoid rule up to
-    there. It is no part of the balance: what that leaves without this is unexplained.
+    int r' (u - tau), with u = tau_k of `digital` or the extrapolated one of `second_order`, and
+    tau straight to its value before the jump; and the scheme's step of the estimate in place of
+    the trapezoid rule up to there. It is no part of the balance: what that leaves without this
+    is unexplained.
     """
     at = site.records
     c = site.constants
@@ -564,17 +651,20 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     r = ends.r_right[rows]
     later = rows + 1
     v, a = site.follows.reference(later, e, ed)
-    Yr[rows] = c.arm.gradient(at.q[later], at.qd[later], v, a, r)
+    Yr[rows] = c.arm.gradient(q=at.q[later], qd=at.qd[later], v=v, a=a, r=r)
     found = np.clip(site.control_torque(later, e, ed, r), -c.tau_limit, c.tau_limit)
     bound = site.rests | (site.cut.any(axis=1) & np.any(np.isfinite(c.tau_rate)))
-    tau[rows] = np.where(bound[later, np.newaxis], tau[rows], found)  # then no jump of e moves it
+    # then no jump of e moves it
+    tau[rows] = np.where(bound[later, np.newaxis], tau[rows], found)
     return tau, Yr
 
 
 def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
-    """Returns the exact part that `de` has in the change of 1/2 (r'M r + e' Lambda Kd e), shape (K - 1,), J.
+    """Returns the exact part that `de` has in the change of 1/2 (r'M r + e' Lambda Kd e), shape
+    (K - 1,), J.
 
-    Both are quadratic in e, so that the gradient half-way through the whole jump gives it, linear in `de`.
+    Both are quadratic in e, so that the gradient half-way through the whole jump gives it,
+    linear in `de`.
     """
     c = site.constants
     ends = site.ends

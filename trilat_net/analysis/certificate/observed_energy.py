@@ -1,8 +1,10 @@
-"""ObservedEnergy of laws that declare what proves it: energy of lines, observers and tanks, from the records.
+"""ObservedEnergy of laws that declare what proves it: energy of lines, observers and tanks,
+from the records.
 
-Invariant: a law that declares energies is believed in nothing else. A line is what a site gave less what its
-peer took; the arm's port is the torque that was held times the step of the joints. Lines and stores are
-never below zero, and what a law has taken for good never falls, or the certificate says where.
+Invariant: a law that declares energies is believed in nothing else. A line is what a site gave
+less what its peer took; the arm's port is the torque that was held times the step of the
+joints. Lines and stores are never below zero, and what a law has taken for good never falls, or
+the certificate says where.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,7 +45,8 @@ class EnergyCurve(NamedTuple):
     """An energy over time.
 
     Attributes:
-        kind: "line" from a peer to a site, "known" there of a peer, "store" of, "taken" by or "given" by it.
+        kind: "line" from a peer to a site, "known" there of a peer, "store" of, "taken" by or
+            "given" by it.
         site: whose it is.
         peer: the other end; "" of what has none.
         t_s: of the site's ticks, s.
@@ -103,9 +106,16 @@ class ObservedEnergy(NamedTuple):
 
     def to_json(self) -> JsonObject:
         """Returns it ready for JSON."""
-        premises, least = ([one._asdict() for one in rows] for rows in (self.premises, self.least))
+        premises, least = (
+            [one._asdict() for one in rows] for rows in (self.premises, self.least)
+        )
         plain = {key: value for key, value in self._asdict().items() if key != "curves"}
-        return {**plain, "finding": self.finding.name.lower(), "premises": premises, "least": least}
+        return {
+            **plain,
+            "finding": self.finding.name.lower(),
+            "premises": premises,
+            "least": least,
+        }
 
 
 class _SiteBooks(NamedTuple):
@@ -129,7 +139,8 @@ class _SiteBooks(NamedTuple):
 
 
 def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | None:
-    """Returns the verdict on the energies that the laws of a log declare; None if none declares any.
+    """Returns the verdict on the energies that the laws of a log declare; None if none declares
+    any.
 
     A law from outside is asked with `own_laws` alone, since that runs its code.
 
@@ -146,11 +157,17 @@ def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | No
     if not laws:
         return None
     silent = [name for name in log.sites if name not in laws]
-    gaps = [name for name in log.sites if not len(log[name]) or log[name].missing or log[name].tick[0]]
+    gaps = [
+        name
+        for name in log.sites
+        if not len(log[name]) or log[name].missing or log[name].tick[0]
+    ]
     if silent or gaps:
         why = f"the law of {', '.join(silent)} declares none"
         why = why if silent else f"records of {', '.join(gaps)} are missing"
-        return ObservedEnergy(ObservedFinding.NOT_JUDGED, f"{ObservedFinding.NOT_JUDGED}: {why}")
+        return ObservedEnergy(
+            ObservedFinding.NOT_JUDGED, f"{ObservedFinding.NOT_JUDGED}: {why}"
+        )
     return _judge(log, {name: _read_books(log, name, law) for name, law in laws.items()})
 
 
@@ -174,7 +191,9 @@ def _read_books(log: Log, name: str, law: Any) -> _SiteBooks:
     left -= left[0]
     taken = left if booked.taken is None else booked.taken - booked.taken[0]
     t_s = part.t_s[:count]
-    return _SiteBooks(t_s, booked, port, taken, left - taken, port - given)
+    return _SiteBooks(
+        t_s=t_s, booked=booked, port=port, taken=taken, residual=left - taken, leak=port - given
+    )
 
 
 def _add_parts(energy: Array) -> Array:
@@ -204,7 +223,11 @@ def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
             for key, values in heard.items()
             if "[" not in key
         }
-        alone = {key.partition("[")[0]: values for key, values in sent.items() if key.endswith(f"[{peer}]")}
+        alone = {
+            key.partition("[")[0]: values
+            for key, values in sent.items()
+            if key.endswith(f"[{peer}]")
+        }
         peers.append(PeerRecords(tick, received, alone))
     to_all = {key: values for key, values in sent.items() if "[" not in key}
     motion = (part.q[:count], part.qd[:count], part.tau[:count], part.tau_x[:count])
@@ -218,7 +241,8 @@ def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCu
         energies = []
         if booked.store is not None:
             energies.append(("store", "", booked.store))
-        for j, peer in enumerate(log[site].peers):  # what the peer had given by each tick of this site
+        # what the peer had given by each tick of this site
+        for j, peer in enumerate(log[site].peers):
             other = books[peer]
             gave = other.booked.gave[log[peer].peers.index(site)]
             row = np.searchsorted(other.t_s, own.t_s + 1e-9, side="right") - 1
@@ -227,9 +251,18 @@ def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCu
                 energies.append(("known", peer, booked.observed[j]))
         for kind, peer, energy in energies:
             least = energy.reshape(len(energy), -1).min(axis=1)
-            yield EnergyCurve(kind, site, peer, own.t_s, _add_parts(energy), least)
+            yield EnergyCurve(
+                kind=kind,
+                site=site,
+                peer=peer,
+                t_s=own.t_s,
+                energy_j=_add_parts(energy),
+                least_j=least,
+            )
         falls = own.taken - np.maximum.accumulate(own.taken)
-        yield EnergyCurve("taken", site, "", own.t_s, own.taken, falls)
+        yield EnergyCurve(
+            kind="taken", site=site, peer="", t_s=own.t_s, energy_j=own.taken, least_j=falls
+        )
 
 
 def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
@@ -239,7 +272,12 @@ def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
         low = int(one.least_j.argmin())
         least.append(LeastEnergy(one.name, float(one.least_j[low]), float(one.t_s[low])))
     largest = max(float(one.energy_j.max()) for one in curves)
-    curves += [EnergyCurve("given", site, "", one.t_s, one.port, one.port) for site, one in books.items()]
+    curves += [
+        EnergyCurve(
+            kind="given", site=site, peer="", t_s=one.t_s, energy_j=one.port, least_j=one.port
+        )
+        for site, one in books.items()
+    ]
     scale = max(largest, *(float(np.abs(own.port).max()) for own in books.values()))
     residual = max(float(np.abs(own.residual).max()) for own in books.values())
     sampling = max(float(own.leak.max()) for own in books.values())
@@ -271,9 +309,15 @@ def _check_premises(log: Log, books: Mapping[str, _SiteBooks], scale: float) -> 
     most = SAMPLING_SHARE * scale + 1e-9
     missed = [name for name in cut if leak[name] > most]
     text = f"cut off at {', '.join(missed or cut)}" if cut else "never cut off"
-    text += ": the arm got another one than the law books" if missed else ", and booked so" * bool(cut)
+    text += (
+        ": the arm got another one than the law books"
+        if missed
+        else ", and booked so" * bool(cut)
+    )
     premises.append(Premise("torque", not missed, text))
     site = max(leak, key=leak.__getitem__)
-    text = f"the arm of {site} got up to {leak[site]:.3g} J more than its law books, between ticks"
+    text = (
+        f"the arm of {site} got up to {leak[site]:.3g} J more than its law books, between ticks"
+    )
     premises.append(Premise("sampling", leak[site] <= most, text))
     return premises

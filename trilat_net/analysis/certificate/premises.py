@@ -1,11 +1,12 @@
-"""What a certificate rests on: the theorem's premises, checked one by one against a log, and its records.
+"""What a certificate rests on: the theorem's premises, checked one by one against a log, and
+its records.
 
-Invariant: what is missing never counts as stable. Too little of the run or of the periods of V, and sites
-that a rerun took over as recorded, leave a run open; a log that was changed passes nothing. A premise holds,
-fails, or cannot be decided; each states its evidence. The theorem is the paper's with the weights and the
-repaired proof of docs/errata.md: constant delays, constant dominance factors under which every site reaches
-every other, one Kd up to a scalar per site, the adaptive law, and no operator or operators that are passive
-with respect to r.
+Invariant: what is missing never counts as stable. Too little of the run or of the periods of V,
+and sites that a rerun took over as recorded, leave a run open; a log that was changed passes
+nothing. A premise holds, fails, or cannot be decided; each states its evidence. The theorem is
+the paper's with the weights and the repaired proof of docs/errata.md: constant delays, constant
+dominance factors under which every site reaches every other, one Kd up to a scalar per site,
+the adaptive law, and no operator or operators that are passive with respect to r.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,12 @@ from ...log.session_check import judge_integrity
 from ...net.messages import HALTED_MODES
 from ...scenario import Scenario
 from ..aligned import Bools, find_unlimited
-from ..dominance_history import compute_lyapunov_weights, find_closed_groups, find_kd_scales, list_losses
+from ..dominance_history import (
+    compute_lyapunov_weights,
+    find_closed_groups,
+    find_kd_scales,
+    list_losses,
+)
 from ..following import TaskFollowing
 from ..timeline import find_mode_intervals, recorded_end_s
 from ..torque_sources import find_wall_energies, list_sampled_walls
@@ -39,22 +45,27 @@ from .energy_terms import SiteConstants, derive_site_constants
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
 """Ages that differ by no more are one: stamps are whole nanoseconds."""
 SAMPLING_RISE_SHARE = 1e-4
-"""Rises up to this share of the scale are attributed to sampling if the residual is as large."""
+"""Rises up to this share of the scale are attributed to sampling if the residual is as large.
+"""
 MIN_FREE_S = 1.0
-"""The least free motion at the end of a run of which the theorem speaks, s; and so many times the largest age
-of a sample in use:"""
+"""The least free motion at the end of a run of which the theorem speaks, s; and so many times
+the largest age of a sample in use:
+"""
 MIN_FREE_AGES = 5.0
 LEAST_ABSENCE_S = 0.1
 """Sites end within that time of each other; a stretch that is shorter is none."""
 LEAST_SPEED_M_S = 1e-9
-"""What rounding may leave of the speed along an axis along which an end effector cannot move."""
+"""What rounding may leave of the speed along an axis along which an end effector cannot move.
+"""
 MAX_LISTED_NAMES = 4
 """Links or sites that a sentence names."""
 
 
 NO_COMMON_TIME = "there is no time of which every site has records"
 NO_PERIOD = "there is no period of which all records are there"
-_OF_ORIENTATIONS = "it follows orientations, whose ed is no derivative of e, so that V has terms of no sign"
+_OF_ORIENTATIONS = (
+    "it follows orientations, whose ed is no derivative of e, so that V has terms of no sign"
+)
 
 
 class Premise(NamedTuple):
@@ -75,9 +86,13 @@ def explain_no_functional(scenario: Scenario) -> str:
     lacking: dict[str, list[str]] = {}
     for site, spec in scenario.sites.items():
         if not spec.arm.known:
-            lacking.setdefault("nobody knows the arm's theta, and V is made of it", []).append(site)
+            lacking.setdefault("nobody knows the arm's theta, and V is made of it", []).append(
+                site
+            )
         elif not spec.control.has_functional:
-            lacking.setdefault(f"law {spec.control.tag}, for which there is no such V", []).append(site)
+            lacking.setdefault(
+                f"law {spec.control.tag}, for which there is no such V", []
+            ).append(site)
         elif spec.task.space == "pose":
             lacking.setdefault(_OF_ORIENTATIONS, []).append(site)
     return "; ".join(f"{', '.join(names)}: {reason}" for reason, names in lacking.items())
@@ -97,7 +112,8 @@ class FunctionalFacts(NamedTuple):
     Attributes:
         log: of the run.
         energies, balance: of every site, and of all together.
-        groups: the closed groups for which there is at some time no unique beta; () if there is one.
+        groups: the closed groups for which there is at some time no unique beta; () if there is
+            one.
         absent: when sites were away.
         unjudged: the times between which records are missing though all sites were there, s.
         tolerance: the size that a rise of V must exceed, J.
@@ -153,13 +169,25 @@ def gather_facts(log: Log) -> RunFacts:
     ]
     sampled = min(float(np.ptp(balance.residual)), SAMPLING_RISE_SHARE * balance.scale)
     tolerance = float(np.ptp(balance.unexplained)) + sampled + ZERO_ENERGY_J
-    known = FunctionalFacts(log, energies, balance, named, absent, there, tolerance)
+    known = FunctionalFacts(
+        log=log,
+        energies=energies,
+        balance=balance,
+        groups=named,
+        absent=absent,
+        unjudged=there,
+        tolerance=tolerance,
+    )
     return RunFacts(log, constants, known)
 
 
 def check_premises(run: RunFacts) -> list[Premise]:
-    """Returns the premises of the theorem, and that on sampled walls: what each check finds, in order."""
-    law = "adaptive at every site, of arms whose theta is known" if run.constants else run.unknown
+    """Returns the premises of the theorem, and that on sampled walls: what each check finds, in
+    order.
+    """
+    law = (
+        "adaptive at every site, of arms whose theta is known" if run.constants else run.unknown
+    )
     found: list[Premise | None] = [Premise("law", bool(run.constants), law)]
     if run.constants:
         found += [_check_parameters(run), _check_gains(run)]
@@ -175,7 +203,9 @@ def _check_parameters(run: RunFacts) -> Premise:
     for site, c in run.constants.items():
         if ((c.theta < c.low) | (c.theta > c.high)).any():
             faults.append(f"{site}: theta is outside of the box that its estimates are held in")
-        first = np.clip(run.log.scenario.sites[site].control.gains(c.theta).theta_hat0, c.low, c.high)
+        first = np.clip(
+            run.log.scenario.sites[site].control.gains(c.theta).theta_hat0, c.low, c.high
+        )
         if (~c.adapts & (first != c.theta)).any():
             faults.append(f"{site}: a parameter is not learnt, and not known either")
         if c.unknown_friction.any():
@@ -189,7 +219,10 @@ def _check_gains(run: RunFacts) -> Premise:
     Kd = np.array([c.weighing_Kd for c in constants.values()])
     scales = find_kd_scales(Kd)
     if scales is None:
-        rows = [f"{site} ({', '.join(f'{value:g}' for value in c.Kd)})" for site, c in constants.items()]
+        rows = [
+            f"{site} ({', '.join(f'{value:g}' for value in c.Kd)})"
+            for site, c in constants.items()
+        ]
         text = f"Kd differs in shape between sites, so that no beta exists: {', '.join(rows)}"
         return Premise("Kd", False, text)
     if not Kd.all():  # NaN counts as positive
@@ -212,14 +245,18 @@ def _check_walls(log: Log) -> Premise | None:
         f"{wall.damping_n_s_m:.3g}; gave {wall.gave_j:.3g} J with respect to qd"
         for wall in giving or walls
     ]
-    kind = "a sampled wall gives energy in contact" if giving else "every sampled wall is passive"
+    kind = (
+        "a sampled wall gives energy in contact" if giving else "every sampled wall is passive"
+    )
     return Premise("walls", not giving, f"{kind}: {'; '.join(texts)}")
 
 
 def _check_dominance(run: FunctionalFacts) -> Premise:
     names = run.log.scenario.names
     energies = run.energies
-    changing = [site for site, energy in energies.items() if not energy.motion.dominance.constant]
+    changing = [
+        site for site, energy in energies.items() if not energy.motion.dominance.constant
+    ]
     if changing:
         lost = list_losses(run.log)
         why = f": {_list(lost)}; those that are left follow each other" if lost else ""
@@ -235,7 +272,9 @@ def _check_dominance(run: FunctionalFacts) -> Premise:
         text = f"alpha is reducible, {why}: V tells nothing of it; it follows as in a cascade"
         return Premise("shares", False, text)
     beta = (
-        "" if weights.scales is None else f"; beta: {_per_site(dict(zip(names, weights.beta, strict=True)))}"
+        ""
+        if weights.scales is None
+        else f"; beta: {_per_site(dict(zip(names, weights.beta, strict=True)))}"
     )
     return Premise("shares", True, f"constant, alpha irreducible{beta}")
 
@@ -259,13 +298,21 @@ def _check_delays(run: FunctionalFacts) -> Premise:
             first_s = view.stamp_s[used][0]
             late = records.first == 0 and first_s > records.h_s + CONSTANT_DELAY_TOLERANCE_S
             if np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S or late:
-                varying.append(f"{peer}->{site} ({1e3 * age_s.min():.4g} to {1e3 * age_s.max():.4g} ms)")
+                varying.append(
+                    f"{peer}->{site} ({1e3 * age_s.min():.4g} to {1e3 * age_s.max():.4g} ms)"
+                )
             else:
                 constant.add(f"{1e3 * age_s[0]:.4g} ms")
     if varying:
-        return Premise("delays", False, f"the age of the sample in use varies: {_list(varying)}")
+        return Premise(
+            "delays", False, f"the age of the sample in use varies: {_list(varying)}"
+        )
     text = f"constant on every link: {', '.join(sorted(constant))}"
-    return Premise("delays", True, text) if constant else Premise("delays", None, "no sample came into use")
+    return (
+        Premise("delays", True, text)
+        if constant
+        else Premise("delays", None, "no sample came into use")
+    )
 
 
 def _check_following(run: FunctionalFacts) -> Premise:
@@ -293,19 +340,27 @@ def _check_torque_limits(run: FunctionalFacts) -> Premise:
         for site, rows in cut.items()
         if rows.any()
     ]
-    return Premise("torque", not ticks, f"cut off: {_list(ticks)}" if ticks else "never cut off")
+    return Premise(
+        "torque", not ticks, f"cut off: {_list(ticks)}" if ticks else "never cut off"
+    )
 
 
 def _name_joints(run: FunctionalFacts, site: str, rows: Bools) -> str:
-    """Returns the joints of a chain for which some row is True, in brackets; "" of the planar arm."""
+    """Returns the joints of a chain for which some row is True, in brackets; "" of the planar
+    arm.
+    """
     model = run.log.scenario.arms[site]
     names = [model.joint_names[n] for n in np.flatnonzero(rows.any(axis=0))]
     return "" if model.chain is None else f" ({_list(names)})"
 
 
 def _check_stops(run: FunctionalFacts) -> Premise | None:
-    """No stop is touched: they are passive with respect to qd, and not to r; None if no joint has any."""
-    chains = [model.chain for model in run.log.scenario.arms.values() if model.chain is not None]
+    """No stop is touched: they are passive with respect to qd, and not to r; None if no joint
+    has any.
+    """
+    chains = [
+        model.chain for model in run.log.scenario.arms.values() if model.chain is not None
+    ]
     if not any(joint.stop_stiffness for chain in chains for joint in chain.joints):
         return None
     touched = []
@@ -315,13 +370,23 @@ def _check_stops(run: FunctionalFacts) -> Premise | None:
         if pushed.any():
             first_s = records.t_s[int(np.argmax(pushed.any(axis=1)))]
             touched.append(f"{site}{_name_joints(run, site, pushed)} from {first_s:.4g} s on")
-    text = f"the arm runs into stops of its joints: {_list(touched)}" if touched else "no stop is touched"
+    text = (
+        f"the arm runs into stops of its joints: {_list(touched)}"
+        if touched
+        else "no stop is touched"
+    )
     return Premise("stops", not touched, text)
 
 
 def _check_axes(run: FunctionalFacts) -> Premise | None:
-    """Nobody follows a site along an axis along which it moves and follows nobody; None in joint space."""
-    motions = {site: energy.motion for site, energy in run.energies.items() if energy.motion.constants.axes}
+    """Nobody follows a site along an axis along which it moves and follows nobody; None in
+    joint space.
+    """
+    motions = {
+        site: energy.motion
+        for site, energy in run.energies.items()
+        if energy.motion.constants.axes
+    }
     faults = []
     for site, motion in motions.items():
         free = np.array(motion.constants.axes) == 0.0
@@ -329,7 +394,9 @@ def _check_axes(run: FunctionalFacts) -> Premise | None:
         for follower, other in motions.items():
             followed = site in run.energies[follower].followed
             if followed and (free & (np.array(other.constants.axes) > 0.0)).any():
-                faults.append(f"{follower} follows {site} along an axis that {site} does not follow")
+                faults.append(
+                    f"{follower} follows {site} along an axis that {site} does not follow"
+                )
     text = "every site follows along each axis along which it moves and is followed"
     return Premise("axes", not faults, _list(faults) or text) if motions else None
 
@@ -364,15 +431,25 @@ def _check_operators(run: FunctionalFacts) -> Premise:
         return Premise("hands", None, f"no record says who pushes the arm of {_list(outside)}")
     if not sites:
         return Premise("hands", True, "nobody pushes")
-    weightless = [s for n, s in enumerate(energies) if s in sites and not balance.beta[:, n].any()]
+    weightless = [
+        s for n, s in enumerate(energies) if s in sites and not balance.beta[:, n].any()
+    ]
     if weightless:
-        return Premise("hands", False, f"{_list(weightless)}, of beta 0, is pushed: V tells nothing of that")
+        return Premise(
+            "hands",
+            False,
+            f"{_list(weightless)}, of beta 0, is pushed: V tells nothing of that",
+        )
     gave = float(rise_above_minimum(balance.external_work).max())
     who = " and ".join(balance.external)
     if gave <= 1e-9 * balance.scale + ZERO_ENERGY_J:
         return Premise("hands", True, f"the {who} only took: passive with respect to r")
     let_go_s = max(pushed_s[site][-1] for site in sites)
-    r = "qd - v" if any(energy.motion.constants.axes for energy in energies.values()) else "qd + Lambda e"
+    r = (
+        "qd - v"
+        if any(energy.motion.constants.axes for energy in energies.values())
+        else "qd + Lambda e"
+    )
     text = f"the {who} gave up to {gave:.3g} J with respect to r = {r}"
     ages_s = [energy.largest_age_s for energy in energies.values()]
     free_s = float(balance.t_s[-1] - let_go_s)
@@ -382,7 +459,9 @@ def _check_operators(run: FunctionalFacts) -> Premise:
     if free_s > 1e-9:
         short = f"{free_s:.3g} s of free motion at the end are less than {least_s:.3g} s"
         return Premise("hands", False, f"{text}, and push until {let_go_s:.3f} s: {short}")
-    return Premise("hands", False, f"{text}, and push to the end: not passive with respect to r")
+    return Premise(
+        "hands", False, f"{text}, and push to the end: not passive with respect to r"
+    )
 
 
 def _check_records(run: FunctionalFacts) -> Premise:
@@ -399,7 +478,9 @@ def find_absent_spans(log: Log) -> list[AbsentSpan]:
     found = []
     for site in log.sites:
         part = log[site]
-        spans = [(a / part.rate_hz, (b + 1) / part.rate_hz) for a, b in log.absences.get(site, ())]
+        spans = [
+            (a / part.rate_hz, (b + 1) / part.rate_hz) for a, b in log.absences.get(site, ())
+        ]
         left_s = (part.last_tick + 1) / part.rate_hz
         kinds = {event.kind for event in log.events if event.about == site}
         if left_s < end_s - LEAST_ABSENCE_S and kinds & {"left", "lost"}:
@@ -409,18 +490,26 @@ def find_absent_spans(log: Log) -> list[AbsentSpan]:
 
 
 def _check_presence(run: FunctionalFacts) -> Premise | None:
-    """All sites are there all the time; None if they are. Else what the stretches are by themselves."""
+    """All sites are there all the time; None if they are. Else what the stretches are by
+    themselves.
+    """
     if not run.absent:
         return None
     after_s = max(energy.begin_s for energy in run.energies.values())
-    edges = [(after_s, after_s), *((a, b) for _, a, b in run.absent), (recorded_end_s(run.log),) * 2]
+    edges = [
+        (after_s, after_s),
+        *((a, b) for _, a, b in run.absent),
+        (recorded_end_s(run.log),) * 2,
+    ]
     stretches = []
     for from_s, to_s in edges:
         if from_s - after_s > LEAST_ABSENCE_S:
             stretches.append(_describe_stretch(run.energies, after_s, from_s))
         after_s = max(after_s, to_s)
     who = _list([f"{site} {from_s:.4g} to {to_s:.4g} s" for site, from_s, to_s in run.absent])
-    text = f"away: {who}, of which the theorem says nothing; by themselves: {'; '.join(stretches)}"
+    text = (
+        f"away: {who}, of which the theorem says nothing; by themselves: {'; '.join(stretches)}"
+    )
     return Premise("presence", False, text)
 
 
@@ -440,14 +529,20 @@ OF_RUN = (
 
 
 def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: float) -> str:
-    """Returns from when on all sites follow in a stretch of time, and if the delays are constant then."""
+    """Returns from when on all sites follow in a stretch of time, and if the delays are
+    constant then.
+    """
     follow_s = from_s
     varying = []
     for energy in energies.values():
         records = energy.motion.records
-        apart = records.known & ~records.follows & (records.t_s >= from_s) & (records.t_s < to_s)
+        apart = (
+            records.known & ~records.follows & (records.t_s >= from_s) & (records.t_s < to_s)
+        )
         if apart.any():
-            follow_s = max(follow_s, float(records.t_s[np.flatnonzero(apart)[-1]]) + records.h_s)
+            follow_s = max(
+                follow_s, float(records.t_s[np.flatnonzero(apart)[-1]]) + records.h_s
+            )
     stretch = f"{from_s:.4g} to {to_s:.4g} s"
     if to_s - follow_s < LEAST_ABSENCE_S:
         return f"{stretch} not all follow"
@@ -464,7 +559,9 @@ def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: f
 
 def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
     """Returns the times between which records are missing, s."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[True], balance.judged, [True]]).astype(np.int8)))
+    edges = np.flatnonzero(
+        np.diff(np.concatenate([[True], balance.judged, [True]]).astype(np.int8))
+    )
     times = balance.t_s[edges]
     return list(zip(times[::2].tolist(), times[1::2].tolist(), strict=True))
 
@@ -483,8 +580,8 @@ class Evidence(NamedTuple):
 
     Attributes:
         coverage: ticks of every site that have a record, and those of the run.
-        functional_share: share of the periods of V that rest on records, while no site was away; None
-            without V.
+        functional_share: share of the periods of V that rest on records, while no site was
+            away; None without V.
         min_coverage: the least share of either that passes.
         integrity: whether the log is as it was made.
         unmet: sites of an open-loop rerun that met samples which are not in the file.
@@ -499,11 +596,17 @@ class Evidence(NamedTuple):
     @property
     def reasons(self) -> list[str]:
         """What leaves the run open, in words."""
-        found = [] if self.integrity.passed else [f"the log is not as it was made: {self.integrity.text}"]
+        found = (
+            []
+            if self.integrity.passed
+            else [f"the log is not as it was made: {self.integrity.text}"]
+        )
         if self.coverage.share < self.min_coverage:
             found.append(f"records are missing: {self.coverage.describe(self.min_coverage)}")
         if self.functional_share is not None and self.functional_share < self.min_coverage:
-            found.append(f"V is judged over {100.0 * self.functional_share:.4g} % of its periods")
+            found.append(
+                f"V is judged over {100.0 * self.functional_share:.4g} % of its periods"
+            )
         if self.unmet:
             found.append(f"{' and '.join(self.unmet)}, as recorded, did not react to this run")
         return found
@@ -540,4 +643,10 @@ def collect_evidence(run: RunFacts, min_coverage: float) -> Evidence:
     unmet = tuple(site for site in log.sites if site not in log.executed_sites)
     there = {site: len(np.unique(log[site].tick)) for site in log.sites}
     coverage = Coverage(there, {site: log.expected_ticks(site) for site in log.sites})
-    return Evidence(coverage, share, min_coverage, judge_integrity(log), unmet)
+    return Evidence(
+        coverage=coverage,
+        functional_share=share,
+        min_coverage=min_coverage,
+        integrity=judge_integrity(log),
+        unmet=unmet,
+    )

@@ -1,9 +1,11 @@
-"""V of a session while it runs, and the work of operator and environment, from the newest records.
+"""V of a session while it runs, and the work of operator and environment, from the newest
+records.
 
-Invariant: V is that of `certify` at the same instants, to rounding: the same functions over the records of a
-window that reaches back to the oldest sample in use. Nothing is estimated: a time whose records are not all
-there yet waits for them, and is passed over if they cannot be had. A window is bounded; a record may come
-late, out of order or twice, and what is not there is not known, as in `AlignedRecords`.
+Invariant: V is that of `certify` at the same instants, to rounding: the same functions over the
+records of a window that reaches back to the oldest sample in use. Nothing is estimated: a time
+whose records are not all there yet waits for them, and is passed over if they cannot be had. A
+window is bounded; a record may come late, out of order or twice, and what is not there is not
+known, as in `AlignedRecords`.
 """
 
 from collections.abc import Iterable, Mapping
@@ -37,11 +39,14 @@ STEP_S = 0.25
 LONGEST_STEP_S = 2.0
 """The longest, s: what is behind by more catches up in several steps."""
 KEPT_S = 12.0
-"""Records that are kept at least: the largest age of a sample, and the time in which a gap is filled."""
+"""Records that are kept at least: the largest age of a sample, and the time in which a gap is
+filled.
+"""
 
 
 class RecordWindow:
-    """The records of one site, from `first` on; `newest` is the last one's tick, -1 before the first.
+    """The records of one site, from `first` on; `newest` is the last one's tick, -1 before the
+    first.
 
     Args:
         scenario: the session's scenario.
@@ -55,10 +60,16 @@ class RecordWindow:
         self.peers = scenario.peers(site)
         self._axes = scenario.arms[site].axes
         layout = scenario.layout(site)
-        names = (*RECORD_COLUMNS, *(TASK_VECTORS if layout.task else ()), *(("hand",) if layout.hand else ()))
+        names = (
+            *RECORD_COLUMNS,
+            *(TASK_VECTORS if layout.task else ()),
+            *(("hand",) if layout.hand else ()),
+        )
         lengths = layout.lengths()
         ends = list(accumulate(lengths[name] for name in names))
-        self._columns = {name: slice(*span) for name, span in zip(names, pairwise([0, *ends]), strict=True)}
+        self._columns = {
+            name: slice(*span) for name, span in zip(names, pairwise([0, *ends]), strict=True)
+        }
         self._kept = max(8, round(kept_s * self.rate_hz))
         self._floats = np.zeros((2 * self._kept, ends[-1]))
         self._used = np.full((2 * self._kept, len(self.peers)), -1, dtype=np.int64)
@@ -106,7 +117,9 @@ class RecordWindow:
         return self.first <= tick <= self.newest and bool(self._known[tick - self.first])
 
     def rows(self, first: int, last: int) -> AlignedRecords:
-        """Returns the records of ticks in the window, both ends included; a missing one is interpolated."""
+        """Returns the records of ticks in the window, both ends included; a missing one is
+        interpolated.
+        """
         part = slice(first - self.first, last + 1 - self.first)
         known = self._known[part].copy()
         floats = self._floats[part]
@@ -118,11 +131,15 @@ class RecordWindow:
             there = np.flatnonzero(known)
             for column in floats.T:
                 column[:] = np.interp(np.arange(len(known)), there, column[there])
-            before = there[np.maximum(np.searchsorted(there, np.arange(len(known)), side="right") - 1, 0)]
+            before = there[
+                np.maximum(np.searchsorted(there, np.arange(len(known)), side="right") - 1, 0)
+            ]
             used = used[before]
             follows = follows[before]
             rests = rests[before]
-        columns: dict[str, Any] = {name: floats[:, where] for name, where in self._columns.items()}
+        columns: dict[str, Any] = {
+            name: floats[:, where] for name, where in self._columns.items()
+        }
         return AlignedRecords(
             *(self.site, self.rate_hz, first, known, follows),
             **columns,
@@ -157,7 +174,9 @@ class RunningEnergy:
     def __init__(self, scenario: Scenario, windows: Mapping[str, RecordWindow]) -> None:
         self.reason = explain_no_functional(scenario)
         if any(spec.on_stale.rule.degrades for spec in scenario.sites.values()):
-            self.reason = self.reason or "shares change when a peer is lost: trilat certify tells V"
+            self.reason = (
+                self.reason or "shares change when a peer is lost: trilat certify tells V"
+            )
         self._scenario = scenario
         self._windows = windows
         self._dominance = {site: list_scripted_ramps(scenario, site) for site in windows}
@@ -166,12 +185,15 @@ class RunningEnergy:
 
     def take_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
         """Notes changes that a site took in; those of its dominance factors count."""
-        self._dominance[site][1].extend(change.ramp for change in changes if change.ramp is not None)
+        self._dominance[site][1].extend(
+            change.ramp for change in changes if change.ramp is not None
+        )
 
     def advance(self, complete: Mapping[str, int]) -> EnergyCourse | None:
         """Returns V since the last call; None if it is not known yet.
 
-        `complete` has of every site the last tick up to which all records are there or cannot be had.
+        `complete` has of every site the last tick up to which all records are there or cannot
+        be had.
         """
         if self.reason or min(complete.values()) < 1:
             return None
@@ -190,7 +212,10 @@ class RunningEnergy:
     def _compute(self, begin_s: float, end_s: float) -> EnergyCourse | None:
         """Returns V between two times; the first of them was there at the call before."""
         spans = {
-            site: (int(np.ceil(begin_s * w.rate_hz - 1e-6)), int(np.floor(end_s * w.rate_hz + 1e-6)))
+            site: (
+                int(np.ceil(begin_s * w.rate_hz - 1e-6)),
+                int(np.floor(end_s * w.rate_hz + 1e-6)),
+            )
             for site, w in self._windows.items()
         }
         if any(last - first < 1 for first, last in spans.values()):
@@ -208,12 +233,17 @@ class RunningEnergy:
         for alpha in find_dominance_matrices(energies):
             if len(groups := find_closed_groups(alpha)) > 1:
                 names = list(records)
-                self.reason = describe_closed_groups([[names[n] for n in group] for group in groups[:2]])
+                self.reason = describe_closed_groups(
+                    [[names[n] for n in group] for group in groups[:2]]
+                )
                 return None
-        balance = compute_energy_balance(energies) if len(find_common_times(energies)) > 1 else None
+        balance = (
+            compute_energy_balance(energies) if len(find_common_times(energies)) > 1 else None
+        )
         for site, known in self._dominance.items():
             self._dominance[site] = forget_ramps(*known, begin_s - 1.0)
-        if balance is None:  # a session that was joined late: what was under way then is not known
+        # a session that was joined late: what was under way then is not known
+        if balance is None:
             return None
         supplied = self._supplied + balance.external_work
         self._supplied = float(supplied[-1])

@@ -1,9 +1,10 @@
-"""Stability certificate of a log: premises, energy balance, end of the run and the verdict, also as JSON.
+"""Stability certificate of a log: premises, energy balance, end of the run and the verdict,
+also as JSON.
 
-Invariant: V falls except for supplied energy. A rise beyond operator and environment is reported with its
-time, amount and sources; energy without a source means that the log's equations did not produce it. What
-a log cannot decide is stated: without a functional the end of the run alone decides. JSON keys end in
-their unit, and unknown values are null.
+Invariant: V falls except for supplied energy. A rise beyond operator and environment is
+reported with its time, amount and sources; energy without a source means that the log's
+equations did not produce it. What a log cannot decide is stated: without a functional the end
+of the run alone decides. JSON keys end in their unit, and unknown values are null.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -42,18 +43,20 @@ from .premises import (
 )
 
 BROKEN_BALANCE_SHARE = 2e-4
-"""Largest unexplained energy as a share of the scale, beyond the uncertainty of the trapezoid rule."""
+"""Largest unexplained energy as a share of the scale, beyond the uncertainty of the trapezoid
+rule.
+"""
 CLEAR_BREAK_SHARE = 1e-3
 """With more than this, and no uncertainty of that size, the period is not the cause."""
 TORQUE_TOLERANCE = 1e-6
-"""A recorded torque that differs from Eq. (13) by more, relative to 1 + |tau|, was not made by it."""
+"""A recorded torque that differs from Eq. (13) by more, relative to 1 + |tau|, was not made by
+it.
+"""
 COARSE_TOLERANCE_SHARE = 1e-2
 """A tolerance above this share of the scale decides nothing about a rise."""
 
 FALSE_RECORDS_TEXT = "these records were not made by the equations that the log claims"
-_PERIOD_OR_FALSE = (
-    f"the period is too long for these gains, or {FALSE_RECORDS_TEXT}; `trilat verify` tells which"
-)
+_PERIOD_OR_FALSE = f"the period is too long for these gains, or {FALSE_RECORDS_TEXT}; `trilat verify` tells which"
 
 
 _REFUTES = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
@@ -102,9 +105,12 @@ class EndPoseRoots(NamedTuple):
     """The loop linearised where a run ended.
 
     Attributes:
-        verdict: stable, unstable or at the edge, of small motions there; "" if there is no such loop.
-        rate_per_s: the largest real part of a root that is not zero by structure, 1/s; None without one.
-        exact: True of the sampled loop where delays repeat; else the roots are no proof, but may be a doubt.
+        verdict: stable, unstable or at the edge, of small motions there; "" if there is no such
+            loop.
+        rate_per_s: the largest real part of a root that is not zero by structure, 1/s; None
+            without one.
+        exact: True of the sampled loop where delays repeat; else the roots are no proof, but
+            may be a doubt.
         text: the rest and its roots, or why there are none.
     """
 
@@ -144,15 +150,19 @@ class Certificate(Result):
 
     @property
     def ones_rise(self) -> FunctionalRise | None:
-        """The largest rise of V with the paper's weights; None if it did not rise, or if they are right."""
-        return None if self.ones is None else _find_largest_rise(self.ones, self.verdict.tolerance)
+        """The largest rise of V with the paper's weights; None if it did not rise, or if they
+        are right.
+        """
+        return (
+            None if self.ones is None else _find_largest_rise(self.ones, self.verdict.tolerance)
+        )
 
     @property
     def bounded_by_v(self) -> bool:
         """True if V bounds every site: it did not rise, and no site's weight in it is zero.
 
-        A site of no weight is bounded as well if the dominance factors are all that fails: it converges after
-        those that it follows (docs/errata.md, 11).
+        A site of no weight is bounded as well if the dominance factors are all that fails: it
+        converges after those that it follows (docs/errata.md, 11).
         """
         sound = (StabilityFinding.COVERED, StabilityFinding.DID_NOT_RISE)
         if self.balance is None or self.verdict.finding not in sound:
@@ -163,7 +173,9 @@ class Certificate(Result):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """What leaves the run open or false, in words: of the log, its end, V, the roots at its end pose."""
+        """What leaves the run open or false, in words: of the log, its end, V, the roots at its
+        end pose.
+        """
         broken = self.verdict.finding is StabilityFinding.BROKEN
         found = [self.verdict.text] if broken else []
         if self.balance is not None and not broken:
@@ -173,7 +185,8 @@ class Certificate(Result):
         if roots is not None and roots.verdict == "unstable":
             doubt = None if roots.exact else roots.rate_per_s
             if doubt is None or twins is None or doubt <= twins.excluded_rate_per_s:
-                found.append(roots.text)  # roots that are no proof give way to pushes in the run's own ticks
+                # roots that are no proof give way to pushes in the run's own ticks
+                found.append(roots.text)
         if self.observed is not None and self.observed.finding in _REFUTES:
             found.append(self.observed.text)
         told = self._by_twins.reason
@@ -184,7 +197,11 @@ class Certificate(Result):
         if self.twins is None:
             return TwinVerdict(self.end.stability)
         known = {"stable": True, "unstable": False}
-        settles = known.get(self.roots.verdict) if self.roots is not None and self.roots.exact else None
+        settles = (
+            known.get(self.roots.verdict)
+            if self.roots is not None and self.roots.exact
+            else None
+        )
         if self.verdict.finding is StabilityFinding.COVERED:
             settles = True
         rose = self.verdict.finding is StabilityFinding.ROSE
@@ -192,7 +209,9 @@ class Certificate(Result):
 
     @property
     def stability(self) -> Stability:
-        """The judgement: of its end and its twins; what else is known may leave a stable run open."""
+        """The judgement: of its end and its twins; what else is known may leave a stable run
+        open.
+        """
         own = self._by_twins.stability
         return Stability.OPEN if own is Stability.STABLE and self.reasons else own
 
@@ -203,7 +222,9 @@ class Certificate(Result):
 
     def headline(self) -> str:
         """Returns the judgement, and how the run ended."""
-        by_twins = self.stability is Stability.STABLE and self.end.stability is not Stability.STABLE
+        by_twins = (
+            self.stability is Stability.STABLE and self.end.stability is not Stability.STABLE
+        )
         return f"{self.stability}: {self.end.behaviour}{', yet every push dies away' if by_twins else ''}"
 
     def to_dict(self) -> JsonObject:
@@ -246,18 +267,24 @@ class Certificate(Result):
 
         Never with a broken balance or a changed log.
         """
-        if self.verdict.finding is StabilityFinding.BROKEN or not self.evidence.integrity.passed:
+        if (
+            self.verdict.finding is StabilityFinding.BROKEN
+            or not self.evidence.integrity.passed
+        ):
             return False
         bounded = "bounded" in accepted and self.end.behaviour is EndBehaviour.BOUNDED
         opened = "open" in accepted and self.stability is Stability.OPEN
         return bounded or opened or self.stability is Stability.STABLE
 
 
-def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False) -> Certificate:
+def certify(
+    log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False
+) -> Certificate:
     """Returns the certificate of a log; torn, short and empty ones too.
 
-    Of a run of which less than `min_coverage` of every site's ticks can be judged, a stable end is open.
-    With `own_laws` the code of laws from outside runs, as far as they declare energies.
+    Of a run of which less than `min_coverage` of every site's ticks can be judged, a stable end
+    is open. With `own_laws` the code of laws from outside runs, as far as they declare
+    energies.
 
     Raises:
         LogError: a record cannot be read, or names a change that is none.
@@ -274,7 +301,9 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = Fa
         verdict = verdict._replace(text=f"{verdict.finding}: {verdict.text}")
     end = classify_log_end(log)
     observed = observe_energies(log, own_laws=own_laws)
-    found = Certificate(premises, verdict, end, collect_evidence(run, min_coverage), observed=observed)
+    found = Certificate(
+        premises, verdict, end, collect_evidence(run, min_coverage), observed=observed
+    )
     if known is None:
         return found
     if known.groups:
@@ -287,8 +316,9 @@ def certify(log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = Fa
 def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
     """A site's balance does not close; each site counts by itself.
 
-    An arm outside of the program need not follow its theta, nor are its angles and velocities measured at
-    once; the records of any other are not what they claim, unless the period may be the cause.
+    An arm outside of the program need not follow its theta, nor are its angles and velocities
+    measured at once; the records of any other are not what they claim, unless the period may be
+    the cause.
     """
     energies = run.energies
     scale = run.balance.scale
@@ -309,7 +339,9 @@ def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> Stabilit
     text = f"the energy of {site} does not add up from {at_s:.4g} s on, by {amount}"
     if not ours:
         why = f"the arm of {', '.join(outside)}, outside of the program, does not move as its theta says"
-        return StabilityVerdict(StabilityFinding.NOT_JUDGED, f"{text}: {why}, or somebody pushes it")
+        return StabilityVerdict(
+            StabilityFinding.NOT_JUDGED, f"{text}: {why}, or somebody pushes it"
+        )
     clear = worst[site] > allow(site, CLEAR_BREAK_SHARE)
     certain = clear and energy.uncertainty < CLEAR_BREAK_SHARE * scale
     why = FALSE_RECORDS_TEXT if certain else _PERIOD_OR_FALSE
@@ -355,14 +387,24 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
     rise = _find_largest_rise(balance, run.tolerance)
     if rise is not None:
         held = "though the premises of the theorem hold, which is one of continuous time"
-        causes = ", ".join(f"{name} {amount:.3g} J" for name, amount in list(rise.causes.items())[:4])
+        causes = ", ".join(
+            f"{name} {amount:.3g} J" for name, amount in list(rise.causes.items())[:4]
+        )
         who = f"; given by {causes}" if causes else "; nobody gave it"
         share = f"{100.0 * rise.amount / balance.V.max():.3g} % of its largest value"
         text = f"V rose by {rise.amount:.3g} J ({share}) from {rise.from_s:.4g} to {rise.at_s:.4g} s{who}"
-        return StabilityVerdict(StabilityFinding.ROSE, f"{outside if failed else held}: {text}", rise)
+        return StabilityVerdict(
+            StabilityFinding.ROSE, f"{outside if failed else held}: {text}", rise
+        )
     first, last = (x if x > ZERO_ENERGY_J else 0.0 for x in (balance.V[0], balance.V[-1]))
-    fell = f"V rose by no more than the {' and '.join(sources)} gave" if sources else "V did not rise"
-    fell += f": {first:.4g} J at {balance.t_s[0]:.4g} s, {last:.4g} J at {balance.t_s[-1]:.4g} s"
+    fell = (
+        f"V rose by no more than the {' and '.join(sources)} gave"
+        if sources
+        else "V did not rise"
+    )
+    fell += (
+        f": {first:.4g} J at {balance.t_s[0]:.4g} s, {last:.4g} J at {balance.t_s[-1]:.4g} s"
+    )
     undecided = [premise.text for premise in premises if premise.holds is None]
     text = "; ".join([fell, *undecided])
     if failed:
@@ -371,12 +413,22 @@ def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> Stabilit
     return StabilityVerdict(StabilityFinding.COVERED, f"{covered}: {text}")
 
 
-JUDGEMENTS = (_judge_site_balances, _judge_torques, _judge_weights, _judge_precision, _judge_course)
-"""What refutes the log, what keeps V from being judged, and what V did: the first that applies decides."""
+JUDGEMENTS = (
+    _judge_site_balances,
+    _judge_torques,
+    _judge_weights,
+    _judge_precision,
+    _judge_course,
+)
+"""What refutes the log, what keeps V from being judged, and what V did: the first that applies
+decides.
+"""
 
 
 def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
-    """Returns the largest rise of V that operator and environment did not supply, if above a tolerance, J."""
+    """Returns the largest rise of V that operator and environment did not supply, if above a
+    tolerance, J.
+    """
     V = balance.unsupplied
     rise = rise_above_minimum(V)
     last = int(rise.argmax())
@@ -392,14 +444,17 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
     causes = {name: float(x[last] - x[first]) for name, x in sources.items()}
     ordered = sorted(causes.items(), key=lambda cause: -cause[1])
     notable = {name: amount for name, amount in ordered if amount > 0.05 * rise[last]}
-    return FunctionalRise(float(balance.t_s[first]), float(balance.t_s[last]), float(rise[last]), notable)
+    return FunctionalRise(
+        float(balance.t_s[first]), float(balance.t_s[last]), float(rise[last]), notable
+    )
 
 
 def find_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
-    """Returns what V, less the work of operator and environment, says against a run that looks stable.
+    """Returns what V, less the work of operator and environment, says against a run that looks
+    stable.
 
-    It must not end above its beginning, nor rise at the end of the judged half: to above its least value
-    there, by more than half of what it fell within that half.
+    It must not end above its beginning, nor rise at the end of the judged half: to above its
+    least value there, by more than half of what it fell within that half.
     """
     V = balance.unsupplied
     half = len(balance.unsupplied) // 2
@@ -413,7 +468,9 @@ def find_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
     fell = float(judged[0] - judged[lowest])
     if risen > tolerance and risen > 0.5 * fell:
         from_s = float(balance.t_s[half + lowest])
-        found.append(f"V rises at the end: by {risen:.3g} J from {from_s:.4g} s on, and nobody gave that")
+        found.append(
+            f"V rises at the end: by {risen:.3g} J from {from_s:.4g} s on, and nobody gave that"
+        )
     return found
 
 
@@ -439,7 +496,9 @@ def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> Jso
         "scale_j": balance.scale,
         "residual_max_j": _largest(balance.residual),
         "unexplained_max_j": _largest(balance.unexplained),
-        "sites_unexplained_max_j": {site: _largest(energy.unexplained) for site, energy in sites.items()},
+        "sites_unexplained_max_j": {
+            site: _largest(energy.unexplained) for site, energy in sites.items()
+        },
         "not_judged_s": find_unjudged_spans(balance),
         "ones": with_ones,
     }
@@ -448,7 +507,12 @@ def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> Jso
 def _rise_to_json(rise: FunctionalRise | None) -> JsonObject | None:
     if rise is None:
         return None
-    return {"from_s": rise.from_s, "at_s": rise.at_s, "amount_j": rise.amount, "causes_j": rise.causes}
+    return {
+        "from_s": rise.from_s,
+        "at_s": rise.at_s,
+        "amount_j": rise.amount,
+        "causes_j": rise.causes,
+    }
 
 
 def _last(columns: dict[str, Array]) -> dict[str, float]:

@@ -1,8 +1,9 @@
 """All metrics of a log, their JSON, and the comparison of several logs.
 
-Invariant: every quantity is present for every place it applies to, as a number or with the reason for its
-absence; in JSON the number is null and `unknown` has the reason. Whatever a file of this folder measures
-belongs to it. A comparison has one column per log and one row per metric of the whole run.
+Invariant: every quantity is present for every place it applies to, as a number or with the
+reason for its absence; in JSON the number is null and `unknown` has the reason. Whatever a file
+of this folder measures belongs to it. A comparison has one column per log and one row per
+metric of the whole run.
 """
 
 import math
@@ -44,14 +45,16 @@ class LogMetrics(Result):
     """All metrics of a log.
 
     Attributes:
-        log, scenario, driver, complete: the name of its file, and what it says of itself.
-        run, sites, links, walls: of the whole, per site, per link "j->i", per wall "s/1" (the first of s).
+        log, scenario, driver, complete: the name of its file, and what it says of itself. run,
+        sites, links, walls: of the whole, per site, per link "j->i", per wall "s/1" (the first
+        of s).
         estimates: per site with records, its parameter estimates.
         static_windows, stiffness: their number, and the stiffness from one of them to the next.
         joint_loads: the loaded joints in them, with the torques of all loaded sites.
         sharing_ratios: the force sharing of those at which two sites are loaded.
         responses: impedances and reflections over frequency.
-        axes: names of what sites share in task space, where a joint's number is that of an axis; else ().
+        axes: names of what sites share in task space, where a joint's number is that of an
+            axis; else ().
         joint_names: names that the files of the arms give their joints, if they agree; else ().
     """
 
@@ -73,14 +76,18 @@ class LogMetrics(Result):
     joint_names: tuple[str, ...] = ()
 
     def label(self, number: int) -> str:
-        """Returns what the number of a joint stands for, from 1: "1", "3 elbow", or the name of an axis."""
+        """Returns what the number of a joint stands for, from 1: "1", "3 elbow", or the name of
+        an axis.
+        """
         if self.axes:
             return self.axes[number - 1]
         return f"{number} {self.joint_names[number - 1]}" if self.joint_names else str(number)
 
     def unit(self, of_joint: str, number: int) -> str:
         """Returns the unit of a joint's quantity, or of that along an axis of a place."""
-        return _ALONG_AXES.get(of_joint, of_joint) if self.axes and number <= PLACE else of_joint
+        return (
+            _ALONG_AXES.get(of_joint, of_joint) if self.axes and number <= PLACE else of_joint
+        )
 
     def headline(self) -> str:
         """Returns what was measured, in one line."""
@@ -91,8 +98,16 @@ class LogMetrics(Result):
         """Returns plain values, with the keys of `trilat metrics --json`."""
         places = {"sites": self.sites, "links": self.links, "walls": self.walls}
         windows = self.static_windows.value
-        named = {f"{kind}.{name}.": one for kind, found in places.items() for name, one in found.items()}
-        metrics_by_path = {"run.": self.run, **named, "": {"windows_at_rest": self.static_windows}}
+        named = {
+            f"{kind}.{name}.": one
+            for kind, found in places.items()
+            for name, one in found.items()
+        }
+        metrics_by_path = {
+            "run.": self.run,
+            **named,
+            "": {"windows_at_rest": self.static_windows},
+        }
         content: dict[str, Any] = {
             "version": METRICS_JSON_VERSION,
             "log": self.log,
@@ -100,8 +115,13 @@ class LogMetrics(Result):
             "driver": self.driver,
             "complete": self.complete,
             "run": _values(self.run),
-            **{kind: {name: _values(one) for name, one in found.items()} for kind, found in places.items()},
-            "parameters": {site: estimates.to_json() for site, estimates in self.estimates.items()},
+            **{
+                kind: {name: _values(one) for name, one in found.items()}
+                for kind, found in places.items()
+            },
+            "parameters": {
+                site: estimates.to_json() for site, estimates in self.estimates.items()
+            },
             "windows_at_rest": None if windows is None else int(windows),
             **_details_to_json(self),
             "unknown": {
@@ -115,7 +135,11 @@ class LogMetrics(Result):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per quantity and place."""
-        return [{**row, "value": one.value, "why": one.why} for row, one in self._each() if one.applies]
+        return [
+            {**row, "value": one.value, "why": one.why}
+            for row, one in self._each()
+            if one.applies
+        ]
 
     def _each(self) -> Iterator[tuple[dict[str, str], Metric]]:
         for quantity in quantities():
@@ -138,10 +162,13 @@ class LogMetrics(Result):
 def find_whole(quantity: Quantity, places: Mapping[str, Metric]) -> Metric:
     """Returns a quantity of the run, of that of its places: the largest of them, or their sum.
 
-    A place that can have none does not count; if one lacks a number that it could have, so does the run.
+    A place that can have none does not count; if one lacks a number that it could have, so does
+    the run.
     """
     counted = {name: one for name, one in places.items() if one.applies}
-    whys = [f"{name}: {one.why}" if name else one.why for name, one in counted.items() if one.why]
+    whys = [
+        f"{name}: {one.why}" if name else one.why for name, one in counted.items() if one.why
+    ]
     if whys:
         return Metric(None, "; ".join(whys))
     values = [one.value for one in counted.values() if one.value is not None]
@@ -151,7 +178,8 @@ def find_whole(quantity: Quantity, places: Mapping[str, Metric]) -> Metric:
     return Metric(sum(values) if quantity.whole == "sum" else max(values))
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # what is not finite is no number
+# what is not finite is no number
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def compute_log_metrics(log: Log) -> LogMetrics:
     """Returns all quantities of a log; of torn, short and empty ones too.
 
@@ -161,7 +189,10 @@ def compute_log_metrics(log: Log) -> LogMetrics:
     view = RunView(log)
     scenario = log.scenario
     found = _measure_places(view, list_measures())
-    names = {arm.joint_names if scenario.sites[site].arm.urdf else () for site, arm in scenario.arms.items()}
+    names = {
+        arm.joint_names if scenario.sites[site].arm.urdf else ()
+        for site, arm in scenario.arms.items()
+    }
     return LogMetrics(
         *(Path(log.source).name, scenario.name, log.driver, log.complete),
         found["run"][""],
@@ -172,12 +203,16 @@ def compute_log_metrics(log: Log) -> LogMetrics:
         view.once(static_windows.find_sharing_ratios),
         static_windows.estimate_stiffness(view),
         estimate_impedances(view),
-        TASK_AXES[: scenario.arms[log.sites[0]].counts.shared] if follows_in_task_space(log) else (),
+        TASK_AXES[: scenario.arms[log.sites[0]].counts.shared]
+        if follows_in_task_space(log)
+        else (),
         names.pop() if len(names) == 1 else (),
     )
 
 
-def _measure_places(view: RunView, wanted: Iterable[Measure]) -> dict[str, dict[str, MetricValues]]:
+def _measure_places(
+    view: RunView, wanted: Iterable[Measure]
+) -> dict[str, dict[str, MetricValues]]:
     found: dict[str, dict[str, MetricValues]] = {
         of: {place: {} for place in view.places(of)} for of in ("run", "site", "link", "wall")
     }
@@ -204,7 +239,11 @@ def find_quantity(key: str) -> Quantity:
 def measure_whole(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
     """Returns quantities of the whole run by their keys; nothing else is computed."""
     asked = {key: find_quantity(key) for key in keys}
-    wanted = [one for one in list_measures() if any(quantity.key in asked for quantity in one.quantities)]
+    wanted = [
+        one
+        for one in list_measures()
+        if any(quantity.key in asked for quantity in one.quantities)
+    ]
     found = _measure_places(RunView(log), wanted)
     return {
         key: find_whole(one, {place: values[key] for place, values in found[one.of].items()})
@@ -219,7 +258,9 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
 
     found = {
         "levers": [
-            load._asdict() | {"weight": _values(load.weight)} | _value_and_why("imbalance", load.imbalance)
+            load._asdict()
+            | {"weight": _values(load.weight)}
+            | _value_and_why("imbalance", load.imbalance)
             for load in metrics.joint_loads
         ],
         "force_sharing": [
@@ -237,10 +278,14 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
         ],
     }
     if not metrics.axes:
-        for entry in (one for entries in found.values() for one in entries if metrics.joint_names):
+        for entry in (
+            one for entries in found.values() for one in entries if metrics.joint_names
+        ):
             entry["joint_name"] = metrics.joint_names[entry["joint"] - 1]
         return found
-    return {name: [_name_axis(metrics, one) for one in entries] for name, entries in found.items()}
+    return {
+        name: [_name_axis(metrics, one) for one in entries] for name, entries in found.items()
+    }
 
 
 def _name_axis(metrics: LogMetrics, entry: dict[str, Any]) -> dict[str, Any]:
@@ -286,7 +331,9 @@ class ComparisonRow(NamedTuple):
 
 
 class MetricComparison(NamedTuple):
-    """Runs side by side, by name: the quantities that one could have, in the order of the catalogue."""
+    """Runs side by side, by name: the quantities that one could have, in the order of the
+    catalogue.
+    """
 
     columns: tuple[str, ...]
     rows: tuple[ComparisonRow, ...]
@@ -297,19 +344,25 @@ class MetricComparison(NamedTuple):
 
 
 def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricComparison:
-    """Returns logs side by side, torn, short and empty ones too; columns bear their files' names by default.
+    """Returns logs side by side, torn, short and empty ones too; columns bear their files'
+    names by default.
 
     Raises:
         LogError: a record cannot be read, or names a change that is none.
     """
     measured = [compute_log_metrics(log) for log in logs]
-    rows = [ComparisonRow(one, tuple(metrics.whole(one) for metrics in measured)) for one in quantities()]
+    rows = [
+        ComparisonRow(one, tuple(metrics.whole(one) for metrics in measured))
+        for one in quantities()
+    ]
     kept = tuple(row for row in rows if any(entry.applies for entry in row.entries))
     return MetricComparison(tuple(names) or tuple(Path(log.source).stem for log in logs), kept)
 
 
 def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:
-    """Returns a comparison, ready for JSON: finite numbers, and null with its reason in `unknown`."""
+    """Returns a comparison, ready for JSON: finite numbers, and null with its reason in
+    `unknown`.
+    """
     return {
         "columns": list(comparison.columns),
         "rows": [

@@ -1,13 +1,14 @@
 """Rendered impedance and reflected wall force over frequency, by a run's frequency response.
 
-Invariant: a response without sufficient excitation is undecided, with a reason. It is given at the spectral
-line with the strongest drive, and at all that are driven nearly as much, if at least `MIN_SEGMENTS`
-independent segments excite the line and both signals have a coherence of at least `MIN_COHERENCE` with the
+Invariant: a response without sufficient excitation is undecided, with a reason. It is given at
+the spectral line with the strongest drive, and at all that are driven nearly as much, if at
+least `MIN_SEGMENTS` independent segments excite the line and both signals have a coherence of
+at least `MIN_COHERENCE` with the
 drive: then its random error is at most 17.2 %.
 
-In a closed loop the ratio of two signals depends on the drive, so the drive is a signal of its own that
-depends on nothing else: H = S_dy / S_dx. docs/metrics.md names drives and sources (Welch; Bendat and Piersol;
-Soderstrom and Stoica).
+In a closed loop the ratio of two signals depends on the drive, so the drive is a signal of its
+own that depends on nothing else: H = S_dy / S_dx. docs/metrics.md names drives and sources
+(Welch; Bendat and Piersol; Soderstrom and Stoica).
 """
 
 import math
@@ -36,7 +37,9 @@ _OVERLAP_FACTOR = 1.06
 MIN_DRIVE_TORQUE_NM = 0.05
 """Least amplitude of a torque that drives, N m."""
 _NEARLY = 0.55
-"""Share of the strongest drive from which on a line counts as driven: a Hann window leaks 0.5 to the next."""
+"""Share of the strongest drive from which on a line counts as driven: a Hann window leaks 0.5
+to the next.
+"""
 STILL_SCRIPT_NM_S = 1e-6
 """A script that changes by less stands still, N m/s."""
 NO_SCRIPT_TEXT = "what the hand was to do is not in the scenario: nobody knows who drives"
@@ -49,7 +52,8 @@ class FrequencyResponse(NamedTuple):
         frequency_hz: the line with the strongest drive.
         gain, phase_rad: of the ratio, in the unit of output over input.
         coherence: the smaller of both signals' coherences with the drive.
-        segments: number of segments of equal power that would drive the line as much as all of them do.
+        segments: number of segments of equal power that would drive the line as much as all of
+            them do.
         error: random error of the gain, one standard deviation as a share of it.
         why: the reason why the ratio is undecided; "" if it is decided.
     """
@@ -66,20 +70,28 @@ class FrequencyResponse(NamedTuple):
 def estimate_responses(
     drive: Array, put_in: Array, came_out: Array, usable: Bools, rate_hz: int, least: float
 ) -> list[FrequencyResponse]:
-    """Returns the ratio of two signals at the driven lines, that with the strongest drive first.
+    """Returns the ratio of two signals at the driven lines, that with the strongest drive
+    first.
 
-    Driven is a line with a drive of `least` or more; without one, the only entry says so. The drive depends
-    on no other signal. Usable are rows that are recorded while no other drive is active.
-    Own code in place of `scipy.signal.csd`, which cannot leave out segments with unusable rows.
+    Driven is a line with a drive of `least` or more; without one, the only entry says so. The
+    drive depends on no other signal. Usable are rows that are recorded while no other drive is
+    active. Own code in place of `scipy.signal.csd`, which cannot leave out segments with
+    unusable rows.
     """
     length = round(SEGMENT_S * rate_hz)
-    starts: list[int] = []  # of segments with usable rows alone, each half a length after the one before
+    starts: list[
+        int
+    ] = []  # of segments with usable rows alone, each half a length after the one before
     if length >= 4 * _LOWEST_LINE:
         unusable = np.concatenate([[0], np.cumsum(~usable)])
         first = np.arange(0, len(usable) - length + 1, length // 2)
         starts = first[unusable[first + length] == unusable[first]].tolist()
     if not starts:
-        return [FrequencyResponse(why=f"no {SEGMENT_S:g} s are recorded in which nobody else drives")]
+        return [
+            FrequencyResponse(
+                why=f"no {SEGMENT_S:g} s are recorded in which nobody else drives"
+            )
+        ]
     D = _spectra(drive, starts, length)
     power = (np.abs(D) ** 2).mean(axis=0)
     if not np.isfinite(power).all():
@@ -95,22 +107,31 @@ def estimate_responses(
     ]
 
 
-def _estimate_at_line(frequency_hz: float, D: Complex, X: Complex, Y: Complex) -> FrequencyResponse:
+def _estimate_at_line(
+    frequency_hz: float, D: Complex, X: Complex, Y: Complex
+) -> FrequencyResponse:
     power = np.abs(D) ** 2
     segments = float(power.sum() ** 2 / (power**2).sum()) / _OVERLAP_FACTOR
     if segments < MIN_SEGMENTS:
         why = f"undecided: {segments:.1f} stretches of {SEGMENT_S:g} s drive {frequency_hz:g} Hz, "
-        return FrequencyResponse(frequency_hz, segments=segments, why=f"{why}{MIN_SEGMENTS:g} are needed")
+        return FrequencyResponse(
+            frequency_hz, segments=segments, why=f"{why}{MIN_SEGMENTS:g} are needed"
+        )
     coherence = min(_coherence(D, X), _coherence(D, Y))
     if coherence < MIN_COHERENCE:
-        why = (
-            f"undecided: the coherence at {frequency_hz:g} Hz is {coherence:.2f}, {MIN_COHERENCE:g} is needed"
-        )
+        why = f"undecided: the coherence at {frequency_hz:g} Hz is {coherence:.2f}, {MIN_COHERENCE:g} is needed"
         return FrequencyResponse(frequency_hz, coherence=coherence, segments=segments, why=why)
     H = np.vdot(D, Y) / np.vdot(D, X)
     noise = sum(1.0 / _coherence(D, one) - 1.0 for one in (X, Y))
     error = math.sqrt(max(0.0, noise) / (2.0 * segments))
-    return FrequencyResponse(frequency_hz, float(abs(H)), float(np.angle(H)), coherence, segments, error)
+    return FrequencyResponse(
+        frequency_hz=frequency_hz,
+        gain=float(abs(H)),
+        phase_rad=float(np.angle(H)),
+        coherence=coherence,
+        segments=segments,
+        error=error,
+    )
 
 
 def _coherence(D: Complex, X: Complex) -> float:
@@ -121,14 +142,16 @@ def _coherence(D: Complex, X: Complex) -> float:
 def _spectra(signal: Array, starts: list[int], length: int) -> Complex:
     """Returns the lines of every segment above the mean, shape (S, L), under a Hann window.
 
-    Scaled so that the square of a line is the mean square of its sinusoid. No slope is taken out: that would
-    bend slow sinusoids too.
+    Scaled so that the square of a line is the mean square of its sinusoid. No slope is taken
+    out: that would bend slow sinusoids too.
     """
     segments = np.stack([signal[n : n + length] for n in starts])
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(length) + 0.5) / length)
     highest = min(int(HIGHEST_HZ * SEGMENT_S), length // 2 - 1)
     scale = math.sqrt(2.0) / window.sum()
-    lines: Complex = np.fft.rfft(segments * window, axis=1)[:, _LOWEST_LINE : highest + 1] * scale
+    lines: Complex = (
+        np.fft.rfft(segments * window, axis=1)[:, _LOWEST_LINE : highest + 1] * scale
+    )
     return lines
 
 
@@ -136,9 +159,9 @@ class ImpedanceEstimate(NamedTuple):
     """An impedance or a reflection over frequency, of a joint, from 1.
 
     Attributes:
-        kind: "impedance": torque of an operator ON its arm over the velocity of the joint: of its site and of
-            all behind it, N m s/rad. "reflection": torque that an operator feels over the one of the
-            environment ON another arm.
+        kind: "impedance": torque of an operator ON its arm over the velocity of the joint: of
+            its site and of all behind it, N m s/rad. "reflection": torque that an operator
+            feels over the one of the environment ON another arm.
         at, of: the site of the operator, and of a reflection that of the environment, else "".
         ratio: at the line with the strongest drive.
         spectrum: at every driven line, by rising frequency.
@@ -158,7 +181,9 @@ class ImpedanceEstimate(NamedTuple):
 
 
 def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
-    """Returns the impedance at every operator, and its reflection of every environment elsewhere."""
+    """Returns the impedance at every operator, and its reflection of every environment
+    elsewhere.
+    """
     runs = view.shared
     operators = [site for site, run in runs.items() if run.torque.operator.any()]
     walls = [site for site, run in runs.items() if run.torque.environment.any()]
@@ -167,7 +192,9 @@ def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
     return [one for site, wall in pairs for one in _estimate_joints(runs, site, wall)]
 
 
-def _estimate_joints(runs: Mapping[str, SiteRun], site: str, wall: str) -> Iterator[ImpedanceEstimate]:
+def _estimate_joints(
+    runs: Mapping[str, SiteRun], site: str, wall: str
+) -> Iterator[ImpedanceEstimate]:
     records, by_source, _ = runs[site]
     script = by_source.script
     usable = _find_still_rows(runs, site, alone=not wall)
@@ -183,13 +210,23 @@ def _estimate_joints(runs: Mapping[str, SiteRun], site: str, wall: str) -> Itera
             else:
                 signals = script[:, joint], records.qd[:, joint], operator, usable
             found = estimate_responses(*signals, records.rate_hz, MIN_DRIVE_TORQUE_NM)
-        spectrum = sorted((one for one in found if one.frequency_hz), key=lambda one: one.frequency_hz or 0.0)
+        spectrum = sorted(
+            (one for one in found if one.frequency_hz), key=lambda one: one.frequency_hz or 0.0
+        )
         kind = "reflection" if wall else "impedance"
-        yield ImpedanceEstimate(kind, site, wall, joint + 1, found[0], tuple(spectrum))
+        yield ImpedanceEstimate(
+            kind=kind,
+            at=site,
+            of=wall,
+            joint=joint + 1,
+            ratio=found[0],
+            spectrum=tuple(spectrum),
+        )
 
 
 def _find_still_rows(runs: Mapping[str, SiteRun], at: str, *, alone: bool) -> Bools | None:
-    """Returns at which ticks of a site no operator moves, that of the site included unless `alone` drives.
+    """Returns at which ticks of a site no operator moves, that of the site included unless
+    `alone` drives.
 
     None if one of them has no script.
     """

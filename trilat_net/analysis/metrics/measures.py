@@ -1,7 +1,8 @@
 """What a metric is: the quantities of a kind of place, and the function that measures them.
 
-Invariant: a value is a finite number, or None with a reason. A key has one definition, beside its function
-in one file of this folder, and in docs/metrics.md; whoever shows, compares or asks finds it by its file.
+Invariant: a value is a finite number, or None with a reason. A key has one definition, beside
+its function in one file of this folder, and in docs/metrics.md; whoever shows, compares or asks
+finds it by its file.
 """
 
 import math
@@ -37,12 +38,20 @@ _NOT_FINITE = "it is no finite number"
 
 def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
     """Returns a metric of a number; with the reason if it is None or not finite."""
-    return Metric(None, why) if value is None or not math.isfinite(value) else Metric(float(value))
+    return (
+        Metric(None, why) if value is None or not math.isfinite(value) else Metric(float(value))
+    )
 
 
 def unavailable(group: str, why: str, *, of: str = "", applies: bool = True) -> MetricValues:
-    """Returns the quantities of a group, or those of it that are `of` a kind of place, without a number."""
-    return {q.key: Metric(None, why, applies) for q in quantities() if q.group == group and of in ("", q.of)}
+    """Returns the quantities of a group, or those of it that are `of` a kind of place, without
+    a number.
+    """
+    return {
+        q.key: Metric(None, why, applies)
+        for q in quantities()
+        if q.group == group and of in ("", q.of)
+    }
 
 
 def measure_shared(
@@ -53,7 +62,8 @@ def measure_shared(
     at_end: NDArray[np.bool_],
     none: str = _NOT_FINITE,
 ) -> MetricValues:
-    """Returns what sites share, angles, rad, or places, m, or both of a pose: RMS, peak, peak at the end.
+    """Returns what sites share, angles, rad, or places, m, or both of a pose: RMS, peak, peak
+    at the end.
 
     Args:
         group: that of the quantities.
@@ -77,7 +87,9 @@ def measure_shared(
 
 
 def rms(values: ArrayLike) -> float:
-    """Returns the root mean square over rows of the column with the largest; NaN of no rows, shape (K, n)."""
+    """Returns the root mean square over rows of the column with the largest; NaN of no rows,
+    shape (K, n).
+    """
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
         return math.nan
@@ -111,7 +123,8 @@ class Quantity(NamedTuple):
 
 
 def list_shared_quantities(names: Mapping[str, str]) -> list[Quantity]:
-    """Returns what sites share by key and name: of their angles q, rad, and then of their places x, m.
+    """Returns what sites share by key and name: of their angles q, rad, and then of their
+    places x, m.
 
     A key lacks its unit; "{0}" in a name stands for q or x.
     """
@@ -124,7 +137,9 @@ def list_shared_quantities(names: Mapping[str, str]) -> list[Quantity]:
 
 
 Measuring = Callable[[RunView, str], MetricValues]
-"""Returns the quantities of a place, by their keys; each a number or the reason why there is none."""
+"""Returns the quantities of a place, by their keys; each a number or the reason why there is
+none.
+"""
 
 
 class Measure(NamedTuple):
@@ -148,12 +163,25 @@ SHARING = "force sharing"
 USERS = "users"
 NETWORK = "network"
 LOOP = "loop"
-_SHOWN = (TRACKING, SPREAD, FOLLOWING, EFFORT, ENERGY, CONTACT, SHARING, USERS, LEARNING, NETWORK, LOOP)
+_SHOWN = (
+    TRACKING,
+    SPREAD,
+    FOLLOWING,
+    EFFORT,
+    ENERGY,
+    CONTACT,
+    SHARING,
+    USERS,
+    LEARNING,
+    NETWORK,
+    LOOP,
+)
 """Headings in the order in which they are shown; others follow."""
 
 
 def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring], Measuring]:
-    """Declares that a function measures these quantities of every "run", "site", "link" or "wall".
+    """Declares that a function measures these quantities of every "run", "site", "link" or
+    "wall".
 
     Raises:
         ValueError: another function measures one of them.

@@ -1,10 +1,12 @@
-"""Metrics of motion, links and loops: tracking, spread, following, effort, contact, estimates, timing.
+"""Metrics of motion, links and loops: tracking, spread, following, effort, contact, estimates,
+timing.
 
-Invariant: e is Eq. (9) and includes the delay; the spread compares one instant; a slave is compared with its
-master as that was when the sample in use was taken. Effort counts the torque in the record: Eq. (13) within
-its limit, gravity compensation included. A wall is the scenario's, at the logged states; ticks without a
-record contribute nothing. A parameter counts if the control law adapts it (Gamma > 0); if theta is unknown
-there is no error, but the estimates are still reported.
+Invariant: e is Eq. (9) and includes the delay; the spread compares one instant; a slave is
+compared with its master as that was when the sample in use was taken. Effort counts the torque
+in the record: Eq. (13) within its limit, gravity compensation included. A wall is the
+scenario's, at the logged states; ticks without a record contribute nothing. A parameter counts
+if the control law adapts it (Gamma > 0); if theta is unknown there is no error, but the
+estimates are still reported.
 
 Those of links and of the loops of sites add no definition to docs/definitions.md.
 """
@@ -23,7 +25,13 @@ from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
 from .. import site_signals
 from ..aligned import AlignedRecords, Bools, find_common_rows
-from ..arm_rows import ArmRows, PlanarArmRows, build_arm_rows, find_base_parameters, find_consistent_links
+from ..arm_rows import (
+    ArmRows,
+    PlanarArmRows,
+    build_arm_rows,
+    find_base_parameters,
+    find_consistent_links,
+)
 from ..file_overview import describe_site_health
 from ..run_view import RunView
 from ..torque_sources import wall_depth, wall_force
@@ -63,7 +71,9 @@ _LAGS = {
 }
 
 
-@measures("site", TRACKING, Quantity("settle_s", "settled", "s"), *list_shared_quantities(_ERRORS))
+@measures(
+    "site", TRACKING, Quantity("settle_s", "settled", "s"), *list_shared_quantities(_ERRORS)
+)
 def measure_tracking(view: RunView, site: str) -> MetricValues:
     """Returns settling, RMS and peak of a site's e."""
     log = view.log
@@ -76,17 +86,18 @@ def measure_tracking(view: RunView, site: str) -> MetricValues:
     unsettled = f"|e| exceeds {site_signals.SETTLED_ERROR_RAD:g} {unit} in the last record"
     at_end = part.t_s > part.t_s[-1] - END_WINDOW_S
     return {
-        **measure_shared(TRACKING, space, _ERRORS, e, at_end),
+        **measure_shared(group=TRACKING, space=space, keys=_ERRORS, off=e, at_end=at_end),
         "settle_s": metric(site_signals.settling_time_s(part), unsettled),
     }
 
 
 @measures("run", SPREAD, *list_shared_quantities(_SPREADS))
 def measure_spread(view: RunView, _run: str) -> MetricValues:
-    """Returns the undelayed spread: the largest difference between sites' angles of a joint at an instant.
+    """Returns the undelayed spread: the largest difference between sites' angles of a joint at
+    an instant.
 
-    In task space between their places, along axes that all follow. Instants are the ticks of the first site
-    at which every other site has its own latest tick recorded.
+    In task space between their places, along axes that all follow. Instants are the ticks of
+    the first site at which every other site has its own latest tick recorded.
     """
     log = view.log
     runs = view.sites
@@ -98,7 +109,8 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
     if not known.any():
         return unavailable(SPREAD, "no instant of which every site has a record")
     there = np.stack(poses)[:, known]
-    if sites[0].x.shape[1] == POSE:  # of vectors on both sides of half a turn the difference is a whole turn
+    # of vectors on both sides of half a turn the difference is a whole turn
+    if sites[0].x.shape[1] == POSE:
         for turns in there[1:, :, PLACE:]:
             turns[:] = bring_nearer(turns, there[0, :, PLACE:])
     apart = np.ptp(there, axis=0)
@@ -108,15 +120,23 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
     end_s = min(float(records.t_s[-1]) for records in sites)
     last = sites[0].t_s[known] > end_s - END_WINDOW_S
     none = "no instant of the last second of which every site has a record"
-    return measure_shared(SPREAD, log.scenario.sites[log.sites[0]].task.space, _SPREADS, apart, last, none)
+    return measure_shared(
+        group=SPREAD,
+        space=log.scenario.sites[log.sites[0]].task.space,
+        keys=_SPREADS,
+        off=apart,
+        at_end=last,
+        none=none,
+    )
 
 
 @measures("link", FOLLOWING, *list_shared_quantities(_LAGS))
 def measure_following(view: RunView, link: str) -> MetricValues:
-    """Returns q_m(t - T) - q_s of a master's link to a slave, T being the effective delay of the tick.
+    """Returns q_m(t - T) - q_s of a master's link to a slave, T being the effective delay of
+    the tick.
 
-    At every tick t_k of the slave from its first sample of that master on: the master's angles in the record
-    whose sample the slave has in use, less the slave's own.
+    At every tick t_k of the slave from its first sample of that master on: the master's angles
+    in the record whose sample the slave has in use, less the slave's own.
     """
     log = view.log
     runs = view.sites
@@ -142,7 +162,9 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     last = slave.known_at_end(END_WINDOW_S)[known]
     space = log.scenario.sites[site].task.space
     none = "no sample in the last second"
-    return measure_shared(FOLLOWING, space, _LAGS, off, last, none)
+    return measure_shared(
+        group=FOLLOWING, space=space, keys=_LAGS, off=off, at_end=last, none=none
+    )
 
 
 @measures(
@@ -168,7 +190,9 @@ def measure_effort(view: RunView, site: str) -> MetricValues:
         "rms_tau_nm": metric(rms(tau)),
         "peak_tau_nm": metric(peak(tau)),
         "saturated_share": metric(float(at_limit.mean())),
-        "chatter_nm": metric(float(np.abs(steps).mean(axis=0).max()) if len(steps) else None, "no two ticks"),
+        "chatter_nm": metric(
+            float(np.abs(steps).mean(axis=0).max()) if len(steps) else None, "no two ticks"
+        ),
     }
 
 
@@ -187,7 +211,8 @@ def measure_effort(view: RunView, site: str) -> MetricValues:
     Quantity("end_hits", "hits, last 5 s", "", "sum"),
 )
 def measure_wall_contact(view: RunView, name: str) -> MetricValues:
-    """Returns force, hits and depth of a wall, over the run and over its last 5 s; None without records.
+    """Returns force, hits and depth of a wall, over the run and over its last 5 s; None without
+    records.
 
     The first record, of all and after a gap, begins no contact: its beginning is unknown.
     """
@@ -215,7 +240,8 @@ def measure_wall_contact(view: RunView, name: str) -> MetricValues:
 
 
 class BaseEstimates(NamedTuple):
-    """Estimates of a chain in the combinations of learnt parameters that torques determine, shape (B,) each.
+    """Estimates of a chain in the combinations of learnt parameters that torques determine,
+    shape (B,) each.
 
     Attributes:
         parameter: the parameter that each is named after, by its place in theta, from 0.
@@ -239,8 +265,10 @@ class ParameterEstimates(NamedTuple):
         learnt: True for each that the law adapts.
         theta: the true parameters; None if unknown.
         first, last: the estimates of the first and the last record.
-        slope_per_s: of straight lines through the last 5 s, 1/s; None with less than two records.
-        base: the same of a chain, of whose parameters torques determine combinations alone; else None.
+        slope_per_s: of straight lines through the last 5 s, 1/s; None with less than two
+            records.
+        base: the same of a chain, of whose parameters torques determine combinations alone;
+            else None.
     """
 
     learnt: list[bool]
@@ -278,10 +306,15 @@ def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> Par
 
 def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
     """Returns the estimates of every site with records."""
-    return {site: read_parameter_estimates(view.scenario, run.records) for site, run in view.sites.items()}
+    return {
+        site: read_parameter_estimates(view.scenario, run.records)
+        for site, run in view.sites.items()
+    }
 
 
-def _in_base(arm: ArmRows, learnt: Bools, theta: list[float] | None, theta_hat: Array) -> BaseEstimates:
+def _in_base(
+    arm: ArmRows, learnt: Bools, theta: list[float] | None, theta_hat: Array
+) -> BaseEstimates:
     base = find_base_parameters(arm, learnt)
     first, last = (base.combination @ theta_hat[[0, -1]].T).T.tolist()
     truth = None if theta is None else (base.combination @ np.array(theta)).tolist()
@@ -300,10 +333,11 @@ def _in_base(arm: ArmRows, learnt: Bools, theta: list[float] | None, theta_hat: 
     Quantity("unphysical_links", "unphysical links, at last", "", "sum"),
 )
 def measure_parameter_error(view: RunView, site: str) -> MetricValues:
-    """Returns the distance of the estimates from theta at both ends, and their rate of change at the end.
+    """Returns the distance of the estimates from theta at both ends, and their rate of change
+    at the end.
 
-    Distance and energy of a chain are those of the combinations that torques determine: what else its
-    estimates are off by stays as it is, and acts on nothing.
+    Distance and energy of a chain are those of the combinations that torques determine: what
+    else its estimates are off by stays as it is, and acts on nothing.
     """
     scenario = view.scenario
     estimates = view.once(read_all_estimates).get(site)
@@ -319,7 +353,9 @@ def measure_parameter_error(view: RunView, site: str) -> MetricValues:
     slope = None if slopes is None else float(np.linalg.norm(np.array(slopes)[rows]))
     metrics = unavailable(LEARNING, "theta of the arm is not known")
     metrics["theta_slope_per_s"] = metric(slope, "less than two records in the last 5 s")
-    metrics["unphysical_links"] = Metric(None, "it is no chain, of ten parameters a link", applies=False)
+    metrics["unphysical_links"] = Metric(
+        None, "it is no chain, of ten parameters a link", applies=False
+    )
     if base is not None:
         metrics["unphysical_links"] = metric(base.consistent_last.count(False))
     if estimates.theta is None:
@@ -330,15 +366,25 @@ def measure_parameter_error(view: RunView, site: str) -> MetricValues:
     energy: list[float | None] = [None, None]
     if gains.law is Law.ADAPTIVE:
         energy = _find_parameter_energy(arm, rows, np.array(gains.Gamma), off)
-    why = "it is no finite number" if gains.law is Law.ADAPTIVE else "the gains of learning are not known"
-    for end, distance, stored in zip(("first", "last"), np.linalg.norm(off, axis=1), energy, strict=True):
+    why = (
+        "it is no finite number"
+        if gains.law is Law.ADAPTIVE
+        else "the gains of learning are not known"
+    )
+    for end, distance, stored in zip(
+        ("first", "last"), np.linalg.norm(off, axis=1), energy, strict=True
+    ):
         metrics[f"theta_error_{end}"] = metric(float(distance))
         metrics[f"theta_energy_{end}_j"] = metric(stored, why)
     return metrics
 
 
-def _find_parameter_energy(arm: ArmRows, learnt: Bools, Gamma: Array, off: Array) -> list[float | None]:
-    """Returns the part of V of errors of base parameters, which learn with B Gamma B', shape (K, B), J."""
+def _find_parameter_energy(
+    arm: ArmRows, learnt: Bools, Gamma: Array, off: Array
+) -> list[float | None]:
+    """Returns the part of V of errors of base parameters, which learn with B Gamma B', shape
+    (K, B), J.
+    """
     if isinstance(arm, PlanarArmRows):
         energy = 0.5 * (off**2 / Gamma[learnt]).sum(axis=1)
     else:
@@ -372,7 +418,9 @@ def measure_network(view: RunView, link: str) -> MetricValues:
         "silence_ms": metric(use.silence_ms, never),
         "loss": metric(use.loss, unknown),
         "burst": lossless if use.loss == 0.0 else metric(use.burst, unknown),
-        "late_samples": metric(use.counts.late if use.counts else None, f"no records of {use.site}"),
+        "late_samples": metric(
+            use.counts.late if use.counts else None, f"no records of {use.site}"
+        ),
     }
 
 

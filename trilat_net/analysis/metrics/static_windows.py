@@ -1,9 +1,11 @@
-"""Metrics at rest: windows in which all arms rest under constant torques, rendered stiffness, force sharing.
+"""Metrics at rest: windows in which all arms rest under constant torques, rendered stiffness,
+force sharing.
 
-Invariant: docs/metrics.md defines and derives each. A stiffness is the operator's own, and is not given, if
-anything but that operator changed; it is a secant along the path taken: the other joint moves as well. The
-torques tau_i ON the arms obey sum_i (pi_i / K_i) tau_i = 0 per joint, pi being the left Perron vector of the
-dominance matrix and K_i what holds e_i; if gravity is adapted the estimates take up the load.
+Invariant: docs/metrics.md defines and derives each. A stiffness is the operator's own, and is
+not given, if anything but that operator changed; it is a secant along the path taken: the other
+joint moves as well. The torques tau_i ON the arms obey sum_i (pi_i / K_i) tau_i = 0 per joint,
+pi being the left Perron vector of the dominance matrix and K_i what holds e_i; if gravity is
+adapted the estimates take up the load.
 """
 
 from collections.abc import Mapping
@@ -47,7 +49,8 @@ class StaticWindow(NamedTuple):
     """A static window, from its first tick to its last; per site means over it, shape (n,).
 
     Attributes:
-        torque, environment: of operator and environment ON the arm, and of the environment alone, N m.
+        torque, environment: of operator and environment ON the arm, and of the environment
+        alone, N m.
         script: the operator's script, N m; None if unknown.
         q: the joint angles, rad.
         alpha: the dominance matrix, shape (N, N).
@@ -79,7 +82,11 @@ def find_static_windows(view: RunView) -> list[StaticWindow]:
             static &= ~(np.append(moves, False) | np.append(False, moves))
         still &= recorded & static[rows[site]]
     need = int(np.ceil(WINDOW_S * first.rate_hz))
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]))).reshape(-1, 2).tolist()
+    edges = (
+        np.flatnonzero(np.diff(np.concatenate([[False], still, [False]])))
+        .reshape(-1, 2)
+        .tolist()
+    )
     windows = []
     for last in (slice(end - need - 1, end) for begin, end in edges if end - begin > need):
         here = {site: row[last] for site, row in rows.items()}
@@ -91,9 +98,19 @@ def find_static_windows(view: RunView) -> list[StaticWindow]:
     return windows
 
 
-def _average_window(runs: Mapping[str, SiteRun], rows: Mapping[str, Ints], t_s: Array) -> StaticWindow:
+def _average_window(
+    runs: Mapping[str, SiteRun], rows: Mapping[str, Ints], t_s: Array
+) -> StaticWindow:
     names = list(runs)
-    window = StaticWindow(float(t_s[0]), float(t_s[-1]), {}, {}, {}, {}, np.zeros((len(names), len(names))))
+    window = StaticWindow(
+        from_s=float(t_s[0]),
+        to_s=float(t_s[-1]),
+        torque={},
+        environment={},
+        script={},
+        q={},
+        alpha=np.zeros((len(names), len(names))),
+    )
     for i, (site, (records, torque, dominance)) in enumerate(runs.items()):
         row = rows[site]
         window.torque[site] = -records.tau_x[row].mean(axis=0)
@@ -106,10 +123,12 @@ def _average_window(runs: Mapping[str, SiteRun], rows: Mapping[str, Ints], t_s: 
 
 
 class StiffnessEstimate(NamedTuple):
-    """Stiffness that an operator met at a joint, from 1, between the ends of two static windows in a row.
+    """Stiffness that an operator met at a joint, from 1, between the ends of two static windows
+    in a row.
 
     Attributes:
-        torque_nm, angle_rad: change of the operator's torque ON its arm, and of the joint's angle.
+        torque_nm, angle_rad: change of the operator's torque ON its arm, and of the joint's
+        angle.
         stiffness_nm_rad: their ratio; None if the joint did not move: too stiff to measure.
     """
 
@@ -123,7 +142,9 @@ class StiffnessEstimate(NamedTuple):
 
 
 def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
-    """Returns the stiffness between each two static windows between which one operator alone moved."""
+    """Returns the stiffness between each two static windows between which one operator alone
+    moved.
+    """
     estimates = []
     for before, after in pairwise(view.once(find_static_windows)):
         moved = []
@@ -137,7 +158,9 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
         if not known or len(moved) != 1 or (before.alpha != after.alpha).any():
             continue
         site = moved[0]
-        operator = [window.torque[site] - window.environment[site] for window in (before, after)]
+        operator = [
+            window.torque[site] - window.environment[site] for window in (before, after)
+        ]
         torques = operator[1] - operator[0]
         angles = after.q[site] - before.q[site]
         for joint in range(len(torques)):
@@ -145,18 +168,27 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
             angle = float(angles[joint])
             if abs(torque) >= MIN_TORQUE_CHANGE_NM:
                 K = torque / angle if abs(angle) >= MIN_ANGLE_CHANGE_RAD else None
-                found = StiffnessEstimate(before.to_s, after.to_s, site, joint + 1, torque, angle, K)
+                found = StiffnessEstimate(
+                    from_s=before.to_s,
+                    to_s=after.to_s,
+                    site=site,
+                    joint=joint + 1,
+                    torque_nm=torque,
+                    angle_rad=angle,
+                    stiffness_nm_rad=K,
+                )
                 estimates.append(found)
     return estimates
 
 
 class SharingRatio(NamedTuple):
-    """Two loaded sites in a static window, from its first tick to its last; joints count from 1.
+    """Two loaded sites in a static window, from its first tick to its last; joints count from
+    1.
 
     Attributes:
         pushed, pushed_nm: the site of the torque, and that torque, ON its arm.
-        by_wall: True if the environment makes most of it.
-        holds, felt_nm: the site of the operator that feels it, and what: the negative of its own ON its arm.
+        by_wall: True if the environment makes most of it. holds, felt_nm: the site of the
+        operator that feels it, and what: the negative of its own ON its arm.
         expected_nm: the torque by the dominance factors.
     """
 
@@ -174,7 +206,9 @@ class SharingRatio(NamedTuple):
     def off(self) -> float | None:
         """Relative deviation of the felt torque from the expected one; None without one."""
         expected = self.expected_nm.value
-        return None if expected is None or expected == 0.0 else abs(self.felt_nm / expected - 1.0)
+        return (
+            None if expected is None or expected == 0.0 else abs(self.felt_nm / expected - 1.0)
+        )
 
 
 class JointLoad(NamedTuple):
@@ -230,7 +264,9 @@ def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
     if offs:
         return {"sharing_off": metric(max(offs))}
     whys = "; ".join(dict.fromkeys(pair.expected_nm.why for pair in pairs))
-    why = count_static_windows(view).why or whys or "no two sites are loaded in a window at rest"
+    why = (
+        count_static_windows(view).why or whys or "no two sites are loaded in a window at rest"
+    )
     return {"sharing_off": Metric(None, why, applies=bool(view.absent))}
 
 
@@ -239,7 +275,14 @@ def _weigh_load(
 ) -> JointLoad:
     if isinstance(weights, str):
         why = Metric(None, weights)
-        return JointLoad(window.from_s, window.to_s, joint + 1, torque, dict.fromkeys(torque, why), why)
+        return JointLoad(
+            from_s=window.from_s,
+            to_s=window.to_s,
+            joint=joint + 1,
+            torque_nm=torque,
+            weight=dict.fromkeys(torque, why),
+            imbalance=why,
+        )
     column = weights[:, joint] / np.nanmax(weights[:, joint])
     weight = dict(zip(window.torque, column.tolist(), strict=True))
     moments = [weight[site] * value for site, value in torque.items()]
@@ -247,22 +290,35 @@ def _weigh_load(
     share = abs(sum(moments)) / largest if largest > 0.0 else None
     imbalance = metric(share, "nobody who is followed is loaded")
     shown = {site: metric(weight[site]) for site in torque}
-    return JointLoad(window.from_s, window.to_s, joint + 1, torque, shown, imbalance)
+    return JointLoad(
+        from_s=window.from_s,
+        to_s=window.to_s,
+        joint=joint + 1,
+        torque_nm=torque,
+        weight=shown,
+        imbalance=imbalance,
+    )
 
 
 def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
-    """Returns the force sharing of every joint in a static window at which two sites are loaded.
+    """Returns the force sharing of every joint in a static window at which two sites are
+    loaded.
 
-    The operator that feels is a spring; if both are or none, the slave is the site of the torque.
+    The operator that feels is a spring; if both are or none, the slave is the site of the
+    torque.
     """
     scenario = view.scenario
     at = {window.from_s: window for window in view.once(find_static_windows)}
     pairs = []
     for load in view.once(find_joint_loads):
         if len(load.torque_nm) == 2:
-            pushed, holds = sorted(load.torque_nm, key=lambda site: _holding_rank(scenario, site, load.to_s))
+            pushed, holds = sorted(
+                load.torque_nm, key=lambda site: _holding_rank(scenario, site, load.to_s)
+            )
             torque = load.torque_nm[pushed]
-            by_wall = abs(float(at[load.from_s].environment[pushed][load.joint - 1])) > 0.5 * abs(torque)
+            by_wall = abs(
+                float(at[load.from_s].environment[pushed][load.joint - 1])
+            ) > 0.5 * abs(torque)
             one = load.weight[pushed]
             other = load.weight[holds]
             if one.value is None or other.value is None:
@@ -272,20 +328,30 @@ def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
             else:
                 expected = metric(torque * one.value / other.value)
             felt = -load.torque_nm[holds]
-            pairs.append(SharingRatio(*load[:3], pushed, torque, by_wall, holds, felt, expected))
+            pairs.append(
+                SharingRatio(*load[:3], pushed, torque, by_wall, holds, felt, expected)
+            )
     return pairs
 
 
 def _holding_rank(scenario: Scenario, site: str, at_s: float) -> tuple[bool, bool]:
-    """Returns a sort key of the site that feels: a spring is active there and no wall; it is a master."""
+    """Returns a sort key of the site that feels: a spring is active there and no wall; it is a
+    master.
+    """
     spec = scenario.sites[site]
-    springs = (one.actor for one in spec.hands if one.actor.acts in (TorqueKind.HAND, TorqueKind.TASK_HAND))
+    springs = (
+        one.actor
+        for one in spec.hands
+        if one.actor.acts in (TorqueKind.HAND, TorqueKind.TASK_HAND)
+    )
     held = any(spring.start_s <= at_s < spring.end_s for spring in springs)
     return held and not spec.environment, spec.role == "master"
 
 
 def _torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
-    """Returns pi_i / K_i per joint, shape (N, n); or the reason why that does not weigh torques."""
+    """Returns pi_i / K_i per joint, shape (N, n); or the reason why that does not weigh
+    torques.
+    """
     if len(find_closed_groups(alpha)) > 1:
         return "two groups of sites follow nobody else: who feels whom is not unique"
     stiffness = []
@@ -298,7 +364,9 @@ def _torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
 
 
 def _holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
-    """Returns the stiffness that holds e at rest, shape (n,), N m/rad, and the reason why more acts."""
+    """Returns the stiffness that holds e at rest, shape (n,), N m/rad, and the reason why more
+    acts.
+    """
     spec = scenario.sites[site]
     arm = build_arm_rows(scenario, site)
     gains = spec.control.gains(arm.theta)
@@ -315,7 +383,10 @@ def _holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
     adaptive = gains.law is Law.ADAPTIVE
     gravity = arm.gravity_parameters
     if adaptive and arm.task is not None:
-        return none, "in task space what holds the e of this law changes with the pose: J+'Kp J+ Lambda"
+        return (
+            none,
+            "in task space what holds the e of this law changes with the pose: J+'Kp J+ Lambda",
+        )
     estimate = np.array(gains.theta_hat0 if adaptive else gains.known)
     if adaptive and np.any((np.array(gains.Gamma) > 0.0) & gravity):
         return none, "gravity is learnt: the estimates take up the load"

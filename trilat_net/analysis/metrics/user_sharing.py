@@ -1,8 +1,9 @@
 """Metrics of users who share a slave: authority, disagreement, interventions, takeovers.
 
-Invariant: the users are the masters of the scenario, the slave its first one; a user leads whose share in the
-slave's reference is the largest. Torques are those of hands ON arms, without the environment's; in task space
-they are forces at end effectors. Rows without a record do not count.
+Invariant: the users are the masters of the scenario, the slave its first one; a user leads
+whose share in the slave's reference is the largest. Torques are those of hands ON arms, without
+the environment's; in task space they are forces at end effectors. Rows without a record do not
+count.
 """
 
 import math
@@ -11,13 +12,31 @@ import numpy as np
 
 from ...core.task_space import PLACE
 from ..aligned import AlignedRecords, find_common_rows, find_latest_rows
-from ..dominance_history import RAMP_TIME_TOLERANCE_S, UserShares, find_user_shares, find_users, list_ramps
+from ..dominance_history import (
+    RAMP_TIME_TOLERANCE_S,
+    UserShares,
+    find_user_shares,
+    find_users,
+    list_ramps,
+)
 from ..run_view import RunView, SiteRun
-from .measures import USERS, Metric, MetricValues, Quantity, measures, metric, peak, rms, unavailable
+from .measures import (
+    USERS,
+    Metric,
+    MetricValues,
+    Quantity,
+    measures,
+    metric,
+    peak,
+    rms,
+    unavailable,
+)
 
 PARTS = 8
 WIDEST = 0.25
-"""Of a share in motion: parts that the jackknife leaves out in turn, and the widest half interval, 95 %."""
+"""Of a share in motion: parts that the jackknife leaves out in turn, and the widest half
+interval, 95 %.
+"""
 STUDENT_T = 2.3646
 """The 0.975 quantile of Student's t with one degree of freedom less than parts, 7."""
 
@@ -43,7 +62,9 @@ def read_user_shares(view: RunView) -> UserShares | Metric:
     Quantity("motion_share", "share in the slave's motion"),
 )
 def measure_authority(view: RunView, site: str) -> MetricValues:
-    """Returns a user's share in the slave's motion, and h sum_k a_k |tau_h,k|^2 by its dominance a_k."""
+    """Returns a user's share in the slave's motion, and h sum_k a_k |tau_h,k|^2 by its
+    dominance a_k.
+    """
     shared = view.once(read_user_shares)
     (slave, users) = find_users(view.scenario)
     if isinstance(shared, Metric):
@@ -60,9 +81,11 @@ def measure_authority(view: RunView, site: str) -> MetricValues:
 
 
 def _identify_shares(view: RunView) -> list[float] | Metric:
-    """Returns by user the a that minimise sum_k |qd_k - sum_i a_i qd_i(used_k)|^2, their sum being 1.
+    """Returns by user the a that minimise sum_k |qd_k - sum_i a_i qd_i(used_k)|^2, their sum
+    being 1.
 
-    qd is the slave's velocity, that of task space where it is, and used_k the sample of user i in use.
+    qd is the slave's velocity, that of task space where it is, and used_k the sample of user i
+    in use.
     """
     slave, users = find_users(view.scenario)
     own = view.sites[slave].records
@@ -76,7 +99,9 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
     *firsts, last = (rate[judged].ravel() for rate in rates)
     apart = np.column_stack([one - last for one in firsts])
     moves = own.shared_rate[judged].ravel()
-    if not len(moves) or np.linalg.svd(apart, compute_uv=False)[-1] <= 1e-9 * np.linalg.norm(moves):
+    if not len(moves) or np.linalg.svd(apart, compute_uv=False)[-1] <= 1e-9 * np.linalg.norm(
+        moves
+    ):
         return Metric(None, "the users move alike, or nobody moves")
     every = np.arange(len(moves))
     rows = [every, *(np.delete(every, part) for part in np.array_split(every, PARTS))]
@@ -106,7 +131,9 @@ def measure_sharing(view: RunView, _run: str) -> MetricValues:
         return unavailable(USERS, shared.why, of="run", applies=shared.applies)
     records = view.sites[slave].records
     intervenes = shared.lead[records.known] != shared.program
-    spans = sorted((ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in list_ramps(view.log, slave)[1])
+    spans = sorted(
+        (ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in list_ramps(view.log, slave)[1]
+    )
     changed = records.t_s[1:][np.diff(shared.lead) != 0]
     taken = [_time_taken(at_s, records.h_s, spans) for at_s in changed.tolist()]
     return {
@@ -120,31 +147,49 @@ def measure_sharing(view: RunView, _run: str) -> MetricValues:
 
 def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
     rows, known = find_common_rows([run.records for run in runs])
-    torques = np.stack([run.torque.operator[row] for run, row in zip(runs, rows, strict=True)])[:, known]
+    torques = np.stack([run.torque.operator[row] for run, row in zip(runs, rows, strict=True)])[
+        :, known
+    ]
     sizes = np.abs(torques).sum(axis=0)
     cancels = 0.5 * (sizes - np.abs(torques.sum(axis=0)))
     whole = sizes.sum()
     places = PLACE if runs[0].records.x.size else 0
-    found = {"internal_share": metric(2.0 * cancels.sum() / whole) if whole else _unasked("nobody pushes")}
+    found = {
+        "internal_share": metric(2.0 * cancels.sum() / whole)
+        if whole
+        else _unasked("nobody pushes")
+    }
     for unit, part in (("n", cancels[:, :places]), ("nm", cancels[:, places:])):
-        found[f"internal_rms_{unit}"] = metric(rms(part)) if part.shape[1] else _unasked("none is shared")
+        found[f"internal_rms_{unit}"] = (
+            metric(rms(part)) if part.shape[1] else _unasked("none is shared")
+        )
     return found
 
 
 def _time_taken(at_s: float, h_s: float, spans: list[tuple[float, float]]) -> float:
-    """Returns how long before a change of the lead the ramp began that made it; 0 if no ramp did."""
-    within = [start for start, end in spans if start <= at_s + RAMP_TIME_TOLERANCE_S and at_s <= end + h_s]
+    """Returns how long before a change of the lead the ramp began that made it; 0 if no ramp
+    did.
+    """
+    within = [
+        start
+        for start, end in spans
+        if start <= at_s + RAMP_TIME_TOLERANCE_S and at_s <= end + h_s
+    ]
     return at_s - within[-1] if within else 0.0
 
 
 def _compare_steps(records: AlignedRecords, spans: list[tuple[float, float]]) -> Metric:
-    """Returns the largest step of q_id from tick to tick while shares change, over that of the rest."""
+    """Returns the largest step of q_id from tick to tick while shares change, over that of the
+    rest.
+    """
     places = records.q_des[:, :PLACE] if records.x.size else records.q_des
     follows = records.known & records.follows
     steps = np.abs(np.diff(places, axis=0)).max(axis=1)
     begins = records.t_s[:-1] - RAMP_TIME_TOLERANCE_S
     ends = records.t_s[1:] + RAMP_TIME_TOLERANCE_S
-    changing = np.any([(ends >= start) & (begins <= end) for start, end in [*spans, (np.inf, 0.0)]], axis=0)
+    changing = np.any(
+        [(ends >= start) & (begins <= end) for start, end in [*spans, (np.inf, 0.0)]], axis=0
+    )
     judged = follows[:-1] & follows[1:]
     if not (judged & changing).any():
         return _unasked("no share changes")

@@ -1,8 +1,8 @@
 """Packer and reader of standard ROS 2 messages: CDR, little-endian; no ROS installation needed.
 
-Invariant: the bytes equal those of any other serializer. Fields are aligned to their size, counted from
-the end of the four-byte header; padding is zero. The constant layout is computed once, so that a message
-is one `struct` call.
+Invariant: the bytes equal those of any other serializer. Fields are aligned to their size,
+counted from the end of the four-byte header; padding is zero. The constant layout is computed
+once, so that a message is one `struct` call.
 """
 
 import math
@@ -30,7 +30,9 @@ _HEAD = b"\x00\x01\x00\x00"  # plain CDR, little-endian, no options
 _LAST_S = (1 << 31) - 1  # of the stamps of ROS 2
 
 DEFINITIONS = resources.files("trilat_net.log.ros2") / "definitions"
-"""Texts of ROS: types with the types of their fields, the quality of service of a bag, the planar arm."""
+"""Texts of ROS: types with the types of their fields, the quality of service of a bag, the
+planar arm.
+"""
 ROS2_SCHEMAS = {
     name: (DEFINITIONS / f"{name.rpartition('/')[2]}.msg").read_bytes()
     for name in (
@@ -70,9 +72,13 @@ def _format_floats(offset: int, count: int) -> tuple[str, int]:
 
 
 class JointStatePacker:
-    """Packer of `sensor_msgs/msg/JointState` with these joints, with or without velocities and efforts."""
+    """Packer of `sensor_msgs/msg/JointState` with these joints, with or without velocities and
+    efforts.
+    """
 
-    def __init__(self, names: Sequence[str], *, velocity: bool = True, effort: bool = True) -> None:
+    def __init__(
+        self, names: Sequence[str], *, velocity: bool = True, effort: bool = True
+    ) -> None:
         self._names = _pack_fields(8, "", len(names), *names)  # after the stamp; of no frame
         self._counts = [len(names) * present for present in (True, velocity, effort)]
         form = f"<4siI{len(self._names)}s"
@@ -91,7 +97,9 @@ class JointStatePacker:
     ) -> bytes:
         """Returns one message of a time (Unix ns, not below 0): rad, rad/s and N m per joint."""
         p, v, e = self._counts
-        return self._pack(_HEAD, *_split_stamp(stamp_ns), self._names, p, *position, v, *velocity, e, *effort)
+        return self._pack(
+            _HEAD, *_split_stamp(stamp_ns), self._names, p, *position, v, *velocity, e, *effort
+        )
 
 
 class TransformPacker:
@@ -118,7 +126,8 @@ class TransformPacker:
 
 
 def make_float_array_packer(*dimensions: tuple[str, int]) -> Callable[..., bytes]:
-    """Returns a packer of `std_msgs/msg/Float64MultiArray` of one shape; it takes the numbers row by row.
+    """Returns a packer of `std_msgs/msg/Float64MultiArray` of one shape; it takes the numbers
+    row by row.
 
     Each dimension is a label and a size.
     """
@@ -147,15 +156,16 @@ class RosLogLevel(IntEnum):
 
 def pack_log(stamp_ns: int, level: RosLogLevel, name: str, text: str) -> bytes:
     """Returns an `rcl_interfaces/msg/Log` of a member at a time (Unix ns, not below 0)."""
-    fields = _pack_fields(9, name, text, "", "", 0)  # after stamp and level; of no file, function and line
+    # after stamp and level; of no file, function and line
+    fields = _pack_fields(9, name, text, "", "", 0)
     return _HEAD + struct.pack("<iIB", *_split_stamp(stamp_ns), level) + fields
 
 
 def pack_frame_vectors(stamp_ns: int, frame: str, *numbers: float) -> bytes:
     """Returns a message of vectors in a frame.
 
-    It is a `PoseStamped` (x, y, z, m, and the quaternion x, y, z, w), a `TwistStamped` (m/s, rad/s) or a
-    `WrenchStamped` (N, N m).
+    It is a `PoseStamped` (x, y, z, m, and the quaternion x, y, z, w), a `TwistStamped` (m/s,
+    rad/s) or a `WrenchStamped` (N, N m).
     """
     head = struct.pack("<iI", *_split_stamp(stamp_ns)) + _pack_fields(8, frame)
     return _HEAD + head + b"\0" * (-len(head) % 8) + struct.pack(f"<{len(numbers)}d", *numbers)
@@ -167,7 +177,9 @@ def pack_trigger_response(*, success: bool, text: str) -> bytes:
 
 
 class Diagnosis(NamedTuple):
-    """A part of `/diagnostics`: its level (0 ok, 1 warning, 2 error, 3 stale), name, text and values."""
+    """A part of `/diagnostics`: its level (0 ok, 1 warning, 2 error, 3 stale), name, text and
+    values.
+    """
 
     level: int
     name: str
@@ -232,7 +244,9 @@ class CdrReader:
 
 
 class RosJoints(NamedTuple):
-    """A `JointState`: stamp, ns, names, and positions, velocities, efforts, as many as they, or none."""
+    """A `JointState`: stamp, ns, names, and positions, velocities, efforts, as many as they, or
+    none.
+    """
 
     stamp_ns: int
     names: list[str]
@@ -250,7 +264,13 @@ def read_joint_state(payload: bytes) -> RosJoints:
     reader = CdrReader(payload)
     stamp_ns, _ = reader.header()
     names = [reader.text() for _ in range(reader.count())]
-    return RosJoints(stamp_ns, names, reader.floats(), reader.floats(), reader.floats())
+    return RosJoints(
+        stamp_ns=stamp_ns,
+        names=names,
+        position=reader.floats(),
+        velocity=reader.floats(),
+        effort=reader.floats(),
+    )
 
 
 def read_float_array(payload: bytes) -> tuple[float, ...]:
@@ -268,7 +288,8 @@ def read_float_array(payload: bytes) -> tuple[float, ...]:
 
 
 def read_frame_vectors(payload: bytes, count: int) -> tuple[str, tuple[float, ...]]:
-    """Returns the frame of a `PoseStamped` (7 numbers) or a `WrenchStamped` (6), and its numbers.
+    """Returns the frame of a `PoseStamped` (7 numbers) or a `WrenchStamped` (6), and its
+    numbers.
 
     Raises:
         ValueError: it cannot be read.

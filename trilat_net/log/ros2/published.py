@@ -1,8 +1,9 @@
 """What a session publishes in ROS 2, live and in a bag: topics, types and messages.
 
 Invariant:
-- The live bridge and a bag make their messages here, so that both have the same topics with the same types
-  and the same numbers. A bag has a message for every record; the bridge publishes a part of them.
+- The live bridge and a bag make their messages here, so that both have the same topics with the
+  same types and the same numbers. A bag has a message for every record; the bridge publishes a
+  part of them.
 - The sign of the quaternions of a topic is consistent: each is nearest to the one before.
 - A message is made only if it is wanted.
 """
@@ -30,8 +31,12 @@ _STEADY = "unit quaternion, each nearest to the one before"
 _NO_TURN = (0.0, 0.0, 0.0)
 
 COMMON_TOPICS = {
-    FRAMES: Ros2Channel(cdr.TRANSFORMS, {"content": "frames of the links", "unit": "m", "rotation": _STEADY}),
-    DIAGNOSTICS: Ros2Channel(cdr.DIAGNOSTICS, {"content": "modes and loops of the sites, once a second"}),
+    FRAMES: Ros2Channel(
+        cdr.TRANSFORMS, {"content": "frames of the links", "unit": "m", "rotation": _STEADY}
+    ),
+    DIAGNOSTICS: Ros2Channel(
+        cdr.DIAGNOSTICS, {"content": "modes and loops of the sites, once a second"}
+    ),
 }
 """Topics of all sessions together, by their full names."""
 
@@ -76,7 +81,9 @@ class SiteMessages:
         self.frame = self._robot.frames[0][1]
         self._pack_shared: Callable[..., bytes] | None = None
         if any((*spec.arm.base_xyz_m, *spec.arm.base_rpy_rad)):
-            self.frame = f"{site}/shared"  # the end effector is in the frame that the sites share
+            self.frame = (
+                f"{site}/shared"  # the end effector is in the frame that the sites share
+            )
             self._pack_shared = cdr.TransformPacker([(WORLD, self.frame)]).pack
         self._pack_states = cdr.JointStatePacker(shapes.joints).pack
         self._pack_reference = cdr.JointStatePacker(shapes.joints, effort=False).pack
@@ -88,12 +95,18 @@ class SiteMessages:
         shapes = self._shapes
         own: Topics = {"joint_states": shapes.joint_states(shapes.joints)}
         if self._arm.shares_pose:
-            for topic, what in (("tip", "the end effector"), ("reference", "its reference, Eq. (6)")):
+            for topic, what in (
+                ("tip", "the end effector"),
+                ("reference", "its reference, Eq. (6)"),
+            ):
                 pose = {"content": f"pose of {what}", "unit": "m", "orientation": _STEADY}
                 twist = {"content": f"velocity of {what}", "unit": "m/s, rad/s"}
                 own[f"{topic}_pose"] = Ros2Channel(cdr.POSE, {**pose, "frame": self.frame})
                 own[f"{topic}_twist"] = Ros2Channel(cdr.TWIST, {**twist, "frame": self.frame})
-            wrench = {"content": "force of operator and environment ON the end effector", "unit": "N, N m"}
+            wrench = {
+                "content": "force of operator and environment ON the end effector",
+                "unit": "N, N m",
+            }
             own["tip_wrench"] = Ros2Channel(cdr.WRENCH, {**wrench, "frame": self.frame})
         else:
             own["reference"] = shapes.joint_states(shapes.joints, effort=False)
@@ -106,7 +119,9 @@ class SiteMessages:
         own["robot_description"] = Ros2Channel(cdr.STRING, robot, latched=True)
         arrays = {_name_array(name): array.channel for name, array in shapes.arrays.items()}
         if self._arm.counts.shared == POSE and self._arm.shares_pose:
-            turn = {"orientation": "rotation vector of the law's error, at most half a turn long"}
+            turn = {
+                "orientation": "rotation vector of the law's error, at most half a turn long"
+            }
             arrays["error"] = arrays["error"]._replace(about={**arrays["error"].about, **turn})
         return own | arrays
 
@@ -115,7 +130,10 @@ class SiteMessages:
         return max(0, self._epoch_unix_ns + record.t_ns)
 
     def pack_record(
-        self, record: State, shares: Sequence[float], wanted: Callable[[str], bool] = lambda _topic: True
+        self,
+        record: State,
+        shares: Sequence[float],
+        wanted: Callable[[str], bool] = lambda _topic: True,
     ) -> Iterator[tuple[str, bytes]]:
         """Yields the messages of a record by our names of their topics.
 
@@ -147,7 +165,9 @@ class SiteMessages:
         for topic, (pose, rate) in poses.items():
             if wanted(topic):
                 # followed for every message that is made, so that the sign never changes between two of them
-                turned = self._signs[topic].follow(find_quaternion(self._find_turn(record, pose)))
+                turned = self._signs[topic].follow(
+                    find_quaternion(self._find_turn(record, pose))
+                )
                 numbers = *self._find_place(record, pose), *turned
                 yield topic, cdr.pack_frame_vectors(stamp_ns, self.frame, *numbers)
             twist = topic.replace("pose", "twist")
@@ -167,12 +187,16 @@ class SiteMessages:
         return [*self._arm.end_effector(record.q), 0.0][:PLACE]
 
     def _find_turn(self, record: State, pose: Sequence[float]) -> tuple[float, float, float]:
-        """Returns the rotation vector of a pose, rad; of one without orientation the end effector's own."""
+        """Returns the rotation vector of a pose, rad; of one without orientation the end
+        effector's own.
+        """
         if len(pose) == POSE:
             return pose[PLACE], pose[PLACE + 1], pose[PLACE + 2]
         return self._arm.end_turn(record.q)
 
-    def _pack_arrays(self, record: State, wanted: Callable[[str], bool]) -> Iterator[tuple[str, bytes]]:
+    def _pack_arrays(
+        self, record: State, wanted: Callable[[str], bool]
+    ) -> Iterator[tuple[str, bytes]]:
         shapes = self._shapes
         if not any(wanted(_name_array(name)) for name in shapes.record_arrays):
             return
@@ -203,7 +227,9 @@ def _name_array(name: str) -> str:
     return "mode_number" if name == "mode" else name
 
 
-def pack_session_diagnostics(session: str, epoch_unix_ns: int, records: Sequence[State]) -> bytes:
+def pack_session_diagnostics(
+    session: str, epoch_unix_ns: int, records: Sequence[State]
+) -> bytes:
     """Returns a message for `/diagnostics` by the newest record of every site."""
     newest_ns = max((record.t_ns for record in records), default=0)
     parts: list[cdr.Diagnosis] = []

@@ -1,7 +1,9 @@
-"""An arm for viewers: its URDF with names of its own, and the frames of its links at every time.
+"""An arm for viewers: its URDF with names of its own, and the frames of its links at every
+time.
 
-Invariant: the frame of a link is called "<site>/<link>", in the URDF as in the transforms, so that arms of
-one file stand beside each other below `WORLD`. A file without shapes gets plain ones; none is opened.
+Invariant: the frame of a link is called "<site>/<link>", in the URDF as in the transforms, so
+that arms of one file stand beside each other below `WORLD`. A file without shapes gets plain
+ones; none is opened.
 """
 
 import math
@@ -137,13 +139,17 @@ class RobotModel:
         return found
 
     def pack(self, stamp_ns: int, q: Sequence[float]) -> bytes:
-        """Returns the transforms of a time (Unix ns, not below 0) at positions q as one message."""
+        """Returns the transforms of a time (Unix ns, not below 0) at positions q as one
+        message.
+        """
         return self.pack_transforms(stamp_ns, self.transforms(q))
 
     def pack_transforms(
         self, stamp_ns: int, transforms: Iterable[tuple[Sequence[float], Sequence[float]]]
     ) -> bytes:
-        """Returns the transforms of a time as one message: origins, m, and quaternions x, y, z, w."""
+        """Returns the transforms of a time as one message: origins, m, and quaternions x, y, z,
+        w.
+        """
         numbers = [x for origin, turned in transforms for x in (*origin, *turned)]
         return self._packer.pack(stamp_ns, numbers)
 
@@ -160,7 +166,9 @@ def _link_of(joint: Element, end: str) -> str:
 
 
 def _vector(element: Element | None, key: str, absent: Vector) -> Vector:
-    """Returns three numbers; what is none in a branch that is no part of the arm counts as absent."""
+    """Returns three numbers; what is none in a branch that is no part of the arm counts as
+    absent.
+    """
     try:
         x, y, z = map(float, ("" if element is None else element.get(key, "")).split())
     except ValueError:
@@ -178,18 +186,26 @@ def _read_frame(joint: Element, names: Sequence[str]) -> _JointFrame:
     unit = (axis[0] / size, axis[1] / size, axis[2] / size)
     place = names.index(name) if name in names else -1
     return _JointFrame(
-        _vector(origin, "xyz", (0.0, 0.0, 0.0)), turned, unit, joint.get("type") == "prismatic", place
+        origin_m=_vector(origin, "xyz", (0.0, 0.0, 0.0)),
+        turned=turned,
+        axis=unit,
+        slides=joint.get("type") == "prismatic",
+        place=place,
     )
 
 
 def _describe(root: Element, site: str, number: int) -> str:
-    """Returns a robot as text, with the names of its links after the site; it is changed to that."""
+    """Returns a robot as text, with the names of its links after the site; it is changed to
+    that.
+    """
     plain = root.find("link/visual") is None
     colour = _SHAPE_COLOURS[number % len(_SHAPE_COLOURS)]
     links = {link.get("name", ""): link for link in root.findall("link")}
     for joint in root.findall("joint"):
         if plain and (parent := links.get(_link_of(joint, "parent"))) is not None:
-            _add_shape(parent, _vector(joint.find("origin"), "xyz", (0.0, 0.0, 0.0)), colour, site)
+            _add_shape(
+                parent, _vector(joint.find("origin"), "xyz", (0.0, 0.0, 0.0)), colour, site
+            )
         for end in ("parent", "child"):
             if (found := joint.find(end)) is not None:
                 found.set("link", f"{site}/{found.get('link', '')}")
@@ -207,7 +223,9 @@ def _add_shape(link: Element, to: Vector, colour: str, site: str) -> None:
     ElementTree.SubElement(visual, "origin", xyz=middle, rpy=f"0 {tilt:.9g} {turn:.9g}")
     geometry = ElementTree.SubElement(visual, "geometry")
     if length > 0.0:
-        ElementTree.SubElement(geometry, "cylinder", radius=f"{_RADIUS_M:g}", length=f"{length:.9g}")
+        ElementTree.SubElement(
+            geometry, "cylinder", radius=f"{_RADIUS_M:g}", length=f"{length:.9g}"
+        )
     else:
         ElementTree.SubElement(geometry, "sphere", radius=f"{1.2 * _RADIUS_M:g}")
     material = ElementTree.SubElement(visual, "material", name=f"{site}_plain")

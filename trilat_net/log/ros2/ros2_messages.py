@@ -1,8 +1,8 @@
 """Mapping of a session's messages to standard ROS 2 messages: channels, units, names.
 
-Invariant: only units are converted, as the channel's metadata states; an unmeasured value is NaN. A
-curve's name stands where viewers look for it: with the joints in the message, else in the label of its
-dimension.
+Invariant: only units are converted, as the channel's metadata states; an unmeasured value is
+NaN. A curve's name stands where viewers look for it: with the joints in the message, else in
+the label of its dimension.
 """
 
 import math
@@ -40,7 +40,9 @@ FRAMES = "tf"
 
 
 class Ros2Channel(NamedTuple):
-    """A standard channel: type of its messages, metadata, and whether late subscribers get the last one."""
+    """A standard channel: type of its messages, metadata, and whether late subscribers get the
+    last one.
+    """
 
     kind: str
     about: dict[str, str]
@@ -48,21 +50,29 @@ class Ros2Channel(NamedTuple):
 
 
 class StandardChannels:
-    """The channels of a file, of all that are known by topic; each is registered with its first message."""
+    """The channels of a file, of all that are known by topic; each is registered with its first
+    message.
+    """
 
     def __init__(self, file: McapWriter, known: Mapping[str, Ros2Channel]) -> None:
         self._file = file
         self._known = known
-        self._numbers: dict[str, int] = {}  # of schemas by their kind, and of channels by their topic
+        self._numbers: dict[
+            str, int
+        ] = {}  # of schemas by their kind, and of channels by their topic
 
     def __getitem__(self, topic: str) -> int:
         if topic not in self._numbers:
             kind, about, _ = self._known[topic]
             if kind not in self._numbers:
-                schema = self._file.register_schema(kind, cdr.SCHEMA_ENCODING, cdr.ROS2_SCHEMAS[kind])
+                schema = self._file.register_schema(
+                    kind, cdr.SCHEMA_ENCODING, cdr.ROS2_SCHEMAS[kind]
+                )
                 self._numbers[kind] = schema
             schema = self._numbers[kind]
-            self._numbers[topic] = self._file.register_channel(topic, cdr.ENCODING, schema, about)
+            self._numbers[topic] = self._file.register_channel(
+                topic, cdr.ENCODING, schema, about
+            )
         return self._numbers[topic]
 
 
@@ -76,13 +86,17 @@ ROBOT_CHANNELS = {
 }
 _LEVELS = {
     **dict.fromkeys(("diverged", "failed"), cdr.RosLogLevel.ERROR),
-    **dict.fromkeys(("lost", "left", "unheard", "waiting", "refused", "clock fault"), cdr.RosLogLevel.WARN),
+    **dict.fromkeys(
+        ("lost", "left", "unheard", "waiting", "refused", "clock fault"), cdr.RosLogLevel.WARN
+    ),
 }
 _MODES = {name: float(mode) for mode, word in MODE_WORDS.items() for name in (mode, word)}
 
 
 def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
-    """Yields an event for the channels of the session; `stamp_ns` is its Unix time, not below 0."""
+    """Yields an event for the channels of the session; `stamp_ns` is its Unix time, not below
+    0.
+    """
     text = describe_event(event.kind, event.text, event.command)
     level = _LEVELS.get(event.kind, cdr.RosLogLevel.INFO)
     yield EVENTS, cdr.pack_string(f"{event.member}: {text}")
@@ -90,14 +104,23 @@ def pack_event(event: Event, stamp_ns: int) -> Iterator[tuple[str, bytes]]:
 
 
 class ArrayChannel:
-    """A channel of `std_msgs/msg/Float64MultiArray`: content and unit of its numbers, names on its axes."""
+    """A channel of `std_msgs/msg/Float64MultiArray`: content and unit of its numbers, names on
+    its axes.
+    """
 
     def __init__(self, content: str, unit: str, *axes: Sequence[str]) -> None:
         self.channel = Ros2Channel(
             cdr.FLOAT64_ARRAY,
-            {"content": content, "unit": unit, "names": "; ".join(" ".join(axis) for axis in axes)},
+            {
+                "content": content,
+                "unit": unit,
+                "names": "; ".join(" ".join(axis) for axis in axes),
+            },
         )
-        labels = [f"{content}: {' '.join(axis)}" if not n else " ".join(axis) for n, axis in enumerate(axes)]
+        labels = [
+            f"{content}: {' '.join(axis)}" if not n else " ".join(axis)
+            for n, axis in enumerate(axes)
+        ]
         labels[-1] += f" ({unit})"
         self.size = math.prod(map(len, axes))
         self.pack = cdr.make_float_array_packer(*zip(labels, map(len, axes), strict=True))
@@ -110,7 +133,8 @@ class Ros2SiteChannels:
         joints: names of its joints: those of its file, or numbered ones of a planar arm.
         arrays: the channels that are arrays, by the last part of their topic.
         record_arrays: the names of those that a record has; the others are of statistics.
-        error_row: of a row of `stack_signals`, behind the joints, the error e = q - q_des, Eq. (9).
+        error_row: of a row of `stack_signals`, behind the joints, the error e = q - q_des, Eq.
+            (9).
         slow_row: the rest: tau_x, theta_hat, what the law sends, mode.
         robot: the arm for viewers, or None where arms are planar ones alone.
     """
@@ -126,7 +150,9 @@ class Ros2SiteChannels:
         self.error_row = slice(4 * n, 4 * n + shared)
         self.slow_row = slice(4 * n + shared, None)
         self.robot = RobotModel(scenario, site) if arm.chain is not None else None
-        self.joints = [*arm.joint_names] if self.robot else [f"{site}_{name}" for name in arm.joint_names]
+        self.joints = (
+            [*arm.joint_names] if self.robot else [f"{site}_{name}" for name in arm.joint_names]
+        )
         labels = ["_".join(name.split()) for name in self.joints]
         parameters = ["_".join(name.split()) for name, _ in arm.parameters]
         spread = ("median", "max")
@@ -140,7 +166,9 @@ class Ros2SiteChannels:
             "error": ArrayChannel("x - x_des", "m or rad", axes)
             if arm.shares_pose
             else ArrayChannel("q - q_des", self._unit("rad"), labels),
-            "tau_x": ArrayChannel("exogenous torque, as Eq. (8) subtracts it", self._unit("N m"), labels),
+            "tau_x": ArrayChannel(
+                "exogenous torque, as Eq. (8) subtracts it", self._unit("N m"), labels
+            ),
             "theta_hat": ArrayChannel(*estimate, parameters),
             **sent,
             "mode": ArrayChannel("run 1, diverged 2, hold 3, brake 4, return 5", "-", ["mode"]),
@@ -149,12 +177,16 @@ class Ros2SiteChannels:
             "link_offset": ArrayChannel(
                 "the peer's clock minus the own one", "ms", peers, ("offset", "bound")
             ),
-            "timing": ArrayChannel("largest in the last 100 ms", "us", ("lateness", "computing_time")),
+            "timing": ArrayChannel(
+                "largest in the last 100 ms", "us", ("lateness", "computing_time")
+            ),
         }
 
     @property
     def channels(self) -> dict[str, Ros2Channel]:
-        """Its channels by the last part of their topic: those of arrays, and of an arm for viewers."""
+        """Its channels by the last part of their topic: those of arrays, and of an arm for
+        viewers.
+        """
         arrays = {name: array.channel for name, array in self.arrays.items()}
         return arrays if self.robot is None else arrays | ROBOT_CHANNELS
 
@@ -162,7 +194,8 @@ class Ros2SiteChannels:
         """Returns a channel of joint states with these names."""
         units = ", ".join(map(self._unit, ("rad", "rad/s", "N m")[: 2 + effort]))
         return Ros2Channel(
-            cdr.JOINT_STATE, {"unit": units, "names": " ".join("_".join(n.split()) for n in names)}
+            cdr.JOINT_STATE,
+            {"unit": units, "names": " ".join("_".join(n.split()) for n in names)},
         )
 
     def _unit(self, unit: str) -> str:
@@ -177,17 +210,30 @@ class Ros2SiteChannels:
             start += array.size
 
     def statistics(self, stats: LinkStats) -> Iterator[tuple[str, bytes]]:
-        """Yields the arrays of one statistics; those of clocks and networks only in a live session."""
+        """Yields the arrays of one statistics; those of clocks and networks only in a live
+        session.
+        """
         arrays = self.arrays
         peers = self._peers
         if not peers:
             return
-        yield "link_age", arrays["link_age"].pack(*(_ms(stats.age_us.get(peer, -1)) for peer in peers))
+        yield (
+            "link_age",
+            arrays["link_age"].pack(*(_ms(stats.age_us.get(peer, -1)) for peer in peers)),
+        )
         if not stats.delay_us:  # virtual time has neither
             return
-        delays = [_ms(by.get(peer, -1)) for peer in peers for by in (stats.delay_us, stats.delay_max_us)]
+        delays = [
+            _ms(by.get(peer, -1))
+            for peer in peers
+            for by in (stats.delay_us, stats.delay_max_us)
+        ]
         yield "link_delay", arrays["link_delay"].pack(*delays)
-        offsets = [by.get(peer, math.nan) / 1e3 for peer in peers for by in (stats.offset_us, stats.bound_us)]
+        offsets = [
+            by.get(peer, math.nan) / 1e3
+            for peer in peers
+            for by in (stats.offset_us, stats.bound_us)
+        ]
         yield "link_offset", arrays["link_offset"].pack(*offsets)
         yield "timing", arrays["timing"].pack(stats.late_max_us, stats.busy_max_us)
 
@@ -210,7 +256,8 @@ def _ms(us: int) -> float:
 
 
 def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
-    """Returns the standard channels of a finished file by topic, {} if it has no readable index.
+    """Returns the standard channels of a finished file by topic, {} if it has no readable
+    index.
 
     Raises:
         LogError: the file cannot be opened.
@@ -223,7 +270,9 @@ def read_ros2_channels(path: Path) -> dict[str, Ros2Channel]:
     if summary is None:
         return {}
     return {
-        channel.topic: Ros2Channel(summary.schemas[channel.schema_id].name, dict(channel.metadata))
+        channel.topic: Ros2Channel(
+            summary.schemas[channel.schema_id].name, dict(channel.metadata)
+        )
         for channel in sorted(summary.channels.values(), key=lambda channel: channel.id)
         if channel.message_encoding == cdr.ENCODING and channel.schema_id in summary.schemas
     }
@@ -234,24 +283,33 @@ SignalRow = Sequence[float]
 
 
 def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
-    """Returns the numbers of records, a column per curve: q, q_des, qd, tau, e, tau_x, theta_hat, ch, mode.
+    """Returns the numbers of records, a column per curve: q, q_des, qd, tau, e, tau_x,
+    theta_hat, ch, mode.
 
-    A column may be shorter where all of its numbers are the same. In task space no joint has a reference: its
-    own angle stands there, and e is x - x_des.
+    A column may be shorter where all of its numbers are the same. In task space no joint has a
+    reference: its own angle stands there, and e is x - x_des.
     """
     task = bool(records[0].x)
     rows = [
-        (*m.q, *(m.q if task else m.q_des), *m.qd, *m.tau, *m.tau_x, *m.theta_hat, *m.ch) for m in records
+        (*m.q, *(m.q if task else m.q_des), *m.qd, *m.tau, *m.tau_x, *m.theta_hat, *m.ch)
+        for m in records
     ]
     columns: list[SignalRow] = [*zip(*rows, strict=True)]
     n = len(records[0].q)
     here = [*zip(*(m.x for m in records), strict=True)] if task else columns[:n]
     there = [*zip(*(m.q_des for m in records), strict=True)]
-    error = [[a - b for a, b in zip(*pair, strict=True)] for pair in zip(here, there, strict=True)]
+    error = [
+        [a - b for a, b in zip(*pair, strict=True)] for pair in zip(here, there, strict=True)
+    ]
     if len(error) > PLACE and task:
         x, x_des = (np.array(columns).T for columns in (here, there))
         error = find_task_errors(x, x_des, [1.0] * len(error)).T.tolist()
     modes = [m.mode for m in records]
     if modes.count(modes[0]) == len(modes):
         del modes[1:]
-    return [*columns[: 4 * n], *error, *columns[4 * n :], [_MODES.get(mode, 0.0) for mode in modes]]
+    return [
+        *columns[: 4 * n],
+        *error,
+        *columns[4 * n :],
+        [_MODES.get(mode, 0.0) for mode in modes],
+    ]

@@ -45,9 +45,10 @@ TOPICS = {
     "robot_states": ("robot/joint_states", "robot/measured_js"),
     "robot_commands": ("robot/commands", "robot/commands"),
 }
-"""By our name of a topic the one that it has under `/<session>/<site>` in each of `NAMINGS`: as CRISP, and as
-the Collaborative Robotics Toolkit of the da Vinci Research Kit call it. What a law sends is "sent_" and the
-name of the vector, in every naming."""
+"""By our name of a topic the one that it has under `/<session>/<site>` in each of `NAMINGS`: as
+CRISP, and as the Collaborative Robotics Toolkit of the da Vinci Research Kit call it. What a
+law sends is "sent_" and the name of the vector, in every naming.
+"""
 FRAMES = "tf"
 DIAGNOSTICS = "diagnostics"
 """Topics of all sessions together, where tools of ROS look for them."""
@@ -57,7 +58,8 @@ class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a file says of the robot that is the arm of a site.
 
     Attributes:
-        joints: its names of the arm's joints, in the scenario's order; empty: as the scenario calls them.
+        joints: its names of the arm's joints, in the scenario's order; empty: as the scenario
+            calls them.
         controller: the same in the order of its controller; empty: in that of the scenario.
         safe: what this controller gets while the arm is to brake, in its order; empty: zeros.
     """
@@ -68,7 +70,9 @@ class RobotTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class TopicTable(NamedTuple):
-    """By our names of topics those that they have at every site, and where a site has others; the robots."""
+    """By our names of topics those that they have at every site, and where a site has others;
+    the robots.
+    """
 
     names: Mapping[str, str]
     of_site: Mapping[str, Mapping[str, str]] = {}
@@ -87,15 +91,19 @@ def make_session_name(text: str) -> str:
 
 
 def read_topic_table(asked: str) -> TopicTable:
-    """Returns the names of "crisp" or "crtk", or those of a file, which is TOML upon those of CRISP.
+    """Returns the names of "crisp" or "crtk", or those of a file, which is TOML upon those of
+    CRISP.
 
-    As in `joint_states = "arm/joint_states"`; a table `[sites.s]` is for one site, and says of its robot
-    what a `RobotTable` has.
+    As in `joint_states = "arm/joint_states"`; a table `[sites.s]` is for one site, and says of
+    its robot what a `RobotTable` has.
 
     Raises:
         UsageError: it cannot be read, or a name in it cannot be right.
     """
-    plain = {topic: row[NAMINGS.index(asked) if asked in NAMINGS else 0] for topic, row in TOPICS.items()}
+    plain = {
+        topic: row[NAMINGS.index(asked) if asked in NAMINGS else 0]
+        for topic, row in TOPICS.items()
+    }
     if asked in NAMINGS:
         return TopicTable(plain)
     try:
@@ -103,7 +111,10 @@ def read_topic_table(asked: str) -> TopicTable:
             found = tomllib.loads(stream.read().decode())
         tables = msgspec.convert(found.pop("sites", {}), dict[str, dict[str, Any]])
         of_robot = RobotTable.__struct_fields__
-        own = {site: {key: of.pop(key) for key in of_robot if key in of} for site, of in tables.items()}
+        own = {
+            site: {key: of.pop(key) for key in of_robot if key in of}
+            for site, of in tables.items()
+        }
         robots = msgspec.convert(own, dict[str, RobotTable])
     except OSError as error:
         raise UsageError(
@@ -116,8 +127,11 @@ def read_topic_table(asked: str) -> TopicTable:
             raise UsageError(f"{asked}: no topic {key!r}{suggest_nearest(key, list(TOPICS))}")
         check_ros_name(str(name), f"{asked}: {key}")
     table = TopicTable(plain | found, tables, robots)
-    shown = [topic for topic in TOPICS if topic != "robot_states"]  # several arms may stand in one message
+    # several arms may stand in one message
+    shown = [topic for topic in TOPICS if topic != "robot_states"]
     places = [table.find("", site, topic) for site in (*tables, "*", "**") for topic in shown]
     if len(set(places)) < len(places):
-        raise UsageError(f"{asked}: two topics have one name; one that begins with / is for one site")
+        raise UsageError(
+            f"{asked}: two topics have one name; one that begins with / is for one site"
+        )
     return table

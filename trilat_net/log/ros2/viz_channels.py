@@ -1,10 +1,10 @@
 """Decimated ROS 2 channels of a log, for general viewers, with every extreme kept.
 
-Invariant: the file holds the exact minimum and maximum of every curve in every bucket of a site's
-records, in the order in which they came. Buckets have equal length on the tick grid. A bucket's first
-message bears the time of its first record and is written at the bucket's end; the second bears that of
-its middle record and is written half a bucket later. Records that arrive after their bucket was closed
-form a bucket of their own.
+Invariant: the file holds the exact minimum and maximum of every curve in every bucket of a
+site's records, in the order in which they came. Buckets have equal length on the tick grid. A
+bucket's first message bears the time of its first record and is written at the bucket's end;
+the second bears that of its middle record and is written half a bucket later. Records that
+arrive after their bucket was closed form a bucket of their own.
 """
 
 import math
@@ -44,7 +44,8 @@ _tick = attrgetter("tick")
 
 
 class _BucketOutput:
-    """Output of buckets: the first row at once, the second by `flush` or before the next bucket.
+    """Output of buckets: the first row at once, the second by `flush` or before the next
+    bucket.
 
     `write` takes stamp, signals and log time.
     """
@@ -84,23 +85,31 @@ class _SiteBuckets:
         self._states = JointStatePacker(names)
         joints = len(shapes.joints)
         sent = scenario.channel(site).floats
-        self.most_pending_bytes = MAX_PENDING_BYTES * -(-joints // 2) + SENT_PENDING_BYTES * sent
+        self.most_pending_bytes = (
+            MAX_PENDING_BYTES * -(-joints // 2) + SENT_PENDING_BYTES * sent
+        )
         self._none = [math.nan] * joints  # velocity, effort of a reference: size is dear
         own = {"joint_states": shapes.joint_states(names), **shapes.channels}
         self._topics = {name: f"{VIZ_ROOT}{site}/{name}" for name in own}
         self.channels = {topic: own[name] for name, topic in self._topics.items()}
         self._described = shapes.robot is None
         self._half = max(1, int(rate_hz // views_hz))  # ticks of half a bucket
-        self._ratio = 1 if views_hz == FULL_RATE_HZ else max(1, round(rate_hz / self._half / SLOW_VIZ_HZ))
+        self._ratio = (
+            1 if views_hz == FULL_RATE_HZ else max(1, round(rate_hz / self._half / SLOW_VIZ_HZ))
+        )
         self._fast = _BucketOutput(self._write_fast)
         self._slow = _BucketOutput(self._write_slow)
-        self._bucket = self._first = self._half_end = 0  # the open bucket, its first tick, the end of a half
+        self._bucket = self._first = self._half_end = (
+            0  # the open bucket, its first tick, the end of a half
+        )
         self._open: list[ros2_messages.Record] = []
         self._slow_open: list[StampedRow] = []
         self._late: list[ros2_messages.Record] = []
 
     def _write_fast(self, stamp_ns: int, row: ros2_messages.SignalRow, log_ns: int) -> None:
-        """Writes the joint states, the angles of the reference as joints of their own; and the error."""
+        """Writes the joint states, the angles of the reference as joints of their own; and the
+        error.
+        """
         none = self._none
         n = len(self._none)
         velocity = [*row[2 * n : 3 * n], *none]
@@ -113,8 +122,18 @@ class _SiteBuckets:
         if robot is not None:
             if not self._described:
                 self._described = True
-                self._put(self._topics[ros2_messages.ROBOT], pack_string(robot.description), stamp_ns, log_ns)
-            self._put(self._topics[ros2_messages.FRAMES], robot.pack(stamp_ns, row[:n]), stamp_ns, log_ns)
+                self._put(
+                    self._topics[ros2_messages.ROBOT],
+                    pack_string(robot.description),
+                    stamp_ns,
+                    log_ns,
+                )
+            self._put(
+                self._topics[ros2_messages.FRAMES],
+                robot.pack(stamp_ns, row[:n]),
+                stamp_ns,
+                log_ns,
+            )
 
     def _write_slow(self, stamp_ns: int, row: ros2_messages.SignalRow, log_ns: int) -> None:
         for name, data in self._shapes.slow(row):
@@ -122,7 +141,8 @@ class _SiteBuckets:
 
     def record(self, message: ros2_messages.Record, log_ns: int) -> None:
         tick = message.tick
-        if tick < self._first:  # its bucket is closed: with others of that bucket it waits for the next close
+        # its bucket is closed: with others of that bucket it waits for the next close
+        if tick < self._first:
             length = 2 * self._half
             if self._late and self._late[0].tick // length != tick // length:
                 self._flush_late(log_ns)
@@ -151,7 +171,9 @@ class _SiteBuckets:
         if self._open:
             rows = self._decimate(self._open)
             self._fast.add(rows, log_ns)
-            self._slow_open += [(stamp_ns, row[self._shapes.slow_row]) for stamp_ns, row in rows]
+            self._slow_open += [
+                (stamp_ns, row[self._shapes.slow_row]) for stamp_ns, row in rows
+            ]
             self._open = []
         half = 2 * bucket // self._ratio
         was = 2 * self._bucket // self._ratio
@@ -168,7 +190,9 @@ class _SiteBuckets:
         if self._late:
             rows = self._decimate(self._late)
             self._fast.add_late(rows, log_ns)
-            self._slow.add_late([(stamp_ns, row[self._shapes.slow_row]) for stamp_ns, row in rows], log_ns)
+            self._slow.add_late(
+                [(stamp_ns, row[self._shapes.slow_row]) for stamp_ns, row in rows], log_ns
+            )
             self._late = []
 
     def _decimate(self, records: list[ros2_messages.Record]) -> list[StampedRow]:
@@ -181,7 +205,8 @@ class _SiteBuckets:
 
 
 def parse_viz_rate(text: str) -> float:
-    """Returns the messages a second of the option `--views`: a number from 1 on, or "off" or "full".
+    """Returns the messages a second of the option `--views`: a number from 1 on, or "off" or
+    "full".
 
     Raises:
         UsageError: it is none of them.
@@ -196,8 +221,12 @@ def parse_viz_rate(text: str) -> float:
     return rate_hz
 
 
-def _stamp_extremes(stamps_ns: Sequence[int], columns: Iterable[ros2_messages.SignalRow]) -> list[StampedRow]:
-    """Returns the extremes of columns at the first and the middle of their stamps; a single row as it is."""
+def _stamp_extremes(
+    stamps_ns: Sequence[int], columns: Iterable[ros2_messages.SignalRow]
+) -> list[StampedRow]:
+    """Returns the extremes of columns at the first and the middle of their stamps; a single row
+    as it is.
+    """
     chosen = (stamps_ns[0], stamps_ns[len(stamps_ns) // 2])[: len(stamps_ns)]
     return list(zip(chosen, decimate_min_max(columns)))  # noqa: B905 - of a single row both are the same
 
@@ -218,12 +247,18 @@ class VizChannels:
     """
 
     def __init__(
-        self, scenario: Scenario, session: str, epoch_unix_ns: int, views_hz: float, put: PutMessage
+        self,
+        scenario: Scenario,
+        session: str,
+        epoch_unix_ns: int,
+        views_hz: float,
+        put: PutMessage,
     ) -> None:
         self._epoch_unix_ns = epoch_unix_ns
         self._put = put
         self.channels = {
-            f"{VIZ_ROOT}{name}": channel for name, channel in ros2_messages.SESSION_CHANNELS.items()
+            f"{VIZ_ROOT}{name}": channel
+            for name, channel in ros2_messages.SESSION_CHANNELS.items()
         }
         self.takers: dict[str, TakeMessage] = {
             topics.key(session, member, topics.EVENT): self._event
@@ -231,7 +266,9 @@ class VizChannels:
         }
         self._buckets: list[_SiteBuckets] = []
         for site in scenario.names:
-            buckets = _SiteBuckets(scenario, site, views_hz, epoch_unix_ns, put)
+            buckets = _SiteBuckets(
+                scenario=scenario, site=site, views_hz=views_hz, epoch_ns=epoch_unix_ns, put=put
+            )
             self._buckets.append(buckets)
             self.channels |= buckets.channels
             self.takers[topics.key(session, site, topics.STATE)] = buckets.record
@@ -253,15 +290,19 @@ class VizChannels:
         return sum(buckets.most_pending_bytes for buckets in self._buckets)
 
 
-def decimate_min_max(columns: Iterable[ros2_messages.SignalRow]) -> tuple[list[float], list[float]]:
-    """Returns the smallest and the largest number of each column, the one that came first in the first list.
+def decimate_min_max(
+    columns: Iterable[ros2_messages.SignalRow],
+) -> tuple[list[float], list[float]]:
+    """Returns the smallest and the largest number of each column, the one that came first in
+    the first list.
 
     Each column has one finite number at least, in the order in which they came.
     """
     first = []
     second = []
     for column in columns:
-        ordered = sorted(column)  # smooth curves are nearly in order: a third of what min and max take
+        # smooth curves are nearly in order: a third of what min and max take
+        ordered = sorted(column)
         low = ordered[0]
         high = ordered[-1]
         start = column[0]

@@ -22,7 +22,9 @@ def _write(log: Log, folder: Path, written: Written) -> None:
                 columns = (column.rows(first, first + _ROWS) for column in table.columns)
                 writer.writerows(zip(*columns, strict=True))
 
-    describe_folder(log, folder, store_tables(log, written, lambda table: f"{table.label}.csv", store))
+    describe_folder(
+        log, folder, store_tables(log, written, lambda table: f"{table.label}.csv", store)
+    )
 
 
 FORMAT = ExportFormat(_write, "-csv", folder=True)

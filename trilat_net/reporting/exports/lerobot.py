@@ -1,9 +1,11 @@
-"""A dataset of LeRobot, v3.0: what each user commands, who leads, and where a person intervened.
+"""A dataset of LeRobot, v3.0: what each user commands, who leads, and where a person
+intervened.
 
 Invariant:
-- A frame has of every site the newest record at or before its time, as float32; nothing is interpolated.
-- Where that record is older than a period of the site and of the frames an episode ends, and the next one
-  begins behind the gap.
+- A frame has of every site the newest record at or before its time, as float32; nothing is
+  interpolated.
+- Where that record is older than a period of the site and of the frames an episode ends, and
+  the next one begins behind the gap.
 - An orientation is six numbers, which never jump (see `trilat_net.log.orientations`).
 - With `actions`, the names and units of actions are those of `action_features` of the plugin
   `lerobot_robot_trilat` (a test compares them).
@@ -43,11 +45,20 @@ _MEANINGS = {
     "intervention": "true where another user than the program leads",
     "frame": "of each site the newest record at or before its time; nothing is interpolated",
 }
-_INDEX = {"name": "task", "field_name": "task", "pandas_type": "unicode", "numpy_type": "object"}
-_PANDAS = {"pandas": json.dumps({"index_columns": ["task"], "column_indexes": [], "columns": [_INDEX]})}
+_INDEX = {
+    "name": "task",
+    "field_name": "task",
+    "pandas_type": "unicode",
+    "numpy_type": "object",
+}
+_PANDAS = {
+    "pandas": json.dumps({"index_columns": ["task"], "column_indexes": [], "columns": [_INDEX]})
+}
 """By this the reader of LeRobot, pandas, takes the texts of tasks for its index."""
 ACTIONS = ("tip", "joints")
-"""What actions may be besides what sites share: the modes of the plugin's hand that go to a place."""
+"""What actions may be besides what sites share: the modes of the plugin's hand that go to a
+place.
+"""
 Names = dict[str, list[str]]
 Columns = dict[str, NDArray[Any]]
 """Columns of frames by the names of their features, shape (K, n) or (K,)."""
@@ -75,20 +86,32 @@ def _write(
         rows, episode, left_out = _find_rows(log, fps)
         columns, found = _read_columns(log, rows, program, actions)
         if (names := names or found) != found:
-            raise LogError(f"{log.source}: its users and joints are not those of {logs[0].source}")
-        columns["episode_index"] = episode + (parts[-1]["episode_index"][-1] + 1 if parts else 0)
+            raise LogError(
+                f"{log.source}: its users and joints are not those of {logs[0].source}"
+            )
+        columns["episode_index"] = episode + (
+            parts[-1]["episode_index"][-1] + 1 if parts else 0
+        )
         task = tasks.setdefault(log.scenario.title or log.scenario.name, len(tasks))
         parts.append({**columns, "task_index": np.full_like(episode, task)})
-        sessions.append({**log.session, "scenario": log.scenario_text, "frames_left_out": left_out})
+        sessions.append(
+            {**log.session, "scenario": log.scenario_text, "frames_left_out": left_out}
+        )
         lost += left_out
         written(sum(len(log[site]) for site in log.sites))
     whole = {key: np.concatenate([one[key] for one in parts]) for key in parts[0]}
     index = np.arange(len(whole["episode_index"]))
     starts = np.flatnonzero(np.diff(whole["episode_index"], prepend=-1))
     frame = index - starts[whole["episode_index"]]
-    whole |= {"timestamp": (frame / fps).astype(np.float32), "frame_index": frame, "index": index}
+    whole |= {
+        "timestamp": (frame / fps).astype(np.float32),
+        "frame_index": frame,
+        "index": index,
+    }
     texts = _store_tables(folder, whole, [*starts.tolist(), len(index)], list(tasks))
-    texts["meta/info.json"] = _describe_set(fps, names, whole, len(starts), len(tasks))
+    texts["meta/info.json"] = _describe_set(
+        fps=fps, names=names, whole=whole, episodes=len(starts), tasks=len(tasks)
+    )
     about: dict[str, Any] = {
         "exported_by": f"trilat-net {collect_provenance()['version_trilat-net']}",
         "meanings": _MEANINGS,
@@ -96,7 +119,9 @@ def _write(
     about |= {"actions": actions or "what sites share", "program": program or "the last user"}
     texts[EXPORT_MANIFEST] = {**about, "sessions": sessions}
     for place, content in texts.items():
-        (folder / place).write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8", newline="\n")
+        (folder / place).write_text(
+            json.dumps(content, indent=4) + "\n", encoding="utf-8", newline="\n"
+        )
     return (
         f"{count_nouns(len(index), 'frame')} in {count_nouns(len(starts), 'episode')}; "
         f"{count_nouns(lost, 'frame lies in a gap and is', 'frames lie in gaps and are')} left out"
@@ -104,11 +129,16 @@ def _write(
 
 
 def _find_rows(log: Log, fps: int) -> tuple[dict[str, Ints], Ints, int]:
-    """Returns per site the rows of the frames' records, each frame's episode, and how many are left out."""
+    """Returns per site the rows of the frames' records, each frame's episode, and how many are
+    left out.
+    """
     kept = {site: np.flatnonzero(log[site].mode != "diverged") for site in log.sites}
     if empty := [site for site, rows in kept.items() if not len(rows)]:
         raise LogError(f"{log.source}: no records of {', '.join(empty)}")
-    stamps = {site: log[site].tick[rows] * NS_PER_S // log[site].rate_hz for site, rows in kept.items()}
+    stamps = {
+        site: log[site].tick[rows] * NS_PER_S // log[site].rate_hz
+        for site, rows in kept.items()
+    }
     begin_ns = max(t[0] for t in stamps.values())
     end_ns = min(t[-1] for t in stamps.values())
     at_ns = begin_ns + np.arange((end_ns - begin_ns) * fps // NS_PER_S + 1) * NS_PER_S // fps
@@ -120,10 +150,16 @@ def _find_rows(log: Log, fps: int) -> tuple[dict[str, Ints], Ints, int]:
     if not len(frames := np.flatnonzero(fresh)):
         raise LogError(f"{log.source}: there is no time of which every site has a record")
     episode = np.cumsum(np.diff(frames, prepend=frames[0]) > 1, dtype=np.int64)
-    return {site: rows[frames] for site, rows in kept.items()}, episode, len(at_ns) - len(frames)
+    return (
+        {site: rows[frames] for site, rows in kept.items()},
+        episode,
+        len(at_ns) - len(frames),
+    )
 
 
-def _read_columns(log: Log, rows: dict[str, Ints], program: str, actions: str) -> tuple[Columns, Names]:
+def _read_columns(
+    log: Log, rows: dict[str, Ints], program: str, actions: str
+) -> tuple[Columns, Names]:
     """Returns the columns of all frames, and the names of their numbers."""
     slave, users = find_users(log.scenario)
     if not slave or not users:
@@ -140,13 +176,18 @@ def _read_columns(log: Log, rows: dict[str, Ints], program: str, actions: str) -
     found = [
         ("observation.state", np.hstack([read(slave, "q"), read(slave, "qd")]), state),
         ("action", np.stack(commands)[shared.lead, np.arange(len(alpha))], commanded),
-        *((f"action.{user}", one, commanded) for user, one in zip(users, commands, strict=True)),
+        *(
+            (f"action.{user}", one, commanded)
+            for user, one in zip(users, commands, strict=True)
+        ),
         ("dominance", shared.shares, users),
         ("tau_x", read(slave, "tau_x"), joints[slave]),
         *((f"tau_x.{user}", read(user, "tau_x"), joints[user]) for user in users),
     ]
     columns: Columns = {key: values.astype(np.float32) for key, values, _ in found}
-    return {**columns, "intervention": shared.lead != shared.program}, {key: names for key, _, names in found}
+    return {**columns, "intervention": shared.lead != shared.program}, {
+        key: names for key, _, names in found
+    }
 
 
 def _read_commands(
@@ -169,19 +210,25 @@ def _read_commands(
         places = [f"{axis}.pos" for axis in TASK_AXES[:PLACE]]
         turned = [f"{entry}.rot" for entry in MATRIX_ENTRIES]
         return poses, [*places, *turned][: poses[0].shape[1]]
-    joints = {user: [f"{name}.pos" for name in log.scenario.arms[user].joint_names] for user in users}
+    joints = {
+        user: [f"{name}.pos" for name in log.scenario.arms[user].joint_names] for user in users
+    }
     if other := next((user for user in users if joints[user] != joints[users[0]]), None):
         text = f"the joints of {other} are not those of {users[0]}, so that an action cannot stand for both"
         raise LogError(f"{log.source}: {text}: use --actions tip")
     return [log[user].q[rows[user]] for user in users], joints[users[0]]
 
 
-def _store_tables(folder: Path, whole: Columns, edges: list[int], tasks: list[str]) -> dict[str, Any]:
+def _store_tables(
+    folder: Path, whole: Columns, edges: list[int], tasks: list[str]
+) -> dict[str, Any]:
     """Stores the tables of a dataset, and returns its statistics by their place."""
     pa = import_extra("pyarrow", *_EXTRA[1:])
     parquet = import_extra(*_EXTRA)
     vectors = {
-        key: pa.FixedSizeListArray.from_arrays(one.ravel(), one[0].size) if one[0].size > 1 else one.ravel()
+        key: pa.FixedSizeListArray.from_arrays(one.ravel(), one[0].size)
+        if one[0].size > 1
+        else one.ravel()
         for key, one in whole.items()
     }
     described = [_describe_episode(whole, *ends, tasks) for ends in pairwise(edges)]
@@ -193,12 +240,16 @@ def _store_tables(folder: Path, whole: Columns, edges: list[int], tasks: list[st
     }
     for place, table in tables.items():
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
-        with (folder / place).open("wb") as stream:  # a full disk is reported here, not by pyarrow
+        with (folder / place).open(
+            "wb"
+        ) as stream:  # a full disk is reported here, not by pyarrow
             parquet.write_table(table, stream)
     return {"meta/stats.json": {key: _describe(one) for key, one in whole.items()}}
 
 
-def _describe_set(fps: int, names: Names, whole: Columns, episodes: int, tasks: int) -> dict[str, Any]:
+def _describe_set(
+    fps: int, names: Names, whole: Columns, episodes: int, tasks: int
+) -> dict[str, Any]:
     return {
         "codebase_version": "v3.0",
         "robot_type": "trilat",
@@ -227,15 +278,25 @@ def _describe_episode(whole: Columns, first: int, end: int, tasks: list[str]) ->
         "length": end - first,
         "dataset_from_index": first,
         "dataset_to_index": end,
-        **{f"{of}/{which}_index": 0 for of in ("data", "meta/episodes") for which in ("chunk", "file")},
-        **{f"stats/{key}/{name}": one for key, found in stats.items() for name, one in found.items()},
+        **{
+            f"{of}/{which}_index": 0
+            for of in ("data", "meta/episodes")
+            for which in ("chunk", "file")
+        },
+        **{
+            f"stats/{key}/{name}": one
+            for key, found in stats.items()
+            for name, one in found.items()
+        },
     }
 
 
 def _describe(values: NDArray[Any]) -> dict[str, list[float]]:
     """Returns what LeRobot scales a feature by, of each of its numbers."""
     rows = values.reshape(len(values), -1).astype(np.float64)
-    found = {name: getattr(np, name)(rows, axis=0).tolist() for name in ("min", "max", "mean", "std")}
+    found = {
+        name: getattr(np, name)(rows, axis=0).tolist() for name in ("min", "max", "mean", "std")
+    }
     for share in (0.01, 0.1, 0.5, 0.9, 0.99):
         found[f"q{100 * share:02.0f}"] = np.quantile(rows, share, axis=0).tolist()
     return {**found, "count": [len(rows)]}

@@ -26,13 +26,17 @@ def _write(log: Log, path: Path, written: Written) -> None:
     variables: dict[str, Any] = {}
 
     def store(table: Table, place: str) -> None:
-        struct: dict[str, Any] = {column.name: _matlab(column, table) for column in table.columns}
+        struct: dict[str, Any] = {
+            column.name: _matlab(column, table) for column in table.columns
+        }
         struct["units"] = {column.name: column.unit for column in table.columns}
         name, _, kind = place.partition(".")
         (variables[name] if kind else variables)[kind or name] = struct
 
     def place_of(table: Table) -> str:
-        return name_inside(table, f"{table.name}_site" if table.name in _KEYWORDS else table.name, ".")
+        return name_inside(
+            table, f"{table.name}_site" if table.name in _KEYWORDS else table.name, "."
+        )
 
     about = store_tables(log, written, place_of, store)
     variables |= {"about_json": about, "scenario_toml": log.scenario_text}

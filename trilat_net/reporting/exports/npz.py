@@ -17,7 +17,9 @@ def _write(log: Log, path: Path, written: Written) -> None:
 
     def store(table: Table, place: str) -> None:
         for column in table.columns:
-            arrays[f"{place}/{column.name}"] = read_texts(column) if column.is_text else column.numbers()
+            arrays[f"{place}/{column.name}"] = (
+                read_texts(column) if column.is_text else column.numbers()
+            )
 
     about = store_tables(log, written, lambda table: name_inside(table, table.name, "/"), store)
     arrays |= {"about_json": np.array(about), "scenario_toml": np.array(log.scenario_text)}

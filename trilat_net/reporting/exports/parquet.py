@@ -14,7 +14,11 @@ def _write(log: Log, folder: Path, written: Written) -> None:
         to_data_frame(table).write_parquet(made, compression="zstd")
         (folder / name).write_bytes(made.getbuffer())
 
-    describe_folder(log, folder, store_tables(log, written, lambda table: f"{table.label}.parquet", store))
+    describe_folder(
+        log, folder, store_tables(log, written, lambda table: f"{table.label}.parquet", store)
+    )
 
 
-FORMAT = ExportFormat(_write, "-parquet", folder=True, extra=("polars", "frames", "Parquet files"))
+FORMAT = ExportFormat(
+    _write, "-parquet", folder=True, extra=("polars", "frames", "Parquet files")
+)

@@ -2,9 +2,10 @@
 
 Invariant:
 - A bag has every record once, with its numbers and times; nothing is decimated.
-- Topics and types are those of the live bridge (`trilat_net.log.ros2.published`), and so are their names.
-- A header's stamp is the nominal time of its tick, the publish time the time of sending, the log time the
-  time of arrival.
+- Topics and types are those of the live bridge (`trilat_net.log.ros2.published`), and so are
+  their names.
+- A header's stamp is the nominal time of its tick, the publish time the time of sending, the
+  log time the time of arrival.
 """
 
 import heapq
@@ -36,23 +37,28 @@ SOURCE_METADATA = "trilat.source"
 _QOS = (cdr.DEFINITIONS / "qos.yaml").read_text(encoding="utf-8")
 _VOLATILE = {"DEPTH": "10", "DURABILITY": "2"}
 _LATCHED = {"DEPTH": "1", "DURABILITY": "1"}
-"""Quality of service of the live topics: reliable; the last ten messages, or the last one also for who comes
-later (transient local)."""
+"""Quality of service of the live topics: reliable; the last ten messages, or the last one also
+for who comes later (transient local).
+"""
 _EVERY = 1000
 """Records between two reports of progress."""
 
 TimedMessages = tuple[int, int, list[tuple[str, bytes]]]
-"""Messages of one publish time, by topic: the log time and the publish time, ns, before them."""
+"""Messages of one publish time, by topic: the log time and the publish time, ns, before them.
+"""
 
 
-def export_ros2(log: Log, path: Path, written: Written = lambda _: None, *, names: str = NAMINGS[0]) -> None:
+def export_ros2(
+    log: Log, path: Path, written: Written = lambda _: None, *, names: str = NAMINGS[0]
+) -> None:
     """Writes a log as a bag that `ros2 bag` and its like play and read.
 
     The topics are those of the live bridge: `/<session>/<site>/joint_states` and so on, `/tf`,
-    `/diagnostics`, and of the session `/<session>/events` and `/<session>/log`. Units, names and
-    representations of orientations stand in the channels' metadata.
+    `/diagnostics`, and of the session `/<session>/events` and `/<session>/log`. Units, names
+    and representations of orientations stand in the channels' metadata.
 
-    An earlier file is replaced; `written` is called with the number of records since its last call.
+    An earlier file is replaced; `written` is called with the number of records since its last
+    call.
 
     Args:
         log: the log.
@@ -68,11 +74,25 @@ def export_ros2(log: Log, path: Path, written: Written = lambda _: None, *, name
     table = read_topic_table(names)
     session = make_session_name(log.session.get("session", "") or log.scenario.name)
     with path.open("wb") as stream:
-        file = McapWriter(stream, f"trilat-net {collect_provenance()['version_trilat-net']}", profile="ros2")
+        file = McapWriter(
+            stream, f"trilat-net {collect_provenance()['version_trilat-net']}", profile="ros2"
+        )
         file.add_metadata(SOURCE_METADATA, {"source": log.source, **log.session})
-        file.add_attachment(0, 0, SCENARIO, "application/toml", log.scenario_text.encode())
-        sites = [_SiteRecords(log, name, session, table, written) for name in log.sites]
-        known = {f"/{topic}": channel for topic, channel in list_topics(log.scenario, session, table).items()}
+        file.add_attachment(
+            create_time=0,
+            log_time=0,
+            name=SCENARIO,
+            media_type="application/toml",
+            data=log.scenario_text.encode(),
+        )
+        sites = [
+            _SiteRecords(log=log, name=name, session=session, table=table, progress=written)
+            for name in log.sites
+        ]
+        known = {
+            f"/{topic}": channel
+            for topic, channel in list_topics(log.scenario, session, table).items()
+        }
         bag = ros2_messages.StandardChannels(
             file, {topic: _offer_quality(channel) for topic, channel in known.items()}
         )
@@ -96,7 +116,12 @@ class _SiteRecords:
     """The messages of one site, with their times."""
 
     def __init__(
-        self, log: Log, name: str, session: str, table: TopicTable, progress: Callable[[int], None]
+        self,
+        log: Log,
+        name: str,
+        session: str,
+        table: TopicTable,
+        progress: Callable[[int], None],
     ) -> None:
         self._log = log
         self._name = name
@@ -121,7 +146,9 @@ class _SiteRecords:
             record = part.states[at]
             messages = self._named(self._messages.pack_record(record, shares[at]))
             if count == 1:
-                messages.insert(0, (self._find_topic("robot_description"), self._messages.description))
+                messages.insert(
+                    0, (self._find_topic("robot_description"), self._messages.description)
+                )
             messages += [(FRAMES, data) for data in self._messages.pack_frames(record)]
             yield log_ns[at], publish_ns[at], messages
             if not count % _EVERY or count == len(part):
@@ -130,7 +157,9 @@ class _SiteRecords:
     def statistics(self) -> Iterator[TimedMessages]:
         """Yields its statistics in the order of arrival."""
         timed = self._log.timed_link_stats(self._name)
-        rows = zip(timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True)
+        rows = zip(
+            timed.log_ns.tolist(), timed.publish_ns.tolist(), timed.messages, strict=True
+        )
         for log_ns, publish_ns, stats in sorted(rows, key=itemgetter(0)):
             yield log_ns, publish_ns, self._named(self._messages.pack_statistics(stats))
 
@@ -153,11 +182,16 @@ def _diagnostics(log: Log, session: str) -> Iterator[TimedMessages]:
     end_ns = max((int(part.t_ns.max()) for part in parts), default=-1)
     log_ns = publish_ns = 0
     for second in range(end_ns // NS_PER_S + 1):
-        places = [int(np.searchsorted(part.t_ns, second * NS_PER_S, side="right")) - 1 for part in parts]
+        places = [
+            int(np.searchsorted(part.t_ns, second * NS_PER_S, side="right")) - 1
+            for part in parts
+        ]
         newest = [(part, at) for part, at in zip(parts, places, strict=True) if at >= 0]
         if newest:
             log_ns = max([log_ns, *(int(part.log_time_ns[at]) for part, at in newest)])
-            publish_ns = max([publish_ns, *(int(part.publish_time_ns[at]) for part, at in newest)])
+            publish_ns = max(
+                [publish_ns, *(int(part.publish_time_ns[at]) for part, at in newest)]
+            )
             records = [part.record(at) for part, at in newest]
             data = pack_session_diagnostics(session, _find_epoch_ns(log), records)
             yield log_ns, publish_ns, [(DIAGNOSTICS, data)]

@@ -1,7 +1,8 @@
 """Figures of links and loops: age of the samples in use, delays, lateness and computing time.
 
-Invariant: a measured link has no line of stated delay; a log of constant links has no distributions. Virtual
-time reads no clock, so its figure of the loops gives that reason in place of zeros.
+Invariant: a measured link has no line of stated delay; a log of constant links has no
+distributions. Virtual time reads no clock, so its figure of the loops gives that reason in
+place of zeros.
 """
 
 from typing import Any, NamedTuple
@@ -36,7 +37,9 @@ _BINS_PER_DECADE = 20
 
 
 class DelayDistribution(NamedTuple):
-    """Delays of a link's samples, by its model or else measured, and ages in use at the receiver's ticks."""
+    """Delays of a link's samples, by its model or else measured, and ages in use at the
+    receiver's ticks.
+    """
 
     peer: str
     site: str
@@ -47,13 +50,19 @@ class DelayDistribution(NamedTuple):
 @draws("sample_age", "age of the samples in use, per link", in_report=True)
 def draw_sample_age(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the age of the sample in use on every link over time, ms: a row per receiver."""
-    lines = {link: stated_delay_line(log, states) for link, states in _stated_models(log).items()}
+    lines = {
+        link: stated_delay_line(log, states) for link, states in _stated_models(log).items()
+    }
     with style.time_figure(log, form, 0.6 + 1.05 * len(log.sites)) as plot:
-        grid = style.add_panels(plot.figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
+        grid = style.add_panels(
+            plot.figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True
+        )
         drawn: list[Array] = []
         spread = False
         for site, row in zip(log.sites, grid, strict=True):
-            for peer, age_ms, axes in zip(log[site].peers, sample_ages_ms(log, site).T, row, strict=True):
+            for peer, age_ms, axes in zip(
+                log[site].peers, sample_ages_ms(log, site).T, row, strict=True
+            ):
                 line = lines[f"{peer}->{site}"]
                 plot.mark(axes, [site], f"{peer}->{site}")
                 line_of = style.site_line(log, peer, 1.4)
@@ -95,12 +104,18 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
     """
     found = {(d.peer, d.site): d for d in measure_delay_distributions(log)}
     with style.styled_figure(form, 0.6 + 1.05 * len(log.sites)) as figure:
-        grid = style.add_panels(figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True)
+        grid = style.add_panels(
+            figure, len(log.sites), len(log.sites) - 1, sharex=True, sharey=True
+        )
         x_ms = delay_axis_ms(list(found.values()))
         for site, row in zip(log.sites, grid, strict=True):
             for peer, axes in zip(log[site].peers, row, strict=True):
                 link = found[peer, site]
-                axes.plot(x_ms, cumulative_percent(link.age_ms, x_ms), **style.site_line(log, peer, 1.8))
+                axes.plot(
+                    x_ms,
+                    cumulative_percent(link.age_ms, x_ms),
+                    **style.site_line(log, peer, 1.8),
+                )
                 axes.plot(x_ms, cumulative_percent(link.delay_ms, x_ms), **style.LIMIT_LINE)
                 _title_link(axes, peer, site)
         for axes in grid[:, 0]:
@@ -110,7 +125,9 @@ def draw_delay_distributions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
         grid[0, 0].set(ylim=(0.0, 104.0), xlim=(x_ms[0], x_ms[-1]))
         if x_ms[0] > 0.0:
             grid[0, 0].set_xscale("log")
-            style.set_plain_log_axis(grid[0, 0].xaxis, (1.0,) if form.narrow else (1.0, 2.0, 5.0))
+            style.set_plain_log_axis(
+                grid[0, 0].xaxis, (1.0,) if form.narrow else (1.0, 2.0, 5.0)
+            )
         entries = [(f"age, {text}", options) for text, options in _senders(log)]
         style.add_legend(figure, [*entries, ("delay of the samples", style.LIMIT_LINE)])
     return figure
@@ -130,13 +147,19 @@ def measure_delay_distributions(log: Log) -> list[DelayDistribution]:
             delay_ms = predict_delivery(log, peer, site, count).drawn_ms
             if not len(delay_ms) and log.driver == "live":
                 delay_ms = came.delay_us / 1e3
-            found.append(DelayDistribution(peer, site, delay_ms, sample_ages_ns(log, peer, site) / 1e6))
+            found.append(
+                DelayDistribution(peer, site, delay_ms, sample_ages_ns(log, peer, site) / 1e6)
+            )
     return found
 
 
 def delay_axis_ms(found: list[DelayDistribution]) -> Array:
-    """Returns the delays at which distributions are drawn, ms, to the longest; by logarithm if it is rare."""
-    values = np.concatenate([part for d in found for part in (d.delay_ms, d.age_ms)] or [np.zeros(0)])
+    """Returns the delays at which distributions are drawn, ms, to the longest; by logarithm if
+    it is rare.
+    """
+    values = np.concatenate(
+        [part for d in found for part in (d.delay_ms, d.age_ms)] or [np.zeros(0)]
+    )
     known = values[np.isfinite(values)]
     end_ms = 1.05 * max(float(known.max(initial=0.0)), 1.0)
     if not needs_log_axis(known):
@@ -145,18 +168,24 @@ def delay_axis_ms(found: list[DelayDistribution]) -> Array:
 
 
 def cumulative_percent(values: Array, limits: Array) -> Array:
-    """Returns the percentage of values that are at most as large as each limit; NaN without values."""
+    """Returns the percentage of values that are at most as large as each limit; NaN without
+    values.
+    """
     if not len(values):
         return np.full(len(limits), np.nan)
     return 100.0 * np.searchsorted(np.sort(values), limits, side="right") / len(values)
 
 
 def stated_delay_line(log: Log, states: list[StatedModel]) -> tuple[Array, Array]:
-    """Returns the stated mean delay over time as a line: times, s, and delays, ms; NaN between states."""
+    """Returns the stated mean delay over time as a line: times, s, and delays, ms; NaN between
+    states.
+    """
     starts = [state.from_s for state in states]
     ends = [*starts[1:], max(recorded_end_s(log), starts[-1])]
     times = [t for start, end in zip(starts, ends, strict=True) for t in (start, end, end)]
-    means = [mean for state in states for mean in (*(state.link.moments().mean_ms,) * 2, np.nan)]
+    means = [
+        mean for state in states for mean in (*(state.link.moments().mean_ms,) * 2, np.nan)
+    ]
     return np.array(times), np.array(means)
 
 
@@ -167,7 +196,9 @@ def needs_log_axis(ages_ms: Array) -> bool:
 
 
 def is_unsteady(ages_ms: Array) -> bool:
-    """True if ages go up and down within what a pixel shows, so that a line would fill all between."""
+    """True if ages go up and down within what a pixel shows, so that a line would fill all
+    between.
+    """
     falls = np.flatnonzero(np.diff(ages_ms) < -_STEP_MS)
     return len(falls) > style.SPREAD_BUCKETS
 
@@ -175,7 +206,9 @@ def is_unsteady(ages_ms: Array) -> bool:
 def _age_axis(axes: Axes, values: Array) -> None:
     known = values[np.isfinite(values)]
     if needs_log_axis(known):
-        axes.set(yscale="log", ylim=(0.7 * float(known[known > 0.0].min()), 2.0 * float(known.max())))
+        axes.set(
+            yscale="log", ylim=(0.7 * float(known[known > 0.0].min()), 2.0 * float(known.max()))
+        )
         style.set_plain_log_axis(axes.yaxis, (1.0, 3.0))
     else:
         axes.set_ylim(0.0, 1.25 * max(float(known.max(initial=0.0)), 1.0))
@@ -186,7 +219,10 @@ def _title_link(axes: Axes, peer: str, site: str) -> None:
 
 
 def _senders(log: Log) -> list[tuple[str, dict[str, Any]]]:
-    return [(f"from {style.site_title(log, site)}", style.site_line(log, site, 1.8)) for site in log.sites]
+    return [
+        (f"from {style.site_title(log, site)}", style.site_line(log, site, 1.8))
+        for site in log.sites
+    ]
 
 
 def explain_missing_loop_times(log: Log) -> str:
@@ -197,12 +233,19 @@ def explain_missing_loop_times(log: Log) -> str:
 
 
 def loop_time_bin_edges(log: Log) -> Array:
-    """Returns the edges of the histograms of a log, shape (B + 1,), us, equal steps of the logarithm.
+    """Returns the edges of the histograms of a log, shape (B + 1,), us, equal steps of the
+    logarithm.
 
-    The last edge lies above every time in the log; times below the first, 1 us, count in the first bin.
+    The last edge lies above every time in the log; times below the first, 1 us, count in the
+    first bin.
     """
     largest = max(
-        (int(times.max()) for s in log.sites for times in (log[s].late_us, log[s].busy_us) if len(times)),
+        (
+            int(times.max())
+            for s in log.sites
+            for times in (log[s].late_us, log[s].busy_us)
+            if len(times)
+        ),
         default=1,
     )
     decades = np.log10(max(largest, 10) * 1.1)
@@ -211,22 +254,45 @@ def loop_time_bin_edges(log: Log) -> Array:
 
 
 def bin_loop_times(times_us: Ints, edges: Array) -> Ints:
-    """Returns how many times, shape (K,), us, lie in each bin between `edges`, shape (B + 1,), us."""
+    """Returns how many times, shape (K,), us, lie in each bin between `edges`, shape (B + 1,),
+    us.
+    """
     return np.histogram(np.maximum(times_us, 1), edges)[0].astype(np.int64)
 
 
-@draws("loop_timing", "lateness and computing time of the loops", explain_missing_loop_times, in_report=True)
+@draws(
+    "loop_timing",
+    "lateness and computing time of the loops",
+    explain_missing_loop_times,
+    in_report=True,
+)
 def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns histograms of each site's lateness and computing time, us."""
     edges = loop_time_bin_edges(log)
     labels = ("lateness", "computing time")
     if not form.narrow:
         labels = ("wake-up after the deadline", "computing time of a tick")
-    with style.styled_figure(form, 0.6 + (1.3 if form.narrow else 1.05) * len(log.sites)) as figure:
+    with style.styled_figure(
+        form, 0.6 + (1.3 if form.narrow else 1.05) * len(log.sites)
+    ) as figure:
         grid = style.add_panels(figure, len(log.sites), 2, sharex=True, sharey=True)
         for site, (late, busy) in zip(log.sites, grid, strict=True):
-            _bars(log, site, late, log[site].late_us, edges, form)
-            _bars(log, site, busy, log[site].busy_us, edges, form)
+            _bars(
+                log=log,
+                site=site,
+                axes=late,
+                times_us=log[site].late_us,
+                edges=edges,
+                form=form,
+            )
+            _bars(
+                log=log,
+                site=site,
+                axes=busy,
+                times_us=log[site].busy_us,
+                edges=edges,
+                form=form,
+            )
             late.set_ylabel("ticks (count)")
         grid[0, 0].set_ylim(bottom=0.7)
         for axes, text in zip(grid[-1], labels, strict=True):
@@ -235,7 +301,9 @@ def draw_loop_timing(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     return figure
 
 
-def _bars(log: Log, site: str, axes: Axes, times_us: Ints, edges: Array, form: FigureSize) -> None:
+def _bars(
+    log: Log, site: str, axes: Axes, times_us: Ints, edges: Array, form: FigureSize
+) -> None:
     axes.set(xscale="log", yscale="log")
     counts = bin_loop_times(times_us, edges)
     colour = style.site_colour(log, site)
@@ -244,6 +312,10 @@ def _bars(log: Log, site: str, axes: Axes, times_us: Ints, edges: Array, form: F
     if not len(times_us):
         style.annotate_empty_panel(axes, f"no times of {site}")
         return
-    p50, p99, largest = (f"{value:.0f}" for value in np.percentile(times_us, (50.0, 99.0, 100.0)))
+    p50, p99, largest = (
+        f"{value:.0f}" for value in np.percentile(times_us, (50.0, 99.0, 100.0))
+    )
     between = "\n" if form.narrow else " "
-    axes.set_title(f"{site}: p50 {p50}, p99 {p99},{between}max {largest} µs", loc="left", pad=2.0)
+    axes.set_title(
+        f"{site}: p50 {p50}, p99 {p99},{between}max {largest} µs", loc="left", pad=2.0
+    )

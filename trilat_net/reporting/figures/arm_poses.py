@@ -1,7 +1,9 @@
-"""Poses of the arms at a few instants: base, joints and end effector; a figure of them, and SVG for the page.
+"""Poses of the arms at a few instants: base, joints and end effector; a figure of them, and SVG
+for the page.
 
-Invariant: forward kinematics are those of the core; the reference pose is dashed behind each arm. A chain is
-seen along parallel lines from one fixed direction, with up where gravity does not pull.
+Invariant: forward kinematics are those of the core; the reference pose is dashed behind each
+arm. A chain is seen along parallel lines from one fixed direction, with up where gravity does
+not pull.
 """
 
 from collections.abc import Iterable, Sequence
@@ -27,23 +29,43 @@ INSTANTS = 6
 _NARROW_INSTANTS = 3
 _PATH_POINTS = 400
 _AZIMUTH, _ELEVATION = np.deg2rad((-50.0, 22.0))
-"""Direction from which chains are seen: about the vertical from the base's x axis on, and above the floor."""
-_SHADOW: dict[str, Any] = {"color": "#c9c9c9", "linewidth": 1.6, "solid_capstyle": "round", "zorder": 1.0}
-_DESIRED: dict[str, Any] = {"color": style.REFERENCE, "linestyle": (0, (3, 1.5)), "linewidth": 0.8}
+"""Direction from which chains are seen: about the vertical from the base's x axis on, and above
+the floor.
+"""
+_SHADOW: dict[str, Any] = {
+    "color": "#c9c9c9",
+    "linewidth": 1.6,
+    "solid_capstyle": "round",
+    "zorder": 1.0,
+}
+_DESIRED: dict[str, Any] = {
+    "color": style.REFERENCE,
+    "linestyle": (0, (3, 1.5)),
+    "linewidth": 0.8,
+}
 PictureBox = tuple[float, float, float, float]
 """Left, right, bottom and top."""
 _BOX_PATH = 0.5 * np.array(
-    [[1 - 2 * (n >> axis & 1) for axis in range(3)] for n in (0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4)]
+    [
+        [1 - 2 * (n >> axis & 1) for axis in range(3)]
+        for n in (0, 1, 3, 2, 0, 4, 5, 1, 5, 7, 3, 7, 6, 2, 6, 4)
+    ]
 )
 """Along all edges of a box of sides 1."""
-_BASE: dict[str, Any] = {"linestyle": "none", "marker": "s", "markersize": 4.5, "color": style.REFERENCE}
+_BASE: dict[str, Any] = {
+    "linestyle": "none",
+    "marker": "s",
+    "markersize": 4.5,
+    "color": style.REFERENCE,
+}
 
 
 class ArmPose(NamedTuple):
-    """A site at an instant: its base, joints and end effector, (L, 2), and the path of the last, (P, 2), m.
+    """A site at an instant: its base, joints and end effector, (L, 2), and the path of the
+    last, (P, 2), m.
 
-    `shadow` is what a light straight above would cast onto a floor at the base: that of a chain, (L, 2), or
-    nothing, (0, 2). `bodies` are those of its plant, see `trace_bodies_m`.
+    `shadow` is what a light straight above would cast onto a floor at the base: that of a
+    chain, (L, 2), or nothing, (0, 2). `bodies` are those of its plant, see `trace_bodies_m`.
     """
 
     actual: Array
@@ -53,8 +75,11 @@ class ArmPose(NamedTuple):
     bodies: Sequence[Array] = ()
 
 
-def trace_bodies_m(arm: ArmModel, sizes_m: Iterable[Sequence[float]], poses: Array) -> list[Array]:
-    """Returns the edges of the boxes of a plant's bodies as paths in the plane of a picture, (K, P, 2), m.
+def trace_bodies_m(
+    arm: ArmModel, sizes_m: Iterable[Sequence[float]], poses: Array
+) -> list[Array]:
+    """Returns the edges of the boxes of a plant's bodies as paths in the plane of a picture,
+    (K, P, 2), m.
 
     Args:
         arm: of the site.
@@ -73,7 +98,8 @@ def trace_bodies_m(arm: ArmModel, sizes_m: Iterable[Sequence[float]], poses: Arr
 
 
 def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> Array:
-    """Returns points of an arm in the plane of a picture, shape (..., 2), m: a planar arm's are that already.
+    """Returns points of an arm in the plane of a picture, shape (..., 2), m: a planar arm's are
+    that already.
 
     `onto_floor`: those of their shadows.
     """
@@ -83,11 +109,14 @@ def project_arm_m(arm: ArmModel, points: Array, *, onto_floor: bool = False) -> 
     across = y * np.cos(_AZIMUTH) - x * np.sin(_AZIMUTH)
     towards = x * np.cos(_AZIMUTH) + y * np.sin(_AZIMUTH)
     height = np.zeros_like(z) if onto_floor else z
-    return np.stack([across, height * np.cos(_ELEVATION) - towards * np.sin(_ELEVATION)], axis=-1)
+    return np.stack(
+        [across, height * np.cos(_ELEVATION) - towards * np.sin(_ELEVATION)], axis=-1
+    )
 
 
 def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
-    """Returns instants to draw, first and last included, s: half by the clock, half by how much moves.
+    """Returns instants to draw, first and last included, s: half by the clock, half by how much
+    moves.
 
     Equal steps of time alone would spend most of a row on arms at rest.
     """
@@ -97,7 +126,9 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
     for name in log.sites:
         part = log[name]
         if len(part):
-            step = np.abs(np.diff(site_signals.joint_angles(part), axis=0, prepend=part.q[:1])).sum(axis=1)
+            step = np.abs(
+                np.diff(site_signals.joint_angles(part), axis=0, prepend=part.q[:1])
+            ).sum(axis=1)
             moved += np.interp(grid, part.t_s, np.cumsum(step))
     share = grid / end_s + (moved / moved[-1] if moved[-1] > 0.0 else 0.0)
     chosen = np.interp(np.linspace(0.0, share[-1], count), share, grid)
@@ -107,7 +138,9 @@ def choose_instants_s(log: Log, count: int = INSTANTS) -> list[float]:
 
 
 def pose_at(log: Log, site: str, t_s: float) -> ArmPose | None:
-    """Returns the pose of a site at an instant: that of its last record until then; None without one."""
+    """Returns the pose of a site at an instant: that of its last record until then; None
+    without one.
+    """
     part = log[site]
     arm = log.scenario.arms[site]
     last = int(np.searchsorted(part.t_s, t_s + 1e-9, side="right")) - 1
@@ -116,17 +149,29 @@ def pose_at(log: Log, site: str, t_s: float) -> ArmPose | None:
     rows = np.unique(np.linspace(0, last, _PATH_POINTS).astype(np.int64))
     found = joint_positions_m(arm, part.q[rows])
     actual = project_arm_m(arm, found)
-    desired = project_arm_m(arm, joint_positions_m(arm, reference_angles(part)[last : last + 1])[0])
+    desired = project_arm_m(
+        arm, joint_positions_m(arm, reference_angles(part)[last : last + 1])[0]
+    )
     shadow = project_arm_m(arm, found[-1 if arm.chain else len(found) :][:1], onto_floor=True)
     sizes_m = log.scenario.bodies_m(site).values()
     bodies = (
-        [path[0] for path in trace_bodies_m(arm, sizes_m, part.bodies[last : last + 1])] if sizes_m else ()
+        [path[0] for path in trace_bodies_m(arm, sizes_m, part.bodies[last : last + 1])]
+        if sizes_m
+        else ()
     )
-    return ArmPose(actual[-1], desired, actual[:, -1], shadow.reshape(-1, 2), bodies)
+    return ArmPose(
+        actual=actual[-1],
+        desired=desired,
+        path=actual[:, -1],
+        shadow=shadow.reshape(-1, 2),
+        bodies=bodies,
+    )
 
 
 def pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
-    """Returns left, right, bottom and top of a box around poses with a margin, m; the base is inside."""
+    """Returns left, right, bottom and top of a box around poses with a margin, m; the base is
+    inside.
+    """
     points = [np.concatenate([*one[:4], *one.bodies]) for one in poses if one is not None]
     every = np.concatenate([*points, np.zeros((1, 2))])
     low = every.min(axis=0)
@@ -141,7 +186,9 @@ def pose_box_m(poses: Sequence[ArmPose | None]) -> PictureBox:
 
 @draws("arms", "the arms at a few instants", in_report=True)
 def draw_arms(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the arms of all sites at a few instants: a row per site, a column per instant, axes in m."""
+    """Returns the arms of all sites at a few instants: a row per site, a column per instant,
+    axes in m.
+    """
     times = choose_instants_s(log, _NARROW_INSTANTS if form.narrow else INSTANTS)
     drawn = {site: [pose_at(log, site, t) for t in times] for site in log.sites}
     planar = all(arm.chain is None for arm in log.scenario.arms.values())
@@ -179,7 +226,13 @@ def _arm(axes: Axes, drawn: ArmPose | None, colour: str) -> None:
         axes.plot(*path.T, color=style.REFERENCE, linewidth=0.8)
     axes.plot(*drawn.path.T, color=colour, linewidth=0.6, alpha=0.55)
     axes.plot(*drawn.desired.T, **_DESIRED)
-    axes.plot(*drawn.actual.T, color=colour, linewidth=2.0, solid_capstyle="round", solid_joinstyle="round")
+    axes.plot(
+        *drawn.actual.T,
+        color=colour,
+        linewidth=2.0,
+        solid_capstyle="round",
+        solid_joinstyle="round",
+    )
     axes.plot(*drawn.actual[1:].T, linestyle="none", marker="o", markersize=2.6, color=colour)
     axes.plot(0.0, 0.0, **_BASE)
 
@@ -205,7 +258,11 @@ def render_arms_svg(log: Log, bounds_m: PictureBox, factor: float) -> str:
             if drawn is not None:
                 bodies = [factor * path for path in drawn.bodies]
                 scaled = ArmPose._make([*(factor * points for points in drawn[:4]), bodies])
-            cells.append(_render_picture(scaled, index, (left, right, bottom, top), f"{site} at {t:.4g} s"))
+            cells.append(
+                _render_picture(
+                    scaled, index, (left, right, bottom, top), f"{site} at {t:.4g} s"
+                )
+            )
     note = "Gray: the shadow on a floor at the base; up is where gravity does not pull."
     chains = any(arm.chain for arm in log.scenario.arms.values())
     columns = f"grid-template-columns: max-content repeat({len(times)}, 1fr)"
@@ -231,9 +288,12 @@ def _render_picture(drawn: ArmPose | None, index: int, bounds: PictureBox, label
         if len(drawn.shadow):
             ground = ""
             paths.insert(0, ("shadow", drawn.shadow))
-        inside = "".join(f'<polyline class="{kind}" points="{_svg_points(path)}"/>' for kind, path in paths)
+        inside = "".join(
+            f'<polyline class="{kind}" points="{_svg_points(path)}"/>' for kind, path in paths
+        )
         inside += "".join(
-            f'<circle class="fill-{index}" cx="{x:.3f}" cy="{-y:.3f}" r=".055"/>' for x, y in drawn.actual[1:]
+            f'<circle class="fill-{index}" cx="{x:.3f}" cy="{-y:.3f}" r=".055"/>'
+            for x, y in drawn.actual[1:]
         )
     return f'<svg viewBox="{box}" role="img" aria-label="{escape(label)}">{ground}{inside}{base}</svg>'
 

@@ -1,9 +1,10 @@
 """Figures of the certificate's energies.
 
-V and its parts, dissipation and work, and the residual of the balance; the energies that laws declare.
+V and its parts, dissipation and work, and the residual of the balance; the energies that laws
+declare.
 
-Invariant: energies in J over the time of the whole run; spans without complete records are shaded, the
-largest rise is marked.
+Invariant: energies in J over the time of the whole run; spans without complete records are
+shaded, the largest rise is marked.
 """
 
 from typing import Any
@@ -33,7 +34,12 @@ _COLOURS = ("#117733", "#aa4499", "#999933", "#882255", "#44aa99", "#661100")
 _TOTAL: dict[str, Any] = {"color": style.REFERENCE, "linewidth": 1.6}
 _ONES: dict[str, Any] = {"color": style.REFERENCE, "linewidth": 0.9, "linestyle": (0, (4, 2))}
 _RISE: dict[str, Any] = {"color": "#cc3311", "alpha": 0.25, "linewidth": 0.0, "zorder": 0.4}
-_UNJUDGED: dict[str, Any] = {"color": style.FAINT, "alpha": 0.3, "linewidth": 0.0, "zorder": 0.3}
+_UNJUDGED: dict[str, Any] = {
+    "color": style.FAINT,
+    "alpha": 0.3,
+    "linewidth": 0.0,
+    "zorder": 0.3,
+}
 _HEIGHTS = (1.5, 1.2, 1.3, 1.0)
 _OBSERVED_PANELS = {
     "line": "in the lines (J)",
@@ -43,8 +49,11 @@ _OBSERVED_PANELS = {
 }
 
 
-def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns V with its sites, its parts, dissipation and work, and the residual of the balance, J.
+def draw_functional(
+    log: Log, certificate: Certificate, form: FigureSize = REPORT_SIZE
+) -> Figure:
+    """Returns V with its sites, its parts, dissipation and work, and the residual of the
+    balance, J.
 
     A certificate without a balance gives a figure with the reason.
     """
@@ -61,7 +70,14 @@ def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPOR
         rows[0].set_ylim(bottom=0.0)
         rows[0].set_ylabel(r"V and its $\beta_i V_i$ (J)")
         for (name, values), line in zip(balance.parts.items(), style.DASHES, strict=True):
-            _draw(balance, rows[1], values, label=_PARTS[name], color=style.REFERENCE, linestyle=line)
+            _draw(
+                balance,
+                rows[1],
+                values,
+                label=_PARTS[name],
+                color=style.REFERENCE,
+                linestyle=line,
+            )
         rows[1].set_ylabel("parts of V (J)")
         _add_panel_legend(rows[1], form)
         _draw_work(balance, rows[2], form)
@@ -75,7 +91,9 @@ def draw_functional(log: Log, certificate: Certificate, form: FigureSize = REPOR
             rows[0].axvspan(rise.from_s, rise.at_s, **_RISE)
             rows[0].axvline(rise.at_s, color=_RISE["color"], linewidth=0.8)
         by_ones = [] if ones is None else [("V with the paper's ones", _ONES)]
-        plot.finish([rows[-1]], [*style.site_legend_entries(log, log.sites), ("V", _TOTAL), *by_ones])
+        plot.finish(
+            [rows[-1]], [*style.site_legend_entries(log, log.sites), ("V", _TOTAL), *by_ones]
+        )
     return plot.figure
 
 
@@ -87,14 +105,19 @@ draws(
 )(lambda log, form: draw_functional(log, certify(log), form))
 
 
-def draw_observed_energy(log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the energies that the laws declare: lines and what is known of them, stores, arms' work, J.
+def draw_observed_energy(
+    log: Log, observed: ObservedEnergy, form: FigureSize = REPORT_SIZE
+) -> Figure:
+    """Returns the energies that the laws declare: lines and what is known of them, stores,
+    arms' work, J.
 
     A line has the color of the site that it comes to.
     """
     kinds = {one.kind for one in observed.curves}
     panels = [kind for kind in _OBSERVED_PANELS if kind in kinds]
-    with style.time_figure(log, form, (1.6 if form.narrow else 1.4) * len(panels) + 0.8) as plot:
+    with style.time_figure(
+        log, form, (1.6 if form.narrow else 1.4) * len(panels) + 0.8
+    ) as plot:
         rows = style.add_panels(plot.figure, len(panels), 1, sharex=True)[:, 0]
         at = dict(zip(panels, rows, strict=True))
         for one in observed.curves:
@@ -168,5 +191,9 @@ def _draw_residual(balance: EnergyBalance, axes: Axes, form: FigureSize) -> None
         positive = np.maximum(np.abs(values), floor)
         _draw(balance, axes, positive, label=label, color=style.REFERENCE, linestyle=line)
     axes.axhline(scale, color=style.FAINT, linewidth=0.9, label="largest energy")
-    axes.set(yscale="log", ylabel="residual (J)", ylim=(floor, (1e12 if form.narrow else 1e4) * scale))
+    axes.set(
+        yscale="log",
+        ylabel="residual (J)",
+        ylim=(floor, (1e12 if form.narrow else 1e4) * scale),
+    )
     axes.legend(loc="upper left", ncols=1 if form.narrow else 3, fontsize=_legend_pt(form))

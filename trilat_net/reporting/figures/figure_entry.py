@@ -1,4 +1,5 @@
-"""How a function becomes a figure of a log: its name, what is in it, and when there is nothing to show.
+"""How a function becomes a figure of a log: its name, what is in it, and when there is nothing
+to show.
 
     @draws("positions", "actual and desired angles (Fig. 4)", in_report=True)
     def draw_positions(log, form): ...
@@ -20,7 +21,9 @@ Drawing = TypeVar("Drawing", bound=Callable[..., Figure])
 
 
 class FigureEntry(NamedTuple):
-    """A figure: what is in it, what draws it, and what returns why a log has nothing to show in it, or ""."""
+    """A figure: what is in it, what draws it, and what returns why a log has nothing to show in
+    it, or "".
+    """
 
     about: str
     draw: Draw
@@ -57,7 +60,9 @@ def draws(
 
 
 def unless(shows: Callable[[Log], object], reason: str) -> Absent:
-    """Returns what says the reason for which a log has nothing to show, unless `shows` is true of it."""
+    """Returns what says the reason for which a log has nothing to show, unless `shows` is true
+    of it.
+    """
     return lambda log: "" if shows(log) else reason
 
 

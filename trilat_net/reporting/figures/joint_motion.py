@@ -1,9 +1,10 @@
-"""Figures of the arms' signals: torques, angles, errors, settling, estimates, paths, shares, contact.
+"""Figures of the arms' signals: torques, angles, errors, settling, estimates, paths, shares,
+contact.
 
-Invariant: torques of operators are those ON the arm, the negative of the record's tau_x. Settling times are
-those of `analysis.site_signals`. Dominance factors follow from the scenario and the changes in the records,
-Eq. (6) and (7), wall forces from the scenario's walls at the logged states; `analysis.torque_sources` has the
-equations.
+Invariant: torques of operators are those ON the arm, the negative of the record's tau_x.
+Settling times are those of `analysis.site_signals`. Dominance factors follow from the scenario
+and the changes in the records, Eq. (6) and (7), wall forces from the scenario's walls at the
+logged states; `analysis.torque_sources` has the equations.
 """
 
 from collections.abc import Sequence
@@ -46,34 +47,56 @@ explain_absent_operator = unless(site_signals.sites_with_operator, NO_OPERATOR)
 """Returns why there is no torque of an operator to draw; "" if there is one."""
 
 
-@draws("operator_torques", "torque on the arms (Fig. 3)", explain_absent_operator, in_report=True)
+@draws(
+    "operator_torques", "torque on the arms (Fig. 3)", explain_absent_operator, in_report=True
+)
 def draw_operator_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
     """Returns the torques of the operators ON the arms over time, N m; Fig. 3 of the paper."""
     signal = style.site_records(log, site_signals.external_torques)
-    return _draw_joints(log, form, site_signals.sites_with_operator(log), signal, "torque on the arm (N m)")
+    return _draw_joints(
+        log=log,
+        form=form,
+        sites=site_signals.sites_with_operator(log),
+        signal=signal,
+        label="torque on the arm (N m)",
+    )
 
 
 def _explain_no_twin(log: Log) -> str:
     withheld = (str(law) for law in find_user_laws(log.scenario) if not law.allowed)
-    return next(withheld, "") if any(site.hands for site in log.scenario.sites.values()) else NO_OPERATOR
+    return (
+        next(withheld, "")
+        if any(site.hands for site in log.scenario.sites.values())
+        else NO_OPERATOR
+    )
 
 
-@draws("hands_moved", "the log minus the same run without operators", _explain_no_twin, in_report=True)
+@draws(
+    "hands_moved",
+    "the log minus the same run without operators",
+    _explain_no_twin,
+    in_report=True,
+)
 def draw_operator_displacement(
     log: Log, form: FigureSize = REPORT_SIZE, *, twin: Log | None = None
 ) -> Figure:
-    """Returns how far the operators moved every site over time, rad: the log minus a run without operators.
+    """Returns how far the operators moved every site over time, rad: the log minus a run
+    without operators.
 
     That run, `twin`, is simulated if it is not given.
     """
     other = simulate_without_operators(log) if twin is None else twin
     signal = partial(site_signals.operator_displacement, log, other)
-    return _draw_joints(log, form, log.sites, signal, "moved by operators (rad)")
+    return _draw_joints(
+        log=log, form=form, sites=log.sites, signal=signal, label="moved by operators (rad)"
+    )
 
 
 @draws("control_torques", "torque of the controllers")
 def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns tau of Eq. (13) of every site over time, N m, with the limit where a site reached it."""
+    """Returns tau of Eq. (13) of every site over time, N m, with the limit where a site reached
+    it.
+    """
     limits = list[Array]()
     for site in log.sites:
         largest = np.abs(site_signals.controller_torques(log[site])).max(axis=0, initial=0.0)
@@ -81,7 +104,14 @@ def draw_control_torques(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         if (largest >= stated).any():
             limits.append(stated)
     signal = style.site_records(log, site_signals.controller_torques)
-    return _draw_joints(log, form, log.sites, signal, "control torque (N m)", limits)
+    return _draw_joints(
+        log=log,
+        form=form,
+        sites=log.sites,
+        signal=signal,
+        label="control torque (N m)",
+        limits=limits,
+    )
 
 
 def _draw_joints(
@@ -112,12 +142,17 @@ def _draw_joints(
 
 
 def _add_joint_rows(
-    plot: style.TimeFigure, form: FigureSize, heads: Sequence[str], labels: Sequence[str], sharey: str
+    plot: style.TimeFigure,
+    form: FigureSize,
+    heads: Sequence[str],
+    labels: Sequence[str],
+    sharey: str,
 ) -> tuple[list[list[Axes]], list[Axes]]:
     """Returns panels per quantity and joint, and the lowest of them.
 
-    Two joints have columns beside each other, and a row per quantity, see `labels`; more have a row each,
-    and a column per quantity, see `heads`. `sharey` says which two joints share their axes of values.
+    Two joints have columns beside each other, and a row per quantity, see `labels`; more have a
+    row each, and a column per quantity, see `heads`. `sharey` says which two joints share their
+    axes of values.
     """
     titles = style.name_joints(plot.log)
     if len(titles) == 2:
@@ -126,7 +161,9 @@ def _add_joint_rows(
         for row, label in zip(grid, labels, strict=True):
             row[0].set_ylabel(label)
         return [[*row] for row in grid], [*grid[-1]]
-    grid = style.add_panels(plot.figure, len(titles), len(heads), sharex=True, sharey=_ACROSS[sharey])
+    grid = style.add_panels(
+        plot.figure, len(titles), len(heads), sharex=True, sharey=_ACROSS[sharey]
+    )
     for row, title in zip(grid, titles, strict=True):
         style.label_row(row[0], title, form)
     for axes, head in zip(grid[0], heads, strict=True):
@@ -136,7 +173,8 @@ def _add_joint_rows(
 
 @draws("operation", "torque on the arms above their angles", explain_absent_operator)
 def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the torques ON the arms, N m, above the angles of all arms, rad: a column per joint.
+    """Returns the torques ON the arms, N m, above the angles of all arms, rad: a column per
+    joint.
 
     Arms of more joints have a row per joint, with both quantities beside each other.
     """
@@ -145,7 +183,9 @@ def draw_operation(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         heads = ("torque on the arm (N m)", "joint angle (rad)")
     height_in = 2.9 if form.narrow else 3.4
     with style.time_figure(log, form, _height_in(log, height_in)) as plot:
-        (upper, lower), lowest = _add_joint_rows(plot, form, heads, heads, "none")
+        (upper, lower), lowest = _add_joint_rows(
+            plot=plot, form=form, heads=heads, labels=heads, sharey="none"
+        )
         if len(upper) == 2:
             upper[1].sharey(upper[0])
             upper[1].tick_params(labelleft=False)
@@ -164,13 +204,22 @@ def _height_in(log: Log, of_two: float) -> float:
 
 @draws("positions", "actual and desired angles (Fig. 4)", in_report=True)
 def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns desired and actual joint angles of every site over time, rad; Fig. 4 of the paper."""
-    labels = [("{}: q (rad)" if form.narrow else "angle of {} (rad)").format(site) for site in log.sites]
+    """Returns desired and actual joint angles of every site over time, rad; Fig. 4 of the
+    paper.
+    """
+    labels = [
+        ("{}: q (rad)" if form.narrow else "angle of {} (rad)").format(site)
+        for site in log.sites
+    ]
     heads = [f"{site}: q (rad)" for site in log.sites]
-    entries = [(f"{style.site_title(log, s)}, actual", style.site_line(log, s, 1.6)) for s in log.sites]
+    entries = [
+        (f"{style.site_title(log, s)}, actual", style.site_line(log, s, 1.6)) for s in log.sites
+    ]
     height_in = 0.7 + (0.95 if form.narrow else 1.25) * len(log.sites)
     with style.time_figure(log, form, _height_in(log, height_in)) as plot:
-        grid, lowest = _add_joint_rows(plot, form, heads, labels, "col")
+        grid, lowest = _add_joint_rows(
+            plot=plot, form=form, heads=heads, labels=labels, sharey="col"
+        )
         for site, row in zip(log.sites, grid, strict=True):
             actual = site_signals.joint_angles(log[site])
             desired = site_signals.reference_angles(log[site])
@@ -186,10 +235,12 @@ def draw_positions(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 @draws("tracking_errors", "errors, and the largest one still to come (Fig. 5)", in_report=True)
 def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns e = q - q_des of every site over time, rad, Fig. 5 of the paper, and how it settles.
+    """Returns e = q - q_des of every site over time, rad, Fig. 5 of the paper, and how it
+    settles.
 
-    In task space it is that of the place along each axis, m. The lowest panel shows, at every time, the
-    largest error of any joint that is still to come: where it crosses the dashed line, the site has settled.
+    In task space it is that of the place along each axis, m. The lowest panel shows, at every
+    time, the largest error of any joint that is still to come: where it crosses the dashed
+    line, the site has settled.
     """
     titles = style.name_shared(log)
     unit = site_signals.shared_unit(log)
@@ -200,7 +251,9 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         settling = panels.below
         assert settling is not None
         style.title_joints(log, panels.joints, titles)
-        plot.joint_row(panels.joints, log.sites, style.site_records(log, site_signals.joint_errors))
+        plot.joint_row(
+            panels.joints, log.sites, style.site_records(log, site_signals.joint_errors)
+        )
         for axes in panels.joints[:: panels.columns]:
             axes.set_ylabel(f"tracking error ({unit})")
         low = high = SETTLED_ERROR_RAD
@@ -212,17 +265,22 @@ def draw_tracking_errors(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             high = np.nanmax(positive, initial=high)
         settling.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
         settling.set(
-            yscale="log", ylim=(0.5 * low, 2.0 * high), ylabel=f"largest error\nstill to come ({unit})"
+            yscale="log",
+            ylim=(0.5 * low, 2.0 * high),
+            ylabel=f"largest error\nstill to come ({unit})",
         )
         plot.mark(settling, log.sites)
         limit = (f"settled: {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE)
-        plot.finish([*panels.lowest, settling], [*style.site_legend_entries(log, log.sites), limit])
+        plot.finish(
+            [*panels.lowest, settling], [*style.site_legend_entries(log, log.sites), limit]
+        )
     return plot.figure
 
 
 @draws("settling", "size of the errors on a log axis, settling times")
 def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the largest error of any joint of every site over time, rad, on a logarithmic axis.
+    """Returns the largest error of any joint of every site over time, rad, on a logarithmic
+    axis.
 
     A triangle marks the time at which a site settles; the legend has its value.
     """
@@ -242,21 +300,32 @@ def draw_settling(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
                 high = max(high, most)
             settled = site_signals.settling_time_s(log[site])
             if settled is not None:
-                mark = {"marker": "v", "markersize": 6.0, "color": line["color"], "clip_on": False}
+                mark = {
+                    "marker": "v",
+                    "markersize": 6.0,
+                    "color": line["color"],
+                    "clip_on": False,
+                }
                 axes.plot(settled, SETTLED_ERROR_RAD, **mark)
             when = "not settled" if settled is None else f"settled at {settled:.1f} s"
             entries.append((f"{site}: {when}", line))
         axes.axhline(SETTLED_ERROR_RAD, **style.LIMIT_LINE)
         axes.set(
-            yscale="log", ylim=(max(0.5 * low, _LEAST_RAD), 2.0 * high), ylabel=f"largest error ({unit})"
+            yscale="log",
+            ylim=(max(0.5 * low, _LEAST_RAD), 2.0 * high),
+            ylabel=f"largest error ({unit})",
         )
         plot.mark(axes, log.sites)
-        plot.finish([axes], [*entries, (f"limit {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE)])
+        plot.finish(
+            [axes], [*entries, (f"limit {SETTLED_ERROR_RAD:g} {unit}", style.LIMIT_LINE)]
+        )
     return plot.figure
 
 
 def _learns(log: Log) -> bool:
-    return any(len(log[site]) and np.ptp(log[site].theta_hat, axis=0).any() for site in log.sites)
+    return any(
+        len(log[site]) and np.ptp(log[site].theta_hat, axis=0).any() for site in log.sites
+    )
 
 
 @draws(
@@ -266,9 +335,11 @@ def _learns(log: Log) -> bool:
     in_report=True,
 )
 def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the estimates of the parameters over time with the true values; Fig. 6 of the paper.
+    """Returns the estimates of the parameters over time with the true values; Fig. 6 of the
+    paper.
 
-    They are those of all sites; the paper shows master 1. A chain has a row per link, two in a narrow figure.
+    They are those of all sites; the paper shows master 1. A chain has a row per link, two in a
+    narrow figure.
     """
     if log.scenario.arms[log.sites[0]].chain is not None:
         return _draw_link_estimates(log, form)
@@ -287,7 +358,9 @@ def draw_parameter_estimates(log: Log, form: FigureSize = REPORT_SIZE) -> Figure
 
 
 def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
-    arm = max((log.scenario.arms[site] for site in log.sites), key=lambda each: each.counts.joints)
+    arm = max(
+        (log.scenario.arms[site] for site in log.sites), key=lambda each: each.counts.joints
+    )
     columns = LINK_PARAMETERS // (2 if form.narrow else 1)
     rows = len(arm.theta) // columns
     with style.time_figure(log, form, 0.8 + 0.74 * rows) as plot:
@@ -295,11 +368,13 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
         panels: list[Axes] = [*grid.flat]
         for index, (axes, (name, unit)) in enumerate(zip(panels, arm.parameters, strict=True)):
             known = [s for s in log.sites if index < len(log.scenario.arms[s].theta)]
-            _draw_estimate(plot, known, index, axes, 0.9)
+            _draw_estimate(plot=plot, sites=known, index=index, axes=axes, width=0.9)
             plot.mark(axes, log.sites, numbered=False)
             link, _, symbol = name.rpartition(".")
             axes.set_title(
-                f"{style.typeset_symbol(symbol)} ({style.typeset_unit(unit)})", fontsize=5.5, pad=3.5
+                f"{style.typeset_symbol(symbol)} ({style.typeset_unit(unit)})",
+                fontsize=5.5,
+                pad=3.5,
             )
             axes.tick_params(labelsize=5.0, length=1.5, pad=1.0)
             axes.locator_params(axis="y", nbins=2)
@@ -314,12 +389,18 @@ def _draw_link_estimates(log: Log, form: FigureSize) -> Figure:
 
 
 def _draw_estimate(
-    plot: style.TimeFigure, sites: Sequence[str], index: int, axes: Axes, width: float | None = None
+    plot: style.TimeFigure,
+    sites: Sequence[str],
+    index: int,
+    axes: Axes,
+    width: float | None = None,
 ) -> None:
     """Draws the estimates of one parameter, and its true value once if all sites share it."""
     truths = {site: float(plot.log.scenario.arms[site].theta[index]) for site in sites}
     for site in sites:
-        plot.trace(axes, site, site_signals.parameter_estimates(plot.log[site])[:, index], width)
+        plot.trace(
+            axes, site, site_signals.parameter_estimates(plot.log[site])[:, index], width
+        )
     if len(set(truths.values())) == 1:
         axes.axhline(truths[sites[0]], **style.LIMIT_LINE)
         return
@@ -329,7 +410,8 @@ def _draw_estimate(
 
 @draws("phase", "errors against their rates")
 def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the phase portrait of the errors: e over the run against qd - qd_des, a panel per joint.
+    """Returns the phase portrait of the errors: e over the run against qd - qd_des, a panel per
+    joint.
 
     A ring marks the start of a site, a disc its end.
     """
@@ -361,13 +443,17 @@ def draw_phase_portrait(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 @draws(
     "paths",
     "paths of the end effectors in three planes",
-    unless(lambda log: all(arm.chain for arm in log.scenario.arms.values()), "its arms are planar"),
+    unless(
+        lambda log: all(arm.chain for arm in log.scenario.arms.values()), "its arms are planar"
+    ),
     in_report=True,
 )
 def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the paths of the end effectors of chains, m, in three planes of the frame that all sites share.
+    """Returns the paths of the end effectors of chains, m, in three planes of the frame that
+    all sites share.
 
-    Of sites in task space in the metres of the task. A ring marks the start of a site, a disc its end.
+    Of sites in task space in the metres of the task. A ring marks the start of a site, a disc
+    its end.
     """
     places = style.arrange_joints(len(_PLANES), form.narrow)
     height_in = 0.9 * form.width_in / len(places[0])
@@ -398,9 +484,11 @@ def _draw_path(axes: Axes, path: Array, line: dict[str, Any]) -> None:
 
 
 def thin_path(path: Array) -> Array:
-    """Returns points of a path, shape (K, 2), K > 0, at about equal distances along it, ends included.
+    """Returns points of a path, shape (K, 2), K > 0, at about equal distances along it, ends
+    included.
 
-    A path in a plane is thinned by its length and not by time, so that fast parts keep as many points.
+    A path in a plane is thinned by its length and not by time, so that fast parts keep as many
+    points.
     """
     extent = np.ptp(path, axis=0)
     scaled = path / np.where(extent > 0.0, extent, 1.0)
@@ -438,7 +526,9 @@ def draw_authority(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             axes.set(ylim=(-0.05, 1.05), ylabel=f"share in {site} (1)")
             plot.mark(axes, [site])
         for site in log.sites:
-            moved = site_signals.joint_angles(log[site]) - np.array(log.scenario.sites[site].q0_rad)
+            moved = site_signals.joint_angles(log[site]) - np.array(
+                log.scenario.sites[site].q0_rad
+            )
             for axes, values in zip(column[len(owners) :], moved.T, strict=False):
                 plot.trace(axes, site, values)
         for title, axes in zip(titles, column[len(owners) :], strict=True):
@@ -459,14 +549,18 @@ def sites_with_walls(log: Log) -> list[str]:
     unless(sites_with_walls, "no site has a wall in this run"),
 )
 def draw_contact(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the normal force of every wall over time, N, above the depth of the end effector in it, mm."""
+    """Returns the normal force of every wall over time, N, above the depth of the end effector
+    in it, mm.
+    """
     sites = sites_with_walls(log)
     with style.time_figure(log, form, 2.9) as plot:
         column = style.add_panels(plot.figure, 2, 1, sharex=True)[:, 0]
         for site in sites:
             part = log[site]
             spec = log.scenario.sites[site]
-            end_effector = build_arm_rows(log.scenario, site).place_end_effector(part.q, part.qd)
+            end_effector = build_arm_rows(log.scenario, site).place_end_effector(
+                part.q, part.qd
+            )
             walls = list_walls(spec)
             for wall, dashes in zip(walls, [*style.DASHES] * len(walls), strict=False):
                 depth_mm = 1e3 * np.maximum(wall_depth(wall, end_effector), 0.0)

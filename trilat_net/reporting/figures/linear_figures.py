@@ -1,6 +1,8 @@
-"""Figures of a linear loop: its roots; transmitted impedance and passivity of its ports over frequency.
+"""Figures of a linear loop: its roots; transmitted impedance and passivity of its ports over
+frequency.
 
-Invariant: free is solid and clamped dashed, in the colour of the operator's site; bands that fail are shaded.
+Invariant: free is solid and clamped dashed, in the colour of the operator's site; bands that
+fail are shaded.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,13 +28,18 @@ _CLAMPED: tuple[int, tuple[float, float]] = (0, (4.0, 1.6))
 _FAILS: dict[str, Any] = {"color": "#cc3311", "alpha": 0.12, "linewidth": 0.0, "zorder": 0.3}
 _BAND: dict[str, Any] = {"color": style.FAINT, "alpha": 0.12, "linewidth": 0.0, "zorder": 0.2}
 _ALL: dict[str, Any] = {"color": SITE_COLOURS[0], "linewidth": 1.6}
-_PROOF: dict[str, Any] = {"color": style.REFERENCE, "linewidth": 1.0, "linestyle": (0, (5, 1.5, 1, 1.5))}
+_PROOF: dict[str, Any] = {
+    "color": style.REFERENCE,
+    "linewidth": 1.0,
+    "linestyle": (0, (5, 1.5, 1, 1.5)),
+}
 _MAX_SHOWN_PARAMETER = 2.5
 """Llewellyn's parameter is drawn up to here: values far above 1 do not differ in meaning."""
 
 
 def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns magnitude and phase of the transmitted impedance, free and clamped, a column for each joint.
+    """Returns magnitude and phase of the transmitted impedance, free and clamped, a column for
+    each joint.
 
     The joints of larger arms stand in several rows of both.
     """
@@ -52,7 +59,9 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
             of_joint = [one for one in ports.transparency if one.joint == joint]
             magnitude, phase = grid[top : top + 2, column]
             _plot_impedance(ports, of_joint, magnitude, phase)
-            magnitude.set_title(ports.name_port(joint) + ("" if crowded else _describe_ratios(of_joint)))
+            magnitude.set_title(
+                ports.name_port(joint) + ("" if crowded else _describe_ratios(of_joint))
+            )
             if place + columns >= len(joints):
                 phase.set_xlabel("frequency (Hz)")
                 phase.xaxis.set_tick_params(labelbottom=True)
@@ -83,9 +92,12 @@ def _plot_impedance(
         hz = one.w_rad_s / (2.0 * np.pi)
         for Z, dashes in ((one.free, "-"), (one.clamped, _CLAMPED)):
             line: dict[str, Any] = {"color": _colour(ports, one.at), "linestyle": dashes}
-            line["linewidth"] = 2.0 - 1.2 * n / (len(transparency) - 1) if len(transparency) > 1 else 1.1
+            line["linewidth"] = (
+                2.0 - 1.2 * n / (len(transparency) - 1) if len(transparency) > 1 else 1.1
+            )
             magnitude.loglog(hz, np.abs(Z), **line)
-            phase.semilogx(hz, np.rad2deg(np.unwrap(np.angle(Z))), **line)  # from -180 to 180 degrees on
+            # from -180 to 180 degrees on
+            phase.semilogx(hz, np.rad2deg(np.unwrap(np.angle(Z))), **line)
     for axes in (magnitude, phase):
         axes.axvspan(*transparency[0].band_hz, **_BAND)
         axes.set_xlim(hz[0], hz[-1])
@@ -101,13 +113,17 @@ def _colour(ports: PortAnalysis, site: str) -> str:
 
 
 def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns the least eigenvalue of Y + Y^H, and below it the criterion for any passive operators.
+    """Returns the least eigenvalue of Y + Y^H, and below it the criterion for any passive
+    operators.
 
-    The eigenvalue is drawn over 2 norm(Y), its bound: -1 is a network that returns all energy. The criterion
-    is Llewellyn's parameter of each joint for two sites, and the margin under the best weights for more.
+    The eigenvalue is drawn over 2 norm(Y), its bound: -1 is a network that returns all energy.
+    The criterion is Llewellyn's parameter of each joint for two sites, and the margin under the
+    best weights for more.
     """
     if ports.verdict == "unstable":
-        return style.empty_figure("The loop without operators is unstable: it cannot be passive.", size)
+        return style.empty_figure(
+            "The loop without operators is unstable: it cannot be passive.", size
+        )
     with style.styled_figure(size, 3.9) as figure:
         above, below = style.add_panels(figure, 2, 1, sharex=True)[:, 0]
         _plot_eigenvalues(ports, above)
@@ -116,7 +132,9 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
         figure.align_ylabels()
         every = "axes" if ports.axes else "joints"
         proof = [] if ports.proof is None else [(f"all {every}, in r (weighted)", _PROOF)]
-        joints = [(f"{ports.name_port(joint)} alone", _joint_line(joint)) for joint in ports.joints]
+        joints = [
+            (f"{ports.name_port(joint)} alone", _joint_line(joint)) for joint in ports.joints
+        ]
         fails = ("fails", {**_FAILS, "linewidth": 6.0})
         style.add_legend(figure, [(f"all {every}", _ALL), *joints, *proof, fails])
     return figure
@@ -124,7 +142,11 @@ def draw_port_passivity(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
 
 def _joint_line(joint: int) -> dict[str, Any]:
     colour = SITE_COLOURS[joint % len(SITE_COLOURS)]
-    return {"color": colour, "linestyle": style.DASHES[joint % len(style.DASHES)], "linewidth": 1.0}
+    return {
+        "color": colour,
+        "linestyle": style.DASHES[joint % len(style.DASHES)],
+        "linewidth": 1.0,
+    }
 
 
 def _plot(axes: Axes, minima: Minima, values: Array, **options: Any) -> None:
@@ -170,12 +192,32 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
     """Returns the map of continuous and sampled roots."""
     with style.styled_figure(_SIZE, _HEIGHT_IN) as figure:
         axes = figure.add_subplot()
-        _plot_roots(axes, analysis.continuous, "o", SITE_COLOURS[0], "continuous")
+        _plot_roots(
+            axes=axes,
+            spectrum=analysis.continuous,
+            mark="o",
+            colour=SITE_COLOURS[0],
+            label="continuous",
+        )
         if analysis.sampled is not None:
-            _plot_roots(axes, analysis.sampled, "x", SITE_COLOURS[1], "as computed")
+            _plot_roots(
+                axes=axes,
+                spectrum=analysis.sampled,
+                mark="x",
+                colour=SITE_COLOURS[1],
+                label="as computed",
+            )
         if zeros := analysis.decisive.zeros:
             label = f"zero by structure ({zeros})"
-            axes.plot([0.0], [0.0], "s", markersize=9.0, fillstyle="none", color=style.FAINT, label=label)
+            axes.plot(
+                [0.0],
+                [0.0],
+                "s",
+                markersize=9.0,
+                fillstyle="none",
+                color=style.FAINT,
+                label=label,
+            )
         low, high = axes.get_xlim()
         high = max(high, 0.06 * (high - low), 0.0)
         axes.axvline(0.0, **style.LIMIT_LINE)
@@ -188,7 +230,9 @@ def draw_root_map(analysis: LinearAnalysis) -> Figure:
 def _plot_roots(axes: Axes, spectrum: Spectrum, mark: str, colour: str, label: str) -> None:
     roots = [root.s for root in spectrum.roots]
     both = np.array([*roots, *(s.conjugate() for s in roots if s.imag)])
-    axes.plot(both.real, both.imag, mark, markersize=4.5, fillstyle="none", color=colour, label=label)
+    axes.plot(
+        both.real, both.imag, mark, markersize=4.5, fillstyle="none", color=colour, label=label
+    )
 
 
 _MARKS = ("o", "s", "^", "v")
@@ -205,22 +249,32 @@ def draw_network_delays(facts: Mapping[str, Any]) -> Figure:
         axes = figure.add_subplot()
         for row in rows:
             number = transports.index(row["transport"])
-            at = cases.index((row["bytes"], row["rate_hz"])) + 0.22 * (number - (len(transports) - 1) / 2)
+            at = cases.index((row["bytes"], row["rate_hz"])) + 0.22 * (
+                number - (len(transports) - 1) / 2
+            )
             _plot_case(axes, at, row, number)
         _plot_bounds(axes, facts)
         axes.set_yscale("log")
         labels = [f"{size} B\n{rate:g} Hz" for size, rate in cases]
         own = cases.index((needs["sample_bytes"], needs["rate_hz"]))
-        axes.axvspan(own - 0.45, own + 0.45, color=style.FAINT, alpha=0.15, linewidth=0.0, zorder=0.3)
+        axes.axvspan(
+            own - 0.45, own + 0.45, color=style.FAINT, alpha=0.15, linewidth=0.0, zorder=0.3
+        )
         labels[own] += f"\n{facts['scenario']}"
         axes.set_xticks(range(len(cases)), labels)
         axes.set(xlim=(-0.5, len(cases) - 0.5), ylabel="one way: p50, p99, largest (ms)")
         axes.grid(visible=False, axis="x")
         handles = [
-            Line2D([], [], label=name, color=SITE_COLOURS[n], marker=_MARKS[n % 4], linewidth=1.1)
+            Line2D(
+                [], [], label=name, color=SITE_COLOURS[n], marker=_MARKS[n % 4], linewidth=1.1
+            )
             for n, name in enumerate(transports)
         ]
-        lost = [Line2D([], [], label="lost some", **_LOST)] if any(row["lost"] for row in rows) else []
+        lost = (
+            [Line2D([], [], label="lost some", **_LOST)]
+            if any(row["lost"] for row in rows)
+            else []
+        )
         style.place_legend(figure, [*handles, *lost])
     return figure
 
@@ -240,7 +294,10 @@ def _plot_case(axes: Axes, at: float, row: Mapping[str, Any], number: int) -> No
 
 def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
     needs = facts["needs"]
-    bounds = [("one period", 1e3 / needs["rate_hz"], "center"), ("held by links", needs["held_ms"], "top")]
+    bounds = [
+        ("one period", 1e3 / needs["rate_hz"], "center"),
+        ("held by links", needs["held_ms"], "top"),
+    ]
     ages = [one["age_ms"] for one in facts["transports"] if one["age_ms"] is not None]
     for low, high in needs["stable_ms"] or []:
         if any(low <= age <= high for age in ages) or [low, high] == needs["stable_ms"][0]:
@@ -251,25 +308,39 @@ def _plot_bounds(axes: Axes, facts: Mapping[str, Any]) -> None:
         if at:
             axes.axhline(at, **style.LIMIT_LINE)
             axes.annotate(
-                label, (1.01, at), xycoords=("axes fraction", "data"), va=where, fontsize=REPORT_SIZE.tick_pt
+                label,
+                (1.01, at),
+                xycoords=("axes fraction", "data"),
+                va=where,
+                fontsize=REPORT_SIZE.tick_pt,
             )
 
 
 def draw_arm_gains(facts: Mapping[str, Any]) -> Figure:
-    """Returns k at the edge over the delay, with the gains and the runs, see `ArmGains.to_dict`."""
+    """Returns k at the edge over the delay, with the gains and the runs, see
+    `ArmGains.to_dict`.
+    """
     edge = facts["edge"]
     margin = facts["margin"]
     delay_ms, k = np.array(facts["curve"]).T * [[1e3], [1.0]]
     runs = [run for run in facts["runs"] if run["share"]]
-    marks = {True: ("o", "run decays"), False: ("x", "run grows"), None: ("s", "run tells nothing")}
+    marks = {
+        True: ("o", "run decays"),
+        False: ("x", "run grows"),
+        None: ("s", "run tells nothing"),
+    }
     with style.styled_figure(_SIZE, _HEIGHT_IN) as figure:
         axes = figure.add_subplot()
-        axes.loglog(delay_ms, k, color=SITE_COLOURS[0], linewidth=1.4, label="edge, constant delay")
+        axes.loglog(
+            delay_ms, k, color=SITE_COLOURS[0], linewidth=1.4, label="edge, constant delay"
+        )
         axes.fill_between(delay_ms, k, 10.0 * k.max(), **_UNSTABLE)
         used = (edge["used_per_s2"] / margin, "D", f"the gains, margin {margin:g}")
         shown = [(run["share"] * edge["k_per_s2"], *marks[run["stable"]]) for run in runs]
         for at, mark, label in (used, *shown):
-            axes.plot(facts["age_ms"], at, mark, color=SITE_COLOURS[1], markersize=4.5, label=label)
+            axes.plot(
+                facts["age_ms"], at, mark, color=SITE_COLOURS[1], markersize=4.5, label=label
+            )
         axes.set(xlim=(delay_ms[0], delay_ms[-1]), ylim=(0.3 * k.min(), 3.0 * k.max()))
         axes.set(xlabel="delay of each link (ms)", ylabel=r"K / inertia (1/s$^2$)")
         figure.legend(loc="outside upper center", ncols=2, handlelength=1.2, columnspacing=1.0)

@@ -2,8 +2,8 @@
 
     trilat_net.figure(log, "settling").savefig("settling.pdf")
 
-Invariant: a figure is a function of a log and a figure size; equal logs give equal bytes. Whatever a file of
-this folder draws belongs to it.
+Invariant: a figure is a function of a log and a figure size; equal logs give equal bytes.
+Whatever a file of this folder draws belongs to it.
 """
 
 import pkgutil
@@ -34,7 +34,9 @@ FIGURES = list_figures()
 """By name, in the order in which a paper has them."""
 
 
-def figure(log: str | Path | Log, name: str = "positions", width_in: float = COLUMN_IN) -> Figure:
+def figure(
+    log: str | Path | Log, name: str = "positions", width_in: float = COLUMN_IN
+) -> Figure:
     """Returns a figure of a log for a paper, one of `FIGURES`: 3.5 or 7 in wide, type 8 pt.
 
     It shows itself in a notebook. The command is `trilat figure`.
@@ -65,19 +67,22 @@ def write_figures(
     force: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Writes figures of a log into a folder, which is made if it does not exist, and returns the paths.
+    """Writes figures of a log into a folder, which is made if it does not exist, and returns
+    the paths.
 
-    Without names these are all for which the log has something to show. They are 3.5 or 7 in wide;
-    `progress` is called with the number of figures that are drawn, and of all.
+    Without names these are all for which the log has something to show. They are 3.5 or 7 in
+    wide; `progress` is called with the number of figures that are drawn, and of all.
 
     Raises:
-        UsageError: there is no such figure, width or format, the log has nothing to show in it, or a file
-            exists.
+        UsageError: there is no such figure, width or format, the log has nothing to show in it,
+            or a file exists.
     """
     form = make_print_size(width_in)
     wanted = list(dict.fromkeys(names)) or list_drawable_figures(log)
     chosen = {name: partial(_find_figure(log, name).draw, log, form) for name in wanted}
-    return _write(chosen, folder, form, formats, progress, force=force)
+    return _write(
+        chosen=chosen, folder=folder, form=form, formats=formats, progress=progress, force=force
+    )
 
 
 def write_overlay(
@@ -88,7 +93,8 @@ def write_overlay(
     formats: Sequence[str] = FIGURE_FORMATS[:2],
     force: bool = False,
 ) -> list[Path]:
-    """Writes several logs over one another, by their names in the legend, as overlay.pdf and so on.
+    """Writes several logs over one another, by their names in the legend, as overlay.pdf and so
+    on.
 
     Raises:
         UsageError: there is no such width or format, the logs differ in kind, or a file exists.
@@ -105,10 +111,11 @@ def write_report_figures(
     progress: Progress | None = None,
     pushed: TwinGrowth | None = None,
 ) -> list[Path]:
-    """Writes the figures of the report for which a log has something to show, and returns the paths.
+    """Writes the figures of the report for which a log has something to show, and returns the
+    paths.
 
-    Earlier figures in the folder are replaced. Without `twin`, the same experiment without operators,
-    `hands_moved` is left out. Twins that are given are not made again.
+    Earlier figures in the folder are replaced. Without `twin`, the same experiment without
+    operators, `hands_moved` is left out. Twins that are given are not made again.
     """
     chosen: dict[str, Callable[[], Figure]] = {
         name: partial(FIGURES[name].draw, log, REPORT_SIZE)
@@ -121,7 +128,9 @@ def write_report_figures(
         chosen["hands_moved"] = partial(draw_operator_displacement, log, twin=twin)
     if pushed is not None and "twins" in chosen:
         chosen["twins"] = partial(draw_twins, PushedTwins(log, 0.0, pushed))
-    return _write(chosen, folder, REPORT_SIZE, ["png"], progress)
+    return _write(
+        chosen=chosen, folder=folder, form=REPORT_SIZE, formats=["png"], progress=progress
+    )
 
 
 def _write(
@@ -136,7 +145,9 @@ def _write(
     """Writes figures by their names; refuses what can be refused before it draws the first."""
     kinds = list(dict.fromkeys(formats))
     if strange := [kind for kind in kinds if kind not in FIGURE_FORMATS]:
-        raise UsageError(f"a figure is written as {', '.join(FIGURE_FORMATS)}, not as {strange[0]!r}")
+        raise UsageError(
+            f"a figure is written as {', '.join(FIGURE_FORMATS)}, not as {strange[0]!r}"
+        )
     for path in (folder / f"{name}.{kind}" for name in chosen for kind in kinds):
         refuse_existing(path, force=force)
     paths = []

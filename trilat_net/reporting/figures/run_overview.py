@@ -1,6 +1,8 @@
-"""A run in four panels, errors, speeds, torques and ages; and several runs over one another in the same.
+"""A run in four panels, errors, speeds, torques and ages; and several runs over one another in
+the same.
 
-Invariant: a line of one run is a site's, a line of several is a run's: the largest of its sites at any time.
+Invariant: a line of one run is a site's, a line of several is a run's: the largest of its sites
+at any time.
 """
 
 import textwrap
@@ -53,8 +55,12 @@ _PANELS = (
         lambda log, site: largest_magnitude(log[site].e),
         log_scale=True,
     ),
-    _Panel("largest speed", lambda _: "rad/s", lambda log, site: largest_magnitude(log[site].qd)),
-    _Panel("largest torque", lambda _: "N m", lambda log, site: largest_magnitude(log[site].tau)),
+    _Panel(
+        "largest speed", lambda _: "rad/s", lambda log, site: largest_magnitude(log[site].qd)
+    ),
+    _Panel(
+        "largest torque", lambda _: "N m", lambda log, site: largest_magnitude(log[site].tau)
+    ),
     _Panel("oldest sample", lambda _: "ms", _oldest_sample_ms),
 )
 
@@ -71,9 +77,13 @@ def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
             for site, values in columns.items():
                 plot.trace(axes, site, style.positive(values) if panel.log_scale else values)
             plot.mark(axes, log.sites)
-        last = settling_time_of_all_s([site_signals.settling_time_s(log[site]) for site in log.sites])
+        last = settling_time_of_all_s(
+            [site_signals.settling_time_s(log[site]) for site in log.sites]
+        )
         when = "not settled" if last is None else f"settled at {last:.1f} s"
-        words = f"{log.scenario.title or log.scenario.name}: {certify_run(log).stability}, {when}"
+        words = (
+            f"{log.scenario.title or log.scenario.name}: {certify_run(log).stability}, {when}"
+        )
         title = "\n".join(textwrap.wrap(words, round(_LETTERS_PER_IN * form.width_in)))
         entries = style.site_legend_entries(log, log.sites)
         plot.finish(panels[3:] if form.narrow else panels[2:], entries, title=title)
@@ -81,7 +91,8 @@ def draw_overview(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns several runs, by their names in the legend, over one another in the panels of an overview.
+    """Returns several runs, by their names in the legend, over one another in the panels of an
+    overview.
 
     Raises:
         UsageError: there is no log, or their sites follow each other in different units.
@@ -89,7 +100,9 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
     units = {site_signals.shared_unit(log) for log in logs.values()}
     if len(units) != 1:
         found = f"errors in {' and '.join(sorted(units))}" if units else "no log"
-        raise UsageError(f"only runs of one kind are drawn over one another, and these have {found}")
+        raise UsageError(
+            f"only runs of one kind are drawn over one another, and these have {found}"
+        )
     first = next(iter(logs.values()))
     end_s = max(map(recorded_end_s, logs.values()))
     with style.styled_figure(form, _NARROW_HEIGHT_IN if form.narrow else _HEIGHT_IN) as figure:
@@ -99,7 +112,9 @@ def draw_overlay(logs: Mapping[str, Log], form: FigureSize = REPORT_SIZE) -> Fig
             envelopes = {name: _find_envelope(panel, log) for name, log in logs.items()}
             _scale(axes, panel, [values for _, values in envelopes.values()])
             for name, (t_s, values) in envelopes.items():
-                axes.plot(t_s, style.positive(values) if panel.log_scale else values, **lines[name])
+                axes.plot(
+                    t_s, style.positive(values) if panel.log_scale else values, **lines[name]
+                )
             axes.set_xlim(0.0, end_s)
         for axes in panels[3:] if form.narrow else panels[2:]:
             axes.set_xlabel("time (s)")
@@ -122,7 +137,9 @@ def _line(n: int) -> dict[str, Any]:
 
 
 def _find_envelope(panel: _Panel, log: Log) -> tuple[Array, Array]:
-    """Returns the largest of all sites in even spans of time, NaN without any, after their middles, s."""
+    """Returns the largest of all sites in even spans of time, NaN without any, after their
+    middles, s.
+    """
     count = max(1, min(_SPANS, *(len(log[site]) // 2 for site in log.sites)))
     edges = np.linspace(0.0, recorded_end_s(log), count + 1)
     found = np.full(count, np.nan)

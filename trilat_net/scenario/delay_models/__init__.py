@@ -1,9 +1,11 @@
-"""The delay models that a link can have, and what they share: loss, duplicates, outages, order, play-out.
+"""The delay models that a link can have, and what they share: loss, duplicates, outages, order,
+play-out.
 
-Invariant: each model states its mean and deviation in closed form, and the core draws from just that
-distribution. It is found by its file in this folder; nothing else lists them. The kernel's own models name a
-`DelayKind`, any other has a function. Loss is stated by its share and the mean length of its bursts, as
-measured; the two-state chain that draws it follows from these in closed form. Keys end in their unit.
+Invariant: each model states its mean and deviation in closed form, and the core draws from just
+that distribution. It is found by its file in this folder; nothing else lists them. The kernel's
+own models name a `DelayKind`, any other has a function. Loss is stated by its share and the
+mean length of its bursts, as measured; the two-state chain that draws it follows from these in
+closed form. Keys end in their unit.
 """
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, Union
@@ -43,7 +45,8 @@ _SURE = (DelayKind.CONSTANT, DelayKind.SINE, DelayKind.TRACE, DelayKind.MEASURED
 
 
 class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
-    """A directed link; a subclass states its delay in the methods that begin with an underscore.
+    """A directed link; a subclass states its delay in the methods that begin with an
+    underscore.
 
     Attributes:
         loss: share of samples that are lost in the long run.
@@ -51,21 +54,27 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         loss_bad: of a burst's samples, the share that is lost; below 1 bursts have holes.
         duplicate: share of samples that come twice, the copy with a delay of its own.
         outages_s: times between which the link is cut, by the samples' stamps, s.
-        order: "newest": a newer sample replaces an older one; "in_order": none overtakes an older one.
-        playout_ms: every sample is held at least so long: jitter below it becomes a constant delay.
+        order: "newest": a newer sample replaces an older one; "in_order": none overtakes an
+            older one.
+        playout_ms: every sample is held at least so long: jitter below it becomes a constant
+            delay.
     """
 
     loss: Probability = 0.0
     loss_burst: Annotated[float, Meta(ge=0.0, le=1e6)] = 0.0
     loss_bad: Annotated[float, Meta(gt=0.0, le=1.0)] = 1.0
     duplicate: Probability = 0.0
-    outages_s: Annotated[tuple[tuple[OutageTime, OutageTime], ...], Meta(max_length=MAX_OUTAGES)] = ()
+    outages_s: Annotated[
+        tuple[tuple[OutageTime, OutageTime], ...], Meta(max_length=MAX_OUTAGES)
+    ] = ()
     order: Literal["newest", "in_order"] = "newest"
     playout_ms: Milliseconds = 0.0
 
     @classmethod
     def derive_keys(cls, table: TomlTable) -> TomlTable:  # noqa: ARG003 - for the models that derive keys
-        """Returns keys that an author may leave out and that follow from the others of a link's table."""
+        """Returns keys that an author may leave out and that follow from the others of a link's
+        table.
+        """
         return {}
 
     def _delay(self) -> LinkModel:
@@ -89,7 +98,9 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         return f"{self.__struct_config__.tag} {mean_ms:.4g} +- {deviation_ms:.3g} ms"
 
     def moments(self) -> DelayMoments:
-        """Returns the moments of the stated delay, before play-out, order and the cut at `MAX_DELAY_MS`."""
+        """Returns the moments of the stated delay, before play-out, order and the cut at
+        `MAX_DELAY_MS`.
+        """
         return DelayMoments(*self._moments())
 
     @property
@@ -123,11 +134,12 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         )
 
     def _loss_chain(self) -> tuple[float, float, float, float]:
-        """Returns the chain of losses: loss in good and bad state, probability to enter and leave the bad.
+        """Returns the chain of losses: loss in good and bad state, probability to enter and
+        leave the bad.
 
-        In the bad state a sample is lost with h = `loss_bad`, in the good one never. A run of losses goes
-        on with (1 - leave) h, so its mean length is B = 1 / (1 - (1 - leave) h); the share of bad samples
-        is loss / h = enter / (enter + leave).
+        In the bad state a sample is lost with h = `loss_bad`, in the good one never. A run of
+        losses goes on with (1 - leave) h, so its mean length is B = 1 / (1 - (1 - leave) h);
+        the share of bad samples is loss / h = enter / (enter + leave).
         """
         if self.loss_burst == 0.0 or self.loss == 0.0:
             return self.loss, 0.0, 0.0, 1.0
@@ -152,16 +164,22 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 
     def _find_burst_problem(self) -> KeyProblem | None:
         if self.loss_burst < 1.0:
-            return KeyProblem("loss_burst", f"must be 0 or at least 1 sample, is {self.loss_burst:g}")
+            return KeyProblem(
+                "loss_burst", f"must be 0 or at least 1 sample, is {self.loss_burst:g}"
+            )
         if self.loss >= self.loss_bad:
             text = f"must be below loss_bad = {self.loss_bad:g} in bursts, is {self.loss:g}"
             return KeyProblem("loss", text)
         _, _, enter, leave = self._loss_chain()
         if leave <= 0.0:
             longest = 1.0 / (1.0 - self.loss_bad)
-            return KeyProblem("loss_burst", f"must be below {longest:g} with loss_bad = {self.loss_bad:g}")
+            return KeyProblem(
+                "loss_burst", f"must be below {longest:g} with loss_bad = {self.loss_bad:g}"
+            )
         if enter > 1.0:
-            return KeyProblem("loss_burst", f"{self.loss_burst:g} is too short for a loss of {self.loss:g}")
+            return KeyProblem(
+                "loss_burst", f"{self.loss_burst:g} is too short for a loss of {self.loss:g}"
+            )
         return None
 
     def describe(self) -> str:
@@ -183,14 +201,15 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
 class OwnDelay(LinkBase, frozen=True, kw_only=True):
     """A delay with a function of its own, a file of this folder; its keys are numbers.
 
-    It states `_moments`, and `_reach_ms` if three deviations above the mean are not the longest.
+    It states `_moments`, and `_reach_ms` if three deviations above the mean are not the
+    longest.
     """
 
     def draw(self, now: Any) -> None:
         """Writes `now.drawn_us`, the delay of a sample, us, by `now.sample` and `now.stamp_ns`.
 
-        It is compiled. Chance is `core.delay.draw_pair` of `now` alone: a function of the link's key and an
-        index (L4).
+        It is compiled. Chance is `core.delay.draw_pair` of `now` alone: a function of the
+        link's key and an index (L4).
         """
         raise NotImplementedError
 
@@ -204,11 +223,15 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         return LinkModel(kind=DelayKind.OWN, location=1e3 * self._reach_ms())
 
     def core(self, from_ns: int = 0) -> LinkModel:
-        """Returns the core's model, as of any link, with the address of `draw`, which is compiled here."""
+        """Returns the core's model, as of any link, with the address of `draw`, which is
+        compiled here.
+        """
         return super().core(from_ns)._replace(call=plug(self, "draw", LINK_MODEL_DTYPE))
 
 
-DELAY_MODELS = {str(kind.__struct_config__.tag): kind for kind in find_kinds(__name__, LinkBase)}
+DELAY_MODELS = {
+    str(kind.__struct_config__.tag): kind for kind in find_kinds(__name__, LinkBase)
+}
 """The models by name."""
 if TYPE_CHECKING:
     Link = LinkBase

@@ -34,7 +34,8 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
     Attributes:
         delay_ms: its mean, ms.
-        half_width_ms: half of its width, ms; at most the mean. An author may leave it out: half of the mean.
+        half_width_ms: half of its width, ms; at most the mean. An author may leave it out: half
+            of the mean.
     """
 
     delay_ms: Milliseconds
@@ -47,7 +48,9 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         return {"half_width_ms": 0.5 * delay_ms} if is_number(delay_ms) else {}
 
     def _delay(self) -> LinkModel:
-        return LinkModel(kind=DelayKind.UNIFORM, location=1e3 * self.delay_ms, scale=1e3 * self.half_width_ms)
+        return LinkModel(
+            kind=DelayKind.UNIFORM, location=1e3 * self.delay_ms, scale=1e3 * self.half_width_ms
+        )
 
     def _moments(self) -> tuple[float, float]:
         """Half the width over the root of 3."""
@@ -74,7 +77,9 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
     deviation_ms: Deviation
 
     def _delay(self) -> LinkModel:
-        return LinkModel(kind=DelayKind.NORMAL, location=1e3 * self.delay_ms, scale=1e3 * self.deviation_ms)
+        return LinkModel(
+            kind=DelayKind.NORMAL, location=1e3 * self.delay_ms, scale=1e3 * self.deviation_ms
+        )
 
     def _moments(self) -> tuple[float, float]:
         """Of the normal distribution truncated at zero."""
@@ -122,7 +127,9 @@ class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognorm
         """Sigma^2 = ln(1 + s^2 / m^2), mu = ln m - sigma^2 / 2."""
         variance = math.log1p((self.deviation_ms / self.delay_ms) ** 2)
         location = math.log(1e3 * self.delay_ms) - 0.5 * variance
-        return LinkModel(kind=DelayKind.LOG_NORMAL, location=location, scale=math.sqrt(variance))
+        return LinkModel(
+            kind=DelayKind.LOG_NORMAL, location=location, scale=math.sqrt(variance)
+        )
 
 
 class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexponential"):
@@ -160,7 +167,8 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
 
 
 class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
-    """Normal, each sample's delay correlated with the one before, cut off at zero instead of drawn again.
+    """Normal, each sample's delay correlated with the one before, cut off at zero instead of
+    drawn again.
 
     Attributes:
         correlation: of a sample's delay with that of the sample before.
@@ -179,7 +187,9 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
         above = _probability(a)
         below = _probability(-a)
         density = _density(a)
-        variance = above + a * above * a * below + a * density * (below - above) - density * density
+        variance = (
+            above + a * above * a * below + a * density * (below - above) - density * density
+        )
         return m * above + s * density, s * math.sqrt(max(variance, 0.0))
 
 
@@ -275,7 +285,9 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
     def _moments(self) -> tuple[float, float]:
         """Over one pass, by time; lost samples have no delay."""
         t_us, delay_us = self.points.T
-        lasts_us = np.diff(t_us, append=2 * t_us[-1] - t_us[-2] if len(t_us) > 1 else t_us[-1] + 1)
+        lasts_us = np.diff(
+            t_us, append=2 * t_us[-1] - t_us[-2] if len(t_us) > 1 else t_us[-1] + 1
+        )
         weights = np.where(delay_us >= 0, lasts_us, 0)
         if not weights.any():
             return math.nan, math.nan

@@ -10,9 +10,11 @@ from ..delay_models import Milliseconds, OwnDelay
 
 
 class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
-    """A floor, a part that is drawn for each slot of time, and one for each sample, both exponential.
+    """A floor, a part that is drawn for each slot of time, and one for each sample, both
+    exponential.
 
-    Low-orbit networks assign terminals to satellites anew every 15 s, all at once, and delay and jitter step
+    Low-orbit networks assign terminals to satellites anew every 15 s, all at once, and delay
+    and jitter step
     then: Mohan et al., "A Multifaceted Look at Starlink Performance", WWW (2024).
 
     Attributes:
@@ -31,7 +33,9 @@ class LowOrbit(OwnDelay, frozen=True, kw_only=True, tag="low_orbit"):
         """Writes the delay, us."""
         _, path = draw_pair(now, now.stamp_ns // int(1e9 * self.slot_s), 0)
         _, own = draw_pair(now, now.sample, 1)
-        now.drawn_us = 1e3 * (self.floor_ms - self.path_ms * math.log(path) - self.jitter_ms * math.log(own))
+        now.drawn_us = 1e3 * (
+            self.floor_ms - self.path_ms * math.log(path) - self.jitter_ms * math.log(own)
+        )
 
     def _moments(self) -> tuple[float, float]:
         """Over many slots: sums of independent exponential parts."""

@@ -1,9 +1,11 @@
-"""Operators and environments of a scenario: which there are, and how an author's tables become complete ones.
+"""Operators and environments of a scenario: which there are, and how an author's tables become
+complete ones.
 
-Invariant: torques and forces are those ON the arm; times are seconds after the epoch; keys end in their unit.
-An operator is one class, found by its file in this folder, and nothing else lists them; its name in a
-scenario is its tag. The kernel's own kinds name a `TorqueKind`; any other has a file of its own, with a
-function that is compiled and one for many rows. Mistakes are refused at their own key.
+Invariant: torques and forces are those ON the arm; times are seconds after the epoch; keys end
+in their unit. An operator is one class, found by its file in this folder, and nothing else
+lists them; its name in a scenario is its tag. The kernel's own kinds name a `TorqueKind`; any
+other has a file of its own, with a function that is compiled and one for many rows. Mistakes
+are refused at their own key.
 """
 
 import math
@@ -51,7 +53,9 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
         return self._source()
 
     @classmethod
-    def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:
+    def complete(
+        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str
+    ) -> None:
         """Fills in what an author's entry left to the arm; errors call the entry `path`."""
 
     def find_problem(self) -> fields.KeyProblem | None:
@@ -61,7 +65,9 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
         start_s = getattr(self, "start_s", 0.0)
         end_s = getattr(self, "end_s", fields.MAX_QUANTITY)
         if end_s <= start_s:
-            return fields.KeyProblem("end_s", f"must be later than start_s = {start_s:g}, is {end_s:g}")
+            return fields.KeyProblem(
+                "end_s", f"must be later than start_s = {start_s:g}, is {end_s:g}"
+            )
         return None
 
 
@@ -81,25 +87,28 @@ class SampledActor(TimedActor, frozen=True, kw_only=True):
 class OwnActor(SampledActor, frozen=True, kw_only=True):
     """An operator or an environment with a function of its own, a file of this folder.
 
-    Its keys are numbers, or a vector with a number per joint or axis. It acts on the joints; or with `at_tip`
-    on the end effector: then `act` and `effort` see its place and velocity, m and m/s, and give a force, N.
+    Its keys are numbers, or a vector with a number per joint or axis. It acts on the joints; or
+    with `at_tip` on the end effector: then `act` and `effort` see its place and velocity, m and
+    m/s, and give a force, N.
     """
 
     at_tip: ClassVar[bool] = False
 
     def act(self, now: Any) -> None:
-        """Writes `now.effort[i]`, N m or N, for i below `now.coordinates`, by now.t_s, now.at, now.speed.
+        """Writes `now.effort[i]`, N m or N, for i below `now.coordinates`, by now.t_s, now.at,
+        now.speed.
 
-        It is compiled, and asked in every stage of the integrator: what it computes depends on its keys and
-        on `now` alone, and rounds alike everywhere (core.elementary, sqrt).
+        It is compiled, and asked in every stage of the integrator: what it computes depends on
+        its keys and on `now` alone, and rounds alike everywhere (core.elementary, sqrt).
         """
         raise NotImplementedError
 
     def effort(self, t_s: Array, at: Array, speed: Array) -> Array:
-        """Returns the same for many rows, shape (..., n), written apart from `act`; a test compares them.
+        """Returns the same for many rows, shape (..., n), written apart from `act`; a test
+        compares them.
 
-        The linearised loop differentiates it by complex steps: it takes complex numbers, and branches on real
-        parts.
+        The linearised loop differentiates it by complex steps: it takes complex numbers, and
+        branches on real parts.
         """
         raise NotImplementedError
 
@@ -111,7 +120,9 @@ class OwnActor(SampledActor, frozen=True, kw_only=True):
 _GAIN = "one number for {joints}, at least 0"
 ROW_WORDS = "[time in s, torque on {each} in N m]"
 WORDS = {
-    **dict.fromkeys(("start_s", "end_s", "move_start_s", "move_end_s"), "a time of at least 0 s"),
+    **dict.fromkeys(
+        ("start_s", "end_s", "move_start_s", "move_end_s"), "a time of at least 0 s"
+    ),
     **dict.fromkeys(("from_rad", "to_rad"), "one angle for {joints}, rad"),
     **dict.fromkeys(("from_m", "to_m", "point_m"), "{axes}, m"),
     **dict.fromkeys(("peak_nm", "amplitude_nm"), "one torque for {joints}, ON the arm, N m"),
@@ -142,7 +153,9 @@ IN_WORDS = {
 """Those of the planar arm, and of any other."""
 
 
-_KINDS = {str(kind.__struct_config__.tag): kind for kind in fields.find_kinds(__name__, ActorBase)}
+_KINDS = {
+    str(kind.__struct_config__.tag): kind for kind in fields.find_kinds(__name__, ActorBase)
+}
 OPERATORS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "hands"}
 ENVIRONMENTS = {tag: kind for tag, kind in _KINDS.items() if kind.group == "environment"}
 """The operators and the environments by the name of their kind."""
@@ -175,14 +188,18 @@ def resolve_operators(
             raise ScenarioError("must be a table", path=place)
         kind = _find_kind(entry, kinds, place)
         fields.check_keys(entry, ("kind", *fields.field_names(kind)), place)
-        table = holding.draws.draw_numbers(fields.expand_vectors(entry, kind, holding.counts), place)
+        table = holding.draws.draw_numbers(
+            fields.expand_vectors(entry, kind, holding.counts), place
+        )
         kind.complete(table, entry, holding, place)
-        _check_values(table, kind, entry, place, holding.counts)
+        _check_values(table=table, kind=kind, entry=entry, path=place, counts=holding.counts)
         tables.append(table)
     return tables
 
 
-def _find_kind(entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], path: str) -> type[ActorBase]:
+def _find_kind(
+    entry: fields.TomlTable, kinds: Mapping[str, type[ActorBase]], path: str
+) -> type[ActorBase]:
     if "kind" not in entry:
         raise ScenarioError(f"is missing: {' or '.join(map(repr, kinds))}", path=f"{path}.kind")
     kind = entry["kind"]
@@ -216,7 +233,9 @@ def _check_values(
         problem, _, place = str(error).partition(" - at ")
         if missing := re.search(r"missing required field `(\w+)`", problem):
             key = missing[1]
-            raise ScenarioError(f"is missing: {describe_values(key)}", path=f"{path}.{key}") from None
+            raise ScenarioError(
+                f"is missing: {describe_values(key)}", path=f"{path}.{key}"
+            ) from None
         at = re.match(r"`\$\.(\w+)(.*)`", place)
         key, rest = (at[1], at[2]) if at else ("", place)
         if key not in entry:  # taken over from the arm, which is refused at its own key
@@ -226,4 +245,6 @@ def _check_values(
             raise ScenarioError(f"must be {one}", path=f"{path}.{key}{rest}") from None
         value = repr(entry[key])
         is_now = f", is {value}" if len(value) <= _SHOWN else ""
-        raise ScenarioError(f"must be {describe_values(key)}{is_now}", path=f"{path}.{key}") from None
+        raise ScenarioError(
+            f"must be {describe_values(key)}{is_now}", path=f"{path}.{key}"
+        ) from None

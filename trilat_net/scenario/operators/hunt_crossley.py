@@ -12,11 +12,13 @@ from ..operators import OwnActor
 
 
 class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
-    """Tissue or rubber: F = K d^(3/2) (1 + lambda d') along its normal, d the depth, and it never pulls.
+    """Tissue or rubber: F = K d^(3/2) (1 + lambda d') along its normal, d the depth, and it
+    never pulls.
 
-    The contact of a sphere after Hertz with the damping of Hunt and Crossley, "Coefficient of restitution
-    interpreted as damping in vibroimpact", J. Applied Mechanics 42 (1975): the force begins and ends at zero,
-    where a spring and a damper jump and pull. It is passive: its damping takes energy at every depth.
+    The contact of a sphere after Hertz with the damping of Hunt and Crossley, "Coefficient of
+    restitution interpreted as damping in vibroimpact", J. Applied Mechanics 42 (1975): the
+    force begins and ends at zero, where a spring and a damper jump and pull. It is passive: its
+    damping takes energy at every depth.
 
     Attributes:
         point_m: a point of its surface, m.
@@ -48,7 +50,12 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
             length = math.sqrt(square)
             depth = depth / length
             inward = inward / length
-            push = self.stiffness_n_m15 * depth * math.sqrt(depth) * (1.0 + self.damping_s_m * inward)
+            push = (
+                self.stiffness_n_m15
+                * depth
+                * math.sqrt(depth)
+                * (1.0 + self.damping_s_m * inward)
+            )
             if push > 0.0:
                 for i in range(now.coordinates):
                     now.effort[i] = push * self.normal[i] / length
@@ -58,6 +65,11 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
         depth = (np.array(self.point_m) - at) @ normal
         touched = np.where(depth.real > 0.0, depth, 0.0)
-        push = self.stiffness_n_m15 * touched * np.sqrt(touched) * (1.0 - self.damping_s_m * (speed @ normal))
+        push = (
+            self.stiffness_n_m15
+            * touched
+            * np.sqrt(touched)
+            * (1.0 - self.damping_s_m * (speed @ normal))
+        )
         force: Array = np.where(push.real > 0.0, push, 0.0)[..., None] * normal
         return force

@@ -1,7 +1,7 @@
 """The operators and environments that the kernel itself computes.
 
-Invariant: each is a `TorqueKind`; the meaning of its vectors there is told by `TorqueSource`. An operator
-without a start pose holds the arm at the arm's start pose.
+Invariant: each is a `TorqueKind`; the meaning of its vectors there is told by `TorqueSource`.
+An operator without a start pose holds the arm at the arm's start pose.
 """
 
 import math
@@ -23,7 +23,9 @@ from ..arms import ArmModel
 from ..operators import ActorBase, Holding, SampledActor, TimedActor
 
 Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]
-RecordedPoint = Annotated[tuple[fields.Real, ...], Meta(min_length=2, max_length=1 + MAX_JOINTS)]
+RecordedPoint = Annotated[
+    tuple[fields.Real, ...], Meta(min_length=2, max_length=1 + MAX_JOINTS)
+]
 FARTHEST = 100.0
 """Largest norm of a live hand's target, m or rad; what is further is no arm's."""
 STRONGEST = 10.0
@@ -61,7 +63,8 @@ class Pulse(ActorBase, frozen=True, tag="pulse"):
 class MovingSpring(ActorBase, frozen=True, kw_only=True):
     """A spring and a damper of an operator, towards a target that moves (minimum jerk).
 
-    Four fields come first: the target, that before, left out as the arm starts; stiffness and damping.
+    Four fields come first: the target, that before, left out as the arm starts; stiffness and
+    damping.
 
     Attributes:
         move_start_s: when the target begins to move.
@@ -81,7 +84,13 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
     sampled: bool = False
 
     @classmethod
-    def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:  # noqa: ARG003 - as all kinds
+    def complete(
+        cls,
+        table: fields.TomlTable,
+        entry: fields.TomlTable,  # noqa: ARG003 - all kinds have the same arguments
+        holding: Holding,
+        path: str,
+    ) -> None:
         """Holds the arm as it starts where no target is given."""
         to, before = fields.field_names(cls)[:2]
         start = holding.end_effector_m() if cls.at_tip else holding.q0_rad
@@ -94,7 +103,9 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         end_s = self.move_end_s
         if (problem := super().find_problem()) or end_s >= start_s:
             return problem
-        return fields.KeyProblem("move_end_s", f"must not be before move_start_s = {start_s:g}, is {end_s:g}")
+        return fields.KeyProblem(
+            "move_end_s", f"must not be before move_start_s = {start_s:g}, is {end_s:g}"
+        )
 
     def _source(self) -> TorqueSource:
         end, start, stiffness, damping = msgspec.structs.astuple(self)[:4]
@@ -122,7 +133,8 @@ class JointSpring(MovingSpring, frozen=True, tag="spring"):
 
 
 class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
-    """An operator at the end effector: a spring and a damper in the plane, towards a point that moves.
+    """An operator at the end effector: a spring and a damper in the plane, towards a point that
+    moves.
 
     Attributes:
         to_m: the point that it moves to, x and y, m.
@@ -141,7 +153,8 @@ class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
 
 
 class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
-    """A torque that was recorded, linear between its points; nothing before the first and after the last.
+    """A torque that was recorded, linear between its points; nothing before the first and after
+    the last.
 
     Attributes:
         points: rows of time, s, and the torque on each joint, N m, in order of time.
@@ -160,7 +173,8 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
 
 
 class Chirp(TimedActor, frozen=True, tag="chirp"):
-    """A torque of an operator whose frequency runs from one to another, evenly, again and again.
+    """A torque of an operator whose frequency runs from one to another, evenly, again and
+    again.
 
     Attributes:
         peak_nm: its peak on each joint, N m.
@@ -177,7 +191,12 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
     def _source(self) -> TorqueSource:
         sweep = (self.start_s, self.start_s + self.sweep_s)
         return TorqueSource(
-            TorqueKind.CHIRP, self.start_s, self.end_s, *sweep, self.peak_nm, (self.from_hz, self.to_hz)
+            TorqueKind.CHIRP,
+            self.start_s,
+            self.end_s,
+            *sweep,
+            self.peak_nm,
+            (self.from_hz, self.to_hz),
         )
 
 
@@ -187,9 +206,10 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
     Attributes:
         amplitude_nm: amplitude of each sine on each joint, N m.
         frequencies_hz: their frequencies, Hz.
-        phases_rad: their phases at the start, rad; left out: -pi k (k - 1) / n for the k-th of n, which keeps
-            the peak of their sum low (Schroeder, "Synthesis of low-peak-factor signals and binary sequences
-            with low autocorrelation", IEEE Trans. Information Theory 16 (1970)).
+        phases_rad: their phases at the start, rad; left out: -pi k (k - 1) / n for the k-th of
+            n, which keeps the peak of their sum low (Schroeder, "Synthesis of low-peak-factor
+            signals and binary sequences with low autocorrelation", IEEE Trans. Information
+            Theory 16 (1970)).
     """
 
     amplitude_nm: fields.Joints
@@ -210,15 +230,18 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
         turns = [phase / (2.0 * math.pi) for phase in self.phases_rad]
         turns = turns or [-k * (k - 1) / (2.0 * count) for k in range(1, count + 1)]
         table = np.column_stack((self.frequencies_hz, turns, np.zeros(count)))
-        return TorqueSource(TorqueKind.MULTISINE, self.start_s, self.end_s, a=self.amplitude_nm, table=table)
+        return TorqueSource(
+            TorqueKind.MULTISINE, self.start_s, self.end_s, a=self.amplitude_nm, table=table
+        )
 
 
 class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
     """How a device in somebody's hand leads an arm, and what it renders of the arm's reaction.
 
     Attributes:
-        frame: where each axis of the arm points, for whoever holds the device: "right", "left", "ahead",
-            "back", "up" or "down"; left out: right and up in the plane, ahead, left and up in space.
+        frame: where each axis of the arm points, for whoever holds the device: "right", "left",
+            "ahead", "back", "up" or "down"; left out: right and up in the plane, ahead, left
+            and up in space.
         scale: motion of the target over motion of the device.
         clutch: the button that leads the arm while it is pressed; pressed first, it takes hold.
         release: the button that lets go.
@@ -241,15 +264,17 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
 
 
 class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
-    """An operator who takes hold while a live session runs, with a mouse, a device or a program.
+    """An operator who takes hold while a live session runs, with a mouse, a device or a
+    program.
 
-    Nobody holds the arm before, and in virtual time nobody ever does, unless a log says so. Its force is
-    computed once a tick and held. One that pushes ("force") sets a force itself: its work is of first order
-    in the period, as nothing but the arm resists it.
+    Nobody holds the arm before, and in virtual time nobody ever does, unless a log says so. Its
+    force is computed once a tick and held. One that pushes ("force") sets a force itself: its
+    work is of first order in the period, as nothing but the arm resists it.
 
     Attributes:
-        mode: "tip": a spring at the end effector, "joint": a spring at every joint, both towards a target
-            that somebody moves; "force": a force at the end effector that somebody sets.
+        mode: "tip": a spring at the end effector, "joint": a spring at every joint, both
+            towards a target that somebody moves; "force": a force at the end effector that
+            somebody sets.
         stiffness_n_m: of "tip", along each axis, N/m.
         damping_n_s_m: of "tip", along each axis, N s/m.
         force_limit_n: of "tip" and "force", the largest force, N.
@@ -260,7 +285,8 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         speed_limit_rad_s: of "joint", the largest speed of the target, rad/s.
         acceleration_limit_m_s2: of "tip", the largest acceleration of the target, m/s^2.
         acceleration_limit_rad_s2: of "joint", the largest acceleration of the target, rad/s^2.
-        device: of "tip", how a device leads it (`trilat hand --device`, a controller in virtual reality).
+        device: of "tip", how a device leads it (`trilat hand --device`, a controller in virtual
+            reality).
     """
 
     words: ClassVar[Mapping[str, str]] = {
@@ -284,7 +310,9 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     device: DeviceSettings = DeviceSettings()
 
     @classmethod
-    def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:
+    def complete(
+        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str
+    ) -> None:
         """Leaves out what another mode has; refuses what the author wrote of that."""
         mode = entry.get("mode", "tip")
         fields.check_choice(mode, list(LIVE_KEYS), f"{path}.mode")
@@ -308,11 +336,15 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
                 )
                 raise ScenarioError(f"must be {words}, is {frame}", path=f"{path}.device.frame")
 
-    def rules(self, rate_hz: int, arm: ArmModel, limits: MotionLimits | None = None) -> HandRules:
+    def rules(
+        self, rate_hz: int, arm: ArmModel, limits: MotionLimits | None = None
+    ) -> HandRules:
         """Returns what somebody who holds an arm may do; `limits`: of the motion of its site."""
         if self.mode == "force":
             strongest = STRONGEST * self.force_limit_n
-            return HandRules(arm.counts.axes, rate_hz, math.inf, from_arm=False, farthest=strongest)
+            return HandRules(
+                arm.counts.axes, rate_hz, math.inf, from_arm=False, farthest=strongest
+            )
         if self.mode == "joint":
             size = arm.counts.joints
             speed_limit = self.speed_limit_rad_s
@@ -378,12 +410,17 @@ class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
 
     def _source(self) -> TorqueSource:
         return TorqueSource(
-            TorqueKind.VISCOUS, self.start_s, self.end_s, B=self.damping_nm_s_rad, sampled=self.sampled
+            TorqueKind.VISCOUS,
+            self.start_s,
+            self.end_s,
+            B=self.damping_nm_s_rad,
+            sampled=self.sampled,
         )
 
 
 class Wall(SampledActor, frozen=True, tag="wall"):
-    """A unilateral wall for the end effector: it pushes out of itself, along its normal, and never pulls.
+    """A unilateral wall for the end effector: it pushes out of itself, along its normal, and
+    never pulls.
 
     Attributes:
         point_m: a point of its surface, x and y, m.
@@ -411,4 +448,6 @@ class Wall(SampledActor, frozen=True, tag="wall"):
         stiffness = (self.stiffness_n_m, 0.0)
         damping = (self.damping_n_s_m, 0.0)
         vectors: dict[str, Any] = {"a": self.point_m, "b": unit, "K": stiffness, "B": damping}
-        return TorqueSource(TorqueKind.WALL, self.start_s, self.end_s, **vectors, sampled=self.sampled)
+        return TorqueSource(
+            TorqueKind.WALL, self.start_s, self.end_s, **vectors, sampled=self.sampled
+        )

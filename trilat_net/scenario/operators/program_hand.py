@@ -1,7 +1,8 @@
 """A hand of one's own in a scenario: `{ kind = "own", class = "package.module:Class", ... }`.
 
-Invariant: naming the class runs nothing. A hand that fails lets go at that tick and is not asked again, and
-the run goes on without it: whoever else holds the arm, and all other sites, never notice.
+Invariant: naming the class runs nothing. A hand that fails lets go at that tick and is not
+asked again, and the run goes on without it: whoever else holds the arm, and all other sites,
+never notice.
 """
 
 import math
@@ -30,15 +31,18 @@ OWN_KEYS = ("class", "rate_hz", "delay_ms", "process", "source_sha256", "setting
 class ProgramHand(
     LiveHand, frozen=True, kw_only=True, tag="own", omit_defaults=True, rename={"code": "class"}
 ):
-    """An operator that is a class of one's own: it sees what its site knows, and moves, turns or pushes.
+    """An operator that is a class of one's own: it sees what its site knows, and moves, turns
+    or pushes.
 
-    It takes hold at its first action. All else is as of a live hand; nobody else can hold the arm.
+    It takes hold at its first action. All else is as of a live hand; nobody else can hold the
+    arm.
 
     Attributes:
         code: its class, as in "my_policy:Reach".
         rate_hz: how often it is asked, Hz; the tick rate of the site is a multiple of it.
         delay_ms: time from what it sees to what it does: it may think for so long.
-        process: true: live it runs in a process of its own (`trilat hand`), else in that of the site.
+        process: true: live it runs in a process of its own (`trilat hand`), else in that of the
+            site.
         acceleration_limit_m_s2: as of a live hand; left out, there is none.
         acceleration_limit_rad_s2: likewise.
         source_sha256: hash of the file of its class.
@@ -67,7 +71,9 @@ class ProgramHand(
     settings: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def complete(cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str) -> None:
+    def complete(
+        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str
+    ) -> None:
         """Names the file of its class by a hash, and does as a live hand."""
         code = table.get("class")
         place = f"{path}.class"
@@ -122,11 +128,14 @@ class HandSite(NamedTuple):
         arm = self.scenario.arms[self.name]
         place: Any = list if self.spec.mode == "joint" else arm.end_effector
         delay = math.ceil(round(self.delay_s * tick_rate_hz, 6))
-        return OwnHand(self.spec.rules(tick_rate_hz, arm), tick_rate_hz // self.rate_hz, delay, place)
+        return OwnHand(
+            self.spec.rules(tick_rate_hz, arm), tick_rate_hz // self.rate_hz, delay, place
+        )
 
 
 class HandPlayer:
-    """A hand of one's own at its site: asks its class, lets it act, and lets go of the arm if it fails.
+    """A hand of one's own at its site: asks its class, lets it act, and lets go of the arm if
+    it fails.
 
     Attributes:
         hand: when it is asked and acts.
@@ -152,7 +161,9 @@ class HandPlayer:
         return step.vector
 
     def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Returns what it does from tick k until it needs the arm again, before tick `end`, a row a tick."""
+        """Returns what it does from tick k until it needs the arm again, before tick `end`, a
+        row a tick.
+        """
         return self.hand.advance_until(k, end, self._begin(k, arrays))
 
     def _begin(self, k: int, arrays: SiteArrays) -> Callable[[], list[float]]:
@@ -186,8 +197,20 @@ class HandPlayer:
 
 def place_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
     """Returns a site with its hand of one's own, or None if it has none."""
-    spec = next((one for one in scenario.sites[site].hands if isinstance(one, ProgramHand)), None)
-    return None if spec is None else HandSite(scenario, site, spec, spec.rate_hz, spec.delay_ms * 1e-3)
+    spec = next(
+        (one for one in scenario.sites[site].hands if isinstance(one, ProgramHand)), None
+    )
+    return (
+        None
+        if spec is None
+        else HandSite(
+            scenario=scenario,
+            name=site,
+            spec=spec,
+            rate_hz=spec.rate_hz,
+            delay_s=spec.delay_ms * 1e-3,
+        )
+    )
 
 
 def make_program(at: HandSite) -> HandProgram:

@@ -1,4 +1,6 @@
-"""The suite: control laws on the same tasks, links and seeds, with gains that one procedure tuned."""
+"""The suite: control laws on the same tasks, links and seeds, with gains that one procedure
+tuned.
+"""
 
 from .bench_plan import BenchPlan, plan_bench
 from .bench_results import BenchResults

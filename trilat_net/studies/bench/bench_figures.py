@@ -1,7 +1,7 @@
 """Figures of the suite: a panel per task, a row per law, a column per link.
 
-Invariant: a cell is coloured by its mean alone; a white cross says that a run there is not stable, a dot that
-one is open. Equal results give equal bytes.
+Invariant: a cell is coloured by its mean alone; a white cross says that a run there is not
+stable, a dot that one is open. Equal results give equal bytes.
 """
 
 from pathlib import Path
@@ -49,12 +49,16 @@ def list_figures_with_values(results: BenchResults) -> list[str]:
 def _collect_fields(results: BenchResults, name: str) -> dict[str, Array]:
     """Returns the numbers of a figure: by task an array of shape (laws, links)."""
     _, quantity = FIGURES_OF_BENCH[name]
-    tasks = [task for task in results.plan.tasks if quantity != "stiffness_n_m" or task == "contact"]
+    tasks = [
+        task for task in results.plan.tasks if quantity != "stiffness_n_m" or task == "contact"
+    ]
     return {task: _collect(results, task, quantity) for task in tasks}
 
 
 def draw_bench(results: BenchResults, name: str) -> Figure:
-    """Returns a figure by its name in `FIGURES_OF_BENCH`; `list_figures_with_values` has the names."""
+    """Returns a figure by its name in `FIGURES_OF_BENCH`; `list_figures_with_values` has the
+    names.
+    """
     label, quantity = FIGURES_OF_BENCH[name]
     links = results.plan.links
     fields = _collect_fields(results, name)
@@ -69,7 +73,9 @@ def draw_bench(results: BenchResults, name: str) -> Figure:
         ratios = [len(field) for field in fields.values()]
         grid = style.add_panels(figure, len(fields), 1, sharex=True, height_ratios=ratios)[:, 0]
         for axes, (task, field) in zip(grid, fields.items(), strict=True):
-            image = axes.imshow(field, aspect="auto", cmap=_PALETTE, norm=scale, interpolation="nearest")
+            image = axes.imshow(
+                field, aspect="auto", cmap=_PALETTE, norm=scale, interpolation="nearest"
+            )
             _mark(axes, results, task)
             axes.set_title(task)
         grid[-1].set_xticks(range(len(links)), links, rotation=90, fontsize=_TEXT_PT)

@@ -1,7 +1,8 @@
 """The results of the suite: its runs by place, as tables, as Markdown, as CSV and as JSON.
 
-Invariant: a function of the runs alone, without a clock: equal results give equal bytes. A number over
-seeds has its 95 % interval, and every run that is not stable shows. No law is ranked.
+Invariant: a function of the runs alone, without a clock: equal results give equal bytes. A
+number over seeds has its 95 % interval, and every run that is not stable shows. No law is
+ranked.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,11 +24,15 @@ LEAST_CONTACT_N = 1.0
 PASSIVE_J = -1e-3
 """What hands, friction and wall have put into a passive run is never less, J."""
 LONGEST_S = 100.0
-"""No run is made longer; so long, too, is the one that refutes or confirms one that is not stable, s."""
+"""No run is made longer; so long, too, is the one that refutes or confirms one that is not
+stable, s.
+"""
 
 
 def name_run(key: str, to_s: float) -> str:
-    """Returns what the runs of a cell are called in the journal; those that were made again, of their own."""
+    """Returns what the runs of a cell are called in the journal; those that were made again, of
+    their own.
+    """
     return f"{key} to {to_s:g} s" if to_s else key
 
 
@@ -47,13 +52,14 @@ class BenchRun(msgspec.Struct, frozen=True):
         bounded: no joint passed `BOUND_RAD_S`, or left its start by more than `THROWN_RAD`.
         energy_j: the least that hands, friction and wall had put in until any instant, J.
         settled_s: since when all arms stay where they end, s; None: not within the run.
-        error_rad: RMS distance of the slave from its users, undelayed, weighted by dominance, over the time
-            of the task; None where the run diverged, as the numbers below.
+        error_rad: RMS distance of the slave from its users, undelayed, weighted by dominance,
+            over the time of the task; None where the run diverged, as the numbers below.
         effort_nm: RMS of tau - G(q) over sites and joints.
         hand_nm: RMS torque of the operators over joints, of the sites that have one.
         wall_n: mean force of the wall in the last quarter, N; None without a wall.
         force_peak_n: largest force of the wall, N.
-        stiffness_n_m: what the user feels of the wall, by two reaches, N/m; None unless both come to rest.
+        stiffness_n_m: what the user feels of the wall, by two reaches, N/m; None unless both
+            come to rest.
     """
 
     name: str
@@ -79,14 +85,22 @@ class BenchRun(msgspec.Struct, frozen=True):
 
     @property
     def cell(self) -> str:
-        """Its cell, told apart from one of the same name with other gains, and from a longer run of it."""
+        """Its cell, told apart from one of the same name with other gains, and from a longer
+        run of it.
+        """
         return name_run(f"{self.name} {self.inputs}", self.to_s)
 
     @property
     def doubtful(self) -> bool:
-        """True if it is not stable, did not diverge, and is not as long as one that would confirm it."""
+        """True if it is not stable, did not diverge, and is not as long as one that would
+        confirm it.
+        """
         diverged = self.behaviour is EndBehaviour.DIVERGED
-        return self.stability is Stability.NOT_STABLE and not diverged and self.length_s < LONGEST_S
+        return (
+            self.stability is Stability.NOT_STABLE
+            and not diverged
+            and self.length_s < LONGEST_S
+        )
 
     @property
     def masked(self) -> bool:
@@ -102,7 +116,9 @@ QUANTITIES = {
     "stiffness_n_m": "stiffness at the user's hand, by two reaches, N/m",
     "settled_s": "since when all arms stay where they end, s",
 }
-"""The numbers of a run that are averaged over its seeds; those of runs without contact are masked."""
+"""The numbers of a run that are averaged over its seeds; those of runs without contact are
+masked.
+"""
 LEAST_SEEDS = 20
 """Of fewer runs there is no interval."""
 
@@ -126,7 +142,11 @@ class BenchPlace(NamedTuple):
     def judgement(self) -> Stability:
         """Stable if all of its runs are, not stable if one is."""
         found = {run.stability for run in self.runs}
-        return next(one for one in (Stability.NOT_STABLE, Stability.OPEN, Stability.STABLE) if one in found)
+        return next(
+            one
+            for one in (Stability.NOT_STABLE, Stability.OPEN, Stability.STABLE)
+            if one in found
+        )
 
     @property
     def masked(self) -> bool:
@@ -142,7 +162,11 @@ class BenchPlace(NamedTuple):
     @property
     def interval(self) -> tuple[float, float] | None:
         """The 95 % interval of the share of stable runs; None of too few."""
-        return wilson_interval(self.stable, len(self.runs)) if len(self.runs) >= LEAST_SEEDS else None
+        return (
+            wilson_interval(self.stable, len(self.runs))
+            if len(self.runs) >= LEAST_SEEDS
+            else None
+        )
 
     def mean(self, quantity: str) -> float | MeanInterval | None:
         """Returns a number's mean over the seeds, with its interval if they are enough."""
@@ -164,7 +188,8 @@ class BenchResults(Result):
     def __init__(self, plan: BenchPlan, runs: dict[tuple[str, int], BenchRun]) -> None:
         self.plan = plan
         self.places = [
-            BenchPlace(cell, [_confirm(runs, cell, seed) for seed in cell.seeds]) for cell in plan.cells
+            BenchPlace(cell, [_confirm(runs, cell, seed) for seed in cell.seeds])
+            for cell in plan.cells
         ]
         self.runs = [run for place in self.places for run in place.runs]
 
@@ -221,10 +246,22 @@ def _confirm(runs: dict[tuple[str, int], BenchRun], cell: BenchCell, seed: int) 
         return run
     confirmed = longer.stability is Stability.NOT_STABLE
     words = f"of {LONGEST_S:g} s: {longer.text}"
-    return msgspec.structs.replace(run, stability=longer.stability, text=words, confirmed=confirmed)
+    return msgspec.structs.replace(
+        run, stability=longer.stability, text=words, confirmed=confirmed
+    )
 
 
-_SHOWN_LINKS = ("rtt8", "rtt136", "rtt544", "rtt1088", "rtt136-loss50", "4g", "5g", "geo", "trace")
+_SHOWN_LINKS = (
+    "rtt8",
+    "rtt136",
+    "rtt544",
+    "rtt1088",
+    "rtt136-loss50",
+    "4g",
+    "5g",
+    "geo",
+    "trace",
+)
 """Links of a table for people, if they are among those that ran; else all that ran."""
 OPEN_MARK = "?"
 UNSTABLE_MARK = "!"
@@ -232,7 +269,11 @@ UNSTABLE_MARK = "!"
 
 def list_quantities(results: BenchResults) -> list[tuple[str, str]]:
     """Returns what is shown of the tasks that ran: each with a key of `QUANTITIES`."""
-    more = {"free": ["hand_nm"], "disagree": ["hand_nm"], "contact": ["stiffness_n_m", "force_peak_n"]}
+    more = {
+        "free": ["hand_nm"],
+        "disagree": ["hand_nm"],
+        "contact": ["stiffness_n_m", "force_peak_n"],
+    }
     tasks = results.plan.tasks
     found = [(task, key) for key in ("error_rad", "effort_nm", "settled_s") for task in tasks]
     return found + [(task, key) for task in tasks for key in more.get(task, [])]
@@ -244,7 +285,9 @@ def name_law(law: str, form: str) -> str:
 
 
 def tabulate_verdicts(results: BenchResults) -> TextTable:
-    """Returns a row per law: of each task over how many links it is stable, open, and not stable."""
+    """Returns a row per law: of each task over how many links it is stable, open, and not
+    stable.
+    """
     tasks = results.plan.tasks
 
     def cell(law: str, form: str, task: str) -> str:
@@ -252,7 +295,9 @@ def tabulate_verdicts(results: BenchResults) -> TextTable:
         counts = " / ".join(str(found.count(one)) for one in _JUDGEMENTS)
         return counts if found else explain_no_cell(law, form, task)
 
-    rows = [(name_law(*one), *(cell(*one, task) for task in tasks)) for one in results.plan.laws]
+    rows = [
+        (name_law(*one), *(cell(*one, task) for task in tasks)) for one in results.plan.laws
+    ]
     return TextTable(("links: stable / open / not stable", *tasks), rows, align="lr")
 
 
@@ -260,7 +305,9 @@ _JUDGEMENTS = (Stability.STABLE, Stability.OPEN, Stability.NOT_STABLE)
 
 
 def tabulate_properties(results: BenchResults, task: str) -> TextTable:
-    """Returns a row per law: over how many links each property holds of all runs, and the least energy."""
+    """Returns a row per law: over how many links each property holds of all runs, and the least
+    energy.
+    """
     rows = []
     for law, form in results.plan.laws:
         places = list(results.of(task, law))
@@ -278,13 +325,17 @@ def tabulate_properties(results: BenchResults, task: str) -> TextTable:
         energy = "-" if least is None else f"{least if least < -1e-9 else 0.0:.2g}"
         shown = [f"{count}/{len(places)}" for count in kept]
         masked = str(sum(place.masked for place in places))
-        rows.append((name_law(law, form), shown[0], shown[1], energy, shown[2], shown[3], masked))
+        rows.append(
+            (name_law(law, form), shown[0], shown[1], energy, shown[2], shown[3], masked)
+        )
     heads = ("bounded", "passive", "least energy, J", "converged", "stable", "no contact")
     return TextTable((task, *heads), rows, align="lr")
 
 
 def tabulate_quantity(results: BenchResults, task: str, quantity: str) -> TextTable:
-    """Returns a row per law and a column per link: means over seeds; marks say what is not stable."""
+    """Returns a row per law and a column per link: means over seeds; marks say what is not
+    stable.
+    """
     links = results.plan.links
     if len(links) > len(_SHOWN_LINKS):
         links = [link for link in links if link in _SHOWN_LINKS]
@@ -316,7 +367,9 @@ def _describe_place(place: BenchPlace, quantity: str) -> str:
 
 
 def tabulate_round_trips(results: BenchResults) -> TextTable:
-    """Returns what the published study speaks of: how much delay and loss make of the errors of each law."""
+    """Returns what the published study speaks of: how much delay and loss make of the errors of
+    each law.
+    """
 
     def error(law: str, task: str, link: str) -> float | None:
         place = next(results.of(task, law, link), None)
@@ -331,9 +384,18 @@ def tabulate_round_trips(results: BenchResults) -> TextTable:
         for law, _ in results.plan.laws:
             first = error(law, task, "rtt8")
             later = error(law, task, "rtt272")
-            times = ratio(error(law, task, "rtt1088"), first), ratio(error(law, task, "rtt272-loss50"), later)
+            times = (
+                ratio(error(law, task, "rtt1088"), first),
+                ratio(error(law, task, "rtt272-loss50"), later),
+            )
             rows.append((task, law, format_number(first, 4), *times))
-    heads = ("task", "law", "error at 8 ms, rad", "1088 ms: times that", "272 ms: half lost, times none lost")
+    heads = (
+        "task",
+        "law",
+        "error at 8 ms, rad",
+        "1088 ms: times that",
+        "272 ms: half lost, times none lost",
+    )
     return TextTable(heads, rows, align="llr")
 
 
@@ -377,10 +439,14 @@ def tabulate_gains(results: BenchResults) -> TextTable:
         )
         for one in used.values()
     ]
-    return TextTable(("law", "tuned at, ms", "gains", "stable", "without margin"), rows, align="lrlrr")
+    return TextTable(
+        ("law", "tuned at, ms", "gains", "stable", "without margin"), rows, align="lrlrr"
+    )
 
 
-def build_bench_page(results: BenchResults, command: str, pictures: Mapping[str, str] = {}) -> str:
+def build_bench_page(
+    results: BenchResults, command: str, pictures: Mapping[str, str] = {}
+) -> str:
     """Returns the results in Markdown, under the command that makes them.
 
     Args:
@@ -399,7 +465,10 @@ def build_bench_page(results: BenchResults, command: str, pictures: Mapping[str,
     for task in results.plan.tasks:
         parts += [f"## {task}: properties", tabulate_properties(results, task).markdown()]
     for task, key in list_quantities(results):
-        parts += [f"## {task}: {QUANTITIES[key]}", tabulate_quantity(results, task, key).markdown()]
+        parts += [
+            f"## {task}: {QUANTITIES[key]}",
+            tabulate_quantity(results, task, key).markdown(),
+        ]
     if results.plan.study == "round-trips":
         parts += ["## Delay against loss", tabulate_round_trips(results).markdown()]
     parts += ["## Gains", tabulate_gains(results).markdown()]
@@ -434,7 +503,9 @@ def _place_row(place: BenchPlace) -> dict[str, Any]:
     }
     for key in QUANTITIES:
         value = place.mean(key)
-        row[key], row[f"{key}_half"] = value if isinstance(value, MeanInterval) else (value, None)
+        row[key], row[f"{key}_half"] = (
+            value if isinstance(value, MeanInterval) else (value, None)
+        )
     row |= dict.fromkeys(_GONE)
     row |= {
         "judgement": place.judgement.value,

@@ -1,10 +1,11 @@
-"""Runs the suite: a run's judgement by its end and by its twins, its numbers, the folder and its journal.
+"""Runs the suite: a run's judgement by its end and by its twins, its numbers, the folder and
+its journal.
 
-Invariant: a run's numbers are a function of its scenario. Errors, efforts and forces are those of the log
-that its command makes, over the time of its task; what is judged lasts as long as the judgement needs. The
-number of processes, their order and the number of interruptions do not enter. A run that is in the journal is
-never made again; one with other gains is another run. A folder belongs to one version of the program on one
-arithmetic.
+Invariant: a run's numbers are a function of its scenario. Errors, efforts and forces are those
+of the log that its command makes, over the time of its task; what is judged lasts as long as
+the judgement needs. The number of processes, their order and the number of interruptions do not
+enter. A run that is in the journal is never made again; one with other gains is another run. A
+folder belongs to one version of the program on one arithmetic.
 """
 
 import json
@@ -37,11 +38,17 @@ from .bench_results import LONGEST_S, BenchResults, BenchRun, name_run
 SLAVE = "s"
 USER = "m1"
 BOUND_RAD_S = 5.0
-"""No joint of a bounded run is faster, rad/s, and none further from its start than `THROWN_RAD`."""
+"""No joint of a bounded run is faster, rad/s, and none further from its start than
+`THROWN_RAD`.
+"""
 REST_S = 2.0
-"""A run has converged if its arms stay within `SETTLED_ERROR_RAD` of their last pose for so long, s."""
+"""A run has converged if its arms stay within `SETTLED_ERROR_RAD` of their last pose for so
+long, s.
+"""
 TWINS = 3
-"""Twins of a run of the first seed, pushed at all joints, at single ones, and in estimates; else one."""
+"""Twins of a run of the first seed, pushed at all joints, at single ones, and in estimates;
+else one.
+"""
 TIME_CONSTANTS = 6.0
 """A run lasts for so many of its slowest time constants, but for no longer than `LONGEST_S`."""
 
@@ -76,7 +83,13 @@ def run_bench_task(task: BenchRunItem) -> BenchRun:
     judged = _run(scenario, task.to_s or scenario.duration_s, twins)
     if not task.to_s:
         judged = _lengthen(judged, twins)
-    found = judged.stability, judged.end.behaviour, judged.text, judged.scenario.duration_s, task.to_s
+    found = (
+        judged.stability,
+        judged.end.behaviour,
+        judged.text,
+        judged.scenario.duration_s,
+        task.to_s,
+    )
     made = BenchRun(cell.name, cell.inputs, task.seed, scenario.random, scenario.sha256, *found)
     if judged.end.diverged_at_s is None:
         made = _measure(made, judged, TASKS[cell.task].duration_s)
@@ -92,11 +105,20 @@ def _run(scenario: Scenario, length_s: float, twins: int) -> _JudgedRun:
     if end.diverged_at_s is None and twins:
         growth = measure_virtual_twins(scenario, end, length_s, twins)
     found = judge_end_by_twins(end, growth, settles=None, rises=False)
-    return _JudgedRun(scenario, records, end, growth, found.stability, found.reason or end.text)
+    return _JudgedRun(
+        scenario=scenario,
+        records=records,
+        end=end,
+        twins=growth,
+        stability=found.stability,
+        text=found.reason or end.text,
+    )
 
 
 def _lengthen(judged: _JudgedRun, twins: int) -> _JudgedRun:
-    """Returns a run that lasts for its slowest time constants; not stable is what twice as long is, too."""
+    """Returns a run that lasts for its slowest time constants; not stable is what twice as long
+    is, too.
+    """
     length_s = judged.scenario.duration_s
     rates = [judged.end.error.rate_per_s, judged.end.speed.rate_per_s]
     rates += [one.rate_per_s for one in judged.twins.pushes if one.factor > 0.0]
@@ -114,7 +136,9 @@ def _lengthen(judged: _JudgedRun, twins: int) -> _JudgedRun:
 def _measure(made: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
     scenario = judged.scenario
     whole = judged.records
-    records = {name: one.between(0, round(duration_s * NS_PER_S)) for name, one in whole.items()}
+    records = {
+        name: one.between(0, round(duration_s * NS_PER_S)) for name, one in whole.items()
+    }
     efforts = []
     hands = []
     walls = []
@@ -143,15 +167,21 @@ def _measure(made: BenchRun, judged: _JudgedRun, duration_s: float) -> BenchRun:
 
 
 def _find_hand_torque(scenario: Scenario, name: str, record: RecordBatch) -> Array:
-    """Returns the torque of the operators ON an arm, without the friction of its joints, shape (K, n)."""
-    dampers = (one for one in scenario.sites[name].environment if isinstance(one, ViscousEnvironment))
+    """Returns the torque of the operators ON an arm, without the friction of its joints, shape
+    (K, n).
+    """
+    dampers = (
+        one for one in scenario.sites[name].environment if isinstance(one, ViscousEnvironment)
+    )
     return sum((np.array(one.damping_nm_s_rad) * record.qd for one in dampers), -record.tau_x)
 
 
 def find_least_energy(records: dict[str, RecordBatch]) -> float:
-    """Returns the least over time of sum_i int -tau_x' qd dt: what came from outside until then, J.
+    """Returns the least over time of sum_i int -tau_x' qd dt: what came from outside until
+    then, J.
 
-    All arms begin at rest, so that of a passive network with passive controllers none is below zero.
+    All arms begin at rest, so that of a passive network with passive controllers none is below
+    zero.
     """
     power = sum(-np.sum(one.tau_x * one.qd, axis=1) for one in records.values())
     h_s = 1e-9 * np.diff(records[SLAVE].t_ns[:2])[0]
@@ -159,7 +189,9 @@ def find_least_energy(records: dict[str, RecordBatch]) -> float:
 
 
 def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
-    """Returns since when every joint stays where it ends, s; None if that is too short a time ago."""
+    """Returns since when every joint stays where it ends, s; None if that is too short a time
+    ago.
+    """
     last_s = 0.0
     for record in records.values():
         away = np.flatnonzero(np.abs(record.q - record.q[-1]).max(axis=1) > SETTLED_ERROR_RAD)
@@ -168,9 +200,13 @@ def _find_settled_s(records: dict[str, RecordBatch]) -> float | None:
 
 
 def _find_stiffness(task: BenchRunItem, far: _JudgedRun) -> float | None:
-    """Returns by how much more the user has to push to get so much further, along the wall's normal, N/m."""
+    """Returns by how much more the user has to push to get so much further, along the wall's
+    normal, N/m.
+    """
     built = task.cell.build(task.seed)
-    short = load_tuning_scenario(built.source, (*built.overrides, *name_settings(SHORTER_REACH)))
+    short = load_tuning_scenario(
+        built.source, (*built.overrides, *name_settings(SHORTER_REACH))
+    )
     near = _run(short.scenario, far.scenario.duration_s, twins=0)
     if None in (_find_settled_s(near.records), _find_settled_s(far.records)):
         return None
@@ -180,7 +216,9 @@ def _find_stiffness(task: BenchRunItem, far: _JudgedRun) -> float | None:
 
 
 def _find_push(judged: _JudgedRun) -> tuple[float, float]:
-    """Returns of the last second where the user's end effector is along x, m, and how it is pushed, N."""
+    """Returns of the last second where the user's end effector is along x, m, and how it is
+    pushed, N.
+    """
     scenario = judged.scenario
     record = judged.records[USER].since(judged.records[USER].t_ns[-1] - NS_PER_S)
     tip = build_arm_rows(scenario, USER).place_end_effector(record.q, record.qd)
@@ -196,7 +234,8 @@ def _follow_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> fl
     period_s = 1.0 / scenario.sites[SLAVE].rate_hz
     alpha = evaluate_ramps(*list_scripted_ramps(scenario, SLAVE), t_s, period_s).alpha
     led: Array = sum(
-        (alpha[:, n, None] * records[peer].q for n, peer in enumerate(peers)), np.zeros_like(own.q)
+        (alpha[:, n, None] * records[peer].q for n, peer in enumerate(peers)),
+        np.zeros_like(own.q),
     )
     return float(np.sqrt(np.mean((own.q - led) ** 2)))
 
@@ -232,7 +271,11 @@ def prepare_bench_folder(plan: BenchPlan, path: Path | None = None) -> BenchFold
         )
     remedy = build_resume_hint("bench", "--study", plan.study, "--out", str(chosen))
     return BenchFolder(
-        chosen, plan, facts, remedy, lambda: RunJournal(chosen / JOURNAL_NAME, origin, BenchRun, remedy)
+        chosen,
+        plan,
+        facts,
+        remedy,
+        lambda: RunJournal(chosen / JOURNAL_NAME, origin, BenchRun, remedy),
     )
 
 
@@ -244,9 +287,11 @@ def run_bench(
     *,
     confirm: bool = False,
 ) -> BenchResults:
-    """Runs what is left of a suite, and returns all of it; other arguments are those of `trilat_net.bench`.
+    """Runs what is left of a suite, and returns all of it; other arguments are those of
+    `trilat_net.bench`.
 
-    What the journal of the folder has is not run again; `progress` gets the runs that are done, and all.
+    What the journal of the folder has is not run again; `progress` gets the runs that are done,
+    and all.
 
     Raises:
         RunFailed: a run ended its workers, or the cluster is gone. What is done is kept.
@@ -259,7 +304,9 @@ def run_bench(
                 found = [(one, journal.done[one.cell.key, one.seed]) for one in asked]
                 asked = [one._replace(to_s=LONGEST_S) for one, run in found if run.doubtful]
             keys = [(name_run(one.cell.key, one.to_s), one.seed) for one in asked]
-            tasks = [one for key, one in zip(keys, asked, strict=True) if key not in journal.done]
+            tasks = [
+                one for key, one in zip(keys, asked, strict=True) if key not in journal.done
+            ]
             if tasks:
                 hint = "; what is done is kept: the same command goes on"
                 with open_worker_pool(jobs, on, most=len(tasks), hint=hint) as pool:

@@ -1,1 +1,3 @@
-"""Experiments with people: movement measures, questionnaires, and the statistics of what they show."""
+"""Experiments with people: movement measures, questionnaires, and the statistics of what they
+show.
+"""

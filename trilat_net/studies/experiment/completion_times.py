@@ -1,20 +1,21 @@
-"""Completion times of trials that may run into a time limit: medians, their intervals, and sign tests.
+"""Completion times of trials that may run into a time limit: medians, their intervals, and sign
+tests.
 
-A trial that was not completed has no completion time: it is known only that the time is longer than the
-limit (right censoring), or, of a trial that failed before the limit, that the task was never done. Both
-count as longer than every time that was measured. Order statistics need no more than that: the median, which
-is that of Kaplan and Meier, is exact as long as more than half of the trials were completed, and otherwise it
-was not reached. A mean would need the times themselves, and the limit in their place makes conditions look
-alike that are not.
+A trial that was not completed has no completion time: it is known only that the time is longer
+than the limit (right censoring), or, of a trial that failed before the limit, that the task was
+never done. Both count as longer than every time that was measured. Order statistics need no
+more than that: the median, which is that of Kaplan and Meier, is exact as long as more than
+half of the trials were completed, and otherwise it was not reached. A mean would need the times
+themselves, and the limit in their place makes conditions look alike that are not.
 
 Invariant:
 - The limit never enters a sum or a difference.
-- Trials are summarised per unit and condition before units are compared, so that more trials are not more
-  participants.
+- Trials are summarised per unit and condition before units are compared, so that more trials
+  are not more participants.
 
-Sources: Kaplan and Meier, "Nonparametric estimation from incomplete observations", J. American Statistical
-Association 53 (1958); Conover, "Practical nonparametric statistics", 3rd edition (1999), 3.2 and 3.4, for the
-interval of a median and the sign test.
+Sources: Kaplan and Meier, "Nonparametric estimation from incomplete observations", J. American
+Statistical Association 53 (1958); Conover, "Practical nonparametric statistics", 3rd edition
+(1999), 3.2 and 3.4, for the interval of a median and the sign test.
 """
 
 import math
@@ -40,8 +41,9 @@ class CompletionTime(NamedTuple):
         timed_out: how many of them ran into the time limit.
         number: of units.
         median: over units, of each unit's median time, s; None: it was not reached.
-        interval: of that median, 95 % or more, by order statistics, s; its upper end is None if it was not
-            reached. None: there are too few units, or the lower end was not reached either.
+        interval: of that median, 95 % or more, by order statistics, s; its upper end is None if
+            it was not reached. None: there are too few units, or the lower end was not reached
+            either.
     """
 
     condition: str
@@ -61,9 +63,11 @@ class CompletionComparison(NamedTuple):
         second: the other one.
         number: of units that have both.
         longer: of units whose median was longer under the second condition.
-        shorter: of units whose median was shorter there; the rest are ties, as two that were not reached.
+        shorter: of units whose median was shorter there; the rest are ties, as two that were
+            not reached.
         difference: median over units of second minus first, s; None if the limit hides it.
-        p: of the sign test, two-sided and exact, ties left out; None of fewer than two units that differ.
+        p: of the sign test, two-sided and exact, ties left out; None of fewer than two units
+            that differ.
         p_holm: p corrected for all comparisons.
     """
 
@@ -91,7 +95,9 @@ def find_median(times_s: Sequence[float]) -> float:
     return (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2.0
 
 
-def find_unit_medians(rows: Sequence[Row], unit: str = "participant") -> dict[str, dict[str, float]]:
+def find_unit_medians(
+    rows: Sequence[Row], unit: str = "participant"
+) -> dict[str, dict[str, float]]:
     """Returns the median completion time of every condition and unit, s; infinite: not reached.
 
     Args:
@@ -106,9 +112,12 @@ def find_unit_medians(rows: Sequence[Row], unit: str = "participant") -> dict[st
         if (value := row.get(COMPLETION)) in (None, ""):
             continue
         time_s = read_number(value, COMPLETION, row) if is_completed(row) else math.inf
-        times_s.setdefault(str(row["condition"]), {}).setdefault(str(row[unit]), []).append(time_s)
+        times_s.setdefault(str(row["condition"]), {}).setdefault(str(row[unit]), []).append(
+            time_s
+        )
     return {
-        condition: {who: find_median(own) for who, own in each.items()} for condition, each in times_s.items()
+        condition: {who: find_median(own) for who, own in each.items()}
+        for condition, each in times_s.items()
     }
 
 
@@ -142,10 +151,12 @@ def summarise_times(
 
 
 def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None] | None:
-    """Returns the interval of a median of at least 95 % by order statistics; None of fewer than six times.
+    """Returns the interval of a median of at least 95 % by order statistics; None of fewer than
+    six times.
 
-    The r-th smallest and the r-th largest time enclose the median with probability 1 - 2 P(B < r), B binomial
-    with p = 1/2; r is the largest for which that is 95 % or more. Censored times are infinite.
+    The r-th smallest and the r-th largest time enclose the median with probability 1 - 2 P(B <
+    r), B binomial with p = 1/2; r is the largest for which that is 95 % or more. Censored times
+    are infinite.
     """
     ordered = sorted(times_s)
     tail = (1.0 - CONFIDENCE) / 2.0
@@ -156,11 +167,13 @@ def find_median_interval(times_s: Sequence[float]) -> tuple[float, float | None]
     return ordered[ranks[-1] - 1], _finite(ordered[-ranks[-1]])
 
 
-def compare_times(rows: Sequence[Row], *, unit: str = "participant") -> list[CompletionComparison]:
+def compare_times(
+    rows: Sequence[Row], *, unit: str = "participant"
+) -> list[CompletionComparison]:
     """Returns the comparison of every two conditions, in the order of the rows.
 
-    A unit counts by which of its two medians is longer; one that was not reached is longer than any that was,
-    and two that were not reached are a tie.
+    A unit counts by which of its two medians is longer; one that was not reached is longer than
+    any that was, and two that were not reached are a tie.
 
     Args:
         rows: as of `find_unit_medians`.
@@ -176,7 +189,9 @@ def compare_times(rows: Sequence[Row], *, unit: str = "participant") -> list[Com
     return [one._replace(p_holm=p) for one, p in zip(found, corrected, strict=True)]
 
 
-def _compare(first: str, second: str, pairs: Sequence[tuple[float, float]]) -> CompletionComparison:
+def _compare(
+    first: str, second: str, pairs: Sequence[tuple[float, float]]
+) -> CompletionComparison:
     """Returns the comparison of two conditions by the medians that each unit has under them, s."""
     longer = sum(after > before for before, after in pairs)
     shorter = sum(after < before for before, after in pairs)
@@ -196,8 +211,8 @@ def _compare(first: str, second: str, pairs: Sequence[tuple[float, float]]) -> C
 def _find_median_difference(pairs: Sequence[tuple[float, float]]) -> float | None:
     """Returns the median difference, s; None if it depends on medians that were not reached.
 
-    Such a median may lie anywhere above 0, so that each difference lies between two bounds. Their median is
-    known where the medians of both bounds agree.
+    Such a median may lie anywhere above 0, so that each difference lies between two bounds.
+    Their median is known where the medians of both bounds agree.
     """
     if not pairs:
         return None
@@ -212,6 +227,8 @@ def _finite(time_s: float) -> float | None:
     return time_s if math.isfinite(time_s) else None
 
 
-def to_table(found: Sequence[CompletionTime] | Sequence[CompletionComparison]) -> list[dict[str, Any]]:
+def to_table(
+    found: Sequence[CompletionTime] | Sequence[CompletionComparison],
+) -> list[dict[str, Any]]:
     """Returns a row for each condition or comparison."""
     return [one._asdict() for one in found]

@@ -1,7 +1,7 @@
 """The figure of a measure under the conditions of an experiment with people.
 
-Invariant: every participant is shown, a point per condition that they have, joined by a thin line; means with
-their intervals stand on top. Equal rows give equal bytes.
+Invariant: every participant is shown, a point per condition that they have, joined by a thin
+line; means with their intervals stand on top. Equal rows give equal bytes.
 """
 
 import math
@@ -20,15 +20,26 @@ from .statistics import ConditionMean, Row, average_trials, summarise_conditions
 
 _FORM = make_print_size(COLUMN_IN)
 _HEIGHT_IN = 2.6
-_USER: dict[str, Any] = {"color": style.FAINT, "linewidth": 0.5, "marker": "o", "markersize": 2.5}
+_USER: dict[str, Any] = {
+    "color": style.FAINT,
+    "linewidth": 0.5,
+    "marker": "o",
+    "markersize": 2.5,
+}
 _COURSE: dict[str, Any] = {"linewidth": 1.2, "marker": "o", "markersize": 3.0}
-_MEAN: dict[str, Any] = {"color": SITE_COLOURS[0], "linewidth": 1.6, "marker": "D", "markersize": 5.0}
+_MEAN: dict[str, Any] = {
+    "color": SITE_COLOURS[0],
+    "linewidth": 1.6,
+    "marker": "D",
+    "markersize": 5.0,
+}
 
 _LIMIT: dict[str, Any] = {"color": style.FAINT, "linewidth": 1.0, "linestyle": "--"}
 
 
 def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participant") -> Figure:
-    """Returns the figure of a measure: the mean of every unit and condition, and means with 95 % intervals.
+    """Returns the figure of a measure: the mean of every unit and condition, and means with 95
+    % intervals.
 
     Args:
         rows: tidy rows, as of `statistics`.
@@ -44,7 +55,9 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
         for n, mean in enumerate(summarise_conditions(rows, measure, unit=unit)):
             _plot_interval(axes, n, mean, {**_MEAN, "marker": "_", "zorder": 3})
             axes.plot([n], [mean.mean], zorder=3, **_MEAN)
-        axes.set_xticks(range(len(means)), [f"{name}\nn = {len(each)}" for name, each in means.items()])
+        axes.set_xticks(
+            range(len(means)), [f"{name}\nn = {len(each)}" for name, each in means.items()]
+        )
         axes.set_xlim(-0.4, len(means) - 0.6)
         style.add_legend(figure, [(f"a {unit}", _USER), ("mean, 95 % interval", _MEAN)])
     return figure
@@ -53,7 +66,8 @@ def draw_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participa
 def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant") -> Figure:
     """Returns the figure of completion times of which some are longer than the limit.
 
-    Points are the medians of every unit and condition; open ones on the line of the limit were not reached.
+    Points are the medians of every unit and condition; open ones on the line of the limit were
+    not reached.
 
     Args:
         rows: as of `completion_times`.
@@ -68,13 +82,23 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
             places = [n for n, each in enumerate(medians.values()) if one in each]
             times_s = [list(medians.values())[n][one] for n in places]
             axes.plot(places, [min(time_s, limit_s) for time_s in times_s], **_USER)
-            _plot_censored(axes, places, times_s, limit_s, _USER)
+            _plot_censored(
+                axes=axes, places=places, times_s=times_s, limit_s=limit_s, look=_USER
+            )
         for n, time in enumerate(summarise_times(rows, limit_s, unit=unit)):
             low, high = time.interval or (None, None)
             if low is not None:
-                axes.plot([n, n], [low, limit_s if high is None else high], **{**_MEAN, "marker": "_"})
+                axes.plot(
+                    [n, n], [low, limit_s if high is None else high], **{**_MEAN, "marker": "_"}
+                )
             axes.plot([n], [limit_s if time.median is None else time.median], zorder=3, **_MEAN)
-            _plot_censored(axes, [n], [math.inf if time.median is None else time.median], limit_s, _MEAN)
+            _plot_censored(
+                axes=axes,
+                places=[n],
+                times_s=[math.inf if time.median is None else time.median],
+                limit_s=limit_s,
+                look=_MEAN,
+            )
         labels = [f"{name}\nn = {len(each)}" for name, each in medians.items()]
         axes.set_xticks(range(len(medians)), labels)
         axes.set_xlim(-0.4, len(medians) - 0.6)
@@ -88,17 +112,31 @@ def draw_times(rows: Sequence[Row], limit_s: float, *, unit: str = "participant"
 
 
 def _plot_censored(
-    axes: Axes, places: Sequence[float], times_s: Sequence[float], limit_s: float, look: dict[str, Any]
+    axes: Axes,
+    places: Sequence[float],
+    times_s: Sequence[float],
+    limit_s: float,
+    look: dict[str, Any],
 ) -> None:
     """Draws an open marker on the limit for every time that is longer."""
-    longer = [place for place, time_s in zip(places, times_s, strict=True) if math.isinf(time_s)]
-    marker = {"marker": look["marker"], "markersize": look["markersize"] + 1.0, "linestyle": "none"}
+    longer = [
+        place for place, time_s in zip(places, times_s, strict=True) if math.isinf(time_s)
+    ]
+    marker = {
+        "marker": look["marker"],
+        "markersize": look["markersize"] + 1.0,
+        "linestyle": "none",
+    }
     colours = {"markerfacecolor": "white", "markeredgecolor": look["color"]}
     axes.plot(longer, [limit_s] * len(longer), zorder=4, **marker, **colours)
 
 
 def draw_learning(
-    rows: Sequence[Row], measure: str, *, unit: str = "participant", limit_s: float | None = None
+    rows: Sequence[Row],
+    measure: str,
+    *,
+    unit: str = "participant",
+    limit_s: float | None = None,
 ) -> Figure:
     """Returns the course of a measure over the trials of a block, a line for each condition.
 
@@ -106,8 +144,8 @@ def draw_learning(
         rows: tidy rows, as of `statistics`, with the number of each `trial` in its block.
         measure: its name in the rows.
         unit: "participant" or "pair".
-        limit_s: given of completion times of which some are longer: then medians are drawn, and open markers
-            on the line of the limit were not reached.
+        limit_s: given of completion times of which some are longer: then medians are drawn, and
+            open markers on the line of the limit were not reached.
     """
     if limit_s is not None:
         return _draw_learning_times(rows, limit_s, unit)
@@ -151,7 +189,9 @@ def _draw_learning_times(rows: Sequence[Row], limit_s: float, unit: str) -> Figu
             units = [find_unit_medians(by_trial[trial], unit)[condition] for trial in trials]
             times_s = [find_median(list(each.values())) for each in units]
             axes.plot(trials, [min(time_s, limit_s) for time_s in times_s], **look)
-            _plot_censored(axes, trials, times_s, limit_s, look)
+            _plot_censored(
+                axes=axes, places=trials, times_s=times_s, limit_s=limit_s, look=look
+            )
             shown.append((condition, look))
         axes.set_xlabel("trial of the block")
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -1,11 +1,12 @@
-"""What an experiment found: means by condition, comparisons, a mixed model, figures, a methods paragraph.
+"""What an experiment found: means by condition, comparisons, a mixed model, figures, a methods
+paragraph.
 
 Invariant:
 - It is a function of the journals. Practice and catch trials do not count.
-- A trial that was not completed counts, and its completion time is censored: longer than any (see
-  `completion_times`).
-- Every measure that trials have is summarised, also where all values are equal; every one that is missing
-  somewhere says how often. Every number of a figure or a sentence is in a table.
+- A trial that was not completed counts, and its completion time is censored: longer than any
+  (see `completion_times`).
+- Every measure that trials have is summarised, also where all values are equal; every one that
+  is missing somewhere says how often. Every number of a figure or a sentence is in a table.
 - The methods paragraph describes the analyses that were computed, and no others.
 """
 
@@ -91,14 +92,17 @@ class ExperimentAnalysis(Result):
     """The statistics of an experiment.
 
     Attributes:
-        rows: the trials that count, after a training if there is one; `learning_rows` has all of its phases.
-        throughput_rows, gain_rows, threshold_rows: a row for each participant, or pair, and condition.
-        means: by measure, for each condition; `completion_s` is among them if every trial was completed.
+        rows: the trials that count, after a training if there is one; `learning_rows` has all
+        of its phases. throughput_rows, gain_rows, threshold_rows: a row for each participant,
+        or pair, and condition.
+        means: by measure, for each condition; `completion_s` is among them if every trial was
+            completed.
         comparisons: by measure, of every two conditions.
         times: of a task with a time limit, the completion time for each condition.
         time_comparisons: of every two conditions, if trials were not completed.
         missing_answers: of every questionnaire and condition.
-        absent: measures that this experiment could have and that no trial has a number for, with the reasons.
+        absent: measures that this experiment could have and that no trial has a number for,
+            with the reasons.
         methods: the paragraph of a paper.
         paths: the files that were written.
     """
@@ -123,7 +127,9 @@ class ExperimentAnalysis(Result):
             raise UsageError(f"{experiment.folder}: no trial that counts is done yet")
         self.throughput_rows = list(self._find_throughput())
         self.gain_rows = list(self._find_gains())
-        self.threshold_rows = sorted(self._find_thresholds(), key=lambda row: order(row["condition"]))
+        self.threshold_rows = sorted(
+            self._find_thresholds(), key=lambda row: order(row["condition"])
+        )
         scores = sorted(experiment.list_scores(), key=lambda row: order(row["condition"]))
         self._scores = [row for row in scores if row[self.unit] not in exclude]
         forms = [form.name for form in protocol.questionnaires if form.after == "block"]
@@ -169,7 +175,9 @@ class ExperimentAnalysis(Result):
                 absent[name] = "every questionnaire lacks an answer"
         is_reaching = self._experiment.plan.protocol.task.words.startswith("reaching")
         if is_reaching and not self.throughput_rows:
-            absent["throughput_bits_s"] = f"no {self.unit} has enough completed trials under a condition"
+            absent["throughput_bits_s"] = (
+                f"no {self.unit} has enough completed trials under a condition"
+            )
         return absent
 
     def _count_missing_answers(self) -> Iterator[MissingAnswers]:
@@ -197,11 +205,19 @@ class ExperimentAnalysis(Result):
 
     def of(self, measure: str) -> Sequence[Row]:
         """Returns the rows that have a measure."""
-        found = {"throughput": self.throughput_rows, "gain": self.gain_rows, "threshold": self.threshold_rows}
+        found = {
+            "throughput": self.throughput_rows,
+            "gain": self.gain_rows,
+            "threshold": self.threshold_rows,
+        }
         kind, named, _ = measure.partition("_")
         if named and kind in found:
             return found[kind]
-        return self.rows if measure in MEASURES else [row for row in self._scores if measure in row]
+        return (
+            self.rows
+            if measure in MEASURES
+            else [row for row in self._scores if measure in row]
+        )
 
     def _find_throughput(self) -> Iterator[dict[str, Any]]:
         """Yields the throughput of each participant and condition, where the task is to reach."""
@@ -210,17 +226,28 @@ class ExperimentAnalysis(Result):
             by.setdefault((row[self.unit], row["condition"]), []).append(row)
         for (who, condition), rows in by.items():
             done = [row for row in rows if row["succeeded"]]
-            if self._experiment.plan.protocol.task.words.startswith("reaching") and len(done) > 1:
+            if (
+                self._experiment.plan.protocol.task.words.startswith("reaching")
+                and len(done) > 1
+            ):
                 left, aims, ends = (
                     np.array([[row[f"{name}_{axis}_m"] for axis in "xy"] for row in done])
                     for name in ("start", "target", "end")
                 )
-                found = measure_throughput(left, aims, ends, [row["completion_s"] for row in done])
+                found = measure_throughput(
+                    left, aims, ends, [row["completion_s"] for row in done]
+                )
                 if found is not None:
-                    yield {self.unit: who, "condition": condition, "throughput_bits_s": found.bits_s}
+                    yield {
+                        self.unit: who,
+                        "condition": condition,
+                        "throughput_bits_s": found.bits_s,
+                    }
 
     def _find_gains(self) -> Iterator[dict[str, Any]]:
-        """Yields by how much each pair has become better by a training: at once (transfer), and later."""
+        """Yields by how much each pair has become better by a training: at once (transfer), and
+        later.
+        """
         learnt = self._experiment.plan.protocol.task.learnt
         means = dict[str, Any]()
         for phase in ("before", "after", "retention"):
@@ -228,17 +255,28 @@ class ExperimentAnalysis(Result):
                 means[phase] = self._average_learnt(rows, learnt)
         for condition, each in means.pop("before", {}).items():
             for who, before in each.items():
-                of = {phase: found.get(condition, {}).get(who) for phase, found in means.items()}
-                gains = {f"gain_{phase}_{learnt}": before - mean for phase, mean in of.items() if mean}
+                of = {
+                    phase: found.get(condition, {}).get(who) for phase, found in means.items()
+                }
+                gains = {
+                    f"gain_{phase}_{learnt}": before - mean
+                    for phase, mean in of.items()
+                    if mean
+                }
                 yield {self.unit: who, "condition": condition, **gains}
 
     def _is_censored(self, measure: str) -> bool:
         """Whether a measure is the completion time of trials of which some were not completed."""
         has_limit = self._experiment.plan.protocol.task.has_limit
-        return measure == COMPLETION and has_limit and not all(map(is_completed, self.learning_rows))
+        return (
+            measure == COMPLETION
+            and has_limit
+            and not all(map(is_completed, self.learning_rows))
+        )
 
     def _average_learnt(self, rows: Sequence[Row], learnt: str) -> dict[str, dict[str, float]]:
-        """Returns what is learnt by condition and unit: means, or medians of times that may be censored.
+        """Returns what is learnt by condition and unit: means, or medians of times that may be
+        censored.
 
         A median that is longer than the limit is left out.
         """
@@ -251,7 +289,9 @@ class ExperimentAnalysis(Result):
         }
 
     def _find_thresholds(self) -> Iterator[dict[str, Any]]:
-        """Yields the threshold of each participant and condition, of a staircase that turned often enough."""
+        """Yields the threshold of each participant and condition, of a staircase that turned
+        often enough.
+        """
         plan = self._experiment.plan
         choices = self._experiment.list_choices()
         if (stairs := plan.protocol.staircase) is None:
@@ -267,7 +307,8 @@ class ExperimentAnalysis(Result):
         scenario = next(iter(plan.scenarios.values()))
         who = dict.fromkeys(row[self.unit] for row in self.rows)
         rows_of = {
-            name: [row for row in self.rows if row["condition"] == name] for name in protocol.conditions
+            name: [row for row in self.rows if row["condition"] == name]
+            for name in protocol.conditions
         }
         delays = {
             name: {"delay_ms": round(float(np.mean([row["delay_ms"] for row in rows])), 1)}
@@ -275,11 +316,14 @@ class ExperimentAnalysis(Result):
             if rows
         }
         control = msgspec.to_builtins(scenario.sites[protocol.users[0]].control)
-        reasons = ", ".join(f"{name}: {why}" if why else name for name, why in self._exclude.items())
+        reasons = ", ".join(
+            f"{name}: {why}" if why else name for name, why in self._exclude.items()
+        )
         facts: dict[str, Any] = {  # "": there is nothing to say of it
             "participants": len(who) * len(protocol.users),
             "pairs": len(who) if self.unit == "pair" else "",
-            "excluded": len(protocol.groups) * len(protocol.users) - len(who) * len(protocol.users),
+            "excluded": len(protocol.groups) * len(protocol.users)
+            - len(who) * len(protocol.users),
             "exclusions": reasons,
             "training": protocol.training.describe() if protocol.training else "",
             "staircase": protocol.staircase.describe() if protocol.staircase else "",
@@ -347,7 +391,9 @@ class ExperimentAnalysis(Result):
         )
 
     def write(self, folder: Path) -> "ExperimentAnalysis":
-        """Writes tables, figures, the paragraph and all as JSON into a folder; `paths` names them."""
+        """Writes tables, figures, the paragraph and all as JSON into a folder; `paths` names
+        them.
+        """
         made = make_folder(folder)
         tables = {
             "conditions.csv": self._list_means(),
@@ -358,20 +404,27 @@ class ExperimentAnalysis(Result):
         }
         optional = ("completion_times.csv", "completion_comparisons.csv", "missing_answers.csv")
         tables = {name: rows for name, rows in tables.items() if rows or name not in optional}
-        texts = {name: encode_csv([dict(_flatten(row)) for row in rows]) for name, rows in tables.items()}
+        texts = {
+            name: encode_csv([dict(_flatten(row)) for row in rows])
+            for name, rows in tables.items()
+        }
         whole = json.dumps(self.to_dict(), indent=1)
         texts |= {"methods.txt": f"{self.methods}\n", "analysis.json": f"{whole}\n"}
         for name, text in texts.items():
             write_whole(made / name, text, force=True)
         self.paths = [made / name for name in texts]
-        figures = {name: draw_conditions(self.of(name), name, unit=self.unit) for name in self.means}
+        figures = {
+            name: draw_conditions(self.of(name), name, unit=self.unit) for name in self.means
+        }
         if self.time_comparisons:
             figures[COMPLETION] = draw_times(self.rows, self._limit_s, unit=self.unit)
         if len({row["trial"] for row in self.learning_rows}) > 1:
             protocol = self._experiment.plan.protocol
             learnt = "difference" if protocol.staircase else protocol.task.learnt
             limit_s = self._limit_s if self._is_censored(learnt) else None
-            figures["learning"] = draw_learning(self.learning_rows, learnt, unit=self.unit, limit_s=limit_s)
+            figures["learning"] = draw_learning(
+                self.learning_rows, learnt, unit=self.unit, limit_s=limit_s
+            )
         page = made / "report.md"
         write_whole(page, self.compose_page(list(figures)), force=True)
         self.paths.append(page)
@@ -389,13 +442,17 @@ class ExperimentAnalysis(Result):
         protocol = self._experiment.plan.protocol
         parts = [f"# {protocol.title or protocol.name}"]
         for block in compose(self):
-            text = block.markdown() if isinstance(block, TextTable) else "\n".join(block.lines())
+            text = (
+                block.markdown() if isinstance(block, TextTable) else "\n".join(block.lines())
+            )
             parts += [text] if text.strip() else []
         parts += [f"![{name}]({name}.png)" for name in figures]
         return "\n\n".join(parts) + "\n"
 
     def fit_models(self) -> Iterator[MixedModel]:
-        """Yields mixed models of the forces of users within pairs, where statsmodels is installed."""
+        """Yields mixed models of the forces of users within pairs, where statsmodels is
+        installed.
+        """
         pairs = {row[self.unit] for row in self.rows}
         if self.unit == "participant" or len(pairs) < 2 or find_spec("statsmodels") is None:
             return
@@ -409,7 +466,11 @@ class ExperimentAnalysis(Result):
                 yield fit_mixed_model(rows, measure + "_n")
 
     def _list_means(self) -> list[dict[str, Any]]:
-        return [{"measure": name, **one._asdict()} for name, means in self.means.items() for one in means]
+        return [
+            {"measure": name, **one._asdict()}
+            for name, means in self.means.items()
+            for one in means
+        ]
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row for each comparison."""
@@ -417,7 +478,10 @@ class ExperimentAnalysis(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns it as `trilat experiment analyse --json`."""
-        facts = {"name": self._experiment.plan.protocol.name, "digest": self._experiment.plan.digest}
+        facts = {
+            "name": self._experiment.plan.protocol.name,
+            "digest": self._experiment.plan.digest,
+        }
         models = {model.measure: model._asdict() for model in self.models}
         for model in models.values():
             model["effects"] = [effect._asdict() for effect in model["effects"]]
@@ -448,13 +512,17 @@ class ExperimentAnalysis(Result):
         for one in self.missing_answers:
             under = f", {one.condition}" if one.condition else ""
             without = (
-                (f"; {one.unscored} of {one.forms} have no score for that reason") if one.missing else ""
+                (f"; {one.unscored} of {one.forms} have no score for that reason")
+                if one.missing
+                else ""
             )
             yield (
                 f"{one.questionnaire}{under}: {one.missing} of "
                 f"{count_nouns(one.asked, 'answer is', 'answers are')} missing{without}"
             )
-        yield from (f"{name}: no number, because {reason}" for name, reason in self.absent.items())
+        yield from (
+            f"{name}: no number, because {reason}" for name, reason in self.absent.items()
+        )
         if self.missing_answers or self.absent:
             yield ""
         yield self.methods
@@ -510,7 +578,9 @@ class ExperimentAnalysis(Result):
                 )
                 for one in means
             ]
-            yield TextTable(("condition", "n", "missing", "mean", "interval"), rows, align="lrrrl")
+            yield TextTable(
+                ("condition", "n", "missing", "mean", "interval"), rows, align="lrrrl"
+            )
             yield ""
             found = [
                 (
@@ -563,7 +633,8 @@ def analyse_experiment(
     *,
     exclude: Mapping[str, str] = {},
 ) -> ExperimentAnalysis:
-    """Returns the statistics of an experiment, written into its folder; `trilat experiment analyse`.
+    """Returns the statistics of an experiment, written into its folder; `trilat experiment
+    analyse`.
 
     >>> found = tn.analyse_experiment("runs/experiment-reaching-001")  # doctest: +SKIP
     >>> found.means["completion_s"][0].interval  # doctest: +SKIP
@@ -575,7 +646,8 @@ def analyse_experiment(
         exclude: participants or pairs whose data do not count, with the reasons.
 
     Raises:
-        UsageError: there is no experiment, no trial is done, or nobody is called what is excluded.
+        UsageError: there is no experiment, no trial is done, or nobody is called what is
+            excluded.
     """
     experiment = open_experiment(folder)
     return ExperimentAnalysis(experiment, exclude).write(
@@ -597,18 +669,24 @@ class PowerOfExperiment(Result):
     def __init__(self, d_z: float, participants: int | None, seed: int) -> None:
         self.d_z = d_z
         self.participants = participants
-        self.least = {wanted: find_least_number(d_z, wanted=wanted) for wanted in (0.8, 0.9, 0.95)}
+        self.least = {
+            wanted: find_least_number(d_z, wanted=wanted) for wanted in (0.8, 0.9, 0.95)
+        }
         self.power = self.simulated = None
         if participants is not None:
             means = {"first": 0.0, "second": d_z}
             deviation = 0.5**0.5
             self.power = power(d_z, participants)
-            (self.simulated,) = simulate_power(means, participants, trial_deviation=deviation, seed=seed)
+            (self.simulated,) = simulate_power(
+                means, participants, trial_deviation=deviation, seed=seed
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Returns it as `trilat experiment power --json`."""
         drawn = None if self.simulated is None else self.simulated._asdict()
-        least = [{"power": wanted, "participants": number} for wanted, number in self.least.items()]
+        least = [
+            {"power": wanted, "participants": number} for wanted, number in self.least.items()
+        ]
         return {
             "d_z": self.d_z,
             "least": least,
@@ -621,7 +699,9 @@ class PowerOfExperiment(Result):
         """Yields its text."""
         yield f"paired comparison of two conditions, two-sided, alpha 0.05, effect d_z {self.d_z:g}"
         yield TextTable(
-            ("power", "participants"), [(f"{p:g}", str(n)) for p, n in self.least.items()], align="rr"
+            ("power", "participants"),
+            [(f"{p:g}", str(n)) for p, n in self.least.items()],
+            align="rr",
         )
         if self.power is not None and self.simulated is not None:
             drawn = f"{self.simulated.found:.3f} {_span(self.simulated.interval)} of 500 drawn experiments"
@@ -640,7 +720,8 @@ def compute_experiment_power(
     34
 
     Args:
-        effect: mean over standard deviation of the differences within participants, Cohen's d_z.
+        effect: mean over standard deviation of the differences within participants, Cohen's
+            d_z.
         participants: how many there are to be, of whom the power is told and simulated.
         seed: of the experiments that are drawn.
 

@@ -1,8 +1,9 @@
 """An experiment in its folder: a verified log for each trial, journals, and tables in the end.
 
-Invariant: a folder belongs to one plan, by its digest. A trial in the journal is never made again, and
-one that was interrupted is made anew, whole: nothing is there twice and nothing is lost, wherever it was
-killed. The tables are a function of the journals. People and synthetic participants never share a folder.
+Invariant: a folder belongs to one plan, by its digest. A trial in the journal is never made
+again, and one that was interrupted is made anew, whole: nothing is there twice and nothing is
+lost, wherever it was killed. The tables are a function of the journals. People and synthetic
+participants never share a folder.
 """
 
 import json
@@ -88,15 +89,22 @@ class Experiment(Result):
         self._remedy = build_resume_hint("experiment", "run", str(folder))
 
     def open_trials(self, *, people: bool | None = None) -> RunJournal[TrialEntry]:
-        """Opens the journal of trials, to read it or to go on with people or synthetic participants.
+        """Opens the journal of trials, to read it or to go on with people or synthetic
+        participants.
 
         Raises:
             UsageError: its trials are of the others.
         """
-        if people is not None and any(one.people != people for one in self.read_entries().values()):
+        if people is not None and any(
+            one.people != people for one in self.read_entries().values()
+        ):
             whose = "synthetic participants: go on without" if people else "people: go on with"
-            raise UsageError(f"{self.folder}: its trials are of {whose} --live, or begin another experiment")
-        return RunJournal(self.folder / JOURNAL_FILE, self.plan.digest, TrialEntry, self._remedy)
+            raise UsageError(
+                f"{self.folder}: its trials are of {whose} --live, or begin another experiment"
+            )
+        return RunJournal(
+            self.folder / JOURNAL_FILE, self.plan.digest, TrialEntry, self._remedy
+        )
 
     def open_notes(self) -> RunJournal[Note]:
         """Opens the journal of consents, answers and aborted trials."""
@@ -134,7 +142,9 @@ class Experiment(Result):
                 choice = stairs.draw_choice(stairs.list_differences(right)[-1], more, last.seed)
                 chosen[last.number] = choice
                 answers: dict[str, float | None] = {CHOICE: choice}
-                notes.add(Note(f"{step.key} {who}", step.kind, who, last.number, 0.0, CHOICE, answers))
+                notes.add(
+                    Note(f"{step.key} {who}", step.kind, who, last.number, 0.0, CHOICE, answers)
+                )
 
     def status(self) -> ExperimentStatus:
         """Returns how far it is."""
@@ -155,7 +165,8 @@ class Experiment(Result):
             done = {entry.cell for entry in journal.done.values()}
             left = [one for one in plan.trials if one.number not in done]
             tasks = [
-                (plan.protocol, plan.find_scenario(one, choices).text, one, plan.digest, logs) for one in left
+                (plan.protocol, plan.find_scenario(one, choices).text, one, plan.digest, logs)
+                for one in left
             ]
             with open_worker_pool(jobs, on, most=len(tasks) or 1, hint=self._remedy) as pool:
                 journal.complete(pool, run_trial, tasks, len(done), len(plan.trials), show)
@@ -195,15 +206,24 @@ class Experiment(Result):
         return {"difference": difference, "right": None if right is None else int(right)}
 
     def list_answers(self) -> list[dict[str, Any]]:
-        """Returns a row for each item that somebody was asked; the value of a missing answer is None."""
+        """Returns a row for each item that somebody was asked; the value of a missing answer is
+        None.
+        """
         return [
-            {**row, "questionnaire": note.text, "item": item, "value": value, "unix_s": note.unix_s}
+            {
+                **row,
+                "questionnaire": note.text,
+                "item": item,
+                "value": value,
+                "unix_s": note.unix_s,
+            }
             for row, note in self._list_answered()
             for item, value in note.answers.items()
         ]
 
     def list_scores(self) -> list[dict[str, Any]]:
-        """Returns a row for each questionnaire that somebody was asked, with its score by its name.
+        """Returns a row for each questionnaire that somebody was asked, with its score by its
+        name.
 
         The score is None if an answer is missing.
         """
@@ -216,17 +236,24 @@ class Experiment(Result):
 
     def _list_answered(self) -> Iterator[tuple[dict[str, Any], Note]]:
         """Yields whose answers of which block there are, and these."""
-        of = {(one.group, one.block): one.condition for one in self.plan.trials if not one.catch}
+        of = {
+            (one.group, one.block): one.condition for one in self.plan.trials if not one.catch
+        }
         for note in self.read_notes():
             last = self.plan.trials[note.number - 1]
             row = {self.unit: "-".join(last.group), "participant": note.who}
             if note.answers:
-                yield {**row, "condition": of[last.group, last.block], "block": last.block}, note
+                yield (
+                    {**row, "condition": of[last.group, last.block], "block": last.block},
+                    note,
+                )
 
     def write_tables(self) -> Path:
-        """Writes trials.csv, tidy: a row for each trial, with the digest of its log; returns its path.
+        """Writes trials.csv, tidy: a row for each trial, with the digest of its log; returns
+        its path.
 
-        With people also questionnaires.csv, and events.csv: who agreed, and which trials were aborted.
+        With people also questionnaires.csv, and events.csv: who agreed, and which trials were
+        aborted.
         """
         happened = [
             {
@@ -241,7 +268,9 @@ class Experiment(Result):
         tables = {"questionnaires.csv": self.list_answers(), "events.csv": happened}
         for name, rows in {TRIALS_FILE: self.to_rows(), **tables}.items():
             if rows or name == TRIALS_FILE:
-                write_whole(self.folder / name, encode_csv(rows), force=True, remedy=self._remedy)
+                write_whole(
+                    self.folder / name, encode_csv(rows), force=True, remedy=self._remedy
+                )
         return self.folder / TRIALS_FILE
 
     def to_dict(self) -> dict[str, Any]:
@@ -261,8 +290,8 @@ class Experiment(Result):
     def blocks(self) -> Iterator[Block]:
         """Yields its text: a row for each condition.
 
-        A trial that was not completed has no completion time: of those there is a median, in which it counts
-        as longer than any.
+        A trial that was not completed has no completion time: of those there is a median, in
+        which it counts as longer than any.
         """
         status = self.status()
         rows = [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
@@ -300,7 +329,8 @@ _SHOWN = ("error_end_mm", "error_rms_mm", "path_m", "sparc")
 
 
 def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False) -> Path:
-    """Writes a protocol with comments, which runs as it is; the command is `trilat experiment new`.
+    """Writes a protocol with comments, which runs as it is; the command is `trilat experiment
+    new`.
 
     >>> tn.new_experiment("reaching.toml").name
     'reaching.toml'
@@ -313,13 +343,18 @@ def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False)
     Raises:
         UsageError: the file exists.
     """
-    template = resources.files("trilat_net") / "scenarios" / f"_experiment{'_pair' if pair else ''}.txt"
+    template = (
+        resources.files("trilat_net")
+        / "scenarios"
+        / f"_experiment{'_pair' if pair else ''}.txt"
+    )
     write_whole(Path(file), template.read_text(encoding="utf-8"), force=force)
     return Path(file)
 
 
 def check_experiment(file: str | Path) -> ExperimentPlan:
-    """Returns the plan of a protocol, if it can be carried out; the command is `trilat experiment check`.
+    """Returns the plan of a protocol, if it can be carried out; the command is `trilat
+    experiment check`.
 
     >>> len(tn.check_experiment(tn.new_experiment("reaching.toml")).trials)
     240
@@ -346,7 +381,8 @@ def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experim
 
 
 def open_experiment(folder: str | Path) -> Experiment:
-    """Returns the experiment of a folder, as it was planned; the command is `trilat experiment status`.
+    """Returns the experiment of a folder, as it was planned; the command is `trilat experiment
+    status`.
 
     >>> tn.open_experiment("runs/experiment-reaching-001").status().done  # doctest: +SKIP
     240
@@ -358,12 +394,18 @@ def open_experiment(folder: str | Path) -> Experiment:
     try:
         facts = json.loads((path / PLAN_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
-        raise UsageError(f"{path}: holds no experiment; `trilat experiment run FILE` begins one") from None
-    scenarios = {name: parse_scenario(text, str(path)) for name, text in facts["scenarios"].items()}
+        raise UsageError(
+            f"{path}: holds no experiment; `trilat experiment run FILE` begins one"
+        ) from None
+    scenarios = {
+        name: parse_scenario(text, str(path)) for name, text in facts["scenarios"].items()
+    }
     protocol = read_protocol(path / PROTOCOL_FILE)
     plan = plan_experiment(protocol, scenarios=scenarios)
     if plan.digest != facts["digest"]:
-        raise UsageError(f"{path}: its protocol was changed after it began: begin another experiment")
+        raise UsageError(
+            f"{path}: its protocol was changed after it began: begin another experiment"
+        )
     return Experiment(path, plan)
 
 
@@ -377,7 +419,8 @@ def run_experiment(
 ) -> Experiment:
     """Runs an experiment with synthetic participants; the command is `trilat experiment run`.
 
-    >>> done = tn.run_experiment(tn.new_experiment("reaching.toml"), "reaching")  # doctest: +SKIP
+    >>> done = tn.run_experiment(tn.new_experiment("reaching.toml"), "reaching")  # doctest:
+    +SKIP
     >>> done.to_frame().groupby("condition").completion_s.mean()  # doctest: +SKIP
 
     Args:

@@ -1,8 +1,10 @@
-"""Measures of people's trials: smoothness, path, force, energy, throughput, forces of a pair, questionnaires.
+"""Measures of people's trials: smoothness, path, force, energy, throughput, forces of a pair,
+questionnaires.
 
-Invariant: a measure is a function of its samples alone. What samples cannot tell (the smoothness of an arm
-that rests, the width of end points that do not spread) is None; arrays that do not belong together and
-answers outside of their scale are errors. Numbers are in SI units; samples are evenly spaced, one a row.
+Invariant: a measure is a function of its samples alone. What samples cannot tell (the
+smoothness of an arm that rests, the width of end points that do not spread) is None; arrays
+that do not belong together and answers outside of their scale are errors. Numbers are in SI
+units; samples are evenly spaced, one a row.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +27,9 @@ def _read(name: str, values: ArrayLike, dimensions: int) -> Array:
         shape = "(K,), a number" if dimensions == 1 else "(K, D), a row"
         raise UsageError(f"{name}: shape {read.shape}; give {shape} per sample")
     if not np.isfinite(read).all():
-        raise UsageError(f"{name}: a sample is not a finite number; leave out what was not measured")
+        raise UsageError(
+            f"{name}: a sample is not a finite number; leave out what was not measured"
+        )
     return read
 
 
@@ -33,7 +37,9 @@ def _read_alike(**values: ArrayLike) -> list[Array]:
     """Returns several rows of samples that belong together, each of shape (K, D)."""
     read = [_read(name, value, 2) for name, value in values.items()]
     if len({one.shape for one in read}) > 1:
-        shapes = ", ".join(f"{name} {one.shape}" for name, one in zip(values, read, strict=True))
+        shapes = ", ".join(
+            f"{name} {one.shape}" for name, one in zip(values, read, strict=True)
+        )
         raise UsageError(f"{shapes}: give as many samples and axes of each")
     return read
 
@@ -46,9 +52,15 @@ def _integrate(values: Array, rate_hz: float) -> float:
 
 
 def sparc(
-    speed: ArrayLike, rate_hz: float, *, padding: int = 4, cutoff_hz: float = 10.0, threshold: float = 0.05
+    speed: ArrayLike,
+    rate_hz: float,
+    *,
+    padding: int = 4,
+    cutoff_hz: float = 10.0,
+    threshold: float = 0.05,
 ) -> float | None:
-    """Returns the spectral arc length of a movement, which is smoother the nearer it is to 0; None at rest.
+    """Returns the spectral arc length of a movement, which is smoother the nearer it is to 0;
+    None at rest.
 
     Args:
         speed: m/s or rad/s, shape (K,), of one movement from its begin to its end.
@@ -57,8 +69,8 @@ def sparc(
         cutoff_hz: frequencies above count as noise.
         threshold: share of the largest magnitude below which the spectrum ends.
 
-    Source: Balasubramanian, Melendez-Calderon, Roby-Brami and Burdet, "On the analysis of movement
-    smoothness", J. NeuroEngineering and Rehabilitation 12:112 (2015).
+    Source: Balasubramanian, Melendez-Calderon, Roby-Brami and Burdet, "On the analysis of
+    movement smoothness", J. NeuroEngineering and Rehabilitation 12:112 (2015).
     """
     samples = _read("speed", speed, 1)
     if not samples.any():
@@ -79,8 +91,12 @@ def path_length_m(places: ArrayLike) -> float:
     return float(np.linalg.norm(np.diff(_read("places", places, 2), axis=0), axis=1).sum())
 
 
-def movement_time_s(speed: ArrayLike, rate_hz: float, *, share: float = ONSET_SHARE) -> float | None:
-    """Returns the time for which speed is at or above a share of its peak, first to last; None at rest."""
+def movement_time_s(
+    speed: ArrayLike, rate_hz: float, *, share: float = ONSET_SHARE
+) -> float | None:
+    """Returns the time for which speed is at or above a share of its peak, first to last; None
+    at rest.
+    """
     samples = np.abs(_read("speed", speed, 1))
     if not samples.any():
         return None
@@ -110,7 +126,8 @@ class Throughput(NamedTuple):
     """What a sequence of movements to targets of one distance and width came to.
 
     Args:
-        width_m: effective width, 4.133 standard deviations of the end points along the axis of the task.
+        width_m: effective width, 4.133 standard deviations of the end points along the axis of
+            the task.
         distance_m: effective distance, the mean of what was moved along that axis.
         difficulty_bits: log2(distance / width + 1).
         time_s: mean movement time.
@@ -128,20 +145,27 @@ class Throughput(NamedTuple):
 
 
 def measure_throughput(
-    starts: ArrayLike, targets: ArrayLike, ends: ArrayLike, times_s: ArrayLike, *, serial: bool = False
+    starts: ArrayLike,
+    targets: ArrayLike,
+    ends: ArrayLike,
+    times_s: ArrayLike,
+    *,
+    serial: bool = False,
 ) -> Throughput | None:
-    """Returns the throughput of movements under one condition of a user; None if end points do not spread.
+    """Returns the throughput of movements under one condition of a user; None if end points do
+    not spread.
 
     Args:
         starts: centres of the targets that are left, m, shape (K, D).
         targets: centres of the targets to reach, of the same shape.
         ends: where each movement ended, of the same shape.
         times_s: how long each took, shape (K,).
-        serial: each movement begins where the last one ended, as around a ring: what that one went beyond its
-            target is moved as well.
+        serial: each movement begins where the last one ended, as around a ring: what that one
+            went beyond its target is moved as well.
 
-    Source: ISO/TS 9241-411 (2012); Soukoreff and MacKenzie, "Towards a standard for pointing device
-    evaluation", Int. J. Human-Computer Studies 61 (2004). As MacKenzie's class `Throughput` computes it.
+    Source: ISO/TS 9241-411 (2012); Soukoreff and MacKenzie, "Towards a standard for pointing
+    device evaluation", Int. J. Human-Computer Studies 61 (2004). As MacKenzie's class
+    `Throughput` computes it.
     """
     left, aims, reached = _read_alike(starts=starts, targets=targets, ends=ends)
     times = _read("times_s", times_s, 1)
@@ -158,18 +182,22 @@ def measure_throughput(
     distance = float(moved.mean())
     if width <= 1e-12 * float(lengths.max()) or distance <= 0.0:
         return None
-    return Throughput(width, distance, float(np.log2(distance / width + 1.0)), float(times.mean()))
+    return Throughput(
+        width, distance, float(np.log2(distance / width + 1.0)), float(times.mean())
+    )
 
 
 # --- a pair ----------------------------------------------------------------------------------------------
 
 
 def find_internal_force(first: ArrayLike, second: ArrayLike) -> Array:
-    """Returns what cancels of two users' forces on an object, N, shape (K, D): as force of the first user.
+    """Returns what cancels of two users' forces on an object, N, shape (K, D): as force of the
+    first user.
 
-    Where the signs of an axis differ the smaller force cancels as much of the larger one; the second is
-    its negative. `internal_rms_n` of docs/metrics.md is its RMS. Source: Groten, Feth, Goshy, Peer, Kenny and
-    Buss, "Experimental analysis of dominance in haptic collaboration", IEEE RO-MAN (2009).
+    Where the signs of an axis differ the smaller force cancels as much of the larger one; the
+    second is its negative. `internal_rms_n` of docs/metrics.md is its RMS. Source: Groten,
+    Feth, Goshy, Peer, Kenny and Buss, "Experimental analysis of dominance in haptic
+    collaboration", IEEE RO-MAN (2009).
     """
     one, other = _read_alike(first=first, second=second)
     opposed = np.sign(one) * np.sign(other) < 0.0
@@ -184,10 +212,12 @@ class PairMeasures(NamedTuple):
         internal_rms_n: RMS force that cancels, of all axes and samples.
         useful_rms_n: RMS of the force that moves the object.
         internal_share: part of the forces that cancels, 0 to 1; None if nobody pushes.
-        first_effort_share: part of the first user in the integral of the squared forces; None likewise.
+        first_effort_share: part of the first user in the integral of the squared forces; None
+            likewise.
         first_work_j: work of the first user on the object.
         second_work_j: work of the second.
-        first_taken_j: what the first user took from the object: the integral of its negative power.
+        first_taken_j: what the first user took from the object: the integral of its negative
+            power.
         second_taken_j: the same of the second.
     """
 
@@ -201,7 +231,9 @@ class PairMeasures(NamedTuple):
     second_taken_j: float
 
 
-def measure_pair(first: ArrayLike, second: ArrayLike, velocity: ArrayLike, rate_hz: float) -> PairMeasures:
+def measure_pair(
+    first: ArrayLike, second: ArrayLike, velocity: ArrayLike, rate_hz: float
+) -> PairMeasures:
     """Returns what two users do to one object.
 
     Args:
@@ -247,8 +279,8 @@ def _rate_tlx(ratings: Mapping[str, float]) -> list[float]:
 def raw_tlx(ratings: Mapping[str, float]) -> float:
     """Returns the mean of six ratings from 0 to 100, by scale: the raw NASA-TLX.
 
-    Source: Hart, "NASA-Task Load Index (NASA-TLX); 20 years later", Proc. Human Factors and Ergonomics
-    Society 50 (2006).
+    Source: Hart, "NASA-Task Load Index (NASA-TLX); 20 years later", Proc. Human Factors and
+    Ergonomics Society 50 (2006).
     """
     return float(np.mean(_rate_tlx(ratings)))
 
@@ -258,14 +290,20 @@ def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> fl
 
     A weight is how often its scale was chosen in the 15 comparisons of two scales.
 
-    Source: Hart and Staveland, "Development of NASA-TLX (Task Load Index): results of empirical and
-    theoretical research", Advances in Psychology 52 (1988).
+    Source: Hart and Staveland, "Development of NASA-TLX (Task Load Index): results of empirical
+    and theoretical research", Advances in Psychology 52 (1988).
     """
     rated = _rate_tlx(ratings)
     given = [weights.get(scale, -1) for scale in TLX_SCALES]
     sums = np.cumsum(sorted(given))
-    fewest = [n * (n - 1) // 2 for n in range(1, 7)]  # n scales are compared with each other that often
-    if len(weights) != 6 or any(w != int(w) for w in given) or sums[-1] != 15 or (sums < fewest).any():
+    # n scales are compared with each other that often
+    fewest = [n * (n - 1) // 2 for n in range(1, 7)]
+    if (
+        len(weights) != 6
+        or any(w != int(w) for w in given)
+        or sums[-1] != 15
+        or (sums < fewest).any()
+    ):
         raise UsageError(
             f"weights {dict(weights)}: give how often each of {', '.join(TLX_SCALES)} was chosen, 0 to 5, in "
             "the 15 comparisons of two"
@@ -274,13 +312,17 @@ def weighted_tlx(ratings: Mapping[str, float], weights: Mapping[str, int]) -> fl
 
 
 def sus_score(answers: Sequence[int]) -> float:
-    """Returns the score, 0 to 100, of ten answers from 1 (strongly disagree) to 5, by order of the questions.
+    """Returns the score, 0 to 100, of ten answers from 1 (strongly disagree) to 5, by order of
+    the questions.
 
-    Source: Brooke, "SUS: a quick and dirty usability scale", Usability Evaluation in Industry (1996).
+    Source: Brooke, "SUS: a quick and dirty usability scale", Usability Evaluation in Industry
+    (1996).
     """
     if len(answers) != 10:
         raise UsageError(f"{count_nouns(len(answers), 'answer')}: SUS has 10 questions")
     for number, answer in enumerate(answers, 1):
         if answer not in (1, 2, 3, 4, 5):
             raise UsageError(f"answer {number} = {answer}: an answer of SUS is 1, 2, 3, 4 or 5")
-    return 2.5 * sum(answer - 1 if n % 2 == 0 else 5 - answer for n, answer in enumerate(answers))
+    return 2.5 * sum(
+        answer - 1 if n % 2 == 0 else 5 - answer for n, answer in enumerate(answers)
+    )

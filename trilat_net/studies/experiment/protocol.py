@@ -1,8 +1,10 @@
-"""The protocol of an experiment with people, from one TOML file, and the trials that follow from it.
+"""The protocol of an experiment with people, from one TOML file, and the trials that follow
+from it.
 
-Invariant: the plan is a function of the protocol. Its digest, over the protocol and the text of the scenario
-of every condition, stands in the log of every trial: what was planned before anybody sat down can be shown
-afterwards. A protocol that cannot be carried out is refused as a whole, with everything that is wrong.
+Invariant: the plan is a function of the protocol. Its digest, over the protocol and the text of
+the scenario of every condition, stands in the log of every trial: what was planned before
+anybody sat down can be shown afterwards. A protocol that cannot be carried out is refused as a
+whole, with everything that is wrong.
 """
 
 import hashlib
@@ -34,12 +36,19 @@ Pseudonym = Annotated[str, Meta(pattern=r"^[A-Za-z0-9_]{1,20}\Z")]
 Count = Annotated[int, Meta(ge=1, le=1000)]
 Counted = Annotated[int, Meta(ge=0, le=1000)]
 Feedback = Literal[
-    "completion_s", "movement_s", "reaction_s", "error_end_mm", "error_rms_mm", "path_m", "wall_force_n"
+    "completion_s",
+    "movement_s",
+    "reaction_s",
+    "error_end_mm",
+    "error_rms_mm",
+    "path_m",
+    "wall_force_n",
 ]
 
 
 class CatchTrials(Frozen, frozen=True):
-    """Trials of another condition among those of a block, so that nobody learns what to expect of it.
+    """Trials of another condition among those of a block, so that nobody learns what to expect
+    of it.
 
     Attributes:
         condition: which.
@@ -54,7 +63,8 @@ class Training(Frozen, frozen=True):
     """Authority that moves from the first user, an expert, to the second one, who learns.
 
     Attributes:
-        lead: by condition the expert's part of what both share at the slave, in the first and last trial.
+        lead: by condition the expert's part of what both share at the slave, in the first and
+            last trial.
         before: trials of a block before that, which the second user makes alone.
         after: trials alone right afterwards: what was learned.
         retention: trials alone later, after a rest: what is left of it.
@@ -69,7 +79,9 @@ class Training(Frozen, frozen=True):
 
     def describe(self) -> str:
         """Returns it in a sentence of a methods paragraph."""
-        parts = ", ".join(f"{first:g} to {last:g} ({name})" for name, (first, last) in self.lead.items())
+        parts = ", ".join(
+            f"{first:g} to {last:g} ({name})" for name, (first, last) in self.lead.items()
+        )
         later = f", and {self.retention} more after {self.rest_s:g} s" if self.retention else ""
         return (
             f"In these the expert's part of the authority went from {parts}; "
@@ -87,10 +99,12 @@ class Protocol(Frozen, frozen=True):
         scenario: name or path of the scenario that all conditions are made of.
         users: the sites that participants hold; two of them are held by a pair.
         participants: how many, or their pseudonyms.
-        design: how the order of conditions is balanced over participants, see `order_conditions`.
+        design: how the order of conditions is balanced over participants, see
+            `order_conditions`.
         trials: trials of a block that count; a block is all trials of one condition.
         practice: trials before those, which do not.
-        foreperiod_s: range of the time from the begin of a trial until its target appears, s; drawn evenly.
+        foreperiod_s: range of the time from the begin of a trial until its target appears, s;
+            drawn evenly.
         seed: of orders, targets and synthetic participants.
         set: keys of the scenario that are alike in all conditions.
         conditions: the keys of the scenario that each sets, by name.
@@ -100,7 +114,8 @@ class Protocol(Frozen, frozen=True):
         questionnaires: what people answer, and when.
         rest_s: how long people rest at least between two blocks, s.
         feedback: the measures that people are told after a trial.
-        force_limit_n: largest force of the live hands of participants who bear less, N, by pseudonym.
+        force_limit_n: largest force of the live hands of participants who bear less, N, by
+            pseudonym.
         catch: trials of another condition among those of a block; they do not count.
         training: trials in which authority moves from an expert to somebody who learns.
         staircase: pairs of trials by which a key is adapted to what a participant can tell.
@@ -129,10 +144,17 @@ class Protocol(Frozen, frozen=True):
     training: Training | None = None
     staircase: Staircase | None = None
 
-    def list_phases(self, condition: str, random: np.random.Generator) -> list[tuple[str, float | None]]:
-        """Returns phase and first user's part of what two share, of every trial of a block after practice."""
+    def list_phases(
+        self, condition: str, random: np.random.Generator
+    ) -> list[tuple[str, float | None]]:
+        """Returns phase and first user's part of what two share, of every trial of a block
+        after practice.
+        """
         if self.staircase is not None:
-            pairs = [random.permutation([STANDARD, COMPARISON]).tolist() for _ in range(self.trials // 2)]
+            pairs = [
+                random.permutation([STANDARD, COMPARISON]).tolist()
+                for _ in range(self.trials // 2)
+            ]
             return [(phase, None) for phase in itertools.chain(*pairs)]
         if (how := self.training) is None:
             return [("", None)] * self.trials
@@ -167,13 +189,14 @@ class PlannedTrial(NamedTuple):
         trial: its place in the block, from 1; practice comes first.
         practice: whether it does not count.
         before: how many trials the group has made before.
-        target: the number of its target; each block begins at another, which is drawn, so that what the
-            direction of a target does is no learning. Both trials of a pair have one.
+        target: the number of its target; each block begins at another, which is drawn, so that
+            what the direction of a target does is no learning. Both trials of a pair have one.
         seed: of what is drawn in it.
         catch: whether its condition is another than the block's, and it does not count.
-        phase: of a training: "before", "training", "after" or "retention"; of a staircase which trial of its
-            pair it is: "standard" or "comparison".
-        lead: the first user's part of what two users share at the slave; None: as the scenario has it.
+        phase: of a training: "before", "training", "after" or "retention"; of a staircase which
+            trial of its pair it is: "standard" or "comparison".
+        lead: the first user's part of what two users share at the slave; None: as the scenario
+            has it.
     """
 
     number: int
@@ -197,7 +220,9 @@ class PlannedTrial(NamedTuple):
 
 
 Choices = Mapping[int, float]
-"""Which trial, 1 or 2, was chosen of each pair of a staircase so far, by the number of its second trial."""
+"""Which trial, 1 or 2, was chosen of each pair of a staircase so far, by the number of its
+second trial.
+"""
 
 
 class Step(NamedTuple):
@@ -216,7 +241,9 @@ class Step(NamedTuple):
     @property
     def key(self) -> str:
         """What it is called in notes and messages."""
-        return f"{self.kind} {self.planned.number}" + (f" {self.form.name}" if self.form else "")
+        return f"{self.kind} {self.planned.number}" + (
+            f" {self.form.name}" if self.form else ""
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -238,7 +265,12 @@ class ExperimentPlan(Result):
         facts = {"name": protocol.name, "digest": self.digest, "groups": len(protocol.groups)}
         counted = sum(not (one.practice or one.catch) for one in self.trials)
         counts = {"trials": len(self.trials), "counted": counted}
-        return {**facts, **counts, "conditions": list(protocol.conditions), "orders": self.list_orders()}
+        return {
+            **facts,
+            **counts,
+            "conditions": list(protocol.conditions),
+            "orders": self.list_orders(),
+        }
 
     def list_steps(self) -> Iterator[Step]:
         """Yields what people do, in order."""
@@ -252,22 +284,30 @@ class ExperimentPlan(Result):
                 yield Step("questionnaire", planned, stairs.form)
             if planned.trial == self.trials[-1].trial:
                 left = planned.block == len(protocol.conditions)
-                asked = [form for form in protocol.questionnaires if left or form.after == "block"]
+                asked = [
+                    form for form in protocol.questionnaires if left or form.after == "block"
+                ]
                 yield from (Step("questionnaire", planned, find_form(form)) for form in asked)
 
     def judge_choices(self, planned: PlannedTrial, choices: Choices) -> list[bool]:
         """Returns whether each choice of a trial's block is the trial that had more."""
         block = self.trials[planned.number - planned.trial :][: self.trials[-1].trial]
         seconds = [one for one in block if one.number in choices]
-        return [choices[second.number] == 1 + (second.phase == COMPARISON) for second in seconds]
+        return [
+            choices[second.number] == 1 + (second.phase == COMPARISON) for second in seconds
+        ]
 
     def find_pair(self, planned: PlannedTrial, choices: Choices) -> tuple[float, bool | None]:
-        """Returns the difference in a trial's pair, and whether the choice was right; None: it is to come."""
+        """Returns the difference in a trial's pair, and whether the choice was right; None: it
+        is to come.
+        """
         stairs = self.protocol.staircase
         number = (planned.trial - self.protocol.practice - 1) // 2
         assert stairs is not None
         right = self.judge_choices(planned, choices)
-        return stairs.list_differences(right)[number], right[number] if number < len(right) else None
+        return stairs.list_differences(right)[number], right[number] if number < len(
+            right
+        ) else None
 
     def find_scenario(self, planned: PlannedTrial, choices: Choices) -> Scenario:
         """Returns the scenario of a trial, after the choices of its block before it."""
@@ -313,7 +353,8 @@ class ExperimentPlan(Result):
             f"s; design {protocol.design}"
         )
         yield TextTable(
-            ("", "order of conditions"), [(name, ", ".join(one)) for name, one in facts["orders"].items()]
+            ("", "order of conditions"),
+            [(name, ", ".join(one)) for name, one in facts["orders"].items()],
         )
         yield f"sha256 of the plan {self.digest}"
 
@@ -338,9 +379,12 @@ def read_protocol(file: str | Path) -> Protocol:
 
 
 def plan_experiment(
-    protocol: Protocol, folder: Path | None = None, scenarios: Mapping[str, Scenario] | None = None
+    protocol: Protocol,
+    folder: Path | None = None,
+    scenarios: Mapping[str, Scenario] | None = None,
 ) -> ExperimentPlan:
-    """Returns the plan of a protocol; a path of its scenario is from `folder`, or all `scenarios` are given.
+    """Returns the plan of a protocol; a path of its scenario is from `folder`, or all
+    `scenarios` are given.
 
     Raises:
         UsageError: it cannot be carried out; the error names everything that is wrong.
@@ -360,16 +404,22 @@ def plan_experiment(
         raise UsageError(f"{protocol.name}: " + "; ".join(problems))
     texts = {name: scenario.text for name, scenario in found.items()}
     whole = msgspec.json.encode([msgspec.to_builtins(protocol), texts], order="sorted")
-    return ExperimentPlan(protocol, found, list(_list_trials(protocol)), hashlib.sha256(whole).hexdigest())
+    return ExperimentPlan(
+        protocol, found, list(_list_trials(protocol)), hashlib.sha256(whole).hexdigest()
+    )
 
 
 def _list_keys(table: Mapping[str, Any], path: str = "") -> dict[str, Any]:
-    """Returns keys of a scenario, each written out that is of a site, a link or a row of dominance."""
+    """Returns keys of a scenario, each written out that is of a site, a link or a row of
+    dominance.
+    """
     found = dict[str, Any]()
     for name, value in table.items():
         key = f"{path}.{name}" if path else name
         inside = key in ("sites", "links", "dominance") or path in ("sites", "links")
-        found |= _list_keys(value, key) if inside and isinstance(value, Mapping) else {key: value}
+        found |= (
+            _list_keys(value, key) if inside and isinstance(value, Mapping) else {key: value}
+        )
     return found
 
 
@@ -385,9 +435,15 @@ def _find_problems(protocol: Protocol) -> Iterator[str]:
         yield f"force_limit_n: there is no participant {', '.join(sorted(unknown))}"
     if protocol.catch is not None and protocol.catch.condition not in protocol.conditions:
         yield f"catch.condition: there is no condition {protocol.catch.condition}"
-    if protocol.training is not None and protocol.training.lead.keys() != protocol.conditions.keys():
+    if (
+        protocol.training is not None
+        and protocol.training.lead.keys() != protocol.conditions.keys()
+    ):
         yield f"training.lead: is a pair of numbers for each of {', '.join(protocol.conditions)}"
-    if sum(one is not None for one in (protocol.training, protocol.catch, protocol.staircase)) > 1:
+    if (
+        sum(one is not None for one in (protocol.training, protocol.catch, protocol.staircase))
+        > 1
+    ):
         yield "an experiment has one of catch trials, a training and a staircase"
     if protocol.staircase is not None:
         yield from _find_staircase_problems(protocol, protocol.staircase)
@@ -421,7 +477,9 @@ def _find_staircase_problems(protocol: Protocol, stairs: Staircase) -> Iterator[
         yield "staircase: is of one user, who answers"
     if protocol.trials % 2:
         yield f"trials: a staircase is of pairs, their number must be even, is {protocol.trials}"
-    if setting := [name for name, keys in protocol.conditions.items() if stairs.key in _list_keys(keys)]:
+    if setting := [
+        name for name, keys in protocol.conditions.items() if stairs.key in _list_keys(keys)
+    ]:
         yield f"staircase.key: {stairs.key} is set by condition {', '.join(setting)} too"
 
 
@@ -429,7 +487,9 @@ def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
     """Returns the scenario of a condition, if participants can hold its masters."""
     for user in protocol.users:
         if user not in scenario.names:
-            raise ScenarioError(f"has no site {user}; there are {', '.join(scenario.names)}", path="users")
+            raise ScenarioError(
+                f"has no site {user}; there are {', '.join(scenario.names)}", path="users"
+            )
         if scenario.sites[user].find_live_hand(is_open=True) is None:
             raise ScenarioError(
                 "has no live hand, so nobody can hold it: hands = [{ kind = 'live' }]",
@@ -449,14 +509,18 @@ def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
     return scenario
 
 
-def limit_forces(scenario: Scenario, protocol: Protocol, group: Sequence[str]) -> dict[str, Any]:
-    """Returns the users' sites whose live hand is to be weaker than the scenario's, by `force_limit_n`.
+def limit_forces(
+    scenario: Scenario, protocol: Protocol, group: Sequence[str]
+) -> dict[str, Any]:
+    """Returns the users' sites whose live hand is to be weaker than the scenario's, by
+    `force_limit_n`.
 
     Raises:
         ScenarioError: a hand has no such limit, or a lower one already.
     """
     found = {}
-    for user, name in zip(protocol.users, group, strict=False):  # an odd one out is refused by itself
+    # an odd one out is refused by itself
+    for user, name in zip(protocol.users, group, strict=False):
         spec = scenario.sites[user]
         most = protocol.force_limit_n.get(name)
         hand = spec.find_live_hand(is_open=True)
@@ -465,9 +529,12 @@ def limit_forces(scenario: Scenario, protocol: Protocol, group: Sequence[str]) -
         if hand.mode == "joint" or hand.force_limit_n < most:
             has = "none, N" if hand.mode == "joint" else f"{hand.force_limit_n:g} N"
             raise ScenarioError(
-                f"{most:g} N: the live hand at {user} has a limit of {has}", path=f"force_limit_n.{name}"
+                f"{most:g} N: the live hand at {user} has a limit of {has}",
+                path=f"force_limit_n.{name}",
             )
-        limited = tuple(replace(one, force_limit_n=most) if one is hand else one for one in spec.hands)
+        limited = tuple(
+            replace(one, force_limit_n=most) if one is hand else one for one in spec.hands
+        )
         found[user] = replace(spec, hands=limited)
     return found
 
@@ -475,19 +542,25 @@ def limit_forces(scenario: Scenario, protocol: Protocol, group: Sequence[str]) -
 def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple[str, ...]]:
     """Returns the orders of conditions that participants get in turn.
 
-    Williams (1949): each condition is equally often at each place, and equally often right after each other
-    one; of an odd number of conditions there are twice as many orders. A cyclic Latin square balances places
-    alone. "random": every permutation, shuffled; "fixed": as written.
+    Williams (1949): each condition is equally often at each place, and equally often right
+    after each other one; of an odd number of conditions there are twice as many orders. A
+    cyclic Latin square balances places alone. "random": every permutation, shuffled; "fixed":
+    as written.
     """
     n = len(conditions)
     if design == "fixed":
         return [tuple(conditions)]
     if design == "random":
         random = np.random.default_rng(seed)
-        return [tuple(np.array(conditions)[random.permutation(n)].tolist()) for _ in range(1000)]
+        return [
+            tuple(np.array(conditions)[random.permutation(n)].tolist()) for _ in range(1000)
+        ]
     first = list(range(n))
     if design == "williams":  # 0, 1, n - 1, 2, n - 2, ...
-        first = [0, *(place for k in range(1, n // 2 + 1) for place in dict.fromkeys((k, n - k)))][:n]
+        first = [
+            0,
+            *(place for k in range(1, n // 2 + 1) for place in dict.fromkeys((k, n - k))),
+        ][:n]
     rows = [[(place + shift) % n for place in first] for shift in range(n)]
     if design == "williams" and n % 2:
         rows += [row[::-1] for row in rows]
@@ -497,7 +570,9 @@ def list_orders(design: str, conditions: Sequence[str], seed: int) -> list[tuple
 def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
     orders = list_orders(protocol.design, list(protocol.conditions), protocol.seed)
     number = 0
-    for (n, group), block in itertools.product(enumerate(protocol.groups), range(len(protocol.conditions))):
+    for (n, group), block in itertools.product(
+        enumerate(protocol.groups), range(len(protocol.conditions))
+    ):
         condition = orders[n % len(orders)][block]
         random = np.random.default_rng([protocol.seed, n, block, 2])
         phases = [*[("", None)] * protocol.practice, *protocol.list_phases(condition, random)]
@@ -508,9 +583,13 @@ def _list_trials(protocol: Protocol) -> Iterator[PlannedTrial]:
             seed = int(drawn[0]) >> 1
             practice = trial < protocol.practice
             first = np.random.default_rng([protocol.seed, n, block]).integers(1000)
-            target = int(first) + ((trial - protocol.practice) // 2 if protocol.staircase else trial)
+            target = int(first) + (
+                (trial - protocol.practice) // 2 if protocol.staircase else trial
+            )
             counts = block + 1, trial + 1, practice, block * len(phases) + trial, target
-            shown = protocol.catch.condition if protocol.catch is not None and caught else condition
+            shown = (
+                protocol.catch.condition if protocol.catch is not None and caught else condition
+            )
             yield PlannedTrial(number, group, shown, *counts, seed, caught, *phase)
 
 

@@ -1,9 +1,10 @@
 """Questionnaires that people answer on the page: the published ones that ship, and one's own.
 
 Invariant:
-- An answer is a number of the form's scale or None, or it is refused. None is an item that was left out, as a
-  slider that nobody touched; it is stored and counted as missing.
-- A questionnaire with a missing answer has no score: nobody knows what the answer would have been.
+- An answer is a number of the form's scale or None, or it is refused. None is an item that was
+  left out, as a slider that nobody touched; it is stored and counted as missing.
+- A questionnaire with a missing answer has no score: nobody knows what the answer would have
+  been.
 """
 
 import tomllib
@@ -26,7 +27,8 @@ Words = Annotated[str, Meta(max_length=300)]
 
 
 CHOICE = "choice"
-"""The form after a pair of trials of a staircase: a forced choice, which nobody can leave out."""
+"""The form after a pair of trials of a staircase: a forced choice, which nobody can leave out.
+"""
 Answers = Mapping[str, float | None]
 """Answers by item; None is a missing one."""
 
@@ -67,11 +69,13 @@ class Questionnaire(Frozen, frozen=True):
             values: in the order of the items; None for one that was left out.
 
         Raises:
-            UsageError: there are more or fewer values than items, a value is not on the scale, or one is
-                left out where none can be.
+            UsageError: there are more or fewer values than items, a value is not on the scale,
+                or one is left out where none can be.
         """
         scale = range(self.least, self.most + 1, self.step)
-        valid = [value in scale if value is not None else not self.is_forced for value in values]
+        valid = [
+            value in scale if value is not None else not self.is_forced for value in values
+        ]
         if len(values) != len(self.items) or not all(valid):
             raise UsageError(
                 f"{self.name}: {count_nouns(len(self.items), 'answer')} of {self.least} to {self.most}"
@@ -79,7 +83,9 @@ class Questionnaire(Frozen, frozen=True):
         return dict(zip(self.items, values, strict=True))
 
     def score(self, answers: Answers) -> float | None:
-        """Returns one number: raw NASA-TLX, the score of SUS, else the mean; None if an answer is missing."""
+        """Returns one number: raw NASA-TLX, the score of SUS, else the mean; None if an answer
+        is missing.
+        """
         given = {item: value for item, value in answers.items() if value is not None}
         if len(given) < len(answers):
             return None
@@ -101,16 +107,23 @@ def find_form(asked: Questionnaire) -> Questionnaire:
     """Returns a questionnaire with its items.
 
     Raises:
-        UsageError: it has none, and none of its name ships; or its scale has less than two numbers.
+        UsageError: it has none, and none of its name ships; or its scale has less than two
+            numbers.
     """
     shipped = _read_shipped()
     if asked.items and asked.name in shipped:
-        raise UsageError(f"questionnaire {asked.name} ships with its items: give your own another name")
+        raise UsageError(
+            f"questionnaire {asked.name} ships with its items: give your own another name"
+        )
     if not asked.items and asked.name not in shipped:
-        raise UsageError(f"questionnaire {asked.name} has no items; those that ship are {', '.join(shipped)}")
+        raise UsageError(
+            f"questionnaire {asked.name} has no items; those that ship are {', '.join(shipped)}"
+        )
     if not asked.items:
         form = msgspec.convert({"name": asked.name, **shipped[asked.name]}, Questionnaire)
         return replace(form, after=asked.after)
     if asked.most < asked.least + asked.step or asked.most - asked.least > 100 * asked.step:
-        raise UsageError(f"questionnaire {asked.name}: a scale has 2 to 101 numbers from least to most")
+        raise UsageError(
+            f"questionnaire {asked.name}: a scale has 2 to 101 numbers from least to most"
+        )
     return asked

@@ -1,11 +1,13 @@
-"""Statistics of experiments with people: means, comparisons, a mixed model, power, a methods paragraph.
+"""Statistics of experiments with people: means, comparisons, a mixed model, power, a methods
+paragraph.
 
-Rows are tidy: a mapping per trial with `participant`, `pair`, `condition` and the measures by their names, as
-`trials.csv` has them. A trial without a number, None or "", does not count.
+Rows are tidy: a mapping per trial with `participant`, `pair`, `condition` and the measures by
+their names, as `trials.csv` has them. A trial without a number, None or "", does not count.
 
-Invariant: trials are averaged per participant and condition before anything is tested, so that more trials
-are not more participants. A measure of a pair, which both of its users share, is tested with `unit="pair"`.
-What the numbers cannot tell is None. Equal rows and seeds give equal numbers.
+Invariant: trials are averaged per participant and condition before anything is tested, so that
+more trials are not more participants. A measure of a pair, which both of its users share, is
+tested with `unit="pair"`. What the numbers cannot tell is None. Equal rows and seeds give equal
+numbers.
 """
 
 import math
@@ -48,7 +50,8 @@ def import_scipy_stats() -> Any:
 def average_trials(
     rows: Sequence[Row], measure: str, unit: str = "participant"
 ) -> dict[str, dict[str, float]]:
-    """Returns the mean of a measure over the trials of every condition and unit, in the order of the rows.
+    """Returns the mean of a measure over the trials of every condition and unit, in the order
+    of the rows.
 
     Args:
         rows: trials.
@@ -56,18 +59,26 @@ def average_trials(
         unit: the key of what is sampled independently: "participant" or "pair".
 
     Raises:
-        UsageError: no row has the measure, a row lacks a key, or a value is not a finite number.
+        UsageError: no row has the measure, a row lacks a key, or a value is not a finite
+            number.
     """
     found: dict[str, dict[str, list[float]]] = {}
     for row in rows:
         if missing := [key for key in (unit, "condition") if key not in row]:
-            raise UsageError(f"a row without {' and '.join(missing)}: tidy rows have a key for each")
+            raise UsageError(
+                f"a row without {' and '.join(missing)}: tidy rows have a key for each"
+            )
         each = found.setdefault(str(row["condition"]), {})
         if (value := row.get(measure)) not in (None, ""):
             each.setdefault(str(row[unit]), []).append(read_number(value, measure, row))
-    means = {name: {u: math.fsum(v) / len(v) for u, v in each.items()} for name, each in found.items()}
+    means = {
+        name: {u: math.fsum(v) / len(v) for u, v in each.items()}
+        for name, each in found.items()
+    }
     if not any(means.values()):
-        names = sorted({key for row in rows for key in row} - {"participant", "pair", "condition"})
+        names = sorted(
+            {key for row in rows for key in row} - {"participant", "pair", "condition"}
+        )
         raise UsageError(
             f"no trial has a number for {measure}; the rows have {', '.join(names) or 'nothing'}"
         )
@@ -85,7 +96,9 @@ def read_number(value: Any, measure: str, row: Row) -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not math.isfinite(number):
-        where = ", ".join(f"{key} {row[key]}" for key in ("participant", "condition", "trial") if key in row)
+        where = ", ".join(
+            f"{key} {row[key]}" for key in ("participant", "condition", "trial") if key in row
+        )
         raise UsageError(f"{measure} = {value!r} ({where}): give a finite number, or nothing")
     return number
 
@@ -100,7 +113,8 @@ class ConditionMean(NamedTuple):
         deviation: their standard deviation; None for fewer than two.
         interval: of 95 % by Student's t; None likewise.
         bootstrap: of 95 % by the bias-corrected and accelerated bootstrap (BCa); None likewise.
-        missing: how many trials, or questionnaires, have no number; they are counted and not averaged.
+        missing: how many trials, or questionnaires, have no number; they are counted and not
+            averaged.
     """
 
     condition: str
@@ -115,7 +129,9 @@ class ConditionMean(NamedTuple):
 def summarise_conditions(
     rows: Sequence[Row], measure: str, *, unit: str = "participant", seed: int = 0
 ) -> list[ConditionMean]:
-    """Returns mean, spread and intervals of every condition with a number, in the order of the rows."""
+    """Returns mean, spread and intervals of every condition with a number, in the order of the
+    rows.
+    """
     means = average_trials(rows, measure, unit)
     lacking = Counter(str(row["condition"]) for row in rows if row.get(measure) in (None, ""))
     return [
@@ -128,17 +144,32 @@ def summarise_conditions(
 def _summarise(condition: str, values: list[float], seed: int) -> ConditionMean:
     mean = mean_interval(values)
     if mean is None:
-        return ConditionMean(condition, len(values), values[0], None, None, None)
+        return ConditionMean(
+            condition=condition,
+            number=len(values),
+            mean=values[0],
+            deviation=None,
+            interval=None,
+            bootstrap=None,
+        )
     low_high = (mean.mean - mean.half, mean.mean + mean.half)
     deviation = float(np.std(values, ddof=1))
     boot = bootstrap_interval(values, seed)
-    return ConditionMean(condition, len(values), mean.mean, deviation, low_high, boot)
+    return ConditionMean(
+        condition=condition,
+        number=len(values),
+        mean=mean.mean,
+        deviation=deviation,
+        interval=low_high,
+        bootstrap=boot,
+    )
 
 
 def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, float] | None:
     """Returns the 95 % interval of a mean by the BCa bootstrap; None of fewer than two values.
 
-    Source: Efron, "Better bootstrap confidence intervals", J. American Statistical Association 82 (1987).
+    Source: Efron, "Better bootstrap confidence intervals", J. American Statistical Association
+    82 (1987).
     """
     sample = np.asarray(values, dtype=np.float64)
     if sample.size < 2:
@@ -147,7 +178,12 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
         return float(sample.mean()), float(sample.mean())
     generator = np.random.default_rng(seed)
     found = import_scipy_stats().bootstrap(
-        (sample,), np.mean, n_resamples=RESAMPLES, confidence_level=CONFIDENCE, method="BCa", rng=generator
+        (sample,),
+        np.mean,
+        n_resamples=RESAMPLES,
+        confidence_level=CONFIDENCE,
+        method="BCa",
+        rng=generator,
     )
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
@@ -156,7 +192,8 @@ def bootstrap_interval(values: Sequence[float], seed: int = 0) -> tuple[float, f
 
 
 class Comparison(NamedTuple):
-    """Two conditions of a measure, compared within units; what fewer than two units cannot tell is None.
+    """Two conditions of a measure, compared within units; what fewer than two units cannot tell
+    is None.
 
     Args:
         measure: its name.
@@ -165,12 +202,14 @@ class Comparison(NamedTuple):
         number: of units that have both.
         difference: mean of second minus first.
         interval: of the difference, 95 % by Student's t.
-        t: of the paired test, with number - 1 degrees of freedom; None if all differences are the same.
+        t: of the paired test, with number - 1 degrees of freedom; None if all differences are
+            the same.
         p: two-sided.
         p_holm: p corrected for all comparisons of the measure.
         d_z: difference over the standard deviation of the differences.
         d_av: difference over the mean of the standard deviations of both conditions.
-        p_wilcoxon: of the signed-rank test, two-sided, not corrected; zero differences are left out.
+        p_wilcoxon: of the signed-rank test, two-sided, not corrected; zero differences are left
+            out.
     """
 
     measure: str
@@ -187,20 +226,26 @@ class Comparison(NamedTuple):
     p_wilcoxon: float | None = None
 
 
-def compare_conditions(rows: Sequence[Row], measure: str, *, unit: str = "participant") -> list[Comparison]:
+def compare_conditions(
+    rows: Sequence[Row], measure: str, *, unit: str = "participant"
+) -> list[Comparison]:
     """Returns the comparison of every two conditions, in the order of the rows.
 
-    Sources: Holm, "A simple sequentially rejective multiple test procedure", Scandinavian J. Statistics 6
-    (1979); Lakens, "Calculating and reporting effect sizes to facilitate cumulative science", Frontiers in
-    Psychology 4:863 (2013), for d_z and d_av.
+    Sources: Holm, "A simple sequentially rejective multiple test procedure", Scandinavian J.
+    Statistics 6 (1979); Lakens, "Calculating and reporting effect sizes to facilitate
+    cumulative science", Frontiers in Psychology 4:863 (2013), for d_z and d_av.
     """
     means = average_trials(rows, measure, unit)
-    found = [_compare(measure, first, second, means) for first, second in combinations(means, 2)]
+    found = [
+        _compare(measure, first, second, means) for first, second in combinations(means, 2)
+    ]
     corrected = correct_holm([one.p for one in found])
     return [one._replace(p_holm=p) for one, p in zip(found, corrected, strict=True)]
 
 
-def _compare(measure: str, first: str, second: str, means: Mapping[str, Mapping[str, float]]) -> Comparison:
+def _compare(
+    measure: str, first: str, second: str, means: Mapping[str, Mapping[str, float]]
+) -> Comparison:
     both = [unit for unit in means[first] if unit in means[second]]
     one, other = (np.array([means[name][unit] for unit in both]) for name in (first, second))
     differences = other - one
@@ -227,7 +272,9 @@ def _compare(measure: str, first: str, second: str, means: Mapping[str, Mapping[
 
 
 def correct_holm(p: Sequence[float | None]) -> list[float | None]:
-    """Returns p values corrected for their number, in their order; those that are None do not count."""
+    """Returns p values corrected for their number, in their order; those that are None do not
+    count.
+    """
     order = sorted((value, n) for n, value in enumerate(p) if value is not None)
     corrected: list[float | None] = [None] * len(p)
     least = 0.0
@@ -241,7 +288,9 @@ def correct_holm(p: Sequence[float | None]) -> list[float | None]:
 
 
 class MixedEffect(NamedTuple):
-    """A condition against the first: estimate, its standard error and 95 % interval, t and two-sided p."""
+    """A condition against the first: estimate, its standard error and 95 % interval, t and
+    two-sided p.
+    """
 
     condition: str
     estimate: float
@@ -252,14 +301,15 @@ class MixedEffect(NamedTuple):
 
 
 class MixedModel(NamedTuple):
-    """`measure ~ condition + (1 | pair/participant)`, fitted to the means of participants by REML.
+    """`measure ~ condition + (1 | pair/participant)`, fitted to the means of participants by
+    REML.
 
     Args:
         measure: its name.
         reference: the first condition, which the others are held against.
         effects: of every other condition.
-        freedom: degrees of freedom of t: observations less participants less effects, as in the analysis of
-            variance if everybody has all conditions.
+        freedom: degrees of freedom of t: observations less participants less effects, as in the
+            analysis of variance if everybody has all conditions.
         variances: of "pair", of "participant" within it, and "residual".
         notes: what the fit complains of, as a variance at 0.
     """
@@ -275,17 +325,20 @@ class MixedModel(NamedTuple):
 def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
     """Returns the mixed model of a measure, of users within pairs.
 
-    What both users of a pair share in a trial is no part of it: such a measure has `unit="pair"` in
-    `compare_conditions`. Needs `pip install 'trilat-net[stats]'`.
+    What both users of a pair share in a trial is no part of it: such a measure has
+    `unit="pair"` in `compare_conditions`. Needs `pip install 'trilat-net[stats]'`.
 
     Raises:
-        UsageError: statsmodels is not installed, a participant has two pairs, or nothing is left to compare.
+        UsageError: statsmodels is not installed, a participant has two pairs, or nothing is
+            left to compare.
     """
     formulas = import_extra("statsmodels.formula.api", "stats", "mixed models")
     frames = import_extra("pandas", "stats", "mixed models")
     means = {name: each for name, each in average_trials(rows, measure).items() if each}
     pairs = _find_pairs(rows)
-    records = [(pairs[u], u, name, mean) for name, each in means.items() for u, mean in each.items()]
+    records = [
+        (pairs[u], u, name, mean) for name, each in means.items() for u, mean in each.items()
+    ]
     people = {u for _, u, *_ in records}
     freedom = len(records) - len(people) - len(means) + 1
     if len(means) < 2 or freedom < 1:
@@ -302,20 +355,33 @@ def fit_mixed_model(rows: Sequence[Row], measure: str) -> MixedModel:
     parts = {"pair": fit.cov_re.iloc[0, 0], "participant": fit.vcomp[0], "residual": fit.scale}
     variances = {name: float(value) for name, value in parts.items()}
     notes = list(dict.fromkeys(str(one.message) for one in caught))
-    return MixedModel(measure, next(iter(means)), effects, freedom, variances, notes)
+    return MixedModel(
+        measure=measure,
+        reference=next(iter(means)),
+        effects=effects,
+        freedom=freedom,
+        variances=variances,
+        notes=notes,
+    )
 
 
 def _fit(formulas: Any, frame: Any, measure: str) -> Any:
-    """Returns the likelier of two fits: by the gradient alone it may end before a variance that is at 0."""
+    """Returns the likelier of two fits: by the gradient alone it may end before a variance that
+    is at 0.
+    """
     parts = {"participant": "0 + C(participant)"}
-    model = formulas.mixedlm("measure ~ condition", frame, groups="pair", re_formula="1", vc_formula=parts)
+    model = formulas.mixedlm(
+        "measure ~ condition", frame, groups="pair", re_formula="1", vc_formula=parts
+    )
     fits = []
     for method in ("powell", "lbfgs"):
         with suppress(np.linalg.LinAlgError):
             fits.append(model.fit(reml=True, method=method))
     fits = [fit for fit in fits if np.isfinite([fit.llf, *fit.bse_fe]).all()]
     if not fits:
-        raise UsageError(f"{measure}: a mixed model cannot be fitted to it; compare conditions instead")
+        raise UsageError(
+            f"{measure}: a mixed model cannot be fitted to it; compare conditions instead"
+        )
     return max(fits, key=lambda fit: float(fit.llf))
 
 
@@ -325,7 +391,9 @@ def _find_pairs(rows: Sequence[Row]) -> dict[str, str]:
         user = str(row["participant"])
         pair = "" if row.get("pair") is None else str(row["pair"])
         if pairs.setdefault(user, pair) != pair:
-            raise UsageError(f"participant {user} is in pairs {pairs[user]} and {pair}: one pair each")
+            raise UsageError(
+                f"participant {user} is in pairs {pairs[user]} and {pair}: one pair each"
+            )
     if "" in pairs.values() or len(set(pairs.values())) == len(pairs):
         raise UsageError("no pair has two participants: a mixed model is of users within pairs")
     return pairs
@@ -338,19 +406,30 @@ def _read_effect(fit: Any, condition: str, freedom: int) -> MixedEffect:
     error = float(fit.bse_fe[name])
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, freedom)) * error
     p = 2.0 * float(stats.t.sf(abs(estimate / error), freedom))
-    return MixedEffect(condition, estimate, error, (estimate - half, estimate + half), estimate / error, p)
+    return MixedEffect(
+        condition=condition,
+        estimate=estimate,
+        error=error,
+        interval=(estimate - half, estimate + half),
+        t=estimate / error,
+        p=p,
+    )
 
 
 # --- power -----------------------------------------------------------------------------------------------
 
 
 def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
-    """Returns the chance that a paired t test, two-sided, finds an effect of a size d_z with so many units.
+    """Returns the chance that a paired t test, two-sided, finds an effect of a size d_z with so
+    many units.
 
-    Source: Cohen, "Statistical power analysis for the behavioral sciences" (1988); by the noncentral t.
+    Source: Cohen, "Statistical power analysis for the behavioral sciences" (1988); by the
+    noncentral t.
     """
     if number < 2 or not 0.0 < alpha < 1.0:
-        raise UsageError(f"{number} units, alpha {alpha}: give two units or more, and alpha between 0 and 1")
+        raise UsageError(
+            f"{number} units, alpha {alpha}: give two units or more, and alpha between 0 and 1"
+        )
     stats = import_scipy_stats()
     shift = abs(d_z) * math.sqrt(number)
     freedom = number - 1
@@ -359,7 +438,9 @@ def power(d_z: float, number: int, *, alpha: float = 0.05) -> float:
     return float(sum(stats.nct.sf(critical, freedom, sign * shift) for sign in (1.0, -1.0)))
 
 
-def find_least_number(d_z: float, *, wanted: float = 0.8, alpha: float = 0.05, most: int = 10_000) -> int:
+def find_least_number(
+    d_z: float, *, wanted: float = 0.8, alpha: float = 0.05, most: int = 10_000
+) -> int:
     """Returns the least number of units with which `power` is at least what is wanted.
 
     Raises:
@@ -369,7 +450,9 @@ def find_least_number(d_z: float, *, wanted: float = 0.8, alpha: float = 0.05, m
         raise UsageError(
             f"power {wanted} at d_z = {d_z}: not with {most} units; give a larger effect, or less power"
         )
-    return bisect_left(range(most), wanted, lo=2, key=lambda number: power(d_z, number, alpha=alpha))
+    return bisect_left(
+        range(most), wanted, lo=2, key=lambda number: power(d_z, number, alpha=alpha)
+    )
 
 
 class SimulatedPower(NamedTuple):
@@ -403,14 +486,16 @@ def simulate_power(
     repetitions: int = 500,
     seed: int = 0,
 ) -> list[SimulatedPower]:
-    """Returns how often each two conditions are found to differ, by drawing trials and comparing them.
+    """Returns how often each two conditions are found to differ, by drawing trials and
+    comparing them.
 
     Args:
         means: the expected mean of a measure by condition.
         number: of participants.
         trial_deviation: standard deviation from trial to trial.
         trials: of a participant under a condition.
-        effect_deviation: standard deviation, over participants, of what a condition does to them.
+        effect_deviation: standard deviation, over participants, of what a condition does to
+            them.
         alpha: of the tests.
         repetitions: experiments that are drawn.
         seed: of what is drawn.
@@ -421,9 +506,13 @@ def simulate_power(
         own = generator.normal(0.0, effect_deviation, (number, len(means), 1))
         values = own + generator.normal(0.0, trial_deviation, (number, len(means), trials))
         runs.append(compare_conditions(_list_rows(values, means), "measure"))
-    deviation = math.sqrt(2.0 * (float(effect_deviation) ** 2 + float(trial_deviation) ** 2 / trials))
+    deviation = math.sqrt(
+        2.0 * (float(effect_deviation) ** 2 + float(trial_deviation) ** 2 / trials)
+    )
     return [
-        _count_found(each, float(means[each[0].second] - means[each[0].first]) / deviation, alpha)
+        _count_found(
+            each, float(means[each[0].second] - means[each[0].first]) / deviation, alpha
+        )
         for each in zip(*runs, strict=True)
     ]
 
@@ -441,7 +530,14 @@ def _count_found(runs: Sequence[Comparison], d_z: float, alpha: float) -> Simula
     found = sum(run.p is not None and run.p < alpha for run in runs)
     holm = sum(run.p_holm is not None and run.p_holm < alpha for run in runs)
     interval = wilson_interval(found, len(runs))
-    return SimulatedPower(runs[0].first, runs[0].second, d_z, found / len(runs), interval, holm / len(runs))
+    return SimulatedPower(
+        first=runs[0].first,
+        second=runs[0].second,
+        d_z=d_z,
+        found=found / len(runs),
+        interval=interval,
+        found_holm=holm / len(runs),
+    )
 
 
 # --- methods paragraph -----------------------------------------------------------------------------------
@@ -483,13 +579,14 @@ def write_methods(facts: Mapping[str, Any]) -> str:
     """Returns the paragraph on methods of a paper, with every number that is given.
 
     Args:
-        facts: `participants`, whose data count; `excluded`, how many more; `exclusions`, why; `pairs`;
-            `design`; `blocks`; `trials` of a participant under a condition; `training` or `staircase`, what
-            they were; `conditions`, by name what each was, with its delay as measured (`delay_ms`); `law`;
-            `gains`; `rate_hz`; `seeds`; `measures`; `correction` of p; `unit`; `alpha`; `program`, its
-            version; `digest` of the protocol; `computed`, which of `COMPUTED` were, by default none;
-            `completion` and `answers`, sentences on trials that were not completed and on missing answers.
-            Keys end in their unit.
+        facts: `participants`, whose data count; `excluded`, how many more; `exclusions`, why;
+            `pairs`; `design`; `blocks`; `trials` of a participant under a condition; `training`
+            or `staircase`, what they were; `conditions`, by name what each was, with its delay
+            as measured (`delay_ms`); `law`; `gains`; `rate_hz`; `seeds`; `measures`;
+            `correction` of p; `unit`; `alpha`; `program`, its version; `digest` of the
+            protocol; `computed`, which of `COMPUTED` were, by default none; `completion` and
+            `answers`, sentences on trials that were not completed and on missing answers. Keys
+            end in their unit.
 
     Raises:
         UsageError: a fact is missing or unknown, or a condition has no delay.
@@ -507,10 +604,18 @@ def write_methods(facts: Mapping[str, Any]) -> str:
                 f"condition {name} has no delay: give delay_ms, as measured, 0 if there was none"
             )
     told = {key: _tell(value, key) for key, value in facts.items()}
-    told["conditions"] = "; ".join(f"{name} ({_tell(each)})" for name, each in facts["conditions"].items())
-    told["measures"] = ", ".join(" in ".join(filter(None, split_unit(name))) for name in facts["measures"])
+    told["conditions"] = "; ".join(
+        f"{name} ({_tell(each)})" for name, each in facts["conditions"].items()
+    )
+    told["measures"] = ", ".join(
+        " in ".join(filter(None, split_unit(name))) for name in facts["measures"]
+    )
     first = "".join(text.format(told[key]) for key, text in _METHODS if told.get(key))
-    sentences = [f"{first} over the trials of a condition", told.get("completion"), told.get("answers")]
+    sentences = [
+        f"{first} over the trials of a condition",
+        told.get("completion"),
+        told.get("answers"),
+    ]
     sentences += _describe_computed(frozenset(facts.get("computed", ())), told)
     text = " ".join(f"{_capitalise(sentence)}." for sentence in sentences if sentence)
     singular = re.sub(r"(?<![\w.])1 (participant|pair|block|trial)s\b", r"1 \1", text)
@@ -518,11 +623,15 @@ def write_methods(facts: Mapping[str, Any]) -> str:
 
 
 def _describe_computed(computed: Collection[str], told: Mapping[str, str]) -> Iterator[str]:
-    """Yields a sentence for each analysis that was computed, or that conditions were not compared."""
+    """Yields a sentence for each analysis that was computed, or that conditions were not
+    compared.
+    """
     correction = f"with p corrected by {told['correction']} over all comparisons of a measure"
     level = f", at alpha = {told['alpha']}" if told.get("alpha") else ""
     if "t tests" in computed:
-        wilcoxon = " and by Wilcoxon's signed-rank test beside them" if "wilcoxon" in computed else ""
+        wilcoxon = (
+            " and by Wilcoxon's signed-rank test beside them" if "wilcoxon" in computed else ""
+        )
         yield f"conditions were compared by two-sided paired t tests, {correction}{level}{wilcoxon}"
     if "sign tests" in computed:
         rule = "in which one that was not reached is longer than any that was"
@@ -535,7 +644,11 @@ def _describe_computed(computed: Collection[str], told: Mapping[str, str]) -> It
     if "effect sizes" in computed:
         yield "effect sizes are Cohen's d_z and d_av"
     if "intervals" in computed:
-        bootstrap = f" and by the bootstrap (BCa, {RESAMPLES} resamples)" if "bootstrap" in computed else ""
+        bootstrap = (
+            f" and by the bootstrap (BCa, {RESAMPLES} resamples)"
+            if "bootstrap" in computed
+            else ""
+        )
         yield f"intervals are of {100 * CONFIDENCE:g} %, by Student's t{bootstrap}"
 
 
@@ -544,11 +657,15 @@ def _capitalise(sentence: str) -> str:
 
 
 def _tell(value: Any, key: str = "") -> str:
-    """Returns numbers with all their digits and the unit of their key, and what holds numbers in words."""
+    """Returns numbers with all their digits and the unit of their key, and what holds numbers
+    in words.
+    """
     if isinstance(value, str):
         return value
     if isinstance(value, Mapping):
-        return ", ".join(f"{split_unit(name)[0]} {_tell(one, name)}" for name, one in value.items())
+        return ", ".join(
+            f"{split_unit(name)[0]} {_tell(one, name)}" for name, one in value.items()
+        )
     if isinstance(value, Sequence):
         return ", ".join(_tell(one, key) for one in value)
     number = str(value) if isinstance(value, int) else repr(float(value)).removesuffix(".0")

@@ -1,10 +1,12 @@
-"""A synthetic participant: a model of somebody at a master, for experiments without people, and named so.
+"""A synthetic participant: a model of somebody at a master, for experiments without people, and
+named so.
 
-It moves towards a target by what it sees of the slave, over the network, in movements of minimum jerk (Flash
-and Hogan, 1985) whose ends scatter with their length (Harris and Wolpert, 1998) and whose durations follow
-Fitts' law; it waits until the slave has come to rest before it corrects, as people do over a delay (Ferrell,
-1965). A moving target it follows by a rate of correction that it lowers with the delay it knows (McRuer and
-Jex, 1967). With practice it is faster by a power law.
+It moves towards a target by what it sees of the slave, over the network, in movements of
+minimum jerk (Flash and Hogan, 1985) whose ends scatter with their length (Harris and Wolpert,
+1998) and whose durations follow Fitts' law; it waits until the slave has come to rest before it
+corrects, as people do over a delay (Ferrell, 1965). A moving target it follows by a rate of
+correction that it lowers with the delay it knows (McRuer and Jex, 1967). With practice it is
+faster by a power law.
 
 Invariant: what it does is a function of what its site knows, of its numbers and of its seed.
 """
@@ -54,7 +56,9 @@ class ParticipantModel(Frozen, frozen=True):
         random = np.random.default_rng(seed)
         drawn = ("reaction_s", "fitts_a_s", "fitts_b_s", "noise", "crossover_rad_s")
         factors = np.exp(self.spread * random.standard_normal(len(drawn)))
-        own = {name: getattr(self, name) * float(x) for name, x in zip(drawn, factors, strict=True)}
+        own = {
+            name: getattr(self, name) * float(x) for name, x in zip(drawn, factors, strict=True)
+        }
         return replace(self, **{**own, "noise": min(own["noise"], 1.0)})
 
 
@@ -65,7 +69,8 @@ class SyntheticParticipant:
         facts: of its site.
         model: its numbers.
         goal: the target that it sees.
-        slave: the site of the slave, its arm, and the force at its end effector by angles and torques, N.
+        slave: the site of the slave, its arm, and the force at its end effector by angles and
+            torques, N.
         before: how many trials it has made before.
         seed: of the trial, for what it draws.
         user: which of the users it is, from 0.
@@ -129,7 +134,9 @@ class SyntheticParticipant:
         return self._reach(now.t_s)
 
     def _press(self, slave: PeerView, t_s: float) -> Array:
-        """Returns the way to the force that is asked, by the force seen over the network; 0 off a wall."""
+        """Returns the way to the force that is asked, by the force seen over the network; 0 off
+        a wall.
+        """
         felt_n = self._find_force_n(slave.q, slave.tau_x)
         towards = (self._goal.place(t_s) - self._goal.start_m)[: self._size]
         way: Array = towards * (self._goal.width_m / np.linalg.norm(towards))
@@ -149,15 +156,27 @@ class SyntheticParticipant:
 
     def _reach(self, t_s: float) -> Array:
         s = min(max((t_s - self._begins_s) / self._takes_s, 0.0), 1.0) if self._takes_s else 1.0
-        found: Array = self._from + (self._to - self._from) * (10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5)
+        found: Array = self._from + (self._to - self._from) * (
+            10.0 * s**3 - 15.0 * s**4 + 6.0 * s**5
+        )
         return found
 
     def _follow(self, now: HandView, way: Array, age_s: float) -> Array:
-        """Moves on towards a target that moves, the slower the longer the way of what it does is."""
+        """Moves on towards a target that moves, the slower the longer the way of what it does
+        is.
+        """
         most = 0.7 / (self._model.reaction_s + 2.0 * age_s)
         rate = min(self._model.crossover_rad_s, most)
-        scatter = self._model.noise * float(np.linalg.norm(way)) * self._random.standard_normal(self._size)
-        step = rate * (now.t_s - max(self._begins_s, 0.0)) if not math.isinf(self._begins_s) else 0.0
+        scatter = (
+            self._model.noise
+            * float(np.linalg.norm(way))
+            * self._random.standard_normal(self._size)
+        )
+        step = (
+            rate * (now.t_s - max(self._begins_s, 0.0))
+            if not math.isinf(self._begins_s)
+            else 0.0
+        )
         self._begins_s = now.t_s
         self._to = self._to + min(step, 1.0) * (way + scatter)
         return self._to

@@ -1,8 +1,10 @@
-"""What participants do in a trial: reach, carry, hand over, follow a path, agree on one, press a wall.
+"""What participants do in a trial: reach, carry, hand over, follow a path, agree on one, press
+a wall.
 
-Invariant: a task is a function of its numbers, the trial's seed and where the slave's arm began. It is judged
-by where the slave's end effector is and what presses on it, not by what anybody sees; a trial ends by
-dwelling, by its time, or when something went wrong that the task forbids.
+Invariant: a task is a function of its numbers, the trial's seed and where the slave's arm
+began. It is judged by where the slave's end effector is and what presses on it, not by what
+anybody sees; a trial ends by dwelling, by its time, or when something went wrong that the task
+forbids.
 """
 
 import math
@@ -40,7 +42,9 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def has_limit(self) -> bool:
-        """Whether a trial that is not completed by `longest_s` has failed; else each lasts as long."""
+        """Whether a trial that is not completed by `longest_s` has failed; else each lasts as
+        long.
+        """
         return True
 
     @property
@@ -68,8 +72,10 @@ class TrialGoal:
         appears_s: when it appears, s: the end of the fore-period.
         moves: whether it moves from then on.
         force_n: the force to press with, N; 0: none.
-        lead: the first user's part of what two users share at the slave until a handover; None: as written.
-        handover: when it goes to the second, s after the target, and how long that takes; None: never.
+        lead: the first user's part of what two users share at the slave until a handover; None:
+            as written.
+        handover: when it goes to the second, s after the target, and how long that takes; None:
+            never.
     """
 
     moves = False
@@ -83,11 +89,15 @@ class TrialGoal:
         self.appears_s = 0.0
 
     def place(self, t_s: float, user: int | None = None) -> Array:
-        """Returns where the end effector is to be, m, shape (2,) or (3,), as a user, from 0, is shown it."""
+        """Returns where the end effector is to be, m, shape (2,) or (3,), as a user, from 0, is
+        shown it.
+        """
         return self.start_m if t_s < self.appears_s else self._place(t_s - self.appears_s, user)
 
     def judge(self, t_s: float, at_m: Array, force_n: float = 0.0) -> "Outcome | None":
-        """Returns how the trial ended, with the end effector at a place, under a force; None: it goes on."""
+        """Returns how the trial ended, with the end effector at a place, under a force; None:
+        it goes on.
+        """
         return None if t_s < self.appears_s else self._judge(t_s, at_m, force_n)
 
     def leads(self, t_s: float, user: int) -> bool:
@@ -97,13 +107,17 @@ class TrialGoal:
         return self.lead is None or abs(self.lead - (user != handed)) > 0.05
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:  # noqa: ARG002 - there is none
-        """Returns from where the way to the target leads that nobody may leave, m, and its width, m."""
+        """Returns from where the way to the target leads that nobody may leave, m, and its
+        width, m.
+        """
         return None
 
     def measure(self, after_s: Array, at_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
-        """Returns what is measured of this task alone, of K rows from when the target appears to the end.
+        """Returns what is measured of this task alone, of K rows from when the target appears
+        to the end.
 
-        `at_m`, shape (K, 2) or (K, 3), is where the slave's end effector is, `force_n` what presses on it.
+        `at_m`, shape (K, 2) or (K, 3), is where the slave's end effector is, `force_n` what
+        presses on it.
         """
         return {}
 
@@ -127,7 +141,8 @@ class Outcome(NamedTuple):
 
 
 class ReachTrial(TrialTask, frozen=True, tag="reach"):
-    """Targets on a ring about the start, in the order of ISO 9241-411: each across from the one before.
+    """Targets on a ring about the start, in the order of ISO 9241-411: each across from the one
+    before.
 
     Attributes:
         targets: how many.
@@ -135,9 +150,12 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         width_m: diameter of a target, m.
         dwell_s: how long the end effector has to stay in it, s.
         timeout_s: after which the trial has failed, s.
-        corridor_m: width of the straight way to it, m, which nobody may leave, as with a load; None: any way.
-        handover_s: after which the second user gets the first one's authority, s; None: it stays as it is.
-        ramp_s: how long that takes, s, in which the end effector stays; then the next target appears.
+        corridor_m: width of the straight way to it, m, which nobody may leave, as with a load;
+            None: any way.
+        handover_s: after which the second user gets the first one's authority, s; None: it
+            stays as it is.
+        ramp_s: how long that takes, s, in which the end effector stays; then the next target
+            appears.
     """
 
     words: ClassVar[str] = "reaching to a ring of targets"
@@ -163,13 +181,19 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         """Returns what users are asked for, with what is forbidden and what comes next."""
         aside_mm = 0.0 if self.corridor_m is None else 500.0 * self.corridor_m
         way = f" Leave the straight way by no more than {aside_mm:g} mm." if aside_mm else ""
-        then = f" After {self.handover_s:g} s the other user takes over." if self.handover_s else ""
+        then = (
+            f" After {self.handover_s:g} s the other user takes over."
+            if self.handover_s
+            else ""
+        )
         return super().ask(slave) + way + then
 
     @property
     def longest_s(self) -> float:
         """The time-out, from the last target on, s."""
-        return self.timeout_s + (0.0 if self.handover_s is None else self.handover_s + self.ramp_s)
+        return self.timeout_s + (
+            0.0 if self.handover_s is None else self.handover_s + self.ramp_s
+        )
 
     def begin(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the order is fixed
         """Returns the next target around the ring, and after a handover the one after it."""
@@ -243,7 +267,10 @@ class _ReachGoal(_DwellGoal):
         if self._corridor_m is not None:
             left, to = self._leg(t_s - self.appears_s)
             along = np.clip((at_m - left) @ (to - left) / ((to - left) @ (to - left)), 0.0, 1.0)
-            if float(np.linalg.norm(at_m - left - along * (to - left))) > self._corridor_m / 2.0:
+            if (
+                float(np.linalg.norm(at_m - left - along * (to - left)))
+                > self._corridor_m / 2.0
+            ):
                 return Outcome(False, t_s)
         return super()._judge(t_s, at_m, force_n)
 
@@ -290,13 +317,17 @@ class _ContactGoal(_DwellGoal):
         super().__init__(task, start_m)
         self.force_n = task.force_n
         self._tolerance_n = task.tolerance_n
-        self._target_m: Array = start_m + task.distance_m * (np.arange(len(start_m)) == task.axis)
+        self._target_m: Array = start_m + task.distance_m * (
+            np.arange(len(start_m)) == task.axis
+        )
 
     def _place(self, after_s: float, user: int | None) -> Array:  # noqa: ARG002 - it does not move
         return self._target_m
 
     def measure(self, after_s: Array, at_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
-        """Returns the force while it was to be held, and how far it was from what was asked, by its RMS."""
+        """Returns the force while it was to be held, and how far it was from what was asked, by
+        its RMS.
+        """
         held_n = force_n[after_s >= after_s[-1] - self._dwell_s]
         off_n = float(np.sqrt(np.mean((held_n - self.force_n) ** 2)))
         return {"wall_force_n": float(held_n.mean()), "error_force_n": off_n}
@@ -314,11 +345,14 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
         frequencies_hz: of the sines, Hz; their phases are drawn for every trial.
         duration_s: how long it lasts, s.
         width_m: how wide the target is drawn, m.
-        apart_m: how far apart two users are shown it, along that axis, m: they have to settle on one.
+        apart_m: how far apart two users are shown it, along that axis, m: they have to settle
+            on one.
     """
 
     words: ClassVar[str] = "tracking a path of sines"
-    asks: ClassVar[str] = "Keep the end effector of {slave} in the circle for {task.duration_s:g} s."
+    asks: ClassVar[str] = (
+        "Keep the end effector of {slave} in the circle for {task.duration_s:g} s."
+    )
     learnt: ClassVar[str] = "error_rms_mm"
 
     axis: Annotated[int, Meta(ge=0, le=2)] = 0
@@ -345,7 +379,9 @@ class TrackTrial(TrialTask, frozen=True, tag="track"):
 
     def begin(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - phases are of the seed
         """Returns the path, which begins at the start."""
-        phases = np.random.default_rng(seed).uniform(0.0, 2.0 * math.pi, len(self.frequencies_hz))
+        phases = np.random.default_rng(seed).uniform(
+            0.0, 2.0 * math.pi, len(self.frequencies_hz)
+        )
         return _TrackGoal(self, start_m, phases)
 
 
@@ -358,7 +394,9 @@ class _TrackGoal(TrialGoal):
         self._phases = phases
 
     def measure(self, after_s: Array, at_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
-        """Returns whose target the slave was at where two are shown: 1 the first user's, 0 the other's."""
+        """Returns whose target the slave was at where two are shown: 1 the first user's, 0 the
+        other's.
+        """
         if not self._task.needs_pair:
             return {}
         middle_m = np.array([self._place(after, None) for after in after_s.tolist()])
@@ -370,7 +408,9 @@ class _TrackGoal(TrialGoal):
         off = np.sin(turns * after_s + self._phases) - np.sin(self._phases)
         at = self.start_m.copy()
         aside_m = 0.0 if user is None else self._task.apart_m * (0.5 - user)
-        at[self._task.axis] += aside_m + self._task.amplitude_m * float(off.sum()) / (2.0 * len(off))
+        at[self._task.axis] += aside_m + self._task.amplitude_m * float(off.sum()) / (
+            2.0 * len(off)
+        )
         return at
 
     def _judge(self, t_s: float, at_m: Array, force_n: float) -> Outcome | None:  # noqa: ARG002 - by its time
@@ -381,6 +421,8 @@ AnyTask = ReachTrial | ContactTrial | TrackTrial
 
 
 def place_slave(arm: Any, shared: Sequence[float]) -> Array:
-    """Returns where an end effector is, m, by what its site shares: joint angles, rad, or its pose."""
+    """Returns where an end effector is, m, by what its site shares: joint angles, rad, or its
+    pose.
+    """
     place = shared[:3] if arm.shares_pose else arm.end_effector(shared)
     return np.array(place, dtype=np.float64)

@@ -1,8 +1,9 @@
-"""One trial: its scenario, how it is judged record by record, what its log says; and synthetic participants.
+"""One trial: its scenario, how it is judged record by record, what its log says; and synthetic
+participants.
 
-Invariant: what counts is a function of the log, whoever took part. It is executed again, and judged by every
-record of the slave in it. A synthetic trial is run twice by the same numbers: compiled, to find when it ends,
-and into its log, which then lasts just that long.
+Invariant: what counts is a function of the log, whoever took part. It is executed again, and
+judged by every record of the slave in it. A synthetic trial is run twice by the same numbers:
+compiled, to find when it ends, and into its log, which then lasts just that long.
 """
 
 import hashlib
@@ -41,7 +42,9 @@ EVERY = 5
 HAND_HZ = 50
 HAND_DELAY_S = 0.02
 REST_S = 0.1
-"""How often a synthetic participant acts; time from what it decides to what its arm does; after the end."""
+"""How often a synthetic participant acts; time from what it decides to what its arm does; after
+the end.
+"""
 
 
 class TrialEntry(msgspec.Struct, frozen=True):
@@ -78,10 +81,14 @@ class TrialJudge:
         self.outcome: Outcome | None = None
 
     def take(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
-        """Takes in angles and exogenous torques of a record; returns the outcome, once there is one."""
+        """Takes in angles and exogenous torques of a record; returns the outcome, once there is
+        one.
+        """
         if self.outcome is None:
             force_n = self._trial.find_force_n(q, tau_x) if self.goal.force_n else 0.0
-            self.outcome = self.goal.judge(t_s, np.array(self._trial.arm.end_effector(q)), force_n)
+            self.outcome = self.goal.judge(
+                t_s, np.array(self._trial.arm.end_effector(q)), force_n
+            )
         return self.outcome
 
 
@@ -98,7 +105,9 @@ class ExperimentTrial:
 
     people = True
 
-    def __init__(self, protocol: Protocol, scenario: Scenario, planned: PlannedTrial, digest: str) -> None:
+    def __init__(
+        self, protocol: Protocol, scenario: Scenario, planned: PlannedTrial, digest: str
+    ) -> None:
         self.protocol = protocol
         self.planned = planned
         self.slave = scenario.slave
@@ -107,9 +116,7 @@ class ExperimentTrial:
         self._start_m = np.array(self.arm.end_effector(spec.q0_rad), dtype=np.float64)
         whose = "" if self.people else "synthetic "
         about = f"trial {planned.number} of {protocol.name}: {whose}{', '.join(planned.group)}, condition "
-        about += (
-            f"{planned.condition}, block {planned.block}, trial {planned.trial}; protocol sha256 {digest}"
-        )
+        about += f"{planned.condition}, block {planned.block}, trial {planned.trial}; protocol sha256 {digest}"
         drawn_s = np.random.default_rng(planned.seed).uniform(*protocol.foreperiod_s)
         self.appears_s = round(float(drawn_s), 3)
         scenario = self._share_out(scenario)
@@ -117,12 +124,18 @@ class ExperimentTrial:
         lasts_s = self.longest_s + REST_S
         sites = limit_forces(scenario, protocol, planned.group)
         self.scenario = replace(
-            scenario, duration_s=lasts_s, seed=planned.seed, about=about, sites={**scenario.sites, **sites}
+            scenario,
+            duration_s=lasts_s,
+            seed=planned.seed,
+            about=about,
+            sites={**scenario.sites, **sites},
         )
         self._rows = build_arm_rows(self.scenario, self.slave)
 
     def _share_out(self, scenario: Scenario) -> Scenario:
-        """Returns a scenario in which users have the authority over the slave that the trial gives them."""
+        """Returns a scenario in which users have the authority over the slave that the trial
+        gives them.
+        """
         row = scenario.dominance[self.slave]
         (first, *rest) = self.protocol.users
         goal = self.make_goal()
@@ -130,7 +143,8 @@ class ExperimentTrial:
             return scenario
         both = row[first] + row[rest[0]]
         before, after = (
-            {**row, first: both * lead, rest[0]: both - both * lead} for lead in (goal.lead, 1.0 - goal.lead)
+            {**row, first: both * lead, rest[0]: both - both * lead}
+            for lead in (goal.lead, 1.0 - goal.lead)
         )
         dominance = {**scenario.dominance, self.slave: before}
         timeline = scenario.timeline
@@ -192,12 +206,15 @@ class ExperimentTrial:
             which = f"_user{place}" if len(self.protocol.users) > 1 else ""
             split = split_torque(own, log.scenario)
             until = own.t_s <= outcome.ended_s
-            forces.append(split.end_effector.find_force(split.operator)[until])  # of the hand ON its arm
+            # of the hand ON its arm
+            forces.append(split.end_effector.find_force(split.operator)[until])
             force_n = np.linalg.norm(forces[-1], axis=1)
             found |= {
                 f"force_mean{which}_n": float(force_n.mean()),
                 f"force_peak{which}_n": float(force_n.max()),
-                f"work{which}_j": energy_j(forces[-1], split.end_effector.speed[until], own.rate_hz),
+                f"work{which}_j": energy_j(
+                    forces[-1], split.end_effector.speed[until], own.rate_hz
+                ),
             }
         if len(forces) > 1:
             found |= self._measure_pair(aligned, forces, outcome.ended_s)
@@ -207,7 +224,9 @@ class ExperimentTrial:
     def _follow(
         self, part: SiteLog | AlignedRecords, from_s: float, until_s: float
     ) -> tuple[Ints, Array, Array, float]:
-        """Returns which records of the slave are measured, its places and velocities, and their rate, Hz."""
+        """Returns which records of the slave are measured, its places and velocities, and their
+        rate, Hz.
+        """
         rows = np.flatnonzero((part.t_s >= from_s) & (part.t_s <= until_s))[::EVERY]
         places = self._place(part.q[rows]).at
         rate_hz = part.rate_hz / EVERY
@@ -221,7 +240,9 @@ class ExperimentTrial:
         rows, _, moves, rate_hz = self._follow(slave, 0.0, ended_s)
         t_s = slave.t_s[rows]
         one, other = (
-            np.column_stack([np.interp(t_s, aligned[user].t_s[: len(force)], axis) for axis in force.T])
+            np.column_stack(
+                [np.interp(t_s, aligned[user].t_s[: len(force)], axis) for axis in force.T]
+            )
             for user, force in zip(self.protocol.users, forces, strict=True)
         )
         found = measure_pair(one, other, moves, rate_hz)
@@ -237,7 +258,9 @@ class ExperimentTrial:
         wanted = np.array([goal.place(t) for t in t_s])
         apart_m = np.linalg.norm(places - wanted, axis=1)
         smooth = sparc(speed, rate_hz)
-        force_n = self._find_forces_n(part.q[rows], part.tau_x[rows]) if goal.force_n else 0.0 * t_s
+        force_n = (
+            self._find_forces_n(part.q[rows], part.tau_x[rows]) if goal.force_n else 0.0 * t_s
+        )
         ends = {"start": goal.start_m, "target": wanted[-1], "end": places[-1]}
         return {
             "completion_s": ended_s - goal.appears_s,
@@ -266,8 +289,12 @@ class SyntheticTrial(ExperimentTrial):
         for user, name in zip(self.protocol.users, self.planned.group, strict=True):
             hand = scenario.sites[user].find_live_hand(is_open=True)
             assert hand is not None  # see `plan_experiment`
-            at = HandSite(scenario, user, hand, HAND_HZ, HAND_DELAY_S)
-            own = int.from_bytes(hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()[:4], "big")
+            at = HandSite(
+                scenario=scenario, name=user, spec=hand, rate_hz=HAND_HZ, delay_s=HAND_DELAY_S
+            )
+            own = int.from_bytes(
+                hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()[:4], "big"
+            )
             model = self.protocol.model.draw(own)
             slave = (self.slave, self.arm, self.find_force_n)
             mine = (self.make_goal(), slave, self.planned.before, self.planned.seed, len(found))
@@ -312,4 +339,6 @@ def run_trial(task: tuple[Protocol, str, PlannedTrial, str, Path]) -> TrialEntry
         LogError: the log is not that of its run.
     """
     protocol, text, planned, digest, folder = task
-    return SyntheticTrial(protocol, parse_scenario(text), planned, digest).write(folder / planned.file)
+    return SyntheticTrial(protocol, parse_scenario(text), planned, digest).write(
+        folder / planned.file
+    )

@@ -1,4 +1,6 @@
-"""Stability maps: one scenario over a plane of its keys, in virtual time, on all cores; docs/sweep.md."""
+"""Stability maps: one scenario over a plane of its keys, in virtual time, on all cores;
+docs/sweep.md.
+"""
 
 from .sweep_plan import plan_sweep
 from .sweep_results import read_results

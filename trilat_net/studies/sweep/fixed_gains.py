@@ -1,4 +1,5 @@
-"""The gains of the control laws of a sweep that were not swept: what a picture of it depends on besides.
+"""The gains of the control laws of a sweep that were not swept: what a picture of it depends on
+besides.
 
 Invariant: a gain is named unless an axis of the sweep changes it at every site.
 """
@@ -18,7 +19,8 @@ FAIR_COMPARISON = "laws at their best gains compare fairly by: trilat compare --
 
 
 def describe_fixed_gains(plan: SweepPlan) -> list[str]:
-    """Returns for each law the gains that were not swept, in words, as in "p_d of s: K 10, gravity 1".
+    """Returns for each law the gains that were not swept, in words, as in "p_d of s: K 10,
+    gravity 1".
 
     Sites with the same gains share a text, and a text for all sites names none.
     """
@@ -29,7 +31,9 @@ def describe_fixed_gains(plan: SweepPlan) -> list[str]:
         owners: dict[str, list[str]] = {}
         for site, spec in scenario.sites.items():
             gains = ", ".join(_format_gains(plan, site, spec.control))
-            owners.setdefault(f"{identify_law(spec.control)}: {gains or 'none'}", []).append(site)
+            owners.setdefault(f"{identify_law(spec.control)}: {gains or 'none'}", []).append(
+                site
+            )
         for text, sites in owners.items():
             law, _, gains = text.partition(": ")
             of_sites = "" if len(sites) == len(scenario.sites) else f" of {', '.join(sites)}"
@@ -38,7 +42,9 @@ def describe_fixed_gains(plan: SweepPlan) -> list[str]:
 
 
 def _format_gains(plan: SweepPlan, site: str, law: Any) -> Iterator[str]:
-    """Yields the gains of a site's law, each with its value, without those that an axis changes."""
+    """Yields the gains of a site's law, each with its value, without those that an axis
+    changes.
+    """
     table = law.settings if isinstance(law, ImportedLaw) else msgspec.to_builtins(law)
     swept = {axis.key for axis in plan.axes}
     for key, value in table.items():

@@ -1,7 +1,9 @@
-"""Confirmation of a map over a real network: runs cells near its edges live and compares the classes.
+"""Confirmation of a map over a real network: runs cells near its edges live and compares the
+classes.
 
-Invariant: a cell is confirmed if the log of the live session, classified over the same duration, has the
-class of virtual time. A failed session confirms nothing, unless it failed by diverging.
+Invariant: a cell is confirmed if the log of the live session, classified over the same
+duration, has the class of virtual time. A failed session confirms nothing, unless it failed by
+diverging.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -23,12 +25,14 @@ from .sweep_results import ResultRow
 MAX_SESSION_S = 60.0
 """A live session lasts as long as the cell ran: longer ones are passed over, s."""
 _BEYOND_S = 0.5
-"""A cell that diverged runs so much longer than it needed to, s: not to end on the very tick."""
+"""A cell that diverged runs so much longer than it needed to, s: not to end on the very tick.
+"""
 
 
 SessionRunner = Callable[[Scenario, str], tuple[Path, Sequence[str]]]
-"""Runs a scenario over a network, called by a name; returns its log, which may be missing, and what went
-wrong, in order."""
+"""Runs a scenario over a network, called by a name; returns its log, which may be missing, and
+what went wrong, in order.
+"""
 
 
 class ConfirmedCell(NamedTuple):
@@ -54,12 +58,14 @@ class ConfirmedCell(NamedTuple):
         return self.virtual is self.live
 
 
-def choose_cells_near_edges(rows: Sequence[ResultRow], axes: Sequence[str], count: int) -> list[ResultRow]:
+def choose_cells_near_edges(
+    rows: Sequence[ResultRow], axes: Sequence[str], count: int
+) -> list[ResultRow]:
     """Returns cells next to edges, as many on the stable side as on the other.
 
-    How far a cell is from an edge is counted in steps along one axis, to the first cell that was decided the
-    other way. The nearest are taken whose runs were short enough; of more than are asked for, those that are
-    spread most evenly along the edge.
+    How far a cell is from an edge is counted in steps along one axis, to the first cell that
+    was decided the other way. The nearest are taken whose runs were short enough; of more than
+    are asked for, those that are spread most evenly along the edge.
 
     Args:
         rows: one mapping per run, with its axes, "law", "seed", "cell", "verdict", "ran_s".
@@ -74,17 +80,22 @@ def choose_cells_near_edges(rows: Sequence[ResultRow], axes: Sequence[str], coun
     places = _index_rows(rows, axes)
     away = _steps_away(places, len(axes))
     if not away:
-        raise UsageError("no two cells along an axis were decided differently: there is no edge to confirm")
+        raise UsageError(
+            "no two cells along an axis were decided differently: there is no edge to confirm"
+        )
     chosen = []
     for side in (True, False):
         brief = [
             place
             for place in away
-            if CellClass(places[place]["verdict"]).stable is side and places[place]["ran_s"] <= MAX_SESSION_S
+            if CellClass(places[place]["verdict"]).stable is side
+            and places[place]["ran_s"] <= MAX_SESSION_S
         ]
         if not brief:
             word = "stable" if side else "other"
-            raise UsageError(f"every cell on the {word} side of an edge ran longer than {MAX_SESSION_S:g} s")
+            raise UsageError(
+                f"every cell on the {word} side of an edge ran longer than {MAX_SESSION_S:g} s"
+            )
         farthest = sorted(away[place] for place in brief)[min(count, len(brief)) - 1]
         near = [place for place in brief if away[place] <= farthest]
         near.sort(key=lambda place: (*map(str, place[2:]), *place[:2]))
@@ -104,15 +115,34 @@ def confirm_cell(row: ResultRow, run: SessionRunner) -> ConfirmedCell:
     try:
         found = classify_log_end(open_log(file))
     except LogError as error:
-        return ConfirmedCell(row, virtual, None, "; ".join([*problems, str(error)]), log)
+        return ConfirmedCell(
+            row=row,
+            virtual=virtual,
+            live=None,
+            text="; ".join([*problems, str(error)]),
+            log=log,
+        )
     if problems and found.behaviour is not EndBehaviour.DIVERGED:  # that ends all, as it should
-        return ConfirmedCell(row, virtual, None, "; ".join(problems), log)
-    return ConfirmedCell(row, virtual, classify_end(found), found.text, log)
+        return ConfirmedCell(
+            row=row, virtual=virtual, live=None, text="; ".join(problems), log=log
+        )
+    return ConfirmedCell(
+        row=row, virtual=virtual, live=classify_end(found), text=found.text, log=log
+    )
 
 
 def tabulate_confirmations(found: Sequence[ConfirmedCell], axes: Sequence[str]) -> TextTable:
     """Returns a row per cell: where it lies, both verdicts, what the log shows and where it is."""
-    heads = ("cell", *map(label_axis, axes), "seed", "virtual", "live", "", "the log shows", "log")
+    heads = (
+        "cell",
+        *map(label_axis, axes),
+        "seed",
+        "virtual",
+        "live",
+        "",
+        "the log shows",
+        "log",
+    )
     rows = []
     for one in found:
         values = [one.row[key] for key in axes]
@@ -130,7 +160,10 @@ GridIndex = tuple[Any, ...]
 
 
 def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridIndex, ResultRow]:
-    values = [sorted({row[key] for row in rows}, key=lambda one: (isinstance(one, str), one)) for key in axes]
+    values = [
+        sorted({row[key] for row in rows}, key=lambda one: (isinstance(one, str), one))
+        for key in axes
+    ]
     numbers = [{value: n for n, value in enumerate(some)} for some in values]
 
     def index(row: ResultRow) -> GridIndex:
@@ -141,7 +174,9 @@ def _index_rows(rows: Sequence[ResultRow], axes: Sequence[str]) -> dict[GridInde
 
 
 def _steps_away(places: Mapping[GridIndex, ResultRow], axes: int) -> dict[GridIndex, int]:
-    """Returns of decided places how many steps along an axis the first one is that was decided otherwise."""
+    """Returns of decided places how many steps along an axis the first one is that was decided
+    otherwise.
+    """
     stable = {place: CellClass(row["verdict"]).stable for place, row in places.items()}
     lines: dict[GridIndex, list[GridIndex]] = {}
     for place, side in stable.items():
@@ -151,7 +186,9 @@ def _steps_away(places: Mapping[GridIndex, ResultRow], axes: int) -> dict[GridIn
     away: dict[GridIndex, int] = {}
     for (n, *_), line in lines.items():
         for place in line:
-            others = [abs(one[n] - place[n]) for one in line if stable[one] is not stable[place]]
+            others = [
+                abs(one[n] - place[n]) for one in line if stable[one] is not stable[place]
+            ]
             if others:
                 away[place] = min(min(others), away.get(place, min(others)))
     return away

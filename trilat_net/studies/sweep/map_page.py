@@ -1,10 +1,10 @@
 """The figure and the page of a stability map: map.png, map.svg, map.pdf and map.md.
 
-Invariant: the page holds only results, lines and commands, and equal results give equal bytes. A cell of the
-figure is coloured by its classes alone: with several seeds by the stable share of the decided runs, hatched
-where half or more are undecided; or, judged by twins, by its growth exponent, white at zero. Cells stay
-pixels in vector output, since viewers show seams between touching shapes; the classes differ in lightness
-for grey print and colour-blind readers.
+Invariant: the page holds only results, lines and commands, and equal results give equal bytes.
+A cell of the figure is coloured by its classes alone: with several seeds by the stable share of
+the decided runs, hatched where half or more are undecided; or, judged by twins, by its growth
+exponent, white at zero. Cells stay pixels in vector output, since viewers show seams between
+touching shapes; the classes differ in lightness for grey print and colour-blind readers.
 """
 
 import math
@@ -57,9 +57,13 @@ _LINE_STYLES: tuple[dict[str, Any], ...] = (
     {"color": "#ddaa33", "linestyle": "-", "linewidth": 2.6},  # measured, below the others
 )
 _VERDICT_EDGE: dict[str, Any] = {"color": "#6b6b6b", "linewidth": 1.6, "alpha": 0.6}
-_EXPONENTS = LinearSegmentedColormap.from_list("exponents", ["#004488", "#ffffff", "#a23b53"], 257)
+_EXPONENTS = LinearSegmentedColormap.from_list(
+    "exponents", ["#004488", "#ffffff", "#a23b53"], 257
+)
 _CLASSES_OF_SHARES = (CellClass.DIVERGED, CellClass.BOUNDED, CellClass.CONVERGED)
-_SHARES = LinearSegmentedColormap.from_list("share", [CLASS_COLOURS[one] for one in _CLASSES_OF_SHARES])
+_SHARES = LinearSegmentedColormap.from_list(
+    "share", [CLASS_COLOURS[one] for one in _CLASSES_OF_SHARES]
+)
 """Colours of shares: those of the classes, dark where nothing is stable, and ever lighter."""
 _HALO_PT = 2.6
 _COUNT_PT = 5.0
@@ -92,8 +96,12 @@ def draw_stability_map(
     height_in = 0.95 + rows * each_in + _CAPTION_LINE_IN * len(caption)
     with style.styled_figure(form, height_in) as figure:
         shared = columns * rows > 1
-        low = _write_caption(figure, caption, height_in, shared_label=shared) if caption else None
-        grid: list[Any] = list(style.add_panels(figure, rows, columns, sharex=True, sharey=True).flat)
+        low = (
+            _write_caption(figure, caption, height_in, shared_label=shared) if caption else None
+        )
+        grid: list[Any] = list(
+            style.add_panels(figure, rows, columns, sharex=True, sharey=True).flat
+        )
         for axes in grid[len(plane.panels) :]:
             axes.set_axis_off()
         for axes, panel, drawn in zip(grid, plane.panels, lines, strict=False):
@@ -116,7 +124,8 @@ def draw_stability_map(
             _draw_scale(figure, grid, plane)
         _draw_legend(figure, plane, lines)
         figure.draw(FigureCanvasAgg(figure).get_renderer())  # type: ignore[no-untyped-call]
-        if plane.seeds > 1 and not plane.judged_by_twins:  # only now it is known how much room there is
+        # only now it is known how much room there is
+        if plane.seeds > 1 and not plane.judged_by_twins:
             for axes, panel in zip(grid, plane.panels, strict=False):
                 _draw_counts(axes, plane, panel)
     return figure
@@ -131,17 +140,26 @@ def _wrap_caption(fixed: Sequence[str], form: FigureSize) -> list[str]:
     return [line for text in texts for line in textwrap.wrap(text, width)]
 
 
-def _write_caption(figure: Figure, caption: Sequence[str], height_in: float, *, shared_label: bool) -> float:
-    """Writes the caption below the panels, which give way to it; returns where it ends, from 0 to 1.
+def _write_caption(
+    figure: Figure, caption: Sequence[str], height_in: float, *, shared_label: bool
+) -> float:
+    """Writes the caption below the panels, which give way to it; returns where it ends, from 0
+    to 1.
 
-    The layout engine moves panels, but no label that they share: with `shared_label` they make room for that.
+    The layout engine moves panels, but no label that they share: with `shared_label` they make
+    room for that.
     """
     end = (_CAPTION_LINE_IN * len(caption) + 0.04) / height_in
     share = end + _SHARED_LABEL_IN / height_in * shared_label
     engine: Any = figure.get_layout_engine()
     engine.set(rect=(0.0, share, 1.0, 1.0 - share))
     figure.text(
-        0.01, 0.02 / height_in, "\n".join(caption), va="bottom", fontsize=_CAPTION_PT, color=style.REFERENCE
+        0.01,
+        0.02 / height_in,
+        "\n".join(caption),
+        va="bottom",
+        fontsize=_CAPTION_PT,
+        color=style.REFERENCE,
     )
     return end
 
@@ -183,22 +201,34 @@ def _draw_panel(axes: Axes, plane: MapPlane, panel: MapPanel, lines: Sequence[Ma
 
 
 def _draw_line(axes: Axes, plane: MapPlane, line: MapLine) -> None:
-    x, y = (np.concatenate([_bounds(one)[:1], one.places, _bounds(one)[-1:]]) for one in (plane.x, plane.y))
+    x, y = (
+        np.concatenate([_bounds(one)[:1], one.places, _bounds(one)[-1:]])
+        for one in (plane.x, plane.y)
+    )
     spare = _extended(_extended(line.spare, y).T, x).T
-    inside = [np.diff(one, append=np.inf) > 0.0 for one in (y, x)]  # a border at zero is a place itself
+    # a border at zero is a place itself
+    inside = [np.diff(one, append=np.inf) > 0.0 for one in (y, x)]
     shown = np.ma.masked_invalid(spare[np.ix_(*inside)])
     look = _LINE_STYLES[line.rank % len(_LINE_STYLES)]
     drawn = axes.contour(
-        x[inside[1]], y[inside[0]], shown, [0.0], colors=look["color"], linewidths=look["linewidth"]
+        x[inside[1]],
+        y[inside[0]],
+        shown,
+        [0.0],
+        colors=look["color"],
+        linewidths=look["linewidth"],
     )
     halo = [Stroke(linewidth=_HALO_PT, foreground="#ffffff"), Normal()]
     drawn.set(linestyle=look["linestyle"], path_effects=halo)
 
 
 def _extended(rows: Array, places: Array) -> Array:
-    """Returns a field with a row more at either end, of which the places are the first and the last."""
+    """Returns a field with a row more at either end, of which the places are the first and the
+    last.
+    """
     before, after = (
-        rows[i] + (rows[j] - rows[i]) * (places[at] - places[near]) / (places[far] - places[near])
+        rows[i]
+        + (rows[j] - rows[i]) * (places[at] - places[near]) / (places[far] - places[near])
         for i, j, at, near, far in ((0, 1, 0, 1, 2), (-1, -2, -1, -2, -3))
     )
     return np.concatenate([before[np.newaxis], rows, after[np.newaxis]])
@@ -208,7 +238,9 @@ def _undecided(plane: MapPlane, panel: MapPanel) -> Any:
     """Returns where half of the runs or more are undecided, or have no exponent, shape (y, x)."""
     if plane.judged_by_twins:
         return (panel.runs > 0) & np.isnan(panel.exponents_per_s)
-    return (panel.runs > 0) & (2 * panel.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)] >= panel.runs)
+    return (panel.runs > 0) & (
+        2 * panel.counts[:, :, CELL_CLASSES.index(CellClass.UNDECIDED)] >= panel.runs
+    )
 
 
 def _bounds(side: PlaneAxis) -> Array:
@@ -225,7 +257,9 @@ def _bounds(side: PlaneAxis) -> Array:
 
 
 def _scale(axes: Axes, plane: MapPlane) -> None:
-    """Gives a panel its ticks: round numbers on an even axis, else every value that there is room for."""
+    """Gives a panel its ticks: round numbers on an even axis, else every value that there is
+    room for.
+    """
     x = _bounds(plane.x)
     y = _bounds(plane.y)
     axes.set_xlim(x[0], x[-1])
@@ -243,11 +277,15 @@ def _scale(axes: Axes, plane: MapPlane) -> None:
 
 
 def _find_exponent_limit(plane: MapPlane) -> float:
-    """Returns the exponent of the darkest colours, 1/s, a round number that four fifths are below."""
+    """Returns the exponent of the darkest colours, 1/s, a round number that four fifths are
+    below.
+    """
     found = np.abs(np.concatenate([panel.exponents_per_s.ravel() for panel in plane.panels]))
     least = max(float(np.nanquantile(found, 0.8)), 1e-6)
     decade = 10.0 ** math.floor(math.log10(least))
-    return next(step * decade for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= least * (1.0 - 1e-9))
+    return next(
+        step * decade for step in (1.0, 2.0, 5.0, 10.0) if step * decade >= least * (1.0 - 1e-9)
+    )
 
 
 def _draw_scale(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
@@ -257,7 +295,9 @@ def _draw_scale(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
     colours = ScalarMappable(cmap=_EXPONENTS if twins else _SHARES)
     colours.set_clim(-limit if twins else 0.0, limit)
     ends = "both" if twins else "neither"
-    bar = figure.colorbar(colours, ax=list(grid), fraction=0.05, pad=0.02, aspect=30, extend=ends)
+    bar = figure.colorbar(
+        colours, ax=list(grid), fraction=0.05, pad=0.02, aspect=30, extend=ends
+    )
     if twins:
         bar.set_ticks([-limit, -0.5 * limit, 0.0, 0.5 * limit, limit])
     bar.set_label("growth exponent of a push (1/s)" if twins else "share of stable runs")
@@ -265,7 +305,9 @@ def _draw_scale(figure: Figure, grid: Sequence[Axes], plane: MapPlane) -> None:
 
 
 def _draw_counts(axes: Axes, plane: MapPlane, panel: MapPanel) -> None:
-    """Writes how many runs were stable, of the decided ones, into places where not all agree: if they fit."""
+    """Writes how many runs were stable, of the decided ones, into places where not all agree:
+    if they fit.
+    """
     extent = axes.get_window_extent()
     width_pt = 72.0 * extent.width / axes.figure.dpi / len(plane.x.values)
     height_pt = 72.0 * extent.height / axes.figure.dpi / len(plane.y.values)
@@ -288,7 +330,12 @@ def _draw_legend(figure: Figure, plane: MapPlane, lines: Sequence[Sequence[MapLi
             handles.append(Line2D([], [], label="edge of the verdicts", **_VERDICT_EDGE))
     elif plane.seeds == 1:
         handles += [
-            Patch(label=one.value, facecolor=CLASS_COLOURS[one], edgecolor="#6b6b6b", linewidth=0.5)
+            Patch(
+                label=one.value,
+                facecolor=CLASS_COLOURS[one],
+                edgecolor="#6b6b6b",
+                linewidth=0.5,
+            )
             for one, count in zip(CELL_CLASSES, counts, strict=True)
             if count and one is not CellClass.UNDECIDED
         ]
@@ -324,11 +371,21 @@ def write_map(chart: StabilityMap, folder: Path, width_in: float = COLUMN_IN) ->
 
 def build_map_page(chart: StabilityMap, picture: str) -> str:
     """Returns the page of a map, as Markdown."""
-    parts = [f"# {chart.title}", "```sh\n" + "\n".join(chart.commands) + "\n```", f"![map]({picture})"]
+    parts = [
+        f"# {chart.title}",
+        "```sh\n" + "\n".join(chart.commands) + "\n```",
+        f"![map]({picture})",
+    ]
     parts.append(tabulate_classes(chart.plane).markdown())
-    meanings = dict.fromkeys(f"{line.text}: {line.about}" for lines in chart.lines for line in lines)
+    meanings = dict.fromkeys(
+        f"{line.text}: {line.about}" for lines in chart.lines for line in lines
+    )
     fixed = [f"gains that were not swept: {text}" for text in chart.fixed]
-    advice = [FAIR_COMPARISON.replace("trilat compare --tune", "`trilat compare --tune`")] if fixed else []
+    advice = (
+        [FAIR_COMPARISON.replace("trilat compare --tune", "`trilat compare --tune`")]
+        if fixed
+        else []
+    )
     if notes := [*meanings, *chart.remarks, *fixed, *advice]:
         parts.append("\n".join(f"- {one}" for one in notes))
     for panel, lines in zip(chart.plane.panels, chart.lines, strict=True):
@@ -349,13 +406,16 @@ def tabulate_classes(plane: MapPlane) -> TextTable:
 
 
 def tabulate_edges(plane: MapPlane, panel: MapPanel, lines: Sequence[MapLine]) -> TextTable:
-    """Returns the measured edges next to the lines, a row each; none if only one axis was swept.
+    """Returns the measured edges next to the lines, a row each; none if only one axis was
+    swept.
 
-    Judged by twins an edge is where the exponent is zero, next to that of the verdicts.
-    The difference is that of a line from the middle of the measured edge; "within" where the line lies in the
-    measured edge, as well as its grid can tell.
+    Judged by twins an edge is where the exponent is zero, next to that of the verdicts. The
+    difference is that of a line from the middle of the measured edge; "within" where the line
+    lies in the measured edge, as well as its grid can tell.
     """
-    measured, theory = ([line for line in lines if (line.rank < 0) is own] for own in (True, False))
+    measured, theory = (
+        [line for line in lines if (line.rank < 0) is own] for own in (True, False)
+    )
     heads = [plane.x.label, f"edge of {plane.y.label}", "stable is"]
     heads += ["edge of the verdicts"] * plane.judged_by_twins
     for line in theory:

@@ -1,15 +1,15 @@
 """Stability margins.
 
-Per grid point the edges along one key by a scan and bisection, with the edges of theory, as a table, a
-Markdown page and plain values.
+Per grid point the edges along one key by a scan and bisection, with the edges of theory, as a
+table, a Markdown page and plain values.
 
-Invariant: an edge lies between two values that were run, one stable and one not. Undecided values widen
-it and count for neither side; every edge that the scan sees is kept. The margin of a grid point is a
-function of its scenario, its seed and the range.
+Invariant: an edge lies between two values that were run, one stable and one not. Undecided
+values widen it and count for neither side; every edge that the scan sees is kept. The margin of
+a grid point is a function of its scenario, its seed and the range.
 """
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -50,8 +50,10 @@ class KeyMargin(NamedTuple):
     """Edges along one key.
 
     Attributes:
-        spans: the edges, from below; none where nothing changes, more than one where the scan saw islands.
-        stable: where there is no edge, whether all that was decided is stable; None where nothing was.
+        spans: the edges, from below; none where nothing changes, more than one where the scan
+            saw islands.
+        stable: where there is no edge, whether all that was decided is stable; None where
+            nothing was.
         undecided: how many values stayed undecided.
         runs: how many values were run.
     """
@@ -90,21 +92,37 @@ def search_key_margin(
     values = list(dict.fromkeys((np.round(scan) if whole else scan).tolist()))
     decided = [value for value in values if ask(value) is not None]
     spans = tuple(
-        _narrowed(ask, a, b, tolerance, whole) for a, b in pairwise(decided) if known[a] != known[b]
+        _narrowed(ask=ask, low=a, high=b, tolerance=tolerance, whole=whole)
+        for a, b in pairwise(decided)
+        if known[a] != known[b]
     )
     everywhere = known[decided[0]] if decided and not spans else None
     return KeyMargin(spans, everywhere, sum(one is None for one in known.values()), len(known))
 
 
-def _narrowed(ask: StabilityTest, low: float, high: float, tolerance: float, whole: bool) -> StableInterval:
+def _narrowed(
+    ask: StabilityTest, low: float, high: float, tolerance: float, whole: bool
+) -> StableInterval:
     first = ask(low)
     last = ask(high)
-    low, above = _halved(lambda value: ask(value) is first, low, high, tolerance, whole)
+    low, above = _halved(
+        holds=lambda value: ask(value) is first,
+        low=low,
+        high=high,
+        tolerance=tolerance,
+        whole=whole,
+    )
     sharp = ask(above) is not None
     if sharp:
         high = above
     else:
-        _, high = _halved(lambda value: ask(value) is not last, above, high, tolerance, whole)
+        _, high = _halved(
+            holds=lambda value: ask(value) is not last,
+            low=above,
+            high=high,
+            tolerance=tolerance,
+            whole=whole,
+        )
     return StableInterval(low, high, first is True, sharp)
 
 
@@ -153,7 +171,8 @@ class GridPointMargin(NamedTuple):
         margin: what the runs show.
         linear: where the linear analysis has edges in the range, from below.
         remark: what is to be known of those, or "".
-        closed: where the criterion in closed form has its edge; None where it has none in the range.
+        closed: where the criterion in closed form has its edge; None where it has none in the
+            range.
     """
 
     cell: SweepCell
@@ -175,9 +194,13 @@ def parse_search_range(text: str, tolerance: float = MARGIN_TOLERANCE) -> Search
     try:
         found = SearchRange(key.strip(), float(low), float(high), tolerance)
     except ValueError:
-        raise UsageError(f"--margin reads KEY=FROM:TO, as in control.d=0.2:3, not {text!r}") from None
+        raise UsageError(
+            f"--margin reads KEY=FROM:TO, as in control.d=0.2:3, not {text!r}"
+        ) from None
     if not 0.0 < tolerance < 1.0:
-        raise UsageError(f"--tolerance is a share of the edge's value, as in 0.005, not {tolerance:g}")
+        raise UsageError(
+            f"--tolerance is a share of the edge's value, as in 0.005, not {tolerance:g}"
+        )
     if not colon or not found.key or not -float("inf") < found.low < found.high < float("inf"):
         form = "KEY=FROM:TO with FROM below TO, as in control.d=0.2:3"
         raise UsageError(f"--margin reads {form}, not {text!r}")
@@ -238,7 +261,19 @@ def search_margin_task(task: MarginItem) -> GridPointMargin:
     margin = search_key_margin(stable, low, high, tolerance, whole=whole)
     closed = find_criterion_edge(lambda value: evaluate_criterion(at(value)), low, high)
     linear, remark = find_root_crossings(at(high), key, low, high)
-    return GridPointMargin(task.cell, task.seed, margin, linear, remark, closed)
+    return GridPointMargin(
+        cell=task.cell,
+        seed=task.seed,
+        margin=margin,
+        linear=linear,
+        remark=remark,
+        closed=closed,
+    )
+
+
+def _find_nearest(value: float, edges: Sequence[float]) -> float | None:
+    """Returns the edge that is nearest to a value; None if there are no edges."""
+    return min(edges, key=lambda edge: abs(edge - value), default=None)
 
 
 @dataclass(frozen=True, repr=False)
@@ -263,17 +298,28 @@ class SweepMargins(Result):
         axes = self.plan.axes[:-1]
         seeds = len({one.seed for one in self.found}) > 1
         closed = any(one.closed is not None for one in self.found)
-        heads = [*(label_axis(axis.key, plan.base) for axis in axes), *(["law"] if plan.laws else [])]
-        heads += [*(["seed"] if seeds else []), f"edge of {label_axis(self.within.key, plan.base)}"]
+        heads = [
+            *(label_axis(axis.key, plan.base) for axis in axes),
+            *(["law"] if plan.laws else []),
+        ]
+        heads += [
+            *(["seed"] if seeds else []),
+            f"edge of {label_axis(self.within.key, plan.base)}",
+        ]
         heads += ["stable is", "linear", "difference"]
         heads += [*(["closed form", "difference"] if closed else []), "runs"]
         rows = []
         for one in self.found:
-            place = [value if isinstance(value, str) else f"{value:g}" for value in one.cell.values]
-            place += [*([one.cell.law] if plan.laws else []), *([str(one.seed)] if seeds else [])]
+            place = [
+                value if isinstance(value, str) else f"{value:g}" for value in one.cell.values
+            ]
+            place += [
+                *([one.cell.law] if plan.laws else []),
+                *([str(one.seed)] if seeds else []),
+            ]
             for span in one.margin.spans or (None,):
                 near = self.within.low if span is None else span.middle
-                linear = min(one.linear, key=lambda edge, near=near: abs(edge - near), default=None)  # type: ignore[misc]
+                linear = _find_nearest(near, one.linear)
                 cells = [*place, *_edge_cells(one.margin, span), *_theory_cells(span, linear)]
                 cells += _theory_cells(span, one.closed) if closed else []
                 rows.append((*cells, str(one.margin.runs)))
@@ -350,7 +396,11 @@ class SweepMargins(Result):
 
 def _edge_cells(margin: KeyMargin, span: StableInterval | None) -> list[str]:
     if span is None:
-        words = {True: "none: all stable", False: "none: nothing stable", None: "none: nothing decided"}
+        words = {
+            True: "none: all stable",
+            False: "none: nothing stable",
+            None: "none: nothing decided",
+        }
         return [words[margin.stable], "-"]
     digits, blur = (5, "") if span.sharp else (4, " (undecided between)")
     place = f"{span.low:.{digits}g} to {span.high:.{digits}g}{blur}"

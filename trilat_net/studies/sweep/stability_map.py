@@ -1,16 +1,19 @@
-"""A stability map: the plane of a sweep's results with the lines of theory, and the commands that make both.
+"""A stability map: the plane of a sweep's results with the lines of theory, and the commands
+that make both.
 
-The plane has two numeric axes with their labels, a panel per setting of the others, class counts per grid
-point, and the measured edges. Lines are those of closed-form stability criteria and of the dominant root of
-the linear loop, where either is marginal.
+The plane has two numeric axes with their labels, a panel per setting of the others, class
+counts per grid point, and the measured edges. Lines are those of closed-form stability criteria
+and of the dominant root of the linear loop, where either is marginal.
 
-Invariant: the runs come from the results and the lines from the plan alone. Every run is in exactly one grid
-point of one panel. A label takes its words from the scenario key and its unit from the key's suffix; a gain
-has the unit that its control law states. An edge lies between two decided grid points of a column, one stable
-and one not; undecided ones widen it, the majority of the runs decides, and a draw decides nothing. A line is
-the zero set of a quantity that theory gives, found between any two places of a column of which just one is
-stable. A criterion applies only if all of its hypotheses hold, and its excess is positive where it is met.
-P+d counts as it is computed, from tick to tick; of the roots' line only those with scheme `digital` do.
+Invariant: the runs come from the results and the lines from the plan alone. Every run is in
+exactly one grid point of one panel. A label takes its words from the scenario key and its unit
+from the key's suffix; a gain has the unit that its control law states. An edge lies between two
+decided grid points of a column, one stable and one not; undecided ones widen it, the majority
+of the runs decides, and a draw decides nothing. A line is the zero set of a quantity that
+theory gives, found between any two places of a column of which just one is stable. A criterion
+applies only if all of its hypotheses hold, and its excess is positive where it is met. P+d
+counts as it is computed, from tick to tick; of the roots' line only those with scheme `digital`
+do.
 """
 
 import math
@@ -48,7 +51,9 @@ MAX_PANELS = 12
 
 
 class PlaneAxis(NamedTuple):
-    """One axis of a plane: a dotted key, the numbers that it takes, rising, in its unit, and a label."""
+    """One axis of a plane: a dotted key, the numbers that it takes, rising, in its unit, and a
+    label.
+    """
 
     key: str
     values: tuple[float, ...]
@@ -62,8 +67,14 @@ class PlaneAxis(NamedTuple):
 
     @property
     def places(self) -> Array:
-        """Where its values are drawn: at themselves where they are even, else one apart from the next."""
-        return np.array(self.values) if self.even else np.arange(len(self.values), dtype=np.float64)
+        """Where its values are drawn: at themselves where they are even, else one apart from
+        the next.
+        """
+        return (
+            np.array(self.values)
+            if self.even
+            else np.arange(len(self.values), dtype=np.float64)
+        )
 
 
 class MapPanel(NamedTuple):
@@ -73,7 +84,8 @@ class MapPanel(NamedTuple):
         title: where it lies along the axes that are not drawn; "" where there are none.
         settings: the same as overrides, key by key; "law" among them where laws were swept.
         counts: runs per place and class, shape (y, x, 4), in the order of `CELL_CLASSES`.
-        exponents_per_s: growth exponents, 1/s, means of the seeds, shape (y, x); NaN where there is none.
+        exponents_per_s: growth exponents, 1/s, means of the seeds, shape (y, x); NaN where
+            there is none.
     """
 
     title: str
@@ -90,9 +102,9 @@ class MapPanel(NamedTuple):
     @property
     def stable(self) -> RunCounts:
         """Stable runs per place, shape (y, x)."""
-        stable: RunCounts = self.counts[:, :, [verdict.stable is True for verdict in CELL_CLASSES]].sum(
-            axis=2
-        )
+        stable: RunCounts = self.counts[
+            :, :, [verdict.stable is True for verdict in CELL_CLASSES]
+        ].sum(axis=2)
         return stable
 
     @property
@@ -102,7 +114,9 @@ class MapPanel(NamedTuple):
 
     @property
     def share(self) -> Array:
-        """Share of stable runs among the decided ones, shape (y, x); NaN where none was decided."""
+        """Share of stable runs among the decided ones, shape (y, x); NaN where none was
+        decided.
+        """
         stable = self.stable
         decided = self.decided
         share: Array = np.full(decided.shape, np.nan)
@@ -132,12 +146,16 @@ class MapPlane(NamedTuple):
         return max(int(panel.runs.max()) for panel in self.panels)
 
 
-def build_plane(rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario: Scenario) -> MapPlane:
-    """Returns the plane of results: its first two axes of numbers, a panel per place of all others.
+def build_plane(
+    rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario: Scenario
+) -> MapPlane:
+    """Returns the plane of results: its first two axes of numbers, a panel per place of all
+    others.
 
     Args:
         rows: one mapping per run: a value per axis, and "verdict" as its text.
-        axes: the keys of the axes, in the order in which they were given; "law" where laws were swept.
+        axes: the keys of the axes, in the order in which they were given; "law" where laws were
+            swept.
         scenario: the experiment that was swept, for its words.
 
     Raises:
@@ -147,20 +165,27 @@ def build_plane(rows: Sequence[Mapping[str, Any]], axes: Sequence[str], scenario
         raise UsageError("no cell has run: there is nothing to draw")
     drawn = [key for key in axes if all(is_number(row[key]) for row in rows)][:2]
     if not drawn:
-        raise UsageError(f"a map needs an axis of numbers, and {', '.join(axes)} has words only")
+        raise UsageError(
+            f"a map needs an axis of numbers, and {', '.join(axes)} has words only"
+        )
     sides = [  # whole numbers stay whole
-        PlaneAxis(key, tuple(sorted({row[key] for row in rows})), label_axis(key, scenario)) for key in drawn
+        PlaneAxis(key, tuple(sorted({row[key] for row in rows})), label_axis(key, scenario))
+        for key in drawn
     ]
     if len(sides) == 1:
         sides.append(PlaneAxis("", (0.0,), ""))
     others = [key for key in axes if key not in drawn and len({row[key] for row in rows}) > 1]
     settings = list(dict.fromkeys(tuple((key, row[key]) for key in others) for row in rows))
     if len(settings) > MAX_PANELS:
-        found = f"at most {MAX_PANELS} panels, and {', '.join(others)} would make {len(settings)}"
+        found = (
+            f"at most {MAX_PANELS} panels, and {', '.join(others)} would make {len(settings)}"
+        )
         raise UsageError(f"a map has {found}: sweep fewer values of what is not drawn")
     shape = len(sides[1].values), len(sides[0].values), len(CELL_CLASSES)
     panels = [
-        MapPanel(_title(one, scenario), one, np.zeros(shape, dtype=np.int64), np.zeros(shape[:2]))
+        MapPanel(
+            _title(one, scenario), one, np.zeros(shape, dtype=np.int64), np.zeros(shape[:2])
+        )
         for one in settings
     ]
     of = dict(zip(settings, panels, strict=True))
@@ -242,7 +267,9 @@ class StabilityCriterion(NamedTuple):
 
 def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
     """Returns the condition in closed form that covers a scenario, or None."""
-    if scenario.timeline or any(spec.on_stale.action != "use" for spec in scenario.sites.values()):
+    if scenario.timeline or any(
+        spec.on_stale.action != "use" for spec in scenario.sites.values()
+    ):
         return None
     if any(arm.shares_pose for arm in scenario.arms.values()):
         return None
@@ -251,17 +278,24 @@ def evaluate_criterion(scenario: Scenario) -> StabilityCriterion | None:
 
 
 def _damped(scenario: Scenario) -> StabilityCriterion | None:
-    """P+d: 4 d1 d2 > (T1 + T2)^2 K1 K2 for two sites, d > max(abs(lambda_min), 0.2172) K T for N equal ones.
+    """P+d: 4 d1 d2 > (T1 + T2)^2 K1 K2 for two sites, d > max(abs(lambda_min), 0.2172) K T for
+    N equal ones.
 
-    Of N sites the shares must be reversible. It is the condition for no root on the unit circle whatever the
-    masses, down to d h: lighter arms no damping steadies at this tick rate (docs/errata.md, 13).
+    Of N sites the shares must be reversible. It is the condition for no root on the unit circle
+    whatever the masses, down to d h: lighter arms no damping steadies at this tick rate
+    (docs/errata.md, 13).
     """
     delays_s = _delays_s(scenario)
     rates_hz = {spec.rate_hz for spec in scenario.sites.values()}
     gains = [_scalar_gains(spec) for spec in scenario.sites.values()]
     K = [gain[0] for gain in gains if gain]
     d = [gain[1] for gain in gains if gain]
-    if delays_s is None or len(K) < len(gains) or len(rates_hz) > 1 or scenario.scheme != "second_order":
+    if (
+        delays_s is None
+        or len(K) < len(gains)
+        or len(rates_hz) > 1
+        or scenario.scheme != "second_order"
+    ):
         return None
     rate_hz = rates_hz.pop()
     if max(d) / rate_hz >= min(map(_least_inertia, scenario.arms.values())):
@@ -283,7 +317,9 @@ def _damped(scenario: Scenario) -> StabilityCriterion | None:
 
 
 def _scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
-    """Returns K and d of P+d with known gravity, if they are alike at all joints, which the arm couples."""
+    """Returns K and d of P+d with known gravity, if they are alike at all joints, which the arm
+    couples.
+    """
     law: Any = spec.control
     if law.kind is not PD or law.gravity != 1.0 or len({*law.K}) + len({*law.d}) > 2:
         return None
@@ -291,7 +327,8 @@ def _scalar_gains(spec: SiteSpec) -> tuple[float, float] | None:
 
 
 def _tick_angles(ticks: float) -> tuple[Array, Array, Array]:
-    """Returns angles phi = w h of z from almost 0 to almost pi, 2 tan(phi / 2), and the scheme's lag.
+    """Returns angles phi = w h of z from almost 0 to almost pi, 2 tan(phi / 2), and the
+    scheme's lag.
 
     The first turn of a delay of so many ticks has the more of them.
     """
@@ -304,16 +341,20 @@ def _tick_angles(ticks: float) -> tuple[Array, Array, Array]:
 def _find_asked_share(least: float, ticks: int) -> float:
     phi, w, lag = _tick_angles(ticks)
     asked = [
-        (lag * (1.0 - a * np.cos(ticks * phi)) - a * np.sin(ticks * phi)) / (w * ticks) for a in (least, 1.0)
+        (lag * (1.0 - a * np.cos(ticks * phi)) - a * np.sin(ticks * phi)) / (w * ticks)
+        for a in (least, 1.0)
     ]
     return float(np.max(asked))
 
 
 def _excess_of_two(K: list[float], d: list[float], ticks: float, rate_hz: float) -> float:
-    """Returns the least of 2 sqrt(d1 d2) - (T1 + T2) sqrt(K1 K2) over all frequencies, T1 + T2 = 2 ticks."""
+    """Returns the least of 2 sqrt(d1 d2) - (T1 + T2) sqrt(K1 K2) over all frequencies, T1 + T2
+    = 2 ticks.
+    """
     phi, w, lag = _tick_angles(ticks)
     first, second = (
-        np.maximum(damping - K_i * lag / (w * rate_hz), 0.0) for K_i, damping in zip(K, d, strict=True)
+        np.maximum(damping - K_i * lag / (w * rate_hz), 0.0)
+        for K_i, damping in zip(K, d, strict=True)
     )
     across = np.abs(np.sin(ticks * phi) + lag * np.cos(ticks * phi)) / (w * rate_hz)
     return float(2.0 * np.min(np.sqrt(first * second) - math.sqrt(K[0] * K[1]) * across))
@@ -322,7 +363,8 @@ def _excess_of_two(K: list[float], d: list[float], ticks: float, rate_hz: float)
 def _least_inertia(arm: ArmModel) -> float:
     """Returns what the least eigenvalue of M(q) exceeds in all poses, kg m^2.
 
-    Of the planar arm it lies at cos q2 = 1 or -1; a chain has at least the inertia of its drives.
+    Of the planar arm it lies at cos q2 = 1 or -1; a chain has at least the inertia of its
+    drives.
     """
     if arm.chain is not None:
         return min(joint.armature_kg_m2 for joint in arm.chain.joints)
@@ -331,7 +373,9 @@ def _least_inertia(arm: ArmModel) -> float:
 
 
 def _sampled(scenario: Scenario) -> StabilityCriterion | None:
-    """The adaptive law as `digital` computes it, without delay: it rests where Gamma g^2 h < Kp, about."""
+    """The adaptive law as `digital` computes it, without delay: it rests where Gamma g^2 h <
+    Kp, about.
+    """
     delays_s = _delays_s(scenario)
     if scenario.scheme != "digital" or delays_s is None:
         return None
@@ -347,14 +391,21 @@ def _sampled(scenario: Scenario) -> StabilityCriterion | None:
 
 
 def _delays_s(scenario: Scenario) -> list[float] | None:
-    """Returns the delays of all links that carry a share, s; None where one is not constant or loses."""
+    """Returns the delays of all links that carry a share, s; None where one is not constant or
+    loses.
+    """
     delays_s = []
     for name in scenario.names:
         for peer in scenario.peers(name):
             if scenario.dominance[name].get(peer, 0.0) == 0.0:
                 continue
             link: LinkBase = scenario.links[f"{peer}->{name}"]
-            if not isinstance(link, ConstantDelay | NoDelay) or link.random or link.loss or link.outages_s:
+            if (
+                not isinstance(link, ConstantDelay | NoDelay)
+                or link.random
+                or link.loss
+                or link.outages_s
+            ):
                 return None
             delays_s.append(max(link.moments().mean_ms, link.playout_ms) / 1e3)
     return delays_s
@@ -376,8 +427,8 @@ class MapLine(NamedTuple):
     Attributes:
         label: what the legend calls it; `text`: the same for plain text.
         about: where it is from.
-        spare: what is zero on it and positive on its stable side, shape (y, x), and goes straight from
-            one value of a column to the next; NaN where it is silent.
+        spare: what is zero on it and positive on its stable side, shape (y, x), and goes
+            straight from one value of a column to the next; NaN where it is silent.
         rank: how it is drawn: 0 is the first look, and so on; -1 is that of what was measured.
     """
 
@@ -389,16 +440,23 @@ class MapLine(NamedTuple):
 
     @property
     def there(self) -> bool:
-        """Whether it goes through the map: between four places that theory speaks of, some on either side."""
+        """Whether it goes through the map: between four places that theory speaks of, some on
+        either side.
+        """
         corners = np.array([self.spare[a:b, c:d] for a, b in _PAIR for c, d in _PAIR])
         stable = (corners > 0.0).sum(axis=0)
-        return bool((np.isfinite(corners).all(axis=0) & (stable > 0) & (stable < len(corners))).any())
+        return bool(
+            (np.isfinite(corners).all(axis=0) & (stable > 0) & (stable < len(corners))).any()
+        )
 
     def crossings(self, column: int, y: PlaneAxis) -> list[float]:
         """Returns where it crosses a column, from below."""
         at = y.values
         spare = self.spare[:, column].tolist()
-        return [at[n] + (at[n + 1] - at[n]) * spare[n] / (spare[n] - spare[n + 1]) for n in _changes(spare)]
+        return [
+            at[n] + (at[n + 1] - at[n]) * spare[n] / (spare[n] - spare[n + 1])
+            for n in _changes(spare)
+        ]
 
 
 ZERO_EXPONENT = "exponent = 0"
@@ -407,12 +465,20 @@ _TWINS = "where a small push of the run neither grows nor dies away, straight fr
 
 def trace_zero_exponent(panel: MapPanel) -> MapLine | None:
     """Returns the line on which the growth exponents of a panel are zero; None if it has none."""
-    line = MapLine(ZERO_EXPONENT, ZERO_EXPONENT, _TWINS, -panel.exponents_per_s, -1)
+    line = MapLine(
+        label=ZERO_EXPONENT,
+        text=ZERO_EXPONENT,
+        about=_TWINS,
+        spare=-panel.exponents_per_s,
+        rank=-1,
+    )
     return line if line.there else None
 
 
 def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> MapLine | None:
-    """Returns the line of the condition in closed form; None where there is none, or not within the map."""
+    """Returns the line of the condition in closed form; None where there is none, or not within
+    the map.
+    """
     found = [[evaluate_criterion(at(right, up)) for up in y.values] for right in x.values]
     first = next((one for column in found for one in column if one is not None), None)
     if first is None:
@@ -428,18 +494,34 @@ def trace_closed_form(at: ScenarioAt, x: PlaneAxis, y: PlaneAxis) -> MapLine | N
             )
             edges |= {} if edge is None else {n: edge}
         columns.append(_straighten(y.values, excess, edges))
-    line = MapLine(first.symbol, first.text, first.source, np.array(columns).T, 0)
+    line = MapLine(
+        label=first.symbol,
+        text=first.text,
+        about=first.source,
+        spare=np.array(columns).T,
+        rank=0,
+    )
     return line if line.there else None
 
 
-def trace_linear_analysis(columns: Sequence[GrowthColumn], y: PlaneAxis) -> tuple[MapLine | None, list[str]]:
+def trace_linear_analysis(
+    columns: Sequence[GrowthColumn], y: PlaneAxis
+) -> tuple[MapLine | None, list[str]]:
     """Returns the line of the linear analysis from its columns, and what is to be known of it."""
     spare = [
-        _straighten(y.values, [np.nan if np.isinf(s) else -s for s in one.growth_per_s], one.edges)
+        _straighten(
+            y.values, [np.nan if np.isinf(s) else -s for s in one.growth_per_s], one.edges
+        )
         for one in columns
     ]
     remarks = list(dict.fromkeys(remark for one in columns for remark in one.remarks))
-    line = MapLine(LINEAR_ANALYSIS, LINEAR_ANALYSIS, _ABOUT, np.array(spare).T, 1)
+    line = MapLine(
+        label=LINEAR_ANALYSIS,
+        text=LINEAR_ANALYSIS,
+        about=_ABOUT,
+        spare=np.array(spare).T,
+        rank=1,
+    )
     return line if line.there else None, remarks
 
 
@@ -448,17 +530,25 @@ def _changes(spare: Sequence[float]) -> list[int]:
     return [n for n, (a, b) in pairs if np.isfinite([a, b]).all() and (a > 0.0) != (b > 0.0)]
 
 
-def _straighten(values: Sequence[float], spare: Sequence[float], edges: Mapping[int, float]) -> Array:
-    """Returns what is zero at the edges of a column and goes straight between its values, shape (y,).
+def _straighten(
+    values: Sequence[float], spare: Sequence[float], edges: Mapping[int, float]
+) -> Array:
+    """Returns what is zero at the edges of a column and goes straight between its values, shape
+    (y,).
 
-    Elsewhere it is `spare`, by which a line that rises steeply finds its way between two columns. An edge
-    that is not given is where `spare` itself, if it went straight, would be zero.
+    Elsewhere it is `spare`, by which a line that rises steeply finds its way between two
+    columns. An edge that is not given is where `spare` itself, if it went straight, would be
+    zero.
     """
     straight: Array = np.where(np.isfinite(spare), spare, np.nan)
     straight[straight == 0.0] = -_ROUNDING
     for n in _changes(spare):
         low, high = values[n : n + 2]
-        share = (edges[n] - low) / (high - low) if n in edges else spare[n] / (spare[n] - spare[n + 1])
+        share = (
+            (edges[n] - low) / (high - low)
+            if n in edges
+            else spare[n] / (spare[n] - spare[n + 1])
+        )
         share = min(max(share, _ROUNDING), 1.0 - _ROUNDING)
         straight[n + 1] = straight[n] * (1.0 - 1.0 / share)
     return straight
@@ -467,7 +557,8 @@ def _straighten(values: Sequence[float], spare: Sequence[float], edges: Mapping[
 def find_criterion_edge(
     criterion: Callable[[float], StabilityCriterion | None], low: float, high: float
 ) -> float | None:
-    """Returns where between two values a criterion is just met; None if nowhere, or if it may not be asked.
+    """Returns where between two values a criterion is just met; None if nowhere, or if it may
+    not be asked.
 
     The criterion of a value may refuse it by ScenarioError, as between whole numbers.
     """
@@ -530,7 +621,14 @@ def build_stability_map(
     title = plan.base.title or plan.base.name
     fixed = tuple(describe_fixed_gains(plan))
     if not drawn.y.key or len(drawn.y.values) < 2:
-        return StabilityMap(drawn, ((),) * len(drawn.panels), (), commands, title, fixed)
+        return StabilityMap(
+            plane=drawn,
+            lines=((),) * len(drawn.panels),
+            remarks=(),
+            commands=commands,
+            title=title,
+            fixed=fixed,
+        )
     at = [panel_scenarios(plan, panel, drawn.x.key, drawn.y.key) for panel in drawn.panels]
     lines = [
         [trace_zero_exponent(panel), trace_closed_form(one, drawn.x, drawn.y)]
@@ -546,7 +644,14 @@ def build_stability_map(
             some.append(line)
             remarks |= dict.fromkeys(why)
     kept = tuple(tuple(line for line in some if line is not None) for some in lines)
-    return StabilityMap(drawn, kept, tuple(remarks), commands, title, fixed)
+    return StabilityMap(
+        plane=drawn,
+        lines=kept,
+        remarks=tuple(remarks),
+        commands=commands,
+        title=title,
+        fixed=fixed,
+    )
 
 
 def _column(task: tuple[ScenarioAt, float, PlaneAxis]) -> GrowthColumn:
@@ -555,13 +660,17 @@ def _column(task: tuple[ScenarioAt, float, PlaneAxis]) -> GrowthColumn:
 
 
 def panel_scenarios(plan: SweepPlan, panel: MapPanel, x: str, y: str) -> ScenarioAt:
-    """Returns what makes the scenario of any place of a panel along the keys x and y; it is picklable."""
+    """Returns what makes the scenario of any place of a panel along the keys x and y; it is
+    picklable.
+    """
     settings = dict(panel.settings)
     fixed = plan.laws.get(settings.pop(LAW_AXIS, next(iter(plan.laws), "")), ())
     others = tuple(format_override(key, value) for key, value in settings.items())
     return partial(load_place, plan, (*fixed, *others), x, y)
 
 
-def load_place(plan: SweepPlan, fixed: Sequence[str], x: str, y: str, right: float, up: float) -> Scenario:
+def load_place(
+    plan: SweepPlan, fixed: Sequence[str], x: str, y: str, right: float, up: float
+) -> Scenario:
     """Returns the scenario of a place, of a cell or between some, along the keys x and y."""
     return plan.scenario(*fixed, format_override(x, right), format_override(y, up))

@@ -1,8 +1,9 @@
-"""The plan of a sweep: the scenario, the axes with their values, the control laws and the seeds.
+"""The plan of a sweep: the scenario, the axes with their values, the control laws and the
+seeds.
 
-Invariant: a plan that cannot run is refused before the first run. Cells are numbered row by row, and a
-cell is a function of the plan and its number. An axis value is the text of an override; steps are counted
-in decimals, so 0.2:3:0.1 contains 0.3 and not 0.30000000000000004.
+Invariant: a plan that cannot run is refused before the first run. Cells are numbered row by
+row, and a cell is a function of the plan and its number. An axis value is the text of an
+override; steps are counted in decimals, so 0.2:3:0.1 contains 0.3 and not 0.30000000000000004.
 """
 
 import math
@@ -55,7 +56,9 @@ class _Steps:
 
 
 class SweepAxis(NamedTuple):
-    """One axis, asked for as "KEY=a:b:step" or "KEY=v1,v2,v3"; its values are texts of overrides."""
+    """One axis, asked for as "KEY=a:b:step" or "KEY=v1,v2,v3"; its values are texts of
+    overrides.
+    """
 
     asked: str
     key: str
@@ -80,8 +83,8 @@ def parse_axis(asked: str) -> SweepAxis:
     """Returns the axis that a text describes.
 
     Args:
-        asked: "KEY=a:b:step", with b where it lies on the grid, or "KEY=v1,v2,v3" with numbers, words or
-            other TOML values.
+        asked: "KEY=a:b:step", with b where it lies on the grid, or "KEY=v1,v2,v3" with numbers,
+            words or other TOML values.
 
     Raises:
         ScenarioError: it has no key, no values, or values that make no grid.
@@ -93,13 +96,21 @@ def parse_axis(asked: str) -> SweepAxis:
         raise ScenarioError(f"is no axis: {_ELSEWHERE[key]}", path=key)
     parts = _split(text, ":")
     if len(parts) not in (1, 3):
-        raise ScenarioError(f"values read {_HOW.removeprefix('as in ')}, not {text!r}", path=key)
-    texts = _listed(key, text) if len(parts) == 1 else _steps(key, *(_decimal(key, part) for part in parts))
+        raise ScenarioError(
+            f"values read {_HOW.removeprefix('as in ')}, not {text!r}", path=key
+        )
+    texts = (
+        _listed(key, text)
+        if len(parts) == 1
+        else _steps(key, *(_decimal(key, part) for part in parts))
+    )
     return SweepAxis(f"{key}={text}", key, texts)
 
 
 def list_axes(over: str | Sequence[str] | Mapping[str, Any]) -> list[str]:
-    """Returns axes as texts, as of `parse_axis`; by their keys they may be lists or arrays of values."""
+    """Returns axes as texts, as of `parse_axis`; by their keys they may be lists or arrays of
+    values.
+    """
     if isinstance(over, Mapping):
         return [f"{key}={_join_values(values)}" for key, values in over.items()]
     return list(over) if isinstance(over, list | tuple) else [str(over)]
@@ -111,7 +122,8 @@ def _join_values(values: Any) -> str:
     entries = values if isinstance(values, list | tuple) else np.atleast_1d(values)
     is_word = (isinstance(one, str) and one.isidentifier() for one in entries)
     return ",".join(
-        one if word else format_toml_value(one) for one, word in zip(entries, is_word, strict=True)
+        one if word else format_toml_value(one)
+        for one, word in zip(entries, is_word, strict=True)
     )
 
 
@@ -138,7 +150,9 @@ def _decimal(key: str, text: str) -> Decimal:
     if not number.is_finite():
         raise ScenarioError(f"a range is of finite numbers, and {text!r} is none", path=key)
     if abs(number) > Decimal("1e18") or (number and abs(number) < Decimal("1e-18")):
-        raise ScenarioError(f"{text} is beyond what a range is for: from 1e-18 to 1e18", path=key)
+        raise ScenarioError(
+            f"{text} is beyond what a range is for: from 1e-18 to 1e18", path=key
+        )
     return number
 
 
@@ -214,8 +228,10 @@ class SweepPlan(NamedTuple):
         overrides: what is changed of it everywhere, as texts KEY=VALUE.
         base: the same, resolved.
         axes: what is swept; the last changes fastest.
-        laws: what puts each law into force; swept around the axes, slowest; none: the experiment's own.
-        seeds: of the runs of a cell in which anything is random; in others the first alone is run.
+        laws: what puts each law into force; swept around the axes, slowest; none: the
+            experiment's own.
+        seeds: of the runs of a cell in which anything is random; in others the first alone is
+            run.
         longest_s: how long a cell may be extended, s.
         judge: of `JUDGES`.
         metrics: keys of `docs/metrics.md` that are measured of every run besides.
@@ -234,7 +250,10 @@ class SweepPlan(NamedTuple):
     @property
     def default_longest_s(self) -> float:
         """How long a cell may be extended unless asked for, s: an exponent needs no extension."""
-        return min(MAX_SCENARIO_S, (1.0 if self.judge == "twins" else MAX_EXTENSION) * self.base.duration_s)
+        return min(
+            MAX_SCENARIO_S,
+            (1.0 if self.judge == "twins" else MAX_EXTENSION) * self.base.duration_s,
+        )
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -253,7 +272,9 @@ class SweepPlan(NamedTuple):
             UsageError: there is none of that number.
         """
         if not 0 <= number < self.cells:
-            raise UsageError(f"there is no cell {number}: they are numbered from 0 to {self.cells - 1}")
+            raise UsageError(
+                f"there is no cell {number}: they are numbered from 0 to {self.cells - 1}"
+            )
         rest = number
         places = list[int]()
         for count in reversed(self.shape):
@@ -263,7 +284,9 @@ class SweepPlan(NamedTuple):
         law, fixed = list(self.laws.items())[place] if self.laws else ("", ())
         along = list(zip(self.axes, others, strict=True))
         values = tuple(axis.value(n) for axis, n in along)
-        return SweepCell(number, law, values, (*fixed, *(axis.override(n) for axis, n in along)))
+        return SweepCell(
+            number, law, values, (*fixed, *(axis.override(n) for axis, n in along))
+        )
 
     def scenario(self, *more: str) -> Scenario:
         """Returns the experiment, with some more overrides.
@@ -304,12 +327,13 @@ def plan_sweep(
 ) -> SweepPlan:
     """Returns a sweep, checked and ready to run; overrides are texts KEY=VALUE.
 
-    The other arguments are those of `trilat_net.sweep`. A law that all sites have stays with the gains of the
-    scenario; another one replaces the law of every site, with its default gains. Overrides of gains count for
-    either.
+    The other arguments are those of `trilat_net.sweep`. A law that all sites have stays with
+    the gains of the scenario; another one replaces the law of every site, with its default
+    gains. Overrides of gains count for either.
 
     Raises:
-        ScenarioError: the scenario, an axis or one of its values cannot be right, or cannot run.
+        ScenarioError: the scenario, an axis or one of its values cannot be right, or cannot
+            run.
         UsageError: another argument cannot be right.
     """
     written = read_experiment(source)
@@ -326,12 +350,22 @@ def plan_sweep(
         if count > 1:
             raise ScenarioError("is swept twice: give one --over with all its values", path=key)
     if chosen and "control.law" in keys:
-        raise ScenarioError("is swept twice: give either --law or --over control.law", path="control.law")
+        raise ScenarioError(
+            "is swept twice: give either --law or --over control.law", path="control.law"
+        )
     forced = {law: _law_overrides(written, texts, before, law) for law in chosen}
     if judge not in JUDGES:
         raise UsageError(f"--judge is one of {', '.join(JUDGES)}, not {judge!r}")
     plan = SweepPlan(
-        written, texts, base, axes, forced, _seeds(seeds, base.seed), 0.0, judge, _list_metrics(metrics)
+        written=written,
+        overrides=texts,
+        base=base,
+        axes=axes,
+        laws=forced,
+        seeds=_seeds(seeds, base.seed),
+        longest_s=0.0,
+        judge=judge,
+        metrics=_list_metrics(metrics),
     )
     if longest_s is None:
         longest_s = plan.default_longest_s
@@ -347,7 +381,8 @@ def plan_sweep(
 
 
 def plan_from_json(facts: dict[str, Any]) -> SweepPlan:
-    """Returns the plan that was kept as facts, from its own text; files that it names are read again.
+    """Returns the plan that was kept as facts, from its own text; files that it names are read
+    again.
 
     Raises:
         ScenarioError: it cannot run here.
@@ -379,10 +414,14 @@ def _list_metrics(asked: Sequence[str]) -> tuple[str, ...]:
 def _seeds(asked: int | Sequence[int], own: int) -> tuple[int, ...]:
     if isinstance(asked, int | str):
         if isinstance(asked, str) or not 1 <= asked <= MAX_SEEDS:
-            raise UsageError(f"--seeds is how many, 1 to {MAX_SEEDS}, or which, as in 1..20; not {asked}")
+            raise UsageError(
+                f"--seeds is how many, 1 to {MAX_SEEDS}, or which, as in 1..20; not {asked}"
+            )
         asked = range(own, own + asked)
     if len(asked) > MAX_SEEDS:
-        raise UsageError(f"{count_nouns(len(asked), 'seed is', 'seeds are')} more than {MAX_SEEDS}")
+        raise UsageError(
+            f"{count_nouns(len(asked), 'seed is', 'seeds are')} more than {MAX_SEEDS}"
+        )
     for seed in asked:
         if not 0 <= seed < 2**63:
             raise UsageError(f"a seed is from 0 to 2^63 - 1, not {seed}")
@@ -402,12 +441,16 @@ class _Base(NamedTuple):
 
 
 def _load_base(
-    written: ExperimentText, overrides: Sequence[str], axes: Sequence[SweepAxis], laws: Sequence[str]
+    written: ExperimentText,
+    overrides: Sequence[str],
+    axes: Sequence[SweepAxis],
+    laws: Sequence[str],
 ) -> _Base:
     """Returns the experiment without its axes and swept laws.
 
-    Overrides may need them: a link of another model needs the delay that an axis gives, and a gain belongs to
-    a law that is swept. The experiment is then that at the first value of each axis, and under the first law.
+    Overrides may need them: a link of another model needs the delay that an axis gives, and a
+    gain belongs to a law that is swept. The experiment is then that at the first value of each
+    axis, and under the first law.
 
     Raises:
         ScenarioError: the experiment is not valid even there.
@@ -436,7 +479,10 @@ def _check_law_name(law: str) -> None:
     """
     ours = [name for name in LAWS if name != "own"]
     if law not in ours and ":" not in law:
-        hint = suggest_nearest(law, ours) or f"; laws are {', '.join(ours)}, and your own, as in mylaws:Law"
+        hint = (
+            suggest_nearest(law, ours)
+            or f"; laws are {', '.join(ours)}, and your own, as in mylaws:Law"
+        )
         raise UsageError(f"--law: there is no law {law!r}{hint}")
 
 
@@ -483,7 +529,8 @@ def _checked(plan: SweepPlan, places: Sequence[int]) -> Scenario:
     """Returns the scenario of a cell.
 
     Raises:
-        ScenarioError: there is none, or it cannot run here; says with which law where several are swept.
+        ScenarioError: there is none, or it cannot run here; says with which law where several
+            are swept.
     """
     number = 0
     for count, place in zip(plan.shape, places, strict=True):
@@ -498,7 +545,13 @@ def _checked(plan: SweepPlan, places: Sequence[int]) -> Scenario:
     return scenario
 
 
-_GAINS = {"K": "N m/rad", "d": "N m s/rad", "Kp": "N m s/rad", "Kd": "N m s/rad", "Lambda": "1/s"}
+_GAINS = {
+    "K": "N m/rad",
+    "d": "N m s/rad",
+    "Kp": "N m s/rad",
+    "Kd": "N m s/rad",
+    "Lambda": "1/s",
+}
 
 
 def label_axis(key: str, scenario: Scenario | None = None) -> str:
@@ -573,5 +626,7 @@ def format_override(key: str, value: Any) -> str:
 
 
 def format_override_value(value: float) -> str:
-    """Returns a number as an override's text, which reads as just that number; whole ones without a point."""
+    """Returns a number as an override's text, which reads as just that number; whole ones
+    without a point.
+    """
     return repr(value).removesuffix(".0")

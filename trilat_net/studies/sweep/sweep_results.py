@@ -4,10 +4,10 @@ Invariant:
 - Results are a function of the plan, and their bytes of the runs alone.
 - Reading the table gives every number back bit for bit.
 - Each row's scenario, run again, reproduces the row.
-- A grid point counts every run once; its stable share is taken over the decided runs and carries a 95 %
-  Wilson interval within [0, 1].
-- Every command shown works: a reproduced run has the scenario hash of its row; if the swept scenario has
-  changed since, the row's own text is written out and named instead.
+- A grid point counts every run once; its stable share is taken over the decided runs and
+  carries a 95 % Wilson interval within [0, 1].
+- Every command shown works: a reproduced run has the scenario hash of its row; if the swept
+  scenario has changed since, the row's own text is written out and named instead.
 """
 
 import csv
@@ -37,9 +37,10 @@ PLAN_FILE = "plan.json"
 
 
 ResultRow = Mapping[str, Any]
-"""A run: `cell`, a value per axis under its key, `law`, `seed`, `random`, the metrics that were asked for
-under their keys, every field of `CellResult`, `scenario_sha256`, `command` and `scenario`, its canonical
-text. Verdict and motion are their words."""
+"""A run: `cell`, a value per axis under its key, `law`, `seed`, `random`, the metrics that were
+asked for under their keys, every field of `CellResult`, `scenario_sha256`, `command` and
+`scenario`, its canonical text. Verdict and motion are their words.
+"""
 
 
 @dataclass(frozen=True, repr=False)
@@ -72,7 +73,8 @@ class SweepResults(Result):
 
     def outcome(self, row: ResultRow) -> CellResult:
         """Returns the result of a run."""
-        return msgspec.convert(row, CellResult)  # whose defaults stand for what older files lack
+        # whose defaults stand for what older files lack
+        return msgspec.convert(row, CellResult)
 
 
 def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[ResultRow]:
@@ -95,7 +97,13 @@ def build_result_rows(plan: SweepPlan, entries: Sequence[CellRun]) -> list[Resul
                 **entry.metrics,
                 **msgspec.to_builtins(entry.outcome),
                 "scenario_sha256": entry.sha256,
-                "command": build_sim_command(plan, cell.overrides, entry.seed, lasts_s, log),
+                "command": build_sim_command(
+                    plan=plan,
+                    overrides=cell.overrides,
+                    seed=entry.seed,
+                    duration_s=lasts_s,
+                    log=log,
+                ),
                 "scenario": apply_diff(entry.scenario, plan.base.text),
             }
         )
@@ -116,17 +124,23 @@ def build_sim_command(
 
 
 def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
-    """Returns a duration that makes a run again: as long as it ran, or until it diverges by itself, s."""
+    """Returns a duration that makes a run again: as long as it ran, or until it diverges by
+    itself, s.
+    """
     if outcome.diverged_s is None:
         return outcome.ran_s
     return max(outcome.ran_s, min(plan.longest_s, plan.base.duration_s * 2.0**outcome.extended))
 
 
 _SCENARIO_COLUMN = "scenario_changes"
-"""The column of the table that holds a row's scenario: as JSON, by what it differs from the swept one."""
+"""The column of the table that holds a row's scenario: as JSON, by what it differs from the
+swept one.
+"""
 
 _LONGEST_CELL = 2**26
-"""Letters of a cell at most; the csv module reads 131 072, and a scenario with a trace has more."""
+"""Letters of a cell at most; the csv module reads 131 072, and a scenario with a trace has
+more.
+"""
 
 
 def encode_results(plan: SweepPlan, rows: Sequence[ResultRow]) -> str:
@@ -149,11 +163,17 @@ def _kinds_of_results(plan: SweepPlan) -> dict[str, type]:
 
 
 def _kinds_of_axes(plan: SweepPlan) -> dict[str, type]:
-    return {"cell": int, **{one.key: float if one.numeric else str for one in plan.axes}, "law": str}
+    return {
+        "cell": int,
+        **{one.key: float if one.numeric else str for one in plan.axes},
+        "law": str,
+    }
 
 
 def _format_cell(value: Any, kind: type) -> str:
-    """Returns a value as the table has it: numbers so that they are read back bit for bit; None is empty."""
+    """Returns a value as the table has it: numbers so that they are read back bit for bit; None
+    is empty.
+    """
     if value is None:
         return ""
     if kind is bool:
@@ -186,7 +206,9 @@ def read_results(path: Path) -> SweepResults:
         raise UsageError(f"{file}: there are no results of a sweep{more}")
     request = file.with_name(PLAN_FILE)
     if not request.is_file():
-        raise UsageError(f"{file}: holds no results of a sweep: there is no {PLAN_FILE} beside it")
+        raise UsageError(
+            f"{file}: holds no results of a sweep: there is no {PLAN_FILE} beside it"
+        )
     try:
         plan = plan_from_json(json.loads(request.read_text(encoding="utf-8")))
     except (OSError, ValueError, KeyError, TypeError):
@@ -205,7 +227,9 @@ def read_results(path: Path) -> SweepResults:
 
 def _read_row(line: Mapping[str, str], plan: SweepPlan) -> ResultRow:
     """Returns a line of the table as a row, with its scenario as text."""
-    row = {name: _parse_cell(line[name], kind) for name, kind in _kinds_of_results(plan).items()}
+    row = {
+        name: _parse_cell(line[name], kind) for name, kind in _kinds_of_results(plan).items()
+    }
     changes = json.loads(line[_SCENARIO_COLUMN])
     return {**row, "scenario": apply_diff(changes, plan.base.text)}
 
@@ -219,8 +243,8 @@ class GridPoint(NamedTuple):
     Attributes:
         cell, law, values: its place.
         counts: how many runs came to each class, in the order of `CellClass`.
-        means: of each number of a run that `list_totals` names its mean over the runs that stayed within
-            their limits; None of fewer than two runs.
+        means: of each number of a run that `list_totals` names its mean over the runs that
+            stayed within their limits; None of fewer than two runs.
     """
 
     cell: int
@@ -232,12 +256,18 @@ class GridPoint(NamedTuple):
     @property
     def decided(self) -> int:
         """How many runs showed whether they are stable."""
-        return sum(n for n, verdict in zip(self.counts, CellClass, strict=True) if verdict.stable is not None)
+        return sum(
+            n
+            for n, verdict in zip(self.counts, CellClass, strict=True)
+            if verdict.stable is not None
+        )
 
     @property
     def stable(self) -> int:
         """How many runs are stable."""
-        return sum(n for n, verdict in zip(self.counts, CellClass, strict=True) if verdict.stable)
+        return sum(
+            n for n, verdict in zip(self.counts, CellClass, strict=True) if verdict.stable
+        )
 
     @property
     def doubtful(self) -> bool:
@@ -267,13 +297,23 @@ def collect_grid_points(results: SweepResults) -> list[GridPoint]:
         kept = [row for row in rows if row["diverged_s"] is None]
         means = tuple(mean_interval([row.get(key) for row in kept]) for key in totals)
         values = results.plan.cell(cell).values
-        points.append(GridPoint(cell, law, values, tuple(counts[one.value] for one in CellClass), means))
+        points.append(
+            GridPoint(
+                cell=cell,
+                law=law,
+                values=values,
+                counts=tuple(counts[one.value] for one in CellClass),
+                means=means,
+            )
+        )
     return points
 
 
 def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> str:
     """Returns grid points as CSV: counts, and the share of stable runs with its interval."""
-    kinds = _kinds_of_axes(plan) | dict.fromkeys(("runs", *(one.value for one in CellClass)), int)
+    kinds = _kinds_of_axes(plan) | dict.fromkeys(
+        ("runs", *(one.value for one in CellClass)), int
+    )
     kinds |= dict.fromkeys(("stable_share", "stable_share_low", "stable_share_high"), float)
     kinds |= dict.fromkeys(
         (f"{key}_{word}" for key in list_totals(plan) for word in MeanInterval._fields), float
@@ -283,7 +323,17 @@ def encode_grid_points(plan: SweepPlan, found: Sequence[GridPoint]) -> str:
         low, high = one.interval
         numbers = [number for mean in one.means for number in mean or (None, None)]
         share = one.stable / one.decided if one.decided else None
-        cells = (one.cell, *one.values, one.law, sum(one.counts), *one.counts, share, low, high, *numbers)
+        cells = (
+            one.cell,
+            *one.values,
+            one.law,
+            sum(one.counts),
+            *one.counts,
+            share,
+            low,
+            high,
+            *numbers,
+        )
         named = zip(kinds.items(), cells, strict=True)
         rows.append({name: _format_cell(cell, kind) for (name, kind), cell in named})
     return encode_csv(rows, list(kinds))
@@ -315,7 +365,11 @@ def describe_sweep_plan(plan: SweepPlan) -> list[str]:
     for one in plan.axes:
         texts = one.texts
         count = len(texts)
-        shown = [texts[0], texts[1], "...", texts[-1]] if count > 4 else [texts[n] for n in range(count)]
+        shown = (
+            [texts[0], texts[1], "...", texts[-1]]
+            if count > 4
+            else [texts[n] for n in range(count)]
+        )
         lines.append(f"  over {one.asked}: {', '.join(shown)}")
     first_s = plan.base.duration_s
     longest_s = plan.longest_s
@@ -341,7 +395,9 @@ def summarize_sweep(results: SweepResults) -> Iterator[str]:
     asked = {one.key: (one.name, one.unit) for one in map(find_quantity, results.plan.metrics)}
     for key, (name, unit) in {**asked, **_TOTALS}.items():
         values = [row[key] for row in kept if row.get(key) is not None]
-        ranges += [f"{name} {min(values):.3g} to {max(values):.3g} {unit}".rstrip()] if values else []
+        ranges += (
+            [f"{name} {min(values):.3g} to {max(values):.3g} {unit}".rstrip()] if values else []
+        )
     if ranges:
         yield f"within their limits {len(kept)}: {', '.join(ranges)}"
     found = [row["exponent_per_s"] for row in rows if row.get("exponent_per_s") is not None]
@@ -361,7 +417,10 @@ def _of_seeds(results: SweepResults) -> Iterator[str]:
         yield f"stable with some seeds and not with others, {_cells(len(doubtful))}:"
     for place in doubtful[:_MAX_DOUBTFUL_SHOWN]:
         axes = zip(results.plan.axes, place.values, strict=True)
-        where = [*([place.law] if results.plan.laws else []), *(f"{one.key} {value}" for one, value in axes)]
+        where = [
+            *([place.law] if results.plan.laws else []),
+            *(f"{one.key} {value}" for one, value in axes),
+        ]
         low, high = (100.0 * end for end in place.interval)
         yield (
             f"  cell {place.cell} ({', '.join(where)}): {place.stable} of {place.decided} stable, "
@@ -384,7 +443,9 @@ def list_next_commands(folder: Path) -> list[str]:
     ]
 
 
-def build_reproduce_command(results: SweepResults, row: ResultRow, folder: Path) -> tuple[str, str]:
+def build_reproduce_command(
+    results: SweepResults, row: ResultRow, folder: Path
+) -> tuple[str, str]:
     """Returns the command that repeats a row, and a note on it or ""."""
     plan = results.plan
     source = plan.written.called
@@ -400,5 +461,7 @@ def build_reproduce_command(results: SweepResults, row: ResultRow, folder: Path)
     file = folder / f"{name}.toml"
     write_whole(file, row["scenario"])
     lasts_s = reproduction_duration_s(plan, results.outcome(row))
-    command = format_command("sim", str(file), "--duration", f"{lasts_s:.12g}", "-o", f"{name}.mcap")
+    command = format_command(
+        "sim", str(file), "--duration", f"{lasts_s:.12g}", "-o", f"{name}.mcap"
+    )
     return command, f"{source} is not what was swept any more, or not here; as it ran: {file}"

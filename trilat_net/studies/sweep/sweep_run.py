@@ -1,8 +1,9 @@
-"""Runs a sweep in its folder, which has the plan, the journal of finished runs, and at the end the results.
+"""Runs a sweep in its folder, which has the plan, the journal of finished runs, and at the end
+the results.
 
-Invariant: a folder belongs to one sweep on one arithmetic; any other is refused and never mixed in. Results
-are a function of the plan; the number of processes, their order and the number of interruptions do not enter.
-A run that is in the journal is never made again.
+Invariant: a folder belongs to one sweep on one arithmetic; any other is refused and never mixed
+in. Results are a function of the plan; the number of processes, their order and the number of
+interruptions do not enter. A run that is in the journal is never made again.
 """
 
 import hashlib
@@ -62,7 +63,11 @@ def _folder(path: Path, plan: SweepPlan, facts: Mapping[str, Any]) -> SweepFolde
     study = hashlib.sha256(_text(facts).encode()).hexdigest()
     remedy = build_resume_hint("sweep", "--resume", str(path))
     return SweepFolder(
-        path, plan, facts, remedy, lambda: RunJournal(path / JOURNAL_FILE, study, CellRun, remedy)
+        path,
+        plan,
+        facts,
+        remedy,
+        lambda: RunJournal(path / JOURNAL_FILE, study, CellRun, remedy),
     )
 
 
@@ -107,11 +112,19 @@ def open_sweep_folder(path: Path, asked: SweepPlan | None = None) -> SweepFolder
 def _shown(key: str, facts: Mapping[str, Any]) -> str:
     value = facts.get(key, JUDGES[0] if key == "judge" else [])
     if key in ("text", "scenario_sha256"):
-        digest = hashlib.sha256(str(value).encode()).hexdigest() if key == "text" else str(value)
+        digest = (
+            hashlib.sha256(str(value).encode()).hexdigest() if key == "text" else str(value)
+        )
         return f"{facts.get('name')} (sha256 {digest[:12]})"
     if isinstance(value, dict):
-        return ", ".join(f"{name.removeprefix('version_')} {one}" for name, one in value.items())
-    if key == "seeds" and isinstance(value, list) and value == list(range(value[0], value[-1] + 1)):
+        return ", ".join(
+            f"{name.removeprefix('version_')} {one}" for name, one in value.items()
+        )
+    if (
+        key == "seeds"
+        and isinstance(value, list)
+        and value == list(range(value[0], value[-1] + 1))
+    ):
         return f"{value[0]}..{value[-1]}"
     if isinstance(value, list):
         return ", ".join(map(str, value)) or "none"
@@ -127,7 +140,11 @@ def _read(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or "is not JSON"
         raise UsageError(f"{file}: cannot be read: {reason}") from None
-    needed = {"source", "folder", "name", *_DIFFERENCES} - {"judge", "metrics"}  # older plans name none
+    # older plans name none
+    needed = {"source", "folder", "name", *_DIFFERENCES} - {
+        "judge",
+        "metrics",
+    }
     if not isinstance(facts, dict) or not needed <= facts.keys():
         raise UsageError(f"{file}: is no plan of a sweep")
     return facts
@@ -152,7 +169,9 @@ _RESUME_HINT = "; what is done is kept: go on with --resume"
 
 
 class DurationEstimate(NamedTuple):
-    """Duration of the runs that a sweep has left at most, estimated by a few of them, which are done then."""
+    """Duration of the runs that a sweep has left at most, estimated by a few of them, which are
+    done then.
+    """
 
     runs: int
     seconds: float
@@ -200,17 +219,25 @@ def run_cell(task: CellItem) -> CellRun:
         scenario = plan.scenario(*cell.overrides, f"seed={task.seed}")
         sweep_cell.check_sweepable(scenario)
     except ScenarioError as error:
-        raise ScenarioError(f"cell {cell.number} ({', '.join(cell.overrides)}): {error}") from None
+        raise ScenarioError(
+            f"cell {cell.number} ({', '.join(cell.overrides)}): {error}"
+        ) from None
     outcome = sweep_cell.classify_cell(scenario.text, max(plan.longest_s, scenario.duration_s))
     if plan.judge == "twins":
-        outcome = msgspec.structs.replace(outcome, exponent_per_s=sweep_cell.measure_exponent(scenario))
+        outcome = msgspec.structs.replace(
+            outcome, exponent_per_s=sweep_cell.measure_exponent(scenario)
+        )
     metrics: dict[str, float | None] = {}
     if further := [key for key in plan.metrics if key not in CellResult.__struct_fields__]:
         measured = measure_whole(simulate_scenario(scenario), further)
         metrics = {key: measured[key].value for key in further}
-    laws = ", ".join(dict.fromkeys(identify_law(site.control) for site in scenario.sites.values()))
+    laws = ", ".join(
+        dict.fromkeys(identify_law(site.control) for site in scenario.sites.values())
+    )
     text = sweep_cell.diff_lines(scenario.text, plan.base.text)
-    return CellRun(cell.number, task.seed, scenario.random, laws, scenario.sha256, text, outcome, metrics)
+    return CellRun(
+        cell.number, task.seed, scenario.random, laws, scenario.sha256, text, outcome, metrics
+    )
 
 
 def estimate_sweep(
@@ -238,10 +265,14 @@ def estimate_sweep(
         took_s = (clock.monotonic_ns() - began_ns) * 1e-9
     seeds = len(plan.seeds) if any(entry.random for entry in entries) else 1
     left = max(len(entries), plan.cells * seeds - len(known))
-    return DurationEstimate(left, took_s / len(entries) * left / min(jobs or count_cores(), left), entries)
+    return DurationEstimate(
+        left, took_s / len(entries) * left / min(jobs or count_cores(), left), entries
+    )
 
 
-def refuse_oversized_sweep(plan: SweepPlan, expected: DurationEstimate, jobs: int | None = None) -> None:
+def refuse_oversized_sweep(
+    plan: SweepPlan, expected: DurationEstimate, jobs: int | None = None
+) -> None:
     """Refuses a sweep of very many runs, or of more than a day.
 
     Raises:
@@ -262,7 +293,11 @@ def refuse_oversized_sweep(plan: SweepPlan, expected: DurationEstimate, jobs: in
 
 def format_wall_time(seconds: float) -> str:
     """Returns a duration for people."""
-    for unit, size, from_s in (("days", 86_400.0, 172_800.0), ("h", 3600.0, 5400.0), ("min", 60.0, 90.0)):
+    for unit, size, from_s in (
+        ("days", 86_400.0, 172_800.0),
+        ("h", 3600.0, 5400.0),
+        ("min", 60.0, 90.0),
+    ):
         if seconds >= from_s:
             return f"{seconds / size:.3g} {unit}"
     return f"{max(1, round(seconds))} s"
@@ -277,8 +312,8 @@ def run_sweep(
 ) -> FinishedSweep:
     """Runs what is left of a sweep, writes its results, and returns them.
 
-    What the journal of the folder has, and the runs that are `known` from an estimate, are not made again;
-    `progress` gets the runs that are done, and their number as far as it is known.
+    What the journal of the folder has, and the runs that are `known` from an estimate, are not
+    made again; `progress` gets the runs that are done, and their number as far as it is known.
 
     Raises:
         ScenarioError: a cell cannot run; says which. What is done is kept.
@@ -294,7 +329,9 @@ def run_sweep(
         left = plan.cells * len(plan.seeds) - len(before)
         laws = list_imported_code([plan.base])
         workers = on if left else None
-        with executor.open_worker_pool(jobs, workers, most=left, laws=laws, hint=_RESUME_HINT) as pool:
+        with executor.open_worker_pool(
+            jobs, workers, most=left, laws=laws, hint=_RESUME_HINT
+        ) as pool:
             count = pool.workers
             _run_cells(plan, journal, pool, progress)
         wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
@@ -307,21 +344,40 @@ def run_sweep(
     table = encode_results(plan, rows)
     write_whole(folder.path / RESULTS_FILE, table, remedy=folder.remedy)
     simulated_s = sum(entry.outcome.ran_s for entry in made)
-    return FinishedSweep(results, folder, len(made), simulated_s, wall_s, count)
+    return FinishedSweep(
+        results=results,
+        folder=folder,
+        runs=len(made),
+        simulated_s=simulated_s,
+        wall_s=wall_s,
+        jobs=count,
+    )
 
 
 def _run_cells(
-    plan: SweepPlan, journal: RunJournal[CellRun], pool: executor.WorkerPool, progress: executor.Progress
+    plan: SweepPlan,
+    journal: RunJournal[CellRun],
+    pool: executor.WorkerPool,
+    progress: executor.Progress,
 ) -> None:
     first, *others = plan.seeds
 
     def make(runs: Iterable[tuple[int, int]], count: int) -> None:
-        tasks = (CellItem(plan, plan.cell(n), seed) for n, seed in runs if (n, seed) not in journal.done)
+        tasks = (
+            CellItem(plan, plan.cell(n), seed)
+            for n, seed in runs
+            if (n, seed) not in journal.done
+        )
         journal.complete(pool, run_cell, tasks, len(journal.done), count, progress)
 
     make(((number, first) for number in range(plan.cells)), plan.cells)
-    again = [number for number in range(plan.cells) if others and journal.done[number, first].random]
-    make(((number, seed) for number in again for seed in others), plan.cells + len(again) * len(others))
+    again = [
+        number for number in range(plan.cells) if others and journal.done[number, first].random
+    ]
+    make(
+        ((number, seed) for number in again for seed in others),
+        plan.cells + len(again) * len(others),
+    )
 
 
 def describe_sweep_speed(speed: FinishedSweep) -> str:

@@ -1,18 +1,20 @@
-"""One candidate of a tuning: its scenario and command, its run in virtual time, its score, and where it ends.
+"""One candidate of a tuning: its scenario and command, its run in virtual time, its score, and
+where it ends.
 
-Where the arms of a comparison ought to end is the consensus of weightless arms: before any operator acts
-q* = sum_i beta_i q_i(0), beta the left Perron vector of the dominance matrix: the limit of
-x_i' = sum_j alpha_ij x_j - x_i. Spring operators move it to q* = sum_i beta_i K_i x_i / sum_i beta_i K_i, per
-joint, with target x_i and stiffness K_i of the operator at site i, since sum_i beta_i tau_i = 0 in statics.
-After they let go it stays. Torques without a target and walls ask for no pose: such a scenario is judged on
-its twin, the same without them.
+Where the arms of a comparison ought to end is the consensus of weightless arms: before any
+operator acts q* = sum_i beta_i q_i(0), beta the left Perron vector of the dominance matrix: the
+limit of x_i' = sum_j alpha_ij x_j - x_i. Spring operators move it to q* = sum_i beta_i K_i x_i
+/ sum_i beta_i K_i, per joint, with target x_i and stiffness K_i of the operator at site i,
+since sum_i beta_i tau_i = 0 in statics. After they let go it stays. Torques without a target
+and walls ask for no pose: such a scenario is judged on its twin, the same without them.
 
-Invariant: a candidate's scenario is loaded through the same settings that its command names, and its score is
-a function of the scenario alone: None for the errors of a run that does not reach its end. No gain and no
-control law enters the pose. A run has exactly one class, and only a settled one may stand on a front: one
-that is stable by the judgement of every run (`analysis.run_end`), at the pose. Arms that hang, however well
-together, have strayed. An arm hangs if both links point down at the end and did not at the start; arms fell
-if their mean ends more than 0.2 rad from the pose in a log without a push that could explain it.
+Invariant: a candidate's scenario is loaded through the same settings that its command names,
+and its score is a function of the scenario alone: None for the errors of a run that does not
+reach its end. No gain and no control law enters the pose. A run has exactly one class, and only
+a settled one may stand on a front: one that is stable by the judgement of every run
+(`analysis.run_end`), at the pose. Arms that hang, however well together, have strayed. An arm
+hangs if both links point down at the end and did not at the start; arms fell if their mean ends
+more than 0.2 rad from the pose in a log without a push that could explain it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -64,7 +66,9 @@ def check_comparable(scenario: Scenario) -> None:
         )
     groups = find_closed_groups(scenario.alpha)
     if len(groups) > 1:
-        words = " and ".join(", ".join(scenario.names[site] for site in group) for group in groups)
+        words = " and ".join(
+            ", ".join(scenario.names[site] for site in group) for group in groups
+        )
         raise ScenarioError(
             f"these groups follow no other site: {words}; there is no pose that all would reach",
             path="dominance",
@@ -85,7 +89,9 @@ def check_comparable(scenario: Scenario) -> None:
 
 
 def build_twin(scenario: Scenario) -> Scenario | None:
-    """Returns the same without torques that have no target, and without walls; None where it has neither."""
+    """Returns the same without torques that have no target, and without walls; None where it
+    has neither.
+    """
     sites = {}
     for name, spec in scenario.sites.items():
         hands = tuple(hand for hand in spec.hands if isinstance(hand, JointSpring))
@@ -95,10 +101,14 @@ def build_twin(scenario: Scenario) -> Scenario | None:
 
 
 def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
-    """Returns q*, the pose of a weightless consensus, shape (K, n), rad, at times of shape (K,), s."""
+    """Returns q*, the pose of a weightless consensus, shape (K, n), rad, at times of shape
+    (K,), s.
+    """
     beta = left_perron_vector(scenario.alpha)
     weights = dict(zip(scenario.names, beta, strict=True))
-    start = np.sum([weights[name] * np.array(spec.q0_rad) for name, spec in scenario.sites.items()], axis=0)
+    start = np.sum(
+        [weights[name] * np.array(spec.q0_rad) for name, spec in scenario.sites.items()], axis=0
+    )
     stiffness = np.zeros((len(t_s), len(start)))
     torque = np.zeros((len(t_s), len(start)))
     for name, spring, on, target in _follow_springs(scenario, t_s):
@@ -106,13 +116,21 @@ def compute_consensus_pose(scenario: Scenario, t_s: Array) -> Array:
         stiffness += pull
         torque += pull * target
     held = stiffness > 0.0
-    rows = np.vstack([start, np.divide(torque, stiffness, where=held, out=np.zeros_like(torque))])
-    last = np.maximum.accumulate(np.where(held, np.arange(1, len(t_s) + 1)[:, np.newaxis], 0), axis=0)
+    rows = np.vstack(
+        [start, np.divide(torque, stiffness, where=held, out=np.zeros_like(torque))]
+    )
+    last = np.maximum.accumulate(
+        np.where(held, np.arange(1, len(t_s) + 1)[:, np.newaxis], 0), axis=0
+    )
     return np.take_along_axis(rows, last, axis=0)
 
 
-def _follow_springs(scenario: Scenario, t_s: Array) -> Iterator[tuple[str, Array, Array, Array]]:
-    """Yields each spring's site, stiffness, where it is at work, 0 or 1, shape (K, 1), and target, rad."""
+def _follow_springs(
+    scenario: Scenario, t_s: Array
+) -> Iterator[tuple[str, Array, Array, Array]]:
+    """Yields each spring's site, stiffness, where it is at work, 0 or 1, shape (K, 1), and
+    target, rad.
+    """
     for name, spec in scenario.sites.items():
         for hand in (hand for hand in spec.hands if isinstance(hand, JointSpring)):
             on = ((t_s >= hand.start_s) & (t_s < hand.end_s))[:, np.newaxis].astype(np.float64)
@@ -120,13 +138,17 @@ def _follow_springs(scenario: Scenario, t_s: Array) -> Iterator[tuple[str, Array
 
 
 STRAYED_RAD = 0.2
-"""Arms whose mean is further than this from where they ought to be fell, hang, or were thrown there."""
+"""Arms whose mean is further than this from where they ought to be fell, hang, or were thrown
+there.
+"""
 TOGETHER_RAD = 0.02
 """Arms no further than this from their mean are together."""
 
 
 class CandidateClass(StrEnum):
-    """Class of a candidate, from the worst to the best, in the order in which it is asked; as in JSON."""
+    """Class of a candidate, from the worst to the best, in the order in which it is asked; as
+    in JSON.
+    """
 
     DIVERGED = "diverged"
     OSCILLATED = "oscillated"
@@ -138,7 +160,10 @@ class CandidateClass(StrEnum):
     @property
     def word(self) -> str:
         """The word for people: that of the judgement, where the judgement decides."""
-        words = {CandidateClass.OSCILLATED: Stability.NOT_STABLE, CandidateClass.SETTLED: Stability.STABLE}
+        words = {
+            CandidateClass.OSCILLATED: Stability.NOT_STABLE,
+            CandidateClass.SETTLED: Stability.STABLE,
+        }
         return words.get(self, self).value
 
 
@@ -151,16 +176,20 @@ CLASS_MEANINGS = {
     CandidateClass.OPEN: "it hardly decays, or is undecided: a longer run may tell",
     CandidateClass.SETTLED: "it converged or decays, and none of these holds",
 }
-"""What the classes mean, as far as the judgement of a run (docs/definitions.md) does not say it."""
+"""What the classes mean, as far as the judgement of a run (docs/definitions.md) does not say
+it.
+"""
 
 
-def classify_candidate(ends: Sequence[RunEnd], fall_rad: float, apart_rad: float) -> CandidateClass:
+def classify_candidate(
+    ends: Sequence[RunEnd], fall_rad: float, apart_rad: float
+) -> CandidateClass:
     """Returns the class of a candidate.
 
     Args:
         ends: the judgements of its run and of its twin; where it has none, the same twice.
-        fall_rad: largest distance, over joints, of the twin's mean pose from q*, after as long again at the
-            pace at which it grew in the second half.
+        fall_rad: largest distance, over joints, of the twin's mean pose from q*, after as long
+            again at the pace at which it grew in the second half.
         apart_rad: largest distance of a joint from the mean of the sites in that second.
     """
     found = {end.stability for end in ends}
@@ -180,7 +209,8 @@ _LOOKS = 2000
 
 
 def check_final_posture(log: Log) -> list[str]:
-    """Returns what to say of how a log ended, a sentence each; nothing where its arms stand at its end.
+    """Returns what to say of how a log ended, a sentence each; nothing where its arms stand at
+    its end.
 
     Raises:
         LogError: a record cannot be read.
@@ -189,12 +219,17 @@ def check_final_posture(log: Log) -> list[str]:
     if diverged:
         return [f"{', '.join(diverged)} diverged: its figures end there"]
     parts = {site: log[site] for site in log.sites if len(log[site])}
-    ends = {site: part.q[part.t_s > part.t_s[-1] - END_WINDOW_S].mean(axis=0) for site, part in parts.items()}
+    ends = {
+        site: part.q[part.t_s > part.t_s[-1] - END_WINDOW_S].mean(axis=0)
+        for site, part in parts.items()
+    }
     warnings = []
     last_s = min((float(part.t_s[-1]) for part in parts.values()), default=0.0)
     wanted_s = log.scenario.duration_s
     if last_s <= wanted_s - _SHORT_S:
-        warnings.append(f"ends at {last_s:.4g} s of {wanted_s:g} s: its figures are of a shorter run")
+        warnings.append(
+            f"ends at {last_s:.4g} s of {wanted_s:g} s: its figures are of a shorter run"
+        )
     hanging = find_hanging_sites(log.scenario, ends)
     if not hanging:
         return [*warnings, *_warn_fallen(log, ends)]
@@ -204,7 +239,9 @@ def check_final_posture(log: Log) -> list[str]:
 
 
 def _warn_fallen(log: Log, ends: dict[str, Array]) -> list[str]:
-    """Warns if the mean pose left the consensus, and no operator or environment can be the cause."""
+    """Warns if the mean pose left the consensus, and no operator or environment can be the
+    cause.
+    """
     scenario = log.scenario
     try:
         check_comparable(scenario)
@@ -228,15 +265,19 @@ class CandidateScore(msgspec.Struct, frozen=True):
 
     Attributes:
         outcome: its class.
-        error_rad: RMS distance of the arms from where they ought to be; None where the run diverged.
-        spread_rad: the part of it that is the arms' distance from each other, at one instant, undelayed.
+        error_rad: RMS distance of the arms from where they ought to be; None where the run
+            diverged.
+        spread_rad: the part of it that is the arms' distance from each other, at one instant,
+            undelayed.
         pose_rad: the part of it that is the distance of their mean from the pose.
         effort_nm: RMS torque beyond what gravity asks at the pose where the arm is.
-        settled_s: since when the largest |e| is below 0.01 rad; None where it is not at the end.
+        settled_s: since when the largest |e| is below 0.01 rad; None where it is not at the
+            end.
         saturated: share of all joint torques that were at the clamp.
         diverged_s: when the first site left its limits, or None.
         seeds: how many runs it is the mean of; its outcome is the worst of theirs.
-        error_half_rad, effort_half_nm: half the width of the 95 % interval of that mean; None of one run.
+        error_half_rad, effort_half_nm: half the width of the 95 % interval of that mean; None
+        of one run.
     """
 
     outcome: CandidateClass
@@ -253,7 +294,9 @@ class CandidateScore(msgspec.Struct, frozen=True):
 
 
 def average_scores(scores: Sequence[CandidateScore]) -> CandidateScore:
-    """Returns the score of a candidate from those of its seeds; a number that one of them lacks is None."""
+    """Returns the score of a candidate from those of its seeds; a number that one of them lacks
+    is None.
+    """
     if len(scores) == 1:
         return scores[0]
     rank = list(CandidateClass)
@@ -276,17 +319,29 @@ def measure_candidate(text: str, twin_text: str | None) -> CandidateScore:
     run = _run(parse_scenario(text))
     alone = run if twin_text is None else _run(parse_scenario(twin_text))
     outcome = classify_candidate((run.end, alone.end), alone.fall_rad, alone.apart_rad)
-    diverged_s = [end.diverged_at_s for end in (run.end, alone.end) if end.diverged_at_s is not None]
+    diverged_s = [
+        end.diverged_at_s for end in (run.end, alone.end) if end.diverged_at_s is not None
+    ]
     if diverged_s:
-        return CandidateScore(outcome, None, None, None, None, None, run.saturated, diverged_s[0])
+        return CandidateScore(
+            outcome, None, None, None, None, None, run.saturated, diverged_s[0]
+        )
     error_rad = float(np.hypot(run.spread_rad, alone.pose_rad))
     return CandidateScore(
-        outcome, error_rad, run.spread_rad, alone.pose_rad, run.effort_nm, run.settled_s, run.saturated
+        outcome,
+        error_rad,
+        run.spread_rad,
+        alone.pose_rad,
+        run.effort_nm,
+        run.settled_s,
+        run.saturated,
     )
 
 
 class _Run(NamedTuple):
-    """What is measured of one run; `fall_rad` and `apart_rad` as `classify_candidate` takes them."""
+    """What is measured of one run; `fall_rad` and `apart_rad` as `classify_candidate` takes
+    them.
+    """
 
     end: RunEnd
     fall_rad: float
@@ -316,7 +371,9 @@ def _run(scenario: Scenario) -> _Run:
     for record, site in zip(records, scenario.names, strict=True):
         beyond_nm = record.tau - build_arm_rows(scenario, site).gravity_torque(record.q)
         efforts.append(np.mean(beyond_nm**2))
-        saturated.append(np.mean(np.abs(record.tau) >= scenario.sites[site].limits.tau_limit_nm))
+        saturated.append(
+            np.mean(np.abs(record.tau) >= scenario.sites[site].limits.tau_limit_nm)
+        )
     return _Run(
         end=end,
         fall_rad=float((end_rad + 2.0 * np.maximum(end_rad - before_rad, 0.0)).max()),
@@ -330,7 +387,9 @@ def _run(scenario: Scenario) -> _Run:
 
 
 def _aligned(records: list[RecordBatch]) -> tuple[Array, Array, Array]:
-    """Returns the ticks of the slowest site, s, and every site's latest q and e at them, shape (N, K, n)."""
+    """Returns the ticks of the slowest site, s, and every site's latest q and e at them, shape
+    (N, K, n).
+    """
     end_ns = min(record.t_ns[-1] for record in records)
     slowest = min((record.t_ns for record in records), key=len)
     at_ns = slowest[slowest <= end_ns]
@@ -345,7 +404,9 @@ def _rms(values: Array) -> float:
 
 
 class TuningScenario(NamedTuple):
-    """The experiment in which laws are compared; a command calls it by source and overrides KEY=VALUE."""
+    """The experiment in which laws are compared; a command calls it by source and overrides
+    KEY=VALUE.
+    """
 
     written: ExperimentText
     overrides: tuple[str, ...]
@@ -357,13 +418,19 @@ class TuningScenario(NamedTuple):
         return self.written.called
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
-        """Returns the same with the control of every site replaced, in as few settings as say it."""
-        single = [f"sites.{name}.control={format_toml_value(table)}" for name, table in controls.items()]
+        """Returns the same with the control of every site replaced, in as few settings as say
+        it.
+        """
+        single = [
+            f"sites.{name}.control={format_toml_value(table)}"
+            for name, table in controls.items()
+        ]
         wanted = self.written.load([*self.overrides, *single])
         first = next(iter(controls.values()))
         if all(table == first for table in controls.values()):
             texts = (*self.overrides, f"control={format_toml_value(first)}")
-            with suppress(ScenarioError):  # a site has gains of its own, which are none of this law
+            # a site has gains of its own, which are none of this law
+            with suppress(ScenarioError):
                 scenario = self.written.load(texts)
                 if scenario.sites == wanted.sites:
                     return TuningScenario(self.written, texts, scenario)
@@ -416,7 +483,8 @@ def measure_candidate_task(task: CandidateItem) -> CandidateScore:
 def load_tuning_scenario(
     source: str | Path | Mapping[str, Any] | Scenario, overrides: Sequence[str] = ()
 ) -> TuningScenario:
-    """Returns the experiment that a name, a path, a text, tables or a scenario mean with overrides.
+    """Returns the experiment that a name, a path, a text, tables or a scenario mean with
+    overrides.
 
     Raises:
         ScenarioError: there is none.

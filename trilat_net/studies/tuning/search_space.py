@@ -2,10 +2,11 @@
 
 Its gains with units and ranges, and the model information all laws share.
 
-Invariant: ranges are log-uniform, one number for both joints and all sites of a role; a quantity has the
-same range in every law (stiffness is K or Kp Lambda, damping d or Kp). Of a chain that number is the
-heaviest joint's, and the others have their share of it, see `weigh_joints`. All laws get the same gravity
-parameters, the true ones times one share, and no inertia: a law that estimates it starts at zero.
+Invariant: ranges are log-uniform, one number for both joints and all sites of a role; a
+quantity has the same range in every law (stiffness is K or Kp Lambda, damping d or Kp). Of a
+chain that number is the heaviest joint's, and the others have their share of it, see
+`weigh_joints`. All laws get the same gravity parameters, the true ones times one share, and no
+inertia: a law that estimates it starts at zero.
 """
 
 import inspect
@@ -19,7 +20,13 @@ from ...errors import ScenarioError, UsageError
 from ...fields import MAX_QUANTITY, is_number, suggest_nearest
 from ...laws.interface import DAMPING, ERROR_DAMPING, ControlLaw, TuningSite
 from ...scenario import Scenario
-from ...scenario.imported_code import CodeConsent, CodeKey, allowed_code, import_class, read_code
+from ...scenario.imported_code import (
+    CodeConsent,
+    CodeKey,
+    allowed_code,
+    import_class,
+    read_code,
+)
 from ...scenario.laws import BUILT_IN
 
 MIN_BOX = 0.1
@@ -33,7 +40,9 @@ class ModelInformation(NamedTuple):
 
     @property
     def box(self) -> float:
-        """Half width of a box of estimates, a share of the given parameters: twice the error, or 10 %."""
+        """Half width of a box of estimates, a share of the given parameters: twice the error,
+        or 10 %.
+        """
         return max(MIN_BOX, 2.0 * abs(1.0 / self.gravity - 1.0))
 
     def prior(self, scenario: Scenario, site: str) -> list[float]:
@@ -43,12 +52,16 @@ class ModelInformation(NamedTuple):
         return [float(f"{value:.12g}") for value in theta]
 
     def box_sides(self, scenario: Scenario, site: str) -> tuple[list[float], list[float]]:
-        """Returns the lower and the upper sides of the box, shape (P,) each: of inertia there is none."""
+        """Returns the lower and the upper sides of the box, shape (P,) each: of inertia there
+        is none.
+        """
         known = build_arm_rows(scenario, site).gravity_parameters.tolist()
         given = list(zip(self.prior(scenario, site), known, strict=True))
         low, high = (
             [
-                float(f"{value + sign * self.box * abs(value):.12g}") if fixed else sign * MAX_QUANTITY
+                float(f"{value + sign * self.box * abs(value):.12g}")
+                if fixed
+                else sign * MAX_QUANTITY
                 for value, fixed in given
             ]
             for sign in (-1.0, 1.0)
@@ -58,7 +71,9 @@ class ModelInformation(NamedTuple):
     @property
     def text(self) -> str:
         """The same in words."""
-        how = "exactly" if self.gravity == 1.0 else f"as {100.0 * self.gravity:g} % of what it is"
+        how = (
+            "exactly" if self.gravity == 1.0 else f"as {100.0 * self.gravity:g} % of what it is"
+        )
         return f"every law is told gravity {how}, and nothing of inertia"
 
 
@@ -103,12 +118,28 @@ class SearchSpace(NamedTuple):
     told: str
     kind: type[ControlLaw] | None = None
 
-    def controls(self, scenario: Scenario, knowledge: ModelInformation, gains: GainValues) -> SiteControls:
-        """Returns the control of every site; gains of chains that make a torque have a number per joint."""
+    def controls(
+        self, scenario: Scenario, knowledge: ModelInformation, gains: GainValues
+    ) -> SiteControls:
+        """Returns the control of every site; gains of chains that make a torque have a number
+        per joint.
+        """
         mean_ms = {name: link.moments().mean_ms for name, link in scenario.links.items()}
-        trips = (there + mean_ms["->".join(reversed(name.split("->")))] for name, there in mean_ms.items())
+        trips = (
+            there + mean_ms["->".join(reversed(name.split("->")))]
+            for name, there in mean_ms.items()
+        )
         longest_ms = 0.5 * max(trips)
-        tables = {name: self._write(scenario, name, knowledge, gains, longest_ms) for name in scenario.names}
+        tables = {
+            name: self._write(
+                scenario=scenario,
+                site=name,
+                knowledge=knowledge,
+                gains=gains,
+                longest_ms=longest_ms,
+            )
+            for name in scenario.names
+        }
         weights = weigh_joints(scenario)
         for table in tables.values() if weights else ():
             for key in _TORQUE_GAINS:
@@ -117,7 +148,12 @@ class SearchSpace(NamedTuple):
         return tables
 
     def _write(
-        self, scenario: Scenario, site: str, knowledge: ModelInformation, gains: GainValues, longest_ms: float
+        self,
+        scenario: Scenario,
+        site: str,
+        knowledge: ModelInformation,
+        gains: GainValues,
+        longest_ms: float,
     ) -> dict[str, Any]:
         if self.kind is None:
             told = {"gravity": knowledge.gravity} if self.told == "gravity" else {}
@@ -130,11 +166,11 @@ class SearchSpace(NamedTuple):
             law = "adaptive"
             estimate = np.where(arm.gravity_parameters, estimate, arm.theta).tolist()
         at = TuningSite(
-            scenario.sites[site].role,
-            knowledge.gravity,
-            estimate,
-            knowledge.box_sides(scenario, site),
-            longest_ms,
+            role=scenario.sites[site].role,
+            gravity=knowledge.gravity,
+            estimate=estimate,
+            box=knowledge.box_sides(scenario, site),
+            longest_ms=longest_ms,
         )
         return {"law": law, **self.kind.write_control(gains, at)}
 
@@ -143,13 +179,18 @@ _TORQUE_GAINS = ("rho_nm", "Kp", "Kd", "K", "d", "P_e", "b", "B")
 
 
 def weigh_joints(scenario: Scenario) -> list[float]:
-    """Returns the share of each joint of chains in a gain that makes a torque, at most 1; [] of planar arms.
+    """Returns the share of each joint of chains in a gain that makes a torque, at most 1; [] of
+    planar arms.
 
-    It is the inertia that the joint shows while the others are free, 1 / (M^-1)_ii, least over the sites'
-    start poses, as a part of the largest; all less where an arm could not take the upper ends of the ranges
-    at its tick rate (`validate`).
+    It is the inertia that the joint shows while the others are free, 1 / (M^-1)_ii, least over
+    the sites' start poses, as a part of the largest; all less where an arm could not take the
+    upper ends of the ranges at its tick rate (`validate`).
     """
-    arms = [(scenario.sites[name], model) for name, model in scenario.arms.items() if model.chain is not None]
+    arms = [
+        (scenario.sites[name], model)
+        for name, model in scenario.arms.items()
+        if model.chain is not None
+    ]
     if not arms:
         return []
     inverses = [np.linalg.inv(model.inertia(np.array(site.q0_rad))) for site, model in arms]
@@ -170,13 +211,16 @@ _KNOWN = "known"
 def _list_search_spaces() -> Iterator[SearchSpace]:
     for name, kind in BUILT_IN.items():
         knobs = tuple(
-            TunedGain(gain, tune[2], tune[0], tune[1], *tune[3:]) for gain, tune in kind.tune.items()
+            TunedGain(gain, tune[2], tune[0], tune[1], *tune[3:])
+            for gain, tune in kind.tune.items()
         )
         if knobs:
             yield SearchSpace(name, knobs, kind.told, kind)
         if name == "adaptive":
             told = "gravity, AND inertia exactly: more than the others"
-            yield SearchSpace(_KNOWN, tuple(one for one in knobs if one.name != "Gamma"), told, kind)
+            yield SearchSpace(
+                _KNOWN, tuple(one for one in knobs if one.name != "Gamma"), told, kind
+            )
 
 
 SEARCH_SPACES = {space.law: space for space in _list_search_spaces()}
@@ -211,9 +255,11 @@ def select_search_spaces(laws: Sequence[str], scenario: Scenario) -> list[Search
 
 
 def build_own_search_space(code: str) -> SearchSpace:
-    """Returns where a law of one's own is searched: its class says it, as `tune = {"K": (10.0, 300.0)}`.
+    """Returns where a law of one's own is searched: its class says it, as `tune = {"K": (10.0,
+    300.0)}`.
 
-    A third entry is the unit. A class with an argument `gravity` is told the share that all laws are told.
+    A third entry is the unit. A class with an argument `gravity` is told the share that all
+    laws are told.
 
     Raises:
         ScenarioError: there is no such class.
@@ -225,11 +271,17 @@ def build_own_search_space(code: str) -> SearchSpace:
     kind = import_class(key, "--law")
     ranges = getattr(kind, "tune", None)
     if not isinstance(ranges, Mapping) or not ranges:
-        raise UsageError(f'--law {code} has no search ranges: its class needs tune = {{"K": (10.0, 300.0)}}')
+        raise UsageError(
+            f'--law {code} has no search ranges: its class needs tune = {{"K": (10.0, 300.0)}}'
+        )
     knobs = []
     for name, entry in ranges.items():
-        low, high, unit = (*entry, "", "", "")[:3] if isinstance(entry, tuple | list) else ("", "", "")
-        if not (is_number(low) and is_number(high) and 0.0 < low < high and isinstance(unit, str)):
+        low, high, unit = (
+            (*entry, "", "", "")[:3] if isinstance(entry, tuple | list) else ("", "", "")
+        )
+        if not (
+            is_number(low) and is_number(high) and 0.0 < low < high and isinstance(unit, str)
+        ):
             problem = "is as in (10.0, 300.0), from above 0 to more, or with a unit behind"
             raise UsageError(f"--law {code}: tune[{name!r}] {problem}, not {entry!r}")
         knobs.append(TunedGain(str(name), unit, float(low), float(high)))

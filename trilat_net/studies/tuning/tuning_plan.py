@@ -1,11 +1,13 @@
-"""The tuning procedure: the plan, its cost, the search that every control law gets, and the Pareto front.
+"""The tuning procedure: the plan, its cost, the search that every control law gets, and the
+Pareto front.
 
-Invariant: the result is a function of the plan alone; neither the number of processes nor their speed enters.
-The gains tried are a function of the seed, the search space and the scores of earlier rounds; their number is
-the budget. Half is a Latin hypercube in the logarithm of the gains (McKay, Beckman and Conover, Technometrics
-21, 1979), half refinement of its front. Both objectives, error and effort, are minimised, only stable runs at
-the pose compete, and of equal ones the first stays. The gains that the paper prints are measured, never
-searched, and stand on no front.
+Invariant: the result is a function of the plan alone; neither the number of processes nor their
+speed enters. The gains tried are a function of the seed, the search space and the scores of
+earlier rounds; their number is the budget. Half is a Latin hypercube in the logarithm of the
+gains (McKay, Beckman and Conover, Technometrics 21, 1979), half refinement of its front. Both
+objectives, error and effort, are minimised, only stable runs at the pose compete, and of equal
+ones the first stays. The gains that the paper prints are measured, never searched, and stand on
+no front.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -59,14 +61,22 @@ class Objective(StrEnum):
     def point(self, score: CandidateScore) -> ObjectivePoint | None:
         """Returns (objective, effort) of a run that may stand on a front, else None."""
         value = score.error_rad if self is Objective.ERROR else score.settled_s
-        if score.outcome is not CandidateClass.SETTLED or value is None or score.effort_nm is None:
+        if (
+            score.outcome is not CandidateClass.SETTLED
+            or value is None
+            or score.effort_nm is None
+        ):
             return None
         return value, score.effort_nm
 
 
 def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
-    """Returns the places of the points that none dominates, by rising effort; None does not compete."""
-    order = sorted((point[1], point[0], n) for n, point in enumerate(points) if point is not None)
+    """Returns the places of the points that none dominates, by rising effort; None does not
+    compete.
+    """
+    order = sorted(
+        (point[1], point[0], n) for n, point in enumerate(points) if point is not None
+    )
     kept: list[int] = []
     least = float("inf")
     for _, value, n in order:
@@ -77,10 +87,11 @@ def find_pareto_front(points: Sequence[ObjectivePoint | None]) -> list[int]:
 
 
 def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
-    """Returns how alone each point of a front is: the side of the box between its neighbours; ends: inf.
+    """Returns how alone each point of a front is: the side of the box between its neighbours;
+    ends: inf.
 
-    After Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist multiobjective genetic algorithm: NSGA-II",
-    IEEE Trans. Evolutionary Computation 6 (2002).
+    After Deb, Pratap, Agarwal and Meyarivan, "A fast and elitist multiobjective genetic
+    algorithm: NSGA-II", IEEE Trans. Evolutionary Computation 6 (2002).
     """
     if len(points) < 3:
         return [float("inf")] * len(points)
@@ -93,9 +104,12 @@ def compute_crowding(points: Sequence[ObjectivePoint]) -> list[float]:
 
 
 REFINEMENT_STEPS = (0.12, 0.08, 0.05, 0.03)
-"""Deviation of the refinements, round by round, as a share of the logarithm of a gain's range."""
+"""Deviation of the refinements, round by round, as a share of the logarithm of a gain's range.
+"""
 GAIN_DIGITS = 4
-"""Gains are rounded to so many significant digits before they are tried, so that a command can name them."""
+"""Gains are rounded to so many significant digits before they are tried, so that a command can
+name them.
+"""
 
 CandidateGains = dict[str, float]
 
@@ -109,7 +123,9 @@ class CandidateSearch:
         rounds: how many candidates each round has; the budget in all.
     """
 
-    def __init__(self, space: SearchSpace, budget: int, seed: int, objective: Objective) -> None:
+    def __init__(
+        self, space: SearchSpace, budget: int, seed: int, objective: Objective
+    ) -> None:
         self.space = space
         self.tried: list[CandidateGains] = []
         self.scores: list[CandidateScore] = []
@@ -134,13 +150,19 @@ class CandidateSearch:
     @property
     def outcomes(self) -> dict[CandidateClass, int]:
         """How many candidates are of each class, all of them counted."""
-        return {outcome: sum(score.outcome is outcome for score in self.scores) for outcome in CandidateClass}
+        return {
+            outcome: sum(score.outcome is outcome for score in self.scores)
+            for outcome in CandidateClass
+        }
 
     def ask(self, number: int) -> list[CandidateGains]:
         """Returns the candidates of a round; `tell` has taken all earlier ones."""
         shape = self.rounds[number], len(self.space.knobs)
         if number == 0:
-            from scipy.stats import qmc  # takes half a second, which most commands can do without
+            # takes half a second, which most commands can do without
+            from scipy.stats import (
+                qmc,
+            )
 
             places = qmc.LatinHypercube(shape[1], rng=self._rng).random(shape[0])
         else:
@@ -155,22 +177,31 @@ class CandidateSearch:
         self.scores += scores
 
     def _parents(self, count: int) -> Array:
-        """Returns places to refine: every other time the best, else the loneliest points of the front.
+        """Returns places to refine: every other time the best, else the loneliest points of the
+        front.
 
-        Where nothing settled yet, those that erred least without diverging; where all diverged, anything.
+        Where nothing settled yet, those that erred least without diverging; where all diverged,
+        anything.
         """
         points = self.points
         places = self.front
         if places:
             lonely = compute_crowding([points[n] or (0.0, 0.0) for n in places])
-            by_space = [n for _, n in sorted(zip(lonely, places, strict=True), key=lambda pair: -pair[0])]
+            by_space = [
+                n
+                for _, n in sorted(zip(lonely, places, strict=True), key=lambda pair: -pair[0])
+            ]
             best = places[-1]
         else:
-            errors = [(s.outcome is CandidateClass.DIVERGED, s.error_rad or 0.0) for s in self.scores]
+            errors = [
+                (s.outcome is CandidateClass.DIVERGED, s.error_rad or 0.0) for s in self.scores
+            ]
             by_space = sorted(range(len(errors)), key=errors.__getitem__)
             best = by_space[0]
             by_space = by_space[: max(1, count // 4)]
-        chosen = [best if k % 2 == 0 else by_space[k // 2 % len(by_space)] for k in range(count)]
+        chosen = [
+            best if k % 2 == 0 else by_space[k // 2 % len(by_space)] for k in range(count)
+        ]
         tried = [[self.tried[n][knob.name] for knob in self.space.knobs] for n in chosen]
         logs = np.log(np.reshape(tried, (count, len(self.space.knobs))))
         parents: Array = (logs - self._logs[:, 0]) / (self._logs[:, 1] - self._logs[:, 0])
@@ -189,7 +220,9 @@ DEFAULT_BUDGET = 64
 MAX_BUDGET = 100_000
 MAX_TUNING_SEEDS = 1000
 MAX_TICKS = 10_000_000
-"""Ticks of all sites that one candidate may take; a run of a minute at 1 kHz with three sites has 180 000."""
+"""Ticks of all sites that one candidate may take; a run of a minute at 1 kHz with three sites
+has 180 000.
+"""
 
 
 class PaperGainsResult(NamedTuple):
@@ -203,7 +236,8 @@ class PaperGainsResult(NamedTuple):
 class TuningPlan(NamedTuple):
     """A comparison that can be run: `budget` candidates per law, `seed` of the search.
 
-    `others` is the experiment with further seeds: of each candidate the mean over all seeds counts.
+    `others` is the experiment with further seeds: of each candidate the mean over all seeds
+    counts.
     """
 
     base: TuningScenario
@@ -226,7 +260,9 @@ class TuningPlan(NamedTuple):
         return build_twin(self.base.scenario) is not None
 
     def printed(self, base: TuningScenario) -> dict[str, TuningScenario]:
-        """Returns the gains that the paper prints, by name, with the common information and without."""
+        """Returns the gains that the paper prints, by name, with the common information and
+        without.
+        """
         told = search_space.SEARCH_SPACES["adaptive"].controls(
             base.scenario, self.knowledge, search_space.PAPER_GAINS
         )
@@ -254,7 +290,10 @@ class TuningPlan(NamedTuple):
         Raises:
             RunFailed: a candidate ended its workers, or the cluster is gone.
         """
-        searches = [CandidateSearch(space, self.budget, self.seed, self.objective) for space in self.spaces]
+        searches = [
+            CandidateSearch(space, self.budget, self.seed, self.objective)
+            for space in self.spaces
+        ]
         bases = (self.base, *self.others)
         printed = list(map(self.printed, bases))
         measured: list[CandidateScore] = []
@@ -277,14 +316,18 @@ class TuningPlan(NamedTuple):
                     for one in batch
                 ]
                 if number == 0:
-                    tasks += [build_candidate_item([of[name] for of in printed]) for name in printed[0]]
+                    tasks += [
+                        build_candidate_item([of[name] for of in printed])
+                        for name in printed[0]
+                    ]
                 scores = iter(pool.map(measure_candidate_task, tasks, show))
                 done += len(tasks)
                 for search, batch in zip(searches, asked, strict=True):
                     search.tell(batch, [next(scores) for _ in batch])
                 measured += scores
         paper = [
-            PaperGainsResult(*one, score) for one, score in zip(printed[0].items(), measured, strict=True)
+            PaperGainsResult(*one, score)
+            for one, score in zip(printed[0].items(), measured, strict=True)
         ]
         return TuningResult(self, searches, paper)
 
@@ -328,7 +371,9 @@ class TuningResult(Result):
                 "seed": scenario.seed,
                 "sites": len(scenario.names),
                 "duration_s": scenario.duration_s,
-                "tau_limit_nm": {name: spec.limits.tau_limit_nm for name, spec in scenario.sites.items()},
+                "tau_limit_nm": {
+                    name: spec.limits.tau_limit_nm for name, spec in scenario.sites.items()
+                },
             },
             "procedure": {
                 "candidates_per_law": asked.budget,
@@ -348,7 +393,11 @@ class TuningResult(Result):
             },
             "laws": {found.space.law: self._describe_law(found) for found in self.found},
             "as_printed": [
-                {"name": one.name, **msgspec.to_builtins(one.score), "command": one.candidate.command}
+                {
+                    "name": one.name,
+                    **msgspec.to_builtins(one.score),
+                    "command": one.candidate.command,
+                }
                 for one in self.printed
             ],
         }
@@ -379,7 +428,11 @@ class TuningResult(Result):
         """Returns a row per candidate."""
         laws = self.to_dict()["laws"].items()
         return [
-            {"law": law, **{key: value for key, value in one.items() if key != "gains"}, **one["gains"]}
+            {
+                "law": law,
+                **{key: value for key, value in one.items() if key != "gains"},
+                **one["gains"],
+            }
             for law, found in laws
             for one in found["candidates"]
         ]
@@ -389,7 +442,9 @@ class TuningResult(Result):
         return self.plan.base.with_gains(found.space, self.plan.knowledge, found.tried[place])
 
     def at_edge(self, found: CandidateSearch) -> list[str]:
-        """Returns which gains of a law's best point stand at an edge of their range: it may lie beyond."""
+        """Returns which gains of a law's best point stand at an edge of their range: it may lie
+        beyond.
+        """
         if not found.front:
             return []
         best = found.tried[found.front[-1]]
@@ -424,24 +479,31 @@ def plan_tuning(
 ) -> TuningPlan:
     """Returns a comparison, checked and ready to run; overrides are texts KEY=VALUE.
 
-    The other arguments are those of `trilat_net.tune`: seeds of the scenario are those from its own on.
+    The other arguments are those of `trilat_net.tune`: seeds of the scenario are those from its
+    own on.
 
     Raises:
         ScenarioError: the scenario is none, or laws cannot be compared in it.
         UsageError: another argument cannot be right.
     """
     if not 1 <= budget <= MAX_BUDGET:
-        raise UsageError(f"--budget is the number of candidates per law, 1 to {MAX_BUDGET}, not {budget}")
+        raise UsageError(
+            f"--budget is the number of candidates per law, 1 to {MAX_BUDGET}, not {budget}"
+        )
     if not 0 <= seed < 2**63:
         raise UsageError(f"--seed is from 0 to 2^63 - 1, not {seed}")
     if objective not in list(Objective):
         raise UsageError(f"--objective is {' or '.join(Objective)}, not {objective!r}")
     if not 1 <= seeds <= MAX_TUNING_SEEDS:
-        raise UsageError(f"--seeds is how many runs each candidate has, 1 to {MAX_TUNING_SEEDS}, not {seeds}")
+        raise UsageError(
+            f"--seeds is how many runs each candidate has, 1 to {MAX_TUNING_SEEDS}, not {seeds}"
+        )
     knowledge = search_space.build_model_information(gravity_percent)
     found = load_tuning_scenario(source, overrides)
     scenario = found.scenario
-    spaces = search_space.select_search_spaces([name_law_classes(law) for law in laws], scenario)
+    spaces = search_space.select_search_spaces(
+        [name_law_classes(law) for law in laws], scenario
+    )
     ticks = sum(map(scenario.ticks, scenario.names))
     if ticks > MAX_TICKS:
         problem = (
@@ -452,4 +514,12 @@ def plan_tuning(
     check_comparable(scenario)
     more = range(scenario.seed + 1, scenario.seed + seeds) if scenario.random else ()
     others = tuple(load_tuning_scenario(source, (*overrides, f"seed={one}")) for one in more)
-    return TuningPlan(found, spaces, budget, seed, Objective(objective), knowledge, others)
+    return TuningPlan(
+        base=found,
+        spaces=spaces,
+        budget=budget,
+        seed=seed,
+        objective=Objective(objective),
+        knowledge=knowledge,
+        others=others,
+    )

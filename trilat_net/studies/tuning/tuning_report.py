@@ -2,9 +2,10 @@
 
 Files: front.json, front.md, front.png, front.pdf.
 
-Invariant: a function of the result alone, without a clock: equal plans give equal bytes; the JSON is the
-result, the others are views of it. Heads carry the unit, and every run is counted in some column. Every
-stable run at the pose is drawn, on a front or not; the gains that the paper prints are stars, on no front.
+Invariant: a function of the result alone, without a clock: equal plans give equal bytes; the
+JSON is the result, the others are views of it. Heads carry the unit, and every run is counted
+in some column. Every stable run at the pose is drawn, on a front or not; the gains that the
+paper prints are stars, on no front.
 """
 
 import json
@@ -32,7 +33,9 @@ _MAX_FRONT_ROWS = 8
 
 
 def compose_tuning(tuned: TuningResult) -> Iterator[Block]:
-    """Yields the laws, the classes, the fronts, the gains as printed, notes, and commands to run."""
+    """Yields the laws, the classes, the fronts, the gains as printed, notes, and commands to
+    run.
+    """
     yield tabulate_laws(tuned)
     yield from (f"  {line}" for line in list_class_meanings())
     for law in tuned.found:
@@ -83,11 +86,15 @@ def tabulate_search(plan: TuningPlan) -> TextTable:
         for n, knob in enumerate(space.knobs):
             name = f"{knob.name} ({knob.where})" if knob.where else knob.name
             told = space.told if n == 0 else ""
-            rows.append((space.law, name, knob.unit or "-", f"{knob.low:g}", f"{knob.high:g}", told))
+            rows.append(
+                (space.law, name, knob.unit or "-", f"{knob.low:g}", f"{knob.high:g}", told)
+            )
     return TextTable(("law", "gain", "unit", "from", "to", "told"), rows, align="lllrrl")
 
 
-def tabulate_front(tuned: TuningResult, found: CandidateSearch, most: int = MAX_BUDGET) -> TextTable:
+def tabulate_front(
+    tuned: TuningResult, found: CandidateSearch, most: int = MAX_BUDGET
+) -> TextTable:
     """Returns a law's front by rising effort; * marks what no law's candidate dominates."""
     count = len(found.front)
     kept = {round(n) for n in np.linspace(0, count - 1, min(most, count))}
@@ -107,7 +114,9 @@ def tabulate_front(tuned: TuningResult, found: CandidateSearch, most: int = MAX_
 
 def tabulate_paper_gains(tuned: TuningResult) -> TextTable:
     """Returns a row for each way to take the gains that the paper prints."""
-    rows = [(one.name, one.score.outcome.word, *_score_cells(one.score)) for one in tuned.printed]
+    rows = [
+        (one.name, one.score.outcome.word, *_score_cells(one.score)) for one in tuned.printed
+    ]
     return TextTable(("law", "class", *_SCORE_HEADS), rows, align="llr")
 
 
@@ -117,12 +126,16 @@ _SCORE_HEADS = ("error rad", "spread rad", "pose rad", "effort N m", "settled s"
 def _score_cells(score: CandidateScore) -> tuple[str, ...]:
     error = _with_interval(score.error_rad, score.error_half_rad)
     effort = _with_interval(score.effort_nm, score.effort_half_nm)
-    spread, pose, settled = map(format_number, (score.spread_rad, score.pose_rad, score.settled_s))
+    spread, pose, settled = map(
+        format_number, (score.spread_rad, score.pose_rad, score.settled_s)
+    )
     return error, spread, pose, effort, settled, f"{100.0 * score.saturated:.3g}"
 
 
 def _with_interval(mean: float | None, half: float | None) -> str:
-    return format_number(mean) if mean is None or half is None else str(MeanInterval(mean, half))
+    return (
+        format_number(mean) if mean is None or half is None else str(MeanInterval(mean, half))
+    )
 
 
 def describe_procedure(plan: TuningPlan) -> list[str]:
@@ -142,16 +155,22 @@ def describe_procedure(plan: TuningPlan) -> list[str]:
     ]
     if weights := weigh_joints(scenario):
         shares = ", ".join(f"{weight:g}" for weight in weights)
-        lines.append(f"of Kp, Kd, K and d the joints have {shares} times the number, by their inertia")
+        lines.append(
+            f"of Kp, Kd, K and d the joints have {shares} times the number, by their inertia"
+        )
     if plan.others:
         lines.append(
             f"every candidate is the mean of {count_nouns(1 + len(plan.others), 'seed')}, "
             "with its 95 % interval"
         )
     if plan.objective is Objective.SETTLING:
-        lines.append("sought: the time from which the largest |e| stays below 0.01 rad, against effort")
+        lines.append(
+            "sought: the time from which the largest |e| stays below 0.01 rad, against effort"
+        )
     if plan.twin:
-        lines.append("the pose is judged on the twin without torques that have no target, and walls")
+        lines.append(
+            "the pose is judged on the twin without torques that have no target, and walls"
+        )
     return lines
 
 
@@ -217,7 +236,9 @@ def draw_front(tuned: TuningResult) -> Figure:
                 style.set_plain_log_axis(axis)
         look: dict[str, Any] = {"labelspacing": 0.3, "columnspacing": 0.8, "handlelength": 1.2}
         handles = [*drawn, *stars]
-        figure.legend(handles=handles, loc="outside upper center", ncols=2, fontsize=_SIZE_PT, **look)
+        figure.legend(
+            handles=handles, loc="outside upper center", ncols=2, fontsize=_SIZE_PT, **look
+        )
     return figure
 
 
@@ -230,9 +251,21 @@ def _draw_law(axes: Axes, found: CandidateSearch) -> Line2D:
     points = found.points
     settled = [point for point in points if point is not None]
     front = [point for place in found.front if (point := points[place]) is not None]
-    faint: dict[str, Any] = {"linestyle": "", "markersize": 2.0, "alpha": 0.3, "markeredgewidth": 0.0}
-    plain: dict[str, Any] = {"marker": mark, "markersize": 3.5, "linewidth": 1.1, "color": colour}
-    axes.plot([x for _, x in settled], [y for y, _ in settled], marker=mark, color=colour, **faint)
+    faint: dict[str, Any] = {
+        "linestyle": "",
+        "markersize": 2.0,
+        "alpha": 0.3,
+        "markeredgewidth": 0.0,
+    }
+    plain: dict[str, Any] = {
+        "marker": mark,
+        "markersize": 3.5,
+        "linewidth": 1.1,
+        "color": colour,
+    }
+    axes.plot(
+        [x for _, x in settled], [y for y, _ in settled], marker=mark, color=colour, **faint
+    )
     axes.step([x for _, x in front], [y for y, _ in front], where="post", **plain)
     count = found.outcomes[CandidateClass.SETTLED]
     return Line2D([], [], label=f"{found.space.law} ({count}/{len(found.scores)})", **plain)
@@ -243,7 +276,12 @@ def _draw_printed(axes: Axes, tuned: TuningResult) -> list[Line2D]:
     entries = []
     for one, fill in zip(tuned.printed, ("full", "none"), strict=True):
         point = tuned.plan.objective.point(one.score)
-        look: dict[str, Any] = {"linestyle": "", "marker": "*", "markersize": 7.0, "fillstyle": fill}
+        look: dict[str, Any] = {
+            "linestyle": "",
+            "marker": "*",
+            "markersize": 7.0,
+            "fillstyle": fill,
+        }
         look["color"] = style.REFERENCE
         if point is not None:
             axes.plot([point[1]], [point[0]], **look)
@@ -258,7 +296,9 @@ def write_tuning(tuned: TuningResult, folder: Path) -> list[Path]:
     """Writes a comparison into a folder that exists, and returns the paths."""
     data = folder / "front.json"
     text = folder / "front.md"
-    write_whole(data, json.dumps(tuned.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    write_whole(
+        data, json.dumps(tuned.to_dict(), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    )
     write_whole(text, build_tuning_page(tuned))
     figure = draw_front(tuned)
     pictures = [folder / "front.png", folder / "front.pdf"]
