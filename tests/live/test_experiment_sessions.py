@@ -166,6 +166,7 @@ def test_killed_experiment_with_people_goes_on_whole(stage: Stage) -> None:
     with participants(first) as people:
         take_part(people, lambda: all(one.look().get("running") for one in people))
         left = first.children()
+        assert left
         first.signal(signal.SIGKILL)
         first.code()
         until(lambda: not any(map(is_running, left)))
@@ -180,7 +181,6 @@ def test_killed_experiment_with_people_goes_on_whole(stage: Stage) -> None:
         second.signal(signal.SIGKILL)
         second.code()
         until(lambda: not any(map(is_running, left)))
-    assert left
     third = begin(stage, folder, name="third")
     with participants(third) as people:
         take_part(people, third.ended)
@@ -198,7 +198,9 @@ def test_killed_experiment_with_people_goes_on_whole(stage: Stage) -> None:
 def test_trial_that_somebody_stops_is_made_again(stage: Stage) -> None:
     """A user stops one, closes the page in another; a second page of the role only watches."""
     folder = stage.folder / "out"
-    running = begin(stage, write_protocol(stage.folder, 1), "--out", str(folder))
+    # nobody dwells so long that a trial succeeds before it is stopped
+    task = REACH.replace("dwell_s = 0.2", "dwell_s = 3.0")
+    running = begin(stage, write_protocol(stage.folder, 1, task=task), "--out", str(folder))
     with participants(running) as people:
         other = people[0].page.context.new_page()
         other.goto(people[0].page.url)

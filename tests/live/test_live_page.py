@@ -36,7 +36,7 @@ from .browsers import (
     take_hold,
     tip_px,
 )
-from .page_client import page_client, with_query
+from .page_client import page_client, socket_address, with_query
 from .processes import PAPER, Process, Session, Stage, connections, executed_again
 
 pytestmark = needs_browser
@@ -311,12 +311,11 @@ def test_a_hostile_page_costs_the_loops_nothing(stage: Stage) -> None:
     """A flood, ten megabytes, NaN, a target a kilometre away: refused and counted, every record is there."""
     running = live(stage, "play", "--set", "rate_hz=250")
     address = page_address(running)
-    socket_address = address.replace("http", "ws") + "socket"
     with browser_page(address) as page:
         shows(page, "trilat.frame && trilat.frame.t > 1")
         for _ in range(3):
             with (
-                connect(socket_address, max_size=None) as hostile,
+                connect(socket_address(address), max_size=None) as hostile,
                 contextlib.suppress(ConnectionClosed),
             ):
                 hostile.send('{"do":"control","want":true}')
@@ -325,7 +324,7 @@ def test_a_hostile_page_costs_the_loops_nothing(stage: Stage) -> None:
                 for _ in range(100_000):
                     hostile.send('{"do":"hand","site":"m1","grip":true,"to":[1000.0,0.0]}')
             with (
-                connect(socket_address, max_size=None) as hostile,
+                connect(socket_address(address), max_size=None) as hostile,
                 contextlib.suppress(ConnectionClosed),
             ):
                 hostile.send("x" * (10 << 20))
