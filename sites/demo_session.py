@@ -404,7 +404,8 @@ def run_starter(number: int, scenario_file: str) -> list[str] | None:
         for name in {arm.counts: name for name, arm in scenario.arms.items()}.values():
             warm_up(scenario, name)
     freeze_gc()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Blocked and not ignored: a copy would lose the signal that meets it before it has a handler.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     return _Starter(Connection(number)).serve()
 
 
@@ -469,6 +470,7 @@ def _become(words: list[str], output: Path) -> None:
         os.dup2(sink, stream.fileno())
     os.close(sink)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     setproctitle(" ".join(["trilat", *words]))
 
 

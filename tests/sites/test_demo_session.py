@@ -86,14 +86,28 @@ def test_what_has_not_begun_is_ended_with_its_starter(tmp_path: Path) -> None:
         assert ended(starter, process).problem() is None
 
 
-@pytest.mark.parametrize("code", [1, 130, -signal.SIGINT])
-def test_the_code_of_an_interrupted_starter_is_no_problem(tmp_path: Path, code: int) -> None:
+def test_interrupted_starter_that_ends_with_any_code_is_no_problem(tmp_path: Path) -> None:
     """An interpreter that a signal meets while it imports its first modules ends with code 1."""
     with closing(started(tmp_path)) as starter:
-        process = starter.start("m1", WAITS)
+        process = SessionProcess(starter, "m1", tmp_path / "m1.txt")
+        process.output.write_text("KeyboardInterrupt")
+        process.code = 1
+        assert process.problem() == "m1 ended with code 1: KeyboardInterrupt"
+        process.code = None
         process.end(signal.SIGINT)
-        process.code = code
+        process.code = 1
         assert process.problem() is None
+
+
+def test_signal_that_meets_a_copy_before_its_handler_ends_it(tmp_path: Path) -> None:
+    """The starter forks and signals at once: none of ten copies loses the signal."""
+    with closing(started(tmp_path)) as starter:
+        waiting(starter, "recorder")  # the starter serves orders
+        processes = []
+        for n in range(10):
+            processes.append(starter.start(f"m{n}", WAITS))
+            processes[-1].end(signal.SIGINT)
+        assert [ended(starter, process).problem() for process in processes] == [None] * 10
 
 
 def test_processes_of_a_killed_starter_end(tmp_path: Path) -> None:
