@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from . import house, reading_walk
+from . import house, line_figures, reading_walk
 
 ARM_STAGES = ("trilat_net/core/chain_stages.py", "trilat_net/core/two_link_stages.py")
 PLUG_INS = {
@@ -15,6 +15,17 @@ PLUG_INS = {
 }
 """Names that an interface asks of several modules: the entry point of a program, the stages of an arm."""
 DESIGN = (house.ROOT / "docs" / "design.md").read_text(encoding="utf-8")
+LINE_LIMITS = {  # part: tokens per line, parallel assignments, unpacked tuples and filler names per 1000 lines
+    "kernel": (9.5, 2.0, 7, 29.0),
+    "session": (8.9, 2.0, 27, 40.0),
+    "analysis": (10.2, 2.0, 12, 63.0),
+    "app": (8.8, 2.0, 8, 57.0),
+    "studies": (9.3, 2.0, 9, 92.0),
+    "people": (9.5, 2.0, 5, 64.0),
+    "ros2": (9.6, 2.0, 2, 44.0),
+    "lerobot": (9.4, 2.0, 0, 90.0),
+}
+"""A number here only falls, until each part has 8.5, 2, 0 and 4; `python -m tests.line_figures` prints them."""
 TOUR = (house.ROOT / "docs" / "tour.md").read_text(encoding="utf-8")
 
 
@@ -43,6 +54,18 @@ def test_a_reader_walks_straight_from_certify_to_its_judgement() -> None:
     found = reading_walk.walk_to_judgement()
     assert len(found.stays) <= 60
     assert len(found.returns) <= 19
+
+
+@pytest.mark.push
+def test_lines_are_no_denser_than_their_limits() -> None:
+    figures = line_figures.measure_parts()
+    assert set(figures) == set(LINE_LIMITS)
+    for part, (tokens, parallel, unpacked, filler) in LINE_LIMITS.items():
+        measured = figures[part]
+        assert measured.tokens_per_line <= tokens, part
+        assert measured.per_thousand_lines("parallel") <= parallel, part
+        assert measured.unpacked <= unpacked, part
+        assert measured.per_thousand_lines("filler") <= filler, part
 
 
 @pytest.mark.push
