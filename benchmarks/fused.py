@@ -65,7 +65,7 @@ def _in_environment() -> list[str]:
     act()
     python = steps / 50 / best_s(act, 10)
     scenario = load_scenario("paper", {"duration_s": 20.0})
-    compiled = 20.0 / best_s(lambda: FusedRun(scenario).advance(20.0), 10)
+    compiled = 20.0 / best_s(lambda: FusedRun(scenario).advance_to(20.0), 10)
     return [
         f"an environment of paper, 50 steps/s, its user in Python: {python:.0f} x real time (bar: >= 25)",
         f"  the same experiment, its users compiled: {compiled:.0f} x real time (bar: >= 150)",
@@ -82,7 +82,7 @@ def _with_plugged_laws(real_s: float, adaptive_s: float) -> list[str]:
         )
 
         def run_it(scenario: Scenario = scenario) -> None:
-            FusedRun(scenario).advance(real_s)
+            FusedRun(scenario).advance_to(real_s)
 
         try:
             run_it()
@@ -101,7 +101,7 @@ def _both_drivers(scenario: Scenario, runs: int) -> tuple[list[str], FusedRun, f
 
     def fused() -> FusedRun:
         whole = FusedRun(scenario)
-        whole.advance(real_s)
+        whole.advance_to(real_s)
         return whole
 
     def per_tick() -> np.ndarray:

@@ -125,7 +125,7 @@ class SiteView:
     @property
     def ended(self) -> bool:
         """True once the site has said that it ends."""
-        return self.reception.made is not None
+        return self.reception.final_ticks is not None
 
     @property
     def complete(self) -> int:
@@ -166,7 +166,7 @@ class SessionView:
         self._query = MemberQuery(bus, clock, session)
         self._queue = InboundQueue(clock)
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
-            bus.tap(topics.key(session, "*", channel), self._queue.take)
+            bus.tap(topics.key(session, "*", channel), self._queue.receive)
 
     @property
     def running(self) -> bool:
@@ -191,7 +191,7 @@ class SessionView:
 
         It is 0.0 below `SILENT_NS`, and once the site has ended.
         """
-        heard_ns = site.reception.heard_ns
+        heard_ns = site.reception.last_received_ns
         if heard_ns is None or site.ended:
             return 0.0
         silence_ns = self._clock.monotonic_ns() - heard_ns
@@ -288,7 +288,7 @@ class SessionView:
                 message = site.reception.read(parts.channel, payload)
             if site.record is None and site.stats is None and parts.channel != topics.EVENT:
                 self._join(site, message.content)
-            if site.reception.take(parts.channel, message, arrived.mono_ns):
+            if site.reception.accept(parts.channel, message, arrived.mono_ns):
                 self._keep(parts.member, site, parts.channel, message.content)
 
     def _begin_start(self, name: str, payload: bytes) -> bool:

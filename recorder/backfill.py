@@ -82,15 +82,15 @@ class GapRepair:
         if self._open is not None:
             yield from self._read_answers(*self._open, now_ns)
         if alive:
-            silent_ns = now_ns - max(self._reception.heard_ns or 0, self._probed_ns)
-            if self._reception.made is None and silent_ns > max(
+            silent_ns = now_ns - max(self._reception.last_received_ns or 0, self._probed_ns)
+            if self._reception.final_ticks is None and silent_ns > max(
                 SILENT_NS, 3 * self._reception.period_ns
             ):
                 self._probed_ns = now_ns
                 self.probe()
             if self._open is None:
                 self._request(now_ns)
-        if self._reception.made is not None:
+        if self._reception.final_ticks is not None:
             if self._ended_ns is None:
                 self._ended_ns = now_ns
             if now_ns - max(self._ended_ns, self._progress_ns) > GIVE_UP_NS:
@@ -154,7 +154,7 @@ class GapRepair:
         channel = past.channel
         account = self._reception.accounts[channel]
         self._probes.discard(channel)
-        self._reception.expect(channel, past.made)
+        self._reception.add_expected(channel, past.made)
         if past.first > wanted.first:
             account.give_up(past.first)
         useful = False

@@ -77,10 +77,10 @@ class Recorder:
         self._is_ending = is_ending
         self._queue = InboundQueue(clock)
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
-            bus.tap(topics.key(session, "*", channel), self._queue.take)
+            bus.tap(topics.key(session, "*", channel), self._queue.receive)
         self._presence = bus.presence(topics.presence_key(session, "*"))
         info = describe_member(topics.RECORDER, boot, clock)
-        keep = partial(self._queue.take, topics.key(session, topics.RECORDER, topics.EVENT))
+        keep = partial(self._queue.receive, topics.key(session, topics.RECORDER, topics.EVENT))
         self._publisher = EventPublisher(bus, session, info, keep)
         self._joining = SessionJoin(
             bus=bus, clock=clock, session=session, publisher=self._publisher, sites=()
@@ -138,7 +138,7 @@ class Recorder:
                 bus=self._bus,
                 publisher=self._publisher,
             )
-            log.so_far = partial(recording.account_texts, self._queue)
+            log.so_far = partial(recording.render_accounts, self._queue)
             report = RecorderReport(
                 bus=self._bus,
                 clock=self._clock,
@@ -178,11 +178,11 @@ class Recorder:
 
     def _watch_presence(self, recording: Recording) -> None:
         while (change := self._presence.poll()) is not None:
-            recording.presence(*change)
+            recording.note_presence(*change)
 
     def _run(self, recording: Recording, report: RecorderReport) -> None:
         ending_ns: int | None = None
-        while not (self._stopped() or recording.over(self._clock.monotonic_ns())):
+        while not (self._stopped() or recording.is_over(self._clock.monotonic_ns())):
             since_ns = self._clock.monotonic_ns()
             if ending_ns is None and self._is_ending():
                 ending_ns = since_ns
@@ -270,12 +270,12 @@ def record_session(
             say("recorder: ended before the session began; nothing was written")
             return interrupt.exit_code
         recording = recorder.record(epoch)
-        say("\n".join(recording.summary()))
+        say("\n".join(recording.render_summary()))
         if not interrupt.requested():
             with suppress(KeyboardInterrupt), interrupt.raising():
                 afterwards()
     if interrupt.requested():
         return interrupt.exit_code
-    if problem := recording.problem():
+    if problem := recording.describe_problem():
         raise RunFailed(problem)
     return 0

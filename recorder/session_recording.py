@@ -144,14 +144,16 @@ class Recording:
                 )
                 self._note_admission(message.content)
         for name, site in self._sites.items():
-            if name in self._stored or not site.full:
+            if name in self._stored or not site.is_complete:
                 continue
             self._stored.add(name)
             text = f"every record of {name} is stored"
-            if shortage := site.shortage():
+            if shortage := site.describe_missing():
                 text = f"all that can be had of {name} is stored; missing for good: {shortage}"
             t_ns = now_ns - self.epoch.mono_ns
-            self.publisher.publish("stored", text, t_ns=t_ns, about=name, ticks=site.made)
+            self.publisher.publish(
+                "stored", text, t_ns=t_ns, about=name, ticks=site.final_ticks
+            )
 
     def _drain(self, queue: InboundQueue, until_ns: int | None) -> None:
         for arrived in queue.drain(until_ns):
@@ -171,7 +173,7 @@ class Recording:
         for name, boot in list(self._candidates.items()):
             before = self._sites[name]
             left = name in self._gone or name not in self._boots
-            if not (left or before.made is not None or boot in self._confirmed):
+            if not (left or before.final_ticks is not None or boot in self._confirmed):
                 continue
             del self._candidates[name]
             self._boots[name] = boot
@@ -203,7 +205,7 @@ class Recording:
         boot = event.boots.get(event.about)
         is_known = boot == self._boots.get(event.about)
         if event.kind == LAST and is_known:
-            self._sites[event.about].hear_of_start_before(event.ticks)
+            self._sites[event.about].count_previous_start(event.ticks)
         if event.kind != "admit" or boot is None or is_known:
             return
         if self._scenario.sites_may_return and len(self._confirmed) < STARTS_KEPT:
@@ -231,7 +233,7 @@ class Recording:
         channel = self._channels[key][1]
         if channel == topics.EVENT:
             self._note_admission(message.content)
-        if site.take(channel, message, mono_ns):
+        if site.accept(channel, message, mono_ns):
             t_ns = message.t_ns if message.t_ns >= 0 or channel != topics.EVENT else since_ns
             log_time_ns = self.epoch.unix_ns + since_ns
             self._writer.add(key, payload, t_ns, log_time_ns, message.sequence, message.content)
@@ -243,7 +245,7 @@ class Recording:
         site.since_ns = since_ns
         log_time_ns = self.epoch.unix_ns + since_ns
         add = self._writer.add
-        for payload, record in site.take_records(split_states(block), mono_ns):
+        for payload, record in site.accept_records(split_states(block), mono_ns):
             add(key, payload, record.sent_ns, log_time_ns, record.tick, record)
 
     def _take_own(self, key: str, payload: bytes, mono_ns: int) -> None:
@@ -268,7 +270,7 @@ class Recording:
                 key, payload, since_ns, self.epoch.unix_ns + since_ns, number, content
             )
 
-    def presence(self, key: str, alive: bool) -> None:
+    def note_presence(self, key: str, alive: bool) -> None:
         """Notes a member's token that appeared or disappeared."""
         parts = topics.parse_key(key)
         if parts is None or parts.member not in self._sites:
@@ -288,10 +290,10 @@ class Recording:
             self._gone_ns.pop(site, None)
             return None
         gone_ns = self._gone_ns.setdefault(site, now_ns)
-        heard_ns = self._sites[site].heard_ns
+        heard_ns = self._sites[site].last_received_ns
         return gone_ns if heard_ns is None or heard_ns < gone_ns + UNDER_WAY_NS else heard_ns
 
-    def over(self, now_ns: int) -> bool:
+    def is_over(self, now_ns: int) -> bool:
         """True once every site has all its messages stored, or is gone for good."""
         left = [self._has_left(name, now_ns) for name in self._sites]  # each notes the time
         return all(left)
@@ -303,9 +305,9 @@ class Recording:
         if since_ns is None:
             return False
         patience_ns = SETTLE_NS
-        if self._sites[site].made is None:
+        if self._sites[site].final_ticks is None:
             patience_ns = max(SETTLE_NS, min(AWAY_NS, self._end_ns - since_ns))
-        elif not self._sites[site].full:
+        elif not self._sites[site].is_complete:
             patience_ns = RECONNECT_NS
         return now_ns - since_ns > patience_ns
 
@@ -322,8 +324,12 @@ class Recording:
         for name, site in self._sites.items():
             if self._has_left(name, now_ns):
                 continue
-            heard_ns = site.heard_ns or 0
-            is_running = site.made is None and now_ns - heard_ns < HEARD_NS and not site.wanted
+            heard_ns = site.last_received_ns or 0
+            is_running = (
+                site.final_ticks is None
+                and now_ns - heard_ns < HEARD_NS
+                and not site.lacks_messages
+            )
             if not (is_running and now_ns - ending_ns > SETTLE_NS):
                 return False
         return True
@@ -337,9 +343,9 @@ class Recording:
         if rest:
             self._drain(queue, None)
         self._overflowed = sum(queue.overflowed.values())
-        self._writer.finish(self.account_texts(queue))
+        self._writer.finish(self.render_accounts(queue))
 
-    def account_texts(self, queue: InboundQueue) -> dict[str, str]:
+    def render_accounts(self, queue: InboundQueue) -> dict[str, str]:
         """Returns the accounts as they stand in the file: per topic, and dropped messages by
         reason.
         """
@@ -356,14 +362,14 @@ class Recording:
             **{f"dropped: {reason}": str(count) for reason, count in self.dropped.items()},
         }
 
-    def summary(self) -> list[str]:
+    def render_summary(self) -> list[str]:
         """Returns a line for every site, and for messages turned away or dropped."""
         lines = []
         for name, site in self._sites.items():
             account = site.accounts[topics.STATE]
             total = (
                 " records, its end is unknown"
-                if site.made is None
+                if site.final_ticks is None
                 else f" of {count_nouns(account.expected, 'record')}"
             )
             lines.append(
@@ -381,12 +387,12 @@ class Recording:
             for reason, count in self.dropped.items()
         ]
 
-    def problem(self) -> str | None:
+    def describe_problem(self) -> str | None:
         """Describes what is missing; None if nothing is."""
         for name, site in self._sites.items():
-            if site.made is None:
+            if site.final_ticks is None:
                 return f"{name} disappeared after {count_nouns(site.accounts[topics.STATE].received, 'record')}"
-            if shortage := site.shortage():
+            if shortage := site.describe_missing():
                 return f"missing of {name}: {shortage}"
         return None
 
@@ -433,7 +439,7 @@ class RecorderReport:
         """Publishes the statistics, and puts them into the queue."""
         payload = encode(self._stats())
         self._flush_max_ns = 0
-        self._queue.take(self._key, payload)
+        self._queue.receive(self._key, payload)
         self._publish(payload)
 
     def _stats(self) -> RecorderStats:

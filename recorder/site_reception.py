@@ -68,7 +68,7 @@ class InboundQueue:
     def __len__(self) -> int:
         return len(self._queue)
 
-    def take(self, key: str, payload: bytes) -> None:
+    def receive(self, key: str, payload: bytes) -> None:
         """Stamps and appends one message; called by the bus."""
         size = len(payload) + OVERHEAD_BYTES
         with self._taking:
@@ -140,8 +140,8 @@ class SiteReception:
     Attributes:
         accounts: its messages by channel; those of events begin anew with every start.
         event_accounts: those of the starts before.
-        made: number of its ticks, once its end event has arrived; else None.
-        heard_ns: arrival of its last message, on the recorder's clock; None before.
+        final_ticks: number of its ticks, once its end event has arrived; else None.
+        last_received_ns: arrival of its last message, on the recorder's clock; None before.
         since_ns: time since the epoch on that clock: what claims to be later is not believed.
     """
 
@@ -159,8 +159,8 @@ class SiteReception:
         if before is not None:
             self.accounts = {**before.accounts, topics.EVENT: Account()}
             self.event_accounts = (*before.event_accounts, before.accounts[topics.EVENT])
-        self.made: int | None = None
-        self.heard_ns: int | None = None
+        self.final_ticks: int | None = None
+        self.last_received_ns: int | None = None
         self.since_ns: float = math.inf if before is None else before.since_ns
         self._boot = boot
         self._rate_hz = scenario.sites[name].rate_hz
@@ -222,7 +222,7 @@ class SiteReception:
         if ticks > self._possible_ticks:
             raise WireError(f"{self.name} is ahead of the clock", f"{channel} number {number}")
 
-    def take_records(
+    def accept_records(
         self, payloads: Iterable[bytes], came_ns: int
     ) -> Iterator[tuple[bytes, State]]:
         """Counts the published records of one block, and yields those that are no duplicates.
@@ -246,7 +246,7 @@ class SiteReception:
                     number=tick,
                     ticks=tick + 1,
                 )
-            self.heard_ns = came_ns
+            self.last_received_ns = came_ns
             new = account.take(tick, came_ns)
             if record.cmd:
                 self._imply(record)
@@ -260,16 +260,16 @@ class SiteReception:
 
     def _take_room(self, event: Event, size: int) -> None:
         """Refuses the events of a flood, which would make a log of nothing else."""
-        ends = event.kind == "end" and self.made is None and size <= EVENT_BYTES_PER_S
+        ends = event.kind == "end" and self.final_ticks is None and size <= EVENT_BYTES_PER_S
         if size > self._event_room and not ends:
             raise WireError(
                 "flood of events", f"{self.name} sent more than a log takes of one site"
             )
         self._event_room -= size
 
-    def take(self, channel: str, message: SiteMessage, came_ns: int) -> bool:
+    def accept(self, channel: str, message: SiteMessage, came_ns: int) -> bool:
         """Counts a published message; False if it is a duplicate."""
-        self.heard_ns = came_ns
+        self.last_received_ns = came_ns
         new = message.number < 0 or self.accounts[channel].take(message.number, came_ns)
         self._imply(message.content)
         return new
@@ -291,7 +291,7 @@ class SiteReception:
                 "stranger", f"{past.member}, start {past.boot}, answers for {self.name}"
             )
 
-    def expect(self, channel: str, made: int) -> None:
+    def add_expected(self, channel: str, made: int) -> None:
         """Counts the messages of a channel that exist at least; no more than scenario and clock
         allow.
         """
@@ -300,7 +300,7 @@ class SiteReception:
             most = min(most, count_messages(channel, self._possible_ticks, self._rate_hz))
         self.accounts[channel].expect(min(made, most))
 
-    def hear_of_start_before(self, ticks: int) -> None:
+    def count_previous_start(self, ticks: int) -> None:
         """Counts what the start before published at least, of which another site heard so many
         ticks.
         """
@@ -318,9 +318,13 @@ class SiteReception:
                 left_out = skipped_numbers(channel, content.tick, skipped, self._rate_hz)
                 self.accounts[channel].begin_anew(*left_out)
         if isinstance(content, LinkStats):
-            self.expect(topics.STATE, content.tick + 1)
+            self.add_expected(topics.STATE, content.tick + 1)
         elif isinstance(content, Event) and content.kind == "join":
-            made = 0 if self._before is None or self._before.made is None else self._before.made
+            made = (
+                0
+                if self._before is None or self._before.final_ticks is None
+                else self._before.final_ticks
+            )
             for channel, gap in self._gaps.items():
                 numbers = (
                     count_messages(channel, ticks, self._rate_hz)
@@ -328,26 +332,28 @@ class SiteReception:
                 )
                 gap.begin_anew(*numbers)
         elif isinstance(content, Event) and content.kind == "end":
-            self.made = content.ticks
+            self.final_ticks = content.ticks
             for channel in (topics.STATE, topics.LINK):
-                self.expect(channel, count_messages(channel, content.ticks, self._rate_hz))
+                self.add_expected(
+                    channel, count_messages(channel, content.ticks, self._rate_hz)
+                )
 
     @property
-    def wanted(self) -> bool:
+    def lacks_messages(self) -> bool:
         """True while a message is missing that can still be had."""
         return any(account.wanted() for account in self.accounts.values())
 
     @property
-    def full(self) -> bool:
+    def is_complete(self) -> bool:
         """True once it has ended and no missing message can still be had."""
-        return self.made is not None and not self.wanted
+        return self.final_ticks is not None and not self.lacks_messages
 
     def give_up(self) -> None:
         """Counts all missing messages as lost for good."""
         for account in self.accounts.values():
             account.give_up(account.last + 1)
 
-    def shortage(self) -> str:
+    def describe_missing(self) -> str:
         """Describes the missing messages; "" without any."""
         return ", ".join(
             f"{account.missing} of {account.expected} {CHANNEL_NOUNS[channel]} "

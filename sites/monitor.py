@@ -17,7 +17,7 @@ from rich.text import Text
 
 from trilat_net.core.live_hand import HandInForce
 from trilat_net.core.ticks import NS_PER_S, LifeAlarm
-from trilat_net.log.site_log import find_task_errors
+from trilat_net.log.site_log import compute_task_errors
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus
 from trilat_net.net.clock import Clock
@@ -75,7 +75,7 @@ def describe_site(
     if record is not None:
         own, desired = (np.array([v]) for v in (record.x or record.q, record.q_des))
         e = (
-            find_task_errors(own, desired, scenario.arms[name].axes)
+            compute_task_errors(own, desired, scenario.arms[name].axes)
             if record.x
             else own - desired
         )

@@ -28,7 +28,7 @@ from trilat_net.core.ticks import (
     tick_ns,
 )
 from trilat_net.errors import CodeFailed, PeerLeft, RunFailed, SessionError, count_nouns
-from trilat_net.log.site_log import find_task_errors
+from trilat_net.log.site_log import compute_task_errors
 from trilat_net.net import topics
 from trilat_net.net.clock import make_system_clock
 from trilat_net.net.connection import open_bus
@@ -465,7 +465,7 @@ class RunningSite:
         own, desired = (np.array([vector]) for vector in (shared, output.q_des))
         axes = self._parts.scenario.arms[self._parts.name].axes
         apart = np.abs(
-            find_task_errors(own, desired, axes) if output.x else own - desired
+            compute_task_errors(own, desired, axes) if output.x else own - desired
         ).max()
         unit = "m or rad" if output.x else "rad"
         torque_nm = max(map(abs, output.tau))

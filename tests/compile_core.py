@@ -47,7 +47,7 @@ def compile_part(part: str) -> str:
                 warm_up(scenario, site)
             trilat_net.verify(file, virtual=True, resume_every=20)
             trilat_net.report(file, Path(folder) / "report")
-    FusedRun(scenario).advance_watching(scenario.duration_s)
+    FusedRun(scenario).run_and_sample(scenario.duration_s)
     return part
 
 

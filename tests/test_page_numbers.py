@@ -177,7 +177,7 @@ def stable_with_any(delay_ms: float, d: float) -> Numbers:
 def fused(name: str, duration_s: float | None = None, **changes: Any) -> FusedRun:
     scenario = load_scenario(name, keys(changes))
     made = FusedRun(scenario)
-    made.advance(duration_s or scenario.duration_s)
+    made.advance_to(duration_s or scenario.duration_s)
     return made
 
 

@@ -75,7 +75,7 @@ def sampled(scenario: Scenario, times_s: Array | tuple[float, ...]) -> Array:
     made = FusedRun(scenario)
     rows = []
     for t_s in times_s:
-        made.advance(float(t_s))
+        made.advance_to(float(t_s))
         rows.append(made.records)
     return np.stack(rows, axis=1)
 

@@ -103,7 +103,7 @@ class Playback:
             history=history,
         )
         self._shown_ns = self.clock.monotonic_ns()
-        own = history, self.clock, self._publisher, self._attend, self.stopped
+        own = history, self.clock, self._publisher, self._serve, self.stopped
         self._player = Player(self.source, *own, low_cpu=self.options.low_cpu)
 
     def _publisher(self, channel: int) -> Callable[[bytes], None]:
@@ -112,8 +112,8 @@ class Playback:
         )
         return self.bus.publisher(key, patient=True)
 
-    def _attend(self, progress: PlayProgress) -> None:
-        self._stand_ins.attend()
+    def _serve(self, progress: PlayProgress) -> None:
+        self._stand_ins.serve_queries()
         now_ns = self.clock.monotonic_ns()
         if now_ns - self._shown_ns >= PROGRESS_EVERY_NS:
             self._shown_ns = now_ns
@@ -135,7 +135,7 @@ class Playback:
             self._stand_ins.begin(pace.due_ns(0))
             self._player.play(pace, loop=options.loop)
         took_ns = max(0, clock.monotonic_ns() - begun_ns)
-        self._stand_ins.attend()
+        self._stand_ins.serve_queries()
         recorders = set(self._stand_ins.recorders)
         self._linger()
         return PlaybackSummary(
@@ -147,7 +147,7 @@ class Playback:
             cut=self._player.stalls,
             strays=self.source.strays,
             recorders=len(recorders),
-            stored=self._stand_ins.stored(recorders),
+            stored=self._stand_ins.have_stored(recorders),
             refilled=self._stand_ins.refilled,
             torn=self.header.torn,
         )
@@ -159,9 +159,9 @@ class Playback:
             self.say("waiting for a recorder")
         give_up_ns = clock.monotonic_ns() + LISTEN_NS
         while not self.stopped():
-            stand_ins.attend()
+            stand_ins.serve_queries()
             missing = self.options.needs_recorder and not stand_ins.recorders
-            listening = stand_ins.recorders_listen()
+            listening = stand_ins.are_recorders_listening()
             if missing:
                 give_up_ns = clock.monotonic_ns() + LISTEN_NS
             elif listening or clock.monotonic_ns() > give_up_ns:
@@ -173,11 +173,11 @@ class Playback:
         stand_ins = self._stand_ins
         give_up_ns = clock.monotonic_ns() + LINGER_NS
         while clock.monotonic_ns() < give_up_ns and not self.stopped():
-            if stand_ins.attend():
+            if stand_ins.serve_queries():
                 give_up_ns = clock.monotonic_ns() + LINGER_NS
                 continue
             # the last messages may still be under way
-            if stand_ins.stored(stand_ins.recorders):
+            if stand_ins.have_stored(stand_ins.recorders):
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + LAST_EVENT_NS)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 

@@ -149,7 +149,7 @@ class PlayProgress(NamedTuple):
 
 
 class Player:
-    """One play of a log: `publisher` returns the publisher of a channel, `attend` does a little
+    """One play of a log: `publisher` returns the publisher of a channel, `serve` does a little
     other work.
 
     Attributes:
@@ -164,7 +164,7 @@ class Player:
         history: PlayedHistory,
         clock: Clock,
         publisher: Callable[[int], Publish],
-        attend: Callable[[PlayProgress], None],
+        serve: Callable[[PlayProgress], None],
         stopped: Callable[[], bool],
         *,
         low_cpu: bool = False,
@@ -176,7 +176,7 @@ class Player:
         self._history = history
         self._clock = clock
         self._publisher = publisher
-        self._attend = attend
+        self._serve_others = serve
         self._stopped = stopped
         self._spin_ns = 0 if low_cpu else SPIN_NS
         self._publish: list[Publish] = []
@@ -209,7 +209,7 @@ class Player:
             pace = pace.later(self._position_ns - pace.start_ns + LOOP_PAUSE_NS)
             self._source.restart()
             if not self._source.whole:
-                self._history.forget()
+                self._history.clear()
 
     def _next(self) -> MessageBatch | None:
         """Waits for the next messages; None at the end of the round, or if stopped."""
@@ -225,7 +225,7 @@ class Player:
     def _play(self, piece: MessageBatch, pace: Pace) -> None:
         clock = self._clock
         add_lateness = self.lateness.add
-        made = self._history.made
+        made = self._history.next_numbers
         now_ns = clock.monotonic_ns
         for t_ns, channel, number, payload in piece.messages():
             self._position_ns = t_ns
@@ -269,5 +269,7 @@ class Player:
 
     def _serve(self) -> None:
         self._source.fill()
-        self._attend(PlayProgress(self._position_ns, self._published, self.lateness.max_us))
+        self._serve_others(
+            PlayProgress(self._position_ns, self._published, self.lateness.max_us)
+        )
         self._served_ns = self._clock.monotonic_ns()

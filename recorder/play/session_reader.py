@@ -56,7 +56,7 @@ class PlaySelection:
     stop_ns: int | None = None
     time: PlayTime = "publish"
 
-    def takes(self, topic: str, sites: Collection[str]) -> bool:
+    def accepts(self, topic: str, sites: Collection[str]) -> bool:
         """True if a channel is played, by its topic ("/trilat/paper/m1/state") and the
         scenario's sites.
         """
@@ -64,7 +64,7 @@ class PlaySelection:
         published = (
             parsed is not None and parsed.member in sites and parsed.channel in SITE_CHANNELS
         )
-        return self.channels.takes(topic.strip("/")) and (
+        return self.channels.accepts(topic.strip("/")) and (
             published or bool(self.channels.include)
         )
 
@@ -175,7 +175,7 @@ class _PlayedChannel:
         )
         self.rate_hz = sites[self.site].rate_hz if self.site else 0
         self.place = -1
-        if selection.takes(topic, sites):
+        if selection.accepts(topic, sites):
             if topic not in header.topics:
                 header.topics.append(topic)
             self.place = header.topics.index(topic)

@@ -47,11 +47,11 @@ class PlayedHistory:
         kept_ns: length of log that is kept, ns; None: everything.
 
     Attributes:
-        made: per channel the number after that of its last played message.
+        next_numbers: per channel the number after that of its last played message.
     """
 
     def __init__(self, kept_ns: int | None = None) -> None:
-        self.made: dict[int, int] = {}
+        self.next_numbers: dict[int, int] = {}
         self._kept_ns = kept_ns
         self._runs: dict[int, deque[_PlayedRun]] = {}
 
@@ -66,11 +66,11 @@ class PlayedHistory:
                 while int(runs[0][2].times_ns[-1]) < oldest_ns:
                     runs.popleft()
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Drops all messages, but not how many were played: another round begins."""
         self._runs.clear()
 
-    def chunk(self, channel: int, first: int, last: int) -> tuple[int, list[bytes]]:
+    def find_messages(self, channel: int, first: int, last: int) -> tuple[int, list[bytes]]:
         """Returns the number of the first message and the consecutive messages of one answer.
 
         Args:
@@ -80,7 +80,7 @@ class PlayedHistory:
             last: number of the last one wanted.
         """
         runs = list(self._runs.get(channel, ()))
-        made = self.made.get(channel, 0)
+        made = self.next_numbers.get(channel, 0)
         payloads: list[bytes] = []
         size = 0
         wanted = first
@@ -173,7 +173,7 @@ class SiteStandIns:
         }
         self._encoded.clear()
 
-    def attend(self) -> bool:
+    def serve_queries(self) -> bool:
         """Answers identity queries, notes presence and events of recorders, and answers one
         backfill query.
 
@@ -199,17 +199,17 @@ class SiteStandIns:
         encoded_ns, answer = self._encoded.get(site, (0, b""))
         now_ns = self._clock.monotonic_ns()
         if not answer or now_ns - encoded_ns >= REFRESH_NS:
-            ticks = self._history.made.get(self._find_channel(site, topics.STATE), 0)
+            ticks = self._history.next_numbers.get(self._find_channel(site, topics.STATE), 0)
             answer = encode(msgspec.structs.replace(self._infos[site], ticks=ticks))
             self._encoded[site] = now_ns, answer
         return answer
 
-    def recorders_listen(self) -> bool:
+    def are_recorders_listening(self) -> bool:
         """Asks the present recorders for their identities; True once all have answered."""
         self._met |= {str(info.boot) for info in self._recorder_query.poll()}
         return not self.recorders - self._met
 
-    def stored(self, recorders: Collection[str]) -> bool:
+    def have_stored(self, recorders: Collection[str]) -> bool:
         """True if all of these recorders have reported that they stored everything of every
         site.
         """
@@ -224,10 +224,10 @@ class SiteStandIns:
         event.
         """
         channel = self._find_channel(site, topics.EVENT)
-        newest = self._history.made.get(channel, 0) - 1
+        newest = self._history.next_numbers.get(channel, 0) - 1
         start = max(newest, 0) // NUMBERS_OF_A_START
         if start and self._boots.get(site, (0, 0))[0] != start:
-            for payload in self._history.chunk(channel, newest, newest)[1]:
+            for payload in self._history.find_messages(channel, newest, newest)[1]:
                 with suppress(WireError):
                     self._boots[site] = start, decode(payload, Event).boot
         first = 0, self._infos[site].boot
@@ -239,8 +239,8 @@ class SiteStandIns:
         def find(wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
             channel = self._find_channel(site, wanted.channel)
             before = start * NUMBERS_OF_A_START if wanted.channel == topics.EVENT else 0
-            made = self._history.made.get(channel, 0) - before
-            first, payloads = self._history.chunk(
+            made = self._history.next_numbers.get(channel, 0) - before
+            first, payloads = self._history.find_messages(
                 channel, wanted.first + before, wanted.last + before
             )
             return max(first - before, 0), payloads, max(made, 0)

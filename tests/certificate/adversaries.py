@@ -590,15 +590,15 @@ def find_truth(drawn: Drawn) -> Truth:
     run = FusedRun(prolong_scenario(scenario, LONGER * ends_s))
     states = []
     for t_s in np.linspace(0.75, 1.0, 100) * ends_s if has_sampled_wall(scenario) else ():
-        run.advance(float(t_s))
+        run.advance_to(float(t_s))
         states.append((run.q, run.theta_hat))
-    run.advance(ends_s)
+    run.advance_to(ends_s)
     in_contact = (
         find_contact_growth(scenario, *map(np.array, zip(*states, strict=True)))
         if states
         else -1.0
     )
-    run.advance(LONGER * ends_s)
+    run.advance_to(LONGER * ends_s)
     at = Equilibrium(run.q, run.theta_hat, "", 0.0)
     if run.diverged_s is not None:
         at = at._replace(q=np.array([spec.q0_rad for spec in scenario.sites.values()]))
@@ -632,7 +632,7 @@ def find_wide_truth(scenario: Scenario) -> Truth:
         scenario.duration_s,
     )
     run = FusedRun(whole)
-    run.advance(LONGER * ends_s)
+    run.advance_to(LONGER * ends_s)
     if run.diverged_s is not None:
         return Truth(True, None, False)
     early, late = (_largest_speed(run, end_s) for end_s in (ends_s, LONGER * ends_s))
@@ -667,7 +667,7 @@ def measure_exponent(scenario: Scenario, until_s: float) -> float:
         run.step_to(round(start_s * NS_PER_S))
         if not sizes:
             pushed.copy_state(run)
-            pushed.push("q", by)
+            pushed.displace("q", by)
             scale = 0.0
         size = _largest_difference(run, pushed, start_s)
         if not np.isfinite(size) or pushed.diverged_s is not None or run.diverged_s is not None:
@@ -677,7 +677,7 @@ def measure_exponent(scenario: Scenario, until_s: float) -> float:
             lost.append((sizes[-1] - np.log(NUDGE_RAD)) / (WINDOW_S * len(sizes)))
             sizes = []
         elif size > LINEAR_RAD_S:
-            pushed.approach(run, NUDGE_RAD / size)
+            pushed.scale_difference(run, NUDGE_RAD / size)
             scale += np.log(size / NUDGE_RAD)
     late = sizes[len(sizes) // 2 :]
     if len(late) < LEAST_WINDOWS:
@@ -743,7 +743,7 @@ class RunInMemory:
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario, self.sites, self._run = scenario, scenario.names, FusedRun(scenario)
-        self._run.advance(scenario.duration_s)
+        self._run.advance_to(scenario.duration_s)
 
     def find_end(self) -> RunEnd:
         """The judgement of its end."""

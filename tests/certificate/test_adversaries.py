@@ -60,10 +60,10 @@ def _speed(scenario: Scenario, *at_s: float) -> list[float]:
     """The largest |qd| of the second before each time."""
     run, found = FusedRun(scenario), []
     for end_s in at_s:
-        run.advance(end_s - 1.0)
+        run.advance_to(end_s - 1.0)
         peaks = []
         for t_s in np.linspace(end_s - 1.0, end_s, 50):
-            run.advance(float(t_s))
+            run.advance_to(float(t_s))
             peaks.append(np.abs(run.records[:, 2:4]).max())
         found.append(max(peaks))
     return found

@@ -13,7 +13,7 @@ from tests.execution.logs import without_records
 from trilat_net.analysis.twin_growth import TWINS
 from trilat_net.cli.runs import certify_command
 from trilat_net.errors import NotRepeatable
-from trilat_net.execution.fused import explain_no_repetition
+from trilat_net.execution.fused import explain_not_repeatable
 
 OWN_LAW = Path(__file__).parents[1] / "golden" / "own-law.mcap"
 
@@ -111,7 +111,7 @@ def test_what_cannot_be_executed_again_has_no_twin() -> None:
     external = SimpleNamespace(
         scenario=tn.load_scenario("free", {"sites.m1.plant": "external"})
     )
-    assert "arm of m1, outside of the program" in explain_no_repetition(external)
+    assert "arm of m1, outside of the program" in explain_not_repeatable(external)
 
 
 @pytest.mark.parametrize("command", ["certify", "twin"])

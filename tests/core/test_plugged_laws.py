@@ -226,7 +226,7 @@ def test_on_chain_plain_compiled_and_fused_have_same_bits() -> None:
     assert a == b
     for scenario in scenarios:
         fused = FusedRun(scenario)
-        fused.advance(0.03)
+        fused.advance_to(0.03)
         for name, row in zip(scenario.names, fused.records, strict=True):
             fields = scenario.layout(name).columns()
             assert row.tolist() == [

@@ -94,7 +94,7 @@ def buckets(outputs: Sequence[TickRecord], rate_hz: int) -> Array:
 def agree(scenario: Scenario) -> None:
     expected = per_tick(scenario)
     fused = FusedRun(scenario)
-    fused.advance(scenario.duration_s)
+    fused.advance_to(scenario.duration_s)
     for record, outputs in zip(fused.records, expected.values(), strict=True):
         last = floats(outputs[-1])
         np.testing.assert_array_equal(record[: len(last)], last)
@@ -138,10 +138,10 @@ def test_run_that_diverges_ends_with_ticks_of_that_instant() -> None:
     scenario = load_scenario("free", {"limits.qd_limit_rad_s": 1.5, "duration_s": 3.0})
     agree(scenario)
     fused = FusedRun(scenario)
-    fused.advance(1.0)
+    fused.advance_to(1.0)
     assert fused.diverged_s is not None
     before = fused.records
-    fused.advance(3.0)
+    fused.advance_to(3.0)
     np.testing.assert_array_equal(fused.records, before)
 
 
@@ -150,10 +150,10 @@ def test_run_that_diverges_ends_with_ticks_of_that_instant() -> None:
 def test_a_run_in_parts_is_the_run_in_one(stops: list[float]) -> None:
     scenario = load_scenario("paper", {"duration_s": 1.0, "link.delay_ms": 35.0})
     whole, parts = FusedRun(scenario), FusedRun(scenario)
-    whole.advance(1.0)
+    whole.advance_to(1.0)
     for until_s in sorted(stops):
-        parts.advance(until_s)
-    parts.advance(1.0)
+        parts.advance_to(until_s)
+    parts.advance_to(1.0)
     np.testing.assert_array_equal(parts.records, whole.records)
     np.testing.assert_array_equal(np.array(parts.maxima), np.array(whole.maxima))
     assert parts.settled_s == whole.settled_s
@@ -179,8 +179,8 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
     """RMS e, peak force and work of the walls as `trilat metrics` has them; the effort by its formula."""
     scenario = load_scenario(load_scenario(name), changes)
     fused = FusedRun(scenario)
-    fused.advance(0.5 * scenario.duration_s)
-    fused.advance(scenario.duration_s)
+    fused.advance_to(0.5 * scenario.duration_s)
+    fused.advance_to(scenario.duration_s)
     log = virtual.simulate_scenario(scenario)
     whole = {
         one.key: compute_log_metrics(log).whole(one).value
@@ -204,8 +204,8 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
 @pytest.mark.long
 def test_it_settles_when_the_last_error_falls_below_the_limit() -> None:
     scenario = load_scenario("free", {"duration_s": 13.0})
-    fused = FusedRun(scenario, apart_rad=0.01)
-    fused.advance(13.0)
+    fused = FusedRun(scenario, settled_rad=0.01)
+    fused.advance_to(13.0)
     apart = [
         output.t_ns
         for outputs in per_tick(scenario).values()
@@ -214,8 +214,8 @@ def test_it_settles_when_the_last_error_falls_below_the_limit() -> None:
         >= 0.01
     ]
     assert fused.settled_s == max(apart) / 1e9
-    early = FusedRun(scenario, apart_rad=0.01)
-    early.advance(2.0)
+    early = FusedRun(scenario, settled_rad=0.01)
+    early.advance_to(2.0)
     assert early.settled_s is None
 
 
@@ -228,7 +228,7 @@ for scheme in ("second_order", "digital"):
                                    "sites.s.rate_hz": 333})
     run = FusedRun(scenario)
     for until_s in (0.05, 0.11, 0.25):
-        run.advance(until_s)
+        run.advance_to(until_s)
         print(run.records.tobytes().hex())
     print(run.maxima[1].tobytes().hex())
 """
@@ -261,8 +261,8 @@ def test_plugged_laws_have_the_bits_of_the_per_tick_driver(law: str) -> None:
     ):
         scenario = load_scenario("asymmetric", {**plugged, **changes})
         fused = FusedRun(scenario)
-        fused.advance(0.05)
-        fused.advance(scenario.duration_s)
+        fused.advance_to(0.05)
+        fused.advance_to(scenario.duration_s)
         last = {tick.site.name: tick.output for tick in virtual.execute_virtual(scenario)}
         for name, row in zip(scenario.names, fused.records, strict=True):
             names = scenario.layout(name).columns()
@@ -278,4 +278,4 @@ def test_a_law_that_fails_in_a_fused_run_is_named(law: str) -> None:
     )
     problem = f"{law} of m2 failed at tick 41: ZeroDivisionError"
     with pytest.raises(LawFailed, match=problem):
-        run.advance(0.2)
+        run.advance_to(0.2)

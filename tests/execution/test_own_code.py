@@ -55,8 +55,8 @@ def test_compiled_run_pauses_where_a_hand_is_asked(
 ) -> None:
     scenario = load_scenario(name, at_m2(kind, **keys))
     log, run = simulate_scenario(scenario), FusedRun(scenario, keep=2000)
-    run.advance(scenario.duration_s)
-    for (_, rows), site in zip(run.take_records(), scenario.names, strict=True):
+    run.advance_to(scenario.duration_s)
+    for (_, rows), site in zip(run.pop_records(), scenario.names, strict=True):
         columns = scenario.layout(site).columns()
         for signal in SIGNALS:
             recorded = np.array(getattr(log[site], signal))
@@ -251,8 +251,8 @@ def test_compiled_run_pauses_where_a_plant_moves(rate_hz: int) -> None:
     log = simulate_scenario(scenario)
     run = FusedRun(scenario, keep=2000, plants=make_plant_players(scenario))
     for until_s in (0.3, 0.3015, 1.0):
-        run.advance(until_s)
-    for (_, rows), site in zip(run.take_records(), scenario.names, strict=True):
+        run.advance_to(until_s)
+    for (_, rows), site in zip(run.pop_records(), scenario.names, strict=True):
         columns = scenario.layout(site).columns()
         for signal in SIGNALS:
             recorded = np.array(getattr(log[site], signal))

@@ -50,7 +50,7 @@ def test_from_any_record_on_a_run_is_the_whole_run(law: str) -> None:
             site = Site(setup)
             inputs.resume(site, first)
             for state in part.states[first : first + 12]:
-                arrivals, missing = inputs.arrivals(state.rx)
+                arrivals, missing = inputs.find_arrivals(state.rx)
                 assert not missing
                 record = site.step(TickInput(state.tick, arrivals))
                 assert record._replace(

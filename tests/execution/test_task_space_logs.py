@@ -24,7 +24,7 @@ def log() -> Log:
 def test_its_records_are_those_of_the_fused_run(log: Log) -> None:
     """Places, velocities and wrenches of arms of two and of seven joints."""
     run = FusedRun(load_scenario("unlike_arms", SHORT))
-    run.advance(1.0)
+    run.advance_to(1.0)
     for record, name in zip(run.records, log.sites, strict=True):
         part = log[name]
         row = np.concatenate([getattr(part, field)[-1] for field in part.layout.lengths()])

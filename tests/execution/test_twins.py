@@ -14,8 +14,8 @@ from trilat_net.execution.twins import (
     LARGEST,
     Push,
     Twins,
-    aim_push,
     choose_pushes,
+    parse_push,
     run_twins,
     run_virtual_twins,
 )
@@ -37,7 +37,7 @@ def rate_per_s(scenario: Scenario, twins: Twins) -> float:
 @pytest.mark.parametrize(("d", "seconds"), [(0.5, 40.0), (2.0, 40.0), (3.0, 40.0)])
 def test_the_difference_of_a_linear_loop_obeys_its_root(d: float, seconds: float) -> None:
     scenario = at_rest(d)
-    twins = run_virtual_twins(scenario, [aim_push(scenario, "m1.q1", 1e-7)], seconds)
+    twins = run_virtual_twins(scenario, [parse_push(scenario, "m1.q1", 1e-7)], seconds)
     roots = tn.linear("p_d_margin", {"control.d": d}, pose=(0.3, 0.5), ports=False).to_dict()
     root_per_s = roots["as_computed"]["roots"][0]["re_per_s"]
     assert rate_per_s(scenario, twins) == pytest.approx(root_per_s, rel=0.02)
@@ -64,7 +64,7 @@ def test_a_live_run_is_repeated_bit_for_bit(name: str) -> None:
 
 def test_a_push_in_one_closed_group_never_reaches_the_other() -> None:
     scenario = two_pairs((p_d(2.0), p_d(2.0)), (0.1, 0.3, 0.2, 0.6))
-    twins = run_virtual_twins(scenario, [aim_push(scenario, "a.q1")], 4.0)
+    twins = run_virtual_twins(scenario, [parse_push(scenario, "a.q1")], 4.0)
     reached = np.isfinite(twins.paths[0].largest).any(axis=0)
     assert reached.tolist() == [True] * 4 + [False] * 4
 
@@ -72,7 +72,7 @@ def test_a_push_in_one_closed_group_never_reaches_the_other() -> None:
 @pytest.mark.long
 def test_to_make_a_difference_small_again_leaves_its_rate() -> None:
     scenario = at_rest(0.5)
-    free = aim_push(scenario, "m1.q1", 1e-9)._replace(largest=math.inf)
+    free = parse_push(scenario, "m1.q1", 1e-9)._replace(largest=math.inf)
     often = free._replace(largest=2e-9)
     twins = run_virtual_twins(scenario, [free, often], 100.0)
     assert not twins.paths[0].scale.any()
@@ -83,7 +83,7 @@ def test_to_make_a_difference_small_again_leaves_its_rate() -> None:
 
 def test_what_dies_down_ends_there_or_is_pushed_anew() -> None:
     scenario = at_rest(3.0)
-    once = aim_push(scenario, "m1.qd2", 1e-9)
+    once = parse_push(scenario, "m1.qd2", 1e-9)
     twins = run_virtual_twins(scenario, [once, once._replace(again=True)], 60.0)
     ended, anew = twins.paths
     assert ended.died is not None
@@ -107,7 +107,7 @@ def test_a_twin_that_leaves_its_limits_is_told() -> None:
 
 def test_a_push_is_at_its_instant() -> None:
     scenario = load_scenario("two_sites")
-    twins = run_virtual_twins(scenario, [aim_push(scenario, "s.q", 1e-3, at_s=1.25)], 2.0)
+    twins = run_virtual_twins(scenario, [parse_push(scenario, "s.q", 1e-3, at_s=1.25)], 2.0)
     path = twins.paths[0]
     assert path.pushed == (25,)
     assert not np.isfinite(path.largest[:25]).any()
@@ -137,7 +137,7 @@ def test_a_push_is_at_its_instant() -> None:
 def test_a_push_is_aimed_by_words(
     target: str, name: str, pushed: list[tuple[int, int]]
 ) -> None:
-    push = aim_push(load_scenario("paper"), target)
+    push = parse_push(load_scenario("paper"), target)
     assert push.name == name
     assert [tuple(at) for at in np.argwhere(push.by).tolist()] == pushed
     assert np.abs(push.by).max() <= 1e-6
@@ -148,10 +148,10 @@ def test_a_push_is_aimed_by_words(
 )
 def test_what_cannot_be_pushed_is_refused_with_what_can(target: str) -> None:
     with pytest.raises(UsageError, match=r"no such number; .* m1 \(2 joints, 5 estimates\)"):
-        aim_push(load_scenario("paper"), target)
+        parse_push(load_scenario("paper"), target)
 
 
 @pytest.mark.parametrize("size", [0.0, math.nan, math.inf, 1e-12, -2.0])
 def test_a_size_that_is_none_is_refused(size: float) -> None:
     with pytest.raises(UsageError, match="from 1e-11 to 1"):
-        aim_push(load_scenario("paper"), "m1.q1", size)
+        parse_push(load_scenario("paper"), "m1.q1", size)

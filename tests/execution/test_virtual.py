@@ -137,9 +137,9 @@ def test_simulate_gives_the_log_of_a_scenario_with_overrides() -> None:
 @pytest.mark.parametrize("site", ["m1", "s"])
 def test_a_virtual_boot_is_a_function_of_scenario_and_name(site: str) -> None:
     one, other = load_scenario("paper"), load_scenario("paper", {"seed": 2})
-    assert virtual.virtual_boot(one, site) == virtual.virtual_boot(load_scenario("paper"), site)
-    assert virtual.virtual_boot(one, site) != virtual.virtual_boot(other, site)
-    assert virtual.virtual_boot(one, "m1") != virtual.virtual_boot(one, "s")
+    assert virtual.compute_boot(one, site) == virtual.compute_boot(load_scenario("paper"), site)
+    assert virtual.compute_boot(one, site) != virtual.compute_boot(other, site)
+    assert virtual.compute_boot(one, "m1") != virtual.compute_boot(one, "s")
 
 
 def opened_delivered(delays: dict[Sample, int]) -> Log:

@@ -8,7 +8,7 @@ from trilat_net.execution.virtual_network import (
     Deliveries,
     RecordedNetwork,
     complete_deliveries,
-    recorded_deliveries,
+    read_deliveries,
     retime_deliveries,
 )
 from trilat_net.log.site_log import SiteLog
@@ -77,14 +77,14 @@ def short(way: Way, lost: set[int] = frozenset()) -> SiteLog:
 
 def entries(came: Deliveries) -> set[Sample]:
     """Every sample that comes, at any tick."""
-    return {(entry[0], entry[1]) for at in came.at.values() for entry in at}
+    return {(entry[0], entry[1]) for at in came.entries.values() for entry in at}
 
 
 def test_of_a_whole_log_it_is_what_the_records_list() -> None:
     part = short(steady(3))
     came = complete_deliveries(part, *SENDERS)
-    assert came == recorded_deliveries(part)
-    assert came.at == {state.tick: state.rx for state in part.states}
+    assert came == read_deliveries(part)
+    assert came.entries == {state.tick: state.rx for state in part.states}
     assert (came.first, came.last, came.unrecorded) == (0, TICKS - 1, frozenset())
 
 
@@ -95,7 +95,7 @@ def test_on_a_steady_network_missing_records_are_found(lost: set[int], ticks: in
         complete_deliveries(short(steady(ticks), lost), *SENDERS),
     )
     assert came.unrecorded == lost
-    pairs = {k: sorted(entry[:2] for entry in at) for k, at in came.at.items() if at}
+    pairs = {k: sorted(entry[:2] for entry in at) for k, at in came.entries.items() if at}
     assert pairs == {
         state.tick: sorted(e[:2] for e in state.rx) for state in whole.states if state.rx
     }
@@ -109,14 +109,14 @@ def test_on_any_network_every_arrived_sample_is_there_once(
     whole, gapped = short(in_order(under_way)), short(in_order(under_way), lost)
     came = complete_deliveries(gapped, *SENDERS)
     for state in gapped.states:
-        assert came.at[state.tick] == state.rx
-    assert sum(map(len, came.at.values())) == len(entries(came))
-    listed = entries(recorded_deliveries(gapped))
+        assert came.entries[state.tick] == state.rx
+    assert sum(map(len, came.entries.values())) == len(entries(came))
+    listed = entries(read_deliveries(gapped))
     newest = [max((tick for j, tick in listed if j == peer), default=-1) for peer in (0, 1)]
     assert {s for s in entries(came) if s[1] <= newest[s[0]]} == {
-        s for s in entries(recorded_deliveries(whole)) if s[1] <= newest[s[0]]
+        s for s in entries(read_deliveries(whole)) if s[1] <= newest[s[0]]
     }
-    assert all(k > tick for k, at in came.at.items() for _, tick, _ in at)
+    assert all(k > tick for k, at in came.entries.items() for _, tick, _ in at)
 
 
 def test_what_never_came_does_not_come() -> None:
@@ -133,10 +133,12 @@ rates = st.sampled_from([250, 333, 500, 1000, 1500, 4000])
 def test_at_other_rates_every_sample_travels_as_long(
     ticks: int, rate_hz: int, peer_rate_hz: int
 ) -> None:
-    came = recorded_deliveries(short(steady(ticks)))
+    came = read_deliveries(short(steady(ticks)))
     there = retime_deliveries(came, 1000, rate_hz, [1000, 1000], [peer_rate_hz, 1000])
     assert there.last == 119 * rate_hz // 1000
-    first = [(k, m) for k in sorted(there.at) for peer, m, _ in there.at[k] if peer == 0]
+    first = [
+        (k, m) for k in sorted(there.entries) for peer, m, _ in there.entries[k] if peer == 0
+    ]
     assert first
     assert [m for _, m in first] == list(range(len(first)))
     for k, m in first:
@@ -145,7 +147,7 @@ def test_at_other_rates_every_sample_travels_as_long(
 
 
 def test_at_other_rates_what_never_came_does_not_come() -> None:
-    came = recorded_deliveries(short({**steady(), (0, 50): None}))
+    came = read_deliveries(short({**steady(), (0, 50): None}))
     doubled = retime_deliveries(came, 1000, 1000, [1000, 1000], [2000, 1000])
     assert not {(0, 100), (0, 101)} & entries(doubled)
     assert {(0, 99), (0, 102), (1, 50)} <= entries(doubled)

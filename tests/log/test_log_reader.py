@@ -55,7 +55,7 @@ def test_the_plain_reader_finds_every_payload_byte_for_byte() -> None:
     sent = {
         (site.name, output.tick): encode_state(
             site.name,
-            virtual.virtual_boot(scenario, site.name),
+            virtual.compute_boot(scenario, site.name),
             site.peers,
             output,
             arrivals,

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from trilat_net.core.site_setup import Layout
 from trilat_net.log import site_log
-from trilat_net.log.site_log import LazyRecords, RecordsByTick, find_task_errors
+from trilat_net.log.site_log import LazyRecords, RecordsByTick, compute_task_errors
 from trilat_net.net.messages import State
 
 STATE_VECTORS = Layout().lengths()
@@ -107,9 +107,9 @@ def test_errors_of_orientations_are_turns_as_scipy_has_them() -> None:
     # half a turn
     x[120:140, 3:] *= np.pi / np.linalg.norm(x[120:140, 3:], axis=1, keepdims=True)
     there, here = (Rotation.from_rotvec(one[:, 3:]) for one in (x_des, x))
-    e = find_task_errors(x, x_des, [1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
+    e = compute_task_errors(x, x_des, [1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
     assert np.abs(e[:, 3:] - (here * there.inv()).as_rotvec()).max() <= 1e-14
     assert not e[100:110, 3:].any()
     assert np.array_equal(e[:, :2], x[:, :2] - x_des[:, :2])
     assert not e[:, 2].any()
-    assert find_task_errors(x[:0], x_des[:0], [1.0] * 6).shape == (0, 6)
+    assert compute_task_errors(x[:0], x_des[:0], [1.0] * 6).shape == (0, 6)

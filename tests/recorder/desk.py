@@ -124,7 +124,7 @@ class Desk:
         own = topics.key(SESSION, topics.RECORDER, topics.EVENT)
         info = told(topics.RECORDER, scenario="", scenario_sha256="")
         publisher = EventPublisher(
-            self.bus, SESSION, info, lambda payload: self.tap.take(own, payload)
+            self.bus, SESSION, info, lambda payload: self.tap.receive(own, payload)
         )
         writer = LogWriter(self.stream, scenario, SESSION, "live", epoch.unix_ns)
         self.recording = Recording(writer, scenario, SESSION, epoch, self.bus, publisher)
@@ -138,7 +138,7 @@ class Desk:
     def take(self, name: str, channel: str, *payloads: bytes) -> None:
         for payload in payloads:
             self.wait(MS)
-            self.tap.take(topics.key(SESSION, name, channel), payload)
+            self.tap.receive(topics.key(SESSION, name, channel), payload)
         self.write()
 
     def write(self) -> None:
@@ -159,7 +159,7 @@ class Desk:
             self.take(name, topics.EVENT, end(name))
 
     def over(self) -> bool:
-        return self.recording.over(self.clock.monotonic_ns())
+        return self.recording.is_over(self.clock.monotonic_ns())
 
     def said(self) -> list[Event]:
         return list(read_messages(self._heard, Event))

@@ -156,7 +156,7 @@ class Run:
             for at_ns, channel, number in came:
                 if begun_ns <= at_ns + MONO_NS < now_ns:
                     desk.clock.sleep_until(at_ns + MONO_NS)
-                    desk.tap.take(topics.key(SESSION, "m", channel), MADE[channel][number])
+                    desk.tap.receive(topics.key(SESSION, "m", channel), MADE[channel][number])
             desk.clock.sleep_until(now_ns)
             desk.write()
             self.site.answer()
@@ -242,7 +242,7 @@ def test_a_silent_site_is_asked_and_its_lost_end_noticed() -> None:
     run = Run(Way(lost={n for n, (at_ns, _, _) in enumerate(SENT) if at_ns >= S}))
     run.live(3100 * MS)
     assert run.until_stored().text == "every record of m is stored"
-    assert run.desk.recording.problem() == "s disappeared after 0 records"
+    assert run.desk.recording.describe_problem() == "s disappeared after 0 records"
 
 
 def test_a_hushed_site_is_asked_three_times_a_second() -> None:
@@ -299,7 +299,7 @@ def test_a_late_message_that_was_given_up_is_welcome() -> None:
 
 def vanish(run: Run) -> None:
     for name in ("m", "s"):
-        run.desk.recording.presence(
+        run.desk.recording.note_presence(
             topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", False
         )
 

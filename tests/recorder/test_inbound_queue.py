@@ -10,13 +10,13 @@ from tests.net.manual_clock import ManualClock
 def test_messages_are_stamped_on_arrival_and_come_out_oldest_first() -> None:
     clock = ManualClock(100)
     tap = InboundQueue(clock)
-    tap.take("a", b"1")
+    tap.receive("a", b"1")
     clock.sleep_until(250)
-    tap.take("b", b"2")
+    tap.receive("b", b"2")
     clock.sleep_until(900)
     messages = tap.drain()
     assert next(messages) == ("a", b"1", 100)
-    tap.take("c", b"3")  # while it is drained
+    tap.receive("c", b"3")  # while it is drained
     assert list(messages) == [("b", b"2", 250), ("c", b"3", 900)]
 
 
@@ -24,10 +24,10 @@ def test_a_full_queue_counts_what_it_loses(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(module, "CAPACITY", 5)
     tap = InboundQueue(ManualClock())
     for n in range(8):
-        tap.take("a", bytes([n]))
+        tap.receive("a", bytes([n]))
     assert tap.overflowed == {"a": 3}
     assert [message.payload for message in tap.drain()] == [bytes([n]) for n in range(5)]
-    tap.take("a", b"again")
+    tap.receive("a", b"again")
     assert [message.payload for message in tap.drain()] == [b"again"]
     assert tap.overflowed == {"a": 3}
 
@@ -39,13 +39,13 @@ def test_a_flood_of_one_key_leaves_room_for_the_others(
     monkeypatch.setattr(module, "CAPACITY_BYTES", 8_000)
     tap = InboundQueue(ManualClock())
     for _ in range(100):
-        tap.take("flood", bytes(1_000))
-    tap.take("quiet", b"1")
+        tap.receive("flood", bytes(1_000))
+    tap.receive("quiet", b"1")
     for _ in range(100):
-        tap.take("more", bytes(1_000))
+        tap.receive("more", bytes(1_000))
     waiting = [(message.key, len(message.payload)) for message in tap.drain()]
     assert sum(size for _, size in waiting) < 10_000  # no more than one message beyond
     assert ("quiet", 1) in waiting
     assert tap.overflowed["flood"] + tap.overflowed["more"] == 201 - len(waiting)
-    tap.take("flood", b"again")  # what was drained makes room
+    tap.receive("flood", b"again")  # what was drained makes room
     assert [message.payload for message in tap.drain()] == [b"again"]

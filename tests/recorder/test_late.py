@@ -27,7 +27,7 @@ def late_desk(*there: str) -> tuple[Desk, dict[str, Memory]]:
     desk.wait(40 * S)
     desk.recording.assume_gone()
     for name in there:
-        desk.recording.presence(
+        desk.recording.note_presence(
             topics.key(SESSION, name, topics.ALIVE) + f"/{BOOTS[name]}", True
         )
     desk.recording.join_late(desk.clock.monotonic_ns())
@@ -46,7 +46,7 @@ def test_it_asks_every_site_for_all_that_it_has() -> None:
     assert said[0].t_ns == 40 * S
     assert "at t = 40.000 s" in said[0].text
     assert desk.over()
-    assert desk.recording.problem() is None
+    assert desk.recording.describe_problem() is None
     log = desk.log()
     assert [state.tick for state in log["m"].states] == list(range(TICKS))
     assert [event.kind for event in log.events if event.member == "s"] == [
@@ -67,7 +67,7 @@ def test_sites_that_are_gone_are_named_and_not_waited_for() -> None:
     assert not desk.over()
     desk.wait(20 * S)
     assert desk.over()
-    assert desk.recording.problem() == "s disappeared after 0 records"
+    assert desk.recording.describe_problem() == "s disappeared after 0 records"
 
 
 def test_what_the_sites_no_longer_have_is_missing_for_good() -> None:
@@ -80,7 +80,7 @@ def test_what_the_sites_no_longer_have_is_missing_for_good() -> None:
         stored[0]
         == f"all that can be had of m is stored; missing for good: 20 of {TICKS} records (0-19)"
     )
-    assert desk.recording.problem() == f"missing of m: 20 of {TICKS} records (0-19)"
+    assert desk.recording.describe_problem() == f"missing of m: 20 of {TICKS} records (0-19)"
 
 
 @pytest.mark.parametrize("ahead_ns", [0, 5 * S])

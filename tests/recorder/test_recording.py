@@ -90,7 +90,7 @@ def test_foreign_messages_are_dropped_the_rest_written_byte_for_byte(
     assert not desk.over()
     desk.whole("s")
     assert desk.over()
-    assert desk.recording.problem() is None
+    assert desk.recording.describe_problem() is None
     written = [message for topic, message in desk.messages() if topic == "m/state"]
     log = open_log(io.BytesIO(desk.stream.getvalue()))
     assert verify(log).identical == 2 * TICKS
@@ -146,8 +146,10 @@ def test_member_that_says_more_than_clock_allows_is_not_believed(
     account = desk.recording.accounts[topics.key(SESSION, "m", topics.STATE)]
     assert (account.expected, account.received, account.missing) == (TICKS, TICKS, 0)
     desk.whole("s")
-    assert desk.recording.problem() is None
-    assert any(f"1 message dropped: {reason}" in line for line in desk.recording.summary())
+    assert desk.recording.describe_problem() is None
+    assert any(
+        f"1 message dropped: {reason}" in line for line in desk.recording.render_summary()
+    )
 
 
 def test_answer_for_more_than_clock_allows_is_not_believed() -> None:
@@ -188,11 +190,16 @@ def test_gaps_are_counted_named_and_a_problem() -> None:
     desk.take("m", topics.EVENT, end("m"))
     desk.whole("s")
     log = desk.log()
-    assert desk.recording.problem() == f"missing of m: 6 of {TICKS} records (10-12 30-30 48-49)"
+    assert (
+        desk.recording.describe_problem()
+        == f"missing of m: 6 of {TICKS} records (10-12 30-30 48-49)"
+    )
     assert "missing 6" in log.account("m")
     assert "largest gap 3" in log.account("m")
     assert f"(10-12 30-30 {TICKS - 2}-{TICKS - 1})" in log.account("m")
-    assert any("m: 44 of 50 records, 6 missing" in line for line in desk.recording.summary())
+    assert any(
+        "m: 44 of 50 records, 6 missing" in line for line in desk.recording.render_summary()
+    )
 
 
 def test_overflow_is_counted_in_the_file_and_in_the_summary(
@@ -201,13 +208,13 @@ def test_overflow_is_counted_in_the_file_and_in_the_summary(
     monkeypatch.setattr(tap_module, "CAPACITY", 20)
     desk = Desk()
     for payload in states("m"):
-        desk.tap.take(topics.key(SESSION, "m", topics.STATE), payload)
+        desk.tap.receive(topics.key(SESSION, "m", topics.STATE), payload)
     log = desk.log()
     assert len(log["m"]) == 20
     assert f"overflowed {TICKS - 20}" in log.account("m")
     assert any(
         str(TICKS - 20) in line and "the queue was full" in line
-        for line in desk.recording.summary()
+        for line in desk.recording.render_summary()
     )
 
 
@@ -225,7 +232,7 @@ def test_flood_of_events_leaves_log_that_can_be_used() -> None:
     assert verify(log).identical == 2 * TICKS
     assert len([event for event in log.events if event.member == "m"]) <= written + 2
     assert {event.member for event in log.events if event.kind == "end"} == {"m", "s"}
-    assert "missing" in (desk.recording.problem() or "")
+    assert "missing" in (desk.recording.describe_problem() or "")
 
 
 def test_stored_is_said_only_when_every_record_is_in() -> None:
@@ -254,15 +261,15 @@ def test_site_that_dies_without_word_ends_recording_and_is_named() -> None:
     desk = Desk()
     desk.whole("m")
     desk.take("s", topics.STATE, *states("s")[:20])
-    desk.recording.presence(alive("s", BOOTS["s"]), False)
+    desk.recording.note_presence(alive("s", BOOTS["s"]), False)
     assert not desk.over()
     # a site stays no longer after its last tick
     desk.clock.sleep_until(MONO_NS + 50_000_000 + LAST_NS)
     assert not desk.over()
     desk.clock.sleep_until(desk.clock.monotonic_ns() + 1)
     assert desk.over()
-    assert desk.recording.problem() == "s disappeared after 20 records"
-    assert "s: 20 records, its end is unknown" in desk.recording.summary()[1]
+    assert desk.recording.describe_problem() == "s disappeared after 20 records"
+    assert "s: 20 records, its end is unknown" in desk.recording.render_summary()[1]
     log = desk.log()
     assert (len(log["m"]), len(log["s"])) == (TICKS, 20)
 
@@ -277,14 +284,14 @@ def test_a_site_cut_off_for_long_is_waited_for(said_its_end: bool, patience_ns: 
         for name in ("m", "s"):
             desk.take(name, topics.EVENT, end(name, 1))
     for name in ("m", "s", "m"):
-        desk.recording.presence(alive(name, BOOTS[name]), False)
+        desk.recording.note_presence(alive(name, BOOTS[name]), False)
         assert not desk.over()
     desk.clock.sleep_until(desk.clock.monotonic_ns() + patience_ns)
     assert not desk.over()
-    desk.recording.presence(alive("m", BOOTS["m"]), True)
+    desk.recording.note_presence(alive("m", BOOTS["m"]), True)
     desk.clock.sleep_until(desk.clock.monotonic_ns() + 1)
     assert not desk.over()
-    desk.recording.presence(alive("m", BOOTS["m"]), False)
+    desk.recording.note_presence(alive("m", BOOTS["m"]), False)
     assert not desk.over()
     desk.clock.sleep_until(desk.clock.monotonic_ns() + patience_ns + 1)
     assert desk.over()
@@ -296,7 +303,7 @@ def test_a_site_cut_off_for_long_is_waited_for(said_its_end: bool, patience_ns: 
 def test_tokens_of_others_end_nothing(key: str) -> None:
     desk = Desk()
     desk.whole("m")
-    desk.recording.presence(key, False)
+    desk.recording.note_presence(key, False)
     desk.clock.sleep_until(desk.clock.monotonic_ns() + 2 * SETTLE_NS)
     desk.over()
     desk.clock.sleep_until(desk.clock.monotonic_ns() + 2 * SETTLE_NS)
@@ -319,8 +326,8 @@ def test_a_crash_leaves_all_that_was_flushed() -> None:
 def test_what_still_waits_at_the_end_is_written() -> None:
     desk = Desk()
     for payload in states("m"):
-        desk.tap.take(topics.key(SESSION, "m", topics.STATE), payload)
-    desk.tap.take("nonsense", b"")
+        desk.tap.receive(topics.key(SESSION, "m", topics.STATE), payload)
+    desk.tap.receive("nonsense", b"")
     log = desk.log()
     assert len(log["m"]) == TICKS
     assert log.accounts["dropped: stranger"] == "1"

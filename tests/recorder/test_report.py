@@ -20,7 +20,7 @@ def test_it_says_what_is_there_and_what_is_missing() -> None:
     desk.take("nobody", topics.STATE, records[0])
     desk.report.flushed(3 * MS)
     desk.report.flushed(2 * MS)
-    desk.tap.take("somewhere", b"")
+    desk.tap.receive("somewhere", b"")
     desk.report.publish()
     (stats,) = heard(desk)
     assert stats.queued == 1

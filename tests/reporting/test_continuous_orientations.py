@@ -38,11 +38,11 @@ from trilat_net.log.data_tables import to_pandas_frame
 from trilat_net.log.log_reader import Log
 from trilat_net.log.orientations import (
     align_signs,
-    bring_nearer,
+    choose_nearest_vectors,
+    compute_continuous_vectors,
+    compute_matrix_columns,
+    compute_quaternions,
     expand_poses,
-    find_quaternions,
-    find_six_numbers,
-    find_steady_vectors,
 )
 from trilat_net.log.ros2.topic_names import read_topic_table
 
@@ -79,17 +79,17 @@ def test_motions_pass_half_a_turn() -> None:
 def test_numbers_of_a_turning_body_never_jump(number: int) -> None:
     truth = turn(number, 1000)
     vectors = truth.as_rotvec()
-    assert_follows("quaternions", find_quaternions(vectors), truth, 1e-12)
-    assert_follows("six numbers", find_six_numbers(vectors), truth, 1e-12)
+    assert_follows("quaternions", compute_quaternions(vectors), truth, 1e-12)
+    assert_follows("six numbers", compute_matrix_columns(vectors), truth, 1e-12)
     pose = np.hstack([np.ones((1000, 3)), vectors])
-    assert np.array_equal(expand_poses(pose)[:, 3:], find_six_numbers(vectors))
+    assert np.array_equal(expand_poses(pose)[:, 3:], compute_matrix_columns(vectors))
     assert expand_poses(pose[7]).shape == (9,)
     flipped = truth.as_quat(canonical=True, scalar_first=True)
     assert_follows("signs", align_signs(flipped), truth, 1e-12)
-    nearer = bring_nearer(vectors[1:], vectors[:-1])
+    nearer = choose_nearest_vectors(vectors[1:], vectors[:-1])
     assert (Rotation.from_rotvec(nearer) * truth[1:].inv()).magnitude().max() < 1e-9
     assert np.linalg.norm(nearer - vectors[:-1], axis=1).max() < 3.0
-    steady = Rotation.from_rotvec(find_steady_vectors(vectors))
+    steady = Rotation.from_rotvec(compute_continuous_vectors(vectors))
     assert (steady * truth.inv()).magnitude().max() < 1e-9
 
 

@@ -76,7 +76,7 @@ def test_a_report_is_a_page_with_numbers_and_pictures(tmp_path):
     assert {path.stem for path in pictures} == wanted | {"hands_moved"}
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in pictures)
     facts = json.loads(paths[1].read_text())
-    assert facts["checks"] == [verdict.line() for verdict in VERDICTS]
+    assert facts["checks"] == [verdict.to_row() for verdict in VERDICTS]
     assert facts["certificate"]["verdict"] == "rose"
     html, data = read(paths[0].read_text(encoding="utf-8"))
     assert len(html) < 1_500_000

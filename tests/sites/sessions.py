@@ -147,8 +147,8 @@ class Session:
                 self.left_ns["log"] = clock.monotonic_ns()
                 clock.sleep_until(clock.monotonic_ns() + self.works_ns)
                 self.left_ns["recorder"] = clock.monotonic_ns()
-                problem = recording.problem()
-                return [*recording.summary(), *([problem] if problem else [])]
+                problem = recording.describe_problem()
+                return [*recording.render_summary(), *([problem] if problem else [])]
             except LogRefused as refused:
                 if self.ends is None:
                     raise

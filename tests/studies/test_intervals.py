@@ -93,7 +93,7 @@ def test_a_swept_cell_has_the_means_of_its_seeds(file: Path) -> None:
     point = collect_grid_points(results)[1]
     runs = [FusedRun(load_scenario(file, [f"seed={seed}"])) for seed in SEEDS]
     for run in runs:
-        run.advance(2.0)
+        run.advance_to(2.0)
     totals = list_totals(plan)
     for key, mean in zip(totals, point.means, strict=True):
         assert mean == mean_interval([getattr(run.totals, key) for run in runs])

@@ -95,10 +95,10 @@ def measure_growth(loop: Loop, push_rad: float, from_s: float, to_s: float) -> f
 def speeds(scenario: Scenario) -> list[Array]:
     """The joint speeds of every record of each site."""
     run = FusedRun(scenario, keep=max(map(scenario.ticks, scenario.names)))
-    run.advance(scenario.duration_s)
+    run.advance_to(scenario.duration_s)
     assert run.diverged_s is None
     columns = scenario.layout(scenario.names[0]).columns()["qd"]
-    return [rows[:, columns] for _, rows in run.take_records()]
+    return [rows[:, columns] for _, rows in run.pop_records()]
 
 
 ORDER = 16

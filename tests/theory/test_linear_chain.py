@@ -107,7 +107,7 @@ def follow(scenario: Scenario, ticks: int) -> Array:
     run, rate_hz = FusedRun(scenario), scenario.sites["m"].rate_hz
     angles = []
     for k in range(1, ticks + 1):
-        run.advance(k / rate_hz)
+        run.advance_to(k / rate_hz)
         angles.append(run.q.ravel())
     return np.array(angles)
 

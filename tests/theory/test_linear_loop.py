@@ -142,7 +142,7 @@ def test_an_unstable_rest_with_wrong_estimates_is_left_for_another() -> None:
         .s
     )
     run = FusedRun(late)
-    run.advance(late.duration_s)
+    run.advance_to(late.duration_s)
     speeds = np.max([site[:, 1] for site in run.maxima], axis=0)
     at = {
         t_s: speeds[(t_s - 1) * BUCKETS_PER_S : t_s * BUCKETS_PER_S].max()

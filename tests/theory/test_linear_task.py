@@ -142,7 +142,7 @@ def follow(scenario: Scenario, rest: Equilibrium, step_s: float, steps: int) -> 
     """Deviations of all joints from a rest along a run, shape (steps, joints of all sites)."""
     run, rows = FusedRun(scenario), []
     for k in range(1, steps + 1):
-        run.advance(k * step_s)
+        run.advance_to(k * step_s)
         rows.append((run.q - rest.q).ravel())
     made = np.array(rows)
     return made[:, made.any(axis=0)]

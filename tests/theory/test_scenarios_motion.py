@@ -51,7 +51,7 @@ def test_settling_of_free_motion_is_no_monotone_function_of_delay(
     delay_ms: float, settled_s: float
 ) -> None:
     made = FusedRun(load_scenario("free", {"link.delay_ms": delay_ms}))
-    made.advance(30.0)
+    made.advance_to(30.0)
     assert made.settled_s == printed(settled_s, 0.1)
 
 
@@ -357,5 +357,5 @@ def test_order_makes_jitter_leave_its_limits_unlike_slower_rates(
     changes: dict[str, str | int], leaves: bool
 ) -> None:
     made = FusedRun(load_scenario("jitter", changes))
-    made.advance(40.0)
+    made.advance_to(40.0)
     assert (made.diverged_s is not None) is leaves

@@ -20,9 +20,9 @@ from ..core.task_space import PLACE, POSE
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..log.log_reader import Log
-from ..log.orientations import bring_nearer
+from ..log.orientations import choose_nearest_vectors
 from ..log.record_columns import Ints
-from ..log.site_log import SiteLog, find_task_errors
+from ..log.site_log import SiteLog, compute_task_errors
 from ..net.messages import RESTING_MODES, TASK_VECTORS
 from ..scenario import Scenario
 from ..scenario.scenario_types import Limits
@@ -113,7 +113,7 @@ class AlignedRecords(NamedTuple):
     def e(self) -> Array:
         """Position error, Eq. (9), shape (K, n), rad; in task space (K, m), see `SiteLog.e`."""
         return (
-            find_task_errors(self.x, self.q_des, self.axes)
+            compute_task_errors(self.x, self.q_des, self.axes)
             if self.x.size
             else self.q - self.q_des
         )
@@ -283,7 +283,7 @@ class PeerTrajectory:
         vb = rate[low + 1]
         # between two rotation vectors of different branches lies nothing
         if self.records.x.shape[1] == POSE:
-            qb[:, PLACE:] = bring_nearer(qb[:, PLACE:], qa[:, PLACE:])
+            qb[:, PLACE:] = choose_nearest_vectors(qb[:, PLACE:], qa[:, PLACE:])
         q = qa + x * (
             h * va
             + x * (3 * (qb - qa) - h * (2 * va + vb) + x * (2 * (qa - qb) + h * (va + vb)))

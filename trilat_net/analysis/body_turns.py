@@ -7,7 +7,7 @@ import numpy as np
 
 from ..core.task_space import PLACE
 from ..core.vectors import Array
-from ..log.orientations import QUATERNION_AXES, SteadyQuaternion
+from ..log.orientations import QUATERNION_AXES, QuaternionSigns
 
 
 class BodyTurns:
@@ -16,8 +16,8 @@ class BodyTurns:
     """
 
     def __init__(self) -> None:
-        self._signs: defaultdict[int, SteadyQuaternion] = defaultdict(
-            lambda: SteadyQuaternion(w=0)
+        self._signs: defaultdict[int, QuaternionSigns] = defaultdict(
+            lambda: QuaternionSigns(w=0)
         )
 
     def align(self, bodies: Sequence[float]) -> Array:
@@ -26,5 +26,5 @@ class BodyTurns:
         """
         poses = np.array(bodies, dtype=np.float64).reshape(-1, PLACE + len(QUATERNION_AXES))
         for body, pose in enumerate(poses):
-            pose[PLACE:] = self._signs[body].follow(pose[PLACE:].tolist())
+            pose[PLACE:] = self._signs[body].align(pose[PLACE:].tolist())
         return poses.ravel()

@@ -14,7 +14,7 @@ import numpy as np
 from ..core.exogenous import TorqueSource
 from ..core.task_space import PLACE, POSE
 from ..log.log_reader import Log
-from ..log.orientations import find_steady_vectors
+from ..log.orientations import compute_continuous_vectors
 from ..scenario import Scenario
 from .aligned import AlignedRecords, align_records
 from .arm_rows import build_arm_rows
@@ -123,6 +123,6 @@ def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
         script = script @ (follows.inverse[0] @ follows.J[0]).T
     x = records.x
     if x.shape[1] == POSE:  # metrics compare poses of different times
-        x = np.hstack([x[:, :PLACE], find_steady_vectors(x[:, PLACE:])])
+        x = np.hstack([x[:, :PLACE], compute_continuous_vectors(x[:, PLACE:])])
     places = records._replace(q=axes * x, qd=axes * records.xd, tau_x=axes * records.wrench)
     return SiteRun(places, forces._replace(script=script), dominance)

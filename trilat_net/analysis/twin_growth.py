@@ -32,8 +32,8 @@ from ..execution.twins import (
     Push,
     TwinPath,
     Twins,
-    aim_push,
     choose_pushes,
+    parse_push,
     run_twins,
     run_virtual_twins,
 )
@@ -581,11 +581,11 @@ def twin(
         (what, _) = next(iter(asked), ("q", 0.0))
         sizes = _read_sizes(delta)
         pushes = [
-            aim_push(scenario, what, size, at_s)._replace(largest=math.inf) for size in sizes
+            parse_push(scenario, what, size, at_s)._replace(largest=math.inf) for size in sizes
         ]
     else:
         usual = [one._replace(at_s=at_s, again=False) for one in choose_pushes(scenario, TWINS)]
-        pushes = [aim_push(scenario, what, size, at_s) for what, size in asked] or usual
+        pushes = [parse_push(scenario, what, size, at_s) for what, size in asked] or usual
     growth = judge_twins(scenario, run_twins(log, pushes, own_laws=True), at_s, math.inf)
     return PushedTwins(
         log, at_s, growth, _find_linear_sizes(scenario, growth, sizes) if delta else None

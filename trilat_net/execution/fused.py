@@ -73,7 +73,7 @@ class RunState:
                 self._words.append(flat)
                 self._floats.append(np.tile(_float_words(array.dtype), array.size))
 
-    def approach(self, other: "RunState", factor: float) -> None:
+    def scale_difference(self, other: "RunState", factor: float) -> None:
         """Becomes another state of the same run plus so much of the difference to it; 0: its
         very bits.
         """
@@ -116,7 +116,7 @@ def _largest_ratio(scenario: Scenario) -> int:
 class HandActor(Protocol):
     """A live hand in a compiled run."""
 
-    def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
+    def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
         """Returns what it does from tick k until it needs the arm again, before tick `end`, a
         row a tick.
 
@@ -171,10 +171,10 @@ def make_prompt_inputs(sites: int) -> RunInputs:
 
 
 class FusedRun:
-    """A run of all sites of a scenario; from |e| = `apart_rad` on, a site is not settled.
+    """A run of all sites of a scenario; from |e| = `settled_rad` on, a site is not settled.
 
     Laws that are compiled run in the loop; those in plain Python are asked between its stages,
-    tick by tick. `keep` of a site's last records are kept for `take_records`. With `inputs` it
+    tick by tick. `keep` of a site's last records are kept for `pop_records`. With `inputs` it
     is a recorded run again; else hands of one's own act, and `hands` in their place: the loop
     pauses where one is asked. `plants` move arms of sites, between any two ticks.
 
@@ -185,7 +185,7 @@ class FusedRun:
     def __init__(
         self,
         scenario: Scenario,
-        apart_rad: float = 0.01,
+        settled_rad: float = 0.01,
         keep: int = 0,
         inputs: RunInputs | None = None,
         hands: Mapping[str, HandActor] = {},
@@ -193,7 +193,7 @@ class FusedRun:
     ) -> None:
         check_fusable(scenario, plants)
         self._scenario = scenario
-        self._apart_rad = apart_rad
+        self._settled_rad = settled_rad
         self._inputs = inputs or make_prompt_inputs(len(scenario.names))
         setups = [scenario.setup(name) for name in scenario.names]
         self._hands: dict[int, HandActor] = {}
@@ -335,7 +335,7 @@ class FusedRun:
             return NEVER_NS
         if k < self._acted.get(i, 0):
             return tick_ns(self._acted[i], rate_hz)
-        block = hand.take_until(k, int(progress["ticks"]), self.arrays(i))
+        block = hand.compute_actions(k, int(progress["ticks"]), self.arrays(i))
         _write_actions(acts[i], k, block)
         self._acted[i] = k + len(block)
         return tick_ns(self._acted[i], rate_hz)
@@ -356,7 +356,7 @@ class FusedRun:
             else:
                 run_until(
                     last_ns,
-                    self._apart_rad,
+                    self._settled_rad,
                     *rows,
                     self._tables,
                     self._tables.chain,
@@ -382,10 +382,10 @@ class FusedRun:
                 if isinstance(law := self._laws.get(i), PlainLaw):
                     law.compute(int(progress[i]["tick"]), t_ns)
                 finishing = (progress, self._sent, *kept, tables, own.chain, laws)
-                if finish_site(i, self._apart_rad, *finishing) == Mode.DIVERGED:
+                if finish_site(i, self._settled_rad, *finishing) == Mode.DIVERGED:
                     progress[i]["diverged_ns"] = last_ns = t_ns
 
-    def advance(self, until_s: float) -> None:
+    def advance_to(self, until_s: float) -> None:
         """Continues the run to the end of a scenario of `until_s` seconds; a diverged run stays
         as it is.
         """
@@ -433,16 +433,16 @@ class FusedRun:
 
     def copy_state(self, other: "FusedRun") -> None:
         """Becomes equal to another run of the same scenario, which is planned alike."""
-        self.approach(other, 0.0)
+        self.scale_difference(other, 0.0)
 
-    def approach(self, other: "FusedRun", factor: float) -> None:
+    def scale_difference(self, other: "FusedRun", factor: float) -> None:
         """Becomes another run plus so much of its difference to that, whose records it has made
         by now.
 
         A run that has programs cannot.
         """
         assert not self.has_programs
-        self._state.approach(other._state, factor)
+        self._state.scale_difference(other._state, factor)
         self._changes = deque(other._changes)
         self._taken_ticks = list(other._taken_ticks)
         for i, law in self._laws.items():
@@ -459,7 +459,7 @@ class FusedRun:
             self._selected[i] = select_site(self._tables, i, self._layouts[i])
         return self._selected[i]
 
-    def push(self, field: str, by: Array) -> None:
+    def displace(self, field: str, by: Array) -> None:
         """Adds to a field of every site's state, shape (N, n)."""
         self._tables.site[field][:, 0, : by.shape[1]] += by
 
@@ -467,13 +467,13 @@ class FusedRun:
         """Returns by how much a field of the sites' state differs at the most."""
         return float(np.abs(self._tables.site[field] - other._tables.site[field]).max())
 
-    def advance_watching(self, until_s: float) -> tuple[Array, Array]:
+    def run_and_sample(self, until_s: float) -> tuple[Array, Array]:
         """Continues the run; returns q, (100, N, n), rad, and theta_hat, (100, N, P), of its
         last quarter.
         """
         found = []
         for t_s in np.linspace(0.75 * until_s, until_s, 100):
-            self.advance(float(t_s))
+            self.advance_to(float(t_s))
             found.append((self.q, self.theta_hat))
         q, theta_hat = map(np.array, zip(*found, strict=True))
         return q, theta_hat
@@ -486,7 +486,7 @@ class FusedRun:
 
     @property
     def settled_s(self) -> float | None:
-        """Time from which on every |e| is below `apart_rad`, s; None if one is not at the end."""
+        """Time from which on every |e| is below `settled_rad`, s; None if one is not at the end."""
         last = max(range(len(self._progress)), key=lambda n: int(self._progress[n]["apart_ns"]))
         progress: Row = self._progress[last]
         if progress.apart_ns < 0:
@@ -559,7 +559,7 @@ class FusedRun:
             for row, layout in zip(self.records, self._layouts, strict=True)
         ]
 
-    def take_records(self) -> list[tuple[IntArray, Array]]:
+    def pop_records(self) -> list[tuple[IntArray, Array]]:
         """Returns of each site the records since the last call, as far as they are kept: t, ns,
         and a row.
         """
@@ -585,7 +585,7 @@ class FusedRun:
         return row
 
 
-def explain_no_repetition(log: Log, *, own_laws: bool = False) -> str:
+def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
     """Returns why a run cannot be executed again from its log alone; "" if it can.
 
     Args:
@@ -608,7 +608,7 @@ def explain_no_repetition(log: Log, *, own_laws: bool = False) -> str:
 
 
 def read_run_inputs(log: Log) -> RunInputs:
-    """Returns the inputs of a run that can be executed again, see `explain_no_repetition`.
+    """Returns the inputs of a run that can be executed again, see `explain_not_repeatable`.
 
     Raises:
         LogError: the log names a change that is none.

@@ -43,7 +43,7 @@ from .verify import (
 from .virtual_network import (
     Deliveries,
     complete_deliveries,
-    recorded_deliveries,
+    read_deliveries,
     retime_deliveries,
 )
 
@@ -337,7 +337,7 @@ class RerunSite:
         """Nominal time of its next tick, ns since the epoch."""
         return self.k * NS_PER_S // self._site.rate_hz
 
-    def advance(self) -> RerunTick:
+    def execute_tick(self) -> RerunTick:
         """Executes one tick.
 
         Raises:
@@ -347,7 +347,7 @@ class RerunSite:
         n = self._places.get(self.k)
         try:
             if n is not None and not self._certain and self._inputs.can_resume(n):
-                missed = self._inputs.take_changes(self.k - 1)
+                missed = self._inputs.pop_changes(self.k - 1)
                 self._inputs.resume(self._site, n, [change for _, change in missed])
                 self._certain = True
             made = self._execute(n) if self._certain or n is None else self._keep(n)
@@ -363,10 +363,10 @@ class RerunSite:
         return made
 
     def _execute(self, n: int | None) -> RerunTick:
-        arrivals, missing = self._inputs.arrivals(self.deliveries.at.get(self.k, ()))
+        arrivals, missing = self._inputs.find_arrivals(self.deliveries.entries.get(self.k, ()))
         self._inputs.add_lacking(missing)
         self.lacking += len(missing)
-        changes = [change for _, change in self._inputs.take_changes(self.k)]
+        changes = [change for _, change in self._inputs.pop_changes(self.k)]
         fits = self._site.layout.hand == self._part.layout.hand
         hand = find_recorded_hand(self._part, self._site, self.k) if fits else ()
         output = self._site.step(TickInput(self.k, arrivals[:MAX_ARRIVALS], changes, hand=hand))
@@ -380,7 +380,7 @@ class RerunSite:
                 output._replace(rx_crc=state.rx_crc) if self._changed or missing else output
             )
             same = equal_record(state, comparable, peers)
-            if not same and not self._changed and self._inputs.in_doubt(state, output):
+            if not same and not self._changed and self._inputs.is_uncertain(state, output):
                 return self._keep(n)
             if not same and self.first is None:
                 self.first = find_first_difference(
@@ -462,7 +462,7 @@ class RerunExecution:
         original = self._log.scenario
         scenario = self._request.scenario
         if not self._request.changes:
-            return recorded_deliveries(part)
+            return read_deliveries(part)
         before = [original.sites[peer].rate_hz for peer in part.peers]
         after = [scenario.sites[peer].rate_hz for peer in part.peers]
         found = complete_deliveries(
@@ -502,7 +502,7 @@ class RerunExecution:
             )
             t_ns, place, _ = pending.pop(first)
             site = sites[place]
-            made = site.advance()
+            made = site.execute_tick()
             output = site.output
             recent = self._recent[site.name]
             recent[output.tick] = make_arrival(0, output.tick, output)
@@ -521,7 +521,7 @@ class RerunExecution:
         """True if every sample of a site's next tick, k, has been computed, or never will be."""
         receiver = self._request.replaced[place]
         peers = self._log[receiver].peers
-        for peer, tick, _ in self.sites[receiver].deliveries.at.get(k, ()):
+        for peer, tick, _ in self.sites[receiver].deliveries.entries.get(k, ()):
             sender = self.sites.get(peers[peer])
             if sender is not None and not sender.done and tick >= sender.k:
                 return False

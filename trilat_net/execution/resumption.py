@@ -49,7 +49,7 @@ def make_arrival(
     peer: int, tick: int, sample: ReceivedMotion | TickRecord, latency_us: int = 0
 ) -> Arrival:
     """Returns the arrival of a peer's sample, whose numbers are those of its record, see
-    `take_parts`.
+    `select_peer_channels`.
     """
     if isinstance(sample, Arrival) or not sample.x:
         return Arrival(
@@ -72,7 +72,9 @@ def make_arrival(
     )
 
 
-def take_parts(arrivals: Sequence[Arrival], links: Sequence[LinkSetup]) -> list[Arrival]:
+def select_peer_channels(
+    arrivals: Sequence[Arrival], links: Sequence[LinkSetup]
+) -> list[Arrival]:
     """Returns the arrivals of whole samples as a site takes them in: without what is for other
     peers.
     """
@@ -121,7 +123,7 @@ class RecordedInputs(Generic[Change]):
         self.assumed: list[set[int]] = [set() for _ in part.peers]
         self.lacking: list[set[int]] = [set() for _ in part.peers]
 
-    def take_changes(self, tick: int) -> list[tuple[int, Change]]:
+    def pop_changes(self, tick: int) -> list[tuple[int, Change]]:
         """Returns the changes up to a tick that have not been taken yet, each with its own
         tick.
         """
@@ -131,7 +133,7 @@ class RecordedInputs(Generic[Change]):
             taken += [(named, change) for change in changes]
         return taken
 
-    def arrivals(
+    def find_arrivals(
         self, entries: Sequence[ArrivalEntry]
     ) -> tuple[list[Arrival], list[ArrivalEntry]]:
         """Returns the arrivals that entries list, and the entries whose sample no record holds."""
@@ -145,7 +147,7 @@ class RecordedInputs(Generic[Change]):
                 missing.append(entry)
             else:
                 arrivals.append(make_arrival(peer, tick, sample, latency_us))
-        return take_parts(arrivals, self._links), missing
+        return select_peer_channels(arrivals, self._links), missing
 
     def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
         """Notes samples that arrived and whose own record is missing."""
@@ -190,12 +192,12 @@ class RecordedInputs(Generic[Change]):
             in_use += (
                 [None]
                 if sample is None
-                else take_parts([make_arrival(j, used, sample)], self._links)
+                else select_peer_channels([make_arrival(j, used, sample)], self._links)
             )
             # a sample older than the one in use is never used any more
             self.lacking[j] = {tick for tick in self.lacking[j] if tick >= used}
             certain, self.assumed[j] = self._find_waiting(n, j, used, site.peer_rate_hz(j))
-            arrived, missing = self.arrivals(
+            arrived, missing = self.find_arrivals(
                 [(j, tick, 0) for tick in sorted(certain | self.assumed[j])]
             )
             self.add_lacking(missing)
@@ -203,7 +205,7 @@ class RecordedInputs(Generic[Change]):
         site.prime(states[n].tick, in_use, waiting[-MAX_ARRIVALS:])
         site.resume(before, last)
 
-    def in_doubt(self, state: State, output: TickRecord) -> bool:
+    def is_uncertain(self, state: State, output: TickRecord) -> bool:
         """True if a sample is in use whose arrival or content the log does not tell."""
         return any(
             output.used[j] in self.assumed[j]

@@ -24,7 +24,7 @@ from ..errors import NotRepeatable, UsageError, count_nouns
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
 from ..scenario import Scenario
-from .fused import FusedRun, RunInputs, explain_no_repetition, read_run_inputs
+from .fused import FusedRun, RunInputs, explain_not_repeatable, read_run_inputs
 
 PUSH_RAD = 1e-6
 """The usual push, rad."""
@@ -122,7 +122,7 @@ def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
     chosen = [("theta", PUSH_RAD)] * (learns and count > 2)
     random = max(1, min(3, count - len(each) - len(chosen)))
     chosen += [("q", factor * PUSH_RAD) for factor in (1.0, 1e-3, 1e3)[:random]]
-    pushes = [aim_push(scenario, *one) for one in (chosen + each)[:count]]
+    pushes = [parse_push(scenario, *one) for one in (chosen + each)[:count]]
     return [one._replace(again=True, largest=LARGEST) for one in pushes]
 
 
@@ -132,7 +132,7 @@ MOST_PUSH = 1.0
 _TARGET = re.compile(r"(?:([a-z][a-z0-9_]*)\.)?(qd?|theta)([1-9]\d*)?")
 
 
-def aim_push(
+def parse_push(
     scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: float = 0.0
 ) -> Push:
     """Returns the push of a number, "m1.q1", "s.qd2", "m2.theta3", or of many in a drawn
@@ -196,7 +196,7 @@ def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Tw
         NotRepeatable: it cannot be executed again, or is another run here.
         LogError: a record cannot be read.
     """
-    if why := explain_no_repetition(log, own_laws=own_laws):
+    if why := explain_not_repeatable(log, own_laws=own_laws):
         raise NotRepeatable(f"no twins: {why}")
     ticks = [len(log[name]) for name in log.scenario.names]
     return _TwinRuns(
@@ -286,7 +286,7 @@ class _TwinRuns:
     def _make_window(self, end_s: float) -> None:
         last_ns = math.ceil(end_s * NS_PER_S) - 1
         self._run.step_to(last_ns)
-        kept = self._run.take_records()
+        kept = self._run.pop_records()
         if self._log is not None:
             self._compare(self._log, kept)
         for at, starts, qd, _ in self._cut(kept, kept):
@@ -296,7 +296,7 @@ class _TwinRuns:
         for n, twin in enumerate(self._twins):
             if self._pushed[n] and self._died[n] is None:
                 twin.step_to(last_ns)
-                self._measure(n, kept, twin.take_records())
+                self._measure(n, kept, twin.pop_records())
                 if not twin.has_programs:  # whose state no twin can take over
                     self._renew(n, end_s)
             elif not self._pushed[n] and self._pushes[n].at_s <= end_s:
@@ -305,7 +305,7 @@ class _TwinRuns:
 
     def _push(self, n: int, at_s: float) -> None:
         push = self._pushes[n]
-        self._twins[n].push(push.field, push.by)
+        self._twins[n].displace(push.field, push.by)
         self._pushed[n].append(round(at_s * BUCKETS_PER_S))
         self._scale[n] = 0.0
 
@@ -378,7 +378,7 @@ class _TwinRuns:
             self._largest[n, self._died[n] :] = -np.inf
         elif push.largest < math.inf and not max(q, qd) <= max(push.largest, 10.0 * pushed):
             factor = pushed / max(q, qd)
-            twin.approach(self._run, factor)
+            twin.scale_difference(self._run, factor)
             self._scale[n] -= math.log(factor)
 
 

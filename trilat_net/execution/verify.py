@@ -357,7 +357,7 @@ class SiteVerifier:
             self._result.gaps.append((self._log.name, expected, absent - 1))
         if absent < first:
             self._result.absences.append((self._log.name, absent, first - 1))
-        self._inputs.take_changes(first - 1)  # the start before took them in
+        self._inputs.pop_changes(first - 1)  # the start before took them in
         self._site = Site(self._setup)
         self._certain = True
         self._first = first
@@ -406,11 +406,11 @@ class SiteVerifier:
             self._site.resume(
                 read_output(states[n - 2], peers), read_output(states[n - 1], peers)
             )
-        arrivals, missing = self._inputs.arrivals(state.rx)
+        arrivals, missing = self._inputs.find_arrivals(state.rx)
         invalid = None
         if missing:
             entries, invalid = self._check_arrivals(state)
-            arrivals, missing = self._inputs.arrivals(entries)
+            arrivals, missing = self._inputs.find_arrivals(entries)
             self._inputs.add_lacking(missing)
         changes, invalid_change = self._parse_changes(state.tick)
         plant = (
@@ -436,7 +436,7 @@ class SiteVerifier:
                 equal=self._equal,
                 channel=self._channel,
             )
-            if difference is not None and self._inputs.in_doubt(state, output):
+            if difference is not None and self._inputs.is_uncertain(state, output):
                 result.unjudged += 1
                 self._certain = False
                 return
@@ -450,7 +450,7 @@ class SiteVerifier:
         difference.
         """
         changes: list[CoreChange] = []
-        for named, text in self._inputs.take_changes(tick):
+        for named, text in self._inputs.pop_changes(tick):
             try:
                 changes.append(parse_core_change(self._scenario, self._log.name, text))
             except ScenarioError:

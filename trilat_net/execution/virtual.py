@@ -50,7 +50,7 @@ from ..scenario.operators.program_hand import make_hand_players
 from ..scenario.own_plant import PlantPlayer, make_plant_players
 from ..scenario.run_changes import count_skipped_ticks
 from ..scenario.validate import refuse_external_arms
-from .resumption import read_output, take_parts
+from .resumption import read_output, select_peer_channels
 from .virtual_network import Network, PromptNetwork
 
 
@@ -294,13 +294,14 @@ def execute_virtual(
     last_ns = round(scenario.duration_s * NS_PER_S)
     while pending and pending[0][0] <= last_ns:
         place = 0
-        if not joined.ready(sites[pending[0][1]].name, pending[0][2]):
+        if not joined.is_ready(sites[pending[0][1]].name, pending[0][2]):
             place = next(
-                (n for n, (_, i, k) in enumerate(pending) if joined.ready(sites[i].name, k)), 0
+                (n for n, (_, i, k) in enumerate(pending) if joined.is_ready(sites[i].name, k)),
+                0,
             )
         t_ns, index, k = pending.pop(place)
         site = sites[index]
-        arrivals = take_parts(joined.deliver(site.name, k), setups[index].links)
+        arrivals = select_peer_channels(joined.deliver(site.name, k), setups[index].links)
         ordered = commands.get(site.name, {})
         arm = measured.get(site.name, {})
         hand = hands[site.name](site, k) if site.name in hands else ()
@@ -322,7 +323,7 @@ def execute_virtual(
             bisect.insort(pending, (after * NS_PER_S // site.rate_hz, index, after))
 
 
-def virtual_boot(scenario: Scenario, site: str) -> int:
+def compute_boot(scenario: Scenario, site: str) -> int:
     """Returns the boot of a site in virtual time: a function of scenario and name."""
     return compute_virtual_boot(scenario.sha256, site)
 
@@ -331,7 +332,7 @@ class _VirtualChannels(SiteChannels):
     """The channels of one site of a virtual run, written as it is executed."""
 
     def __init__(self, scenario: Scenario, site: Site, writer: LogWriter) -> None:
-        boot = virtual_boot(scenario, site.name)
+        boot = compute_boot(scenario, site.name)
         super().__init__(scenario, scenario.name, site.name, boot)
         self._writer = writer
         self._runs = site

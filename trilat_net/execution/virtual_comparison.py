@@ -29,7 +29,7 @@ from .verify import (
     equal_record,
     find_first_difference,
 )
-from .virtual_network import Network, RecordedNetwork, complete_deliveries, recorded_deliveries
+from .virtual_network import Network, RecordedNetwork, complete_deliveries, read_deliveries
 
 
 class RecordComparison(NamedTuple):
@@ -230,8 +230,8 @@ def _complete_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntr
     with suppress(LogError):
         return complete_deliveries(
             part, rates_hz, [log.last_ticks[peer] for peer in part.peers]
-        ).at
-    return recorded_deliveries(part).at
+        ).entries
+    return read_deliveries(part).entries
 
 
 def _recorded_scenario(log: Log) -> Scenario:

@@ -27,7 +27,7 @@ class Network(Protocol):
     def send(self, sender: str, output: TickRecord) -> None:
         """Takes the record of one tick from its sender."""
 
-    def ready(self, receiver: str, k: int) -> bool:
+    def is_ready(self, receiver: str, k: int) -> bool:
         """True where everything that arrives for tick k of a receiver has been sent."""
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
@@ -51,7 +51,7 @@ class PromptNetwork:
             if receiver != sender:
                 queues[sender].append(output)
 
-    def ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
+    def is_ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
         """See `Network`: in order of time, always true."""
         return True
 
@@ -86,7 +86,7 @@ class RecordedNetwork:
         """See `Network`."""
         self._sent[sender, output.tick] = output
 
-    def ready(self, receiver: str, k: int) -> bool:
+    def is_ready(self, receiver: str, k: int) -> bool:
         """See `Network`. A loop that was late received samples of ticks ahead of its own."""
         peers = self._peers[receiver]
         entries = self._schedule[receiver].get(k, ())
@@ -117,13 +117,13 @@ class Deliveries(NamedTuple):
     In the `unrecorded` ticks between them arrivals are assumed.
     """
 
-    at: dict[int, Sequence[ArrivalEntry]]
+    entries: dict[int, Sequence[ArrivalEntry]]
     unrecorded: frozenset[int]
     first: int
     last: int
 
 
-def recorded_deliveries(part: SiteLog) -> Deliveries:
+def read_deliveries(part: SiteLog) -> Deliveries:
     """Returns the arrivals of a site that its records list."""
     counts, rows = part.arrivals
     entries = rows.tolist()
@@ -148,8 +148,8 @@ def complete_deliveries(
     Raises:
         LogError: fewer than half of those ticks have a record.
     """
-    known = recorded_deliveries(part)
-    at = known.at
+    known = read_deliveries(part)
+    at = known.entries
     ticks = known.last + 1 - known.first
     if len(at) == ticks:
         return known
@@ -171,13 +171,13 @@ def complete_deliveries(
         ):
             assumed.setdefault(tick, []).append(entry)
     filled = at | {tick: sorted(entries) for tick, entries in assumed.items()}
-    return known._replace(at=filled, unrecorded=frozenset(missing))
+    return known._replace(entries=filled, unrecorded=frozenset(missing))
 
 
 def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
     first: dict[int, tuple[int, int]] = {}
-    for k in sorted(deliveries.at):
-        for j, tick, us in deliveries.at[k]:
+    for k in sorted(deliveries.entries):
+        for j, tick, us in deliveries.entries[k]:
             if j == peer and tick >= 0:
                 first.setdefault(tick, (k, us))
     return first

@@ -34,7 +34,7 @@ from ..files import import_extra
 from ..net.messages import Event, LinkStats, State, json_schema
 from ..scenario import Scenario
 from ..scenario.arms import TASK_AXES, ArmModel
-from .orientations import QUATERNION_AXES, align_signs, find_quaternions
+from .orientations import QUATERNION_AXES, align_signs, compute_quaternions
 from .record_columns import Ints
 from .site_log import SiteLog, TimedMessages
 
@@ -274,7 +274,7 @@ def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[
     """Yields the orientation of a pose as a quaternion; its source is the record's rotation
     vector.
     """
-    quaternions = find_quaternions(getattr(site, field)[:, PLACE:])
+    quaternions = compute_quaternions(getattr(site, field)[:, PLACE:])
     for name, values in zip(QUATERNION_AXES, quaternions.T, strict=True):
         meaning = f"{text}, {name[1]} of its orientation as {_STEADY_QUATERNION}"
         yield Column(

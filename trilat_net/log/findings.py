@@ -66,12 +66,12 @@ class Finding:
             else str(self.places[0])
         )
 
-    def tell(self, sound: str) -> "Finding":
+    def conclude(self, sound: str) -> "Finding":
         """Takes `sound` as its text if there is no problem, else their summary; returns itself."""
         self.text = self.summary() if self.wrong else sound
         return self
 
-    def line(self) -> dict[str, Any]:
+    def to_row(self) -> dict[str, Any]:
         """Returns it as a line, ready for JSON."""
         return {
             "label": self.check,
@@ -107,4 +107,4 @@ class CheckReport(Result):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per check."""
-        return [finding.line() for finding in self.findings]
+        return [finding.to_row() for finding in self.findings]

@@ -74,7 +74,7 @@ class ChannelFilter:
     include: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
 
-    def takes(self, key: str) -> bool:
+    def accepts(self, key: str) -> bool:
         """True if the filter takes a channel."""
         included, excluded = (
             any(matches_key(expression, key) for expression in expressions)

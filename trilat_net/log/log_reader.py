@@ -321,7 +321,9 @@ class Log(Result, Mapping[str, SiteLog]):
         }
         is_part = bool(self.part) and len(self.sources) == 1
         ended = {event.member for event in self.events if event.kind == "end"}
-        silent = [site for site in self.sites if site not in ended and choice.takes(key[site])]
+        silent = [
+            site for site in self.sites if site not in ended and choice.accepts(key[site])
+        ]
         return () if is_part else tuple(silent)
 
     @cached_property

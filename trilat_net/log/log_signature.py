@@ -145,7 +145,7 @@ def check_signatures(
         if problem := _find_problem(path, key, progress):
             found.add(str(path), None, problem)
     files = "file is" if len(paths) == 1 else count_nouns(len(paths), "file is", "files are")
-    return found.tell(f"the {files} as the owner of {key_file} signed")
+    return found.conclude(f"the {files} as the owner of {key_file} signed")
 
 
 def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) -> str:

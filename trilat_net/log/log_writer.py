@@ -133,7 +133,7 @@ class LogWriter:
                 if name == topics.STATE:
                     about["rate_hz"] = str(scenario.sites[member].rate_hz)
                 channels[key] = None
-                if choice.takes(key):
+                if choice.accepts(key):
                     channels[key] = self._file.register_channel(
                         f"/{key}", "msgpack", schemas[name], about
                     )

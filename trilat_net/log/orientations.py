@@ -35,7 +35,7 @@ SIX_AXES = (*TASK_AXES[:PLACE], *MATRIX_ENTRIES)
 """Names of the numbers of a pose with six numbers for its orientation."""
 
 
-def split_quaternions(turns: Array) -> tuple[Array, Array]:
+def compute_quaternion_parts(turns: Array) -> tuple[Array, Array]:
     """Returns w, shape (K, 1), and x, y, z, shape (K, 3), of rotation vectors, shape (K, 3),
     rad.
     """
@@ -43,11 +43,11 @@ def split_quaternions(turns: Array) -> tuple[Array, Array]:
     return np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * turns
 
 
-def find_quaternions(turns: Array) -> Array:
+def compute_quaternions(turns: Array) -> Array:
     """Returns unit quaternions w, x, y, z of consistent sign, shape (K, 4), of rotation
     vectors, rad.
     """
-    return align_signs(np.hstack(split_quaternions(turns)))
+    return align_signs(np.hstack(compute_quaternion_parts(turns)))
 
 
 def align_signs(quaternions: Array) -> Array:
@@ -61,12 +61,12 @@ def align_signs(quaternions: Array) -> Array:
     return aligned
 
 
-def find_six_numbers(turns: Array) -> Array:
+def compute_matrix_columns(turns: Array) -> Array:
     """Returns the first two columns of the matrices of rotation vectors, shape (..., 6), of
     (..., 3), rad.
     """
     rows = np.reshape(turns, (-1, 3))
-    w, v = split_quaternions(rows)
+    w, v = compute_quaternion_parts(rows)
     two = 2.0 * v
     wx, wy, wz = (w * two).T
     xx, yy, zz = (v * two).T
@@ -100,10 +100,10 @@ def expand_poses(x: Array) -> Array:
     """
     if x.shape[-1] != POSE:
         return x
-    return np.concatenate([x[..., :PLACE], find_six_numbers(x[..., PLACE:])], axis=-1)
+    return np.concatenate([x[..., :PLACE], compute_matrix_columns(x[..., PLACE:])], axis=-1)
 
 
-def bring_nearer(turns: Array, references: Array) -> Array:
+def choose_nearest_vectors(turns: Array, references: Array) -> Array:
     """Returns rotation vectors of the same rotations that are nearest to other ones, shape (K,
     3), rad.
 
@@ -115,11 +115,11 @@ def bring_nearer(turns: Array, references: Array) -> Array:
     return np.asarray(turns + 2.0 * np.pi * np.round((along - angle) / (2.0 * np.pi)) * axis)
 
 
-def find_steady_vectors(turns: Array) -> Array:
+def compute_continuous_vectors(turns: Array) -> Array:
     """Returns rotation vectors, shape (K, 3), rad, without jumps at half a turn; whole turns
     have them.
     """
-    quaternions = find_quaternions(turns)
+    quaternions = compute_quaternions(turns)
     w = quaternions[:, :1]
     v = quaternions[:, 1:]
     sine = np.linalg.norm(v, axis=1, keepdims=True)
@@ -129,7 +129,7 @@ def find_steady_vectors(turns: Array) -> Array:
     return np.asarray(by_sine * v)
 
 
-class SteadyQuaternion:
+class QuaternionSigns:
     """Sign of the quaternions of one stream: each is nearest to the one before; the first has w
     >= 0.
 
@@ -140,7 +140,7 @@ class SteadyQuaternion:
         self._w = w
         self._last: tuple[float, ...] = ()
 
-    def follow(self, quaternion: Sequence[float]) -> tuple[float, ...]:
+    def align(self, quaternion: Sequence[float]) -> tuple[float, ...]:
         """Returns a quaternion or its negative, which is the same rotation."""
         last = self._last
         dot = quaternion[self._w]

@@ -439,27 +439,27 @@ class SessionCheck:
         found = self._findings
         messages = counts["messages"]
         chunks = counts["chunks"]
-        yield found["whole"].tell(f"finished, {counts['bytes'] / 1e6:.1f} MB")
-        yield found["checksums"].tell(f"{counts['crcs']} compared, all agree")
-        yield found["records"].tell(
+        yield found["whole"].conclude(f"finished, {counts['bytes'] / 1e6:.1f} MB")
+        yield found["checksums"].conclude(f"{counts['crcs']} compared, all agree")
+        yield found["records"].conclude(
             f"{count_nouns(messages, 'message')} in {count_nouns(chunks, 'chunk')}, built as the format says"
         )
-        yield found["index"].tell("is what is there")
+        yield found["index"].conclude("is what is there")
         if not self.ours:
             if "chain" in found:
-                yield found["chain"].tell("")
+                yield found["chain"].conclude("")
             return
         yield self._check_sequence()
         yield self._check_accounts()
-        yield found["chain"].tell(self._chain_text)
+        yield found["chain"].conclude(self._chain_text)
         kinds = f"every message is one of version {self._version}"
         views = f", and {count_nouns(self._views, 'view')}" if self._views else ""
-        yield found["schema"].tell(kinds + views)
-        yield found["times"].tell("log times never go back, publish times are the senders'")
+        yield found["schema"].conclude(kinds + views)
+        yield found["times"].conclude("log times never go back, publish times are the senders'")
         yield self._check_rates()
         scenario = self._scenario.name if self._scenario else ""
         text = f"{scenario}, SHA-256 {self._about.get('scenario_sha256', '')[:16]}, as the session names it"
-        yield found["scenario"].tell(text)
+        yield found["scenario"].conclude(text)
 
     def _check_sequence(self) -> Finding:
         finding = self._findings["sequence"]
@@ -500,17 +500,17 @@ class SessionCheck:
         session = self._about["session"]
         choice = parse_filter_facts(self._about)
         names = self._scenario.names if self._scenario else ()
-        takes = all(choice.takes(topics.key(session, name, topics.EVENT)) for name in names)
+        takes = all(choice.accepts(topics.key(session, name, topics.EVENT)) for name in names)
         is_single_part = self._files == self._parts == 1
         return takes and not is_single_part
 
     def _check_accounts(self) -> Finding:
         finding = self._findings["accounts"]
         if not self._accounts:
-            return finding.tell("there are none: the file was not finished")
+            return finding.conclude("there are none: the file was not finished")
         own = (check for check in self.channels.values() if check.member == topics.RECORDER)
         if not self._first_part or len({boot for check in own for boot in check.boots}) > 1:
-            return finding.tell("tell of parts that are not here, and were not compared")
+            return finding.conclude("tell of parts that are not here, and were not compared")
         for topic, check in self.channels.items():
             stated = parse_counts(self._accounts.get(topic, ""))
             if check.kind != topics.STATS:
@@ -522,7 +522,7 @@ class SessionCheck:
                         finding.add("", None, text)
             if not stated and self._version >= _ACCOUNTS_SINCE:
                 finding.add("", None, f"{check.name}: has no account")
-        return finding.tell("agree with what is there")
+        return finding.conclude("agree with what is there")
 
     def _check_rates(self) -> Finding:
         finding = self._findings["rates"]
@@ -543,7 +543,7 @@ class SessionCheck:
             if abs(rate_hz / check.rate_hz - 1) > _RATE_TOLERANCE:
                 sent = f"{check.member} sent {rate_hz:.1f} records a second"
                 finding.add("", None, f"{sent}, the scenario says {check.rate_hz}")
-        return finding.tell(", ".join(texts) or "too short to tell")
+        return finding.conclude(", ".join(texts) or "too short to tell")
 
 
 def judge_integrity(log: Log) -> Integrity:

@@ -24,7 +24,7 @@ from ..net.messages import READABLE, State
 from ..net.wire import decode
 from ..scenario.run_changes import count_skipped_ticks
 from . import record_columns
-from .orientations import align_signs, find_quaternions, split_quaternions
+from .orientations import align_signs, compute_quaternion_parts, compute_quaternions
 from .record_columns import Ints
 
 M = TypeVar("M")
@@ -60,7 +60,7 @@ def freeze(value: T) -> T:
     return value
 
 
-def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
+def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
     """Returns x - x_des of places, and of orientations the turn from one to the other, shape
     (K, m).
 
@@ -74,7 +74,7 @@ def find_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
 
 
 def _find_turns(turn: Array, reference: Array) -> Array:
-    (a, u), (b, v) = map(split_quaternions, (turn, reference))
+    (a, u), (b, v) = map(compute_quaternion_parts, (turn, reference))
     w = a * b + np.sum(u * v, axis=1, keepdims=True)
     p = b * u - a * v - np.cross(u, v)
     # of two quaternions that turn alike that of the shorter turn
@@ -414,7 +414,7 @@ class SiteLog:
     def _make_orientation(self, poses: Array) -> Array:
         if not self.layout.task or self.layout.shared != POSE:
             return freeze(np.zeros((len(self), 0)))
-        return freeze(find_quaternions(poses[:, PLACE:]))
+        return freeze(compute_quaternions(poses[:, PLACE:]))
 
     @cached_property
     def body_poses(self) -> Array:
@@ -437,7 +437,7 @@ class SiteLog:
         most half a turn long: that of the control law, which jumps where it passes half a turn.
         """
         return (
-            find_task_errors(self.x, self.q_des, self.axes)
+            compute_task_errors(self.x, self.q_des, self.axes)
             if self.layout.task
             else self.q - self.q_des
         )

@@ -70,7 +70,7 @@ class Conclusion(CheckReport):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat report --json`."""
-        checks = [finding.line() for finding in self.findings]
+        checks = [finding.to_row() for finding in self.findings]
         paths = [path.as_posix() for path in self.paths]
         found = {"passed": self.passed, "verdict": self.verdict.text, "notes": self.notes}
         return {**found, "checks": checks, "paths": paths}

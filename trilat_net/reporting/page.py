@@ -105,7 +105,7 @@ def write_report(
         section += f'<img src="data:image/png;base64,{data}" alt="{words}" class="picture">'
     section = f"<section><h2>Was it stable, and why</h2>{section}</section>"
     lines = list(verdicts)
-    facts["checks"] = [line.line() for line in lines]
+    facts["checks"] = [line.to_row() for line in lines]
     page = folder / "report.html"
     numbers = folder / "summary.json"
     write_whole(

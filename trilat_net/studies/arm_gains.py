@@ -413,7 +413,7 @@ class _GainSearch:
         run = FusedRun(msgspec.structs.replace(self._scenario, sites=sites))
         first_s = max(_SHORTEST_S, _SETTLES / max(abs(predicted_per_s), _SETTLES / _LONGEST_S))
         for end_s in (first_s * 2.0 ** np.arange(_EXTENSIONS)).tolist():
-            run.advance(end_s)
+            run.advance_to(end_s)
             speed = np.max([site[:, 1] for site in run.maxima], axis=0)
             t_s = np.arange(len(speed)) / BUCKETS_PER_S
             fit = fit_envelopes(

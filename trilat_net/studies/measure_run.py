@@ -39,7 +39,7 @@ from ..execution.virtual_comparison import find_absent_samples
 from ..fields import field_names, split_unit
 from ..log.log_reader import Log
 from ..log.record_columns import Ints
-from ..log.site_log import find_task_errors
+from ..log.site_log import compute_task_errors
 from ..scenario import Expect, Scenario
 from ..scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
 
@@ -93,7 +93,7 @@ def join_batches(blocks: Sequence[RecordBatch]) -> RecordBatch:
 
 def _make_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
     q, qd, q_des, tau, tau_x, x = vectors
-    e = find_task_errors(x, q_des, axes) if x.size else q - q_des
+    e = compute_task_errors(x, q_des, axes) if x.size else q - q_des
     return RecordBatch(t_ns=t_ns, q=q, qd=qd, e=e, tau=tau, tau_x=tau_x, used=used)
 
 
@@ -144,9 +144,9 @@ def run_compiled_in_batches(
     columns = [scenario.layout(name).columns() for name in scenario.names]
     period_s = BATCH_RECORDS / max(spec.rate_hz for spec in scenario.sites.values())
     while run.ran_s < scenario.duration_s and run.diverged_s is None:
-        run.advance(min(run.ran_s + period_s, scenario.duration_s))
+        run.advance_to(min(run.ran_s + period_s, scenario.duration_s))
         for name, place, (t_ns, rows) in zip(
-            scenario.names, columns, run.take_records(), strict=True
+            scenario.names, columns, run.pop_records(), strict=True
         ):
             if not len(t_ns):
                 continue

@@ -404,7 +404,7 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
     run = FusedRun(prolong_scenario(scenario, most_s))
     until_s = scenario.duration_s
     while True:
-        states = run.advance_watching(until_s)
+        states = run.run_and_sample(until_s)
         speed_rad_s = max(float(values[-BUCKETS_PER_S:, 1].max()) for values in run.maxima)
         if (
             run.diverged_s is not None

@@ -23,7 +23,7 @@ from tests.net.local_bus import LocalNetwork
 from tests.net.parties import told
 from tests.net.waiting import drained
 from trilat_net.errors import SessionError
-from trilat_net.execution.virtual import virtual_boot
+from trilat_net.execution.virtual import compute_boot
 from trilat_net.log.log_layout import ChannelFilter
 from trilat_net.net import topics
 from trilat_net.net.bus import Bus, Inbox
@@ -148,7 +148,7 @@ def test_who_asks_finds_a_session_that_runs(
         info.member: info
         for info in (decode(payload, Info) for _, payload in drained(rings[0]))
     }
-    boots = {name: virtual_boot(hall.facts.scenario, name) for name in ("m1", "m2", "s")}
+    boots = {name: compute_boot(hall.facts.scenario, name) for name in ("m1", "m2", "s")}
     assert {name: info.boot for name, info in infos.items()} == boots
     for name, info in infos.items():
         assert info.running

@@ -130,7 +130,7 @@ def test_every_message_is_published_once_in_order_at_its_deadline(
                     len(pieces) * MS if isinstance(source, Trickle) else 10**5
                 )
         assert sum(stage.player.counts) == len(given)
-        assert stage.memory.made == {c: n + 1 for _, c, n in stage.heard}
+        assert stage.memory.next_numbers == {c: n + 1 for _, c, n in stage.heard}
 
 
 def test_a_late_message_makes_no_later_one_late() -> None:
@@ -162,7 +162,7 @@ def test_rounds_follow_each_other_with_the_same_messages() -> None:
     assert [
         heard - due for (heard, _, _), due in zip(stage.heard, due_ns, strict=True)
     ] == pytest.approx([0] * 7, abs=10_000)
-    assert stage.memory.chunk(0, 0, 9) == (0, [b"\0"])
+    assert stage.memory.find_messages(0, 0, 9) == (0, [b"\0"])
 
 
 @pytest.mark.parametrize("count", [1, 5, 300])

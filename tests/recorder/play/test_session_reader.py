@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from recorder.play.session_reader import PlaySelection, preload_messages
 from trilat_net.errors import LogError, UsageError
-from trilat_net.execution.virtual import virtual_boot
+from trilat_net.execution.virtual import compute_boot
 from trilat_net.log.log_layout import ChannelFilter
 
 from .logs import BOOT, event, loaded, payloads, write
@@ -31,7 +31,7 @@ def test_everything_that_sites_published_is_read_byte_for_byte(log_file: Path) -
     assert played == published
     assert facts.session == "paper"
     assert facts.boots == {
-        name: virtual_boot(facts.scenario, name) for name in ("m1", "m2", "s")
+        name: compute_boot(facts.scenario, name) for name in ("m1", "m2", "s")
     }
     assert facts.torn == {}
 

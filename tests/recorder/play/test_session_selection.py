@@ -18,7 +18,7 @@ TOPICS = [
 
 def taken(include: tuple[str, ...] = (), exclude: tuple[str, ...] = ()) -> list[str]:
     selection = parse_selection(include, exclude, None, None, None, "publish")
-    return [topic for topic in TOPICS if selection.takes(topic, SITES)]
+    return [topic for topic in TOPICS if selection.accepts(topic, SITES)]
 
 
 def test_by_default_all_that_sites_published_and_nothing_else() -> None:

@@ -22,7 +22,7 @@ def remembered(
     for piece in gathering.ordered().pieces(40):
         memory.add(piece)
     if played:
-        memory.made[CHANNEL] = numbers[played - 1] + 1
+        memory.next_numbers[CHANNEL] = numbers[played - 1] + 1
     return memory
 
 
@@ -51,7 +51,7 @@ def test_it_answers_records_from_a_number_to_the_next_gap(
 ) -> None:
     played = data.draw(st.integers(0, len(numbers)))
     memory = remembered(numbers, played)
-    told_first, payloads = memory.chunk(CHANNEL, first, first + more)
+    told_first, payloads = memory.find_messages(CHANNEL, first, first + more)
     assert (told_first, [int.from_bytes(p, "big") for p in payloads]) == naive(
         numbers[:played], first, first + more
     )
@@ -66,27 +66,27 @@ def test_where_nothing_is_missing_it_answers_as_a_site(
     for number in range(count):
         ring.keep(number.to_bytes(2, "big") * size)
     memory = remembered(list(range(count)), count, size)
-    told = memory.chunk(CHANNEL, first, first + more)
+    told = memory.find_messages(CHANNEL, first, first + more)
     assert told == ring.chunk(first, first + more)
     assert sum(map(len, told[1])) <= BACKFILL_BYTES
 
 
 def test_what_has_not_been_played_is_not_told() -> None:
     memory = remembered(list(range(30)), 10)
-    assert len(memory.chunk(CHANNEL, 0, 29)[1]) == 10
-    assert memory.chunk(CHANNEL, 10, 29) == (10, [])
+    assert len(memory.find_messages(CHANNEL, 0, 29)[1]) == 10
+    assert memory.find_messages(CHANNEL, 10, 29) == (10, [])
 
 
 def test_what_is_older_than_is_remembered_is_gone() -> None:
     memory = remembered(list(range(200)), 200, kept_ns=50)
-    first, payloads = memory.chunk(CHANNEL, 0, 199)
+    first, payloads = memory.find_messages(CHANNEL, 0, 199)
     assert 130 <= first <= 150
     assert int.from_bytes(payloads[0], "big") == first
 
 
 def test_after_forgetting_all_before_is_gone() -> None:
     memory = remembered(list(range(30)), 30)
-    memory.forget()
-    assert memory.chunk(CHANNEL, 3, 9) == (30, [])
-    assert memory.chunk(CHANNEL, 40, 50) == (40, [])
-    assert memory.chunk(99, 0, 9) == (0, [])
+    memory.clear()
+    assert memory.find_messages(CHANNEL, 3, 9) == (30, [])
+    assert memory.find_messages(CHANNEL, 40, 50) == (40, [])
+    assert memory.find_messages(99, 0, 9) == (0, [])

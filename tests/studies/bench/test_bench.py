@@ -131,7 +131,7 @@ def test_a_cell_is_the_log_that_its_command_makes(whole: BenchResults) -> None:
 def test_effort_is_that_of_the_compiled_run(whole: BenchResults) -> None:
     scenario = whole.plan.cells[0].build(1).scenario
     run = FusedRun(scenario)
-    run.advance(scenario.duration_s)
+    run.advance_to(scenario.duration_s)
     assert whole.runs[0].effort_nm == pytest.approx(run.totals.effort_nm, rel=1e-12)
 
 

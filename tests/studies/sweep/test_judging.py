@@ -97,7 +97,7 @@ def test_what_is_not_plain_goes_on_and_is_longer_run() -> None:
     assert found.ran_s == 4.0 * 2**found.extended
     whole = judged(load_scenario("p_d_margin", {**changes, "duration_s": found.ran_s}))
     totals = FusedRun(scenario)  # those of the scenario's own duration
-    totals.advance(4.0)
+    totals.advance_to(4.0)
     assert (
         msgspec.structs.replace(whole, extended=found.extended, **totals.totals._asdict())
         == found

@@ -18,8 +18,8 @@ import numpy as np
 from ...core.site_setup import Law
 from ...core.task_space import PLACE, POSE
 from ...core.vectors import Array
-from ...log.orientations import bring_nearer
-from ...log.site_log import find_task_errors
+from ...log.orientations import choose_nearest_vectors
+from ...log.site_log import compute_task_errors
 from ...results import JsonObject
 from ...scenario import Scenario
 from ...scenario.expect import END_WINDOW_S
@@ -112,7 +112,7 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
     # of vectors on both sides of half a turn the difference is a whole turn
     if sites[0].x.shape[1] == POSE:
         for turns in there[1:, :, PLACE:]:
-            turns[:] = bring_nearer(turns, there[0, :, PLACE:])
+            turns[:] = choose_nearest_vectors(turns, there[0, :, PLACE:])
     apart = np.ptp(there, axis=0)
     axes = [records.axes for records in sites]
     if all(axes):
@@ -157,7 +157,7 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     if not known.any():
         return unavailable(FOLLOWING, f"no record of {site} uses a recorded sample of {peer}")
     there = master.shared[row]
-    apart = find_task_errors(there, slave.x, slave.axes) if slave.x.size else there - slave.q
+    apart = compute_task_errors(there, slave.x, slave.axes) if slave.x.size else there - slave.q
     off = apart[known]
     last = slave.known_at_end(END_WINDOW_S)[known]
     space = log.scenario.sites[site].task.space

@@ -13,9 +13,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from ...core.task_space import PLACE, POSE
 from ...net.messages import LinkStats, State
 from ...scenario import Scenario
-from ..orientations import SteadyQuaternion
+from ..orientations import QuaternionSigns
 from . import cdr
-from .robot_model import WORLD, RobotModel, find_quaternion
+from .robot_model import WORLD, RobotModel, compute_quaternion
 from .ros2_messages import SESSION_CHANNELS, Ros2Channel, Ros2SiteChannels, stack_signals
 from .topic_names import DIAGNOSTICS, FRAMES, TopicTable
 
@@ -73,8 +73,8 @@ class SiteMessages:
         self._scale = spec.task.scale
         self._shapes = shapes = Ros2SiteChannels(scenario, site)
         self._robot = RobotModel(scenario, site)
-        self._signs = {name: SteadyQuaternion() for name in ("tip_pose", "reference_pose")}
-        self._link_signs = [SteadyQuaternion() for _ in self._robot.frames]
+        self._signs = {name: QuaternionSigns() for name in ("tip_pose", "reference_pose")}
+        self._link_signs = [QuaternionSigns() for _ in self._robot.frames]
         self._mode = ""
         self._shares = tuple[float, ...]()
         self.description = cdr.pack_string(self._robot.description)
@@ -165,8 +165,8 @@ class SiteMessages:
         for topic, (pose, rate) in poses.items():
             if wanted(topic):
                 # followed for every message that is made, so that the sign never changes between two of them
-                turned = self._signs[topic].follow(
-                    find_quaternion(self._find_turn(record, pose))
+                turned = self._signs[topic].align(
+                    compute_quaternion(self._find_turn(record, pose))
                 )
                 numbers = *self._find_place(record, pose), *turned
                 yield topic, cdr.pack_frame_vectors(stamp_ns, self.frame, *numbers)
@@ -211,7 +211,7 @@ class SiteMessages:
         """Yields the messages of a record for `/tf`."""
         stamp_ns = self.stamp_ns(record)
         transforms = zip(self._link_signs, self._robot.transforms(record.q), strict=True)
-        steady = [(origin, signs.follow(turned)) for signs, (origin, turned) in transforms]
+        steady = [(origin, signs.align(turned)) for signs, (origin, turned) in transforms]
         yield self._robot.pack_transforms(stamp_ns, steady)
         if self._pack_shared is not None:
             origin, upright = self._robot.shared

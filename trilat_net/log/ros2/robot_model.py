@@ -62,7 +62,7 @@ def _about(axis: Vector, angle: float) -> Quaternion:
     return axis[0] * s, axis[1] * s, axis[2] * s, math.cos(angle / 2.0)
 
 
-def find_quaternion(turn: Vector) -> Quaternion:
+def compute_quaternion(turn: Vector) -> Quaternion:
     """Returns the rotation by a rotation vector, rad."""
     angle = math.hypot(*turn)
     x, y, z = (one / angle for one in turn) if angle else (1.0, 0.0, 0.0)

@@ -23,7 +23,7 @@ from ...scenario import Scenario
 from ...scenario.arms import TASK_AXES
 from ...scenario.event_text import describe_event
 from ..mcap_writer import McapWriter
-from ..site_log import find_task_errors
+from ..site_log import compute_task_errors
 from . import cdr
 from .robot_model import RobotModel
 
@@ -303,7 +303,7 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
     ]
     if len(error) > PLACE and task:
         x, x_des = (np.array(columns).T for columns in (here, there))
-        error = find_task_errors(x, x_des, [1.0] * len(error)).T.tolist()
+        error = compute_task_errors(x, x_des, [1.0] * len(error)).T.tolist()
     modes = [m.mode for m in records]
     if modes.count(modes[0]) == len(modes):
         del modes[1:]

@@ -27,7 +27,7 @@ from ...analysis.twin_growth import (
 )
 from ...core.ticks import BUCKETS_PER_S
 from ...core.vectors import Array
-from ...execution.fused import explain_no_repetition
+from ...execution.fused import explain_not_repeatable
 from ...execution.twins import SMALLEST, TwinPath
 from .. import style
 from ..appearance import REPORT_SIZE, FigureSize
@@ -111,7 +111,9 @@ def draw_twins(found: PushedTwins, form: FigureSize = REPORT_SIZE) -> Figure:
     return plot.figure
 
 
-draws("twins", "what became of small pushes of the run", explain_no_repetition, in_report=True)(
+draws(
+    "twins", "what became of small pushes of the run", explain_not_repeatable, in_report=True
+)(
     lambda log, form: draw_twins(
         PushedTwins(log, 0.0, measure_twins(log, classify_log_end(log))), form
     )

@@ -160,7 +160,7 @@ class HandPlayer:
         self.news += [(k, self._tell(k, change)) for _, change in step.changes]
         return step.vector
 
-    def take_until(self, k: int, end: int, arrays: SiteArrays) -> Array:
+    def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
         """Returns what it does from tick k until it needs the arm again, before tick `end`, a
         row a tick.
         """

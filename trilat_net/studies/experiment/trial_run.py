@@ -314,7 +314,7 @@ class SyntheticTrial(ExperimentTrial):
         columns = scenario.layout(site).columns()
         for piece in range(math.ceil(self.longest_s * HAND_HZ)):
             run.step_to((piece + 1) * NS_PER_S // HAND_HZ)
-            t_ns, rows = run.take_records()[place]
+            t_ns, rows = run.pop_records()[place]
             moments = (rows[:, columns[name]].tolist() for name in ("q", "tau_x"))
             for moment in zip((t_ns / NS_PER_S).tolist(), *moments, strict=True):
                 judge.take(*moment)

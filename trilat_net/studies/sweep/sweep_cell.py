@@ -143,7 +143,7 @@ def classify_cell(text: str, longest_s: float) -> CellResult:
     ):
         ends_s = min(2.0 * ends_s, longest_s)
         extended += 1
-        run.advance(ends_s)
+        run.advance_to(ends_s)
     trend = outcome.motion in (EndBehaviour.GROWS, EndBehaviour.DECAYS)
     if scenario.links_random and trend and not _pronounced(outcome):
         return msgspec.structs.replace(outcome, verdict=CellClass.UNDECIDED)
@@ -164,7 +164,7 @@ def measure_exponent(scenario: Scenario) -> float | None:
     `analysis.twin_growth`.
     """
     run = FusedRun(scenario, SETTLED_ERROR_RAD)
-    run.advance(scenario.duration_s)
+    run.advance_to(scenario.duration_s)
     found = _measure_twins(scenario, run)
     return max(
         (one.rate_per_s for one in found.pushes if math.isfinite(one.rate_per_s)), default=None
@@ -201,9 +201,9 @@ def _advance_in_contact(scenario: Scenario, run: FusedRun) -> float:
     if not any(
         one.actor.sampled for spec in scenario.sites.values() for one in spec.environment
     ):
-        run.advance(scenario.duration_s)
+        run.advance_to(scenario.duration_s)
         return 0.0
-    states = run.advance_watching(scenario.duration_s)
+    states = run.run_and_sample(scenario.duration_s)
     if run.diverged_s is not None:
         return 0.0
     # SciPy takes a worker half a second, which only sampled walls need

@@ -304,7 +304,9 @@ class TuningPlan(NamedTuple):
             progress(done + more, total)
 
         if not is_core_cached():
-            FusedRun(self.base.scenario).advance(_PROBE_S)  # compiles, once for all processes
+            FusedRun(self.base.scenario).advance_to(
+                _PROBE_S
+            )  # compiles, once for all processes
         with open_worker_pool(jobs, on, most=total) as pool:
             for number in range(len(searches[0].rounds)):
                 asked = [search.ask(number) for search in searches]
