@@ -74,7 +74,7 @@ class ArmFrames:
     def describe(self) -> Json:
         """Returns what never changes."""
         chain = self._model.chain
-        places = self._scenario.order_palette(COLOURS)
+        places = self._scenario.assign_colours(COLOURS)
         start = joint_positions_m(self._model, np.array([self._spec.q0_rad], dtype=np.float64))[
             0
         ]

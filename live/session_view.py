@@ -34,7 +34,7 @@ from trilat_net.net.membership import MemberQuery
 from trilat_net.net.messages import Event, Info, LinkStats, State
 from trilat_net.net.wire import decode, split_states
 from trilat_net.scenario import Scenario, parse_core_change, parse_embedded
-from trilat_net.scenario.run_changes import LinkTables, find_orderer
+from trilat_net.scenario.run_changes import LinkTables, find_requester
 from trilat_net.scenario.sample_uses import PictureDelay
 
 LATE_S = 3.0
@@ -222,7 +222,7 @@ class SessionView:
         newest_ns = max(
             (site.record.t_ns for site in self.sites.values() if site.record), default=0
         )
-        self.links.advance(newest_ns)
+        self.links.advance_to(newest_ns)
 
     def advance_energy(self) -> EnergyCourse | None:
         """Returns V at the ticks of which all records have come since the last call; None
@@ -232,11 +232,11 @@ class SessionView:
         return None if self.energy is None else self.energy.advance(complete)
 
     def find_shown(self, site: str, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns the tick of each peer that a site's user is shown; see `PictureDelay.at`."""
+        """Returns the tick of each peer that a site's user is shown; see `PictureDelay.advance_to`."""
         assert self.scenario is not None
         if site not in self._pictures:
             self._pictures[site] = PictureDelay(self.scenario, site)
-        shown = self._pictures[site].at(tick, used)
+        shown = self._pictures[site].advance_to(tick, used)
         return {peer: min(last, self.sites[peer].window.newest) for peer, last in shown.items()}
 
     def _meet(self) -> None:
@@ -337,7 +337,7 @@ class SessionView:
             if content.kind == "hand" and took_hold:
                 site.holder = words.removeprefix(f"{name}: ")
             if content.kind == "change":
-                site.stopped_by = find_orderer(content.text) or site.stopped_by
+                site.stopped_by = find_requester(content.text) or site.stopped_by
             if content.command and content.kind == "change":
                 self._change(name, content.command)
 

@@ -172,7 +172,7 @@ class ChangeServer:
 
     def _resolve(self, request: ChangeRequest, first: int) -> CoreChange:
         from_ns = tick_ns(first, self._rate_hz)
-        self._links.advance(from_ns)  # the scenario has changed them by then
+        self._links.advance_to(from_ns)  # the scenario has changed them by then
         if first >= self._ticks:
             raise ScenarioError(f"the run ends at tick {self._ticks}, before it could hold")
         if self._accepted[request.link] >= MAX_CHANGES:

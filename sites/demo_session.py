@@ -44,7 +44,7 @@ from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import Interrupt, freeze_gc
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.scenario.code_consent import list_imported_code
-from trilat_net.scenario.operators.program_hand import place_own_hand
+from trilat_net.scenario.operators.program_hand import find_own_hand
 from trilat_net.scenario.validate import check_outside_arms
 
 from .machine_load import describe_load, measure_busy_share
@@ -315,8 +315,8 @@ def _start(
         for n, name in enumerate(scenario.names)
     ]
     for n, name in enumerate(scenario.names):
-        at = place_own_hand(scenario, name)
-        if at is not None and at.runs_alone:
+        at = find_own_hand(scenario, name)
+        if at is not None and at.has_separate_process:
             words = ["hand", name, "--scenario", str(file), "--session", session]
             sites.append(starter.start(f"hand-{name}", [*words, *connect[n], *patience]))
     arguments = ["record", "--session", session, *chain(*connect), "-o", str(log)]

@@ -24,7 +24,11 @@ from trilat_net.net.membership import read_messages
 from trilat_net.net.requests import HandMessage, HandViewMessage
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
-from trilat_net.scenario.operators.program_hand import HandSite, make_program, place_own_hand
+from trilat_net.scenario.operators.program_hand import (
+    HandSite,
+    find_own_hand,
+    make_hand_program,
+)
 
 POLL_NS = 500_000
 HERE_NS = 100_000_000
@@ -122,13 +126,13 @@ def run_hand(
         SessionError: the site does not ask in time.
         RunFailed: its class failed.
     """
-    at = place_own_hand(scenario, name)
-    if at is None or not at.runs_alone:
+    at = find_own_hand(scenario, name)
+    if at is None or not at.has_separate_process:
         problem = "has no hand of kind 'own' with process = true"
         raise UsageError(
             f"{name} {problem}: its site runs such a hand itself, or there is none"
         )
-    program = make_program(at)
+    program = make_hand_program(at)
     clock = SystemClock()
     stopped = interrupt.requested
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)

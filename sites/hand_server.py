@@ -70,7 +70,7 @@ class HandServer:
         self._hand = hand
         self._inbox = inbox
         self._dropped = dropped
-        self._rules = hand.rules(site.rate_hz, arm, limits)
+        self._rules = hand.make_rules(site.rate_hz, arm, limits)
         self._place = lambda: site.q if hand.mode == "joint" else arm.end_effector(site.q)
         self._memory = HandMemory()
         self._free = free_hand(self._rules.size)

@@ -380,7 +380,7 @@ class RunningSession:
                         parse_embedded(info.scenario, self.name), as_site
                     )
                 own = newest[as_site]
-                shown = pictures[as_site].at(own.tick, own.used)
+                shown = pictures[as_site].advance_to(own.tick, own.used)
                 back = {peer: reversed(kept.get(peer, deque())) for peer in shown}
                 seen = {
                     at: next((r for r in back[at] if r.tick == k), None)

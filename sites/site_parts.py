@@ -32,7 +32,11 @@ from trilat_net.net.wire import decode, encode_sample, encode_state, join_states
 from trilat_net.process import Interrupt
 from trilat_net.scenario import Scenario
 from trilat_net.scenario.imported_code import ImportedLaw
-from trilat_net.scenario.operators.program_hand import HandPlayer, make_program, place_own_hand
+from trilat_net.scenario.operators.program_hand import (
+    HandPlayer,
+    find_own_hand,
+    make_hand_program,
+)
 from trilat_net.scenario.own_plant import OwnPlant, PlantPlayer
 from trilat_net.scenario.run_changes import make_site_order, to_core_change
 from trilat_net.scenario.scenario_types import SiteOrder
@@ -142,12 +146,12 @@ class SiteParts:
         bus = self.bus
         session = self.options.session
         live = self.scenario.sites[name].find_live_hand()
-        at = place_own_hand(self.scenario, name)
+        at = find_own_hand(self.scenario, name)
         if live is None:
             return
-        if at is not None and not at.runs_alone:
+        if at is not None and not at.has_separate_process:
             watch = self._watch(f"the hand {at.program}", at.rate_hz)
-            self.hand = HandPlayer(at, make_program(at), watch)
+            self.hand = HandPlayer(at, make_hand_program(at), watch)
             return
         inbox = bus.inbox(topics.key(session, name, topics.HAND), MESSAGES_KEPT)
         dropped = self.stats.dropped

@@ -45,4 +45,4 @@ def test_every_trial_is_of_a_scenario_that_expects_something(words: list[str]) -
     changes = options[1::2]
     assert options[::2] == ["--set"] * len(changes)
     (trial,) = trilat_net.trials(source, set=changes)
-    assert trial.scenario.expect.windows or trial.scenario.expect.asks
+    assert trial.scenario.expect.windows or trial.scenario.expect.has_expectations

@@ -71,7 +71,7 @@ def stamps(count: int, rate_hz: int = 1000) -> Ints:
 def delays_us(link: LinkBase, seed: int, count: int) -> Ints:
     """The delays that a link gives to its first samples, us; none may be lost."""
     points = link.points
-    model = link.core()._replace(trace_count=0 if points is None else len(points))
+    model = link.to_core_model()._replace(trace_count=0 if points is None else len(points))
     ns = due(channel([model], seed, points=points), count) - stamps(count)
     assert (ns >= 0).all()
     assert (ns % 1000 == 0).all()

@@ -52,7 +52,7 @@ def test_loss_rate_and_mean_burst_over_a_million_samples(link: LinkBase, seed: i
 
     The variance of the rate has the chain's correlation 1 - enter - leave in it; lengths are geometric.
     """
-    model = link.core()
+    model = link.to_core_model()
     lost = due(channel([model], seed), COUNT) == LOST
     p, h = link.loss, link.loss_bad
     variance = p * (1 - p)
@@ -76,13 +76,13 @@ def test_loss_rate_and_mean_burst_over_a_million_samples(link: LinkBase, seed: i
 @pytest.mark.parametrize("seed", SEEDS)
 def test_first_sample_is_as_likely_to_be_lost_as_any(seed: int) -> None:
     """A chain begins in its stationary distribution, over links of one seed."""
-    model = NoDelay(loss=0.4, loss_burst=50).core()
+    model = NoDelay(loss=0.4, loss_burst=50).to_core_model()
     first = [due(channel([model], seed, f"a{n}->s"), 1)[0] == LOST for n in range(4000)]
     assert abs(np.mean(first) - 0.4) <= SIGMAS * math.sqrt(0.24 / 4000)
 
 
 def test_directions_and_seeds_lose_independently() -> None:
-    model = NoDelay(loss=0.5).core()
+    model = NoDelay(loss=0.5).to_core_model()
     series = [
         due(channel([model], seed, name), 100_000) == LOST
         for seed, name in ((1, "m1->s"), (1, "s->m1"), (2, "m1->s"))
@@ -94,9 +94,15 @@ def test_directions_and_seeds_lose_independently() -> None:
 def test_what_is_lost_and_how_long_others_take_are_independent() -> None:
     """So the delays of what comes through are those of the link without loss."""
     link = UniformDelay(delay_ms=100, half_width_ms=50)
-    whole = due(channel([link.core()]), 10_000)
+    whole = due(channel([link.to_core_model()]), 10_000)
     holed = due(
-        channel([UniformDelay(delay_ms=100, half_width_ms=50, loss=0.3, loss_burst=4).core()]),
+        channel(
+            [
+                UniformDelay(
+                    delay_ms=100, half_width_ms=50, loss=0.3, loss_burst=4
+                ).to_core_model()
+            ]
+        ),
         10_000,
     )
     kept = holed != LOST
@@ -109,7 +115,7 @@ def test_what_is_lost_and_how_long_others_take_are_independent() -> None:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_share_of_duplicates(seed: int) -> None:
-    made = channel([NoDelay(duplicate=0.07).core()], seed)
+    made = channel([NoDelay(duplicate=0.07).to_core_model()], seed)
     due(made, COUNT)
     assert abs(int(made.row.copies) / COUNT - 0.07) <= SIGMAS * math.sqrt(0.07 * 0.93 / COUNT)
 
@@ -117,8 +123,10 @@ def test_the_share_of_duplicates(seed: int) -> None:
 def test_the_earlier_of_sample_and_copy_counts() -> None:
     """Both have a delay of their own: the smaller of two uniform numbers has its mean at a third."""
     link = UniformDelay(delay_ms=100, half_width_ms=60)
-    single = due(channel([link.core()]), 100_000)
-    made = channel([UniformDelay(delay_ms=100, half_width_ms=60, duplicate=1.0).core()])
+    single = due(channel([link.to_core_model()]), 100_000)
+    made = channel(
+        [UniformDelay(delay_ms=100, half_width_ms=60, duplicate=1.0).to_core_model()]
+    )
     doubled = due(made, 100_000)
     assert made.row.copies == 100_000
     assert (doubled <= single).all()
@@ -135,14 +143,16 @@ def test_an_outage_takes_the_samples_stamped_within_it() -> None:
     cut = np.array(
         [(10_000_000, 20_000_000), (15_000_000, 25_500_000), (40_000_000, 40_000_001)]
     )
-    lost = np.flatnonzero(due(channel([NoDelay().core()], points=cut, outages=3), 60) == LOST)
+    lost = np.flatnonzero(
+        due(channel([NoDelay().to_core_model()], points=cut, outages=3), 60) == LOST
+    )
     assert lost.tolist() == [*range(10, 26), 40]
 
 
 def test_in_order_no_sample_overtakes_an_older_one() -> None:
     keys = {"delay_ms": 50.0, "deviation_ms": 30.0, "loss": 0.1}
-    free = due(channel([GammaDelay(**keys).core()]), 20_000)
-    ordered = due(channel([GammaDelay(**keys, order="in_order").core()]), 20_000)
+    free = due(channel([GammaDelay(**keys).to_core_model()]), 20_000)
+    ordered = due(channel([GammaDelay(**keys, order="in_order").to_core_model()]), 20_000)
     kept = free != LOST
     assert ((ordered == LOST) == ~kept).all()
     assert (ordered[kept] == np.maximum.accumulate(free[kept])).all()
@@ -151,16 +161,22 @@ def test_in_order_no_sample_overtakes_an_older_one() -> None:
 
 def test_link_that_becomes_ordered_holds_samples_back_behind_older_ones() -> None:
     first, then = ConstantDelay(delay_ms=50.0), ConstantDelay(delay_ms=1.0, order="in_order")
-    made = due(channel([first.core(), then.core(10_000_000)]), 80)
+    made = due(channel([first.to_core_model(), then.to_core_model(10_000_000)]), 80)
     assert made[:10].tolist() == [(50 + m) * 10**6 for m in range(10)]
     assert made[10:].tolist() == [max(59, m + 1) * 10**6 for m in range(10, 80)]
 
 
 @given(playout_ms=st.floats(0, 300))
 def test_play_out_holds_every_sample_at_least_so_long(playout_ms: float) -> None:
-    free = due(channel([UniformDelay(delay_ms=100, half_width_ms=100).core()]), 500)
+    free = due(channel([UniformDelay(delay_ms=100, half_width_ms=100).to_core_model()]), 500)
     held = due(
-        channel([UniformDelay(delay_ms=100, half_width_ms=100, playout_ms=playout_ms).core()]),
+        channel(
+            [
+                UniformDelay(
+                    delay_ms=100, half_width_ms=100, playout_ms=playout_ms
+                ).to_core_model()
+            ]
+        ),
         500,
     )
     assert (held == np.maximum(free, stamps(500) + round(playout_ms * 1000) * 1000)).all()
@@ -171,7 +187,7 @@ def test_play_out_holds_every_sample_at_least_so_long(playout_ms: float) -> None
 
 def test_a_model_holds_from_its_first_stamp_on() -> None:
     models = [
-        ConstantDelay(delay_ms=d).core(n)
+        ConstantDelay(delay_ms=d).to_core_model(n)
         for d, n in ((5, 0), (9, 3_000_001), (2, 7_000_000), (1, 7_000_000))
     ]
     delays = due(channel(models), 10) - stamps(10)
@@ -180,9 +196,14 @@ def test_a_model_holds_from_its_first_stamp_on() -> None:
 
 def test_delay_without_memory_does_not_notice_that_loss_changed() -> None:
     keys = {"delay_ms": 80.0, "deviation_ms": 20.0}
-    whole = due(channel([GammaDelay(**keys).core()]), 2000)
+    whole = due(channel([GammaDelay(**keys).to_core_model()]), 2000)
     changed = due(
-        channel([GammaDelay(**keys).core(), GammaDelay(**keys, loss=0.2).core(500 * 10**6)]),
+        channel(
+            [
+                GammaDelay(**keys).to_core_model(),
+                GammaDelay(**keys, loss=0.2).to_core_model(500 * 10**6),
+            ]
+        ),
         2000,
     )
     assert (changed[:500] == whole[:500]).all()

@@ -270,7 +270,7 @@ def test_a_trace_gives_the_delay_of_its_last_point(
 def test_a_trace_may_lose_samples() -> None:
     link = TraceDelay(trace=format_trace([(0.0, 5.0), (0.003, math.inf), (0.005, 6.0)]))
     points = parse_trace(link.trace)
-    made = due(channel([link.core()._replace(trace_count=3)], points=points), 8)
+    made = due(channel([link.to_core_model()._replace(trace_count=3)], points=points), 8)
     assert made.tolist() == [
         5_000_000,
         6_000_000,

@@ -97,4 +97,4 @@ def test_stated_energies_are_those_of_the_equations() -> None:
     peaks = np.sqrt(2.0 * mobility * (bounds.kinetic_j + bounds.blend_j))
     assert bounds.peak_rad_s == pytest.approx(peaks)
     gravity_nm = 9.81 * 3.0
-    assert bounds.bearable == pytest.approx(np.sqrt((200.0 - gravity_nm) / 3.0) / 7.5)
+    assert bounds.bearable_share == pytest.approx(np.sqrt((200.0 - gravity_nm) / 3.0) / 7.5)

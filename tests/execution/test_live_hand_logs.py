@@ -30,7 +30,7 @@ class CirclingHand:
         self._arm, spec = scenario.arms[site], scenario.sites[site]
         live = spec.find_live_hand()
         assert live is not None
-        self._mode, self._rules = live.mode, live.rules(spec.rate_hz, self._arm)
+        self._mode, self._rules = live.mode, live.make_rules(spec.rate_hz, self._arm)
         self._memory = HandMemory()
 
     def __call__(self, site: Site, k: int) -> list[float]:

@@ -38,7 +38,7 @@ def test_whatever_loads_has_moments_words_and_fates(keys: dict[str, Any]) -> Non
         assert 0.0 <= deviation_ms < math.inf
     assert made.describe()
     points = made.points
-    model = made.core()._replace(trace_count=0 if points is None else len(points))
+    model = made.to_core_model()._replace(trace_count=0 if points is None else len(points))
     fates: Ints = due(channel([model], points=points), 50)
     kept = fates[fates != LOST]
     assert (kept >= 0).all()
@@ -48,7 +48,7 @@ def test_whatever_loads_has_moments_words_and_fates(keys: dict[str, Any]) -> Non
 def test_the_chain_of_losses_is_one(keys: dict[str, Any]) -> None:
     """Probabilities, and the stationary loss that the author wrote."""
     made = link(keys)
-    model = made.core()
+    model = made.to_core_model()
     assert all(
         0.0 <= p <= 1.0 + 1e-12
         for p in (model.loss_good, model.loss_bad, model.enter, model.leave)
@@ -227,8 +227,8 @@ def test_extreme_numbers_are_refused_or_have_moments(
         return
     if made.find_problem() is None:
         assert all(math.isfinite(number) and number >= 0 for number in made.moments())
-        assert made.core().kind in set(DelayKind)
-        assert due(channel([made.core()]), 3).min() >= 0
+        assert made.to_core_model().kind in set(DelayKind)
+        assert due(channel([made.to_core_model()]), 3).min() >= 0
 
 
 def test_a_trace_may_reach_the_limit_whatever_its_deviation() -> None:

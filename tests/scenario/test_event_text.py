@@ -6,7 +6,7 @@ from typing import Any, get_args
 import pytest
 
 from trilat_net.scenario.event_text import describe_event
-from trilat_net.scenario.run_changes import describe_change, find_orderer
+from trilat_net.scenario.run_changes import describe_change, find_requester
 from trilat_net.scenario.scenario_types import Change, SiteOrder
 
 CHANGES = {
@@ -58,9 +58,9 @@ def test_every_order_is_a_sentence(order: str) -> None:
 def test_who_ordered_a_stop_is_found_again() -> None:
     change = Change(at_s=58.2, site="m2", order="stop")
     for who in ("the experimenter", "the user of m1", "a watcher at a terminal"):
-        assert find_orderer(describe_change(change, who)) == who
-    assert find_orderer(describe_change(change)) == ""
-    assert find_orderer("m2 follows its peers from t = 1.000 s") == ""
+        assert find_requester(describe_change(change, who)) == who
+    assert find_requester(describe_change(change)) == ""
+    assert find_requester("m2 follows its peers from t = 1.000 s") == ""
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ def with_expect(**keys: Any) -> Expect:
 
 
 def test_without_keys_nothing_is_asked_and_a_tolerance_asks_nothing() -> None:
-    assert not Expect().asks
-    assert not Expect(synchronised_rad=0.5, end_pose_within_rad=0.5).asks
+    assert not Expect().has_expectations
+    assert not Expect(synchronised_rad=0.5, end_pose_within_rad=0.5).has_expectations
 
 
 @pytest.mark.parametrize(
@@ -32,7 +32,7 @@ def test_without_keys_nothing_is_asked_and_a_tolerance_asks_nothing() -> None:
     ids=str,
 )
 def test_every_other_key_asks_something_whatever_its_value(keys: dict[str, Any]) -> None:
-    assert Expect(**keys).asks
+    assert Expect(**keys).has_expectations
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ def test_template_names_every_key_with_value_that_is_valid() -> None:
     window = ["from_s", "to_s", "site", *window_quantities(2)]
     assert set(named[: -len(window)]) | {"windows"} == set(Expect.__struct_fields__)
     assert named[-len(window) :] == window
-    assert [key for key, _ in written.windows[0].asked] == window[3:]
+    assert [key for key, _ in written.windows[0].limits] == window[3:]
 
 
 def test_window_has_quantities_of_as_many_joints_as_arm() -> None:
@@ -143,7 +143,7 @@ def test_window_has_quantities_of_as_many_joints_as_arm() -> None:
         "q6_rad": [0.0, 1.0],
         "push5_mean_nm": [0.0, 1.0],
     }
-    asked = six(**{"expect.windows": [window]}).expect.windows[0].asked
+    asked = six(**{"expect.windows": [window]}).expect.windows[0].limits
     assert dict(asked) == {"q6_rad": (0.0, 1.0), "push5_mean_nm": (0.0, 1.0)}
     with pytest.raises(
         ScenarioError, match=r"windows\[0\].q7_rad: there is no such joint: .* has 6"

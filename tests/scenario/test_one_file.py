@@ -28,7 +28,7 @@ from trilat_net.scenario.operators import OwnActor
 class Tremor(OwnActor, frozen=True, kw_only=True, tag="tremor"):
     \"\"\"A hand that holds the joints where they start, and trembles.\"\"\"
 
-    words = {"turn_rad_s": "a frequency, rad/s"}
+    value_texts = {"turn_rad_s": "a frequency, rad/s"}
     stiffness_nm_rad: fields.NotNegativeJoints
     turn_rad_s: fields.Positive
 
@@ -160,7 +160,9 @@ def test_a_compliant_body_dissipates_whatever_its_depth(
 def test_paths_of_a_low_orbit_stay_for_their_slot() -> None:
     model = LowOrbit(floor_ms=20.0, path_ms=50.0, jitter_ms=0.0, slot_s=0.1)
     fates = due(
-        channel([model.core()._replace(trace_count=len(model.points))], points=model.points),
+        channel(
+            [model.to_core_model()._replace(trace_count=len(model.points))], points=model.points
+        ),
         1000,
     )
     delays = fates - np.arange(1000) * 1_000_000

@@ -9,7 +9,7 @@ import trilat_net as tn
 from trilat_net.core.philox import link_key
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import load_scenario
-from trilat_net.scenario.sample_uses import PictureDelay, draw_uses
+from trilat_net.scenario.sample_uses import PictureDelay, draw_used_samples
 
 MODELS = {
     "constant": {"delay_ms": 130.0},
@@ -42,21 +42,21 @@ def test_a_picture_is_delayed_as_a_link_is(view: dict[str, Any], peer_hz: int) -
     scenario = load_scenario("paper", {"sites.m1.view": view, "sites.s.rate_hz": peer_hz})
     picture, model = PictureDelay(scenario, "m1"), scenario.sites["m1"].view
     assert model is not None
-    used = draw_uses(model, link_key(scenario.seed, "view s->m1"), 1000, peer_hz, 2.0)
-    assert [picture.at(tick, {})["s"] for tick in range(2000)] == used.tolist()
+    used = draw_used_samples(model, link_key(scenario.seed, "view s->m1"), 1000, peer_hz, 2.0)
+    assert [picture.advance_to(tick, {})["s"] for tick in range(2000)] == used.tolist()
 
 
 def test_who_looks_late_is_shown_the_same() -> None:
     scenario = load_scenario("paper", {"sites.m1.view": MODELS["lossy gamma"], "rate_hz": 50})
     from_first, late = (PictureDelay(scenario, "m1") for _ in range(2))
-    shown = [from_first.at(tick, {}) for tick in range(3000)]
-    assert [late.at(tick, {}) for tick in range(2800, 3000)] == shown[2800:]
+    shown = [from_first.advance_to(tick, {}) for tick in range(3000)]
+    assert [late.advance_to(tick, {}) for tick in range(2800, 3000)] == shown[2800:]
 
 
 def test_nothing_is_shown_of_an_outage() -> None:
     view = {"delay_ms": 100.0, "outages_s": [[0.5, 1.0]]}
     picture = PictureDelay(load_scenario("paper", {"sites.m1.view": view}), "m1")
-    shown = np.array([picture.at(tick, {})["s"] for tick in range(1500)])
+    shown = np.array([picture.advance_to(tick, {})["s"] for tick in range(1500)])
     assert shown[[599, 600, 1099, 1100]].tolist() == [499, 499, 499, 1000]
 
 

@@ -12,7 +12,7 @@ from tests.theory.loops import Array
 from tests.theory.tick_recursion import build_recursion
 from trilat_net.execution.fused import FusedRun
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.scenario.sample_uses import draw_uses
+from trilat_net.scenario.sample_uses import draw_used_samples
 from trilat_net.theory import find_equilibrium, floquet
 from trilat_net.theory.characteristic_roots import Spectrum
 from trilat_net.theory.floquet import (
@@ -244,7 +244,9 @@ def test_the_period_is_that_of_the_draws(period_s: float) -> None:
     assert uses.period_s is not None
     for (i, j), (link, key) in conditions.links.items():
         own_hz, peer_hz = (conditions.sites[n].rate_hz for n in (i, j))
-        drawn = draw_uses(link, key, own_hz, peer_hz, 3.0 + 2.0 * uses.period_s)[3 * own_hz :]
+        drawn = draw_used_samples(link, key, own_hz, peer_hz, 3.0 + 2.0 * uses.period_s)[
+            3 * own_hz :
+        ]
         later = drawn[round(uses.period_s * own_hz) :] - round(uses.period_s * peer_hz)
         assert np.mean(drawn[: len(later)] != later) <= (0.0 if period_s == SINE_S else 0.05)
 

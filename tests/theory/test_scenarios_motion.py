@@ -239,7 +239,7 @@ A wall's force at a time is its mean over 0.2 or 0.4 s about it; with a force th
 def test_limits_of_window_are_figure_within_its_bar(
     name: str, key: str, window: tuple[float, float], figure: float, digit: float
 ) -> None:
-    asked = {(w.from_s, w.to_s): dict(w.asked) for w in load_scenario(name).expect.windows}
+    asked = {(w.from_s, w.to_s): dict(w.limits) for w in load_scenario(name).expect.windows}
     least, most = asked[window][key]
     bar = max(digit, 0.02 * abs(figure))
     assert figure - bar <= least + 1e-12

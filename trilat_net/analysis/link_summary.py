@@ -311,7 +311,7 @@ class LinkSummary(NamedTuple):
 def has_one_constant_delay(states: list[StatedModel]) -> bool:
     """True if the models of a link give every sample one and the same delay, and lose none."""
     (_, link), *later = states
-    exact = link.core().kind == DelayKind.CONSTANT and not (
+    exact = link.to_core_model().kind == DelayKind.CONSTANT and not (
         link.loss or link.duplicate or link.outages_s
     )
     return exact and not later

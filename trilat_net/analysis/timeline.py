@@ -21,7 +21,7 @@ from ..net.messages import MODES, ModeMeaning
 from ..scenario import find_owner
 from ..scenario.delay_models import LinkBase
 from ..scenario.event_text import describe_event
-from ..scenario.run_changes import describe_change, find_orderer
+from ..scenario.run_changes import describe_change, find_requester
 from ..scenario.scenario_types import Change
 
 
@@ -171,7 +171,7 @@ def list_alarms(log: Log) -> list[RaisedAlarm]:
     ordered it.
     """
     orderers = {
-        (one.site, one.taken_at_tick): find_orderer(one.sentence) for one in list_changes(log)
+        (one.site, one.taken_at_tick): find_requester(one.sentence) for one in list_changes(log)
     }
     found = []
     for site in log.sites:

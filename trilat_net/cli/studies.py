@@ -113,7 +113,9 @@ def _batch(
     from ..scenario import list_shipped, load_scenario
     from ..studies.trials import trials
 
-    chosen = sources or [name for name in list_shipped() if load_scenario(name).expect.asks]
+    chosen = sources or [
+        name for name in list_shipped() if load_scenario(name).expect.has_expectations
+    ]
     return [
         trial
         for source in dict.fromkeys(chosen)

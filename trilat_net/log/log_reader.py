@@ -501,7 +501,7 @@ class Log(Result, Mapping[str, SiteLog]):
         view by then.
         """
         part = self[site]
-        every = PictureDelay(self.scenario, site).list_all(part.last_tick + 1)
+        every = PictureDelay(self.scenario, site).list_shown_samples(part.last_tick + 1)
         shown = {
             peer: np.minimum(ticks[part.tick], self[peer].last_tick)
             for peer, ticks in every.items()

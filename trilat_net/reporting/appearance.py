@@ -19,7 +19,7 @@ DARK_SITE_COLOURS = ("#79b0f2", "#f08a9b", "#e9bd4c", "#f2f2f2", "#9bd3f5", "#a3
 
 def list_site_colours(scenario: Scenario, colours: Sequence[str] = SITE_COLOURS) -> list[str]:
     """Returns the colours of a palette in the order of a scenario's sites."""
-    return [colours[place] for place in scenario.order_palette(len(SITE_COLOURS))]
+    return [colours[place] for place in scenario.assign_colours(len(SITE_COLOURS))]
 
 
 COLUMN_IN = 3.5

@@ -267,7 +267,7 @@ class ArmModel(NamedTuple):
         place_joints(rows, np.asarray(q, dtype=np.float64))
         return rows
 
-    def end_turn(self, q: Vector) -> tuple[float, float, float]:
+    def end_effector_orientation(self, q: Vector) -> tuple[float, float, float]:
         """Returns the end effector's orientation in a pose as a rotation vector, rad."""
         if self.chain is None:
             return 0.0, 0.0, q[0] + q[1]
@@ -329,7 +329,7 @@ class ArmModel(NamedTuple):
         place = np.array(self.end_effector(q)) * self.chain.task.scale
         if self.counts.shared == len(place):
             return tuple(place.tolist())
-        return (*place.tolist(), *self.end_turn(q))
+        return (*place.tolist(), *self.end_effector_orientation(q))
 
     def task_jacobian(self, q: Vector) -> Array:
         """Returns the Jacobian of what a site in task space shares, in a pose, shape (m, n),

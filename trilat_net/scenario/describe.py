@@ -23,7 +23,7 @@ from ..laws.interface import LawSettings
 from .arms import TASK_AXES, Arm, read_arm
 from .delay_models import LinkBase
 from .rest_bounds import find_rest_bounds
-from .sample_uses import count_silences, draw_uses
+from .sample_uses import count_silences, draw_used_samples
 from .scenario_reader import load_scenario
 from .scenario_types import Scenario
 
@@ -54,7 +54,7 @@ def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]
     delay_s = np.zeros((len(names), len(names)))
     for name, link in links.items():
         peer, _, site = name.partition("->")
-        model = link.core()
+        model = link.to_core_model()
         rate_hz = rates_hz[site]
         constant = model.kind == DelayKind.CONSTANT and not link.loss and not link.measured
         delay_us = max(round(model.location), model.playout_us)
@@ -289,7 +289,7 @@ def _describe_silences(scenario: Scenario) -> list[str]:
                 continue
             key = link_key(scenario.seed, f"{peer}->{name}")
             rates_hz = spec.rate_hz, scenario.sites[peer].rate_hz
-            used = draw_uses(link, key, *rates_hz, scenario.duration_s)
+            used = draw_used_samples(link, key, *rates_hz, scenario.duration_s)
             count = count_silences(used, spec.rate_hz, spec.on_stale.rule.age_ns)
             if not count:
                 continue
@@ -325,8 +325,8 @@ def _describe_stops(scenario: Scenario) -> list[str]:
             continue
         text = f"come to rest within {bounds.rest_s:.3g} s of a stop at {speed}"
         lines.setdefault(text, []).append(name)
-        if bounds.bearable < 1.0:
-            most = bounds.bearable * np.max(qd)
+        if bounds.bearable_share < 1.0:
+            most = bounds.bearable_share * np.max(qd)
             text = (
                 f"can be faster than their motors bear: beyond {most:.3g} rad/s a joint may speed up to "
                 f"{np.max(bounds.peak_rad_s):.3g} rad/s while they brake from {speed}"

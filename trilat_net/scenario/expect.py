@@ -87,7 +87,7 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
     wall_hits: LeastMost | None = None
 
     @property
-    def asked(self) -> Iterator[tuple[str, tuple[float, ...]]]:
+    def limits(self) -> Iterator[tuple[str, tuple[float, ...]]]:
         """Yields each quantity with a limit, and its least and most."""
         for key in _QUANTITIES:
             if (limits := getattr(self, key)) is not None:
@@ -157,7 +157,7 @@ def find_window_problem(window: ExpectWindow, sites: Mapping[str, int]) -> KeyPr
             "site",
             f"no site {window.site!r}{suggest_nearest(window.site, list(sites))}; {names}",
         )
-    limits = dict(window.asked)
+    limits = dict(window.limits)
     if not limits:
         valid = window_quantities(max(sites.values()))
         return KeyProblem("", f"asks nothing; it may ask {', '.join(valid)}")
@@ -237,7 +237,7 @@ class Expect(
     metrics: dict[str, LeastMost] = {}
 
     @property
-    def asks(self) -> bool:
+    def has_expectations(self) -> bool:
         """True if at least one key states an expectation; a tolerance alone does not."""
         tolerances = {"synchronised_rad": 0.01, "end_pose_within_rad": 0.01}
         return msgspec.structs.replace(self, **tolerances) != Expect()

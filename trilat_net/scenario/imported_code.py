@@ -39,7 +39,7 @@ Watch = Callable[[int, Callable[[], Any]], Any]
 """Calls code of a user's own at a tick, and returns what it gives."""
 
 
-def call_plainly(_k: int, call: Callable[[], Any]) -> Any:
+def call_directly(_k: int, call: Callable[[], Any]) -> Any:
     """Calls it, as in virtual time, where nobody waits."""
     return call()
 

@@ -22,7 +22,7 @@ from ..core.vectors import Array
 from ..errors import PlantFailed, ScenarioError, count_nouns
 from ..fields import Frozen, is_number
 from ..laws.interface import make_instance
-from .imported_code import CLASS_PATTERN, CodeKey, Watch, call_plainly, import_class, read_code
+from .imported_code import CLASS_PATTERN, CodeKey, Watch, call_directly, import_class, read_code
 
 if TYPE_CHECKING:
     from .scenario_types import Scenario
@@ -153,7 +153,7 @@ class PlantPlayer:
     """
 
     def __init__(
-        self, scenario: "Scenario", site: str, plant: OwnPlant, watch: Watch = call_plainly
+        self, scenario: "Scenario", site: str, plant: OwnPlant, watch: Watch = call_directly
     ) -> None:
         spec = scenario.sites[site]
         path = f"sites.{site}.plant"

@@ -40,14 +40,14 @@ class RestBounds(NamedTuple):
 
     Attributes:
         rest_s: the time within which the arm is at rest; inf: its motors cannot hold it.
-        bearable: the share of the speed up to which motors hold what joints do to each other.
+        bearable_share: the share of the speed up to which motors hold what joints do to each other.
         kinetic_j: the largest kinetic energy at that speed, J.
         blend_j: the most energy that last torques add.
         peak_rad_s: the largest speed that energy allows each joint, shape (n,).
     """
 
     rest_s: float
-    bearable: float
+    bearable_share: float
     kinetic_j: float
     blend_j: float
     peak_rad_s: Array
@@ -98,7 +98,7 @@ def find_rest_bounds(scenario: Scenario, site: str, qd: Array | None = None) -> 
         rest_s=_bound_rest_time(
             setup=setup, speed=speed, limit=limit, arm=arm, energy_j=kinetic_j + blend_j
         ),
-        bearable=math.sqrt(float(shares.min())),  # (7)
+        bearable_share=math.sqrt(float(shares.min())),  # (7)
         kinetic_j=kinetic_j,
         blend_j=blend_j,
         peak_rad_s=np.sqrt(2.0 * mobility * (kinetic_j + blend_j)),  # (6)

@@ -29,7 +29,7 @@ class LinkTables(dict[str, dict[str, Any]]):
         super().__init__({name: msgspec.to_builtins(link) for name, link in links.items()})
         self._planned = deque(change for change in timeline if change.link)
 
-    def advance(self, to_ns: int) -> None:
+    def advance_to(self, to_ns: int) -> None:
         """Makes the changes that the timeline has up to a time, ns since the epoch."""
         while self._planned and self._planned[0].start_ns <= to_ns:
             change = self._planned.popleft()
@@ -125,7 +125,7 @@ def describe_change(change: Change, ordered_by: str = "") -> str:
     return f"the shares of {change.dominance} were set to {shares or 'nobody'}{within}{by}, from {at} on"
 
 
-def find_orderer(sentence: str) -> str:
+def find_requester(sentence: str) -> str:
     """Returns who ordered a stop, by the sentence of `describe_change`; "" if it does not say."""
     stopped = re.fullmatch(r"\S+ was stopped by (.+) at [\d.]+ s", sentence)
     return "" if stopped is None else stopped[1]
@@ -154,7 +154,7 @@ def to_core_change(scenario: Scenario, change: Change) -> CoreChange:
             text, ramp=scenario.ramp(site, change.to, change.start_ns, change.ramp_s)
         )
     peer = scenario.peers(site).index(change.link.partition("->")[0])
-    return CoreChange(text, peer=peer, model=change.after.core(change.start_ns))
+    return CoreChange(text, peer=peer, model=change.after.to_core_model(change.start_ns))
 
 
 def parse_core_change(scenario: Scenario, site: str, text: str) -> CoreChange:

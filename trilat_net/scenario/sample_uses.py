@@ -93,7 +93,7 @@ def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
 
 
 @lru_cache(maxsize=256)
-def draw_uses(
+def draw_used_samples(
     link: LinkBase, key: int, own_hz: int, peer_hz: int, duration_s: float
 ) -> IntArray:
     """Returns the sample in use at every tick of a site with nothing but this link, -1 before
@@ -105,7 +105,7 @@ def draw_uses(
         rate_hz=peer_hz,
         q0=(),
         key=key,
-        models=(link.core(),),
+        models=(link.to_core_model(),),
         traces=(link.points,),
     )
     released = LinkSchedule(setup).draw_releases(round(duration_s * peer_hz), own_hz)
@@ -151,7 +151,7 @@ class PictureDelay:
                 rate_hz=rate_hz,
                 q0=(),
                 key=key,
-                models=(view.core(),),
+                models=(view.to_core_model(),),
                 traces=(view.points,),
                 outages=outages,
             )
@@ -159,7 +159,7 @@ class PictureDelay:
         self._waiting = {peer: np.empty((2, 0), dtype=np.int64) for peer in self._links}
         self._shown = dict.fromkeys(self._links, -1)
 
-    def at(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
+    def advance_to(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
         """Returns the peers' ticks that are shown at a tick of the site, -1 before the first.
 
         Args:
@@ -172,7 +172,7 @@ class PictureDelay:
             self._shown[peer] = max([self._shown[peer], *sample[release <= tick][-1:].tolist()])
         return {**used, **self._shown}
 
-    def list_all(self, ticks: int) -> dict[str, IntArray]:
+    def list_shown_samples(self, ticks: int) -> dict[str, IntArray]:
         """Returns the same for the first ticks of a run, shape (K,) each; {} without a view."""
         return {peer: _find_newest(*drawn, ticks) for peer, drawn in self._draw(ticks - 1)}
 

@@ -109,7 +109,7 @@ def load_scenario(
             raise ScenarioError(error.problem, path=error.path, source=source.name) from None
     found = read_experiment(source)
     in_file = not isinstance(source, Mapping) and "\n" not in str(source)
-    called = found.called if in_file else "scenario"
+    called = found.label if in_file else "scenario"
     return allow_own_code(parse_scenario(found.text, called, overrides, found.folder))
 
 
@@ -117,12 +117,12 @@ class ExperimentText(NamedTuple):
     """An experiment as its author wrote it.
 
     Attributes:
-        called: what a command calls it: a shipped name or a path; of one that is in no file the
+        label: what a command calls it: a shipped name or a path; of one that is in no file the
             path at which a command would look for it.
         folder: of the files that it names; None: it is resolved, and names none.
     """
 
-    called: str
+    label: str
     text: str
     folder: Path | None
 
@@ -133,8 +133,8 @@ class ExperimentText(NamedTuple):
             ScenarioError: it is not valid with them.
         """
         if self.folder is None:
-            return load_scenario(parse_scenario(self.text, self.called, folder=None), overrides)
-        return allow_own_code(parse_scenario(self.text, self.called, overrides, self.folder))
+            return load_scenario(parse_scenario(self.text, self.label, folder=None), overrides)
+        return allow_own_code(parse_scenario(self.text, self.label, overrides, self.folder))
 
 
 def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> ExperimentText:

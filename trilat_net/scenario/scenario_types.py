@@ -389,7 +389,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         """The hash of the canonical text, which names the experiment."""
         return hashlib.sha256(self.text.encode()).hexdigest()
 
-    def order_palette(self, colours: int) -> list[int]:
+    def assign_colours(self, colours: int) -> list[int]:
         """Returns the places of a palette in the order of the sites; sites beyond them begin
         anew.
         """
@@ -590,7 +590,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             rate_hz=self.sites[peer].rate_hz,
             q0=self.arms[peer].shared_pose(self.sites[peer].q0_rad),
             key=link_key(self.seed, name),
-            models=tuple(link.core(from_ns) for from_ns, link in models),
+            models=tuple(link.to_core_model(from_ns) for from_ns, link in models),
             traces=tuple(link.points for _, link in models),
             outages=tuple((round(a * 1e9), round(b * 1e9)) for a, b in first.outages_s),
             channel=self.channel(peer),

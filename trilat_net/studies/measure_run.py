@@ -631,7 +631,7 @@ def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[Expectation
 
 def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
     for window, ranges in zip(expect.windows, metrics.windows, strict=True):
-        for key, limits in window.asked:
+        for key, limits in window.limits:
             site = f" {window.site}" if window.site else ""
             name = (
                 f"{key}{site} {window.from_s:g}-{window.to_s:g} s"  # as in wall_mean_n s 9-15 s

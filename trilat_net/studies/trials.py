@@ -166,7 +166,7 @@ def trials(
         ScenarioError: the scenario or an override is not valid, or there is no [expect] in it.
     """
     scenario = load_scenario(source, set)
-    called = read_experiment(source).called
+    called = read_experiment(source).label
     _check_expectations_reachable(scenario, called)
     if not live:
         virtual.check_virtual(scenario)
@@ -185,7 +185,7 @@ def trials(
 def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
     expect = scenario.expect
     end_s = scenario.duration_s
-    if not expect.asks:
+    if not expect.has_expectations:
         raise ScenarioError(
             "nothing is expected of it: add a table [expect] with keys such as stable = true or "
             "synchronised_by_s = 12.0; the template of `trilat scenario new` lists them all",

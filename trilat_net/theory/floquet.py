@@ -40,7 +40,7 @@ from scipy.linalg import block_diag, expm
 from ..core.delay import DelayKind, TraceEnd
 from ..core.site_setup import Law, Scheme, SiteSetup
 from ..core.vectors import Array, IntArray
-from ..scenario.sample_uses import draw_uses
+from ..scenario.sample_uses import draw_used_samples
 from .characteristic_roots import (
     NAMED_SHARE,
     ZERO_SHARE,
@@ -234,7 +234,7 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
     spans_s = np.arange(1, round(MAX_PERIOD_S * common_hz) + 1) / common_hz
     slips = np.zeros(len(spans_s))  # by which share of a tick the delays have not repeated
     for link in links:
-        model = link.core()
+        model = link.to_core_model()
         points = link.points
         cycle_s = 0.0
         if points is not None and model.kind == DelayKind.TRACE and len(points) > 1:
@@ -246,7 +246,7 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
             slips = np.maximum(slips, off_s * max(rates_hz))
     place = int(np.argmax(slips <= max(_SLIP, float(slips.min()))))
     drawn = any(link.random for link in links)
-    kinds = [(model.kind, model.at_end) for model in (link.core() for link in links)]
+    kinds = [(model.kind, model.at_end) for model in (link.to_core_model() for link in links)]
     ends = (DelayKind.TRACE, TraceEnd.HOLD) in kinds
     period_s = None if drawn or ends or slips[place] > 0.5 else float(spans_s[place])
     span_s = math.ceil((DRAWN_SPAN_S if drawn else MAX_PERIOD_S) * common_hz) / common_hz
@@ -264,7 +264,7 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
             (ticks / rates_hz[i] - conditions.age_s[i, j]) * rates_hz[j]
         ).astype(np.int64)
         if conditions.varying:
-            whole = draw_uses(
+            whole = draw_used_samples(
                 *conditions.links[i, j], rates_hz[i], rates_hz[j], start_s + span_s
             )
             used[i, j] = np.maximum(whole[first + ticks], 0) - round(start_s * rates_hz[j])

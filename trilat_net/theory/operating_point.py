@@ -27,7 +27,7 @@ from ..laws.conditions import LinearForm, LinearSituation
 from ..scenario import Scenario
 from ..scenario.delay_models import LinkBase
 from ..scenario.imported_code import ImportedLaw
-from ..scenario.sample_uses import draw_uses
+from ..scenario.sample_uses import draw_used_samples
 from ..scenario.scenario_types import scheduled_links
 from ..scenario.validate import refuse_external_arms
 from .numeric_law import NumericLaw
@@ -201,7 +201,9 @@ def derive_operating_conditions(
 
 def is_constant_link(link: LinkBase) -> bool:
     """True if a link delays every sample alike."""
-    return link.core().kind == DelayKind.CONSTANT and not link.loss and not link.measured
+    return (
+        link.to_core_model().kind == DelayKind.CONSTANT and not link.loss and not link.measured
+    )
 
 
 def _make_own_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetup:
@@ -269,7 +271,7 @@ def compute_effective_delay(
     """
     own_hz = scenario.sites[site].rate_hz
     peer_hz = scenario.sites[peer].rate_hz
-    model = link.core()
+    model = link.to_core_model()
     constant = is_constant_link(link)
     if constant and own_hz == peer_hz:
         delay_us = max(round(model.location), model.playout_us)
@@ -280,7 +282,7 @@ def compute_effective_delay(
         if constant
         else scenario.duration_s
     )
-    used = draw_uses(
+    used = draw_used_samples(
         link=link,
         key=link_key(scenario.seed, f"{peer}->{site}"),
         own_hz=own_hz,

@@ -54,7 +54,7 @@ def test_command_of_cell_makes_its_numbers_bit_for_bit(
 def test_where_the_scenario_has_changed_the_rows_own_is_named(
     results: SweepResults, tmp_path: Path
 ) -> None:
-    source = Path(results.plan.written.called)
+    source = Path(results.plan.written.label)
     row = results.rows[-1]
     source.write_text(SHORT.replace("0.3, -0.2", "0.3, -0.3"))
     try:

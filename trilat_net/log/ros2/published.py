@@ -192,7 +192,7 @@ class SiteMessages:
         """
         if len(pose) == POSE:
             return pose[PLACE], pose[PLACE + 1], pose[PLACE + 2]
-        return self._arm.end_turn(record.q)
+        return self._arm.end_effector_orientation(record.q)
 
     def _pack_arrays(
         self, record: State, wanted: Callable[[str], bool]

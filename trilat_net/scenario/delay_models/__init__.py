@@ -119,7 +119,7 @@ class LinkBase(Frozen, frozen=True, tag_field="model", omit_defaults=True):
         """The points of its trace, if it has one."""
         return None
 
-    def core(self, from_ns: int = 0) -> LinkModel:
+    def to_core_model(self, from_ns: int = 0) -> LinkModel:
         """Returns the core's model of the link, which applies from the stamp `from_ns` on, ns."""
         good, bad, enter, leave = self._loss_chain()
         return self._delay()._replace(
@@ -222,11 +222,13 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
     def _delay(self) -> LinkModel:
         return LinkModel(kind=DelayKind.OWN, location=1e3 * self._reach_ms())
 
-    def core(self, from_ns: int = 0) -> LinkModel:
+    def to_core_model(self, from_ns: int = 0) -> LinkModel:
         """Returns the core's model, as of any link, with the address of `draw`, which is
         compiled here.
         """
-        return super().core(from_ns)._replace(call=plug(self, "draw", LINK_MODEL_DTYPE))
+        return (
+            super().to_core_model(from_ns)._replace(call=plug(self, "draw", LINK_MODEL_DTYPE))
+        )
 
 
 DELAY_MODELS = {

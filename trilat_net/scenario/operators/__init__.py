@@ -41,7 +41,7 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
     group: ClassVar[str] = "hands"
     """The list of a site in which it stands: hands or environment."""
-    words: ClassVar[Mapping[str, str]] = {}
+    value_texts: ClassVar[Mapping[str, str]] = {}
     """The values that its own keys take, in words; of those in `WORDS` nothing need be said."""
 
     def _source(self) -> TorqueSource:
@@ -220,7 +220,7 @@ def _check_values(
     words = {name: both[counts != fields.VectorCounts()] for name, both in IN_WORDS.items()}
 
     def describe_values(key: str) -> str:
-        return (kind.words.get(key) or WORDS[key]).format(**words)
+        return (kind.value_texts.get(key) or WORDS[key]).format(**words)
 
     try:
         msgspec.convert(table, kind)

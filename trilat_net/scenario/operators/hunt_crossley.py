@@ -29,7 +29,7 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
 
     group: ClassVar[str] = "environment"
     at_tip: ClassVar[bool] = True
-    words: ClassVar[Mapping[str, str]] = {
+    value_texts: ClassVar[Mapping[str, str]] = {
         "stiffness_n_m15": "a number of at least 0, N/m^1.5",
         "damping_s_m": "a number of at least 0, s/m",
     }

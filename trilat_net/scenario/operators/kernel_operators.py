@@ -144,7 +144,7 @@ class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
     """
 
     at_tip: ClassVar[bool] = True
-    words: ClassVar[Mapping[str, str]] = _AXES_WORDS
+    value_texts: ClassVar[Mapping[str, str]] = _AXES_WORDS
 
     to_m: fields.Point
     from_m: fields.Point
@@ -289,7 +289,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
             reality).
     """
 
-    words: ClassVar[Mapping[str, str]] = {
+    value_texts: ClassVar[Mapping[str, str]] = {
         **_AXES_WORDS,
         "device": "a table of " + ", ".join(fields.field_names(DeviceSettings)),
     }
@@ -336,7 +336,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
                 )
                 raise ScenarioError(f"must be {words}, is {frame}", path=f"{path}.device.frame")
 
-    def rules(
+    def make_rules(
         self, rate_hz: int, arm: ArmModel, limits: MotionLimits | None = None
     ) -> HandRules:
         """Returns what somebody who holds an arm may do; `limits`: of the motion of its site."""
@@ -430,7 +430,7 @@ class Wall(SampledActor, frozen=True, tag="wall"):
     """
 
     group: ClassVar[str] = "environment"
-    words: ClassVar[Mapping[str, str]] = {
+    value_texts: ClassVar[Mapping[str, str]] = {
         "stiffness_n_m": "a number of at least 0, N/m",
         "damping_n_s_m": "a number of at least 0, N s/m",
     }

@@ -18,7 +18,14 @@ from ...core.site_step import Site
 from ...core.ticks import NS_PER_S, tick_ns
 from ...core.vectors import Array
 from ...laws.interface import make_instance
-from ..imported_code import CLASS_PATTERN, CodeKey, Watch, call_plainly, import_class, read_code
+from ..imported_code import (
+    CLASS_PATTERN,
+    CodeKey,
+    Watch,
+    call_directly,
+    import_class,
+    read_code,
+)
 from ..operators import Holding
 from .kernel_operators import LiveHand
 
@@ -51,8 +58,8 @@ class ProgramHand(
 
     is_open: ClassVar[bool] = False
     method: ClassVar[str] = "act"
-    words: ClassVar[Mapping[str, str]] = {
-        **LiveHand.words,
+    value_texts: ClassVar[Mapping[str, str]] = {
+        **LiveHand.value_texts,
         "class": "a class, as in 'my_policy:Reach'",
         "rate_hz": "a whole number from 10 to 1000, Hz",
         "delay_ms": "a time from 0 to 1000 ms",
@@ -103,7 +110,7 @@ class HandSite(NamedTuple):
         return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
 
     @property
-    def runs_alone(self) -> bool:
+    def has_separate_process(self) -> bool:
         """True if live it runs in a process of its own."""
         return isinstance(self.spec, ProgramHand) and self.spec.process
 
@@ -117,7 +124,7 @@ class HandSite(NamedTuple):
         scenario = self.scenario
         name = self.name
         spec = self.spec
-        rules = spec.rules(scenario.sites[name].rate_hz, scenario.arms[name])
+        rules = spec.make_rules(scenario.sites[name].rate_hz, scenario.arms[name])
         limit = spec.torque_limit_nm if spec.mode == "joint" else spec.force_limit_n
         own = (self.rate_hz, self.delay_s, rules.speed_limit, limit, scenario.draw_seed(name))
         return HandContext(name, scenario.peers(name), spec.mode, rules.size, *own)
@@ -129,7 +136,7 @@ class HandSite(NamedTuple):
         place: Any = list if self.spec.mode == "joint" else arm.end_effector
         delay = math.ceil(round(self.delay_s * tick_rate_hz, 6))
         return OwnHand(
-            self.spec.rules(tick_rate_hz, arm), tick_rate_hz // self.rate_hz, delay, place
+            self.spec.make_rules(tick_rate_hz, arm), tick_rate_hz // self.rate_hz, delay, place
         )
 
 
@@ -143,7 +150,7 @@ class HandPlayer:
         news: ticks, and sentences on what it has done that no event names yet.
     """
 
-    def __init__(self, at: HandSite, program: Any, watch: Watch = call_plainly) -> None:
+    def __init__(self, at: HandSite, program: Any, watch: Watch = call_directly) -> None:
         self._program = program
         self._watch = watch
         self.failure = ""
@@ -195,7 +202,7 @@ class HandPlayer:
         return f"{self._site}: {self._code} {change} at t = {tick_ns(k, self._rate_hz) / NS_PER_S:.3f} s"
 
 
-def place_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
+def find_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
     """Returns a site with its hand of one's own, or None if it has none."""
     spec = next(
         (one for one in scenario.sites[site].hands if isinstance(one, ProgramHand)), None
@@ -213,7 +220,7 @@ def place_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
     )
 
 
-def make_program(at: HandSite) -> HandProgram:
+def make_hand_program(at: HandSite) -> HandProgram:
     """Returns the program of a hand.
 
     Raises:
@@ -235,5 +242,5 @@ def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
         CodeWithheld: a class may not run.
         ScenarioError: one cannot be made.
     """
-    placed = (place_own_hand(scenario, name) for name in scenario.names)
-    return {at.name: HandPlayer(at, make_program(at)) for at in placed if at is not None}
+    placed = (find_own_hand(scenario, name) for name in scenario.names)
+    return {at.name: HandPlayer(at, make_hand_program(at)) for at in placed if at is not None}

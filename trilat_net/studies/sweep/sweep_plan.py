@@ -299,7 +299,7 @@ class SweepPlan(NamedTuple):
     def facts(self) -> dict[str, Any]:
         """Returns all that names it, as plain values; `plan_from_json` reads them."""
         return {
-            "source": self.written.called,
+            "source": self.written.label,
             "folder": None if self.written.folder is None else str(self.written.folder),
             "overrides": list(self.overrides),
             "over": [one.asked for one in self.axes],
@@ -517,7 +517,7 @@ def _refuse_unfit(plan: SweepPlan, law: int) -> None:
                     f"{seen[scenario.sha256]} and {text} are the same experiment: nothing here follows this "
                     "key; a site or link may have one of its own, as in sites.NAME.control or links.A->B",
                     path=one.key,
-                    source=plan.written.called,
+                    source=plan.written.label,
                 )
             seen[scenario.sha256] = text
     ends = [(law,), *(sorted({0, len(one.texts) - 1}) for one in plan.axes)]
@@ -541,7 +541,7 @@ def _checked(plan: SweepPlan, places: Sequence[int]) -> Scenario:
         sweep_cell.check_sweepable(scenario)
     except ScenarioError as error:
         problem = f"with law {cell.law}: {error.problem}" if cell.law else error.problem
-        raise ScenarioError(problem, path=error.path, source=plan.written.called) from None
+        raise ScenarioError(problem, path=error.path, source=plan.written.label) from None
     return scenario
 
 
@@ -617,7 +617,7 @@ def build_sweep_command(plan: SweepPlan, *more: str) -> str:
     words += [word for key in plan.metrics for word in ("--metric", key)]
     if plan.longest_s != plan.default_longest_s:
         words += ["--longest", format_override_value(plan.longest_s)]
-    return format_command("sweep", plan.written.called, *words, *more)
+    return format_command("sweep", plan.written.label, *words, *more)
 
 
 def format_override(key: str, value: Any) -> str:

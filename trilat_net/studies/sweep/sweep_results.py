@@ -120,7 +120,7 @@ def build_sim_command(
         if text.partition("=")[0].strip() not in ("seed", "duration_s")
     ]
     run = ["--seed", str(seed), "--duration", f"{duration_s:.12g}", "-o", log]
-    return format_command("sim", plan.written.called, *set_options(others), *run)
+    return format_command("sim", plan.written.label, *set_options(others), *run)
 
 
 def reproduction_duration_s(plan: SweepPlan, outcome: CellResult) -> float:
@@ -448,7 +448,7 @@ def build_reproduce_command(
 ) -> tuple[str, str]:
     """Returns the command that repeats a row, and a note on it or ""."""
     plan = results.plan
-    source = plan.written.called
+    source = plan.written.label
     try:  # is it still what was swept?
         text, home = read_source(source)
         now = plan._replace(written=plan.written._replace(text=text, folder=home))

@@ -415,7 +415,7 @@ class TuningScenario(NamedTuple):
     @property
     def source(self) -> str:
         """What a command calls it."""
-        return self.written.called
+        return self.written.label
 
     def with_controls(self, controls: SiteControls) -> "TuningScenario":
         """Returns the same with the control of every site replaced, in as few settings as say
