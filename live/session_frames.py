@@ -177,7 +177,7 @@ class ArmFrames:
         if not self._spec.hands and np.abs(torque).max() < 1e-9 * (
             1.0 + np.abs(own.tau_x).max()
         ):
-            return np.zeros_like(split.end_effector.at)
+            return np.zeros_like(split.end_effector.position)
         return split.end_effector.find_force(torque, _LEAST_SINGULAR_VALUE)
 
     def _find_pull(self, own: AlignedRecords, split: TorqueSplit) -> list[float]:
@@ -193,7 +193,7 @@ class ArmFrames:
         return _rounded(last.find_force(torque, _LEAST_SINGULAR_VALUE)[0], 3)
 
     def _wall_force(self, own: AlignedRecords, split: TorqueSplit) -> Array:
-        total = np.zeros_like(split.end_effector.at)
+        total = np.zeros_like(split.end_effector.position)
         for wall in self._walls:
             force = wall_force(wall, own.nominal_s, split.end_effector)
             total = total + force[:, np.newaxis] * np.array(wall.b)
@@ -332,7 +332,7 @@ class SessionFrames:
         """Returns a peer at a tick; while its record is not there, as it was found last."""
         known = self._known.get((site, peer)) or self._arms[peer].at_start()
         other = self._view.sites[peer]
-        if tick != known["tick"] and other.window.knows(tick):
+        if tick != known["tick"] and other.window.has_record(tick):
             q = other.window.rows(tick, tick).q[0]
             bodies = _rounded(self._turns[site, peer].align(other.bodies.get(tick, [])))
             known = {**self._arms[peer].pose(q), "tick": tick, "bodies": bodies}

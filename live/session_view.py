@@ -229,7 +229,7 @@ class SessionView:
         without any.
         """
         complete = {name: site.complete for name, site in self.sites.items()}
-        return None if self.energy is None else self.energy.advance(complete)
+        return None if self.energy is None else self.energy.compute_next(complete)
 
     def find_shown(self, site: str, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
         """Returns the tick of each peer that a site's user is shown; see `PictureDelay.advance_to`."""
@@ -322,7 +322,7 @@ class SessionView:
         if isinstance(content, State):
             if site.record is None or content.tick > site.record.tick:
                 site.record = content
-            site.window.take(content)
+            site.window.receive(content)
             if content.bodies:
                 site.bodies[content.tick] = content.bodies
                 while len(site.bodies) > KEPT_S * site.window.rate_hz:
@@ -350,7 +350,7 @@ class SessionView:
         except ScenarioError:
             self.dropped["no change"] += 1
             return
-        self.energy.take_changes(site, [change])
+        self.energy.add_changes(site, [change])
         table = msgspec.json.decode(text)
         if "link" in table:
             self.links[table["link"]] = table["to"]

@@ -147,7 +147,7 @@ class SessionWatch:
         ):
             window = view.sites[peer].window
             seen = {"site": peer}
-            if window.knows(tick):
+            if window.has_record(tick):
                 angles = describe_angles(window.rows(tick, tick).q[0].tolist())
                 seen |= {"time": f"{tick / window.rate_hz:.3f} s", "angles": angles}
             every[peer] = dict.fromkeys(HEADS, "") | seen

@@ -218,7 +218,9 @@ def pi() -> Any:
 
 
 def lyapunov(ones: bool = False, **changes: Any) -> EnergyBalance:
-    return compute_energy_balance(runs.run("lyapunov", keys(changes)).energies, ones=ones)
+    return compute_energy_balance(
+        runs.run("lyapunov", keys(changes)).energies, paper_weights=ones
+    )
 
 
 def rise(V: Any) -> Numbers:

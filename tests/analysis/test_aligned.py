@@ -73,8 +73,8 @@ def test_a_diverged_record_is_left_out_of_a_track() -> None:
 def test_past_is_records_at_ticks_and_rest_before_them() -> None:
     track = align_records(logs.simulated("four"), common=True)["b"]
     now, before = (
-        PeerTrajectory(track).at(track.t_s),
-        PeerTrajectory(track).at(np.array([-0.5, -1e-3])),
+        PeerTrajectory(track).evaluate(track.t_s),
+        PeerTrajectory(track).evaluate(np.array([-0.5, -1e-3])),
     )
     assert np.array_equal(now.q, track.q)
     assert np.array_equal(now.qd, track.qd)
@@ -93,7 +93,7 @@ def test_between_ticks_it_is_the_cubic_through_angles_and_velocities() -> None:
     track.q[:] = np.stack([t_s**3 - t_s, 2.0 - t_s**2], axis=1)
     track.qd[:] = np.stack([3 * t_s**2 - 1.0, -2.0 * t_s], axis=1)
     at_s = np.linspace(0.0, t_s[-1], 997)
-    assert PeerTrajectory(track).at(at_s).q == pytest.approx(
+    assert PeerTrajectory(track).evaluate(at_s).q == pytest.approx(
         np.stack([at_s**3 - at_s, 2.0 - at_s**2], axis=1)
     )
 
@@ -102,5 +102,5 @@ def test_what_lies_in_a_gap_rests_on_no_record() -> None:
     whole = logs.simulated("paper")
     log = logs.rewritten(whole, lambda state: not (state.site == "m1" and state.tick == 100))
     at_s = np.array([98.0, 99.0, 99.5, 100.0, 100.5, 101.0, 102.0]) / 200
-    known = PeerTrajectory(align_records(log, common=True)["m1"]).at(at_s).known
+    known = PeerTrajectory(align_records(log, common=True)["m1"]).evaluate(at_s).known
     assert known.tolist() == [True, True, False, False, False, True, True]

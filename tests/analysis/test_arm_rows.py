@@ -63,7 +63,7 @@ def test_torque_inertia_gradient_and_end_effector_are_those_of_pinocchio(name: s
             arm.multiply_inertia(q, a)[0], state.inertia @ state.a, atol=1e-12
         )
         tip = arm.place_end_effector(q, qd)
-        np.testing.assert_allclose(tip.at[0], state.tip_position, atol=1e-12)
+        np.testing.assert_allclose(tip.position[0], state.tip_position, atol=1e-12)
         np.testing.assert_allclose(tip.J[0], state.jacobian[:3], atol=1e-12)
         np.testing.assert_allclose(tip.speed[0], state.jacobian[:3] @ state.qd, atol=1e-11)
 
@@ -116,7 +116,7 @@ def test_the_planar_arm_is_the_same_as_a_chain() -> None:
         plane.law_torque(np.tile(theta, (len(q), 1)), q, qd, v, a), theirs, atol=1e-12
     )
     ours, theirs = plane.place_end_effector(q, qd), chain.place_end_effector(q, qd)
-    np.testing.assert_allclose(ours.at, theirs.at[:, :2], atol=1e-12)
+    np.testing.assert_allclose(ours.position, theirs.position[:, :2], atol=1e-12)
     np.testing.assert_allclose(ours.J, theirs.J[:, :2], atol=1e-12)
     energies = plane.potential_energy(q), chain.potential_energy(q)
     np.testing.assert_allclose(np.diff(energies[0]), np.diff(energies[1]), atol=1e-12)

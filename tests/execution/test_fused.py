@@ -183,7 +183,7 @@ def test_totals_are_those_of_the_log(name: str, changes: dict[str, Any]) -> None
     fused.advance_to(scenario.duration_s)
     log = virtual.simulate_scenario(scenario)
     whole = {
-        one.key: compute_log_metrics(log).whole(one).value
+        one.key: compute_log_metrics(log).run_value(one).value
         for one in quantities()
         if one.key in TOTALS
     }

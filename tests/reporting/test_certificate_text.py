@@ -96,7 +96,9 @@ def test_the_papers_weights_are_told_where_they_are_wrong() -> None:
     assert told.text.startswith(
         "with the paper's weights, ones, V would have risen by 12.3 J of 32.8"
     )
-    assert runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate.ones is None
+    assert (
+        runs.run("free", {"duration_s": 4.0, "rate_hz": 200}).certificate.paper_balance is None
+    )
 
 
 @pytest.mark.parametrize("name", ["jitter", "rich", "busy"])

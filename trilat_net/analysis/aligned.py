@@ -178,7 +178,7 @@ def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords
     return found if min(len(records.known) for records in found.values()) > 1 else {}
 
 
-def find_unlimited(limits: Limits, qd_des: Array) -> Bools:
+def find_unlimited_rows(limits: Limits, qd_des: Array) -> Bools:
     """Returns the rows in which no coordinate of a reference is as fast as it may be; of one
     row, if so.
     """
@@ -212,7 +212,7 @@ def _fill_tick_grid(
     follows: Bools = (part.mode[rows] == "run")[before]
     glides = scenario.sites[part.name].on_stale.action == "glide"
     rests = _find_rests(part.mode[rows], tick, part.rate_hz)[before] if glides else _NO_ROWS
-    follows &= find_unlimited(scenario.sites[part.name].limits, part.qd_des[rows])[before]
+    follows &= find_unlimited_rows(scenario.sites[part.name].limits, part.qd_des[rows])[before]
     columns = {name: getattr(part, name)[rows] for name in names}
     for name, values in columns.items():
         columns[name] = (
@@ -262,7 +262,7 @@ class PeerTrajectory:
             [np.zeros((1, squares.shape[1])), np.cumsum(steps, axis=0)]
         )
 
-    def at(self, t_s: Array) -> PeerMotion:
+    def evaluate(self, t_s: Array) -> PeerMotion:
         """Returns the site at times, s since the epoch; on its ticks these are its records.
 
         q is the cubic through angles and velocities, qd runs straight from record to record,
@@ -306,15 +306,15 @@ class DelayedPeer(NamedTuple):
     """A peer as a site sees it after its link.
 
     Attributes:
-        now, seen: the peer at the site's ticks, and at the stamps of the samples in use, K rows
+        now, delayed: the peer at the site's ticks, and at the stamps of the samples in use, K rows
         each.
-        kept: the peer at the end of a period if that stamp moves at rate one, K - 1 rows.
+        delayed_end: the peer at the end of a period if that stamp moves at rate one, K - 1 rows.
         stamp_s: the stamp of the sample in use, shape (K,), s; NaN before the first.
     """
 
     now: PeerMotion
-    seen: PeerMotion
-    kept: PeerMotion
+    delayed: PeerMotion
+    delayed_end: PeerMotion
     stamp_s: Array
 
     @property
@@ -323,10 +323,10 @@ class DelayedPeer(NamedTuple):
         ends = (
             self.now.known[:-1],
             self.now.known[1:],
-            self.seen.known[:-1],
-            self.seen.known[1:],
+            self.delayed.known[:-1],
+            self.delayed.known[1:],
         )
-        known: Bools = np.logical_and.reduce([*ends, self.kept.known])
+        known: Bools = np.logical_and.reduce([*ends, self.delayed_end.known])
         return known
 
 
@@ -341,7 +341,9 @@ def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedP
     stamp_s = np.where(began, used / past.records.rate_hz, _BEFORE_EPOCH_S)
     kept_s = np.where(began, stamp_s + records.h_s, _BEFORE_EPOCH_S)[:-1]
     stamps = np.where(began, stamp_s, np.nan)
-    return DelayedPeer(past.at(records.t_s), past.at(stamp_s), past.at(kept_s), stamps)
+    return DelayedPeer(
+        past.evaluate(records.t_s), past.evaluate(stamp_s), past.evaluate(kept_s), stamps
+    )
 
 
 def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:

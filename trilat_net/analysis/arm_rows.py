@@ -162,7 +162,7 @@ class EndEffectorRows(NamedTuple):
         J: its Jacobian, shape (K, 2, n), m/rad: rows x and y (and z), columns the joints.
     """
 
-    at: Array
+    position: Array
     speed: Array
     J: Array
 

@@ -94,12 +94,12 @@ class UserShares(NamedTuple):
 
     Attributes:
         shares: alpha of the slave for each of them, shape (K, U).
-        lead: the user with the largest share, by its place; the program, if no share is larger.
+        leader: the user with the largest share, by its place; the program, if no share is larger.
         program: the user that a program holds, by its place.
     """
 
     shares: Array
-    lead: Ints
+    leader: Ints
     program: int
 
 
@@ -161,7 +161,7 @@ def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[Domi
     return start, scenario.scripted_ramps(site)
 
 
-def forget_ramps(
+def drop_finished_ramps(
     start: Array, ramps: Sequence[DominanceRamp], from_s: float
 ) -> tuple[Array, list[DominanceRamp]]:
     """Returns factors and ramps that give the same history from a time on, without the ramps

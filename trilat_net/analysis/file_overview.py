@@ -149,7 +149,7 @@ class FileInventory:
             "first_log_time_ns": first_ns,
             "last_log_time_ns": last_ns,
             # in the order of the file
-            "between_ms": percentiles(
+            "between_ms": compute_percentiles(
                 np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64)), unit=1e6
             ),
             "encoding": about.encoding,
@@ -308,11 +308,11 @@ def describe_site_health(log: Log, site: str) -> JsonObject:
         "role": spec.role,
         "rate_hz": spec.rate_hz,
         "records": len(part),
-        "made_ticks": made_ticks(log, site),
+        "made_ticks": count_executed_ticks(log, site),
         "expected_ticks": log.scenario.ticks(site),
         "missing": log.missing(site),
-        "late_us": percentiles(part.late_us) if timed else None,
-        "busy_us": percentiles(part.busy_us) if timed else None,
+        "late_us": compute_percentiles(part.late_us) if timed else None,
+        "busy_us": compute_percentiles(part.busy_us) if timed else None,
         "overruns": count_overruns(part) if timed else None,
     }
 
@@ -329,8 +329,8 @@ def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
         one_way_us = came[came[:, 0] == log[site].peers.index(peer), 2]
     return {
         "stated": log.scenario.links[f"{peer}->{site}"].describe(),
-        "age_ms": percentiles(sample_ages_ns(log, peer, site), unit=1e6),
-        "one_way_ms": percentiles(one_way_us, unit=1e3),
+        "age_ms": compute_percentiles(sample_ages_ns(log, peer, site), unit=1e6),
+        "one_way_ms": compute_percentiles(one_way_us, unit=1e3),
         "clock_offset_us": None if clock is None else clock.offset_us,
         "clock_bound_us": None if clock is None else clock.bound_us,
         **{name: getattr(stats[0], name).get(peer) if stats else None for name in counts},
@@ -340,7 +340,7 @@ def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "max": 100.0}
 
 
-def percentiles(
+def compute_percentiles(
     values: ArrayLike, shares: Mapping[str, float] = PERCENTILES, unit: float = 1.0
 ) -> dict[str, float] | None:
     """Returns percentiles by name, in multiples of a unit; None of no values."""
@@ -351,7 +351,7 @@ def percentiles(
     return dict(zip(shares, found, strict=True))
 
 
-def made_ticks(log: Log, site: str) -> int | None:
+def count_executed_ticks(log: Log, site: str) -> int | None:
     """Returns the number of ticks that a site made, by the event of its last start; None
     without one.
     """
@@ -419,7 +419,7 @@ def _describe_site(log: Log, name: str, twin: Log | None) -> JsonObject:
     spec = log.scenario.sites[name]
     end = part.t_s > part.t_s[-1] - END_WINDOW_S if len(part) else np.zeros(0, dtype=bool)
     moved = operator_displacement(log, twin, name)[2] if twin is not None else part.q[:0]
-    made = made_ticks(log, name)
+    made = count_executed_ticks(log, name)
     expected = log.scenario.ticks(name)
     late = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}
     busy = PERCENTILES
@@ -439,8 +439,8 @@ def _describe_site(log: Log, name: str, twin: Log | None) -> JsonObject:
         "settle_s": settling_time_s(part),
         "peak_tau_nm": _largest(part.tau),
         "saturated_ticks": int(np.count_nonzero(at_limit.any(axis=1))),
-        "late_us": percentiles(part.late_us, late) or dict.fromkeys(late),
-        "busy_us": percentiles(part.busy_us, busy) or dict.fromkeys(busy),
+        "late_us": compute_percentiles(part.late_us, late) or dict.fromkeys(late),
+        "busy_us": compute_percentiles(part.busy_us, busy) or dict.fromkeys(busy),
         "overruns": count_overruns(part),
         "hands_moved_max_rad": np.abs(moved).max(axis=0).tolist() if len(moved) else None,
         "hands_moved_end_rad": moved[-1].tolist() if len(moved) else None,

@@ -59,15 +59,15 @@ class JointFollowing(NamedTuple):
 
     Lambda: Array
 
-    def reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:  # noqa: ARG002
+    def compute_reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:  # noqa: ARG002
         """Returns the reference velocity -Lambda e and its derivative, shape (K, n)."""
         return -self.Lambda * e, -self.Lambda * ed
 
-    def lift(self, rows: Rows, de: Array) -> Array:  # noqa: ARG002
+    def compute_jump_of_r(self, rows: Rows, de: Array) -> Array:  # noqa: ARG002
         """Returns what a change of e adds to r, shape (K, n)."""
         return self.Lambda * de
 
-    def push(self, rows: Rows, force: Array) -> Array:  # noqa: ARG002
+    def compute_joint_torque(self, rows: Rows, force: Array) -> Array:  # noqa: ARG002
         """Returns the torque of a force along what sites share, shape (K, n)."""
         return force
 
@@ -75,7 +75,7 @@ class JointFollowing(NamedTuple):
         """Returns the same without a motion that no error asks for."""
         return self
 
-    def miss(self, rows: Rows, e: Array) -> tuple[Array, Array]:  # noqa: ARG002
+    def compute_damping_deviation(self, rows: Rows, e: Array) -> tuple[Array, Array]:  # noqa: ARG002
         """Returns what damping near singular poses leaves of J r and of the reference
         acceleration: 0.
         """
@@ -109,7 +109,7 @@ class TaskFollowing:
         found: Array = np.einsum("kij,kj->ki", self.inverse[rows], b)
         return found
 
-    def reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:
+    def compute_reference(self, rows: Rows, e: Array, ed: Array) -> tuple[Array, Array]:
         """Returns v and a of the joints, shape (K, n)."""
         J, Jd, inverse = (np.moveaxis(x[rows], 0, -1) for x in (self.J, self.Jd, self.inverse))
         posture = self.psi[rows].T, self.psi_rate[rows].T
@@ -119,16 +119,16 @@ class TaskFollowing:
         )
         return v.T, a.T
 
-    def lift(self, rows: Rows, de: Array) -> Array:
+    def compute_jump_of_r(self, rows: Rows, de: Array) -> Array:
         """Returns what a change of e adds to r: J+ Lambda de, shape (K, n)."""
-        return self.push(rows, self._solve(rows, self.Lambda * de))
+        return self.compute_joint_torque(rows, self._solve(rows, self.Lambda * de))
 
-    def push(self, rows: Rows, force: Array) -> Array:
+    def compute_joint_torque(self, rows: Rows, force: Array) -> Array:
         """Returns the torque of a force along what sites share: J'f, shape (K, n)."""
         torque: Array = np.einsum("kij,ki->kj", self.J[rows], force)
         return torque
 
-    def project(self, torque: Array) -> Array:
+    def project_torque(self, torque: Array) -> Array:
         """Returns what a torque of every row amounts to at the end effector, shape (K, m), N."""
         return self._solve(slice(None), np.einsum("kij,kj->ki", self.J, torque))
 
@@ -137,7 +137,7 @@ class TaskFollowing:
         still = np.zeros_like(self.psi)
         return replace(self, psi=still, psi_rate=still)
 
-    def miss(self, rows: Rows, e: Array) -> tuple[Array, Array]:
+    def compute_damping_deviation(self, rows: Rows, e: Array) -> tuple[Array, Array]:
         """Returns J r - x' - Lambda e, shape (K, m), and a - v', shape (K, n): 0 where nothing
         is damped.
         """
@@ -148,13 +148,13 @@ class TaskFollowing:
         y = self._solve(
             rows, -self.Lambda * e - np.einsum("kij,kj->ki", self.J[rows], self.psi[rows])
         )
-        return damping * y, self.push(rows, self._solve(rows, rate * y))
+        return damping * y, self.compute_joint_torque(rows, self._solve(rows, rate * y))
 
 
 Following = JointFollowing | TaskFollowing
 
 
-def follow_rows(arm: ArmRows, q: Array, qd: Array, Lambda: Array) -> Following:
+def build_following(arm: ArmRows, q: Array, qd: Array, Lambda: Array) -> Following:
     """Returns how a site follows along rows of its joints, shape (K, n)."""
     task = arm.task
     if isinstance(arm, PlanarArmRows) or task is None:

@@ -19,7 +19,7 @@ from ..scenario import Scenario
 from .aligned import AlignedRecords, align_records
 from .arm_rows import build_arm_rows
 from .dominance_history import DominanceHistory, trace_dominance
-from .following import JointFollowing, follow_rows
+from .following import JointFollowing, build_following
 from .link_summary import LinkSummary, summarise_links
 from .torque_sources import TorqueSplit, attribute_torque, list_walls
 
@@ -49,7 +49,7 @@ class RunView:
         self.scenario = log.scenario
         self._made: dict[Callable[[RunView], Any], Any] = {}
 
-    def once(self, make: Callable[["RunView"], T]) -> T:
+    def compute_once(self, make: Callable[["RunView"], T]) -> T:
         """Returns what a function makes of this view, made when it is first asked for."""
         if make not in self._made:
             self._made[make] = make(self)
@@ -108,16 +108,16 @@ def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
     """
     records, torque, dominance = run
     arm = build_arm_rows(scenario, records.site)
-    follows = follow_rows(arm, records.q, records.qd, np.array(records.axes))
+    follows = build_following(arm, records.q, records.qd, np.array(records.axes))
     if isinstance(follows, JointFollowing):
         return run
     axes = np.array(records.axes)
     script = torque.script
     forces = torque._replace(
-        operator_now=follows.project(torque.operator_now),
-        operator_held=follows.project(torque.operator_held),
-        environment_now=follows.project(torque.environment_now),
-        environment_held=follows.project(torque.environment_held),
+        operator_now=follows.project_torque(torque.operator_now),
+        operator_held=follows.project_torque(torque.operator_held),
+        environment_now=follows.project_torque(torque.environment_now),
+        environment_held=follows.project_torque(torque.environment_held),
     )
     if script is not None:
         script = script @ (follows.inverse[0] @ follows.J[0]).T

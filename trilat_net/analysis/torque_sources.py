@@ -31,7 +31,7 @@ def list_walls(spec: SiteSpec) -> list[TorqueSource]:
 
 def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
     """Returns the depth of an end effector in a wall, shape (K,), m; negative outside of it."""
-    found: Array = (np.array(wall.a) - end_effector.at) @ np.array(wall.b)
+    found: Array = (np.array(wall.a) - end_effector.position) @ np.array(wall.b)
     return found
 
 
@@ -49,7 +49,7 @@ def wall_force(wall: TorqueSource, t_s: Array, end_effector: EndEffectorRows) ->
     return np.where(there, push, 0.0)
 
 
-def follow_target(source: TorqueSource, t_s: Array) -> tuple[Array, Array]:
+def compute_target_motion(source: TorqueSource, t_s: Array) -> tuple[Array, Array]:
     """Returns the target of a spring, which moves from a to b with minimum jerk, and its
     velocity, (K, n).
     """
@@ -69,7 +69,7 @@ def follow_target(source: TorqueSource, t_s: Array) -> tuple[Array, Array]:
 
 def compute_spring_effort(source: TorqueSource, t_s: Array, at: Array, speed: Array) -> Array:
     """Returns K (target - at) + B (its velocity - speed), per joint or axis, shape (K, n)."""
-    target, velocity = follow_target(source, t_s)
+    target, velocity = compute_target_motion(source, t_s)
     found: Array = np.array(source.K) * (target - at) + np.array(source.B) * (velocity - speed)
     return found
 
@@ -91,12 +91,12 @@ def compute_source_torque(
     elif source.acts is TorqueKind.HAND:
         pushed = compute_spring_effort(source, t_s, q, qd)
     elif source.acts is TorqueKind.TASK_HAND:
-        effort = compute_spring_effort(source, t_s, end_effector.at, end_effector.speed)
+        effort = compute_spring_effort(source, t_s, end_effector.position, end_effector.speed)
         pushed = np.einsum("kij,ki->kj", end_effector.J, effort)
     elif source.acts is TorqueKind.OWN_JOINTS:
         pushed = source.model.effort(t_s, q, qd)
     elif source.acts is TorqueKind.OWN_TIP:
-        effort = source.model.effort(t_s, end_effector.at, end_effector.speed)
+        effort = source.model.effort(t_s, end_effector.position, end_effector.speed)
         pushed = np.einsum("kij,ki->kj", end_effector.J, effort)
     else:
         raise ValueError(f"{source.acts.name} is no function of the state")
@@ -114,7 +114,7 @@ def compute_live_torque(
     target = hand[:, 3 : 3 + size]
     rate = hand[:, 3 + size :]
     at_joints = source.acts is TorqueKind.LIVE_JOINT
-    at, speed = (q, qd) if at_joints else (end_effector.at, end_effector.speed)
+    at, speed = (q, qd) if at_joints else (end_effector.position, end_effector.speed)
     pull = target
     if source.acts is not TorqueKind.LIVE_FORCE:
         pull = np.array(source.K) * (target - at) + np.array(source.B) * (rate - speed)
@@ -298,15 +298,15 @@ class WallEnergy(NamedTuple):
 
     Attributes:
         site: whose wall.
-        gave_j: the most that it gave in qd beyond what its spring had stored, J.
-        needed_n_s_m: K h / 2 + B, N s/m.
-        damping_n_s_m: the arm's own damping b along the normal, the least in contact, N s/m.
+        generated_j: the most that it gave in qd beyond what its spring had stored, J.
+        required_damping_n_s_m: K h / 2 + B, N s/m.
+        arm_damping_n_s_m: the arm's own damping b along the normal, the least in contact, N s/m.
     """
 
     site: str
-    gave_j: float
-    needed_n_s_m: float
-    damping_n_s_m: float
+    generated_j: float
+    required_damping_n_s_m: float
+    arm_damping_n_s_m: float
 
 
 def list_sampled_walls(spec: SiteSpec) -> list[TorqueSource]:

@@ -93,7 +93,7 @@ class PushGrowth(NamedTuple):
     ended_s: float | None = None
 
 
-class LeftRest(NamedTuple):
+class RestDeparture(NamedTuple):
     """A time in which a run went away from a rest, and from its twins, while nobody acted on
     it.
     """
@@ -111,7 +111,7 @@ class TwinGrowth(NamedTuple):
         why: why there are no twins; "" if there are.
         from_s, to_s: the judged part, s.
         pushes: of each push and group of sites what became of it.
-        left: when it left a rest by itself; None: it did not.
+        departure: when it left a rest by itself; None: it did not.
         same: False if the run was repeated on another platform, whose last bits differ.
         random: True if anything in the run's links is drawn: slow trends are chance then.
         twins: the twins themselves, to be drawn.
@@ -121,7 +121,7 @@ class TwinGrowth(NamedTuple):
     from_s: float = 0.0
     to_s: float = 0.0
     pushes: tuple[PushGrowth, ...] = ()
-    left: LeftRest | None = None
+    departure: RestDeparture | None = None
     same: bool = True
     random: bool = False
     twins: Twins | None = None
@@ -143,9 +143,9 @@ class TwinGrowth(NamedTuple):
         """True if half of the pushes of some sites or more grow; by a factor of two if links
         are random.
         """
-        return self.grow_by(DOUBLES if self.random else 1.0, always=True)
+        return self.grows_by(DOUBLES if self.random else 1.0, always=True)
 
-    def grow_by(self, factor: float, *, always: bool) -> bool:
+    def grows_by(self, factor: float, *, always: bool) -> bool:
         """True if half of the pushes of some sites or more grow by a factor; `always`: all the
         time.
         """
@@ -195,7 +195,7 @@ class TwinGrowth(NamedTuple):
                 }
                 for one in self.pushes
             ],
-            "left": None if self.left is None else self.left._asdict(),
+            "left": None if self.departure is None else self.departure._asdict(),
             "needs_s": self.needs_s,
             "same_bits": self.same,
             "text": self.text,
@@ -207,7 +207,7 @@ class TwinGrowth(NamedTuple):
         worst = self.worst
         if worst is None:
             return f"twins: {self.why}"
-        if (left := self.left) is not None:
+        if (left := self.departure) is not None:
             when = f"from {left.from_s:.4g} to {left.to_s:.4g} s"
             rate = f"{left.rate_per_s:+.3g} /s"
             return f"twins: {when} the run and its twins left a rest by themselves, {rate} at {left.joint}"
@@ -261,9 +261,9 @@ def judge_end_by_twins(
         and end.end_speed_rad_s > FLOOR_RAD
     )
     grows = (
-        twins.grows or (settles is False and twins.grow_by(DOUBLES, always=False))
+        twins.grows or (settles is False and twins.grows_by(DOUBLES, always=False))
     ) and not falls
-    left = twins.left is not None and end.behaviour is not EndBehaviour.COASTS
+    left = twins.departure is not None and end.behaviour is not EndBehaviour.COASTS
     if (grows or left) and not end.operator_acts:
         return TwinVerdict(Stability.NOT_STABLE, twins.text)
     dies = trend is EnvelopeTrend.DECAYS or (trend is EnvelopeTrend.HARDLY and bool(settles))
@@ -354,7 +354,7 @@ def judge_twins(
         from_s=0.5 * float(t_s[first] + t_s[end]),
         to_s=float(t_s[end]),
         pushes=tuple(pushes),
-        left=max(left, key=lambda one: one.rate_per_s, default=None),
+        departure=max(left, key=lambda one: one.rate_per_s, default=None),
         same=twins.same,
         random=scenario.links_random,
         twins=twins,
@@ -451,7 +451,7 @@ def _exp(logarithm: float) -> float:
 
 def _find_departures(
     twins: Twins, amplitudes: Sequence[Array], group: Sequence[int], quiet: slice
-) -> Iterator[LeftRest]:
+) -> Iterator[RestDeparture]:
     t_s = twins.paths[0].t_s
     with np.errstate(divide="ignore"):
         speed = np.log(twins.speed[:, group].max(axis=1))
@@ -473,7 +473,7 @@ def _find_departures(
             if 2 * sum(fit.trend is EnvelopeTrend.GROWS for fit in fits) >= len(fits):
                 last = twins.speed[rows.stop - BUCKETS_PER_S : rows.stop, group].max(axis=0)
                 joint = twins.joints[group[int(last.argmax())]]
-                yield LeftRest(
+                yield RestDeparture(
                     float(t_s[start + size]), float(t_s[rows.stop - 1]), rate_per_s, joint
                 )
 

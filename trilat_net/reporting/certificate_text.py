@@ -102,8 +102,10 @@ def describe_certificate(found: Certificate) -> list[CertificateLine]:
     intact = "open" if found.evidence.reasons else "ok"
     mark = intact if found.evidence.integrity.passed else "FAIL"
     lines.append((mark, f"log: {found.evidence.text}"))
-    if found.ones is not None and found.ones_rise is not None:
-        risen = f"V would have risen by {found.ones_rise.amount:.3g} J of {found.ones.V.max():.4g} J"
+    if found.paper_balance is not None and found.paper_weights_rise is not None:
+        rise_j = found.paper_weights_rise.amount
+        largest_j = found.paper_balance.V.max()
+        risen = f"V would have risen by {rise_j:.3g} J of {largest_j:.4g} J"
         lines.append(("note", f"with the paper's weights, ones, {risen} (docs/errata.md, 6)"))
     return [CertificateLine(*line) for line in lines]
 
@@ -127,7 +129,7 @@ _ROOTS = {"stable": "ok", "unstable": "open"}
 def _mark_twins(twins: TwinGrowth) -> str:
     if not twins.pushes:
         return "note"
-    if twins.grows or twins.left is not None:
+    if twins.grows or twins.departure is not None:
         return "FAIL"
     return "ok" if twins.trend in (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY) else "open"
 

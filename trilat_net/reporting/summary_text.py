@@ -459,7 +459,7 @@ def _compose_group(
     """Yields a row per quantity and a column per place that apply; collects reasons of missing
     numbers.
     """
-    rows = {quantity: found.places(quantity) for quantity in members}
+    rows = {quantity: found.values_of(quantity) for quantity in members}
     could = {
         q: places for q, places in rows.items() if any(one.applies for one in places.values())
     }

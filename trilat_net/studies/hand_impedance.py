@@ -215,7 +215,7 @@ def _find_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Array
             torque += compute_operator_script(
                 source, records.nominal_s, split.end_effector.J[0]
             )
-    return split.end_effector.find_force(split.operator - torque), split.end_effector.at
+    return split.end_effector.find_force(split.operator - torque), split.end_effector.position
 
 
 def _find_phasors(

@@ -18,7 +18,7 @@ import numpy as np
 
 from .. import process
 from ..analysis.arm_rows import build_arm_rows
-from ..analysis.metrics.log_metrics import find_quantity, measure_whole
+from ..analysis.metrics.log_metrics import find_quantity, measure_run
 from ..analysis.metrics.measures import Metric
 from ..analysis.run_end import (
     NO_BUCKETS,
@@ -528,7 +528,7 @@ def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
         ),
         missing=missing,
     )
-    return msgspec.structs.replace(found, metrics=measure_whole(log, scenario.expect.metrics))
+    return msgspec.structs.replace(found, metrics=measure_run(log, scenario.expect.metrics))
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):

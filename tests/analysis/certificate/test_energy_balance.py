@@ -160,7 +160,8 @@ def test_any_one_term_with_another_sign_or_factor_is_caught(
 def test_ones_for_beta_is_caught_and_named() -> None:
     """The paper sets beta = (1, 1, 1) after Eq. (20): the right null vector of Upsilon, not the left one."""
     ones = compute_energy_balance(
-        runs.run("asymmetric", {"duration_s": 2.0, "rate_hz": 1000}).energies, ones=True
+        runs.run("asymmetric", {"duration_s": 2.0, "rate_hz": 1000}).energies,
+        paper_weights=True,
     )
     assert runs.relative(ones) > 10 * CAUGHT
     assert np.abs(ones.residual + ones.transfer).max() <= 2e-5 * ones.V.max()
@@ -168,7 +169,10 @@ def test_ones_for_beta_is_caught_and_named() -> None:
 
 def test_v_with_the_papers_weights_rises_the_corrected_one_never() -> None:
     books = runs.run("free", runs.LYAPUNOV).energies
-    ones, right = compute_energy_balance(books, ones=True), compute_energy_balance(books)
+    ones, right = (
+        compute_energy_balance(books, paper_weights=True),
+        compute_energy_balance(books),
+    )
     assert ones.V[0] == pytest.approx(32.8, abs=0.1)
     rise, kept = (float((b.V - np.minimum.accumulate(b.V)).max()) for b in (ones, right))
     assert rise == pytest.approx(12.3, abs=0.5)

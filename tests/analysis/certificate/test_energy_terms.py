@@ -61,7 +61,7 @@ class Situation:
             view_delayed_peer(self.track, PeerTrajectory(peer)) for peer in self.peers
         ]
         self.track.q_des[:] = sum(
-            a * v.seen.q for a, v in zip(self.alpha, self.views, strict=True)
+            a * v.delayed.q for a, v in zip(self.alpha, self.views, strict=True)
         )
         alpha = np.tile(self.alpha, (2, 1))
         self.shares = DominanceHistory(alpha, np.zeros((2, 2)), alpha[:1])
@@ -135,7 +135,7 @@ def test_a_step_of_shares_works_what_it_changes_in_v(seed: int, share: float) ->
     after = np.array([share, 1.0 - share])
     stepped.shares.alpha[1] = after
     stepped.track.q_des[1] = sum(
-        a * v.seen.q[1] for a, v in zip(after, stepped.views, strict=True)
+        a * v.delayed.q[1] for a, v in zip(after, stepped.views, strict=True)
     )
     amount = dominance_change_work(stepped.motion).total[0]
     assert float(amount) == pytest.approx(stepped.v(1) - kept.v(1), rel=1e-9, abs=1e-9)
@@ -152,10 +152,10 @@ def test_slow_change_of_delay_gives_missing_term_of_theorem(seed: int) -> None:
     peer = peer._replace(rate_hz=RATE_HZ)
     grown_s = 1e-6
     one = view_delayed_peer(site.track, PeerTrajectory(peer))
-    later = PeerTrajectory(peer).at(one.stamp_s - np.array([0.0, grown_s]))
-    site.views[0] = one._replace(seen=later)
+    later = PeerTrajectory(peer).evaluate(one.stamp_s - np.array([0.0, grown_s]))
+    site.views[0] = one._replace(delayed=later)
     site.track.q_des[1] = sum(
-        a * v.seen.q[1] for a, v in zip(site.alpha, site.views, strict=True)
+        a * v.delayed.q[1] for a, v in zip(site.alpha, site.views, strict=True)
     )
     booked = float(link_work(site.motion, 0).total[0])
     e, qd, q = site.track.e[1], site.track.qd[1], site.track.q[1]

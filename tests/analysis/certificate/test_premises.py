@@ -163,8 +163,8 @@ def test_a_sampled_wall_gives_half_k_dx_squared_a_tick() -> None:
     gives += 0.5 * wall.stiffness_n_m * float((depth[1:][enters] ** 2).sum())
     found = find_wall_energies(log)[0]
     assert found.site == "s"
-    assert found.gave_j == pytest.approx(gives, rel=0.02)
-    assert found.needed_n_s_m == pytest.approx(0.5 * 2000.0 / 200.0)
+    assert found.generated_j == pytest.approx(gives, rel=0.02)
+    assert found.required_damping_n_s_m == pytest.approx(0.5 * 2000.0 / 200.0)
     assert found.damping_n_s_m == 0.0
 
 

@@ -28,9 +28,9 @@ def courses(
             records = log[site].states[max(first, 0) : max(first + BLOCK, 0)]
             for record in reversed(records):  # out of order
                 if site != log.sites[-1] or record.tick not in without:
-                    windows[site].take(record)
+                    windows[site].receive(record)
         if (
-            course := running.advance({site: windows[site].newest for site in log.sites})
+            course := running.compute_next({site: windows[site].newest for site in log.sites})
         ) is not None:
             found.append(course)
     assert running.reason == ""
@@ -73,8 +73,8 @@ def test_v_begins_late_in_a_session_joined_late() -> None:
     for first in range(1200, 2400, BLOCK):
         for site in log.sites:
             for record in log[site].states[first : first + BLOCK]:
-                windows[site].take(record)
-        found.append(running.advance({site: windows[site].newest for site in log.sites}))
+                windows[site].receive(record)
+        found.append(running.compute_next({site: windows[site].newest for site in log.sites}))
     assert found[0] is None
     course = joined([one for one in found if one is not None])
     assert 2.4 < course.t_s[0] < 3.2
@@ -87,4 +87,4 @@ def test_a_law_without_such_a_v_says_so() -> None:
     windows = {site: RecordWindow(log.scenario, site) for site in log.sites}
     running = RunningEnergy(log.scenario, windows)
     assert "p_d" in running.reason or "law" in running.reason
-    assert running.advance(dict.fromkeys(log.sites, 100)) is None
+    assert running.compute_next(dict.fromkeys(log.sites, 100)) is None

@@ -19,7 +19,7 @@ from trilat_net.analysis.certificate.stability_certificate import (
     EndPoseRoots,
     StabilityFinding,
     certify,
-    find_growth,
+    describe_unsupplied_growth,
 )
 from trilat_net.analysis.run_end import EndBehaviour, Stability
 from trilat_net.log.log_reader import Log
@@ -258,7 +258,7 @@ def test_v_that_rises_at_the_end_is_named() -> None:
         changed = replace(
             balance, parts={**balance.parts, "kinetic": balance.parts["kinetic"] + added}
         )
-        return find_growth(changed, 1e-3)
+        return describe_unsupplied_growth(changed, 1e-3)
 
     assert growth(np.zeros(len(V))) == []
     assert growth(np.where(t_s < 10.0, 0.5, 0.0)) == []

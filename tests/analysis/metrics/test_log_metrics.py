@@ -50,7 +50,7 @@ def told(log: Log) -> dict[str, Any]:
             assert (value is None) == (path in unknown)
             assert value is None or math.isfinite(value)
             assert path not in unknown or unknown[path]
-        whole = measured.whole(quantity)
+        whole = measured.run_value(quantity)
         assert (whole.value is None) == bool(whole.why)
     return found
 

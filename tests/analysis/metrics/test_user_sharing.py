@@ -9,7 +9,7 @@ import pytest
 
 import trilat_net
 from tests.analysis.logs import rewritten
-from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, measure_whole
+from trilat_net.analysis.metrics.log_metrics import compute_log_metrics, measure_run
 from trilat_net.log.log_reader import Log
 from trilat_net.scenario import parse_scenario
 
@@ -96,7 +96,7 @@ def test_three_users_cancel_up_to_the_torque_that_remains() -> None:
 
 def test_a_takeover_lasts_until_the_larger_share() -> None:
     """The ramp of 0.5 s passes 1/2 at 1.25 s: ticks 0 to 249 of 400 are m1's; at equal shares m2 leads."""
-    found = measure_whole(prescribed(), ["intervention_share", "takeovers", "takeover_s"])
+    found = measure_run(prescribed(), ["intervention_share", "takeovers", "takeover_s"])
     assert {key: one.value for key, one in found.items()} == {
         "intervention_share": pytest.approx(250.0 / 400.0),
         "takeovers": 1.0,

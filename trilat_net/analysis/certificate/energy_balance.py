@@ -99,7 +99,7 @@ class SiteEnergy:
         """The first tick at which everything in transit follows from records, s; infinite
         without one.
         """
-        seen = [view.seen.known & view.now.known for view in self.followed.values()]
+        seen = [view.delayed.known & view.now.known for view in self.followed.values()]
         rows = np.flatnonzero(np.logical_and.reduce(seen))
         return float(self.motion.records.t_s[rows[0]]) if len(rows) else np.inf
 
@@ -273,12 +273,12 @@ class EnergyBalance:
 
 
 def compute_energy_balance(
-    energies: Mapping[str, SiteEnergy], *, ones: bool = False
+    energies: Mapping[str, SiteEnergy], *, paper_weights: bool = False
 ) -> EnergyBalance:
     """Returns the balance of a group of sites, in scenario order, of which none follows a site
     outside.
 
-    With `ones` every site weighs the same, as in the paper; then it need not close.
+    With `paper_weights` every site weighs the same, as in the paper; then it need not close.
     """
     times = find_common_times(energies)
     grids = {}
@@ -290,7 +290,7 @@ def compute_energy_balance(
         records = energy.motion.records
         grid = records.first, len(records.known), records.rate_hz
         if grid not in grids:
-            grids[grid] = _trace_weights(energies, records, ones=ones)
+            grids[grid] = _trace_weights(energies, records, paper_weights=paper_weights)
         left, right = (beta[:, n] for beta in grids[grid])
         weighted = _weigh_site(energy, left, right)
         for key, values in weighted.items():
@@ -353,7 +353,7 @@ def _resample(times: Array, t_s: Array, values: Array) -> Array:
 
 
 def _trace_weights(
-    energies: Mapping[str, SiteEnergy], records: AlignedRecords, *, ones: bool
+    energies: Mapping[str, SiteEnergy], records: AlignedRecords, *, paper_weights: bool
 ) -> tuple[Array, Array]:
     """Returns beta at a site's ticks, shape (K, N), and at the ends of its periods, before a
     step there.
@@ -363,7 +363,7 @@ def _trace_weights(
     solved: dict[bytes, Array] = {}  # by dominance matrix
 
     def solve(t_s: Array, ahead_s: float) -> Array:
-        if ones:
+        if paper_weights:
             return np.ones((len(t_s), len(Kd)))
         alpha = _interpolate_dominance(energies, t_s[:1] if constant else t_s, ahead_s)
         rows = np.round(alpha, 12).reshape(len(alpha), -1) + 0.0

@@ -29,7 +29,7 @@ from ...scenario import Scenario
 from ..aligned import AlignedRecords, Bools, DelayedPeer, hold_torque
 from ..arm_rows import ArmRows, build_arm_rows
 from ..dominance_history import DominanceHistory
-from ..following import Following, follow_rows
+from ..following import Following, build_following
 from ..torque_sources import TorqueSplit
 
 RATE_TOLERANCE = 1e-12
@@ -170,11 +170,11 @@ class SiteMotion:
     common: tuple[float, ...] = ()
 
     @cached_property
-    def follows(self) -> Following:
+    def following(self) -> Following:
         """How an error of the reference becomes motion and torque of the joints."""
         at = self.records
         c = self.constants
-        return follow_rows(c.arm, at.q, at.qd, c.Lambda)
+        return build_following(c.arm, at.q, at.qd, c.Lambda)
 
     @cached_property
     def r(self) -> Array:
@@ -183,14 +183,14 @@ class SiteMotion:
         """
         return (
             self.records.qd
-            - self.follows.reference(slice(None), self.records.e, self.records.ed)[0]
+            - self.following.compute_reference(slice(None), self.records.e, self.records.ed)[0]
         )
 
     @cached_property
     def Yr(self) -> Array:  # noqa: N802 - the paper's symbol
         """Y'r of Eq. (15), shape (K, P)."""
         at = self.records
-        v, a = self.follows.reference(slice(None), at.e, at.ed)
+        v, a = self.following.compute_reference(slice(None), at.e, at.ed)
         return self.constants.arm.gradient(q=at.q, qd=at.qd, v=v, a=a, r=self.r)
 
     @cached_property
@@ -214,10 +214,13 @@ class SiteMotion:
         """
         at = self.records
         c = self.constants
-        v, a = self.follows.reference(rows, e, ed)
+        v, a = self.following.compute_reference(rows, e, ed)
         model = c.arm.law_torque(at.theta_hat[rows], at.q[rows], at.qd[rows], v, a)
         found: Array = (
-            model - c.Kp * r - self.follows.push(rows, c.Kd * ed) - c.robust_torque(r)
+            model
+            - c.Kp * r
+            - self.following.compute_joint_torque(rows, c.Kd * ed)
+            - c.robust_torque(r)
         )
         return found - (1.0 - c.friction) * c.arm.friction(v)
 
@@ -246,7 +249,7 @@ class SiteMotion:
         return low, high
 
     @cached_property
-    def cut(self) -> Bools:
+    def limited(self) -> Bools:
         """True for each torque at its limit, or as far from the one before as it may be, shape
         (K, n).
         """
@@ -274,18 +277,23 @@ class SiteMotion:
         before, after, rate = (
             x[:, :, np.newaxis] for x in (alpha.before, alpha.alpha[1:], alpha.rate[:-1])
         )
-        kept_q = np.sum([before[:, j] * v.kept.q for j, v in enumerate(views)], axis=0)
-        rates = [before[:, j] * v.kept.qd + rate[:, j] * v.kept.q for j, v in enumerate(views)]
+        kept_q = np.sum([before[:, j] * v.delayed_end.q for j, v in enumerate(views)], axis=0)
+        rates = [
+            before[:, j] * v.delayed_end.qd + rate[:, j] * v.delayed_end.q
+            for j, v in enumerate(views)
+        ]
         qd_des_left = at.qd_des[:-1]
         qd_des_right = np.where(left, np.sum(rates, axis=0), at.qd_des[1:])
         ruled_q = at.q_des[:-1] + 0.5 * at.h_s * (qd_des_left + qd_des_right)
-        jumps = [before[:, j] * (v.kept.q - v.seen.q[1:]) for j, v in enumerate(views)]
+        jumps = [
+            before[:, j] * (v.delayed_end.q - v.delayed.q[1:]) for j, v in enumerate(views)
+        ]
         link = np.where(here, jumps, 0.0)
-        steps = [(before[:, j] - after[:, j]) * v.seen.q[1:] for j, v in enumerate(views)]
+        steps = [(before[:, j] - after[:, j]) * v.delayed.q[1:] for j, v in enumerate(views)]
         dominance = np.where(here, np.sum(steps, axis=0), 0.0)
         rule = np.where(here, 0.0, np.where(left, kept_q, ruled_q) - at.q_des[1:])
         jump = link.sum(axis=0) + dominance + rule
-        moved = self.follows.lift(slice(1, None), jump)
+        moved = self.following.compute_jump_of_r(slice(1, None), jump)
         return PeriodEnds(
             following,
             link,
@@ -337,7 +345,7 @@ def _energy_in_transit(c: SiteConstants, view: DelayedPeer) -> Array:
     """Returns 1/2 int qd_j' Kd qd_j ds from the stamp of the sample in use to now, shape (K,),
     J.
     """
-    return 0.5 * ((view.now.squares - view.seen.squares) @ c.Kd)
+    return 0.5 * ((view.now.squares - view.delayed.squares) @ c.Kd)
 
 
 class Increment(NamedTuple):
@@ -385,8 +393,8 @@ def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
     rate = at.shared_rate
     left = right = np.zeros(len(at.known) - 1)
     for j, view in enumerate(site.peers.values()):
-        left = left + 0.5 * alpha.alpha[:-1, j] * _norm(c, rate[:-1] - view.seen.qd[:-1])
-        right = right + 0.5 * alpha.before[:, j] * _norm(c, rate[1:] - view.kept.qd)
+        left = left + 0.5 * alpha.alpha[:-1, j] * _norm(c, rate[:-1] - view.delayed.qd[:-1])
+        right = right + 0.5 * alpha.before[:, j] * _norm(c, rate[1:] - view.delayed_end.qd)
     damping = (
         (r * (c.Kp * r + c.robust_torque(r))).sum(axis=1) for r in (ends.r_left, ends.r_right)
     )
@@ -469,7 +477,7 @@ def link_work(site: SiteMotion, j: int) -> Increment:
     theorem's missing term with dT/dt.
     """
     view = list(site.peers.values())[j]
-    stored = 0.5 * (view.kept.squares - view.seen.squares[1:]) @ site.constants.Kd
+    stored = 0.5 * (view.delayed_end.squares - view.delayed.squares[1:]) @ site.constants.Kd
     return _jump(
         _energy_of_jump(site, site.ends.link[j]) + site.dominance.before[:, j] * stored
     )
@@ -493,14 +501,16 @@ def dominance_change_work(site: SiteMotion) -> Increment:
     for j, view in enumerate(site.peers.values()):
         stored = _energy_in_transit(c, view)
         rate = alpha.rate[:-1, j]
-        kept = 0.5 * (view.now.squares[1:] - view.kept.squares) @ c.Kd
+        kept = 0.5 * (view.now.squares[1:] - view.delayed_end.squares) @ c.Kd
         followed_rate = np.where(ends.following, rate, 0.0)
         left = left + rate * stored[:-1]
-        left = left + followed_rate * (at.shared_rate[:-1] * c.Kd * view.seen.q[:-1]).sum(
+        left = left + followed_rate * (at.shared_rate[:-1] * c.Kd * view.delayed.q[:-1]).sum(
             axis=1
         )
         right = right + rate * kept
-        right = right + followed_rate * (at.shared_rate[1:] * c.Kd * view.kept.q).sum(axis=1)
+        right = right + followed_rate * (at.shared_rate[1:] * c.Kd * view.delayed_end.q).sum(
+            axis=1
+        )
         jump = jump + (alpha.alpha[1:, j] - alpha.before[:, j]) * stored[1:]
     return _trapezoid(site, left, right, jump)
 
@@ -516,8 +526,10 @@ def stale_rule_work(site: SiteMotion) -> Increment:
     if not ruled.any():
         return _nothing(site)
     views = list(enumerate(site.peers.values()))
-    seen = np.sum([alpha.alpha[:-1, j, None] * view.seen.qd[:-1] for j, view in views], axis=0)
-    kept = np.sum([alpha.before[:, j, None] * view.kept.qd for j, view in views], axis=0)
+    seen = np.sum(
+        [alpha.alpha[:-1, j, None] * view.delayed.qd[:-1] for j, view in views], axis=0
+    )
+    kept = np.sum([alpha.before[:, j, None] * view.delayed_end.qd for j, view in views], axis=0)
     rate = at.shared_rate
     left = (rate[:-1] * site.constants.Kd * (ends.qd_des_left - seen)).sum(axis=1)
     right = (rate[1:] * site.constants.Kd * (ends.qd_des_right - kept)).sum(axis=1)
@@ -532,7 +544,7 @@ def torque_limit_work(site: SiteMotion) -> Increment:
     (13)).
     """
     at = site.records
-    cut = np.flatnonzero(site.cut.any(axis=1) | site.rests)
+    cut = np.flatnonzero(site.limited.any(axis=1) | site.rests)
     power = np.zeros(len(at.known))
     if len(cut):
         power[cut] = (site.r[cut] * (at.tau[cut] - site.law_torque(cut))).sum(axis=1)
@@ -567,7 +579,7 @@ def singular_pose_work(site: SiteMotion) -> Increment:
         (at.e[:-1], slice(0, -1), ends.qd_des_left, ends.r_left),
         (2.0 * ends.e_middle - at.e[1:], slice(1, None), ends.qd_des_right, ends.r_right),
     ):
-        missed, a_missed = site.follows.miss(rows, e)
+        missed, a_missed = site.following.compute_damping_deviation(rows, e)
         ed = at.shared_rate[rows] - qd_des
         power = -(missed * c.Kd * ed).sum(axis=1)
         if a_missed.any():
@@ -650,10 +662,10 @@ def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
     ed = (at.shared_rate[1:] - ends.qd_des_right)[rows]
     r = ends.r_right[rows]
     later = rows + 1
-    v, a = site.follows.reference(later, e, ed)
+    v, a = site.following.compute_reference(later, e, ed)
     Yr[rows] = c.arm.gradient(q=at.q[later], qd=at.qd[later], v=v, a=a, r=r)
     found = np.clip(site.control_torque(later, e, ed, r), -c.tau_limit, c.tau_limit)
-    bound = site.rests | (site.cut.any(axis=1) & np.any(np.isfinite(c.tau_rate)))
+    bound = site.rests | (site.limited.any(axis=1) & np.any(np.isfinite(c.tau_rate)))
     # then no jump of e moves it
     tau[rows] = np.where(bound[later, np.newaxis], tau[rows], found)
     return tau, Yr
@@ -671,6 +683,8 @@ def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
     if not de.any():
         return np.zeros(len(de))
     momentum = c.arm.multiply_inertia(site.records.q[1:], ends.r_middle)
-    change: Array = (momentum * site.follows.lift(slice(1, None), de)).sum(axis=1)
+    change: Array = (momentum * site.following.compute_jump_of_r(slice(1, None), de)).sum(
+        axis=1
+    )
     change += (c.Kd * ends.e_middle * c.Lambda * de).sum(axis=1)
     return change

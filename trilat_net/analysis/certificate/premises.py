@@ -21,7 +21,7 @@ from ...log.running_digest import Integrity
 from ...log.session_check import judge_integrity
 from ...net.messages import HALTED_MODES
 from ...scenario import Scenario
-from ..aligned import Bools, find_unlimited
+from ..aligned import Bools, find_unlimited_rows
 from ..dominance_history import (
     compute_lyapunov_weights,
     find_closed_groups,
@@ -239,10 +239,10 @@ def _check_walls(log: Log) -> Premise | None:
     walls = find_wall_energies(log)
     if not walls:
         return Premise("walls", True, "no sampled wall was touched")
-    giving = [wall for wall in walls if wall.damping_n_s_m <= wall.needed_n_s_m]
+    giving = [wall for wall in walls if wall.arm_damping_n_s_m <= wall.required_damping_n_s_m]
     texts = [
-        f"{wall.site}: K h / 2 + B is {wall.needed_n_s_m:.3g} N s/m, the arm's own damping "
-        f"{wall.damping_n_s_m:.3g}; gave {wall.gave_j:.3g} J with respect to qd"
+        f"{wall.site}: K h / 2 + B is {wall.required_damping_n_s_m:.3g} N s/m, the arm's own damping "
+        f"{wall.arm_damping_n_s_m:.3g}; gave {wall.generated_j:.3g} J with respect to qd"
         for wall in giving or walls
     ]
     kind = (
@@ -321,7 +321,7 @@ def _check_following(run: FunctionalFacts) -> Premise:
     away = [f"{site} {s[0].from_s:.4g} to {s[-1].to_s:.4g} s" for site, s in found.items() if s]
     stops = any(one.mode in HALTED_MODES for intervals in found.values() for one in intervals)
     for site in log.sites:
-        held = ~find_unlimited(log.scenario.sites[site].limits, log[site].qd_des)
+        held = ~find_unlimited_rows(log.scenario.sites[site].limits, log[site].qd_des)
         if held.any():
             away.append(
                 f"{site} with a reference as fast as it may be at "
@@ -334,7 +334,7 @@ def _check_following(run: FunctionalFacts) -> Premise:
 
 def _check_torque_limits(run: FunctionalFacts) -> Premise:
     """No torque is cut off; of a chain the joints are named at which one is."""
-    cut = {site: energy.motion.cut for site, energy in run.energies.items()}
+    cut = {site: energy.motion.limited for site, energy in run.energies.items()}
     ticks = [
         f"{site}{_name_joints(run, site, rows)} at {count_nouns(np.count_nonzero(rows.any(axis=1)), 'tick')}"
         for site, rows in cut.items()
@@ -403,7 +403,7 @@ def _check_axes(run: FunctionalFacts) -> Premise | None:
 
 def _check_singular_poses(run: FunctionalFacts) -> Premise | None:
     """No pose is damped: then J J+ = I; None in joint space."""
-    following = {site: energy.motion.follows for site, energy in run.energies.items()}
+    following = {site: energy.motion.following for site, energy in run.energies.items()}
     found = {site: one for site, one in following.items() if isinstance(one, TaskFollowing)}
     near = [
         f"{site} from {run.energies[site].motion.records.t_s[int(np.argmax(one.damping > 0.0))]:.4g} s on"

@@ -18,12 +18,18 @@ from ...core.ticks import CoreChange
 from ...core.vectors import Array
 from ...net.messages import RESTING_MODES, TASK_VECTORS, State
 from ...scenario import Scenario
-from ..aligned import RECORD_COLUMNS, RESUMING_S, AlignedRecords, PeerTrajectory, find_unlimited
+from ..aligned import (
+    RECORD_COLUMNS,
+    RESUMING_S,
+    AlignedRecords,
+    PeerTrajectory,
+    find_unlimited_rows,
+)
 from ..dominance_history import (
     DominanceHistory,
+    drop_finished_ramps,
     evaluate_ramps,
     find_closed_groups,
-    forget_ramps,
     list_scripted_ramps,
 )
 from .energy_balance import (
@@ -81,7 +87,7 @@ class RecordWindow:
         self._glides = scenario.sites[site].on_stale.action == "glide"
         self._rested_at = -(2**40)
 
-    def take(self, record: State) -> bool:
+    def receive(self, record: State) -> bool:
         """Adds a record; false if it is older than the window, or says that the site diverged."""
         if record.tick < self.first or record.mode == "diverged":
             return False
@@ -98,7 +104,7 @@ class RecordWindow:
         since = record.tick - self._rested_at
         self._known[row] = True
         self._rests[row] = 0 <= since <= RESUMING_S * self.rate_hz
-        free = self._limits.qd_des_limit_rad_s is None or find_unlimited(
+        free = self._limits.qd_des_limit_rad_s is None or find_unlimited_rows(
             self._limits, np.array(record.qd_des)
         )
         self._follows[row] = record.mode == "run" and free
@@ -112,7 +118,7 @@ class RecordWindow:
         self._known[left:] = False
         self.first = first
 
-    def knows(self, tick: int) -> bool:
+    def has_record(self, tick: int) -> bool:
         """True if there is a record of a tick."""
         return self.first <= tick <= self.newest and bool(self._known[tick - self.first])
 
@@ -183,13 +189,13 @@ class RunningEnergy:
         self._done_s: float | None = None
         self._supplied = 0.0
 
-    def take_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
+    def add_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
         """Notes changes that a site took in; those of its dominance factors count."""
         self._dominance[site][1].extend(
             change.ramp for change in changes if change.ramp is not None
         )
 
-    def advance(self, complete: Mapping[str, int]) -> EnergyCourse | None:
+    def compute_next(self, complete: Mapping[str, int]) -> EnergyCourse | None:
         """Returns V since the last call; None if it is not known yet.
 
         `complete` has of every site the last tick up to which all records are there or cannot
@@ -241,7 +247,7 @@ class RunningEnergy:
             compute_energy_balance(energies) if len(find_common_times(energies)) > 1 else None
         )
         for site, known in self._dominance.items():
-            self._dominance[site] = forget_ramps(*known, begin_s - 1.0)
+            self._dominance[site] = drop_finished_ramps(*known, begin_s - 1.0)
         # a session that was joined late: what was under way then is not known
         if balance is None:
             return None

@@ -128,7 +128,7 @@ class Certificate(Result):
         premises, verdict, end: of the theorem, on V, and of the run from e and qd alone.
         evidence: how much of the run the log has, and that nothing was changed.
         balance: of all sites; None without a functional, or if beta is not unique.
-        ones: the same with the paper's weights; None if those are right, or without a balance.
+        paper_balance: the same with the paper's weights; None if those are right, or without a balance.
         groups: closed groups of sites, if there are several: then beta is not unique.
         energies: of every site; {} without a functional.
         roots: of the loop where the run ended; None if nobody looked.
@@ -141,7 +141,7 @@ class Certificate(Result):
     end: RunEnd
     evidence: Evidence
     balance: EnergyBalance | None = None
-    ones: EnergyBalance | None = None
+    paper_balance: EnergyBalance | None = None
     groups: tuple[tuple[str, ...], ...] = ()
     energies: Mapping[str, SiteEnergy] = field(default_factory=lambda: MappingProxyType({}))
     roots: EndPoseRoots | None = None
@@ -149,12 +149,14 @@ class Certificate(Result):
     twins: TwinGrowth | None = None
 
     @property
-    def ones_rise(self) -> FunctionalRise | None:
+    def paper_weights_rise(self) -> FunctionalRise | None:
         """The largest rise of V with the paper's weights; None if it did not rise, or if they
         are right.
         """
         return (
-            None if self.ones is None else _find_largest_rise(self.ones, self.verdict.tolerance)
+            None
+            if self.paper_balance is None
+            else _find_largest_rise(self.paper_balance, self.verdict.tolerance)
         )
 
     @property
@@ -179,7 +181,7 @@ class Certificate(Result):
         broken = self.verdict.finding is StabilityFinding.BROKEN
         found = [self.verdict.text] if broken else []
         if self.balance is not None and not broken:
-            found += find_growth(self.balance, self.verdict.tolerance)
+            found += describe_unsupplied_growth(self.balance, self.verdict.tolerance)
         roots = self.roots
         twins = self.twins
         if roots is not None and roots.verdict == "unstable":
@@ -309,8 +311,8 @@ def certify(
     if known.groups:
         return replace(found, groups=known.groups, energies=known.energies)
     alike = np.allclose(known.balance.beta, 1.0)
-    ones = None if alike else compute_energy_balance(known.energies, ones=True)
-    return replace(found, balance=known.balance, ones=ones, energies=known.energies)
+    ones = None if alike else compute_energy_balance(known.energies, paper_weights=True)
+    return replace(found, balance=known.balance, paper_balance=ones, energies=known.energies)
 
 
 def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
@@ -449,7 +451,7 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
     )
 
 
-def find_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
+def describe_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
     """Returns what V, less the work of operator and environment, says against a run that looks
     stable.
 
@@ -477,11 +479,11 @@ def find_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
 def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:
     V = balance.V
     sites = certificate.energies
-    ones = certificate.ones
+    ones = certificate.paper_balance
     with_ones: JsonObject | None = None
     if ones is not None:
         with_ones = {"v_first_j": float(ones.V[0]), "v_max_j": float(ones.V.max())}
-        with_ones["rise"] = _rise_to_json(certificate.ones_rise)
+        with_ones["rise"] = _rise_to_json(certificate.paper_weights_rise)
     return {
         "beta_first": dict(zip(sites, balance.beta[0].tolist(), strict=True)),
         "beta_last": dict(zip(sites, balance.beta[-1].tolist(), strict=True)),

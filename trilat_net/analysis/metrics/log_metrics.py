@@ -144,22 +144,22 @@ class LogMetrics(Result):
     def _each(self) -> Iterator[tuple[dict[str, str], Metric]]:
         for quantity in quantities():
             words = {"group": quantity.group, "key": quantity.key, "name": quantity.name}
-            for place, one in self.places(quantity).items():
+            for place, one in self.values_of(quantity).items():
                 yield {**words, "of": place or "run", "unit": quantity.unit}, one
 
-    def places(self, quantity: Quantity) -> dict[str, Metric]:
+    def values_of(self, quantity: Quantity) -> dict[str, Metric]:
         """Returns a quantity of every place that has it; of the run by the name ""."""
         if quantity.of == "run":
             return {"": self.run[quantity.key]}
         found: dict[str, MetricValues] = getattr(self, f"{quantity.of}s")
         return {name: metrics[quantity.key] for name, metrics in found.items()}
 
-    def whole(self, quantity: Quantity) -> Metric:
-        """Returns a quantity of the run, see `find_whole`."""
-        return find_whole(quantity, self.places(quantity))
+    def run_value(self, quantity: Quantity) -> Metric:
+        """Returns a quantity of the run, see `reduce_to_run`."""
+        return reduce_to_run(quantity, self.values_of(quantity))
 
 
-def find_whole(quantity: Quantity, places: Mapping[str, Metric]) -> Metric:
+def reduce_to_run(quantity: Quantity, places: Mapping[str, Metric]) -> Metric:
     """Returns a quantity of the run, of that of its places: the largest of them, or their sum.
 
     A place that can have none does not count; if one lacks a number that it could have, so does
@@ -175,7 +175,7 @@ def find_whole(quantity: Quantity, places: Mapping[str, Metric]) -> Metric:
     if not values:
         nowhere = dict.fromkeys(one.why for one in places.values())
         return Metric(None, "; ".join(nowhere) or f"there is no {quantity.of}", applies=False)
-    return Metric(sum(values) if quantity.whole == "sum" else max(values))
+    return Metric(sum(values) if quantity.reduction == "sum" else max(values))
 
 
 # what is not finite is no number
@@ -197,10 +197,10 @@ def compute_log_metrics(log: Log) -> LogMetrics:
         *(Path(log.source).name, scenario.name, log.driver, log.complete),
         found["run"][""],
         *(found["site"], found["link"], found["wall"]),
-        view.once(read_all_estimates),
+        view.compute_once(read_all_estimates),
         static_windows.count_static_windows(view),
-        view.once(static_windows.find_joint_loads),
-        view.once(static_windows.find_sharing_ratios),
+        view.compute_once(static_windows.find_joint_loads),
+        view.compute_once(static_windows.find_sharing_ratios),
         static_windows.estimate_stiffness(view),
         estimate_impedances(view),
         TASK_AXES[: scenario.arms[log.sites[0]].counts.shared]
@@ -236,7 +236,7 @@ def find_quantity(key: str) -> Quantity:
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as there
-def measure_whole(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
+def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
     """Returns quantities of the whole run by their keys; nothing else is computed."""
     asked = {key: find_quantity(key) for key in keys}
     wanted = [
@@ -246,7 +246,7 @@ def measure_whole(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
     ]
     found = _measure_places(RunView(log), wanted)
     return {
-        key: find_whole(one, {place: values[key] for place, values in found[one.of].items()})
+        key: reduce_to_run(one, {place: values[key] for place, values in found[one.of].items()})
         for key, one in asked.items()
     }
 
@@ -352,7 +352,7 @@ def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricCom
     """
     measured = [compute_log_metrics(log) for log in logs]
     rows = [
-        ComparisonRow(one, tuple(metrics.whole(one) for metrics in measured))
+        ComparisonRow(one, tuple(metrics.run_value(one) for metrics in measured))
         for one in quantities()
     ]
     kept = tuple(row for row in rows if any(entry.applies for entry in row.entries))

@@ -109,7 +109,7 @@ class Quantity(NamedTuple):
         key: its name in programs; ends in its unit, if any.
         name: its name for people.
         unit: its unit; "" for a number without.
-        whole: reduction to the run: "max" or "sum" over all places.
+        reduction: reduction to the run: "max" or "sum" over all places.
         of: the kind of place that has one: "run", "site", "link" or "wall".
         group: its heading.
     """
@@ -117,7 +117,7 @@ class Quantity(NamedTuple):
     key: str
     name: str
     unit: str = ""
-    whole: str = "max"
+    reduction: str = "max"
     of: str = ""
     group: str = ""
 

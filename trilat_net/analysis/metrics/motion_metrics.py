@@ -340,7 +340,7 @@ def measure_parameter_error(view: RunView, site: str) -> MetricValues:
     else its estimates are off by stays as it is, and acts on nothing.
     """
     scenario = view.scenario
-    estimates = view.once(read_all_estimates).get(site)
+    estimates = view.compute_once(read_all_estimates).get(site)
     if estimates is None:
         return unavailable(LEARNING, "no records of the site")
     arm = build_arm_rows(scenario, site)

@@ -24,7 +24,7 @@ from ..aligned import (
     view_delayed_peer,
 )
 from ..arm_rows import ArmRows, build_arm_rows
-from ..following import follow_rows
+from ..following import build_following
 from ..run_view import RunView
 from .measures import ENERGY, Metric, MetricValues, Quantity, measures, metric, unavailable
 
@@ -167,7 +167,7 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
     if min(len(records.known), len(other.known)) < 2:
         return unavailable(ENERGY, "no two records in a row", of="link")
     delayed = view_delayed_peer(records, PeerTrajectory(other))
-    known = delayed.seen.known & delayed.now.known & records.follows
+    known = delayed.delayed.known & delayed.now.known & records.follows
     judged = records.known_periods & known[:-1] & known[1:]
     if not judged.any():
         return unavailable(ENERGY, "no period rests on records of both sites", of="link")
@@ -201,19 +201,21 @@ def _delay_torque(
 
     Without what it does to the Coulomb friction that a law compensates.
     """
-    late = view.seen.q - view.now.q
+    late = view.delayed.q - view.now.q
     off = alpha * late
-    off_rate = alpha * (view.seen.qd - view.now.qd) + rate * late
+    off_rate = alpha * (view.delayed.qd - view.now.qd) + rate * late
     every = slice(None)
     axes = np.array(records.axes or 1.0)
-    follows = follow_rows(
+    follows = build_following(
         arm, records.q, records.qd, axes * np.array(gains.Lambda)
     ).without_posture()
     Kd = axes * np.array(gains.Kd)
     if gains.law is Law.ADAPTIVE:
-        v, a = follows.reference(every, -off, -off_rate)
+        v, a = follows.compute_reference(every, -off, -off_rate)
         torque = arm.weightless().law_torque(records.theta_hat, records.q, records.qd, v, a)
-        return torque + np.array(gains.Kp) * v + follows.push(every, Kd * off_rate)
+        return (
+            torque + np.array(gains.Kp) * v + follows.compute_joint_torque(every, Kd * off_rate)
+        )
     pull = axes * np.array(gains.K) * off + Kd * off_rate
     # it reflects the torque on the peer: as it came, less the one at the same time
     if np.any(gains.k_f):
@@ -223,4 +225,4 @@ def _delay_torque(
         came = np.where((used >= 0)[:, None], -pushed[row], 0.0)
         now = [np.interp(records.t_s, other.t_s, -column) for column in pushed.T]
         pull = pull + axes * np.array(gains.k_f) * alpha * (came - np.stack(now, axis=1))
-    return follows.push(every, pull)
+    return follows.compute_joint_torque(every, pull)

@@ -146,7 +146,7 @@ def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
     moved.
     """
     estimates = []
-    for before, after in pairwise(view.once(find_static_windows)):
+    for before, after in pairwise(view.compute_once(find_static_windows)):
         moved = []
         known = True
         for site, now in after.script.items():
@@ -231,7 +231,7 @@ class JointLoad(NamedTuple):
 def find_joint_loads(view: RunView) -> list[JointLoad]:
     """Returns the loaded joints of every static window."""
     loads = []
-    for window in view.once(find_static_windows):
+    for window in view.compute_once(find_static_windows):
         weights = _torque_weights(view.scenario, window.alpha)
         for joint in range(min(map(len, window.torque.values()))):
             torque = {site: float(values[joint]) for site, values in window.torque.items()}
@@ -247,7 +247,7 @@ def count_static_windows(view: RunView) -> Metric:
     if view.absent:
         return Metric(None, f"no records of {', '.join(view.absent)}")
     return metric(
-        len(view.once(find_static_windows)) or None,
+        len(view.compute_once(find_static_windows)) or None,
         "no second in which all sites rest under torques that stand",
     )
 
@@ -259,7 +259,7 @@ def count_static_windows(view: RunView) -> Metric:
 )
 def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
     """Returns the largest deviation of force sharing from the dominance factors."""
-    pairs = view.once(find_sharing_ratios)
+    pairs = view.compute_once(find_sharing_ratios)
     offs = [pair.off for pair in pairs if pair.off is not None]
     if offs:
         return {"sharing_off": metric(max(offs))}
@@ -308,9 +308,9 @@ def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
     torque.
     """
     scenario = view.scenario
-    at = {window.from_s: window for window in view.once(find_static_windows)}
+    at = {window.from_s: window for window in view.compute_once(find_static_windows)}
     pairs = []
-    for load in view.once(find_joint_loads):
+    for load in view.compute_once(find_joint_loads):
         if len(load.torque_nm) == 2:
             pushed, holds = sorted(
                 load.torque_nm, key=lambda site: _holding_rank(scenario, site, load.to_s)

@@ -65,7 +65,7 @@ def measure_authority(view: RunView, site: str) -> MetricValues:
     """Returns a user's share in the slave's motion, and h sum_k a_k |tau_h,k|^2 by its
     dominance a_k.
     """
-    shared = view.once(read_user_shares)
+    shared = view.compute_once(read_user_shares)
     (slave, users) = find_users(view.scenario)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="site", applies=shared.applies)
@@ -75,7 +75,7 @@ def measure_authority(view: RunView, site: str) -> MetricValues:
     row, recorded = find_latest_rows(view.sites[slave].records, records.t_s)
     squares = shared.shares[row, users.index(site)] * np.square(torque.operator).sum(axis=1)
     effort = squares[records.known & recorded].sum() * records.h_s
-    found = view.once(_identify_shares)
+    found = view.compute_once(_identify_shares)
     share = found if isinstance(found, Metric) else metric(found[users.index(site)])
     return {"authority_effort_nm2_s": metric(float(effort)), "motion_share": share}
 
@@ -125,16 +125,16 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
 )
 def measure_sharing(view: RunView, _run: str) -> MetricValues:
     """Returns disagreement, interventions and takeovers of the users of a slave."""
-    shared = view.once(read_user_shares)
+    shared = view.compute_once(read_user_shares)
     (slave, users) = find_users(view.scenario)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="run", applies=shared.applies)
     records = view.sites[slave].records
-    intervenes = shared.lead[records.known] != shared.program
+    intervenes = shared.leader[records.known] != shared.program
     spans = sorted(
         (ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in list_ramps(view.log, slave)[1]
     )
-    changed = records.t_s[1:][np.diff(shared.lead) != 0]
+    changed = records.t_s[1:][np.diff(shared.leader) != 0]
     taken = [_time_taken(at_s, records.h_s, spans) for at_s in changed.tolist()]
     return {
         **_measure_disagreement([view.shared[user] for user in users]),

@@ -175,7 +175,7 @@ def _read_columns(
     state = [f"{slave}.{one}.{what}" for what in ("pos", "vel") for one in joints[slave]]
     found = [
         ("observation.state", np.hstack([read(slave, "q"), read(slave, "qd")]), state),
-        ("action", np.stack(commands)[shared.lead, np.arange(len(alpha))], commanded),
+        ("action", np.stack(commands)[shared.leader, np.arange(len(alpha))], commanded),
         *(
             (f"action.{user}", one, commanded)
             for user, one in zip(users, commands, strict=True)
@@ -185,7 +185,7 @@ def _read_columns(
         *((f"tau_x.{user}", read(user, "tau_x"), joints[user]) for user in users),
     ]
     columns: Columns = {key: values.astype(np.float32) for key, values, _ in found}
-    return {**columns, "intervention": shared.lead != shared.program}, {
+    return {**columns, "intervention": shared.leader != shared.program}, {
         key: names for key, _, names in found
     }
 
@@ -203,7 +203,7 @@ def _read_commands(
         for user in users:
             q = log[user].q[rows[user]]
             qd = log[user].qd[rows[user]]
-            tips.append(build_arm_rows(log.scenario, user).place_end_effector(q, qd).at)
+            tips.append(build_arm_rows(log.scenario, user).place_end_effector(q, qd).position)
         return tips, [f"{axis}.pos" for axis in TASK_AXES[: tips[0].shape[1]]]
     if not actions and log[users[0]].layout.task:
         poses = [expand_poses(log[user].x[rows[user]]) for user in users]

@@ -63,7 +63,7 @@ def draw_functional(
     with style.time_figure(log, form, 7.2 if form.narrow else 6.4) as plot:
         rows = style.add_panels(plot.figure, 4, 1, sharex=True, height_ratios=_HEIGHTS)[:, 0]
         _draw(balance, rows[0], balance.V, **_TOTAL)
-        if (ones := certificate.ones) is not None:
+        if (ones := certificate.paper_balance) is not None:
             _draw(ones, rows[0], ones.V, **_ONES)
         for site, values in balance.sites.items():
             _draw(balance, rows[0], values, **style.site_line(log, site, 1.0))

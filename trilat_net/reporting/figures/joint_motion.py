@@ -462,7 +462,9 @@ def draw_end_effector_paths(log: Log, form: FigureSize = REPORT_SIZE) -> Figure:
         for site in log.sites:
             part = log[site]
             line = style.site_line(log, site)
-            path = build_arm_rows(log.scenario, site).place_end_effector(part.q, part.qd).at
+            path = (
+                build_arm_rows(log.scenario, site).place_end_effector(part.q, part.qd).position
+            )
             path = path * log.scenario.sites[site].task.scale
             for axes, plane in zip(panels.values() if len(part) else (), _PLANES, strict=False):
                 _draw_path(axes, path[:, plane], line)

@@ -224,7 +224,7 @@ def _find_push(judged: _JudgedRun) -> tuple[float, float]:
     tip = build_arm_rows(scenario, USER).place_end_effector(record.q, record.qd)
     torque = _find_hand_torque(scenario, USER, record)
     force = np.linalg.solve(np.swapaxes(tip.J, 1, 2), torque[:, :, np.newaxis])[:, 0, 0]
-    return float(tip.at[:, 0].mean()), float(force.mean())
+    return float(tip.position[:, 0].mean()), float(force.mean())
 
 
 def _follow_error_rad(scenario: Scenario, records: dict[str, RecordBatch]) -> float:

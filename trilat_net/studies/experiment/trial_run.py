@@ -228,7 +228,7 @@ class ExperimentTrial:
         rate, Hz.
         """
         rows = np.flatnonzero((part.t_s >= from_s) & (part.t_s <= until_s))[::EVERY]
-        places = self._place(part.q[rows]).at
+        places = self._place(part.q[rows]).position
         rate_hz = part.rate_hz / EVERY
         return rows, places, np.gradient(places, 1.0 / rate_hz, axis=0), rate_hz
 

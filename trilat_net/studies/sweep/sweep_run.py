@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from ...analysis.metrics.log_metrics import measure_whole
+from ...analysis.metrics.log_metrics import measure_run
 from ...errors import ScenarioError, UsageError, count_nouns
 from ...execution.virtual import simulate_scenario
 from ...files import make_results_folder, write_whole
@@ -229,7 +229,7 @@ def run_cell(task: CellItem) -> CellRun:
         )
     metrics: dict[str, float | None] = {}
     if further := [key for key in plan.metrics if key not in CellResult.__struct_fields__]:
-        measured = measure_whole(simulate_scenario(scenario), further)
+        measured = measure_run(simulate_scenario(scenario), further)
         metrics = {key: measured[key].value for key in further}
     laws = ", ".join(
         dict.fromkeys(identify_law(site.control) for site in scenario.sites.values())

@@ -30,7 +30,7 @@ from ...analysis.arm_rows import build_arm_rows
 from ...analysis.dominance_history import find_closed_groups, left_perron_vector
 from ...analysis.run_end import EndBehaviour, RunEnd, Stability, find_hanging_sites
 from ...analysis.site_signals import SETTLED_ERROR_RAD
-from ...analysis.torque_sources import follow_target
+from ...analysis.torque_sources import compute_target_motion
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import ScenarioError
@@ -134,7 +134,12 @@ def _follow_springs(
     for name, spec in scenario.sites.items():
         for hand in (hand for hand in spec.hands if isinstance(hand, JointSpring)):
             on = ((t_s >= hand.start_s) & (t_s < hand.end_s))[:, np.newaxis].astype(np.float64)
-            yield name, np.array(hand.stiffness_nm_rad), on, follow_target(hand.actor, t_s)[0]
+            yield (
+                name,
+                np.array(hand.stiffness_nm_rad),
+                on,
+                compute_target_motion(hand.actor, t_s)[0],
+            )
 
 
 STRAYED_RAD = 0.2
