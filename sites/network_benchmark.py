@@ -277,7 +277,7 @@ def find_needs(scenario: Scenario) -> ScenarioNeeds:
     else:
         stable = [[1e3 * one.low_s, 1e3 * one.high_s] for one in found.margin.intervals]
         own = None if instead else 1e3 * float(found.conditions.age_s.max())
-        theory = (own, stable, found.margin.words)
+        theory = (own, stable, found.margin.description)
     playout_ms = min((one.playout_ms for one in links), default=0.0)
     return ScenarioNeeds(
         len(msgspec.msgpack.encode(sample)),

@@ -131,7 +131,7 @@ def ports(name: str, **changes: Any) -> PortAnalysis:
 
 
 def felt(made: PortAnalysis) -> Any:
-    return next(one for one in made.transparency if (one.at, one.joint) == ("m", 1))
+    return next(one for one in made.transparency if (one.operator_site, one.joint) == ("m", 1))
 
 
 def learning(delay_ms: float) -> Numbers:
@@ -143,7 +143,7 @@ def learning(delay_ms: float) -> Numbers:
         *band[:2],
         least.least,
         least.least_hz,
-        *felt(made).size_at(1.0),
+        *felt(made).interpolate_magnitudes(1.0),
         felt(made).ratio_db,
     )
 

@@ -41,7 +41,7 @@ from trilat_net.log.log_reader import Log
 from trilat_net.log.running_digest import DigestState, Integrity
 from trilat_net.scenario import Scenario, load_scenario
 from trilat_net.studies.sweep.sweep_cell import classify_cell
-from trilat_net.theory.equilibrium import follow_equilibrium, prolong_scenario
+from trilat_net.theory.equilibrium import extend_scenario, follow_equilibrium
 from trilat_net.theory.linear_analysis import find_end_pose_roots
 from trilat_net.theory.linear_edge import find_contact_growth, find_rightmost_root
 from trilat_net.theory.operating_point import (
@@ -587,7 +587,7 @@ def find_truth(drawn: Drawn) -> Truth:
     if drawn.wide:
         return find_wide_truth(drawn.scenario)
     scenario, ends_s = drawn.scenario, drawn.scenario.duration_s
-    run = FusedRun(prolong_scenario(scenario, LONGER * ends_s))
+    run = FusedRun(extend_scenario(scenario, LONGER * ends_s))
     states = []
     for t_s in np.linspace(0.75, 1.0, 100) * ends_s if has_sampled_wall(scenario) else ():
         run.advance_to(float(t_s))
@@ -628,7 +628,7 @@ def find_wide_truth(scenario: Scenario) -> Truth:
     up although every push in it dies.
     """
     whole, ends_s = (
-        prolong_scenario(scenario, LONGER * scenario.duration_s),
+        extend_scenario(scenario, LONGER * scenario.duration_s),
         scenario.duration_s,
     )
     run = FusedRun(whole)

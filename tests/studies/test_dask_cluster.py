@@ -18,7 +18,11 @@ from tests.net.waiting import until
 from trilat_net.errors import UsageError
 from trilat_net.files import format_extra_install
 from trilat_net.studies import dask_cluster
-from trilat_net.studies.dask_cluster import WorkerRequirements, describe_worker, find_unfit
+from trilat_net.studies.dask_cluster import (
+    WorkerRequirements,
+    describe_worker,
+    find_unfit_workers,
+)
 from trilat_net.studies.executor import open_worker_pool
 from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep
 from trilat_net.studies.sweep.sweep_results import RESULTS_FILE
@@ -210,12 +214,12 @@ def test_a_worker_without_the_file_of_a_law_is_refused(
 
 def test_what_differs_is_named_on_both_sides() -> None:
     here = describe_worker()
-    assert find_unfit(WorkerRequirements(here), here, []) == ""
+    assert find_unfit_workers(WorkerRequirements(here), here, []) == ""
     for name in ("trilat-net", "arithmetic", "Python", "numpy", "numba", "scipy"):
-        text = find_unfit(WorkerRequirements(here), {**here, name: "other"}, [])
+        text = find_unfit_workers(WorkerRequirements(here), {**here, name: "other"}, [])
         assert f"has {name} other, and here is {name} {here[name]}" in text
-    assert find_unfit(WorkerRequirements(here), {**here, "commit": "other"}, []) == ""
-    assert "a.b:Law" in find_unfit(WorkerRequirements(here), here, ["a.b:Law"])
+    assert find_unfit_workers(WorkerRequirements(here), {**here, "commit": "other"}, []) == ""
+    assert "a.b:Law" in find_unfit_workers(WorkerRequirements(here), here, ["a.b:Law"])
 
 
 @pytest.mark.long

@@ -34,9 +34,9 @@ def test_a_delayed_integrator_bears_a_quarter_turn(a: float) -> None:
 def test_what_damps_itself_enough_is_stable_for_every_delay() -> None:
     """x' = -2 x + x(t - T)."""
     found = find_delay_margin(loop(-2.0, (1.0, 1.0)))
-    assert found.words == "stable for every common delay up to 10 s"
+    assert found.description == "stable for every common delay up to 10 s"
     assert (
-        find_delay_margin(loop(1.0, (1.0, 0.5))).words
+        find_delay_margin(loop(1.0, (1.0, 0.5))).description
         == "unstable for every common delay up to 10 s"
     )
 
@@ -81,7 +81,7 @@ def test_roots_at_zero_cross_nothing() -> None:
             derive_operating_conditions(scenario), find_equilibrium(scenario, (-0.1236, 0.3373))
         )
     )
-    assert found.words == "stable for every common delay up to 10 s"
+    assert found.description == "stable for every common delay up to 10 s"
 
 
 def test_force_reflection_in_contact_has_margin_between_calm_and_hammering() -> None:
@@ -92,4 +92,4 @@ def test_force_reflection_in_contact_has_margin_between_calm_and_hammering() -> 
     )
     (span,) = found.intervals
     assert 0.02 < span.high_s < 0.2
-    assert "crosses at" in found.words
+    assert "crosses at" in found.description

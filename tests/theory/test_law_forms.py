@@ -266,7 +266,7 @@ def test_the_analysis_of_waves_is_whole() -> None:
     assert found.verdict == "stable"
     assert found.sampled is None
     assert any("continuous time alone" in note for note in found.notes)
-    assert found.margin.words.startswith("stable for every common delay")
+    assert found.margin.description.startswith("stable for every common delay")
 
 
 def test_arms_that_line_holds_against_hands_are_at_rest_there() -> None:

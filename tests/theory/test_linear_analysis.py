@@ -138,7 +138,7 @@ def test_a_line_without_losses_has_no_margin() -> None:
         True,
         (),
     )
-    assert found.margin.words.startswith("none: waves run along lines without losses")
+    assert found.margin.description.startswith("none: waves run along lines without losses")
     assert found.ports is not None
 
 

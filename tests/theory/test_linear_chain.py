@@ -171,11 +171,11 @@ def test_rates_and_their_derivatives_are_those_of_the_compiled_leaves() -> None:
 def test_learnt_gravity_stands_for_all_estimates() -> None:
     """Five combinations of sixty: SciPy finds the same roots of both loops, and ports answer alike."""
     case = six("adaptive")
-    whole, short = case.loop(every_estimate=True), case.loop()
+    whole, short = case.loop(all_estimates=True), case.loop()
     assert [name for name in short.names if "gravity" in name] == [
         f"{site}.gravity{joint}" for site in "ms" for joint in LOADED
     ]
-    assert short.left_out == 2 * (60 - len(LOADED)) == len(whole.names) - len(short.names)
+    assert short.omitted_states == 2 * (60 - len(LOADED)) == len(whole.names) - len(short.names)
     values = [eigvals(set_common_delay(loop, 0.0).A) for loop in (whole, short)]
     moving = [np.sort_complex(np.round(found[np.abs(found) > 1e-4], 7)) for found in values]
     assert len(moving[0]) == len(moving[1])
@@ -191,10 +191,8 @@ def test_no_root_at_zero_hides_the_rightmost_one() -> None:
     case = six("adaptive")
     loop = case.loop()
     found = compute_delay_spectrum(loop, 3)
-    assert (found.zeros, found.drifting) == (loop.left_out + 6, 0)
-    assert all(
-        residual(case.loop(every_estimate=True), root.s) <= 1e-12 for root in found.roots
-    )
+    assert (found.zeros, found.drifting) == (loop.omitted_states + 6, 0)
+    assert all(residual(case.loop(all_estimates=True), root.s) <= 1e-12 for root in found.roots)
     # no other root is to the right of the third
     edge = found.roots[2].s.real - 0.05
     right = sum(2 if root.s.imag else 1 for root in found.roots)

@@ -215,10 +215,10 @@ def test_a_run_decays_and_swings_as_its_roots_say(name: str) -> None:
     assert found.verdict == near.verdict == "stable"
     swings = [root.s for root in found.roots if root.s.imag > 0.7 * abs(root.s)][:3]
     assert swings
-    loop = linearise_loop(conditions, rest, every_estimate=True)
+    loop = linearise_loop(conditions, rest, all_estimates=True)
     pencil, names, _ = find_moving_part(loop)
     for s in swings:
-        vector = np.linalg.svd(pencil.at(s)[0])[2][-1].conj()
+        vector = np.linalg.svd(pencil.evaluate(s)[0])[2][-1].conj()
         vector *= 1e-5 / vector[np.abs(vector).argmax()]
         off = dict(zip(names, vector.real.tolist(), strict=True))
         step_s = 0.3 / abs(s)

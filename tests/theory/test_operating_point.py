@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tests.virtual_runs import trajectories
 from trilat_net.errors import ScenarioError
 from trilat_net.scenario import Scenario, load_scenario
-from trilat_net.theory.equilibrium import prolong_scenario
+from trilat_net.theory.equilibrium import extend_scenario
 from trilat_net.theory.operating_point import (
     compute_effective_delay,
     derive_operating_conditions,
@@ -53,7 +53,7 @@ def test_two_recorded_torques_stay_and_a_swinging_one_is_omitted() -> None:
     found = derive_operating_conditions(scenario)
     assert [actor.a for actor in found.sites[0].actors] == [(1.0, 0.0), (2.0, 0.0)]
     assert any("still swings at the end" in note for note in found.notes)
-    assert len(prolong_scenario(scenario, 100.0).sites["m1"].hands) == 2
+    assert len(extend_scenario(scenario, 100.0).sites["m1"].hands) == 2
 
 
 def test_what_varies_is_said_with_its_mean() -> None:
@@ -82,7 +82,7 @@ def test_what_has_no_linear_loop_is_refused(
 
 
 def test_a_run_that_goes_on_has_nothing_new_in_it() -> None:
-    longer = prolong_scenario(load_scenario("training", {"duration_s": 5.0}), 50.0)
+    longer = extend_scenario(load_scenario("training", {"duration_s": 5.0}), 50.0)
     assert longer.duration_s == 50.0
     assert longer.timeline == ()
     held = derive_operating_conditions(longer)

@@ -60,13 +60,19 @@ def test_three_sites_pair_with_the_third_off_and_clamped() -> None:
 
 
 def test_hands_feel_the_slave_unless_another_site_is_named() -> None:
-    assert [(one.at, one.of, one.joint) for one in section_of("p_d_margin").transparency] == [
+    assert [
+        (one.operator_site, one.other_site, one.joint)
+        for one in section_of("p_d_margin").transparency
+    ] == [
         ("m1", "s", 1),
         ("m1", "s", 2),
         ("m2", "s", 1),
         ("m2", "s", 2),
     ]
-    assert {(one.at, one.of) for one in section_of("p_d_margin", of="m1").transparency} == {
+    assert {
+        (one.operator_site, one.other_site)
+        for one in section_of("p_d_margin", of="m1").transparency
+    } == {
         ("m2", "m1"),
         ("s", "m1"),
     }

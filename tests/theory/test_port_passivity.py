@@ -239,8 +239,8 @@ def test_hands_that_damp_what_ports_lack_are_stable(damping: float, shown: bool)
 
 def test_mass_and_stiffness_of_a_hand_dissipate_nothing() -> None:
     w = np.geomspace(0.1, 100.0, 20)
-    assert np.allclose(scalar_hand(3.0).dissipate(w), 3.0)
+    assert np.allclose(scalar_hand(3.0).compute_resistance(w), 3.0)
     swirl = HandMatrices(np.zeros((2, 2)), np.eye(2), np.array([[0.0, 5.0], [-5.0, 0.0]]))
-    least = np.linalg.eigvalsh(swirl.dissipate(w))[:, 0]
+    least = np.linalg.eigvalsh(swirl.compute_resistance(w))[:, 0]
     # a field of force that turns gives energy, the slower the more
     assert np.allclose(least, 1.0 - 5.0 / w)

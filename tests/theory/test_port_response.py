@@ -164,8 +164,8 @@ def test_who_holds_the_third_site_counts() -> None:
     (alone,) = measure_transparency(loop, "a", "c")
     (held,) = measure_transparency(hold_by_spring(loop, "b", 1e3, 10.0), "a", "c")
     # a tenth of a hertz: springs count
-    assert held.size_at(0.1)[0] > 1.5 * alone.size_at(0.1)[0]
-    assert held.size_at(0.1)[1] == pytest.approx(10.0 / (0.2 * np.pi), rel=0.05)
+    assert held.interpolate_magnitudes(0.1)[0] > 1.5 * alone.interpolate_magnitudes(0.1)[0]
+    assert held.interpolate_magnitudes(0.1)[1] == pytest.approx(10.0 / (0.2 * np.pi), rel=0.05)
 
 
 @given(
@@ -182,7 +182,7 @@ def test_the_width_is_the_ratio_in_db_whatever_the_band(
     middle_rad_s = 2.0 * np.pi * np.sqrt(band[0] * band[1])
     assert one.softest_nm_s_rad == pytest.approx(free * middle_rad_s, rel=1e-6)
     assert one.stiffest_nm_s_rad == pytest.approx(clamped * middle_rad_s, rel=1e-6)
-    assert one.size_at(1.0) == pytest.approx(
+    assert one.interpolate_magnitudes(1.0) == pytest.approx(
         (2.0 * np.pi * free, 2.0 * np.pi * clamped), rel=1e-6
     )
 

@@ -32,7 +32,7 @@ def compose_linear(found: LinearAnalysis) -> Iterator[Block]:
     yield describe_zero_roots(found)
     verdict, _, rest = describe_linear_verdict(found).partition(": ")
     yield MarkedText(f"[{_COLOURS[verdict]}]{verdict}[/]:", rest)
-    yield f"delay margin, continuous loop, one delay on all links: {found.margin.words}"
+    yield f"delay margin, continuous loop, one delay on all links: {found.margin.description}"
     yield from (f"note: {note}" for note in found.notes)
     if found.ports is not None:
         yield from describe_ports(found.ports)
@@ -108,7 +108,7 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
             if other is None
             else (f"{other.s.real:.4g}", f"{other.s.imag:.4g}")
         )
-        rows.append((*numbers, *(other_s if differ else ()), root.words))
+        rows.append((*numbers, *(other_s if differ else ()), root.description))
     computed = ("re as computed", "im as computed") if differ else ()
     heads = ("re 1/s", "im rad/s", "Hz", "damping", "modes", *computed, "what moves")
     return TextTable(heads, rows, align="r" * (len(heads) - 1) + "l")
@@ -186,7 +186,7 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
         )
         lines.append(f"  the measured operators at the masters, any at each: {found}")
     if ports.clamped_verdict == "unstable":
-        clamped = ports.transparency[0].of
+        clamped = ports.transparency[0].other_site
         return [
             *lines,
             f"  with {clamped} clamped the loop is unstable: it has no steady impedance",
@@ -273,10 +273,10 @@ def _describe_two_ports(ports: PortAnalysis) -> list[str]:
 
 def _describe_transparency(ports: PortAnalysis, one: Transparency) -> str:
     unit = ports.impedance_unit(one.joint)
-    free, clamped = one.size_at(QUOTED_AT_HZ)
+    free, clamped = one.interpolate_magnitudes(QUOTED_AT_HZ)
     low, high = one.band_hz
     return (
-        f"{one.at} feels of {one.of}, {ports.name_port(one.joint)}: {free:.4g} {unit} free and {clamped:.4g} "
+        f"{one.operator_site} feels of {one.other_site}, {ports.name_port(one.joint)}: {free:.4g} {unit} free and {clamped:.4g} "
         f"clamped at {QUOTED_AT_HZ:g} Hz; over {low:g}-{high:g} Hz the ratio is {one.ratio_db:.3g} dB, the "
         f"difference {one.difference_nm_s_rad:.3g} {unit}"
     )

@@ -135,7 +135,7 @@ class ArmGains(Result):
             for row in rows
         ]
         yield TextTable([head.replace("_", " ") for head in self.joints[0]], cells, align="lr")
-        moves = f"{CharacteristicRoot(0j, 1, tuple(edge['moves'])).words}; {edge['omega_rad_s']:.4g} rad/s"
+        moves = f"{CharacteristicRoot(0j, 1, tuple(edge['moves'])).description}; {edge['omega_rad_s']:.4g} rad/s"
         yield f"edge: K = {edge['k_per_s2']:.4g} /s^2 times inertia ({moves})"
         smooth = (
             "none" if edge["continuous_per_s2"] is None else f"{edge['continuous_per_s2']:.4g}"

@@ -64,7 +64,7 @@ class WorkerRequirements(NamedTuple):
     laws: tuple[tuple[str, str], ...] = ()
 
 
-def find_unfit(
+def find_unfit_workers(
     required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]
 ) -> str:
     """Returns why a worker is refused, or ""."""
@@ -104,7 +104,7 @@ def check_this_worker(required: WorkerRequirements) -> None:
     Raises:
         UsageError: it is not; names the worker and both sides.
     """
-    why = find_unfit(required, describe_worker(), find_missing_laws(required.laws))
+    why = find_unfit_workers(required, describe_worker(), find_missing_laws(required.laws))
     if why:
         raise UsageError(f"the worker {_distributed().get_worker().address} {why}")
 
@@ -197,7 +197,7 @@ class DaskCluster:
                 raise UsageError(
                     f"the worker {worker} cannot be asked for its version: {answer}"
                 )
-            if why := find_unfit(required, *answer):
+            if why := find_unfit_workers(required, *answer):
                 raise UsageError(f"the worker {worker} {why}")
         return required
 

@@ -148,7 +148,7 @@ class RunJournal(Generic[E]):
         self._put(b"%s\t%08x\n" % (text, self._checksum(text)))
         self.done[entry.cell, entry.seed] = entry
 
-    def complete(
+    def run_pending(
         self,
         pool: WorkerPool,
         run: Callable[[T], E],

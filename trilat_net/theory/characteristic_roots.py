@@ -121,7 +121,7 @@ class Pencil(NamedTuple):
         """The matrix of s in Delta(s): the unit matrix, with zeros for states without a rate."""
         return np.eye(len(self.A)) if self.E is None else np.diag(self.E)
 
-    def at(self, s: complex) -> tuple[Complex, Complex]:
+    def evaluate(self, s: complex) -> tuple[Complex, Complex]:
         """Returns Delta(s) and its derivative, shape (n, n) each."""
         delayed = np.exp(-s * self.delays)[:, np.newaxis, np.newaxis] * self.Ad
         delta = s * self.rates - self.A - delayed.sum(axis=0)
@@ -195,7 +195,7 @@ class CharacteristicRoot(NamedTuple):
         return -self.s.real / abs(self.s)
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """The states that participate most, grouped by name, as in "q2 of m1, m2, s"."""
         sites: dict[str, list[str]] = {}
         for state in self.states:
@@ -264,7 +264,7 @@ def _solve_for_root(
     s = complex(first)
     with np.errstate(all="ignore"):
         for _ in range(_MAX_NEWTON_STEPS):
-            delta, derivative = pencil.at(s)
+            delta, derivative = pencil.evaluate(s)
             # exp(-s T) far to the left
             if not (np.isfinite(delta).all() and np.isfinite(derivative).all()):
                 return None
@@ -300,7 +300,7 @@ def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | No
     Participation is the abs of the diagonal of the residue of Delta(s)^-1, which does not
     depend on units.
     """
-    delta, derivative = pencil.at(s)
+    delta, derivative = pencil.evaluate(s)
     if not np.isfinite(delta).all():
         return None
     left, values, right = np.linalg.svd(delta)
@@ -374,7 +374,7 @@ def find_moving_part(loop: LinearLoop) -> MovingPart:
     moving, names, constant = extract_moving_part(
         Pencil(loop.A, delays_s, Ad, E=loop.E), loop.names
     )
-    return moving, names, constant + loop.left_out
+    return moving, names, constant + loop.omitted_states
 
 
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:

@@ -68,7 +68,7 @@ class DelayInterval(NamedTuple):
     high: AxisCrossing | None
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """Its ends and the frequency at its end; "" if it has no ends."""
         if self.low is None and self.high is None:
             return ""
@@ -92,13 +92,13 @@ class DelayMargin(NamedTuple):
     lossless: bool = False
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """The delays for which the loop is stable, in words."""
         if self.lossless:
             return "none: waves run along lines without losses, and roots are on the axis for every delay"
         if not self.intervals:
             return f"unstable for every common delay up to {MAX_COMMON_DELAY_S:g} s"
-        texts = [interval.words for interval in self.intervals]
+        texts = [interval.description for interval in self.intervals]
         if texts == [""]:
             return f"stable for every common delay up to {MAX_COMMON_DELAY_S:g} s"
         more = (

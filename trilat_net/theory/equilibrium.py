@@ -53,7 +53,7 @@ equilibria.
 """
 
 
-def prolong_scenario(scenario: Scenario, duration_s: float) -> Scenario:
+def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
     """Returns the experiment prolonged: forces present at its end stay, but for those that
     swing.
 
@@ -116,7 +116,7 @@ def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium)
     for _ in range(_GAUSS_NEWTON_STEPS):
         if np.abs(residual).max() <= _NEWTON_RESIDUAL:
             break
-        loop = linear_loop.linearise_loop(conditions, rest, every_estimate=True)
+        loop = linear_loop.linearise_loop(conditions, rest, all_estimates=True)
         effects = np.hstack([loop.A, *(term.A for term in loop.delayed)])
         # velocities are zero, and what nothing moves (an estimate without a gain, at an end of its box) stays
         speeds = [name.rpartition(".")[2].startswith("qd") for name in loop.names]
@@ -207,7 +207,7 @@ def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> E
                 np.concatenate([dq[: at.joints], np.zeros(at.joints), d_theta[: at.parameters]])
             )
         deviation = _select_loop_states(conditions, moved)
-        loop = linear_loop.linearise_loop(conditions, rest, every_estimate=True)
+        loop = linear_loop.linearise_loop(conditions, rest, all_estimates=True)
         kept = _project_on_zero_roots(loop, deviation)
         if kept is None:
             break
@@ -401,7 +401,7 @@ def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equ
     """Runs a scenario until it is at rest, for at most `MAX_PROLONGATION` times its duration."""
     ticks = sum(map(scenario.ticks, scenario.names))
     most_s = scenario.duration_s * max(1.0, min(MAX_PROLONGATION, _MAX_RUN_TICKS / ticks))
-    run = FusedRun(prolong_scenario(scenario, most_s))
+    run = FusedRun(extend_scenario(scenario, most_s))
     until_s = scenario.duration_s
     while True:
         states = run.run_and_sample(until_s)

@@ -178,7 +178,7 @@ def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledT
         },
         names=kept,
         owners=owners[[names.index(name) for name in kept]],
-        constant=constant + sum(one.left_out for one in sites),
+        constant=constant + sum(one.omitted_states for one in sites),
     )
 
 

@@ -126,7 +126,7 @@ class LinearAnalysis(Result):
 
     def headline(self) -> str:
         """Returns the verdict in one line."""
-        return f"{self.scenario.name}: {self.verdict}; delay margin {self.margin.words}"
+        return f"{self.scenario.name}: {self.verdict}; delay margin {self.margin.description}"
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat linear --json`."""
@@ -159,7 +159,7 @@ class LinearAnalysis(Result):
             "continuous": _spectrum_to_json(self.continuous),
             "as_computed": None if self.sampled is None else _spectrum_to_json(self.sampled),
             "margin": {
-                "words": self.margin.words,
+                "words": self.margin.description,
                 "stable": [
                     {"from_s": one.low_s, "to_s": one.high_s} for one in self.margin.intervals
                 ],

@@ -41,13 +41,13 @@ class SiteJacobian(NamedTuple):
         rates: the derivatives, see `differentiate_site_rates`.
         states: names of the states, as "q1", "qd2", "theta4"; "gravity2": the learnt gravity of
             joint 2.
-        left_out: number of estimates that no small motion moves or shows.
+        omitted_states: number of estimates that no small motion moves or shows.
     """
 
     at: site_dynamics.ArgumentLayout
     rates: site_dynamics.SiteRates
     states: tuple[str, ...]
-    left_out: int = 0
+    omitted_states: int = 0
 
     @property
     def sent(self) -> Array:
@@ -83,7 +83,7 @@ class LinearLoop(NamedTuple):
         B: shape (n, m).
         C: shape (p, n).
         delayed: one entry per distinct delay above zero, by rising delay.
-        left_out: number of states that no small motion moves or shows, each with a root at
+        omitted_states: number of states that no small motion moves or shows, each with a root at
             zero.
         E: 1 of each state that has a rate, 0 of one that the others give at once, as a wave: 0
             = A x + ...; None: all have one.
@@ -96,7 +96,7 @@ class LinearLoop(NamedTuple):
     B: Array
     C: Array
     delayed: tuple[DelayedTerm, ...]
-    left_out: int = 0
+    omitted_states: int = 0
     E: Array | None = None
 
     @property
@@ -208,12 +208,12 @@ def find_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]
 
 
 def differentiate_rates(
-    conditions: OperatingConditions, rest: Equilibrium, *, every_estimate: bool = False
+    conditions: OperatingConditions, rest: Equilibrium, *, all_estimates: bool = False
 ) -> list[SiteJacobian]:
     """Returns the derivatives of the rates of every site by itself, see
     `differentiate_site_rates`.
 
-    `every_estimate`: of chains too each estimate is a state, and not only what they say of
+    `all_estimates`: of chains too each estimate is a state, and not only what they say of
     gravity.
     """
     x = gather_site_arguments(conditions, rest)
@@ -235,7 +235,7 @@ def differentiate_rates(
             jacobian = SiteJacobian(at, rates, (*_name_motion(at.joints), *site.own.names))
         elif not site_dynamics.has_estimate(site):
             jacobian = _replace_estimate(at, rates, np.zeros((0, at.parameters)), ())
-        elif site.chain is None or every_estimate:
+        elif site.chain is None or all_estimates:
             jacobian = SiteJacobian(at, rates, (*_name_motion(at.joints), *learnt))
         else:
             effect = rates.tau[:, at.estimate]
@@ -246,7 +246,7 @@ def differentiate_rates(
             )
             names = tuple(f"gravity{joint + 1}" for joint in joints)
             jacobian = _replace_estimate(at, rates, effect[joints], names)
-            jacobian = jacobian._replace(left_out=at.parameters - len(joints))
+            jacobian = jacobian._replace(omitted_states=at.parameters - len(joints))
         jacobians.append(jacobian)
     return jacobians
 
@@ -283,12 +283,12 @@ def _replace_estimate(
 
 
 def linearise_loop(
-    conditions: OperatingConditions, rest: Equilibrium, *, every_estimate: bool = False
+    conditions: OperatingConditions, rest: Equilibrium, *, all_estimates: bool = False
 ) -> LinearLoop:
     """Returns the loop under given conditions, linearised at an equilibrium; see
     `differentiate_rates`.
     """
-    sites = differentiate_rates(conditions, rest, every_estimate=every_estimate)
+    sites = differentiate_rates(conditions, rest, all_estimates=all_estimates)
     own, ports = (
         [slice(a, b) for a, b in pairwise(np.cumsum([0, *lengths]).tolist())]
         for lengths in ([one.at.states for one in sites], [one.at.joints for one in sites])
@@ -332,7 +332,7 @@ def linearise_loop(
         for kind in ("tau", "qd")
     )
     delayed = tuple(DelayedTerm(delay_s, *terms[delay_s]) for delay_s in sorted(terms))
-    left_out = sum(one.left_out for one in sites)
+    omitted_states = sum(one.omitted_states for one in sites)
     loop = LinearLoop(
         names=tuple(names),
         inputs=inputs,
@@ -341,9 +341,9 @@ def linearise_loop(
         B=B,
         C=C,
         delayed=delayed,
-        left_out=left_out,
+        omitted_states=omitted_states,
     )
-    if every_estimate or not conditions.has_forms:
+    if all_estimates or not conditions.has_forms:
         return loop
     return add_law_forms(conditions, sites, loop)
 

@@ -414,10 +414,10 @@ def _minima_to_json(one: frequency_search.Minima) -> dict[str, Any]:
 
 
 def _transparency_to_json(one: Transparency) -> dict[str, Any]:
-    free, clamped = one.size_at(QUOTED_AT_HZ)
+    free, clamped = one.interpolate_magnitudes(QUOTED_AT_HZ)
     return {
-        "at": one.at,
-        "of": one.of,
+        "at": one.operator_site,
+        "of": one.other_site,
         "joint": one.joint,
         "free_at_1_hz_nm_s_rad": free,
         "clamped_at_1_hz_nm_s_rad": clamped,

@@ -78,7 +78,7 @@ class HandMatrices(NamedTuple):
     B: Array
     K: Array
 
-    def dissipate(self, w_rad_s: Array) -> Complex:
+    def compute_resistance(self, w_rad_s: Array) -> Complex:
         """Returns the Hermitian part of its impedance at some frequencies, N s/m, shape (F, n,
         n).
         """
@@ -115,7 +115,7 @@ def check_against_hands(
         Z = np.linalg.inv(response(w)).astype(np.complex128)
         Z += np.conj(np.swapaxes(Z, -1, -2))
         shares = [
-            [2.0 * J.T @ one.dissipate(w) @ J for one in hands]
+            [2.0 * J.T @ one.compute_resistance(w) @ J for one in hands]
             for hands, J in zip(held, places, strict=True)
         ]
         values = [np.linalg.eigvalsh(Z + sum(chosen))[:, 0] for chosen in product(*shares)]

@@ -53,7 +53,7 @@ class LoopOutput(NamedTuple):
     C: Array
     delayed: tuple[tuple[float, Array], ...] = ()
 
-    def at(self, s: Complex) -> Complex:
+    def evaluate(self, s: Complex) -> Complex:
         """Returns C + sum_k C_k e^{-s T_k}, shape (F, p, n)."""
         total: Complex = np.broadcast_to(
             self.C.astype(np.complex128), (len(s), *self.C.shape)
@@ -107,7 +107,7 @@ def evaluate_transfer(
             shift = np.exp(-some * term.delay_s)[:, np.newaxis, np.newaxis]
             left -= shift * term.A
             right += shift * term.B
-        response[first : first + _BATCH] = output.at(some) @ np.linalg.solve(left, right)
+        response[first : first + _BATCH] = output.evaluate(some) @ np.linalg.solve(left, right)
     return response
 
 
@@ -253,8 +253,8 @@ class Transparency(NamedTuple):
     """Impedance along one joint at an operator's site, another site free and clamped.
 
     Attributes:
-        at: the operator's site.
-        of: the site that is free or clamped.
+        operator_site: the operator's site.
+        other_site: the site that is free or clamped.
         joint: the joint of the operator's site, from 1 on.
         w_rad_s: frequencies, shape (F,).
         free: impedance with the other site free, shape (F,), N m s/rad.
@@ -262,8 +262,8 @@ class Transparency(NamedTuple):
         band_hz: the band of the means, Hz.
     """
 
-    at: str
-    of: str
+    operator_site: str
+    other_site: str
     joint: int
     w_rad_s: Array
     free: Complex
@@ -293,7 +293,7 @@ class Transparency(NamedTuple):
         apart = self.clamped - self.free
         return self._mean(apart) if apart.all() else 0.0
 
-    def size_at(self, frequency_hz: float) -> tuple[float, float]:
+    def interpolate_magnitudes(self, frequency_hz: float) -> tuple[float, float]:
         """Returns the sizes of the free and the clamped impedance at a frequency, N m s/rad."""
         x = np.log(self.w_rad_s)
         at = np.log(2.0 * np.pi * frequency_hz)
@@ -332,8 +332,8 @@ def measure_transparency(loop: LinearLoop, at: str, of: str) -> tuple[Transparen
     joints = [int(loop.inputs[port].rpartition("tau")[2]) for port in places]
     return tuple(
         Transparency(
-            at=at,
-            of=of,
+            operator_site=at,
+            other_site=of,
             joint=joint,
             w_rad_s=w_rad_s,
             free=1.0 / free[:, n, n],

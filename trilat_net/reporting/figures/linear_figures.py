@@ -46,7 +46,7 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
     if "unstable" in (ports.verdict, ports.clamped_verdict):
         return style.empty_figure("The loop is unstable: it has no impedance.", size)
     joints = sorted({one.joint for one in ports.transparency})
-    sites = dict.fromkeys(one.at for one in ports.transparency)
+    sites = dict.fromkeys(one.operator_site for one in ports.transparency)
     rows = style.arrange_joints(len(joints), size.narrow)
     blocks = len(rows)
     columns = min(len(rows[0]), len(joints))
@@ -74,7 +74,7 @@ def draw_port_impedance(ports: PortAnalysis, size: FigureSize = REPORT_SIZE) -> 
         for column in range(len(joints) - columns * (blocks - 1), columns):
             grid[-2, column].set_visible(False)
             grid[-1, column].set_visible(False)
-        of = ports.transparency[0].of
+        of = ports.transparency[0].other_site
         entries: list[tuple[str, dict[str, Any]]] = [
             *((f"felt at {site}", {"color": _colour(ports, site)}) for site in sites),
             (f"{of} free", {"color": style.REFERENCE}),
@@ -91,7 +91,10 @@ def _plot_impedance(
     for n, one in enumerate(transparency):
         hz = one.w_rad_s / (2.0 * np.pi)
         for Z, dashes in ((one.free, "-"), (one.clamped, _CLAMPED)):
-            line: dict[str, Any] = {"color": _colour(ports, one.at), "linestyle": dashes}
+            line: dict[str, Any] = {
+                "color": _colour(ports, one.operator_site),
+                "linestyle": dashes,
+            }
             line["linewidth"] = (
                 2.0 - 1.2 * n / (len(transparency) - 1) if len(transparency) > 1 else 1.1
             )
@@ -104,7 +107,7 @@ def _plot_impedance(
 
 
 def _describe_ratios(transparency: Sequence[Transparency]) -> str:
-    ratios = ", ".join(f"{one.at} {one.ratio_db:+.1f} dB" for one in transparency)
+    ratios = ", ".join(f"{one.operator_site} {one.ratio_db:+.1f} dB" for one in transparency)
     return f"\nclamped / free {ratios}".replace("-", "\N{MINUS SIGN}")
 
 

@@ -311,5 +311,5 @@ def run_bench(
                 hint = "; what is done is kept: the same command goes on"
                 with open_worker_pool(jobs, on, most=len(tasks), hint=hint) as pool:
                     done = len(asked) - len(tasks)
-                    journal.complete(pool, run_bench_task, tasks, done, len(asked), progress)
+                    journal.run_pending(pool, run_bench_task, tasks, done, len(asked), progress)
         return BenchResults(plan, journal.done)

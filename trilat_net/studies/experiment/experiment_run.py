@@ -169,7 +169,7 @@ class Experiment(Result):
                 for one in left
             ]
             with open_worker_pool(jobs, on, most=len(tasks) or 1, hint=self._remedy) as pool:
-                journal.complete(pool, run_trial, tasks, len(done), len(plan.trials), show)
+                journal.run_pending(pool, run_trial, tasks, len(done), len(plan.trials), show)
         self.write_tables()
         return self
 

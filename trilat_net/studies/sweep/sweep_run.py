@@ -368,7 +368,7 @@ def _run_cells(
             for n, seed in runs
             if (n, seed) not in journal.done
         )
-        journal.complete(pool, run_cell, tasks, len(journal.done), count, progress)
+        journal.run_pending(pool, run_cell, tasks, len(journal.done), count, progress)
 
     make(((number, first) for number in range(plan.cells)), plan.cells)
     again = [
