@@ -265,7 +265,7 @@ def test_the_analysis_of_waves_is_whole() -> None:
     found = analyse_linear_loop(wave_pair(1000.0), pose=(0.0, 0.0))
     assert found.verdict == "stable"
     assert found.sampled is None
-    assert any("continuous time alone" in note for note in found.notes)
+    assert any("continuous time only" in note for note in found.notes)
     assert found.margin.description.startswith("stable for every common delay")
 
 

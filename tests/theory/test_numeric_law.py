@@ -94,7 +94,7 @@ def test_a_certificate_runs_no_code_from_outside() -> None:
     log = tn.simulate("two_sites", {"control.law": PD}, duration_s=0.1)
     found = tn.certify(log).roots
     assert found is not None
-    assert "known by its code alone" in found.text
+    assert "known by its code only" in found.text
 
 
 @pytest.mark.long

@@ -144,5 +144,5 @@ def test_play_out_makes_jitter_a_constant_delay() -> None:
 
 def test_a_link_that_delivers_nothing_is_refused() -> None:
     chosen = scenario(loss=1.0)
-    with pytest.raises(ScenarioError, match=r"links\.m->s: no sample of it ever comes"):
+    with pytest.raises(ScenarioError, match=r"links\.m->s: no sample of it ever arrives"):
         compute_effective_delay(chosen, "m", "s", chosen.links["m->s"])

@@ -1,24 +1,25 @@
-"""Characteristic roots of a nonlinear eigenproblem Delta(s) v = 0: of loops with delays, and
-those at zero.
+"""Characteristic roots of loops with delays: the solutions s of Delta(s) v = 0.
 
-Invariant: a root solves the equation to rounding, whatever discretisation its first guess came
-from. Roots at zero that are there for every delay (shared poses, estimates without excitation)
-are counted, and never called the rightmost.
+Roots are refined by Newton's method in the form of successive linear problems: solve
+Delta(s) v = mu Delta'(s) v and subtract the smallest mu from s. The method converges
+quadratically for simple roots, and also for multiple roots with as many vectors, which loops of
+identical sites have. Ruhe, "Algorithms for the nonlinear eigenvalue problem", SIAM J. Numerical
+Analysis 10 (1973).
 
-Newton's method in the form of successive linear problems: solve Delta(s) v = mu Delta'(s) v and
-subtract the smallest mu from s. It converges quadratically for simple roots, and for multiple
-ones with as many vectors, which loops of identical sites have. Ruhe, "Algorithms for the
-nonlinear eigenvalue problem", SIAM J. Numerical Analysis 10 (1973).
+First guesses for the continuous loop are the eigenvalues of the Chebyshev pseudospectral
+discretisation of the infinitesimal generator. Its order doubles until the wanted roots agree.
+Breda, Maset and Vermiglio, "Pseudospectral differencing methods for characteristic roots of
+delay differential equations", SIAM J. Scientific Computing 27 (2005); nodes after Trefethen,
+"Spectral Methods in MATLAB" (2000).
 
-Guesses for the continuous loop come from the Chebyshev pseudospectral discretisation of the
-infinitesimal generator, whose order doubles until the wanted roots agree. Breda, Maset and
-Vermiglio, "Pseudospectral differencing methods for characteristic roots of delay differential
-equations", SIAM J. Scientific Computing 27 (2005); nodes after Trefethen, "Spectral Methods in
-MATLAB" (2000).
+`limit_blas_threads` keeps OpenBLAS on one thread for these small matrices. OpenBLAS otherwise
+divides products of a hundred rows among all cores and busy-waits for them, which takes a
+hundred times as long if another process occupies a core.
 
-`limit_blas_threads` keeps OpenBLAS on one thread for these small matrices: it shares products
-of a hundred rows out to all cores and busy-waits, which takes a hundred times as long if
-another process has a core.
+Invariant:
+    - A root solves the equation to rounding, whatever discretisation its guess came from.
+    - Roots that are zero for every delay (shared poses, estimates without excitation) are
+      counted, and never called the rightmost.
 """
 
 import ctypes
@@ -40,27 +41,33 @@ from .linear_loop import LinearLoop
 Complex = NDArray[np.complex128]
 
 SAME_ROOT_TOLERANCE = 1e-8
-"""Roots that differ by less, relative to 1 + abs(s), are one."""
+"""Roots that differ by less, relative to 1 + abs(s), count as the same root."""
 STABILITY_EDGE_PER_S = 1e-6
-"""A rightmost root within this of the imaginary axis is on it."""
+"""A rightmost root closer to the imaginary axis than this counts as on the axis, 1/s."""
 ROOT_RESIDUAL_TOLERANCE = 1e-12
 """Largest residual of a root, relative to the size of Delta's terms."""
 _MAX_NEWTON_STEPS = 30
 _STEP_TOLERANCE = 1e-9
-"""A step this small, relative to 1 + abs(s), leaves an error of about its square."""
+"""Newton's method stops after a step this small, relative to 1 + abs(s).
+
+The remaining error is about the square of the step.
+"""
 _SAME_VALUE = 1e-11
-"""Singular values this small, relative to Delta's terms, belong to one root."""
+"""Singular values of Delta this small, relative to its terms, belong to the same root."""
 _MAX_DISTANCE_PER_S = 1e6
-"""Newton's method has failed if it is this far from its guess, 1/s."""
+"""Newton's method has failed once it is this far from its guess, 1/s."""
 ZERO_SHARE = 1e-12
 """A singular value this small, relative to the largest, is zero."""
 _LONGEST_CHAIN = 4
+"""The longest Jordan chain at zero that is searched."""
 NAMED_SHARE = 0.3
 """States with at least this share of the largest participation are named."""
 _INITIAL_ORDER = 12
+"""Degree of the polynomials of the first discretisation."""
 MAX_GENERATOR_SIZE = 1600
-"""The largest discretisation: its eigenvalues take some seconds."""
+"""Rows of the largest discretisation, whose eigenvalues take some seconds."""
 _ROOT_AGREEMENT = 1e-9
+"""Roots of two orders agree if they differ by less, relative to 1 + abs(s)."""
 _BLAS_SYMBOLS = (
     "scipy_openblas_{}_num_threads64_",
     "openblas_{}_num_threads64_",
@@ -76,17 +83,17 @@ def limit_blas_threads() -> Iterator[None]:
         yield
         return
     get_threads, set_threads = functions
-    before = get_threads()
+    previous_count = get_threads()
     set_threads(1)
     try:
         yield
     finally:
-        set_threads(before)
+        set_threads(previous_count)
 
 
 @cache
 def _find_blas_functions() -> tuple[Callable[[], int], Callable[[int], None]] | None:
-    """Returns the functions that read and set OpenBLAS's number of threads, or None."""
+    """Returns the functions that read and set OpenBLAS's number of threads; None: not found."""
     module = getattr(numpy.linalg, "_umath_linalg", None)
     try:
         library = ctypes.CDLL(module.__file__)  # type: ignore[union-attr]
@@ -101,14 +108,14 @@ def _find_blas_functions() -> tuple[Callable[[], int], Callable[[int], None]] | 
 
 
 class Pencil(NamedTuple):
-    """Delta(s) = s E - A - sum_k A_k exp(-s T_k).
+    """The characteristic matrix Delta(s) = s E - A - sum_k A_k exp(-s T_k).
 
     Attributes:
         A: shape (n, n).
         delays: T_k, s, shape (K,).
         Ad: A_k, shape (K, n, n).
-        E: 1 of each state that has a rate, 0 of one that the others give at once; None: all
-            have one.
+        E: diagonal of E, shape (n,): 1 for a state with a rate, 0 for an algebraic state.
+            None: every state has a rate.
     """
 
     A: Array
@@ -117,71 +124,78 @@ class Pencil(NamedTuple):
     E: Array | None = None
 
     @property
-    def rates(self) -> Array:
-        """The matrix of s in Delta(s): the unit matrix, with zeros for states without a rate."""
+    def rate_matrix(self) -> Array:
+        """E as a matrix, the coefficient of s, shape (n, n)."""
         return np.eye(len(self.A)) if self.E is None else np.diag(self.E)
 
     def evaluate(self, s: complex) -> tuple[Complex, Complex]:
-        """Returns Delta(s) and its derivative, shape (n, n) each."""
-        delayed = np.exp(-s * self.delays)[:, np.newaxis, np.newaxis] * self.Ad
-        delta = s * self.rates - self.A - delayed.sum(axis=0)
-        derivative = self.rates + (self.delays[:, np.newaxis, np.newaxis] * delayed).sum(axis=0)
+        """Returns Delta(s) and its derivative by s, shape (n, n) each."""
+        exponentials = np.exp(-s * self.delays)[:, np.newaxis, np.newaxis]
+        delayed = exponentials * self.Ad
+        delta = s * self.rate_matrix - self.A - delayed.sum(axis=0)
+        weighted = self.delays[:, np.newaxis, np.newaxis] * delayed
+        derivative = self.rate_matrix + weighted.sum(axis=0)
         return delta.astype(np.complex128), derivative.astype(np.complex128)
 
-    def size(self, s: complex) -> float:
-        """Returns the sum of the norms of the terms of Delta(s): residuals are relative to it."""
+    def sum_term_norms(self, s: complex) -> float:
+        """Returns the sum of the norms of the terms of Delta(s), which scales residuals."""
         delayed = np.exp(-s.real * self.delays) @ np.linalg.norm(self.Ad, axis=(1, 2))
         return float(abs(s) + np.linalg.norm(self.A) + delayed)
 
-    def taylor(self, power: int) -> Array:
-        """Returns the coefficient of s^power of Delta about 0, shape (n, n)."""
-        own = {0: -self.A, 1: self.rates}.get(power, 0.0)
-        late = np.einsum("k,kab->ab", (-self.delays) ** power, self.Ad) / math.factorial(power)
-        coefficient: Array = own - late
+    def compute_taylor_coefficient(self, power: int) -> Array:
+        """Returns the coefficient of s^power in Delta's Taylor series at 0, shape (n, n)."""
+        undelayed = {0: -self.A, 1: self.rate_matrix}.get(power, 0.0)
+        moments = (-self.delays) ** power
+        delayed = np.einsum("k,kab->ab", moments, self.Ad) / math.factorial(power)
+        coefficient: Array = undelayed - delayed
         return coefficient
 
     @property
     def delayed_states(self) -> NDArray[np.intp]:
-        """Places of the states that act after a delay."""
+        """Indices of the states that act after a delay."""
         return np.flatnonzero(np.abs(self.Ad).sum(axis=(0, 1)))
 
 
 MovingPart = tuple[Pencil, tuple[str, ...], int]
-"""A loop without the states that nothing changes, or that change nothing: its characteristic
-equation, the names of its states, and the number of states left out, each with a root at
-zero.
+"""A loop without its constant states and its states without effect.
+
+The entries are the characteristic matrix, the names of its states, and the number of omitted
+states, each of which has a root at zero.
 """
 
 
 def extract_moving_part(pencil: Pencil, names: Sequence[str]) -> MovingPart:
-    """Returns the part of a loop that moves."""
-    # of state j on the rate of state i
+    """Returns the part of a loop without constant states and without states of no effect."""
+    # entry (i, j): effect of state j on the rate of state i
     effects = np.abs(pencil.A) + np.abs(pencil.Ad).sum(axis=0)
     kept = list(range(len(names)))
     while True:
         inner = effects[np.ix_(kept, kept)]
-        idle = [
-            place for n, place in enumerate(kept) if not inner[n].any() or not inner[:, n].any()
-        ]
-        if not idle:
+        is_constant = ~inner.any(axis=1)
+        has_no_effect = ~inner.any(axis=0)
+        idle = np.flatnonzero(is_constant | has_no_effect)
+        if not len(idle):
             break
-        kept.remove(idle[0])
+        # one state at a time: its removal may leave others without an effect
+        del kept[int(idle[0])]
     rows, columns = np.ix_(kept, kept)
     Ad = pencil.Ad[:, rows, columns]
-    acts = Ad.any(axis=(1, 2))
-    E = None if pencil.E is None else pencil.E[kept]
+    is_used = Ad.any(axis=(1, 2))
     moving = pencil._replace(
-        A=pencil.A[rows, columns], delays=pencil.delays[acts], Ad=Ad[acts], E=E
+        A=pencil.A[rows, columns],
+        delays=pencil.delays[is_used],
+        Ad=Ad[is_used],
+        E=None if pencil.E is None else pencil.E[kept],
     )
-    return moving, tuple(names[place] for place in kept), len(names) - len(kept)
+    return moving, tuple(names[n] for n in kept), len(names) - len(kept)
 
 
 class CharacteristicRoot(NamedTuple):
-    """One characteristic root, or a pair of conjugate ones.
+    """A characteristic root, or a pair of conjugate roots.
 
     Attributes:
-        s: the root, with an imaginary part that is not negative, 1/s.
-        multiplicity: number of modes that share it.
+        s: the root with a non-negative imaginary part, 1/s.
+        multiplicity: number of modes that share the root.
         states: names of the states that participate most, the largest first.
     """
 
@@ -207,18 +221,18 @@ class CharacteristicRoot(NamedTuple):
 
 
 class Spectrum(NamedTuple):
-    """Roots of a loop.
+    """The rightmost roots of a loop.
 
     Attributes:
-        roots: the rightmost ones that are not zero by structure, by falling real part.
+        roots: the rightmost roots that are not zero by structure, by falling real part.
         zeros: number of roots that are zero by structure.
-        drifting: number of those without a vector of their own, which grow with t.
-        dropped: number of candidates that led to no root.
-        order: of the discretisation that gave the candidates; 0 if none was needed.
-        span_s: the period of delays and tick rates over which they are computed, or the span of
-            delays that do not repeat, s; None if each tick is like the one before.
-        deviation_per_s: of the rightmost root, if delays do not repeat, by the parts of the
-            span, 1/s.
+        drifting: number of those zeros without a vector of their own; their modes grow with t.
+        dropped: number of guesses from which no root was found.
+        order: order of the discretisation that gave the guesses; 0 if none was needed.
+        span_s: the period of delays and tick rates over which the roots are computed, or the
+            analysed span of delays that do not repeat, s; None if all ticks are alike.
+        deviation_per_s: standard deviation of the rightmost root between parts of the span, if
+            delays do not repeat, 1/s.
     """
 
     roots: tuple[CharacteristicRoot, ...]
@@ -231,14 +245,13 @@ class Spectrum(NamedTuple):
 
     @property
     def basis(self) -> str:
-        """What it is computed over, in words; "" if each tick is like the one before."""
+        """A phrase that states the span of the analysis; "" if all ticks are alike."""
         if self.span_s is None:
             return ""
         if self.deviation_per_s is None:
             return f", over the period of {self.span_s:.6g} s"
-        return (
-            f", over {self.span_s:.4g} s of the delays in use, +- {self.deviation_per_s:.1g} /s"
-        )
+        deviation = f"+- {self.deviation_per_s:.1g} /s"
+        return f", over {self.span_s:.4g} s of the delays in use, {deviation}"
 
     @property
     def rightmost(self) -> CharacteristicRoot | None:
@@ -247,67 +260,84 @@ class Spectrum(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """stable, unstable, or at the edge."""
-        re = self.roots[0].s.real if self.roots else -math.inf
+        """The stability verdict: "stable", "unstable" or "at the edge"."""
+        rightmost_per_s = self.roots[0].s.real if self.roots else -math.inf
         edge_per_s = max(STABILITY_EDGE_PER_S, self.deviation_per_s or 0.0)
-        if re > edge_per_s:
+        if rightmost_per_s > edge_per_s:
             return "unstable"
-        return "at the edge" if re >= -edge_per_s or self.drifting else "stable"
+        if rightmost_per_s >= -edge_per_s or self.drifting:
+            return "at the edge"
+        return "stable"
 
 
 def _solve_for_root(
-    pencil: Pencil, first: complex, names: Sequence[str]
+    pencil: Pencil, guess: complex, names: Sequence[str]
 ) -> CharacteristicRoot | None:
-    """Returns the root that Newton's method finds from a first guess, 1/s, or None if it finds
-    none.
+    """Returns the root to which Newton's method converges from a guess; None: it diverges.
+
+    Args:
+        pencil: the characteristic matrix.
+        guess: first guess of the root, 1/s.
+        names: names of the states.
     """
-    s = complex(first)
+    s = complex(guess)
     with np.errstate(all="ignore"):
         for _ in range(_MAX_NEWTON_STEPS):
-            delta, derivative = pencil.evaluate(s)
-            # exp(-s T) far to the left
-            if not (np.isfinite(delta).all() and np.isfinite(derivative).all()):
+            step = _compute_newton_step(pencil, s)
+            if step is None:
                 return None
-            try:
-                if pencil.E is None:
-                    mu = np.linalg.eigvals(np.linalg.solve(derivative, delta))
-                else:  # states without a rate make infinite ones
-                    mu = eigvals(delta, derivative)
-                    mu = mu[np.isfinite(mu)]
-            except np.linalg.LinAlgError:
-                return None
-            if not len(mu):
-                return None
-            step = complex(mu[np.argmin(np.abs(mu))])
             s -= step
-            if not np.isfinite(s) or abs(s - first) > _MAX_DISTANCE_PER_S:
+            if not np.isfinite(s) or abs(s - guess) > _MAX_DISTANCE_PER_S:
                 return None
             if abs(step) <= _STEP_TOLERANCE * (1.0 + abs(s)):
                 break
-        shares = _measure_participation(pencil, s)
-    if shares is None:
+        measured = _measure_participation(pencil, s)
+    if measured is None:
         return None
-    states = np.round(shares[1] / shares[1].max(), 6)  # equal ones stay in their order
-    order = [int(n) for n in np.argsort(-states, kind="stable") if states[n] >= NAMED_SHARE]
-    rounded = complex(s.real, abs(s.imag) if abs(s.imag) > SAME_ROOT_TOLERANCE else 0.0)
-    return CharacteristicRoot(rounded, shares[0], tuple(names[n] for n in order))
+    multiplicity, participation = measured
+    # rounded, so that equal shares stay in their order
+    shares = np.round(participation / participation.max(), 6)
+    falling = np.argsort(-shares, kind="stable")
+    states = [names[n] for n in falling if shares[n] >= NAMED_SHARE]
+    imag = abs(s.imag) if abs(s.imag) > SAME_ROOT_TOLERANCE else 0.0
+    return CharacteristicRoot(complex(s.real, imag), multiplicity, tuple(states))
+
+
+def _compute_newton_step(pencil: Pencil, s: complex) -> complex | None:
+    """Returns the smallest mu of Delta(s) v = mu Delta'(s) v; None if there is none."""
+    delta, derivative = pencil.evaluate(s)
+    # far to the left, exp(-s T) overflows
+    if not (np.isfinite(delta).all() and np.isfinite(derivative).all()):
+        return None
+    try:
+        if pencil.E is None:
+            mu = np.linalg.eigvals(np.linalg.solve(derivative, delta))
+        else:
+            # algebraic states make the derivative singular, with infinite eigenvalues
+            mu = eigvals(delta, derivative)
+            mu = mu[np.isfinite(mu)]
+    except np.linalg.LinAlgError:
+        return None
+    if not len(mu):
+        return None
+    return complex(mu[np.argmin(np.abs(mu))])
 
 
 def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | None:
-    """Returns the number of vectors of a root at s, and each state's participation; None if it
-    is no root.
+    """Returns the number of vectors of a root at s, and the participation of each state.
 
-    Participation is the abs of the diagonal of the residue of Delta(s)^-1, which does not
-    depend on units.
+    Participation is the modulus of the diagonal of the residue of Delta(s)^-1,
+    V (W' Delta'(s) V)^-1 W' with the null vectors V and W; it does not depend on units.
+    None: s is not a root.
     """
     delta, derivative = pencil.evaluate(s)
     if not np.isfinite(delta).all():
         return None
     left, values, right = np.linalg.svd(delta)
-    size = pencil.size(s)
-    if not float(values[-1]) / size <= ROOT_RESIDUAL_TOLERANCE:
+    scale = pencil.sum_term_norms(s)
+    if not float(values[-1]) / scale <= ROOT_RESIDUAL_TOLERANCE:
         return None
-    count = int(np.sum(values <= _SAME_VALUE * size))
+    count = int(np.sum(values <= _SAME_VALUE * scale))
     W = left[:, -count:]
     V = right[-count:].conj().T
     try:
@@ -318,22 +348,20 @@ def _measure_participation(pencil: Pencil, s: complex) -> tuple[int, Array] | No
 
 
 def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
-    """Returns the numbers of roots that are zero by structure, and of those among them that
-    drift.
+    """Returns the number of roots that are zero by structure, and how many of them drift.
 
     With Delta(s) = D_0 + s D_1 + s^2 D_2 + ..., the block Toeplitz matrix of D_0 ... D_(m-1)
-    has as many null vectors as there are roots at zero, each chain of them counted up to length
-    m. When that number stops rising with m all are counted; those of chains longer than 1 grow
-    as t does.
+    has as many null vectors as there are roots at zero, with each Jordan chain counted up to
+    length m. Once that number no longer rises with m, all are counted. Roots in chains longer
+    than 1 drift: their modes grow with t.
     """
     counts = [0]
     for length in range(1, _LONGEST_CHAIN + 1):
-        terms = [pencil.taylor(power) for power in range(length)]
-        if not len(terms[0]):
+        coefficients = [pencil.compute_taylor_coefficient(power) for power in range(length)]
+        if not len(coefficients[0]):
             return 0, 0
-        toeplitz = np.sum(
-            [np.kron(np.eye(length, k=-power), D) for power, D in enumerate(terms)], axis=0
-        )
+        blocks = [np.kron(np.eye(length, k=-power), D) for power, D in enumerate(coefficients)]
+        toeplitz = np.sum(blocks, axis=0)
         values = np.linalg.svd(toeplitz, compute_uv=False)
         counts.append(int(np.sum(values <= ZERO_SHARE * values[0])))
         if counts[-1] == counts[-2]:
@@ -344,126 +372,157 @@ def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
 def refine_roots(
     pencil: Pencil, candidates: Complex, names: Sequence[str], wanted: int
 ) -> tuple[list[CharacteristicRoot], int]:
-    """Returns the rightmost `wanted` roots near some candidates, and the number of candidates
-    dropped.
+    """Returns the rightmost `wanted` roots near some guesses, and the number of failed guesses.
 
-    Candidates are guesses of nonzero roots, shape (K,), by falling real part; after two more
-    than wanted the others are skipped, because Newton's method may change their order.
+    Two more roots than wanted are refined, because Newton's method may change their order; the
+    remaining guesses are skipped.
+
+    Args:
+        pencil: the characteristic matrix.
+        candidates: guesses of nonzero roots, shape (K,), by falling real part.
+        names: names of the states.
+        wanted: number of roots; a conjugate pair counts once.
     """
-    found: list[CharacteristicRoot] = []
+    roots: list[CharacteristicRoot] = []
     dropped = 0
     for guess in candidates:
         if guess.imag < -SAME_ROOT_TOLERANCE * (1.0 + abs(guess)):
             continue
-        if len(found) >= wanted + 2:
+        if len(roots) >= wanted + 2:
             break
         root = _solve_for_root(pencil, complex(guess), names)
         if root is None or abs(root.s) < SAME_ROOT_TOLERANCE:
             dropped += 1
-        elif all(
-            abs(root.s - one.s) >= SAME_ROOT_TOLERANCE * (1.0 + abs(root.s)) for one in found
-        ):
-            found.append(root)
-    return sorted(found, key=lambda one: (-round(one.s.real, 9), one.s.imag))[:wanted], dropped
+            continue
+        tolerance = SAME_ROOT_TOLERANCE * (1.0 + abs(root.s))
+        if all(abs(root.s - known.s) >= tolerance for known in roots):
+            roots.append(root)
+    roots.sort(key=lambda root: (-round(root.s.real, 9), root.s.imag))
+    return roots[:wanted], dropped
 
 
 def find_moving_part(loop: LinearLoop) -> MovingPart:
-    """Returns the part of a loop that moves."""
+    """Returns the part of a loop without constant states and without states of no effect."""
     Ad = np.array([term.A for term in loop.delayed]).reshape(-1, *loop.A.shape)
     delays_s = np.array([term.delay_s for term in loop.delayed])
-    moving, names, constant = extract_moving_part(
-        Pencil(loop.A, delays_s, Ad, E=loop.E), loop.names
-    )
-    return moving, names, constant + loop.omitted_states
+    pencil = Pencil(loop.A, delays_s, Ad, E=loop.E)
+    moving, names, idle_count = extract_moving_part(pencil, loop.names)
+    return moving, names, idle_count + loop.omitted_states
 
 
 def compute_delay_spectrum(loop: LinearLoop, wanted: int = 6) -> Spectrum:
-    """Returns the rightmost roots of a loop; conjugate ones and multiple ones count once in
-    `wanted`.
+    """Returns the rightmost roots of a continuous loop.
+
+    Args:
+        loop: the loop.
+        wanted: number of roots; a conjugate pair or a multiple root counts once.
     """
     with limit_blas_threads():
-        pencil, names, constant = find_moving_part(loop)
+        pencil, names, idle_count = find_moving_part(loop)
         zeros, drifting = count_zero_roots(pencil)
         if not len(names):
             return Spectrum(
-                roots=(), zeros=constant + zeros, drifting=drifting, dropped=0, order=0
+                roots=(), zeros=idle_count + zeros, drifting=drifting, dropped=0, order=0
             )
         has_delays = len(pencil.delays) > 0
         order = _INITIAL_ORDER if has_delays else 0
-        before = None
+        previous_roots = None
         while True:
             matrix = discretise_generator(pencil, order) if has_delays else pencil.A
             if pencil.E is not None:
                 matrix = _eliminate_states(matrix, pencil.E)
             values = np.linalg.eigvals(matrix).astype(np.complex128)
-            # the smallest stand for zeros
+            # the eigenvalues of smallest modulus approximate the roots at zero
             values = values[np.argsort(np.abs(values), kind="stable")][zeros:]
             falling = np.lexsort((np.abs(values.imag), -np.round(values.real, 9)))
             roots, dropped = refine_roots(pencil, values[falling], names, wanted)
-            too_large = len(names) + 2 * order * len(pencil.delayed_states) > MAX_GENERATOR_SIZE
-            if not has_delays or too_large or (before is not None and _agree(before, roots)):
+            next_size = len(names) + 2 * order * len(pencil.delayed_states)
+            is_converged = previous_roots is not None and _agree(previous_roots, roots)
+            if not has_delays or next_size > MAX_GENERATOR_SIZE or is_converged:
                 return Spectrum(
                     roots=tuple(roots),
-                    zeros=constant + zeros,
+                    zeros=idle_count + zeros,
                     drifting=drifting,
                     dropped=dropped,
                     order=order,
                 )
-            before = roots
+            previous_roots = roots
             order = 2 * order
 
 
 def _eliminate_states(matrix: Array, E: Array) -> Array:
-    given = np.flatnonzero(E == 0.0)
-    kept = np.setdiff1d(np.arange(len(matrix)), given)
-    ours = np.linalg.solve(matrix[np.ix_(given, given)], matrix[np.ix_(given, kept)])
-    return matrix[np.ix_(kept, kept)] - matrix[np.ix_(kept, given)] @ ours
+    """Returns the matrix of the states with a rate, without algebraic states.
+
+    From 0 = M_aa x_a + M_ar x_r follows the Schur complement M_rr - M_ra M_aa^-1 M_ar.
+
+    Args:
+        matrix: matrix M of all states; the discretised history follows the loop's states.
+        E: 1 for a state with a rate, 0 for an algebraic state, of the loop's states.
+    """
+    algebraic = np.flatnonzero(E == 0.0)
+    kept = np.setdiff1d(np.arange(len(matrix)), algebraic)
+    M_aa = matrix[np.ix_(algebraic, algebraic)]
+    M_ar = matrix[np.ix_(algebraic, kept)]
+    M_ra = matrix[np.ix_(kept, algebraic)]
+    return matrix[np.ix_(kept, kept)] - M_ra @ np.linalg.solve(M_aa, M_ar)
 
 
-def _agree(before: list[CharacteristicRoot], now: list[CharacteristicRoot]) -> bool:
-    return len(now) >= len(before) and all(
-        any(abs(a.s - b.s) <= _ROOT_AGREEMENT * (1.0 + abs(a.s)) for b in before) for a in now
-    )
+def _agree(previous: list[CharacteristicRoot], roots: list[CharacteristicRoot]) -> bool:
+    """True if every root is close to a root of the previous order."""
+    if len(roots) < len(previous):
+        return False
+    for root in roots:
+        tolerance = _ROOT_AGREEMENT * (1.0 + abs(root.s))
+        if not any(abs(root.s - known.s) <= tolerance for known in previous):
+            return False
+    return True
 
 
 def discretise_generator(pencil: Pencil, order: int) -> Array:
-    """Returns the discretised generator of a pencil with delays, by polynomials of degree
-    `order`.
+    """Returns the discretised infinitesimal generator of a loop with delays.
 
-    Its states are the loop's, and the history of their delayed part at Chebyshev nodes.
+    Its states are the states of the loop, and then the history of the delayed states at the
+    Chebyshev nodes over [-T_max, 0].
+
+    Args:
+        pencil: the characteristic matrix, with at least one delay.
+        order: degree of the interpolating polynomials.
     """
     delayed = pencil.delayed_states
     longest_s = float(pencil.delays.max())
     n = len(pencil.A)
     c = len(delayed)
-    whole = np.zeros((n + order * c, n + order * c))
-    whole[:n, :n] = pencil.A
-    # history over [-longest, 0] as a polynomial of x in [-1, 1]
-    for weights, Ad in zip(
-        chebyshev_interpolation(order, 1.0 - 2.0 * pencil.delays / longest_s),
-        pencil.Ad,
-        strict=True,
-    ):
-        whole[:n, delayed] += weights[0] * Ad[:, delayed]
-        whole[:n, n:] += np.kron(weights[1:], Ad[:, delayed])
+    generator = np.zeros((n + order * c, n + order * c))
+    generator[:n, :n] = pencil.A
+    # x in [-1, 1] stands for the time from -T_max to 0
+    x = 1.0 - 2.0 * pencil.delays / longest_s
+    for weights, Ad in zip(chebyshev_interpolation(order, x), pencil.Ad, strict=True):
+        generator[:n, delayed] += weights[0] * Ad[:, delayed]
+        generator[:n, n:] += np.kron(weights[1:], Ad[:, delayed])
     transport = chebyshev_differentiation(order)[1:] * (2.0 / longest_s)
-    whole[n:, n:] = np.kron(transport[:, 1:], np.eye(c))
-    for place, state in enumerate(delayed):
-        whole[n + place :: c, state] = transport[:, 0]
-    return whole
+    generator[n:, n:] = np.kron(transport[:, 1:], np.eye(c))
+    for column, state in enumerate(delayed):
+        generator[n + column :: c, state] = transport[:, 0]
+    return generator
 
 
 def chebyshev_nodes(order: int) -> Array:
-    """Returns Chebyshev's extremal nodes from 1 to -1, shape (M + 1,)."""
+    """Returns the extremal nodes cos(pi k / order) from 1 to -1, shape (order + 1,)."""
     return np.cos(np.pi * np.arange(order + 1) / order)
 
 
 def chebyshev_interpolation(order: int, x: Array) -> Array:
-    """Returns the matrix from values at the nodes to the polynomial's values at x, shape (K, M
-    + 1).
+    """Returns the matrix from values at the nodes to the interpolating polynomial at x.
+
+    Args:
+        order: degree of the polynomial.
+        x: points in [-1, 1], shape (K,).
+
+    Returns:
+        Matrix of shape (K, order + 1).
     """
-    at_nodes = chebvander(chebyshev_nodes(order), order)
-    return np.linalg.solve(at_nodes.T, chebvander(x, order).T).T.astype(np.float64)
+    basis_at_nodes = chebvander(chebyshev_nodes(order), order)
+    return np.linalg.solve(basis_at_nodes.T, chebvander(x, order).T).T.astype(np.float64)
 
 
 def chebyshev_differentiation(order: int) -> Array:

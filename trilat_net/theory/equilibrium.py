@@ -92,13 +92,13 @@ def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibr
     x = linear_loop.gather_site_arguments(conditions, rest)
     states = [
         np.concatenate([np.zeros_like(one.qdd), one.qdd, one.estimate])
-        for one in conditions.rates(x)
+        for one in conditions.evaluate_rates(x)
     ]
     return _select_loop_states(conditions, states)
 
 
 def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]) -> Array:
-    masks = linear_loop.find_loop_states(conditions)
+    masks = linear_loop.mask_loop_states(conditions)
     return np.concatenate([own[mask] for own, mask in zip(states, masks, strict=True)])
 
 
@@ -143,7 +143,7 @@ def _shift_equilibrium(
     """Returns an equilibrium shifted by a deviation of the loop's states; velocities do not
     count.
     """
-    masks = linear_loop.find_loop_states(conditions)
+    masks = linear_loop.mask_loop_states(conditions)
     parts = np.split(step, np.cumsum([np.count_nonzero(mask) for mask in masks])[:-1])
     q = np.array(rest.q)
     theta_hat = np.array(rest.theta_hat)
@@ -311,7 +311,7 @@ def _complete_estimates(
     for n, site in enumerate(conditions.sites):
         given = None if theta_hat is None else theta_hat[n]
         if isinstance(site.own, NumericLaw):
-            rows.append(site.own.complete(given))
+            rows.append(site.own.complete_memory(given))
         elif has_estimate(site):
             rows.append(site.theta if given is None else given[: len(site.theta)])
         else:
@@ -327,7 +327,7 @@ def _settle_memories(
         zip(conditions.sites, linear_loop.gather_site_arguments(conditions, rest), strict=True)
     ):
         if isinstance(site.own, NumericLaw):
-            theta_hat[n, : len(site.own.memory)] = site.own.settle(x, ticks)
+            theta_hat[n, : len(site.own.memory)] = site.own.iterate_memory(x, ticks)
     return rest._replace(theta_hat=theta_hat)
 
 
@@ -394,7 +394,7 @@ def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
     count = len(conditions.sites)
     q = pad_rows([site.q0 for site in conditions.sites])
     alike = conditions._replace(alpha=np.full((count, count), 1.0 / count))
-    return tuple(linear_loop.find_references(alike, Equilibrium(q, q, "", 0.0))[0].tolist())
+    return tuple(linear_loop.compute_references(alike, Equilibrium(q, q, "", 0.0))[0].tolist())
 
 
 def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equilibrium:
@@ -465,7 +465,7 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
                 f"{site.name} rests near a singular pose (bound of its least singular value {least:.3g}, "
                 f"damped below {task.singular_value:g}): the damping is part of the loop, and J J+ is not 1"
             )
-    for site, own, rates in zip(conditions.sites, x, conditions.rates(x), strict=True):
+    for site, own, rates in zip(conditions.sites, x, conditions.evaluate_rates(x), strict=True):
         torques_nm = np.abs(rates.tau)
         limits_nm = np.broadcast_to(site.tau_limit_nm, rates.tau.shape)
         if (torques_nm >= limits_nm).any():

@@ -52,7 +52,7 @@ from .characteristic_roots import (
     limit_blas_threads,
 )
 from .characteristic_roots import STABILITY_EDGE_PER_S as _STILL_PER_S
-from .linear_loop import SiteJacobian, couple_sites, differentiate_rates
+from .linear_loop import SiteJacobian, compute_couplings, differentiate_rates
 from .operating_point import Equilibrium, OperatingConditions
 
 
@@ -92,7 +92,7 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     """Returns one site over a period, from the derivatives of its rates
     (`differentiate_rates`).
     """
-    at = jacobian.at
+    at = jacobian.layout
     rates = jacobian.rates
     h_s = 1.0 / site.rate_hz
     second = site.scheme is Scheme.SECOND_ORDER
@@ -126,7 +126,7 @@ def linearise_site_tick(site: SiteSetup, jacobian: SiteJacobian) -> SiteTickMap:
     if second:
         P[arm, memory.stop :] -= 0.5 * Gamma
     sent = np.zeros((3 * at.coordinates, n))
-    sent[:, : at.states] = jacobian.sent
+    sent[:, : at.states] = jacobian.output
     states = (*jacobian.states, *(f"tau{joint + 1}" for joint in range(at.joints) if second))
     return SiteTickMap(P, Q, sent, tuple(f"{site.name}.{state}" for state in states))
 
@@ -160,7 +160,7 @@ def couple_ticks(conditions: OperatingConditions, rest: Equilibrium) -> CoupledT
         for site, own in zip(conditions.sites, sites, strict=True)
     ]
     owners = np.repeat(np.arange(len(maps)), [len(one.P) for one in maps])
-    couplings = couple_sites(conditions, rest, sites)
+    couplings = compute_couplings(conditions, rest, sites)
     effects = np.zeros((len(couplings), len(owners), len(owners)))
     for effect, ((i, j), coupling) in zip(effects, couplings.items(), strict=True):
         effect[np.ix_(owners == i, owners == j)] = maps[i].Q @ coupling @ maps[j].sent
@@ -257,7 +257,7 @@ def find_samples_in_use(conditions: OperatingConditions) -> SamplesInUse:
     # past what the beginning is like
     start_s = math.ceil((4e-3 * reach_ms + 0.1) * common_hz) / common_hz
     used = {}
-    for i, j in conditions.pairs:
+    for i, j in conditions.coupled_pairs:
         ticks = np.arange(round(span_s * rates_hz[i]))
         first = round(start_s * rates_hz[i])
         used[i, j] = np.rint(

@@ -43,7 +43,7 @@ from .delay_margin import DelayMargin, find_delay_margin
 from .equilibrium import find_equilibrium, follow_equilibrium, pad_rows
 from .floquet import DRAWN_SPAN_S, SamplesInUse, compute_sampled_spectrum
 from .linear_edge import EdgeScan, find_deepest_contact, iterate_linear_edges, parse_edge_range
-from .linear_loop import LinearLoop, linearise_loop, share_poses
+from .linear_loop import LinearLoop, compute_shared_poses, linearise_loop
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .port_analysis import PortAnalysis, analyse_ports, ports_to_json
@@ -90,7 +90,7 @@ class LinearAnalysis(Result):
         sites = self.conditions.sites
         if not sites[0].layout.task:
             return (np.zeros(0),) * len(sites)
-        return tuple(share_poses(self.conditions, self.rest))
+        return tuple(compute_shared_poses(self.conditions, self.rest))
 
     @property
     def decisive(self) -> Spectrum:

@@ -195,7 +195,7 @@ class _GrowthRate:
         )
         conditions = derive_operating_conditions(scenario)
         self._rest = follow_equilibrium(scenario, self._rest)
-        sampled = conditions.held if self._sampled is None else self._sampled
+        sampled = conditions.needs_sampled_loop if self._sampled is None else self._sampled
         self._root = find_rightmost_root(conditions, self._rest, sampled=sampled)
         return -np.inf if self._root is None else self._root.s.real
 
@@ -250,7 +250,7 @@ def compute_growth_column(
         try:
             rest, remark = _assume_equilibrium(scenario, rest)
             conditions = derive_operating_conditions(scenario)
-            root = find_rightmost_root(conditions, rest, sampled=conditions.held)
+            root = find_rightmost_root(conditions, rest, sampled=conditions.needs_sampled_loop)
             found.growth_per_s.append(-np.inf if root is None else root.s.real)
             before, now = found.growth_per_s[-2:] if n else [np.nan, np.nan]
             if np.isfinite([before, now]).all() and (before > 0.0) != (now > 0.0):

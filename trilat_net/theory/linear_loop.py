@@ -1,16 +1,18 @@
-"""The closed loop of all sites, linearised at an equilibrium: a delay-differential equation.
+"""The loop of all sites, linearised at an equilibrium: a delay-differential equation.
 
     x'(t) = A x(t) + sum_k A_k x(t - T_k) + B u(t) + sum_k B_k u(t - T_k),    y(t) = C x(t)
 
-Invariant: x are deviations from the equilibrium, in the order of the scenario's sites; u is the
-torque ON the joints that an operator adds; y are the joint velocities. Sites that follow with
-their end effectors are coupled through what they share of their poses, `SiteRates.x`, and
-through its velocity.
+A chain has ten estimates per link. A small motion changes, and the torque shows, at most one
+combination of them per joint: the learnt gravity torque. With the regressor Y_G at rest it is
+z = Y_G theta_hat in N m, with the rate z' = -Y_G Gamma Y' r. The loop of chains has z as states
+in place of the estimates. Every omitted combination is constant or has no effect, and adds one
+root at zero.
 
-A chain has ten estimates a link, of which a small motion moves, and the torque shows, no more
-than one combination a joint: the gravity that was learnt. With the regressor Y_G at rest it is
-z = Y_G theta_hat, N m, and z' = -Y_G Gamma Y' r. The loop of chains has z in place of the
-estimates; all that is left out is constant or has no effect, each with a root at zero.
+Invariant:
+    - x holds deviations from the equilibrium, in the order of the scenario's sites.
+    - u is the torque ON the joints that operators add; y holds the joint velocities.
+    - Sites that follow in task space are coupled through the shared poses `SiteRates.x` and
+      their velocities.
 """
 
 from collections.abc import Sequence
@@ -21,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, qr
 
+from ..core.site_setup import SiteSetup
 from ..core.task_space import PLACE
 from ..core.vectors import Array
 from ..laws.conditions import LinearForm, Place
@@ -30,32 +33,34 @@ from .operating_point import Equilibrium, OperatingConditions
 from .textbook_arm import evaluate_reference
 
 _DEPENDENT = 1e-9
-"""Rows of a regressor that are dependent to this, relative to the largest, are."""
+"""Pivots of a regressor's QR factorisation below this, relative to the largest, are zero."""
 
 
 class SiteJacobian(NamedTuple):
-    """The derivatives of one site's rates, by the states that the loop keeps.
+    """The derivatives of one site's rates by the states that the loop keeps.
 
     Attributes:
-        at: layout of the columns; of a law that learns nothing it has no estimate.
+        layout: layout of the columns; without an estimate if the law learns nothing.
         rates: the derivatives, see `differentiate_site_rates`.
-        states: names of the states, as "q1", "qd2", "theta4"; "gravity2": the learnt gravity of
-            joint 2.
-        omitted_states: number of estimates that no small motion moves or shows.
+        states: names of the states, as "q1", "qd2", "theta4"; "gravity2" is the learnt gravity
+            torque of joint 2.
+        omitted_states: number of estimates that no small motion changes or shows.
     """
 
-    at: site_dynamics.ArgumentLayout
+    layout: site_dynamics.ArgumentLayout
     rates: site_dynamics.SiteRates
     states: tuple[str, ...]
     omitted_states: int = 0
 
     @property
-    def sent(self) -> Array:
-        """What peers get by the site's own states, shape (3 m, states): x, its velocity, the
-        torque.
+    def output(self) -> Array:
+        """The samples for the peers by the site's states, shape (3 m, states).
+
+        The rows are the shared pose x, its velocity, and the reflected torque.
         """
         rates = self.rates
-        return np.vstack([rates.x, rates.xd, rates.reflected])[:, : self.at.states]
+        samples = np.vstack([rates.x, rates.xd, rates.reflected])
+        return samples[:, : self.layout.states]
 
 
 class DelayedTerm(NamedTuple):
@@ -63,8 +68,8 @@ class DelayedTerm(NamedTuple):
 
     Attributes:
         delay_s: the delay in use, s.
-        A: of the state, shape (n, n).
-        B: of the operators' torque, where a law reflects it, shape (n, m).
+        A: matrix of the delayed state, shape (n, n).
+        B: matrix of the operators' delayed torque, where a law reflects it, shape (n, m).
     """
 
     delay_s: float
@@ -76,17 +81,17 @@ class LinearLoop(NamedTuple):
     """A linear loop with delays.
 
     Attributes:
-        names: of the states, as "m1.q1", "s.qd2", "m1.theta4".
-        inputs: of the torques ON the joints, "m1.tau1".
-        outputs: of the joint velocities, "m1.qd1".
+        names: names of the states, as "m1.q1", "s.qd2", "m1.theta4".
+        inputs: names of the torques ON the joints, as "m1.tau1".
+        outputs: names of the joint velocities, as "m1.qd1".
         A: shape (n, n).
         B: shape (n, m).
         C: shape (p, n).
         delayed: one entry per distinct delay above zero, by rising delay.
-        omitted_states: number of states that no small motion moves or shows, each with a root at
-            zero.
-        E: 1 of each state that has a rate, 0 of one that the others give at once, as a wave: 0
-            = A x + ...; None: all have one.
+        omitted_states: number of states that no small motion changes or shows, each with a
+            root at zero.
+        E: diagonal of the matrix E in E x' = A x + ..., shape (n,): 1 for a state with a rate,
+            0 for an algebraic state, such as a wave. None: every state has a rate.
     """
 
     names: tuple[str, ...]
@@ -101,108 +106,112 @@ class LinearLoop(NamedTuple):
 
     @property
     def static_matrix(self) -> Array:
-        """A + sum_k A_k: the effect of a constant deviation."""
+        """A + sum_k A_k: the rates under a constant deviation."""
         return sum((term.A for term in self.delayed), self.A)
 
 
 def gather_site_arguments(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Returns the arguments of every site's rates at an equilibrium, shape (arguments,) each."""
+    """Returns the arguments of each site's rates at an equilibrium, shape (arguments,) each."""
     layouts = list(map(site_dynamics.lay_out_arguments, conditions.sites))
-    arguments = [np.zeros(at.arguments) for at in layouts]
-    poses = zip(rest.q, rest.theta_hat, find_references(conditions, rest), strict=True)
-    for at, x, (q, theta_hat, q_des) in zip(layouts, arguments, poses, strict=True):
-        x[at.q] = q[: at.joints]
-        x[at.estimate] = theta_hat[: at.parameters]
-        x[at.q_des] = q_des
-    reflected = [one.reflected for one in conditions.rates(arguments)]
-    for i, (at, x, felt) in enumerate(
-        zip(layouts, arguments, conditions.alpha @ reflected, strict=True)
-    ):
-        x[at.peer_torque] = felt
-        others = [j for j in range(len(arguments)) if j != i]
-        for place in range(at.peers):
-            j = others[place]
-            rest_qd = np.zeros(at.coordinates)
-            x[at.of_peer(place)] = np.r_[rest.q[j][: at.coordinates], rest_qd, -reflected[j]]
+    arguments = [np.zeros(layout.arguments) for layout in layouts]
+    references = compute_references(conditions, rest)
+    for i, (layout, x) in enumerate(zip(layouts, arguments, strict=True)):
+        x[layout.q] = rest.q[i][: layout.joints]
+        x[layout.estimate] = rest.theta_hat[i][: layout.parameters]
+        x[layout.q_des] = references[i]
+    reflected = [rates.reflected for rates in conditions.evaluate_rates(arguments)]
+    peer_torques = conditions.alpha @ reflected
+    for i, (layout, x) in enumerate(zip(layouts, arguments, strict=True)):
+        x[layout.peer_torque] = peer_torques[i]
+        peers = [j for j in range(len(arguments)) if j != i]
+        for index in range(layout.peers):
+            j = peers[index]
+            q = rest.q[j][: layout.coordinates]
+            qd = np.zeros(layout.coordinates)
+            x[layout.peer_sample(index)] = np.r_[q, qd, -reflected[j]]
     return arguments
 
 
-def share_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Returns what each site shares of its pose at an equilibrium, shape (m,) each."""
+def compute_shared_poses(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
+    """Returns the pose that each site shares at an equilibrium, shape (m,) each."""
     return [
-        site_dynamics.share_own_pose(site, q[: site.layout.joints])
+        site_dynamics.compute_shared_pose(site, q[: site.layout.joints])
         for site, q in zip(conditions.sites, rest.q, strict=True)
     ]
 
 
-def find_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
-    """Returns what each site follows at an equilibrium, shape (m,) each."""
-    shared = share_poses(conditions, rest)
+def compute_references(conditions: OperatingConditions, rest: Equilibrium) -> list[Array]:
+    """Returns the reference that each site follows at an equilibrium, shape (m,) each."""
+    poses = compute_shared_poses(conditions, rest)
     if not conditions.sites[0].layout.task:
-        return list(conditions.alpha @ np.array(shared))
+        return list(conditions.alpha @ np.array(poses))
     return [
-        evaluate_reference(row, own, shared)
-        for row, own in zip(conditions.alpha, shared, strict=True)
+        evaluate_reference(shares, pose, poses)
+        for shares, pose in zip(conditions.alpha, poses, strict=True)
     ]
 
 
 def differentiate_references(
     conditions: OperatingConditions, rest: Equilibrium
 ) -> dict[tuple[int, int], Array]:
-    """Returns the derivative of what site i follows by what site j shares, shape (m, m), by (i,
-    j).
+    """Returns the derivatives of site i's reference by site j's shared pose, by (i, j).
 
-    It is alpha_ij but for orientations that do not agree, which have one by the site's own pose
-    as well.
+    Each has shape (m, m). It is alpha_ij times the unit matrix, except where orientations
+    differ. Then the reference depends on the site's own pose too, as (i, i).
     """
-    found = {}
-    shared = share_poses(conditions, rest)
-    for i, row in enumerate(conditions.alpha):
-        for j in np.flatnonzero(row):
-            found[i, int(j)] = row[j] * np.eye(len(shared[i]))
-        if len(shared[i]) > PLACE and conditions.sites[i].layout.task:
-            for peer in {i, *np.flatnonzero(row).tolist()}:
-                poses = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in shared]
-                poses[peer] = poses[peer] + 1j * site_dynamics.COMPLEX_STEP * np.eye(
-                    len(shared[peer])
-                )
-                moved = evaluate_reference(row, poses[i], poses).imag
-                found[i, peer] = moved / site_dynamics.COMPLEX_STEP
-    return found
+    derivatives = {}
+    poses = compute_shared_poses(conditions, rest)
+    for i, shares in enumerate(conditions.alpha):
+        for j in np.flatnonzero(shares):
+            derivatives[i, int(j)] = shares[j] * np.eye(len(poses[i]))
+        has_orientation = len(poses[i]) > PLACE and conditions.sites[i].layout.task
+        if not has_orientation:
+            continue
+        for j in {i, *np.flatnonzero(shares).tolist()}:
+            columns = [pose[:, np.newaxis] + np.zeros(len(pose)) for pose in poses]
+            step = 1j * site_dynamics.COMPLEX_STEP * np.eye(len(poses[j]))
+            columns[j] = columns[j] + step
+            reference = evaluate_reference(shares, columns[i], columns)
+            derivatives[i, j] = reference.imag / site_dynamics.COMPLEX_STEP
+    return derivatives
 
 
-def couple_sites(
+def compute_couplings(
     conditions: OperatingConditions, rest: Equilibrium, sites: list[SiteJacobian]
 ) -> dict[tuple[int, int], Array]:
-    """Returns the effect of what j sent on what comes to i, shape (3 m, 3 m), by (i, j).
+    """Returns the effect of site j's output on site i's inputs, by (i, j).
 
-    To a law of one's own it comes once more, by itself.
+    Each has shape (inputs, 3 m). An imported law receives each sample a second time: by itself,
+    beside the sums that are weighted with the dominance factors.
     """
     references = differentiate_references(conditions, rest)
-    coupling = {}
-    for i, j in conditions.pairs:
-        at = sites[i].at
-        zero = np.zeros((sites[i].at.coordinates,) * 2)
-        share = conditions.alpha[i, j] * np.eye(at.coordinates)
-        whole = block_diag(references.get((i, j), zero), share, share)
-        if at.peers:
-            alone = np.zeros((at.peers, len(whole), len(whole)))
-            # its tau_x is not ON its arm
-            alone[j - (j > i)] = np.diag(np.repeat([1.0, 1.0, -1.0], at.coordinates))
-            whole = np.vstack([whole, *alone])
-        coupling[i, j] = whole
-    return coupling
+    couplings = {}
+    for i, j in conditions.coupled_pairs:
+        layout = sites[i].layout
+        m = layout.coordinates
+        zero = np.zeros((m, m))
+        share = conditions.alpha[i, j] * np.eye(m)
+        coupling = block_diag(references.get((i, j), zero), share, share)
+        if layout.peers:
+            samples = np.zeros((layout.peers, len(coupling), len(coupling)))
+            # tau_x in a sample is the torque of the arm, and not the torque ON the arm
+            peer_index = j - (j > i)
+            samples[peer_index] = np.diag(np.repeat([1.0, 1.0, -1.0], m))
+            coupling = np.vstack([coupling, *samples])
+        couplings[i, j] = coupling
+    return couplings
 
 
-def find_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]:
-    """Returns which states of every site are in the loop, shape (states,) each: estimates if it
-    learns.
+def mask_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]:
+    """Returns which states of each site are in the loop, shape (states,) each.
+
+    Estimates are in the loop if the site's law learns.
     """
     masks = []
     for site in conditions.sites:
-        at = site_dynamics.lay_out_arguments(site)
-        mask = np.ones(at.states, dtype=bool)
-        mask[at.estimate] = site_dynamics.has_estimate(site)
+        layout = site_dynamics.lay_out_arguments(site)
+        mask = np.ones(layout.states, dtype=bool)
+        mask[layout.estimate] = site_dynamics.has_estimate(site)
         masks.append(mask)
     return masks
 
@@ -210,239 +219,304 @@ def find_loop_states(conditions: OperatingConditions) -> list[NDArray[np.bool_]]
 def differentiate_rates(
     conditions: OperatingConditions, rest: Equilibrium, *, all_estimates: bool = False
 ) -> list[SiteJacobian]:
-    """Returns the derivatives of the rates of every site by itself, see
-    `differentiate_site_rates`.
+    """Returns the derivatives of each site's rates at an equilibrium, without its peers.
 
-    `all_estimates`: of chains too each estimate is a state, and not only what they say of
-    gravity.
+    Args:
+        conditions: the numbers of the loop.
+        rest: the equilibrium.
+        all_estimates: each estimate of a chain is a state, instead of only the combinations
+            that make the learnt gravity torque.
     """
-    x = gather_site_arguments(conditions, rest)
+    arguments = gather_site_arguments(conditions, rest)
     references = differentiate_references(conditions, rest)
     jacobians = []
-    for i, (site, own) in enumerate(zip(conditions.sites, x, strict=True)):
-        at = site_dynamics.lay_out_arguments(site)
-        rates = site_dynamics.differentiate_site_rates(site, own)
-        if conditions.has_forms:  # what such a law remembers holds the arm there
-            left = site_dynamics.evaluate_site_rates(site, own).qdd
-            own[at.external_torque] -= np.linalg.solve(rates.qdd[:, at.external_torque], left)
-            rates = site_dynamics.differentiate_site_rates(site, own)
-        if (i, i) in references:  # what it follows depends on its own orientation
-            of_own = references[i, i] @ rates.x[:, : at.states]
-            for by in rates:
-                by[:, : at.states] += by[:, at.q_des] @ of_own
-        learnt = tuple(f"theta{p + 1}" for p in range(at.parameters))
-        if isinstance(site.own, NumericLaw):
-            jacobian = SiteJacobian(at, rates, (*_name_motion(at.joints), *site.own.names))
-        elif not site_dynamics.has_estimate(site):
-            jacobian = _replace_estimate(at, rates, np.zeros((0, at.parameters)), ())
-        elif site.chain is None or all_estimates:
-            jacobian = SiteJacobian(at, rates, (*_name_motion(at.joints), *learnt))
-        else:
-            effect = rates.tau[:, at.estimate]
-            _, R, order = qr(effect.T, mode="economic", pivoting=True)  # its independent rows
-            sizes = np.abs(np.diag(R))
-            joints = sorted(
-                order[: int(np.sum(sizes > _DEPENDENT * max(1.0, sizes[0])))].tolist()
-            )
-            names = tuple(f"gravity{joint + 1}" for joint in joints)
-            jacobian = _replace_estimate(at, rates, effect[joints], names)
-            jacobian = jacobian._replace(omitted_states=at.parameters - len(joints))
-        jacobians.append(jacobian)
+    for i, (site, x) in enumerate(zip(conditions.sites, arguments, strict=True)):
+        layout = site_dynamics.lay_out_arguments(site)
+        rates = site_dynamics.differentiate_site_rates(site, x)
+        if conditions.has_forms:
+            # the memory of such a law supplies the torque that holds the arm at rest
+            qdd = site_dynamics.evaluate_site_rates(site, x).qdd
+            inverse_inertia = rates.qdd[:, layout.external_torque]
+            x[layout.external_torque] -= np.linalg.solve(inverse_inertia, qdd)
+            rates = site_dynamics.differentiate_site_rates(site, x)
+        if (i, i) in references:
+            # chain rule: the reference depends on the site's own orientation
+            reference_by_state = references[i, i] @ rates.x[:, : layout.states]
+            for derivative in rates:
+                derivative[:, : layout.states] += (
+                    derivative[:, layout.q_des] @ reference_by_state
+                )
+        jacobians.append(_select_states(site, layout, rates, all_estimates=all_estimates))
     return jacobians
 
 
+def _select_states(
+    site: SiteSetup,
+    layout: site_dynamics.ArgumentLayout,
+    rates: site_dynamics.SiteRates,
+    *,
+    all_estimates: bool,
+) -> SiteJacobian:
+    """Returns a site's derivatives by the states that the loop keeps of its estimate."""
+    motion = _name_motion(layout.joints)
+    if isinstance(site.own, NumericLaw):
+        return SiteJacobian(layout, rates, (*motion, *site.own.names))
+    if not site_dynamics.has_estimate(site):
+        return _replace_estimate(layout, rates, np.zeros((0, layout.parameters)), ())
+    if site.chain is None or all_estimates:
+        estimates = tuple(f"theta{p + 1}" for p in range(layout.parameters))
+        return SiteJacobian(layout, rates, (*motion, *estimates))
+    effect = rates.tau[:, layout.estimate]
+    # pivoted QR factorisation: the leading pivots are the independent rows of the effect
+    _, R, pivots = qr(effect.T, mode="economic", pivoting=True)
+    sizes = np.abs(np.diag(R))
+    rank = int(np.sum(sizes > _DEPENDENT * max(1.0, sizes[0])))
+    joints = sorted(pivots[:rank].tolist())
+    names = tuple(f"gravity{joint + 1}" for joint in joints)
+    jacobian = _replace_estimate(layout, rates, effect[joints], names)
+    return jacobian._replace(omitted_states=layout.parameters - len(joints))
+
+
 def _name_motion(joints: int) -> tuple[str, ...]:
+    """Returns the names of angles and velocities: "q1", "q2", ..., "qd1", "qd2", ..."""
     return tuple(f"{kind}{joint + 1}" for kind in ("q", "qd") for joint in range(joints))
 
 
 def _replace_estimate(
-    at: site_dynamics.ArgumentLayout,
+    layout: site_dynamics.ArgumentLayout,
     rates: site_dynamics.SiteRates,
     T: Array,
     names: tuple[str, ...],
 ) -> SiteJacobian:
-    """Returns a site's derivatives with the states z = T theta_hat, shape (m, P), in place of
-    theta_hat.
+    """Returns a site's derivatives with the states z = T theta_hat in place of theta_hat.
 
-    All effects of the estimate must be combinations of z.
+    The estimate must act through z only, with T of shape (states, P).
     """
-    shown = np.linalg.pinv(T)
+    estimate_by_z = np.linalg.pinv(T)
 
-    def convert(by: Array) -> Array:
-        """Returns derivatives by the new states."""
-        return np.hstack(
-            [by[:, : at.estimate.start], by[:, at.estimate] @ shown, by[:, at.estimate.stop :]]
-        )
+    def convert(derivative: Array) -> Array:
+        """Returns a derivative by the new states."""
+        motion = derivative[:, : layout.estimate.start]
+        by_z = derivative[:, layout.estimate] @ estimate_by_z
+        inputs = derivative[:, layout.estimate.stop :]
+        return np.hstack([motion, by_z, inputs])
 
     converted = site_dynamics.SiteRates(*map(convert, rates))
-    return SiteJacobian(
-        site_dynamics.ArgumentLayout(at.joints, len(T), at.shared, at.peers),
-        converted._replace(estimate=T @ converted.estimate),
-        (*_name_motion(at.joints), *names),
+    new_layout = site_dynamics.ArgumentLayout(
+        layout.joints, len(T), layout.shared, layout.peers
     )
+    return SiteJacobian(
+        layout=new_layout,
+        rates=converted._replace(estimate=T @ converted.estimate),
+        states=(*_name_motion(layout.joints), *names),
+    )
+
+
+def _list_blocks(lengths: Sequence[int]) -> list[slice]:
+    """Returns consecutive slices of the given lengths."""
+    bounds = np.cumsum([0, *lengths]).tolist()
+    return [slice(start, stop) for start, stop in pairwise(bounds)]
 
 
 def linearise_loop(
     conditions: OperatingConditions, rest: Equilibrium, *, all_estimates: bool = False
 ) -> LinearLoop:
-    """Returns the loop under given conditions, linearised at an equilibrium; see
-    `differentiate_rates`.
+    """Returns the loop linearised at an equilibrium, under given conditions.
+
+    Args:
+        conditions: the numbers of the loop.
+        rest: the equilibrium.
+        all_estimates: each estimate of a chain is a state, see `differentiate_rates`.
     """
     sites = differentiate_rates(conditions, rest, all_estimates=all_estimates)
-    own, ports = (
-        [slice(a, b) for a, b in pairwise(np.cumsum([0, *lengths]).tolist())]
-        for lengths in ([one.at.states for one in sites], [one.at.joints for one in sites])
-    )
-    size = own[-1].stop
-    count = ports[-1].stop
-    A = np.zeros((size, size))
-    B = np.zeros((size, count))
-    C = np.zeros((count, size))
+    states = _list_blocks([site.layout.states for site in sites])
+    ports = _list_blocks([site.layout.joints for site in sites])
+    state_count = states[-1].stop
+    port_count = ports[-1].stop
+    A = np.zeros((state_count, state_count))
+    B = np.zeros((state_count, port_count))
+    C = np.zeros((port_count, state_count))
     terms: dict[float, tuple[Array, Array]] = {}
-    effects = []
-    for i, (at, rates, _, _) in enumerate(sites):
-        by = np.vstack(
-            [np.eye(at.joints, at.arguments, at.qd.start), rates.qdd, rates.estimate]
-        )
-        A[own[i], own[i]] = by[:, : at.states]
-        B[own[i], ports[i]] = by[:, at.external_torque]
-        C[ports[i], own[i]] = np.eye(at.joints, at.states, at.qd.start)
-        effects.append(by[:, at.inputs])
-    for (i, j), coupling in couple_sites(conditions, rest, sites).items():
+    input_effects = []
+    for i, site in enumerate(sites):
+        layout = site.layout
+        position_rate = np.eye(layout.joints, layout.arguments, layout.qd.start)
+        derivative = np.vstack([position_rate, site.rates.qdd, site.rates.estimate])
+        A[states[i], states[i]] = derivative[:, : layout.states]
+        B[states[i], ports[i]] = derivative[:, layout.external_torque]
+        C[ports[i], states[i]] = np.eye(layout.joints, layout.states, layout.qd.start)
+        input_effects.append(derivative[:, layout.inputs])
+    for (i, j), coupling in compute_couplings(conditions, rest, sites).items():
         delay_s = float(conditions.age_s[i, j])
-        effect = effects[i] @ coupling
+        effect = input_effects[i] @ coupling
         late_A, late_B = terms.setdefault(delay_s, (np.zeros_like(A), np.zeros_like(B)))
         peer = sites[j]
-        m = sites[j].at.coordinates
-        late_A[own[i], own[j]] += effect @ peer.sent
-        late_B[own[i], ports[j]] += (
-            effect[:, 2 * m :] @ peer.rates.reflected[:, peer.at.external_torque]
-        )
-    names = [
-        f"{name}.{state}"
-        for name, one in zip(conditions.names, sites, strict=True)
-        for state in one.states
-    ]
-    inputs, outputs = (
-        tuple(
-            f"{name}.{kind}{j + 1}"
-            for name, one in zip(conditions.names, sites, strict=True)
-            for j in range(one.at.joints)
-        )
-        for kind in ("tau", "qd")
-    )
-    delayed = tuple(DelayedTerm(delay_s, *terms[delay_s]) for delay_s in sorted(terms))
-    omitted_states = sum(one.omitted_states for one in sites)
+        m = peer.layout.coordinates
+        late_A[states[i], states[j]] += effect @ peer.output
+        reflected_by_port = peer.rates.reflected[:, peer.layout.external_torque]
+        late_B[states[i], ports[j]] += effect[:, 2 * m :] @ reflected_by_port
     loop = LinearLoop(
-        names=tuple(names),
-        inputs=inputs,
-        outputs=outputs,
+        names=_name_states(conditions, sites),
+        inputs=_name_ports(conditions, sites, "tau"),
+        outputs=_name_ports(conditions, sites, "qd"),
         A=A,
         B=B,
         C=C,
-        delayed=delayed,
-        omitted_states=omitted_states,
+        delayed=_sort_terms(terms),
+        omitted_states=sum(site.omitted_states for site in sites),
     )
     if all_estimates or not conditions.has_forms:
         return loop
     return add_law_forms(conditions, sites, loop)
 
 
+def _name_states(
+    conditions: OperatingConditions, sites: Sequence[SiteJacobian]
+) -> tuple[str, ...]:
+    """Returns the names of all states, as "m1.q1"."""
+    names = []
+    for name, site in zip(conditions.names, sites, strict=True):
+        names += [f"{name}.{state}" for state in site.states]
+    return tuple(names)
+
+
+def _name_ports(
+    conditions: OperatingConditions, sites: Sequence[SiteJacobian], kind: str
+) -> tuple[str, ...]:
+    """Returns the names of a quantity of all joints, as "m1.tau1" for the kind "tau"."""
+    names = []
+    for name, site in zip(conditions.names, sites, strict=True):
+        names += [f"{name}.{kind}{joint + 1}" for joint in range(site.layout.joints)]
+    return tuple(names)
+
+
+def _sort_terms(terms: dict[float, tuple[Array, Array]]) -> tuple[DelayedTerm, ...]:
+    """Returns the delayed terms by rising delay."""
+    return tuple(DelayedTerm(delay_s, *terms[delay_s]) for delay_s in sorted(terms))
+
+
 def add_law_forms(
     conditions: OperatingConditions, sites: Sequence[SiteJacobian], loop: LinearLoop
 ) -> LinearLoop:
-    """Returns a loop with the states of laws that have their own, and with what they send.
+    """Returns a loop with the states and the sent signals that laws add (`LinearForm`).
 
-    What is sent has no rate: a law gives it at once, and the peer gets it after the delay.
+    A sent signal is an algebraic state: the law computes it without a rate, and the peer
+    receives it after the delay.
     """
-    inertia = [np.linalg.inv(one.rates.qdd[:, one.at.external_torque]) for one in sites]
-    forms = conditions.find_forms(inertia)
-    at, names = _place_form_states(conditions, forms, loop)
-    size = len(names)
-    count = len(loop.inputs)
-    terms = {0.0: (np.zeros((size, size)), np.zeros((size, count)))}
+    inertias = []
+    for site in sites:
+        inverse_inertia = site.rates.qdd[:, site.layout.external_torque]
+        inertias.append(np.linalg.inv(inverse_inertia))
+    forms = conditions.find_forms(inertias)
+    blocks, names = _index_form_states(conditions, forms, loop)
+    state_count = len(names)
+    port_count = len(loop.inputs)
+
+    def make_zeros() -> tuple[Array, Array]:
+        return np.zeros((state_count, state_count)), np.zeros((state_count, port_count))
+
+    terms = {0.0: make_zeros()}
     for delay_s, A, B in (DelayedTerm(0.0, loop.A, loop.B), *loop.delayed):
-        late_A, late_B = terms.setdefault(
-            delay_s, (np.zeros((size, size)), np.zeros((size, count)))
-        )
+        late_A, late_B = terms.setdefault(delay_s, make_zeros())
         late_A[: len(A), : len(A)] = A
         late_B[: len(B)] = B
-    E = np.ones(size)
+    E = np.ones(state_count)
     for i, form in enumerate(forms):
         if form is not None:
-            _add_form(
-                conditions=conditions, sites=sites, places=at, i=i, form=form, terms=terms
-            )
-    for i, form in enumerate(forms):  # when all that accelerates an arm is there
-        for j in form.list_receivers() if form is not None else ():
-            channel = at[i, ("to", j)]
-            E[channel] = 0.0
-            if form is not None and form.sends_acceleration:
+            _add_form(conditions, sites, blocks=blocks, i=i, form=form, terms=terms)
+    # only now are the accelerations complete that some laws send
+    for i, form in enumerate(forms):
+        if form is None:
+            continue
+        for j in form.list_receivers():
+            signal = blocks[i, ("to", j)]
+            E[signal] = 0.0
+            if form.sends_acceleration:
                 for A, B in terms.values():
-                    A[channel] = A[at[i, "qd"]]
-                    B[channel] = B[at[i, "qd"]]
-            terms[0.0][0][channel, channel] -= np.eye(len(sites[i].rates.qdd))
+                    A[signal] = A[blocks[i, "qd"]]
+                    B[signal] = B[blocks[i, "qd"]]
+            undelayed_A, _ = terms[0.0]
+            undelayed_A[signal, signal] -= np.eye(len(sites[i].rates.qdd))
     A, B = terms.pop(0.0)
-    C = np.hstack([loop.C, np.zeros((len(loop.C), size - loop.C.shape[1]))])
-    delayed = tuple(DelayedTerm(delay_s, *terms[delay_s]) for delay_s in sorted(terms))
-    return loop._replace(names=tuple(names), A=A, B=B, C=C, delayed=delayed, E=E)
+    new_columns = np.zeros((len(loop.C), state_count - loop.C.shape[1]))
+    return loop._replace(
+        names=tuple(names),
+        A=A,
+        B=B,
+        C=np.hstack([loop.C, new_columns]),
+        delayed=_sort_terms(terms),
+        E=E,
+    )
 
 
-_Places = dict[tuple[int, Place], slice]
+_StateBlocks = dict[tuple[int, Place], slice]
+"""The states of each signal of a law, by the site's index and the signal's name."""
 
 
-def _place_form_states(
+def _index_form_states(
     conditions: OperatingConditions, forms: Sequence[LinearForm | None], loop: LinearLoop
-) -> tuple[_Places, list[str]]:
-    places: _Places = {}
+) -> tuple[_StateBlocks, list[str]]:
+    """Returns the state blocks of all laws' signals, and the names of all states."""
+    blocks: _StateBlocks = {}
     names = list(loop.names)
-    for i, (name, form) in enumerate(zip(conditions.names, forms, strict=True)):
-        n = conditions.sites[i].layout.joints
+    for i, (site_name, form) in enumerate(zip(conditions.names, forms, strict=True)):
+        joints = conditions.sites[i].layout.joints
         for kind in ("q", "qd"):
-            first = names.index(f"{name}.{kind}1")
-            places[i, kind] = slice(first, first + n)
-        more: list[tuple[Place, str]] = []
-        if form is not None:
-            more += [(state, state) for state in form.states]
-            more += [(("to", j), f"to_{conditions.names[j]}_") for j in form.list_receivers()]
-        for place, label in more:
-            places[i, place] = slice(len(names), len(names) + n)
-            names += [f"{name}.{label}{joint + 1}" for joint in range(n)]
-    return places, names
+            first = names.index(f"{site_name}.{kind}1")
+            blocks[i, kind] = slice(first, first + joints)
+        if form is None:
+            continue
+        labels: dict[Place, str] = {state: state for state in form.states}
+        for j in form.list_receivers():
+            labels["to", j] = f"to_{conditions.names[j]}_"
+        for signal, label in labels.items():
+            blocks[i, signal] = slice(len(names), len(names) + joints)
+            names += [f"{site_name}.{label}{joint + 1}" for joint in range(joints)]
+    return blocks, names
 
 
 def _add_form(
     conditions: OperatingConditions,
     sites: Sequence[SiteJacobian],
-    places: _Places,
+    *,
+    blocks: _StateBlocks,
     i: int,
     form: LinearForm,
     terms: dict[float, tuple[Array, Array]],
 ) -> None:
+    """Adds the linear form of site i's law to the terms, by delay."""
     site = sites[i]
-    ports = np.cumsum([0, *(one.at.joints for one in sites)])
+    layout = site.layout
+    ports = _list_blocks([jacobian.layout.joints for jacobian in sites])
+    A, B = terms[0.0]
 
-    def late(j: int) -> tuple[Array, Array]:
-        zeros = np.zeros_like(terms[0.0][0]), np.zeros_like(terms[0.0][1])
-        return terms.setdefault(float(conditions.age_s[i, j]), zeros)
+    def find_delayed_matrix(j: int) -> Array:
+        """Returns the state matrix at the age of site j's samples."""
+        zeros = np.zeros_like(A), np.zeros_like(B)
+        late_A, _ = terms.setdefault(float(conditions.age_s[i, j]), zeros)
+        return late_A
 
     for (row, column), gain in form.blocks.items():
-        accelerates = row == "tau"
-        rows = places[i, "qd" if accelerates else row]
-        block = site.rates.qdd[:, site.at.external_torque] @ gain if accelerates else gain
-        if column == "tau_h":
-            own = slice(places[i, "q"].start, places[i, "qd"].stop)
-            on_arm = site.rates.external + site.rates.held
-            terms[0.0][0][rows, own] += block @ on_arm[:, : site.at.qd.stop]
-            terms[0.0][1][rows, ports[i] : ports[i + 1]] += (
-                block @ on_arm[:, site.at.external_torque]
-            )
-        elif column in ("q_des", "qd_des"):
-            for j in np.flatnonzero(conditions.alpha[i]):
-                sent = places[int(j), str(column).removesuffix("_des")]
-                late(int(j))[0][rows, sent] += conditions.alpha[i, j] * block
-        elif isinstance(column, tuple):
-            if (column[1], ("to", i)) in places:
-                late(column[1])[0][rows, places[column[1], ("to", i)]] += block
+        if row == "tau":
+            rows = blocks[i, "qd"]
+            block = site.rates.qdd[:, layout.external_torque] @ gain
         else:
-            terms[0.0][0][rows, places[i, column]] += block
+            rows = blocks[i, row]
+            block = gain
+        if column == "tau_h":
+            motion = slice(blocks[i, "q"].start, blocks[i, "qd"].stop)
+            torque_on_arm = site.rates.external + site.rates.held
+            A[rows, motion] += block @ torque_on_arm[:, : layout.qd.stop]
+            B[rows, ports[i]] += block @ torque_on_arm[:, layout.external_torque]
+        elif column in ("q_des", "qd_des"):
+            signal = str(column).removesuffix("_des")
+            for j in np.flatnonzero(conditions.alpha[i]):
+                late_A = find_delayed_matrix(int(j))
+                late_A[rows, blocks[int(j), signal]] += conditions.alpha[i, j] * block
+        elif isinstance(column, tuple):
+            sender = column[1]
+            if (sender, ("to", i)) in blocks:
+                late_A = find_delayed_matrix(sender)
+                late_A[rows, blocks[sender, ("to", i)]] += block
+        else:
+            A[rows, blocks[i, column]] += block

@@ -1,11 +1,16 @@
-"""A law of one's own as a function of numbers, and its derivatives by central differences.
+"""An imported control law as a function of numbers, differentiated by central differences.
+
+The law is evaluated for one tick,
 
     (tau_k, m_k) = f(q, qd, m_{k-1}, q_des, qd_des, felt, peers, torque ON the arm)
 
-Invariant: it is asked as its site asks it, through the rows from which it gets its input,
-without the clamp. Its memory m is its own, and the torque and the angles of the tick before if
-it uses these. In continuous time m' = (m_k - m_{k-1}) / h, which the sampled loop puts back to
-the memory that it was.
+with its memory m. In continuous time the memory has the rate m' = (m_k - m_{k-1}) / h with the
+tick h; the sampled loop multiplies that rate by h and so recovers m_k exactly.
+
+Invariant:
+    - The law reads the same rows as at its site, without the torque clamp.
+    - The memory m holds the numbers that the law itself remembers. It also holds the torque and
+      the angles of the previous tick if the law uses them.
 """
 
 from collections.abc import Sequence
@@ -24,38 +29,47 @@ from ..core.vectors import Array
 from ..errors import ScenarioError
 
 _TICK = 1_000_000
-"""The tick at which a law is asked: late, so that nothing begins."""
+"""Number of the tick that is evaluated: late enough that no start-up action is in force."""
 _STEP = 1e-5
-"""Half the difference of an argument, relative to its size, at least 1: errors are about 1e-10.
+"""Half the step of a central difference, relative to the argument's size or to 1.
+
+Errors of the derivatives are about 1e-10.
 """
 _STILL = 1e-14
-"""A step by which memory is at rest."""
+"""Largest change of the memory in one tick at which the memory counts as constant."""
 
 
 class NumericLaw:
-    """An imported law of a site, made; called, it returns it, as a factory does.
+    """The imported law of one site, built once; calling the object returns the law itself.
+
+    The object can therefore stand in for the law's factory in a `SiteSetup`.
 
     Args:
-        setup: of its site.
-        code: what the scenario calls it.
-        shares: the dominance factors of the peers in force.
+        setup: setup of the site.
+        code: the name by which the scenario refers to the law.
+        shares: dominance factors of the peers in force.
 
     Attributes:
-        names: of the numbers of its memory, as "error[1]".
-        memory: the same at the beginning.
+        names: names of the numbers in the memory, as "error[1]".
+        memory: the memory at the start of a run.
 
     Raises:
-        ScenarioError: it sends vectors of its own, or follows with an end effector.
+        ScenarioError: the law sends vectors of its own, or follows with an end effector.
     """
 
     def __init__(self, setup: SiteSetup, code: str, shares: Sequence[float]) -> None:
         path = f"sites.{setup.name}.control.law"
         if setup.layout.sent:
             raise ScenarioError(
-                f"{code} sends vectors of its own, which are not linearised", path=path
+                f"{code} sends vectors of its own, and such a law cannot be linearised",
+                path=path,
             )
         if setup.layout.task:
-            raise ScenarioError(f"{code} is linearised between joint angles alone", path=path)
+            raise ScenarioError(
+                f"{code} follows in task space, and an imported law is linearised "
+                "in joint space only",
+                path=path,
+            )
         assert setup.own is not None
         self._law = setup.own(setup.law_context())
         self._layout = setup.layout
@@ -63,118 +77,161 @@ class NumericLaw:
         self._rate_hz = setup.rate_hz
         self._arrays.site["tau_limit"] = np.inf
         self._arrays.links["alpha"] = shares
-        self._asked = plug_law(self._law, setup, self._arrays, np.zeros(0))
-        own = np.array(read_memory(self._law))
-        self._own = len(own)
-        self._keeps_past = False
-        self.memory = own
-        self.names = _name_memory(self._law, self._own)
-        start = np.array(setup.q0)
-        rest = np.zeros(self._layout.joints)
-        peers = [np.r_[link.q0, rest, rest] for link in setup.links]
-        arguments = np.concatenate([start, rest, self.memory, start, rest, rest, *peers, rest])
-        past = np.r_[np.zeros(self._layout.joints), setup.q0]
-        self._keeps_past = not np.array_equal(
-            self._ask(arguments, past), self._ask(arguments, past + 1e-3)
-        )
-        if self._keeps_past:
-            self.memory = np.r_[own, past]
-            for name in ("tau_before", "q_before"):
-                self.names += tuple(
-                    f"{name}[{joint + 1}]" for joint in range(self._layout.joints)
-                )
+        self._plugged_law = plug_law(self._law, setup, self._arrays, np.zeros(0))
+        remembered = np.array(read_memory(self._law))
+        self._remembered_count = len(remembered)
+        self._uses_previous_tick = False
+        self.memory = remembered
+        self.names = _name_memory(self._law, self._remembered_count)
+        self._extend_memory_by_previous_tick(setup)
+
+    def _extend_memory_by_previous_tick(self, setup: SiteSetup) -> None:
+        """Adds the previous torque and angles to the memory if the law's output uses them."""
+        joints = self._layout.joints
+        q0 = np.array(setup.q0)
+        zeros = np.zeros(joints)
+        peers = [np.r_[link.q0, zeros, zeros] for link in setup.links]
+        parts = [q0, zeros, self.memory, q0, zeros, zeros, *peers, zeros]
+        arguments = np.concatenate(parts)
+        previous = np.r_[np.zeros(joints), setup.q0]
+        output = self._evaluate_tick(arguments, previous)
+        output_of_shifted = self._evaluate_tick(arguments, previous + 1e-3)
+        self._uses_previous_tick = not np.array_equal(output, output_of_shifted)
+        if not self._uses_previous_tick:
+            return
+        self.memory = np.r_[self.memory, previous]
+        for name in ("tau_before", "q_before"):
+            self.names += tuple(f"{name}[{joint + 1}]" for joint in range(joints))
 
     @property
-    def _memory_at(self) -> slice:
-        return slice(2 * self._layout.joints, 2 * self._layout.joints + len(self.memory))
+    def _memory_slice(self) -> slice:
+        start = 2 * self._layout.joints
+        return slice(start, start + len(self.memory))
 
     def __call__(self, _context: LawContext) -> UserLaw:
         """Returns the law."""
         return self._law
 
-    def complete(self, memory: Array | None) -> Array:
-        """Returns all of the memory: that at the beginning, with as much of it as is given."""
-        whole: Array = self.memory.copy()
-        if memory is not None:
-            known = len(whole) if len(memory) >= len(whole) else self._own
-            whole[:known] = memory[:known]
-        return whole
+    def complete_memory(self, memory: Array | None) -> Array:
+        """Returns a full memory: the initial one, overwritten by the known leading part.
 
-    def settle(self, x: Array, ticks: int) -> Array:
-        """Returns its memory after so many ticks of the same arguments, or once it stays as it
-        is.
+        Args:
+            memory: known numbers: all of the memory, or at least those that the law itself
+                remembers; longer arrays are cut. None: nothing is known.
         """
-        memory = self._memory_at
+        full_memory: Array = self.memory.copy()
+        if memory is not None:
+            is_full = len(memory) >= len(full_memory)
+            known = len(full_memory) if is_full else self._remembered_count
+            full_memory[:known] = memory[:known]
+        return full_memory
+
+    def iterate_memory(self, x: Array, ticks: int) -> Array:
+        """Returns the memory after at most `ticks` ticks with constant other arguments.
+
+        The iteration ends early once the memory is constant.
+
+        Args:
+            x: arguments in the order of `ArgumentLayout`, shape (arguments,).
+            ticks: the largest number of ticks.
+        """
+        memory = self._memory_slice
         x = x.copy()
         for _ in range(ticks):
-            step = self._evaluate(x)[1] / self._rate_hz
+            _, rate = self._evaluate_rates(x)
+            step = rate / self._rate_hz
             x[memory] += step
             if not np.abs(step).max(initial=0.0) > _STILL:
                 break
         return x[memory]
 
     def evaluate(self, x: Numbers) -> tuple[Numbers, Numbers]:
-        """Returns the torque and the rate of the memory; of complex columns with their
-        derivatives.
+        """Returns the torque and the rate of the memory.
+
+        For a complex x, whose columns are steps of `COMPLEX_STEP` about one real argument, the
+        imaginary parts of the result are the derivatives by central differences.
+
+        Args:
+            x: arguments, shape (arguments,), or complex of shape (arguments, columns).
+
+        Returns:
+            The torque, shape (n, ...), N m, and the memory's rate, shape (memory, ...), 1/s.
         """
         if not np.iscomplexobj(x):
-            return self._evaluate(x)
-        at: Array = x.real[:, 0]
-        torque, rate = self._evaluate(at)
+            return self._evaluate_rates(x)
+        arguments: Array = x.real[:, 0]
+        torque, rate = self._evaluate_rates(arguments)
         columns = []
-        for n, value in enumerate(at):
-            half = _STEP * max(1.0, abs(float(value)))
-            up = at.copy()
-            down = at.copy()
-            up[n] = value + half
-            down[n] = value - half
-            ends = [np.concatenate(self._evaluate(one)) for one in (up, down)]
-            columns.append((ends[0] - ends[1]) / (up[n] - down[n]))
-        whole = np.concatenate([torque, rate])[:, np.newaxis] + 1j * (
-            np.stack(columns, axis=1) @ x.imag
-        )
-        return whole[: len(torque)], whole[len(torque) :]
+        for n, value in enumerate(arguments):
+            half_step = _STEP * max(1.0, abs(float(value)))
+            upper = arguments.copy()
+            lower = arguments.copy()
+            upper[n] = value + half_step
+            lower[n] = value - half_step
+            upper_rates = np.concatenate(self._evaluate_rates(upper))
+            lower_rates = np.concatenate(self._evaluate_rates(lower))
+            # the divisor is the difference of the rounded arguments, not 2 half_step
+            columns.append((upper_rates - lower_rates) / (upper[n] - lower[n]))
+        values = np.concatenate([torque, rate])[:, np.newaxis]
+        derivatives = np.stack(columns, axis=1)
+        outputs = values + 1j * (derivatives @ x.imag)
+        return outputs[: len(torque)], outputs[len(torque) :]
 
-    def _evaluate(self, x: Array) -> tuple[Array, Array]:
-        n = self._layout.joints
-        memory = self._memory_at
-        past = x[memory][self._own :] if self._keeps_past else np.r_[np.zeros(n), x[:n]]
-        after = self._ask(x, past)
-        torque = after[:n]
-        kept = after[n:]
-        now = np.r_[kept, torque, x[:n]] if self._keeps_past else kept
-        return torque, (now - x[memory]) * self._rate_hz
-
-    def _ask(self, x: Array, past: Array) -> Array:
-        """Returns the torque and the law's own memory after a tick; `past`: torque and angles
-        before it.
-        """
-        a = self._arrays
-        n = self._layout.joints
-        s: Any = a.site[0]
-        start = self._memory_at.stop
-        s.q[:] = x[:n]
-        s.qd[:] = x[n : 2 * n]
-        s.q_des[:], s.qd_des[:], s.felt[:] = np.split(x[start : start + 3 * n], 3)
-        s.tau_before[:], s.q_before[:] = np.split(past, 2)
-        s.on_arm[:] = x[len(x) - n :]
-        a.links["used"] = _TICK - 1
-        for j, link in enumerate(a.links):
-            first = start + 3 * n * (1 + j)
-            link["q"][:], link["qd"][:], link["tau_x"][:] = np.split(
-                x[first : first + 3 * n], 3
-            )
-        if a.chain is None:
-            two_link_stages.update_errors(s)  # with the regressor, which gravity is taken from
+    def _evaluate_rates(self, x: Array) -> tuple[Array, Array]:
+        """Returns the torque and the rate of the memory for real arguments."""
+        joints = self._layout.joints
+        q = x[:joints]
+        memory = x[self._memory_slice]
+        if self._uses_previous_tick:
+            previous = memory[self._remembered_count :]
         else:
-            chain_stages.place_chain(s, a.chain)
-        self._asked.recall(x[2 * n : 2 * n + self._own].tolist())
-        memory = self._asked.compute(_TICK, tick_ns(_TICK, self._rate_hz))
-        return np.concatenate([s.tau, memory])
+            previous = np.r_[np.zeros(joints), q]
+        output = self._evaluate_tick(x, previous)
+        torque = output[:joints]
+        next_memory = output[joints:]
+        if self._uses_previous_tick:
+            next_memory = np.r_[next_memory, torque, q]
+        return torque, (next_memory - memory) * self._rate_hz
+
+    def _evaluate_tick(self, x: Array, previous: Array) -> Array:
+        """Returns the torque and what the law itself remembers, after one tick.
+
+        Args:
+            x: arguments, shape (arguments,).
+            previous: torque and angles of the previous tick, shape (2 n,).
+        """
+        arrays = self._arrays
+        n = self._layout.joints
+        row: Any = arrays.site[0]
+        references_start = self._memory_slice.stop
+        peers_start = references_start + 3 * n
+        row.q[:] = x[:n]
+        row.qd[:] = x[n : 2 * n]
+        references = x[references_start:peers_start]
+        row.q_des[:], row.qd_des[:], row.felt[:] = np.split(references, 3)
+        row.tau_before[:], row.q_before[:] = np.split(previous, 2)
+        row.on_arm[:] = x[len(x) - n :]
+        arrays.links["used"] = _TICK - 1
+        for j, link in enumerate(arrays.links):
+            first = peers_start + 3 * n * j
+            sample = x[first : first + 3 * n]
+            link["q"][:], link["qd"][:], link["tau_x"][:] = np.split(sample, 3)
+        if arrays.chain is None:
+            two_link_stages.update_errors(row)  # also computes the regressor, for gravity
+        else:
+            chain_stages.place_chain(row, arrays.chain)
+        remembered = x[2 * n : 2 * n + self._remembered_count]
+        self._plugged_law.recall(remembered.tolist())
+        memory = self._plugged_law.compute(_TICK, tick_ns(_TICK, self._rate_hz))
+        return np.concatenate([row.tau, memory])
 
 
 def _name_memory(law: Any, count: int) -> tuple[str, ...]:
+    """Returns a name for each number that a law remembers, as "error[1]" or "memory[1]"."""
     if callable(getattr(law, "memory", None)):
         return tuple(f"memory[{n + 1}]" for n in range(count))
-    sizes = {name: np.size(getattr(law, name)) for name in list_remembered(law)}
-    return tuple(f"{name}[{n + 1}]" for name, size in sizes.items() for n in range(size))
+    names = []
+    for attribute in list_remembered(law):
+        size = np.size(getattr(law, attribute))
+        names += [f"{attribute}[{n + 1}]" for n in range(size)]
+    return tuple(names)

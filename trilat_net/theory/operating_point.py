@@ -1,15 +1,18 @@
 """The operating point of the linear loop: conditions at the end of a run, and the equilibrium.
 
-Invariant: a linear loop has one set of numbers, those in force at the end of the run. Earlier
-or random values are reported in a note; values that cannot be known beforehand are refused.
+A link has an effective delay: the age of its samples at the ticks that use them. With a
+constant delay T and equal tick rates 1 / h it is max(1, ceil(T / h)) ticks. In all other cases
+it is the mean over the same random draws that a run makes.
 
-A link has an effective delay (L2): the age of its samples at the ticks that use them. With a
-constant delay and equal rates it is max(1, ceil(T / h)) ticks; in all other cases it is
-averaged over the same random draws as a run makes.
+Invariant:
+    - A linear loop has one set of numbers: those in force at the end of the run.
+    - A note reports every number that differed earlier or is random.
+    - Numbers that cannot be known before the run are refused.
 """
 
 import math
 from collections.abc import Mapping, Sequence
+from itertools import permutations
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -35,15 +38,15 @@ from .site_dynamics import SiteRates, evaluate_site_rates
 
 
 class Equilibrium(NamedTuple):
-    """The pose about which a loop is linearised, all sites at rest.
+    """The pose about which a loop is linearised, with all sites at rest.
 
     Attributes:
-        q: joint angles, shape (N, n), rad; of arms with fewer joints followed by zeros.
-        theta_hat: estimates, shape (N, P), so as well; of a law that knows gravity what it
-            assumes.
-        how: the way it was found, in words.
+        q: joint angles, shape (N, n), rad; rows of arms with fewer joints end in zeros.
+        theta_hat: estimates, shape (N, P), also padded with zeros; for a law with known gravity
+            the parameters that the law assumes; for an imported law its memory.
+        how: a phrase that says how the equilibrium was found.
         residual: the largest remaining acceleration, rad/s^2, or rate of an estimate.
-        notes: remarks on it.
+        notes: remarks on the equilibrium.
     """
 
     q: Array
@@ -54,7 +57,13 @@ class Equilibrium(NamedTuple):
 
 
 class EffectiveDelay(NamedTuple):
-    """Age of the samples in use over the receiver's ticks: mean, least and largest, s."""
+    """Age of the samples in use over the receiver's ticks, s.
+
+    Attributes:
+        mean_s: the mean age.
+        least_s: the smallest age.
+        most_s: the largest age.
+    """
 
     mean_s: float
     least_s: float
@@ -62,16 +71,16 @@ class EffectiveDelay(NamedTuple):
 
 
 class OperatingConditions(NamedTuple):
-    """The numbers that the linear loop is built from.
+    """The numbers from which the linear loop is built.
 
     Attributes:
         sites: setups in scenario order, with the actors in force.
         alpha: dominance matrix, shape (N, N), Eq. (6).
-        age_s: age of the sample of j that i uses, shape (N, N), s; 0 where it uses none.
-        notes: remarks on what was left out or fixed.
-        varying: True if ages vary, and `age_s` holds their means.
+        age_s: age of the sample of site j that site i uses, shape (N, N), s; 0 if i uses none.
+        notes: remarks on omitted or fixed numbers.
+        varying: True if ages vary; `age_s` then holds their means.
         laws: the control of each site.
-        links: the link from j to i in force and the key of its draws, by (i, j).
+        links: the link from j to i in force and the key of its random draws, by (i, j).
     """
 
     sites: tuple[SiteSetup, ...]
@@ -83,8 +92,10 @@ class OperatingConditions(NamedTuple):
     links: Mapping[tuple[int, int], tuple[LinkBase, int]] = MappingProxyType({})
 
     def find_forms(self, inertia: Sequence[Array] = ()) -> list[LinearForm | None]:
-        """Returns what laws add to their gains in small motions, with the inertia of their
-        arms.
+        """Returns the linear form of each site's law; None if gains describe the law fully.
+
+        Args:
+            inertia: inertia matrix of each arm, shape (n, n); empty: unit matrices.
         """
         forms: list[LinearForm | None] = []
         for n, law in enumerate(self.laws):
@@ -96,20 +107,22 @@ class OperatingConditions(NamedTuple):
         return forms
 
     @property
-    def pairs(self) -> list[tuple[int, int]]:
-        """Who follows whom, as (i, j): by a dominance factor, or since a law of one's own sees
-        every peer.
+    def coupled_pairs(self) -> list[tuple[int, int]]:
+        """Pairs (i, j) of sites for which site i uses the samples of site j.
+
+        Site i uses them if its dominance factor is not zero, or if its law is imported: such a
+        law reads the samples of every peer.
         """
-        sees = np.array([isinstance(site.own, NumericLaw) for site in self.sites])[
-            :, np.newaxis
-        ]
-        linked = (self.alpha != 0.0) | (sees & ~np.eye(len(self.alpha), dtype=bool))
-        return [(int(i), int(j)) for i, j in zip(*np.nonzero(linked), strict=True)]
+        is_imported = np.array([isinstance(site.own, NumericLaw) for site in self.sites])
+        is_other = ~np.eye(len(self.alpha), dtype=bool)
+        coupled = (self.alpha != 0.0) | (is_imported[:, np.newaxis] & is_other)
+        return [(int(i), int(j)) for i, j in zip(*np.nonzero(coupled), strict=True)]
 
     @property
     def has_forms(self) -> bool:
-        """True if a law has states of its own, or sends more than samples have: then time is
-        continuous.
+        """True if a law has states of its own or sends signals beyond the samples.
+
+        Such a loop is linearised in continuous time only.
         """
         return any(form is not None for form in self.find_forms())
 
@@ -119,30 +132,34 @@ class OperatingConditions(NamedTuple):
         return tuple(site.name for site in self.sites)
 
     @property
-    def held(self) -> bool:
-        """True if the sampled loop alone tells what the tick does: digital controllers, sampled
-        actors.
+    def needs_sampled_loop(self) -> bool:
+        """True if only the sampled loop shows whether the loop is stable.
 
-        Or what ages do that vary and are not drawn.
+        This is so for the scheme `digital`, for sampled actors, and for ages that vary in a
+        known way, without random draws.
         """
-        known = self.varying and not any(link.random for link, _ in self.links.values())
-        digital = self.sites[0].scheme is Scheme.DIGITAL
-        return (
-            known
-            or digital
-            or any(actor.sampled for site in self.sites for actor in site.actors)
-        )
+        has_random_link = any(link.random for link, _ in self.links.values())
+        if self.varying and not has_random_link:
+            return True
+        if self.sites[0].scheme is Scheme.DIGITAL:
+            return True
+        return any(actor.sampled for site in self.sites for actor in site.actors)
 
-    def rates(self, x: Sequence[Array]) -> list[SiteRates]:
+    def evaluate_rates(self, arguments: Sequence[Array]) -> list[SiteRates]:
         """Returns the rates of every site at its own arguments, see `evaluate_site_rates`."""
-        return [evaluate_site_rates(site, own) for site, own in zip(self.sites, x, strict=True)]
+        return [
+            evaluate_site_rates(site, x) for site, x in zip(self.sites, arguments, strict=True)
+        ]
 
 
 def derive_operating_conditions(
     scenario: Scenario, *, own_laws: bool = True
 ) -> OperatingConditions:
-    """Returns the conditions at the end of a run; `own_laws`: the code of imported laws may
-    run.
+    """Returns the conditions at the end of a run.
+
+    Args:
+        scenario: the experiment.
+        own_laws: the code of imported laws may be executed.
 
     Raises:
         ScenarioError: a law has no linear loop, an arm is external, or a link is measured.
@@ -153,44 +170,39 @@ def derive_operating_conditions(
         _select_final_actors(scenario, name, notes)._replace(gains=gains[name])
         for name in scenario.names
     )
-    alpha = _final_dominance(scenario, sites, notes)
+    alpha = _find_final_dominance(scenario, sites, notes)
     age_s = np.zeros_like(alpha)
-    varying = []
     laws = scenario.controls
-    sites = tuple(_make_own_law(scenario, site, alpha) for site in sites)
-    codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
-    for code in filter(None, dict.fromkeys(codes)):
-        owners = ", ".join(
-            name for name, one in zip(scenario.names, codes, strict=True) if one == code
-        )
-        notes.append(
-            f"{code} of {owners} is differentiated numerically, its memory too: central differences"
-        )
-    notes += [law.linear_note for law in laws if law.linear_note]
+    sites = tuple(_build_imported_law(scenario, site, alpha) for site in sites)
+    notes += _describe_laws(scenario)
     conditions = OperatingConditions(sites, alpha, age_s, (), laws=laws)
-    pairs = conditions.pairs
+    pairs = conditions.coupled_pairs
     if conditions.has_forms:
-        pairs = [(i, j) for i in range(len(alpha)) for j in range(len(alpha)) if i != j]
+        pairs = list(permutations(range(len(alpha)), 2))
         notes.append(
-            "a law here has states or waves of its own: it is linearised in continuous time alone"
+            "a law here has states or waves of its own: "
+            "it is linearised in continuous time only"
         )
     links = {}
+    varying = []
     for i, j in pairs:
         peer = scenario.names[j]
-        own = scenario.names[i]
-        link = _find_final_link(scenario, f"{peer}->{own}", notes)
-        links[i, j] = link, link_key(scenario.seed, f"{peer}->{own}")
-        age = compute_effective_delay(scenario, peer, own, link)
+        site = scenario.names[i]
+        link = _find_final_link(scenario, f"{peer}->{site}", notes)
+        links[i, j] = link, link_key(scenario.seed, f"{peer}->{site}")
+        age = compute_effective_delay(scenario, peer, site, link)
         age_s[i, j] = age.mean_s
-        if age.most_s > age.least_s + 1e-8:  # more than ticks in whole ns
+        # times of ticks are whole ns, so that constant ages differ by less than this
+        if age.most_s > age.least_s + 1e-8:
             varying.append(age)
     if varying:
-        least = 1e3 * min(age.least_s for age in varying)
-        most = 1e3 * max(age.most_s for age in varying)
-        where = "one link" if len(varying) == 1 else f"{count_nouns(len(varying), 'link')}"
+        least_ms = 1e3 * min(age.least_s for age in varying)
+        most_ms = 1e3 * max(age.most_s for age in varying)
+        count = "one link" if len(varying) == 1 else f"{count_nouns(len(varying), 'link')}"
         notes.append(
-            f"the age of the samples in use varies on {where}, {least:.4g} to {most:.4g} ms: the continuous "
-            "loop is linearised at the mean of each, and leaves out the effect of the variation itself"
+            f"the age of the samples in use varies on {count}, "
+            f"{least_ms:.4g} to {most_ms:.4g} ms: the continuous loop is linearised at the "
+            "mean of each, and leaves out the effect of the variation itself"
         )
     if any(site.on_stale.action is not StaleAction.USE for site in sites):
         notes.append("rules for stale peers are left out: no peer counts as stale")
@@ -199,27 +211,50 @@ def derive_operating_conditions(
     )
 
 
+def _describe_laws(scenario: Scenario) -> list[str]:
+    """Returns remarks on how the laws of a scenario are linearised."""
+    notes = []
+    laws = scenario.controls
+    codes = [law.code if isinstance(law, ImportedLaw) else "" for law in laws]
+    for code in filter(None, dict.fromkeys(codes)):
+        sites = [
+            name
+            for name, law_code in zip(scenario.names, codes, strict=True)
+            if law_code == code
+        ]
+        notes.append(
+            f"{code} of {', '.join(sites)} is differentiated numerically, "
+            "and so is its memory: by central differences"
+        )
+    notes += [law.linear_note for law in laws if law.linear_note]
+    return notes
+
+
 def is_constant_link(link: LinkBase) -> bool:
-    """True if a link delays every sample alike."""
-    return (
-        link.to_core_model().kind == DelayKind.CONSTANT and not link.loss and not link.measured
-    )
+    """True if a link delays every sample by the same time and loses none."""
+    return link.to_core_model().kind == DelayKind.CONSTANT and not link.loss and not link.measured
 
 
-def _make_own_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetup:
-    """Returns a site whose law, if it is imported, is made, to be asked."""
+def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetup:
+    """Returns a setup whose imported law, if any, is built and can be evaluated."""
     law = scenario.sites[site.name].control
-    i = scenario.names.index(site.name)
     if not isinstance(law, ImportedLaw):
         return site
+    i = scenario.names.index(site.name)
+    shares = np.delete(alpha[i], i).tolist()
     try:
-        return site._replace(own=NumericLaw(site, law.code, np.delete(alpha[i], i).tolist()))
+        return site._replace(own=NumericLaw(site, law.code, shares))
     except ScenarioError as error:
         raise type(error)(error.problem, path=error.path, source=scenario.name) from None
 
 
 def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains]:
-    found: dict[str, Gains] = {}
+    """Returns the gains of each site's law in small motions, by site.
+
+    Raises:
+        ScenarioError: a law has no linear loop, or an arm is external.
+    """
+    gains_by_site: dict[str, Gains] = {}
     for name, spec in scenario.sites.items():
         law = spec.control
         theta = scenario.arms[name].theta
@@ -227,34 +262,53 @@ def _find_linear_gains(scenario: Scenario, *, own_laws: bool) -> dict[str, Gains
         if own_laws and isinstance(law, ImportedLaw):
             gains = law.gains(theta)
         if gains is None:
-            why = law.explain_no_linear_form()
-            if isinstance(law, ImportedLaw):
-                why = f"{law.code} is known by its code alone, which trilat linear runs, and this does not"
-            others = f"adaptive, adaptive_box, p_d, pd_d, p_f and others have one, see {find_page('laws.md')}"
+            reason = _explain_missing_gains(law)
             raise ScenarioError(
-                f"has no linear loop: {why or others}",
+                f"has no linear loop: {reason}",
                 path=f"sites.{name}.control.law",
                 source=scenario.name,
             )
-        found[name] = gains
+        gains_by_site[name] = gains
     refuse_external_arms(scenario)
-    return found
+    return gains_by_site
+
+
+def _explain_missing_gains(law: Any) -> str:
+    """Returns the reason why a law has no linear loop."""
+    if isinstance(law, ImportedLaw):
+        return (
+            f"{law.code} is known by its code only; "
+            "trilat linear runs that code, and this command does not"
+        )
+    others = (
+        "adaptive, adaptive_box, p_d, pd_d, p_f and others have one, "
+        f"see {find_page('laws.md')}"
+    )
+    reason: str = law.explain_no_linear_form() or others
+    return reason
 
 
 def _find_final_link(scenario: Scenario, name: str, notes: list[str]) -> LinkBase:
+    """Returns the link in force at the end of the run; adds remarks to `notes`.
+
+    Raises:
+        ScenarioError: the link's delay is measured, and thus unknown before the run.
+    """
     end_ns = round(scenario.duration_s * 1e9)
     link: LinkBase = scenario.links[name]
     for from_ns, later in scheduled_links(scenario.timeline, name):
         link = later if from_ns <= end_ns else link
     if link.measured:
         raise ScenarioError(
-            "is 'measured': its delay is not known beforehand; give a model, as in link.model = 'constant'",
+            "is 'measured': its delay is not known beforehand; "
+            "give a model, as in link.model = 'constant'",
             path=f"links.{name}.model",
             source=scenario.name,
         )
     if link != scenario.links[name]:
         notes.append(
-            f"link {name} changes during the run: taken as it is at the end, {link.describe()}"
+            f"link {name} changes during the run: its state at the end is used, "
+            f"{link.describe()}"
         )
     if link.outages_s:
         notes.append(f"the outages of link {name} are left out")
@@ -269,39 +323,42 @@ def compute_effective_delay(
     Raises:
         ScenarioError: no sample ever arrives.
     """
-    own_hz = scenario.sites[site].rate_hz
+    site_hz = scenario.sites[site].rate_hz
     peer_hz = scenario.sites[peer].rate_hz
     model = link.to_core_model()
-    constant = is_constant_link(link)
-    if constant and own_hz == peer_hz:
+    is_constant = is_constant_link(link)
+    if is_constant and site_hz == peer_hz:
         delay_us = max(round(model.location), model.playout_us)
-        age_s = max(1, -(-delay_us * own_hz // 1_000_000)) / own_hz
+        # at least one tick, rounded up to whole ticks
+        ticks = max(1, -(-delay_us * site_hz // 1_000_000))
+        age_s = ticks / site_hz
         return EffectiveDelay(age_s, age_s, age_s)
-    duration_s = (
-        min(scenario.duration_s, 2.0 + 2e-6 * model.location)
-        if constant
-        else scenario.duration_s
-    )
-    used = draw_used_samples(
+    duration_s = scenario.duration_s
+    if is_constant:
+        # ages repeat, so that two seconds beyond the delay show them all
+        duration_s = min(duration_s, 2.0 + 2e-6 * model.location)
+    used = draw_uses(
         link=link,
         key=link_key(scenario.seed, f"{peer}->{site}"),
-        own_hz=own_hz,
+        own_hz=site_hz,
         peer_hz=peer_hz,
         duration_s=duration_s,
     )
     if used[-1] < 0:
         raise ScenarioError(
-            "no sample of it ever comes", path=f"links.{peer}->{site}", source=scenario.name
+            "no sample of it ever arrives", path=f"links.{peer}->{site}", source=scenario.name
         )
     first = int(np.argmax(used >= 0))
-    now_ns = np.arange(first, len(used)) * NS_PER_S // own_hz
-    ages_s = (now_ns - used[first:] * NS_PER_S // peer_hz) * 1e-9
+    tick_ns = np.arange(first, len(used)) * NS_PER_S // site_hz
+    sample_ns = used[first:] * NS_PER_S // peer_hz
+    ages_s = (tick_ns - sample_ns) * 1e-9
     return EffectiveDelay(float(ages_s.mean()), float(ages_s.min()), float(ages_s.max()))
 
 
-def _final_dominance(
+def _find_final_dominance(
     scenario: Scenario, sites: tuple[SiteSetup, ...], notes: list[str]
 ) -> Array:
+    """Returns the dominance matrix at the end of the run, shape (N, N); adds to `notes`."""
     alpha = scenario.alpha.copy()
     end_ns = round(scenario.duration_s * 1e9)
     for i, site in enumerate(sites):
@@ -309,55 +366,65 @@ def _final_dominance(
         for ramp in site.ramps:
             if ramp.start_ns > end_ns:
                 continue
-            over = ramp.end_ns <= end_ns
-            share = 1.0 if over else (end_ns - ramp.start_ns) / (ramp.end_ns - ramp.start_ns)
-            alpha[i, peers] += share * (np.array(ramp.alpha) - alpha[i, peers])
+            progress = 1.0
+            if ramp.end_ns > end_ns:
+                progress = (end_ns - ramp.start_ns) / (ramp.end_ns - ramp.start_ns)
+            alpha[i, peers] += progress * (np.array(ramp.alpha) - alpha[i, peers])
             notes.append(
-                f"the dominance factors of {site.name} change during the run: taken as they are at the end"
+                f"the dominance factors of {site.name} change during the run: "
+                "their values at the end are used"
             )
     return alpha
 
 
 def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> SiteSetup:
+    """Returns a site's setup with the actors in force at the end of the run.
+
+    A hand is at the end of its motion, and a scripted torque keeps its last value. Chirps and
+    multisines are left out. Each such change adds a remark to `notes`.
+    """
     setup = scenario.setup(name)
     end_s = scenario.duration_s
     present = [actor for actor in setup.actors if actor.start_s <= end_s < actor.end_s]
-    if any(
-        actor.acts in (TorqueKind.HAND, TorqueKind.TASK_HAND) and actor.move_end_s > end_s
-        for actor in present
-    ):
+    hands = [actor for actor in present if actor.acts in _HANDS]
+    if any(hand.move_end_s > end_s for hand in hands):
         notes.append(
-            f"an operator at {name} still moves at the end: taken to be at the end of that motion"
+            f"an operator at {name} still moves at the end: "
+            "the end of that motion is used as the operator's target"
         )
     if any(actor.acts in _PERIODIC for actor in present):
         notes.append(
-            f"an operator at {name} still swings at the end: left out, its torque has no mean"
+            f"an operator at {name} still swings at the end: "
+            "this torque is left out, because its mean is zero"
         )
     scripted = [
         actor
         for actor in present
         if actor.acts in SCRIPTED_KINDS and actor.acts not in _PERIODIC
     ]
-    constant = [actor._replace(a=_scripted_torque(actor, end_s)) for actor in scripted]
+    constant = [actor._replace(a=_evaluate_script(actor, end_s)) for actor in scripted]
     if any(any(actor.a) for actor in constant):
         notes.append(
-            f"a scripted torque acts on {name} at the end: taken to stay as it is then"
+            f"a scripted torque acts on {name} at the end: its value then is kept constant"
         )
-    own = (actor._replace(move_end_s=end_s) for actor in present if actor.acts in OWN_KINDS)
-    others = (
-        actor
-        for actor in present
-        if actor.acts not in (*SCRIPTED_KINDS, *OWN_KINDS, *LIVE_KINDS)
-    )
-    return setup._replace(actors=(*others, *own, *constant))
+    user_written = [
+        actor._replace(move_end_s=end_s) for actor in present if actor.acts in OWN_KINDS
+    ]
+    special_kinds = (*SCRIPTED_KINDS, *OWN_KINDS, *LIVE_KINDS)
+    others = [actor for actor in present if actor.acts not in special_kinds]
+    return setup._replace(actors=(*others, *user_written, *constant))
 
 
+_HANDS = (TorqueKind.HAND, TorqueKind.TASK_HAND)
 _PERIODIC = (TorqueKind.CHIRP, TorqueKind.MULTISINE)
 
 
-def _scripted_torque(actor: TorqueSource, t_s: float) -> tuple[float, ...]:
+def _evaluate_script(actor: TorqueSource, t_s: float) -> tuple[float, ...]:
+    """Returns the torque of a scripted actor at a time: a sin^2 pulse, or a table's value."""
     if actor.table is None:
         x = (t_s - actor.start_s) / (actor.end_s - actor.start_s)
         return tuple(peak * math.sin(math.pi * x) ** 2 for peak in actor.a)
-    t, *torques = actor.table.T
-    return tuple(float(np.interp(t_s, t, torque, left=0.0, right=0.0)) for torque in torques)
+    times_s, *torques = actor.table.T
+    return tuple(
+        float(np.interp(t_s, times_s, torque, left=0.0, right=0.0)) for torque in torques
+    )

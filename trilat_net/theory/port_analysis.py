@@ -59,7 +59,7 @@ def freeze_external_torques(
     """
     x = gather_site_arguments(conditions, rest)
     sites = []
-    for site, rates in zip(conditions.sites, conditions.rates(x), strict=True):
+    for site, rates in zip(conditions.sites, conditions.evaluate_rates(x), strict=True):
         torque = tuple((rates.external + rates.held).tolist())
         constant = (TorqueSource(TorqueKind.RECORDED, a=torque),) if any(torque) else ()
         sites.append(site._replace(actors=constant))

@@ -1,13 +1,14 @@
-"""One site as a continuous system: derivatives of arm, control law and estimates, and their
-Jacobian.
+"""One site as a continuous system: rates of arm and estimates, and their Jacobian.
 
-Invariant: plain NumPy on `textbook_arm`, nothing of the compiled core. Where a law has branches
-(a wall, the bounds of an estimate) the real part decides, so that a complex step yields the
-Jacobian of the branch in force.
+The Jacobian comes from a complex step: f'(x) = Im f(x + i h) / h with h = 1e-30, exact to
+rounding because nothing is subtracted. Squire and Trapp, "Using complex variables to estimate
+derivatives of real functions", SIAM Review 40 (1998).
 
-Complex step: f'(x) = Im f(x + i h) / h with h = 1e-30, exact to rounding because nothing is
-subtracted. Squire and Trapp, "Using complex variables to estimate derivatives of real
-functions", SIAM Review 40 (1998).
+Invariant:
+    - Plain NumPy on `textbook_arm` and nothing of the compiled core, so that the two check each
+      other.
+    - Where a law has branches (a wall, the bounds of an estimate), the real part decides, so
+      that a complex step yields the Jacobian of the branch in force.
 """
 
 from collections.abc import Iterator
@@ -25,31 +26,29 @@ from .textbook_arm import Following, PlacedChain, follow_in_task, follow_joints,
 
 COMPLEX_STEP = 1e-30
 SWITCHING_TOLERANCE = 1e-9
-"""A wall this near, m, or an estimate this near to an end of its box, is at its switching
-point.
-"""
+"""Within this distance a wall, m, or an end of an estimate's box is at its switching point."""
 
 
 class ArgumentLayout:
-    """Where the parts of a site's argument stand, in their order: state, reference, torques.
+    """The slices of a site's argument vector, in order: state, inputs from peers, own torque.
 
     Args:
-        joints: length of each part but the estimate and what comes from peers.
+        joints: number of joints n; length of q, qd and the external torque.
         parameters: length of the estimate.
-        shared: length of what comes from peers, of each of its three parts; 0: as many as there
-            are joints.
-        peers: of a law of one's own, which sees each peer by itself too, how many there are.
+        shared: length m of each part that comes from peers; 0: as many as there are joints.
+        peers: number of peers whose samples an imported law also reads one by one.
 
     Attributes:
-        q, qd: joint positions, and velocities.
-        estimate: the estimate, theta_hat. q_des, qd_des: the reference, q_id, in task space a
-        pose, see `textbook_arm`; and its derivative.
+        q, qd: joint positions and velocities.
+        estimate: the estimate theta_hat, or the memory of an imported law.
+        q_des, qd_des: the reference q_id and its derivative; in task space the reference is a
+            pose, see `textbook_arm`.
         peer_torque: the exogenous torque of the peers; in task space their force.
         external_torque: torque that an operator adds ON the joints.
-        inputs: what comes from peers: the reference, its derivative, and their torque; then
-            that of each.
-        coordinates: length of each part that comes from peers.
-        states: length of a site's state: q, qd and theta_hat.
+        inputs: everything from peers: the reference, its derivative, their torque, and then the
+            samples of the single peers.
+        coordinates: length m of each part that comes from peers.
+        states: length of the site's state: q, qd and theta_hat.
         arguments: length of the whole argument.
     """
 
@@ -60,22 +59,28 @@ class ArgumentLayout:
         self.peers = peers
         self.coordinates = m = shared or joints
         lengths = (joints, joints, parameters, m, m, m, 3 * m * peers, joints)
-        parts = [slice(*ends) for ends in pairwise(accumulate(lengths, initial=0))]
-        self.q, self.qd, self.estimate, self.q_des, self.qd_des, self.peer_torque, *_ = parts
-        self.external_torque = parts[-1]
+        slices = [slice(*bounds) for bounds in pairwise(accumulate(lengths, initial=0))]
+        self.q = slices[0]
+        self.qd = slices[1]
+        self.estimate = slices[2]
+        self.q_des = slices[3]
+        self.qd_des = slices[4]
+        self.peer_torque = slices[5]
+        self.external_torque = slices[7]
         self.states = self.estimate.stop
         self.arguments = self.external_torque.stop
         self.inputs = slice(self.states, self.external_torque.start)
 
-    def of_peer(self, place: int) -> slice:
-        """What came from one peer: its x, the velocity, and its exogenous torque."""
-        first = self.peer_torque.stop + 3 * self.coordinates * place
+    def peer_sample(self, index: int) -> slice:
+        """Returns the slice of one peer's sample: its x, velocity, and exogenous torque."""
+        first = self.peer_torque.stop + 3 * self.coordinates * index
         return slice(first, first + 3 * self.coordinates)
 
 
 def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
-    """Returns the layout of the arguments of a site's rates; memory of a law of one's own is
-    its estimate.
+    """Returns the layout of the arguments of a site's rates.
+
+    The memory of an imported law takes the position of the estimate.
     """
     if isinstance(site.own, NumericLaw):
         return ArgumentLayout(site.layout.joints, len(site.own.memory), 0, len(site.links))
@@ -84,27 +89,26 @@ def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
 
 def place_arm(site: SiteSetup, q: Numbers) -> PlacedArm | PlacedChain:
     """Returns the arm of a site in the poses q, shape (n, ...)."""
-    return (
-        PlacedArm(site.g_m_s2, site.lengths_m, q)
-        if site.chain is None
-        else PlacedChain(site.chain, q)
-    )
+    if site.chain is None:
+        return PlacedArm(site.g_m_s2, site.lengths_m, q)
+    return PlacedChain(site.chain, q)
 
 
 class SiteRates(NamedTuple):
-    """Rates and torques of a site; as a Jacobian each has a column per entry of the argument.
+    """Rates and torques of a site; in a Jacobian, each has a column per argument.
 
     Attributes:
         qdd: joint accelerations, shape (n, ...), rad/s^2.
         estimate: the derivative of theta_hat, shape (P, ...).
-        tau: the torque of the control law, unclamped, shape (n, ...), N m.
+        tau: the unclamped torque of the control law, shape (n, ...), N m.
         external: the torque of operators and environments that act continuously, shape (n,
             ...), N m.
-        held: the torque of those that are sampled and held, shape (n, ...), N m.
-        x: what peers get of the pose, shape (m, ...): the angles, or place and orientation, see
-            `textbook_arm.Following`.
-        xd: its velocity.
-        reflected: the external and held torque as peers get it, a force in task space.
+        held: the torque of sampled operators and environments, which is held over a tick,
+            shape (n, ...), N m.
+        x: the pose that peers receive, shape (m, ...): joint angles, or position and
+            orientation, see `textbook_arm.Following`.
+        xd: the velocity of x.
+        reflected: the external and held torque as peers receive it; in task space a force.
     """
 
     qdd: Numbers
@@ -118,17 +122,33 @@ class SiteRates(NamedTuple):
 
 
 def follow_peers(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers) -> Following:
-    """Returns how a site follows what came from its peers, in its space."""
-    at = lay_out_arguments(site)
+    """Returns how a site follows its reference, in joint space or in task space.
+
+    Args:
+        site: setup of the site.
+        arm: the arm in the pose of x.
+        x: arguments of the site's rates, shape (arguments, ...).
+    """
+    layout = lay_out_arguments(site)
     Lambda = _as_columns(site.gains.Lambda, x)
-    motion = (Lambda, x[at.q], x[at.qd], x[at.q_des], x[at.qd_des])
+    q = x[layout.q]
+    qd = x[layout.qd]
+    reference = x[layout.q_des]
+    reference_rate = x[layout.qd_des]
     if site.layout.task and isinstance(arm, PlacedChain):
-        return follow_in_task(site, arm, *motion)
-    return follow_joints(*motion)
+        return follow_in_task(
+            site, arm, Lambda, q=q, qd=qd, x_des=reference, xd_des=reference_rate
+        )
+    return follow_joints(Lambda, q=q, qd=qd, q_des=reference, qd_des=reference_rate)
 
 
-def share_own_pose(site: SiteSetup, q: Numbers) -> Numbers:
-    """Returns what a site shares of its poses q, shape (n, ...): them, or its end effector's."""
+def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
+    """Returns the pose that a site shares with its peers: joint angles or an end effector pose.
+
+    Args:
+        site: setup of the site.
+        q: joint positions, shape (n, ...).
+    """
     arm = place_arm(site, q)
     if isinstance(arm, PlacedChain) and site.chain is not None and site.chain.task is not None:
         return share_pose(site.chain.task, arm)
@@ -136,125 +156,166 @@ def share_own_pose(site: SiteSetup, q: Numbers) -> Numbers:
 
 
 def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
-    """Returns the rates of a site, with the actors in force: Eq. (8)-(13), (15), or those of
-    known gravity.
+    """Returns the rates of a site with the actors in force.
 
-    x is laid out as `lay_out_arguments` says, shape (arguments, ...).
+    They are Eq. (8)-(13) and (15) of the paper, or those of a law with known gravity.
+
+    Args:
+        site: setup of the site.
+        x: arguments in the order of `lay_out_arguments`, shape (arguments, ...).
     """
-    at = lay_out_arguments(site)
-    arm = place_arm(site, x[at.q])
-    qd = x[at.qd]
+    layout = lay_out_arguments(site)
+    arm = place_arm(site, x[layout.q])
+    qd = x[layout.qd]
     following = follow_peers(site, arm, x)
-    external = x[at.external_torque] + _sum_actors(site, arm, x, sampled=False)
+    external = x[layout.external_torque] + _sum_actors(site, arm, x, sampled=False)
     held = _sum_actors(site, arm, x, sampled=True)
     if isinstance(site.own, NumericLaw):
-        tau, estimate = site.own.evaluate(
-            np.concatenate([x[: at.inputs.stop], external + held])
-        )
+        law_arguments = np.concatenate([x[: layout.inputs.stop], external + held])
+        tau, estimate_rate = site.own.evaluate(law_arguments)
+    elif has_estimate(site):
+        tau, estimate_rate = _evaluate_adaptive_law(site, arm, following, x)
     else:
-        tau, estimate = _evaluate_law(site, arm, following, x)
-    qdd = arm.joint_acceleration(_as_columns(site.theta, qd), qd, tau + external + held)
-    reflected = following.from_joints(external + held)
+        tau = _evaluate_known_gravity_law(site, arm, following, x)
+        estimate_rate = 0.0 * x[layout.estimate]
+    torque = tau + external + held
+    qdd = arm.joint_acceleration(_as_columns(site.theta, qd), qd, torque)
     return SiteRates(
         qdd=qdd,
-        estimate=estimate,
+        estimate=estimate_rate,
         tau=tau,
         external=external,
         held=held,
         x=following.x,
         xd=following.xd,
-        reflected=reflected,
+        reflected=following.from_joints(external + held),
     )
 
 
 def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
-    """Returns the derivatives of the rates at x by a complex step, a column per entry of x
-    each.
-    """
+    """Returns the derivatives of the rates at x by a complex step, a column per argument."""
     stepped = x[:, np.newaxis] + 1j * COMPLEX_STEP * np.eye(len(x))
-    return SiteRates(*(rate.imag / COMPLEX_STEP for rate in evaluate_site_rates(site, stepped)))
+    rates = evaluate_site_rates(site, stepped)
+    return SiteRates(*(rate.imag / COMPLEX_STEP for rate in rates))
 
 
 def has_estimate(site: SiteSetup) -> bool:
-    """True if the site's state includes an estimate, or the memory of a law of one's own."""
+    """True if the site's state includes an estimate, or the memory of an imported law."""
     if isinstance(site.own, NumericLaw):
         return len(site.own.memory) > 0
     return site.gains.law is Law.ADAPTIVE
 
 
 def _as_columns(values: object, like: Numbers) -> Numbers:
+    """Returns values with a copy for each column of another array, shape (..., columns)."""
     column = np.asarray(values, dtype=np.float64)
     return column.reshape(column.shape + (1,) * (like.ndim - 1)) + np.zeros(like.shape[1:])
 
 
-def _evaluate_law(
+def _evaluate_known_gravity_law(
+    site: SiteSetup, arm: PlacedArm | PlacedChain, following: Following, x: Numbers
+) -> Numbers:
+    """Returns the torque of a law with known gravity, shape (n, ...), N m.
+
+    tau = G(q) - d qd - J' (Kd ed + K e - k_f tau_peers), with J = 1 in joint space.
+    """
+    layout = lay_out_arguments(site)
+    gains = site.gains
+    q = x[layout.q]
+    qd = x[layout.qd]
+    K = _as_columns(gains.K, q)
+    d = _as_columns(gains.d, q)
+    k_f = _as_columns(gains.k_f, q)
+    theta = _as_columns(np.broadcast_to(gains.known, site.theta.shape), q)
+    G = arm.gravity_torque(theta)
+    pull = _as_columns(gains.Kd, q) * following.ed
+    pull = pull + K * following.e - k_f * x[layout.peer_torque]
+    return G - d * qd - following.to_joints(pull)
+
+
+def _evaluate_adaptive_law(
     site: SiteSetup, arm: PlacedArm | PlacedChain, following: Following, x: Numbers
 ) -> tuple[Numbers, Numbers]:
-    at = lay_out_arguments(site)
+    """Returns the torque of an adaptive law, N m, and the rate of its estimate.
+
+    With the reference velocity v and acceleration a, r = qd - v and the bounded projection of
+    the rate onto the estimate's box, Eq. (10)-(13):
+
+        tau = Y(q, qd, v, a) theta_hat - Kp r - J' Kd ed - rho r / sqrt(r^2 + w^2)
+              - (1 - known) friction(v)
+        theta_hat' = -Gamma Y' r
+    """
+    layout = lay_out_arguments(site)
     gains = site.gains
-    q = x[at.q]
-    qd = x[at.qd]
-    estimate = x[at.estimate]
-    _, _, e, ed, v, a, *_ = following
-    pull = _as_columns(gains.Kd, q) * ed
-    if not has_estimate(site):
-        K, d, k_f = (_as_columns(gain, q) for gain in (gains.K, gains.d, gains.k_f))
-        G = arm.gravity_torque(_as_columns(np.broadcast_to(gains.known, site.theta.shape), q))
-        pull = pull + K * e - k_f * x[at.peer_torque]
-        return G - d * qd - following.to_joints(pull), 0.0 * estimate
+    q = x[layout.q]
+    qd = x[layout.qd]
+    estimate = x[layout.estimate]
+    Kp = _as_columns(gains.Kp, q)
+    pull = _as_columns(gains.Kd, q) * following.ed
+    v = following.v
+    a = following.a
     r = qd - v
     if gains.absolute:
+        # the sliding variable is absolute: the reference enters through Kp alone
         Lambda = _as_columns(gains.Lambda, q)
         v = -Lambda * q
         a = -Lambda * qd
         r = qd + Lambda * q
-        led = _as_columns(gains.Kp, q) * (x[at.qd_des] + Lambda * x[at.q_des])
-        pull = pull - led
-    tau = (
-        arm.required_torque(estimate, qd, v, a)
-        - _as_columns(gains.Kp, q) * r
-        - following.to_joints(pull)
-    )
-    rho, width, known = (
-        _as_columns(gain, q) for gain in (gains.rho, gains.width, gains.friction)
-    )
-    tau = (
-        tau - rho * r / np.sqrt(r * r + width * width) - (1.0 - known) * arm.friction_torque(v)
-    )
+        pull = pull - Kp * (x[layout.qd_des] + Lambda * x[layout.q_des])
+    tau = arm.required_torque(estimate, qd, v, a) - Kp * r - following.to_joints(pull)
+    rho = _as_columns(gains.rho, q)
+    width = _as_columns(gains.width, q)
+    known = _as_columns(gains.friction, q)
+    robust_torque = rho * r / np.sqrt(r * r + width * width)
+    unknown_friction = (1.0 - known) * arm.friction_torque(v)
+    tau = tau - robust_torque - unknown_friction
     Y = arm.regressor_matrix(qd, v, a)
     rate = -_as_columns(gains.Gamma, q) * multiply_columns(np.swapaxes(Y, 0, 1), r)
     return tau, np.where(_is_at_bound(site, estimate, rate), 0.0, rate)
 
 
 def _is_at_bound(site: SiteSetup, estimate: Numbers, rate: Numbers) -> Numbers:
+    """Returns where an estimate is at an end of its box and its rate points outward."""
     low = _as_columns(site.gains.low, estimate)
     high = _as_columns(site.gains.high, estimate)
-    down = (estimate.real <= low + SWITCHING_TOLERANCE) & (rate.real < -SWITCHING_TOLERANCE)
-    up = (estimate.real >= high - SWITCHING_TOLERANCE) & (rate.real > SWITCHING_TOLERANCE)
-    return down | up
+    is_low = estimate.real <= low + SWITCHING_TOLERANCE
+    is_high = estimate.real >= high - SWITCHING_TOLERANCE
+    falls = rate.real < -SWITCHING_TOLERANCE
+    rises = rate.real > SWITCHING_TOLERANCE
+    return (is_low & falls) | (is_high & rises)
 
 
 def _sum_actors(
     site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers, *, sampled: bool
 ) -> Numbers:
-    """Returns the torque of the actors in force on the arm, shape (n, ...), N m."""
-    at = lay_out_arguments(site)
-    q = x[at.q]
-    qd = x[at.qd]
+    """Returns the sum of the torques of the continuous or the sampled actors.
+
+    Args:
+        site: setup of the site, with the actors in force.
+        arm: the arm in the pose of x.
+        x: arguments of the site's rates, shape (arguments, ...).
+        sampled: True: sum over the sampled actors; False: over the continuous ones.
+
+    Returns:
+        The torque ON the joints, shape (n, ...), N m.
+    """
+    layout = lay_out_arguments(site)
+    q = x[layout.q]
+    qd = x[layout.qd]
     total: Numbers = 0.0 * q
     for actor in site.actors:
         if actor.sampled == sampled:
-            total = total + _actor_torque(arm, actor, q, qd)
+            total = total + _evaluate_actor(arm, actor, q, qd)
     return total
 
 
-def _actor_torque(
+def _evaluate_actor(
     arm: PlacedArm | PlacedChain, actor: TorqueSource, q: Numbers, qd: Numbers
 ) -> Numbers:
-    """Returns the torque of one actor: an operator's motion has ended, a scripted torque is
-    constant, `a`.
+    """Returns the torque of one actor in force, shape (n, ...), N m.
 
-    One of an own kind stays as it is at `move_end_s`.
+    An operator's motion has ended, and a scripted torque has the constant value `a`. A
+    user-written model keeps the parameters that it has at `move_end_s`.
     """
     if actor.acts in SCRIPTED_KINDS:
         return _as_columns(actor.a, q)
@@ -266,43 +327,58 @@ def _actor_torque(
         torque: Numbers = stiffness * (_as_columns(actor.b, q) - q) - damping * qd
         return torque
     J = arm.position_jacobian()
+    J_transposed = np.swapaxes(J, 0, 1)
     position = arm.end_effector_position()
     velocity = multiply_columns(J, qd)
+    if actor.acts is TorqueKind.OWN_TIP:
+        return multiply_columns(J_transposed, _evaluate_model(actor, position, velocity))
     if actor.acts in OWN_KINDS:
-        at_tip = actor.acts is TorqueKind.OWN_TIP
-        seen = (
-            np.moveaxis(one, 0, -1) for one in ((position, velocity) if at_tip else (q, qd))
-        )
-        effort = np.moveaxis(actor.model.effort(np.array(actor.move_end_s), *seen), -1, 0)
-        return multiply_columns(np.swapaxes(J, 0, 1), effort) if at_tip else effort
+        return _evaluate_model(actor, q, qd)
     if actor.acts is TorqueKind.TASK_HAND:
         force = stiffness * (_as_columns(actor.b, q) - position) - damping * velocity
     else:
         normal = _as_columns(actor.b, q)
         depth = np.sum((_as_columns(actor.a, q) - position) * normal, axis=0)
         push = stiffness[0] * depth - damping[0] * np.sum(velocity * normal, axis=0)
-        force = np.where((depth.real > 0.0) & (push.real > 0.0), push, 0.0) * normal
-    return multiply_columns(np.swapaxes(J, 0, 1), force)
+        touches = (depth.real > 0.0) & (push.real > 0.0)
+        force = np.where(touches, push, 0.0) * normal
+    return multiply_columns(J_transposed, force)
+
+
+def _evaluate_model(actor: TorqueSource, position: Numbers, velocity: Numbers) -> Numbers:
+    """Returns the effort of a user-written hand or environment, components first."""
+    # models expect the components on the last axis
+    effort = actor.model.effort(
+        np.array(actor.move_end_s), np.moveaxis(position, 0, -1), np.moveaxis(velocity, 0, -1)
+    )
+    return np.moveaxis(effort, -1, 0)
 
 
 def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
-    """Yields the switching points at an argument x where the Jacobian is one-sided."""
-    at = lay_out_arguments(site)
-    position = place_arm(site, x[at.q]).end_effector_position()
-    for n, actor in enumerate(actor for actor in site.actors if actor.acts is TorqueKind.WALL):
-        depth_m = float((np.array(actor.a) - position) @ np.array(actor.b))
+    """Yields a sentence for each switching point at x, where the Jacobian is one-sided."""
+    layout = lay_out_arguments(site)
+    position = place_arm(site, x[layout.q]).end_effector_position()
+    walls = [actor for actor in site.actors if actor.acts is TorqueKind.WALL]
+    for n, wall in enumerate(walls):
+        depth_m = float((np.array(wall.a) - position) @ np.array(wall.b))
         if abs(depth_m) < SWITCHING_TOLERANCE:
-            yield f"{site.name} rests exactly on the surface of its wall {n + 1}: it counts as not touching"
-    if site.gains.law is Law.ADAPTIVE:
-        rate = evaluate_site_rates(site, x).estimate
-        unbounded = site.gains._replace(low=-np.inf, high=np.inf)
-        free_rate = evaluate_site_rates(site._replace(gains=unbounded), x).estimate
-        estimate = x[at.estimate]
-        ends = np.stack(
-            [np.broadcast_to(end, estimate.shape) for end in (site.gains.low, site.gains.high)]
+            yield (
+                f"{site.name} rests exactly on the surface of its wall {n + 1}: "
+                "it counts as not touching"
+            )
+    if site.gains.law is not Law.ADAPTIVE:
+        return
+    rate = evaluate_site_rates(site, x).estimate
+    unbounded = site.gains._replace(low=-np.inf, high=np.inf)
+    free_rate = evaluate_site_rates(site._replace(gains=unbounded), x).estimate
+    estimate = x[layout.estimate]
+    bounds = (site.gains.low, site.gains.high)
+    ends = np.stack([np.broadcast_to(end, estimate.shape) for end in bounds])
+    is_near = (np.abs(ends - estimate) < SWITCHING_TOLERANCE).any(axis=0)
+    is_near &= np.abs(rate) <= SWITCHING_TOLERANCE
+    is_near &= ~_is_at_bound(site, estimate, free_rate) & (np.asarray(site.gains.Gamma) > 0)
+    for p in np.flatnonzero(is_near):
+        yield (
+            f"theta{p + 1} of {site.name} rests exactly on the edge of its box: "
+            "it counts as free"
         )
-        near = (np.abs(ends - estimate) < SWITCHING_TOLERANCE).any(axis=0)
-        near &= np.abs(rate) <= SWITCHING_TOLERANCE
-        near &= ~_is_at_bound(site, estimate, free_rate) & (np.asarray(site.gains.Gamma) > 0)
-        for p in np.flatnonzero(near):
-            yield f"theta{p + 1} of {site.name} rests exactly on the edge of its box: it counts as free"
