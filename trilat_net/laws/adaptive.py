@@ -1,7 +1,14 @@
-"""The paper's adaptive law, Eq. (13) and (15); the kernel computes it (`core.control`)."""
+"""The paper's adaptive law, which learns the arm's parameters: Eq. (13) and (15).
+
+The kernel computes this law (`core.control.adaptive_torque` and `update_estimate`);
+`Adaptive.compute_torque` and `Adaptive.advance_estimate` state the same law in plain Python,
+and `tests/control_laws/test_plain_torques.py` compares the two.
+"""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
+
+import numpy as np
 
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
@@ -18,17 +25,18 @@ from .interface import ADAPTATION, CONVERGENCE, DAMPING, ERROR_DAMPING, ControlL
 class Adaptive(ControlLaw):
     """The paper's adaptive law, Eq. (13) and (15).
 
-    Stable for any constant delays without external torque, if the dominance matrix is
-    irreducible and the Kd of all sites are one matrix but for a scalar each (the paper's
-    theorem, weights of docs/errata.md). This is sufficient; it does not cover delays that vary.
+    The loop is stable for any constant delays without external torque, if the dominance matrix
+    is irreducible and the matrices Kd of all sites differ by scalar factors only (the paper's
+    theorem, with the weights of docs/errata.md). This condition is sufficient and does not
+    cover delays that vary.
 
-    Gamma = 0 and theta_hat0 = theta make the law of known parameters; Kd = 0 removes the
-    error's damping.
+    Gamma = 0 and theta_hat0 = theta make the law with known parameters; Kd = 0 removes the
+    damping of the error.
 
     Attributes:
-        Lambda: per joint, 1/s.
-        Kp: per joint, N m s/rad.
-        Kd: per joint, N m s/rad.
+        Lambda: rate at which errors decay, per joint, 1/s.
+        Kp: damping of r = qd + Lambda e, per joint, N m s/rad.
+        Kd: damping of the error's velocity, per joint, N m s/rad.
         Gamma: adaptation gain per parameter.
         theta_hat0: first estimate of theta, Eq. (24).
     """
@@ -48,8 +56,39 @@ class Adaptive(ControlLaw):
     }
     told: ClassVar = "gravity, as its first estimate"
 
+    def compute_torque(self, Y: Array, theta_hat: Array, r: Array, ed: Array) -> Array:
+        """Returns the torque of each joint before the torque limits, N m, Eq. (13).
+
+            tau = Y(q, qd, -Lambda e, -Lambda ed) theta_hat - Kp r - Kd ed
+
+        Args:
+            Y: the regressor of Eq. (12), shape (n, P).
+            theta_hat: the estimate of the parameters, shape (P,).
+            r: qd + Lambda e, Eq. (10), shape (n,), rad/s.
+            ed: derivative of the error, shape (n,), rad/s.
+        """
+        Kp = np.array(self.Kp)
+        Kd = np.array(self.Kd)
+        model_torque = np.zeros(len(Y))
+        # The kernel adds the parameters' terms in this order; `Y @ theta_hat` may use another.
+        for p in range(len(theta_hat)):
+            model_torque += Y[:, p] * theta_hat[p]
+        return model_torque - (Kp * r + Kd * ed)
+
+    def advance_estimate(self, theta_hat: Array, Yr: Array, gain_s: float) -> Array:
+        """Returns the estimate after a step by Eq. (15), theta_hat' = -Gamma Y' r.
+
+            theta_hat - gain_s Gamma Y' r
+
+        Args:
+            theta_hat: the estimate before the step, shape (P,).
+            Yr: Y' r, shape (P,); the trapezoid rule passes the sum of two ticks.
+            gain_s: duration of the step, s; the trapezoid rule passes half of the period.
+        """
+        return theta_hat - gain_s * np.array(self.Gamma) * Yr
+
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the other laws
-        """Returns the gains for the core, for an arm of parameters theta."""
+        """Returns the gains for the kernel, for an arm with parameters theta."""
         return Gains(
             law=Law.ADAPTIVE,
             Lambda=self.Lambda,
@@ -60,10 +99,10 @@ class Adaptive(ControlLaw):
         )
 
     def exchanges_positions(self) -> bool:
-        """True if it does not learn."""
+        """True if the law does not learn (Gamma = 0)."""
         return not any(self.Gamma)
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns tuned gains with the first estimate."""
+        """Returns the [control] table of a site: tuned gains and the first estimate."""
         return {**gains, "theta_hat0": at.estimate}

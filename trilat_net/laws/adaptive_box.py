@@ -1,7 +1,14 @@
-"""The paper's adaptive law with every estimate held in a box; the kernel computes it."""
+"""The paper's adaptive law with each estimated parameter kept in an interval (a box).
+
+The torque is that of `Adaptive`, Eq. (13). The kernel computes the law
+(`core.control.project_estimate`); `AdaptiveBox.advance_estimate` states the projection in plain
+Python, and `tests/control_laws/test_plain_torques.py` compares the two.
+"""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
+
+import numpy as np
 
 from ..core.site_setup import Gains
 from ..core.vectors import Array
@@ -12,16 +19,17 @@ from .interface import TuningSite
 
 
 class AdaptiveBox(Adaptive):
-    """The paper's law with every estimate held in a box.
+    """The paper's law with each estimate kept within its bounds.
 
-    A box that holds the truth, at its edge too, keeps V' <= 0; one that holds it strictly
-    inside also removes the spring by which learning gravity ties the arms to a pose. Projection
-    after Ioannou and Sun, "Robust Adaptive Control" (1996), 4.4.
+    If the box contains the true parameters, also on its edge, V' <= 0 still holds. If the true
+    parameters lie strictly inside, the box also removes the spring by which learning gravity
+    ties the arms to a pose. Projection after Ioannou and Sun, "Robust Adaptive Control" (1996),
+    4.4.
 
     Attributes:
         Lambda, Kp, Kd, Gamma, theta_hat0: as of `Adaptive`.
         theta_low: lower bound of each estimate.
-        theta_high: upper bound.
+        theta_high: upper bound of each estimate.
     """
 
     theta_low: Parameters = (-MAX_QUANTITY,)
@@ -29,12 +37,29 @@ class AdaptiveBox(Adaptive):
 
     told: ClassVar = "gravity, as its first estimate; the box is around it"
 
+    def advance_estimate(self, theta_hat: Array, Yr: Array, gain_s: float) -> Array:
+        """Returns the estimate after a step by Eq. (15), projected into the box.
+
+            min(max(theta_hat - gain_s Gamma Y' r, theta_low), theta_high)
+
+        Args:
+            theta_hat: the estimate before the step, shape (P,).
+            Yr: Y' r, shape (P,).
+            gain_s: duration of the step, s.
+        """
+        estimate = Adaptive.advance_estimate(self, theta_hat, Yr, gain_s)
+        return np.minimum(np.maximum(estimate, self.theta_low), self.theta_high)
+
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the core."""
+        """Returns the gains for the kernel."""
         return Adaptive.gains(self, theta)._replace(low=self.theta_low, high=self.theta_high)
 
     def check(self, path: str, sites: int) -> None:  # noqa: ARG002 - as the other laws
-        """Refuses a box without an inside, and a first estimate outside of it."""
+        """Refuses an empty box, and a first estimate outside the box.
+
+        Raises:
+            ScenarioError: with the path of the key.
+        """
         bounds = zip(self.theta_low, self.theta_hat0, self.theta_high, strict=True)
         for n, (low, first, high) in enumerate(bounds):
             if low > high:
@@ -46,6 +71,7 @@ class AdaptiveBox(Adaptive):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns tuned gains with the first estimate and the box around it."""
+        """Returns the [control] table of a site: gains, first estimate and the box around it."""
+        control = Adaptive.write_control(gains, at)
         low, high = at.box
-        return {**Adaptive.write_control(gains, at), "theta_low": low, "theta_high": high}
+        return {**control, "theta_low": low, "theta_high": high}

@@ -1,5 +1,8 @@
-"""The adaptive law in a box, with a term against torque that no estimate explains; the kernel
-computes it.
+"""The adaptive law in a box, with a bounded term against torque that no estimate explains.
+
+The kernel computes this law (`core.control.robust_torque`); `AdaptiveRobust.compute_torque`
+states the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the
+two.
 """
 
 from collections.abc import Mapping
@@ -17,19 +20,18 @@ from .interface import TuningSite
 
 
 class AdaptiveRobust(AdaptiveBox):
-    """The law with a box, and a term against torque that no estimate explains: - rho r /
-    sqrt(r^2 + width^2).
+    """The law with a box, and the robust term -rho r / sqrt(r^2 + width^2).
 
-    For constant delays, no operator, theta in its box and a disturbance of at most rho at every
-    joint, the mean over time of what V dissipates is at most 0.3003 sum_i beta_i sum rho width;
-    no more is claimed. Smoothed after Slotine and Li, "Applied Nonlinear Control" (1991), 7.1;
-    docs/laws.md derives the bound.
+    Premises: constant delays, no operator, theta in its box, and a disturbance of at most rho
+    at each joint. Then the mean over time of the power that V dissipates is at most 0.3003
+    sum_i beta_i sum rho width. Nothing more is claimed. The term is smoothed after Slotine and
+    Li, "Applied Nonlinear Control" (1991), 7.1; docs/laws.md derives the bound.
 
     Attributes:
         Lambda, Kp, Kd, Gamma, theta_hat0, theta_low, theta_high: as of `AdaptiveBox`.
-        rho_nm: bound of the disturbance per joint, N m (of a sliding joint N).
-        width_rad_s: r at which 0.71 of it opposes, per joint, rad/s (m/s).
-        friction: share of the joints' own friction that the law knows, 0: nothing.
+        rho_nm: bound of the disturbance per joint, N m (N for a sliding joint).
+        width_rad_s: value of r at which 0.71 rho opposes r, per joint, rad/s (m/s).
+        friction: share of the joints' own friction that the law compensates, 0: no friction.
     """
 
     rho_nm: NotNegativeJoints = (1.0,)
@@ -38,30 +40,58 @@ class AdaptiveRobust(AdaptiveBox):
 
     tune: ClassVar = {**AdaptiveBox.tune, "rho_nm": (0.05, 5.0, "N m")}
 
+    def compute_torque(
+        self,
+        Y: Array,
+        theta_hat: Array,
+        r: Array,
+        ed: Array,
+        joint_friction: Array | float = 0.0,
+    ) -> Array:
+        """Returns the torque of each joint before the torque limits, N m.
+
+            tau = Y theta_hat - Kp r - Kd ed - (1 - friction) f(v) - rho r / sqrt(r^2 + width^2)
+
+        Args:
+            Y: the regressor of Eq. (12), shape (n, P).
+            theta_hat: the estimate of the parameters, shape (P,).
+            r: qd + Lambda e, Eq. (10), shape (n,), rad/s.
+            ed: derivative of the error, shape (n,), rad/s.
+            joint_friction: f(v), friction of a chain's joints at the reference velocity, shape
+                (n,), N m. Y theta_hat of a chain contains f(v) in full. The planar arm has no
+                friction.
+        """
+        rho = np.array(self.rho_nm)
+        width = np.array(self.width_rad_s)
+        adaptive = AdaptiveBox.compute_torque(self, Y, theta_hat, r, ed)
+        uncompensated = (1.0 - self.friction) * joint_friction
+        robust = rho * (r / np.sqrt(r * r + width * width))
+        return adaptive - uncompensated - robust
+
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the core."""
-        return AdaptiveBox.gains(self, theta)._replace(
-            rho=self.rho_nm, width=self.width_rad_s, friction=(self.friction,)
-        )
+        """Returns the gains for the kernel."""
+        box = AdaptiveBox.gains(self, theta)
+        return box._replace(rho=self.rho_nm, width=self.width_rad_s, friction=(self.friction,))
 
     def condition(self, situation: LawSituation) -> StabilityCondition:
-        """Returns the bound in the mean square, W, of this site's part of what V dissipates."""
+        """Returns the mean-square bound on this site's part of the dissipated power, W."""
         pairs = zip(self.rho_nm, self.width_rad_s, strict=True)
         bound_w = ROBUST_RESIDUE * sum(rho * width for rho, width in pairs)
-        constant = not np.isnan(situation.longest_s)
-        return StabilityCondition(
-            True if constant else None,
-            f"delays are {'constant' if constant else 'to be constant, and vary here'}, theta is in its box: "
-            f"with torque of at most rho_nm that no estimate explains the mean of beta times r'Kp r and the "
-            f"disagreement is at most beta times {bound_w:.3g} W here; sufficient",
+        is_constant = not np.isnan(situation.longest_s)
+        delays = "constant" if is_constant else "to be constant, and vary here"
+        text = (
+            f"delays are {delays}, theta is in its box: with torque of at most rho_nm that no "
+            "estimate explains the mean of beta times r'Kp r and the disagreement is at most "
+            f"beta times {bound_w:.3g} W here; sufficient"
         )
+        return StabilityCondition(True if is_constant else None, text)
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Where r = 0 the robust term damps by a tenth of Kp, which the joints can take
-        besides.
+        """Returns the [control] table of a site for tuned gains.
+
+        Near r = 0 the robust term adds a damping of rho / width. Its width makes that a tenth
+        of Kp, which the joints can take in addition.
         """
-        return {
-            **AdaptiveBox.write_control(gains, at),
-            "width_rad_s": 10.0 * gains["rho_nm"] / gains["Kp"],
-        }
+        width_rad_s = 10.0 * gains["rho_nm"] / gains["Kp"]
+        return {**AdaptiveBox.write_control(gains, at), "width_rad_s": width_rad_s}

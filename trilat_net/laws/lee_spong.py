@@ -1,9 +1,13 @@
-"""PD+d under its published bound of the damping; the kernel computes it
-(`core.control.damped_torque`).
+"""PD+d whose damping follows from a published bound on the delay.
+
+The kernel computes this law (`core.control.damped_torque`); `LeeSpong.compute_torque` states
+the same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
 """
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
+
+import numpy as np
 
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
@@ -13,7 +17,7 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw, TuningSite
 
 
 class LeeSpong(ControlLaw):
-    """PD+d under its published bound: d = K T_max + P_e for delays up to T_max.
+    """PD+d with the damping d = K T_max + P_e, for delays up to T_max.
 
     Lee and Spong, "Passive bilateral teleoperation with constant time delay", IEEE T-RO 22,
     2006.
@@ -22,8 +26,8 @@ class LeeSpong(ControlLaw):
         K: stiffness per joint, N m/rad.
         Kd: damping of the error's velocity, per joint, N m s/rad.
         T_max_ms: half of the longest round trip, ms.
-        P_e: damping beyond what the delay needs, per joint, N m s/rad.
-        gravity: share of gravity that it knows, 1: exactly.
+        P_e: damping beyond the amount that the delay needs, per joint, N m s/rad.
+        gravity: share of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveCoordinates = (10.0,)
@@ -36,14 +40,31 @@ class LeeSpong(ControlLaw):
 
     @property
     def damping(self) -> tuple[float, ...]:
-        """The damping d per joint, N m s/rad."""
+        """The damping d = K T_max + P_e per joint, N m s/rad."""
         return tuple(
-            stiff * 1e-3 * self.T_max_ms + extra
-            for stiff, extra in zip(self.K, self.P_e, strict=True)
+            stiffness * 1e-3 * self.T_max_ms + extra
+            for stiffness, extra in zip(self.K, self.P_e, strict=True)
         )
 
+    def compute_torque(self, G: Array, e: Array, ed: Array, qd: Array) -> Array:
+        """Returns the torque of each joint before the torque limits, N m.
+
+            tau = G(q) - K e - (K T_max + P_e) qd - Kd ed
+
+        Args:
+            G: torque of the known gravity, shape (n,), N m.
+            e: position error q - q_des, Eq. (9), shape (n,), rad.
+            ed: derivative of the error, shape (n,), rad/s.
+            qd: joint velocities, shape (n,), rad/s.
+        """
+        K = np.array(self.K)
+        Kd = np.array(self.Kd)
+        d = np.array(self.damping)
+        # The order of the terms is the kernel's for the planar arm: the last bit depends on it.
+        return G - K * e - d * qd - Kd * ed
+
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the core: those of PD+d."""
+        """Returns the gains for the kernel, those of PD+d, for an arm with parameters theta."""
         known = (theta * self.gravity).tolist()
         return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.damping, known=known)
 
@@ -53,8 +74,15 @@ class LeeSpong(ControlLaw):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """T_max is half of the longest mean round trip: for delays that vary its bound is not
+        """Returns the [control] table of a site for tuned gains.
+
+        T_max is half of the longest mean round trip. For delays that vary, the bound is not
         proved.
         """
-        told = {"T_max_ms": at.longest_ms, "gravity": at.gravity}
-        return {"K": gains["K"], "Kd": gains["Kd"], "P_e": gains["d_extra"], **told}
+        return {
+            "K": gains["K"],
+            "Kd": gains["Kd"],
+            "P_e": gains["d_extra"],
+            "T_max_ms": at.longest_ms,
+            "gravity": at.gravity,
+        }

@@ -1,6 +1,12 @@
-"""P+d with known gravity; the kernel computes it (`core.control.damped_torque`)."""
+"""P+d: a spring to the peers and a damper, with known gravity.
+
+The kernel computes this law (`core.control.damped_torque`); `PD.compute_torque` states the
+same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
+"""
 
 from typing import ClassVar
+
+import numpy as np
 
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
@@ -11,16 +17,16 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 class PD(ControlLaw):
     """P+d with known gravity: tau = G(q) - K e - d qd.
 
-    For reversible shares, equal gains and one constant delay T the linearised loop of N sites
-    is stable whatever the masses if d > max(abs(lambda_min(alpha)), 0.2172) K T, and for some
-    masses only then; two sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares some
-    heavy arms are unstable at any d. That is in continuous time: held torques need more
-    (docs/laws.md).
+    For reversible shares, equal gains and one constant delay T, the linearised loop of N sites
+    is stable for all masses if d > max(abs(lambda_min(alpha)), 0.2172) K T. For some masses
+    this bound is also necessary. Two sites need 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other
+    shares some heavy arms are unstable at any d. These bounds hold in continuous time: torques
+    that are held over a period need more damping (docs/laws.md).
 
     Attributes:
         K: stiffness per joint, N m/rad.
         d: damping per joint, N m s/rad.
-        gravity: share of gravity that it knows, 1: exactly.
+        gravity: share of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveCoordinates = (10.0,)
@@ -29,10 +35,24 @@ class PD(ControlLaw):
 
     tune: ClassVar = {"K": STIFFNESS, "d": DAMPING}
 
+    def compute_torque(self, G: Array, e: Array, qd: Array) -> Array:
+        """Returns the torque of each joint before the torque limits, N m.
+
+            tau = G(q) - K e - d qd
+
+        Args:
+            G: torque of the known gravity, shape (n,), N m.
+            e: position error q - q_des, Eq. (9), shape (n,), rad.
+            qd: joint velocities, shape (n,), rad/s.
+        """
+        K = np.array(self.K)
+        d = np.array(self.d)
+        return G - K * e - d * qd
+
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the core, for an arm of parameters theta."""
+        """Returns the gains for the kernel, for an arm with parameters theta."""
         return Gains(Law.KNOWN, K=self.K, d=self.d, known=(theta * self.gravity).tolist())
 
     def exchanges_positions(self) -> bool:
-        """True if it knows gravity exactly."""
+        """True if the law compensates gravity exactly."""
         return self.gravity == 1.0

@@ -1,9 +1,13 @@
-"""Direct force reflection with known gravity; the kernel computes it
-(`core.control.damped_torque`).
+"""Direct force reflection: the master feels the external torque on the slave's arm.
+
+The kernel computes this law (`core.control.damped_torque`); `PF.compute_torque` states the
+same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
+
+import numpy as np
 
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
@@ -17,15 +21,15 @@ class PF(ControlLaw):
     """Direct force reflection with known gravity: tau = G(q) - K e - d qd + k_f felt.
 
     `felt` is the torque of operators and environments on the peers' arms as received, weighted
-    by dominance. A slave has K and k_f = 0, a master K = 0 and k_f. It is stable in free
-    motion; for any passive operator and wall the master needs d >= k_f (2 K T + d_s)^2 / (4
-    d_s), K and d_s of the slave. It is for one master and one slave.
+    by dominance. A slave has K > 0 and k_f = 0, a master K = 0 and k_f > 0. The law serves one
+    master and one slave. The loop is stable in free motion. With any passive operator and any
+    wall the master needs d >= k_f (2 K T + d_s)^2 / (4 d_s), where K and d_s are the slave's.
 
     Attributes:
         K: stiffness per joint, N m/rad.
         d: damping per joint, N m s/rad.
         k_f: gain of the reflected force, per joint, dimensionless.
-        gravity: share of gravity that it knows, 1: exactly.
+        gravity: share of the true gravity that the law compensates; 1 is exact.
     """
 
     K: NotNegativeCoordinates = (0.0,)
@@ -40,42 +44,62 @@ class PF(ControlLaw):
         "k_f": (0.05, 2.0, "", "master"),
     }
 
+    def compute_torque(self, G: Array, e: Array, qd: Array, felt: Array) -> Array:
+        """Returns the torque of each joint before the torque limits, N m.
+
+            tau = G(q) - K e - d qd + k_f felt
+
+        Args:
+            G: torque of the known gravity, shape (n,), N m.
+            e: position error q - q_des, Eq. (9), shape (n,), rad.
+            qd: joint velocities, shape (n,), rad/s.
+            felt: torque on the peers' arms as received, weighted by dominance, shape (n,), N m.
+        """
+        K = np.array(self.K)
+        d = np.array(self.d)
+        k_f = np.array(self.k_f)
+        return G - K * e - d * qd + k_f * felt
+
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the core, for an arm of parameters theta."""
-        return Gains(
-            Law.KNOWN, K=self.K, d=self.d, k_f=self.k_f, known=(theta * self.gravity).tolist()
-        )
+        """Returns the gains for the kernel, for an arm with parameters theta."""
+        known = (theta * self.gravity).tolist()
+        return Gains(Law.KNOWN, K=self.K, d=self.d, k_f=self.k_f, known=known)
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses more sites than two: nobody could tell whose contact is felt."""
+        """Refuses a number of sites other than two, because the felt contact is ambiguous then.
+
+        Raises:
+            ScenarioError: with the path of the key.
+        """
         if sites != 2:
             raise ScenarioError(
-                "p_f reflects the force of one slave to one master, and here are "
-                f"{count_nouns(sites, 'site')}: with more "
-                "of them the contact that a site feels is ambiguous; "
-                "choose p_d, pd_d or adaptive, or two sites",
+                "p_f reflects the force of one slave to one master, but the scenario has "
+                f"{count_nouns(sites, 'site')}: with more than two, the contact that a site "
+                "feels is ambiguous; choose p_d, pd_d or adaptive, or two sites",
                 path=f"{path}.law",
             )
 
     def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002 - as the other laws
-        """Returns that a site with neither gain follows nobody."""
-        return "" if any(self.K) or any(self.k_f) else "K = 0 and k_f = 0 follow nobody"
+        """Returns why the dominance factors have no effect if both gains are zero, else ""."""
+        if any(self.K) or any(self.k_f):
+            return ""
+        return "K = 0 and k_f = 0 follow nobody"
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:
-        """Returns that it is for one master and one slave."""
+        """Returns why the law does not fit sites with these roles, or ""."""
         if sorted(roles) == ["master", "slave"]:
             return ""
+        sites = count_nouns(len(roles), "site")
         masters = roles.count("master")
         return (
-            "reflects force between one master and one slave; this has "
-            f"{count_nouns(len(roles), 'site')}, {masters} of "
-            "them masters: leave p_f out, or take contact"
+            "reflects force between one master and one slave; this scenario has "
+            f"{sites}, {masters} of them masters: leave p_f out, or take contact"
         )
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns the gains of a site by its role."""
+        """Returns the [control] table of a site for tuned gains, by the role of the site."""
         if at.role == "master":
             return {
                 "K": 0.0,

@@ -1,6 +1,12 @@
-"""PD+d with known gravity; the kernel computes it (`core.control.damped_torque`)."""
+"""PD+d: a spring and a damper to the peers and a damper of the arm, with known gravity.
+
+The kernel computes this law (`core.control.damped_torque`); `PdD.compute_torque` states the
+same law in plain Python, and `tests/control_laws/test_plain_torques.py` compares the two.
+"""
 
 from typing import ClassVar
+
+import numpy as np
 
 from ..core.site_setup import Gains, Law
 from ..core.vectors import Array
@@ -9,16 +15,16 @@ from .interface import DAMPING, ERROR_DAMPING, STIFFNESS, ControlLaw
 
 
 class PdD(ControlLaw):
-    """PD+d with known gravity: tau = G(q) - K e - Kd ed - d qd.
+    """PD+d with known gravity: tau = G(q) - K e - d qd - Kd ed.
 
-    For constant delays, and Kd / K alike at all sites, the condition of P+d on K and d is
-    sufficient.
+    For constant delays and a ratio Kd / K that is the same at all sites, the condition of P+d
+    on K and d is sufficient.
 
     Attributes:
         K: stiffness per joint, N m/rad.
         Kd: damping of the error's velocity, per joint, N m s/rad.
         d: damping of the arm's velocity, per joint, N m s/rad.
-        gravity: share of gravity that it knows, 1: exactly.
+        gravity: share of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveCoordinates = (10.0,)
@@ -28,12 +34,28 @@ class PdD(ControlLaw):
 
     tune: ClassVar = {"K": STIFFNESS, "Kd": ERROR_DAMPING, "d": DAMPING}
 
+    def compute_torque(self, G: Array, e: Array, ed: Array, qd: Array) -> Array:
+        """Returns the torque of each joint before the torque limits, N m.
+
+            tau = G(q) - K e - d qd - Kd ed
+
+        Args:
+            G: torque of the known gravity, shape (n,), N m.
+            e: position error q - q_des, Eq. (9), shape (n,), rad.
+            ed: derivative of the error, shape (n,), rad/s.
+            qd: joint velocities, shape (n,), rad/s.
+        """
+        K = np.array(self.K)
+        Kd = np.array(self.Kd)
+        d = np.array(self.d)
+        # The order of the terms is the kernel's for the planar arm: the last bit depends on it.
+        return G - K * e - d * qd - Kd * ed
+
     def gains(self, theta: Array) -> Gains:
-        """Returns the gains for the core, for an arm of parameters theta."""
-        return Gains(
-            Law.KNOWN, K=self.K, Kd=self.Kd, d=self.d, known=(theta * self.gravity).tolist()
-        )
+        """Returns the gains for the kernel, for an arm with parameters theta."""
+        known = (theta * self.gravity).tolist()
+        return Gains(Law.KNOWN, K=self.K, Kd=self.Kd, d=self.d, known=known)
 
     def exchanges_positions(self) -> bool:
-        """True if it knows gravity exactly."""
+        """True if the law compensates gravity exactly."""
         return self.gravity == 1.0
