@@ -66,7 +66,8 @@ class AdaptiveRobust(AdaptiveBox):
         adaptive = AdaptiveBox.compute_torque(self, Y, theta_hat, r, ed)
         uncompensated = (1.0 - self.friction) * joint_friction
         robust = rho * (r / np.sqrt(r * r + width * width))
-        return adaptive - uncompensated - robust
+        torque: Array = adaptive - uncompensated - robust
+        return torque
 
     def gains(self, theta: Array) -> Gains:
         """Returns the gains for the kernel."""

@@ -162,8 +162,8 @@ def differentiate_references(
     derivatives = {}
     poses = compute_shared_poses(conditions, rest)
     for i, shares in enumerate(conditions.alpha):
-        for j in np.flatnonzero(shares):
-            derivatives[i, int(j)] = shares[j] * np.eye(len(poses[i]))
+        for j in np.flatnonzero(shares).tolist():
+            derivatives[i, j] = shares[j] * np.eye(len(poses[i]))
         has_orientation = len(poses[i]) > PLACE and conditions.sites[i].layout.task
         if not has_orientation:
             continue

@@ -232,7 +232,9 @@ def _describe_laws(scenario: Scenario) -> list[str]:
 
 def is_constant_link(link: LinkBase) -> bool:
     """True if a link delays every sample by the same time and loses none."""
-    return link.to_core_model().kind == DelayKind.CONSTANT and not link.loss and not link.measured
+    return (
+        link.to_core_model().kind == DelayKind.CONSTANT and not link.loss and not link.measured
+    )
 
 
 def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> SiteSetup:
@@ -337,7 +339,7 @@ def compute_effective_delay(
     if is_constant:
         # ages repeat, so that two seconds beyond the delay show them all
         duration_s = min(duration_s, 2.0 + 2e-6 * model.location)
-    used = draw_uses(
+    used = draw_used_samples(
         link=link,
         key=link_key(scenario.seed, f"{peer}->{site}"),
         own_hz=site_hz,

@@ -230,7 +230,8 @@ def _evaluate_known_gravity_law(
     G = arm.gravity_torque(theta)
     pull = _as_columns(gains.Kd, q) * following.ed
     pull = pull + K * following.e - k_f * x[layout.peer_torque]
-    return G - d * qd - following.to_joints(pull)
+    torque: Array = G - d * qd - following.to_joints(pull)
+    return torque
 
 
 def _evaluate_adaptive_law(
