@@ -33,7 +33,7 @@ class TickParts:
             PeerClock(peer, 0, 0, exact_offset(0), OffsetEstimator()) for peer in site.peers
         ]
         self.timing = SiteTiming(0, site.rate_hz, peers, "m2")
-        self.timing.sent(0, AT_NS - 2 * DELAY_NS)
+        self.timing.record_sent(0, AT_NS - 2 * DELAY_NS)
         self.counter = iter(range(1, 10_000_000))
         self.samples = self.decode()
         self.came = self.take(self.samples)
@@ -47,19 +47,19 @@ class TickParts:
 
     def take(self, samples: list[PeerSample]) -> list[Arrival]:
         """Returns samples as the site takes them in."""
-        pairs = zip(self.timing.meters, samples, strict=True)
-        delays = [meter.take(sample, AT_NS) for meter, sample in pairs]
+        pairs = zip(self.timing.monitors, samples, strict=True)
+        delays = [meter.receive(sample, AT_NS) for meter, sample in pairs]
         return [Arrival(j, s.tick, s.q, s.qd, delays[j] // 1000) for j, s in enumerate(samples)]
 
     def stamp(self) -> None:
         """Does what a tick does with times."""
         k = next(self.counter)
-        self.timing.deadline(k)
+        self.timing.deadline_ns(k)
         self.take(self.samples)
-        self.timing.sent(k, AT_NS)
-        self.timing.echo()
+        self.timing.record_sent(k, AT_NS)
+        self.timing.pop_echo()
         if k % 100 == 0:
-            self.timing.measured(AT_NS)
+            self.timing.pop_measurements(AT_NS)
 
     def step(self) -> TickRecord:
         """Steps the site once more."""
@@ -68,12 +68,12 @@ class TickParts:
     def whole(self) -> bytes:
         """Does all that a tick does up to its sample."""
         k = next(self.counter)
-        self.timing.deadline(k)
+        self.timing.deadline_ns(k)
         taken = self.take(self.decode())
         done = self.site.step(TickInput(k, taken))
-        sent_ns, echoed = self.timing.sent(k, AT_NS), self.timing.echo()
+        sent_ns, echoed = self.timing.record_sent(k, AT_NS), self.timing.pop_echo()
         if k % 100 == 0:
-            self.timing.measured(AT_NS)
+            self.timing.pop_measurements(AT_NS)
         return encode_sample("m1", 7, done, sent_ns, echoed)
 
     def leaf(self) -> None:

@@ -384,7 +384,7 @@ class OrderDesk:
             self._waiting[site, subject] = request
 
     def _ask(self, site: str, channel: str, request: ChangeRequest) -> None:
-        inbox = self._bus.ask(topics.key(self._session, site, channel), encode(request))
+        inbox = self._bus.query(topics.key(self._session, site, channel), encode(request))
         self._open[site, channel] = inbox, self._clock.monotonic_ns(), request
 
     def mark(self, site: str, text: str) -> None:

@@ -133,7 +133,7 @@ class SiteView:
         first.
         """
         account = self.reception.accounts[topics.STATE]
-        gap = account.wanted()
+        gap = account.find_requestable_gap()
         return account.last if gap is None else gap[0] - 1
 
 
@@ -313,7 +313,7 @@ class SessionView:
             return
         site.holds_from = tick
         for channel in (topics.STATE, topics.LINK):
-            site.reception.accounts[channel].give_up(tick)
+            site.reception.accounts[channel].abandon_below(tick)
         site.repair.probe()
 
     def _keep(

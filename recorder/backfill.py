@@ -106,12 +106,15 @@ class GapRepair:
         if now_ns >= self._due_ns:
             self._turns.remove(wanted.channel)
             self._turns.append(wanted.channel)
-            self._open = wanted, self._bus.ask(self._key, encode(wanted)), now_ns
+            self._open = wanted, self._bus.query(self._key, encode(wanted)), now_ns
 
     def _next_request(self) -> BackfillRequest | None:
         for channel in self._turns:
             account = self._reception.accounts[channel]
-            gap = account.wanted(self._next[channel]) or account.wanted()
+            gap = (
+                account.find_requestable_gap(self._next[channel])
+                or account.find_requestable_gap()
+            )
             if gap is None and channel in self._probes:
                 gap = (account.last + 1, account.last + self._chunk)
             if gap is not None:
@@ -156,7 +159,7 @@ class GapRepair:
         self._probes.discard(channel)
         self._reception.add_expected(channel, past.made)
         if past.first > wanted.first:
-            account.give_up(past.first)
+            account.abandon_below(past.first)
         useful = False
         for number, payload in enumerate(past.payloads, past.first):
             if not payload:  # the site never made it, and a record says so
@@ -174,7 +177,7 @@ class GapRepair:
                 useful = True
                 yield channel, message, payload
         self._next[channel] = max(past.first + len(past.payloads), wanted.first + 1)
-        gap = account.wanted(wanted.first)
+        gap = account.find_requestable_gap(wanted.first)
         self._due_ns = now_ns
         if useful:
             self._progress_ns = now_ns
@@ -185,4 +188,4 @@ class GapRepair:
         self._vain[channel] += 1
         if self._vain[channel] >= MAX_VAIN_REQUESTS:
             self._vain[channel] = 0
-            account.give_up(account.last + 1)
+            account.abandon_below(account.last + 1)

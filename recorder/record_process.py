@@ -100,7 +100,7 @@ class Recorder:
                 return epoch
             now_ns = self._clock.monotonic_ns()
             if timeout_s is not None and now_ns - begun_ns > timeout_s * 1e9:
-                met = ", ".join(self._joining.membership.met) or "nobody"
+                met = ", ".join(self._joining.membership.others) or "nobody"
                 raise SessionError(
                     f"the recorder waited {timeout_s:g} s for session {self._session!r} to begin; "
                     f"it met {met}"
@@ -117,7 +117,7 @@ class Recorder:
         """
         scenario = next(
             parse_embedded(info.scenario, info.member)
-            for info in self._joining.membership.met.values()
+            for info in self._joining.membership.others.values()
             if info.scenario and epoch.boots.get(info.member) == info.boot
         )
 
@@ -138,7 +138,7 @@ class Recorder:
                 bus=self._bus,
                 publisher=self._publisher,
             )
-            log.so_far = partial(recording.render_accounts, self._queue)
+            log.current_accounts = partial(recording.render_accounts, self._queue)
             report = RecorderReport(
                 bus=self._bus,
                 clock=self._clock,

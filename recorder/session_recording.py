@@ -265,7 +265,7 @@ class Recording:
             content = event
         if boot != self.publisher.info.boot:
             raise WireError("another recorder", key)
-        if number >= 0 and account.take(number, mono_ns):
+        if number >= 0 and account.receive(number, mono_ns):
             self._writer.add(
                 key, payload, since_ns, self.epoch.unix_ns + since_ns, number, content
             )
@@ -354,7 +354,7 @@ class Recording:
             for name, site in self._sites.items()
         }
         texts = {
-            f"/{key}": f"{account.as_text(*before.get(key, ()))}, overflowed {queue.overflowed[key]}"
+            f"/{key}": f"{account.describe(*before.get(key, ()))}, overflowed {queue.overflowed[key]}"
             for key, account in self.accounts.items()
         }
         return {
@@ -376,7 +376,11 @@ class Recording:
                 f"recorder: {name}: {account.received}{total}, {account.missing} missing, "
                 f"{account.duplicate} duplicate, largest gap {account.largest_gap}"
                 + (f", {account.refilled} from its memory" if account.refilled else "")
-                + (f", {account.unmade} not made while it was away" if account.unmade else "")
+                + (
+                    f", {account.unpublished} not made while it was away"
+                    if account.unpublished
+                    else ""
+                )
             )
         if self._overflowed:
             lines.append(
@@ -465,7 +469,7 @@ class RecorderReport:
             t_ns=now_ns - self._recording.epoch.mono_ns,
             **counts,
             gaps={
-                name: account.gap_texts(most)
+                name: account.format_gaps(most)
                 for name, account in accounts.items()
                 if account.missing
             },

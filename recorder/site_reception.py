@@ -247,7 +247,7 @@ class SiteReception:
                     ticks=tick + 1,
                 )
             self.last_received_ns = came_ns
-            new = account.take(tick, came_ns)
+            new = account.receive(tick, came_ns)
             if record.cmd:
                 self._imply(record)
             if new:
@@ -270,7 +270,7 @@ class SiteReception:
     def accept(self, channel: str, message: SiteMessage, came_ns: int) -> bool:
         """Counts a published message; False if it is a duplicate."""
         self.last_received_ns = came_ns
-        new = message.number < 0 or self.accounts[channel].take(message.number, came_ns)
+        new = message.number < 0 or self.accounts[channel].receive(message.number, came_ns)
         self._imply(message.content)
         return new
 
@@ -298,14 +298,14 @@ class SiteReception:
         most = self._most[channel]
         if channel != topics.EVENT:
             most = min(most, count_messages(channel, self._possible_ticks, self._rate_hz))
-        self.accounts[channel].expect(min(made, most))
+        self.accounts[channel].add_expected(min(made, most))
 
     def count_previous_start(self, ticks: int) -> None:
         """Counts what the start before published at least, of which another site heard so many
         ticks.
         """
         for channel, gap in self._gaps.items():
-            gap.hear_of(number_message(channel, ticks, self._rate_hz))
+            gap.note_published(number_message(channel, ticks, self._rate_hz))
 
     def _imply(self, content: State | LinkStats | Event) -> None:
         """Counts the messages that must exist because this one does, and those that never did."""
@@ -316,7 +316,7 @@ class SiteReception:
         ):
             for channel in (topics.STATE, topics.LINK):
                 left_out = skipped_numbers(channel, content.tick, skipped, self._rate_hz)
-                self.accounts[channel].begin_anew(*left_out)
+                self.accounts[channel].mark_unpublished(*left_out)
         if isinstance(content, LinkStats):
             self.add_expected(topics.STATE, content.tick + 1)
         elif isinstance(content, Event) and content.kind == "join":
@@ -330,7 +330,7 @@ class SiteReception:
                     count_messages(channel, ticks, self._rate_hz)
                     for ticks in (content.ticks, made)
                 )
-                gap.begin_anew(*numbers)
+                gap.begin_next_start(*numbers)
         elif isinstance(content, Event) and content.kind == "end":
             self.final_ticks = content.ticks
             for channel in (topics.STATE, topics.LINK):
@@ -341,7 +341,7 @@ class SiteReception:
     @property
     def lacks_messages(self) -> bool:
         """True while a message is missing that can still be had."""
-        return any(account.wanted() for account in self.accounts.values())
+        return any(account.find_requestable_gap() for account in self.accounts.values())
 
     @property
     def is_complete(self) -> bool:
@@ -351,13 +351,13 @@ class SiteReception:
     def give_up(self) -> None:
         """Counts all missing messages as lost for good."""
         for account in self.accounts.values():
-            account.give_up(account.last + 1)
+            account.abandon_below(account.last + 1)
 
     def describe_missing(self) -> str:
         """Describes the missing messages; "" without any."""
         return ", ".join(
             f"{account.missing} of {account.expected} {CHANNEL_NOUNS[channel]} "
-            f"({' '.join(account.gap_texts(5))})"
+            f"({' '.join(account.format_gaps(5))})"
             for channel, account in self.accounts.items()
             if account.missing
         )

@@ -117,7 +117,7 @@ class ChangeServer:
                 reply = ChangeReply(member=self._site, accepted=True, text=text, tick=tick)
             except (WireError, ScenarioError) as error:
                 reply = ChangeReply(member=self._site, accepted=False, text=str(error))
-            query.answer(encode(reply))
+            query.reply(encode(reply))
         return changes
 
     def _poll(self) -> Query | None:
@@ -136,7 +136,7 @@ class ChangeServer:
                 ):
                     return query
             text = f"{self._site} can be asked to stop under this key, and nothing else"
-            query.answer(encode(ChangeReply(member=self._site, accepted=False, text=text)))
+            query.reply(encode(ChangeReply(member=self._site, accepted=False, text=text)))
         return None
 
     def _mark(self, k: int, text: str) -> str:

@@ -377,9 +377,9 @@ class Rehearsal(LoopStats):
         run_loop(self._stepped, 1, self._ticks, *timed)
         return self._late_us
 
-    def tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
+    def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
         """Counts one tick, and keeps its lateness."""
-        super().tick(late_us, busy_us, skipped)
+        super().count_tick(late_us, busy_us, skipped)
         self._late_us.append(late_us)
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:

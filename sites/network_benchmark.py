@@ -87,7 +87,7 @@ class NearEnd:
         self._number = 0
         self._put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
         key = topics.key(SESSION, "*", topics.SAMPLE)
-        self._inbox: StampedInbox[tuple[int, ...] | None] = bus.stamped(
+        self._inbox: StampedInbox[tuple[int, ...] | None] = bus.stamped_inbox(
             key, clock.monotonic_ns, _read
         )
 

@@ -425,7 +425,7 @@ class Bridge:
 
     def _diagnose(self) -> None:
         records = [shown.newest for shown in self._sites.values() if shown.newest is not None]
-        if self._diagnostics.heard:
+        if self._diagnostics.has_subscribers:
             self._diagnostics.put(
                 pack_session_diagnostics(self._ends.session, self._epoch_unix_ns, records)
             )

@@ -66,7 +66,7 @@ class SiteTopics:
         self.newest: State | None = None
 
     def _is_heard(self, topic: str) -> bool:
-        return self._publishers[topic].heard
+        return self._publishers[topic].has_subscribers
 
     def show(self, record: State, rate_hz: float) -> None:
         """Publishes a record, as far as somebody listens, if it is the first of its time at a
@@ -83,7 +83,7 @@ class SiteTopics:
             record, self.shares.at(record.t_ns), self._is_heard
         ):
             self._publishers[topic].put(data)
-        if self._frames.heard:
+        if self._frames.has_subscribers:
             for data in self._messages.pack_frames(record):
                 self._frames.put(data)
 

@@ -86,7 +86,7 @@ class SessionPing:
         passed_ns = now_ns - self._first_ns
         enough_ns = GATHER_NS + self._count * PING_PACE_NS + PATIENCE_NS
         return passed_ns > GATHER_NS and (
-            self.pinger.know(self._boots) or passed_ns > enough_ns
+            self.pinger.knows_clocks(self._boots) or passed_ns > enough_ns
         )
 
     def report(self) -> PingReport:
@@ -131,7 +131,9 @@ class SessionPing:
         estimate = exact_offset(0) if shared else trips.latest if trips else None
         if estimate is not None:
             facts["offset_ns"] = estimate.offset_ns
-            facts["bound_us"] = estimate.bound_at(estimate.at_ns, estimate.offset_ns) / 1000
+            facts["bound_us"] = (
+                estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns) / 1000
+            )
         return facts
 
 

@@ -135,7 +135,7 @@ class PeerInbox:
         if sample.tick > self._last[index] + 1:  # dropped on the way, or the ring overflowed
             self._dropped["missing"] += sample.tick - self._last[index] - 1
         self._last[index] = max(self._last[index], sample.tick)
-        delay_ns = self._monitors[index].take(sample, arrived_ns)
+        delay_ns = self._monitors[index].receive(sample, arrived_ns)
         ch = link.channel.part(sample.ch, link.place) if sample.ch else ()
         return Arrival(
             peer=index,
@@ -260,7 +260,7 @@ def _send_sample(
     io: "RunningSite",
     output: TickRecord,
 ) -> tuple[Any, ...]:
-    stamps = timing.sent(output.tick, clock.monotonic_ns()), timing.echo()
+    stamps = timing.record_sent(output.tick, clock.monotonic_ns()), timing.pop_echo()
     io.publish_sample(encode_sample(name, boot, output, *stamps))
     return stamps
 
@@ -284,7 +284,7 @@ def run_loop(
     """
     send = partial(_send_sample, site.name, boot, clock, timing, io)
     quarter_ns = NS_PER_S // (4 * site.rate_hz)
-    deadline_ns = timing.deadline(first)
+    deadline_ns = timing.deadline_ns(first)
     busy_us = 0
     mode = Mode.RUN
     last = None
@@ -296,10 +296,10 @@ def run_loop(
             break
         woke_ns = clock.monotonic_ns()
         skipped = 0
-        if not catches_up and k > first and woke_ns >= timing.deadline(k + 1):
-            skipped = bisect_right(range(k, ticks), woke_ns, key=timing.deadline) - 1
+        if not catches_up and k > first and woke_ns >= timing.deadline_ns(k + 1):
+            skipped = bisect_right(range(k, ticks), woke_ns, key=timing.deadline_ns) - 1
             k += skipped
-            deadline_ns = timing.deadline(k)
+            deadline_ns = timing.deadline_ns(k)
         late_us = max(0, (woke_ns - deadline_ns) // 1000)
         arrivals = inbox.drain(k * NS_PER_S // site.rate_hz + woke_ns - deadline_ns)
         output = io.step(k, arrivals)
@@ -308,12 +308,12 @@ def run_loop(
         last = output
         block_due = states.add(output, arrivals, late_us, busy_us)
         states.send_samples(k, send)
-        stats.tick(late_us, busy_us, skipped)
-        stats_due = stats.due(k, skipped)
+        stats.count_tick(late_us, busy_us, skipped)
+        stats_due = stats.is_due(k, skipped)
         if block_due or stats_due:  # statistics say that these records exist
             states.flush(send)
         if stats_due:
-            io.publish_link(encode(stats.take(output, timing.measured(woke_ns))))
+            io.publish_link(encode(stats.pop_stats(output, timing.pop_measurements(woke_ns))))
             io.attend(k, output.t_ns)
         if output.mode is Mode.DIVERGED:
             break
@@ -321,7 +321,7 @@ def run_loop(
             mode = output.mode
             io.report(output)
         k += 1
-        deadline_ns = timing.deadline(k)
+        deadline_ns = timing.deadline_ns(k)
         if (block_due or asked) and deadline_ns - clock.monotonic_ns() > quarter_ns:
             asked = io.use_slack()
         busy_us = (clock.monotonic_ns() - woke_ns) // 1000

@@ -101,7 +101,9 @@ class SiteParts:
         self.stats = LoopStats(self.site, self.boot)
         self.watchdog, self.step = watch_law(scenario, self.site, clock)
         self.rings = [
-            bus.stamped(topics.key(session, link.peer, topics.SAMPLE), clock.monotonic_ns, read)
+            bus.stamped_inbox(
+                topics.key(session, link.peer, topics.SAMPLE), clock.monotonic_ns, read
+            )
             for link, read in zip(
                 self.setup.links, make_sample_readers(self.setup), strict=True
             )
@@ -115,7 +117,7 @@ class SiteParts:
             self.plant = PlantPlayer(scenario, name, plant, watch)
         self.hand: HandServer | HandPlayer | None = None
         self._meet_hand()
-        queries = bus.questions(topics.key(session, name, topics.PAST))
+        queries = bus.query_inbox(topics.key(session, name, topics.PAST))
         self.buffer = RetransmitBuffer(self.site, self.boot, queries)
         self.publish_sample = bus.publisher(topics.key(session, name, topics.SAMPLE))
         # a site that is killed loses no record
@@ -129,7 +131,7 @@ class SiteParts:
         self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
         self._next_tick = -1
         asked, stops = (
-            bus.questions(topics.key(session, name, one)) for one in (topics.SET, topics.STOP)
+            bus.query_inbox(topics.key(session, name, one)) for one in (topics.SET, topics.STOP)
         )
         inputs = (lambda: self.site.mode), (lambda: self.switch is None or self.switch.held)
         self.changes = ChangeServer(scenario, name, asked, *inputs, stops)
@@ -183,7 +185,9 @@ class SiteParts:
             topics.key(session, name, one) for one in (topics.MEASURED, topics.ENABLE)
         )
         if name in self.scenario.outside:
-            ring = self.bus.stamped(measured, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
+            ring = self.bus.stamped_inbox(
+                measured, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT
+            )
             connection = self.options.connection
             # its own, or a router
             reached = connection.reach(connection.listen or connection.connect or ())
@@ -192,7 +196,9 @@ class SiteParts:
                 site=self.site, ring=ring, clock=self.clock, dropped=dropped, place=place
             )
         if self.scenario.sites[name].arm.dead_man:
-            ring = self.bus.stamped(enable, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT)
+            ring = self.bus.stamped_inbox(
+                enable, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT
+            )
             self.switch = DeadManSwitch(name, ring, self.clock, dropped)
 
     def _keeping_publisher(self, channel: str) -> Callable[[list[bytes]], None]:

@@ -166,7 +166,7 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
     )
     membership = joining.membership
     pinger = joining.pinger
-    parts.say(f"waiting for {', '.join(membership.missing()) or 'the epoch'}")
+    parts.say(f"waiting for {', '.join(membership.list_missing()) or 'the epoch'}")
     begins = 0
     while not parts.interrupt.requested():
         epoch = joining.poll()
@@ -179,7 +179,7 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
             parts.site.begin_at(begins)  # it takes 0.1 s for every hour that the session runs
         now_ns = parts.clock.monotonic_ns()
         if now_ns > give_up_ns:
-            missing = membership.missing()
+            missing = membership.list_missing()
             reason = (
                 f"{', '.join(missing)} never came"
                 if missing
@@ -246,7 +246,7 @@ class RunningSite:
             turn_ns=turn_ns,
         )
         self._clock_texts = describe_clocks(pinger, epoch.boots, epoch.mono_ns)
-        heard = (parts.rings, boots, self._timing.meters, parts.stats.dropped)
+        heard = (parts.rings, boots, self._timing.monitors, parts.stats.dropped)
         self._inbox = PeerInbox(parts.setup.links, *heard, tick_ns(epoch.first, site.rate_hz))
         publisher.update(
             running=True,
@@ -258,7 +258,7 @@ class RunningSite:
     def run(self) -> None:
         """Runs every tick, or until the run ends."""
         parts = self._parts
-        parts.states.holds_samples &= all(meter.peer.is_own for meter in self._timing.meters)
+        parts.states.holds_samples &= all(meter.peer.is_own for meter in self._timing.monitors)
         self._publish_setup()
         order = encode(ChangeRequest(order="stop", source="the operator"))
         name = parts.name
@@ -302,7 +302,7 @@ class RunningSite:
                 "join", text, t_ns=tick_ns(first, parts.site.rate_hz), **about
             )
         parts.say(f"{begins}; {obtained['scheduling']}, memory {obtained['memory']}")
-        self._publish_clocks(self._timing.opening(), 0)
+        self._publish_clocks(self._timing.list_initial_notices(), 0)
         if parts.arm is not None and (
             text := parts.arm.bind(parts.scenario.sites[parts.name].q0_rad)
         ):
@@ -357,7 +357,9 @@ class RunningSite:
         grid_ns = self._timing.schedule.due_ns(k + 1) - tick_ns(k + 1, self._parts.site.rate_hz)
         self._publisher.update(ticks=k + 1, grid_ns=grid_ns)
         self._publisher.answer_queries()
-        self._publish_clocks(self._timing.settle(k + 1, self._parts.clock.monotonic_ns()), t_ns)
+        self._publish_clocks(
+            self._timing.update_clocks(k + 1, self._parts.clock.monotonic_ns()), t_ns
+        )
         self._watch_members(t_ns)
         self._come_again(t_ns)
         if (hand := self._parts.hand) is not None:
@@ -412,8 +414,8 @@ class RunningSite:
         monitor.watch(self._publisher, t_ns)
         if monitor.changed:  # 100 ms ago at most: no sample so far is due sooner than before
             parts.states.holds_samples = False
-        for meter in self._timing.meters if monitor.away else ():
-            if meter.is_heard(parts.clock.monotonic_ns()):
+        for meter in self._timing.monitors if monitor.away else ():
+            if meter.is_receiving(parts.clock.monotonic_ns()):
                 monitor.meet_again(meter.peer.name, t_ns)
         for event in monitor.admitted:
             index = parts.site.peers.index(event.member)
@@ -438,8 +440,8 @@ class RunningSite:
         if coming is None or t_ns < self._came_ns + NS_PER_S:
             return
         if any(
-            meter.is_heard(now_ns) and meter.hears(now_ns) is None
-            for meter in self._timing.meters
+            meter.is_receiving(now_ns) and meter.is_acknowledged(now_ns) is None
+            for meter in self._timing.monitors
         ):
             self._came_ns = t_ns
             self._publisher.publish(
@@ -542,7 +544,9 @@ class RunningSite:
             self._publish("law", hiccups)
             parts.say(hiccups)
         about, why = self._find_cause()
-        if unheard := [meter.peer.name for meter in self._timing.meters if meter.unheard]:
+        if unheard := [
+            meter.peer.name for meter in self._timing.monitors if meter.is_unacknowledged
+        ]:
             why += f"; {', '.join(unheard)} did not hear it at the end"
         self._publish(
             "end", f"{parts.name} made {count_nouns(self._ticks, 'tick')}{why}", about=about

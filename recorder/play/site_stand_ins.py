@@ -156,7 +156,7 @@ class SiteStandIns:
                 topics.key(session, site, topics.INFO),
                 topics.key(session, site, topics.PAST),
             )
-            self._queries[site] = bus.questions(keys[0]), bus.questions(keys[1])
+            self._queries[site] = bus.query_inbox(keys[0]), bus.query_inbox(keys[1])
             answer_pings(bus, clock, session, info)
             bus.announce(liveliness_token(session, site, info.boot))
 
@@ -182,7 +182,7 @@ class SiteStandIns:
         """
         for site, (identity_queries, _) in self._queries.items():
             while (query := identity_queries.poll()) is not None:
-                query.answer(self._identity(site))
+                query.reply(self._identity(site))
         for parts, alive in topics.read_presence(self._presence):
             (self.recorders.add if alive else self.recorders.discard)(parts.boot)
         for event in read_messages(self._recorder_events, Event):

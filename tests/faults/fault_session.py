@@ -260,7 +260,7 @@ class FaultSession(Session):
 
     def _ask(self, site: str, asked: ChangeRequest) -> None:
         bus = self.network.join_as("operator")
-        bus.ask(topics.key(SESSION, site, topics.SET), encode(asked))
+        bus.query(topics.key(SESSION, site, topics.SET), encode(asked))
         bus.close()
 
     def _stop(self, fault: Fault) -> None:

@@ -173,7 +173,7 @@ class FaultyBus(LocalBus):
         self._faulty.changes += 1
         return super().inbox(key, capacity)
 
-    def stamped(
+    def stamped_inbox(
         self,
         key: str,
         now_ns: Callable[[], int],
@@ -181,7 +181,7 @@ class FaultyBus(LocalBus):
         capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
         self._faulty.changes += 1
-        return super().stamped(key, now_ns, read, capacity)
+        return super().stamped_inbox(key, now_ns, read, capacity)
 
     def tap(self, key: str, callback: Deliver) -> None:
         self._faulty.changes += 1
@@ -208,14 +208,14 @@ class FaultyBus(LocalBus):
 
         return publish
 
-    def ask(self, key: str, payload: bytes = b"") -> Inbox:
+    def query(self, key: str, payload: bytes = b"") -> Inbox:
         """See `Bus`; who cannot be reached, or cannot reach the asker, does not answer."""
         everyone = self._faulty.members
         self._faulty.members = [
             member for member in everyone if member is self or self._meets(member)
         ]
         try:
-            return super().ask(key, payload)
+            return super().query(key, payload)
         finally:
             self._faulty.members = everyone
 

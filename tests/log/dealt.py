@@ -122,7 +122,7 @@ def split(folder: Path, *, refilled: range) -> list[Path]:
     accounts = {item.topic: Account() for item in items}
 
     def told() -> dict[str, str]:
-        return {topic: account.as_text() for topic, account in accounts.items()}
+        return {topic: account.describe() for topic, account in accounts.items()}
 
     place = LogStorage(folder / "run.mcap", split_ns=40_000_000)
     now_ns = 0
@@ -130,11 +130,11 @@ def split(folder: Path, *, refilled: range) -> list[Path]:
         place,
         lambda stream, part: LogWriter(stream, scenario, "paper", "virtual", 0, part=part),
     ) as log:
-        log.so_far = told
+        log.current_accounts = told
         for item in items:
             now_ns = max(now_ns, item.log_time_ns)
             number = item.sequence // 100 if item.topic.endswith("/link") else item.sequence
-            accounts[item.topic].take(number)
+            accounts[item.topic].receive(number)
             log.add(item.topic[1:], item.payload, item.publish_time_ns, now_ns, item.sequence)
         log.finish(told())
     return sorted(folder.glob("run-*.mcap"))

@@ -25,12 +25,12 @@ def test_an_account_is_what_the_set_of_ticks_says(stream: list[int], ticks: int)
     account, came, duplicate, reordered, newest = Account(), set[int](), 0, 0, -1
     for tick in stream:
         is_new = tick not in came
-        assert account.take(tick) == is_new
+        assert account.receive(tick) == is_new
         duplicate += not is_new
         reordered += is_new and tick < newest
         came.add(tick)
         newest = max(newest, tick)
-    account.expect(ticks)
+    account.add_expected(ticks)
     gaps = gaps_of(came, max(ticks, newest + 1))
     assert account.gaps == gaps
     assert (account.received, account.duplicate, account.reordered) == (
@@ -51,10 +51,10 @@ def test_gaps_are_bounded_and_missing_is_exact_all_the_same(
         patch.setattr(accounting, "MAX_GAPS", most)
         account, taken = Account(), set[int]()
         for tick in stream:
-            if account.take(tick):
+            if account.receive(tick):
                 assert tick not in taken
                 taken.add(tick)
-        account.expect(ticks)
+        account.add_expected(ticks)
         assert len(account.gaps) <= most
         assert account.received == len(taken)
         assert account.missing == max([ticks - 1, *stream], default=-1) + 1 - len(taken)
@@ -79,15 +79,15 @@ def test_records_from_memory_are_there_once_and_in_order(
             newest = max(newest, number)
         else:
             refilled += new
-        assert (account.take if how == "came" else account.refill)(number) == new
+        assert (account.receive if how == "came" else account.refill)(number) == new
         there.add(number)
-    account.give_up(hopeless)
+    account.abandon_below(hopeless)
     assert (account.received, account.refilled) == (len(there), refilled)
     assert (account.reordered, account.duplicate) == (reordered, duplicate)
     missing = sorted(set(range(account.expected)) - there)
     for start in range(0, 52, 3):
         wanted = [number for number in missing if number >= max(start, hopeless)]
-        gap = account.wanted(start)
+        gap = account.find_requestable_gap(start)
         assert (gap[0] if gap else None) == (wanted[0] if wanted else None)
     assert account.missing == len(missing)
 
@@ -98,7 +98,7 @@ def test_longest_silence_is_longest_time_between_two_that_came(
 ) -> None:
     account = Account()
     for number, at_ns in enumerate(came):
-        account.take(0 if again else number, at_ns)
+        account.receive(0 if again else number, at_ns)
         account.refill(number + 5)
     assert account.silence_ns == max((b - a for a, b in pairwise(came)), default=0)
 
@@ -106,10 +106,10 @@ def test_longest_silence_is_longest_time_between_two_that_came(
 def test_an_account_reads_as_one_line() -> None:
     account = Account()
     for tick in (0, 1, 5, 3, 3):
-        account.take(tick, tick * 1_000_000)
+        account.receive(tick, tick * 1_000_000)
     account.refill(4)
-    account.expect(10)
-    assert account.as_text() == (
+    account.add_expected(10)
+    assert account.describe() == (
         "expected 10, received 5, missing 5, duplicate 1, reordered 1, refilled 1, "
         "largest gap 4 (2-2 6-9), longest silence 4.0 ms"
     )
@@ -118,8 +118,8 @@ def test_an_account_reads_as_one_line() -> None:
 def test_of_very_many_gaps_the_first_are_named() -> None:
     account = Account()
     for tick in range(0, 1000, 2):
-        account.take(tick)
-    assert account.as_text().endswith(
+        account.receive(tick)
+    assert account.describe().endswith(
         "largest gap 1 (" + " ".join(f"{n}-{n}" for n in range(1, 40, 2)) + " ...)"
     )
 
@@ -139,29 +139,29 @@ def test_ticks_between_two_starts_are_not_made_and_not_missing(
     for told_first in (True, False):
         account = Account()
         for number in first_start:
-            account.take(number)
-        account.expect(made)
+            account.receive(number)
+        account.add_expected(made)
         if told_first:
-            account.begin_anew(10, made)
+            account.mark_unpublished(10, made)
         for number in range(10, 13):
-            account.take(number)
+            account.receive(number)
         if not told_first:
-            account.begin_anew(10, made)
-        assert (account.missing, account.unmade) == (missing, unmade)
+            account.mark_unpublished(10, made)
+        assert (account.missing, account.unpublished) == (missing, unmade)
         assert account.expected == account.received + account.missing == 13 - unmade
-        account.begin_anew(10, made)  # said twice, it counts once
-        assert account.unmade == unmade
+        account.mark_unpublished(10, made)  # said twice, it counts once
+        assert account.unpublished == unmade
 
 
 def test_records_under_way_at_a_kill_are_not_made() -> None:
     account = Account()
     gap = StartGap(account, 2)
-    account.take(4)
-    gap.begin_anew(10, 0)
-    gap.hear_of(7)
-    assert (account.gaps, account.unmade) == ([[0, 3]], 5)
-    gap.hear_of(8)  # that is more than can have been under way
-    assert (account.gaps, account.unmade) == ([[0, 3], [5, 7]], 2)
+    account.receive(4)
+    gap.begin_next_start(10, 0)
+    gap.note_published(7)
+    assert (account.gaps, account.unpublished) == ([[0, 3]], 5)
+    gap.note_published(8)  # that is more than can have been under way
+    assert (account.gaps, account.unpublished) == ([[0, 3], [5, 7]], 2)
 
 
 @pytest.mark.parametrize(
@@ -173,16 +173,16 @@ def test_what_others_heard_of_a_killed_start_is_missing(
     """0 to 4 came; others heard of 5 and 6; the next start begins with 10."""
     account = Account()
     for number in range(5):
-        account.take(number)
+        account.receive(number)
     gap = StartGap(account, 1)
     for told in order:
         if told == "join":
-            gap.begin_anew(10, 0)
+            gap.begin_next_start(10, 0)
         elif told == "records":
             for number in range(10, 13):
-                account.take(number)
+                account.receive(number)
         else:
-            gap.hear_of(int(told[-1]))
-    gap.begin_anew(10, 0)  # said twice, it counts once
-    assert (account.gaps, account.missing, account.unmade) == ([[5, 6]], 2, 3)
+            gap.note_published(int(told[-1]))
+    gap.begin_next_start(10, 0)  # said twice, it counts once
+    assert (account.gaps, account.missing, account.unpublished) == ([[5, 6]], 2, 3)
     assert account.expected == account.received + account.missing == 10

@@ -290,7 +290,7 @@ def test_room_is_kept_for_what_is_pending_and_for_end(tmp_path: Path) -> None:
         container.add_message(*message)
     before = file.size
     container.flush()
-    assert disk.kept >= file.size - before + container.owed + RESERVE_MARGIN_BYTES
+    assert disk.kept >= file.size - before + container.end_bytes + RESERVE_MARGIN_BYTES
     container.finish()
     file.close()
     assert disk.kept == 0

@@ -50,7 +50,7 @@ def read(path: Path) -> tuple[list[Message], dict[str, Mapping[str, str]]]:
 
 def written(place: LogStorage, messages: list[Message], flush_every: int = 7) -> None:
     with LogParts(place, begin) as log:
-        log.so_far = lambda: {"so far": "yes"}
+        log.current_accounts = lambda: {"so far": "yes"}
         for n, (key, payload, log_ns, number) in enumerate(messages):
             log.add(key, payload, 0, log_ns, number)
             if n % flush_every == 0:

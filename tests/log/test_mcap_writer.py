@@ -49,7 +49,7 @@ def ours(calls: list[tuple[Any, ...]], chunk_bytes: int) -> bytes:
     for name, *arguments in calls:
         getattr(file, name)(*arguments)
         assert file.position == stream.tell()
-    most = file.position + file.pending + file.owed
+    most = file.position + file.open_chunk_bytes + file.end_bytes
     file.finish()
     assert len(stream.getvalue()) == file.position <= most
     return stream.getvalue()
@@ -126,9 +126,9 @@ def test_the_index_of_a_chunk_takes_bytes_and_no_objects() -> None:
     file = McapWriter(io.BytesIO(), "lib")
     schema = file.register_schema("S", "jsonschema", b"{}")
     channels = [file.register_channel(f"/{n}", "msgpack", schema) for n in range(12)]
-    before = file.owed
+    before = file.end_bytes
     for k in range(100):
         for channel in channels:
             file.add_message(channel, k, b"x", k)
         file.flush()
-    assert (file.owed - before) / 100 < 250
+    assert (file.end_bytes - before) / 100 < 250

@@ -52,5 +52,5 @@ def second(
         at_ns = begin_ns + n * (S // 2) // messages
         ceilings.append(ceiling(other, at_ns, there(rnd)))
         floors.append(floor(other, at_ns, back(rnd)))
-    level = lambda limit: limit.offset_ns - other.drift_ppb * limit.at_ns / S  # noqa: E731
+    level = lambda limit: limit.offset_ns - other.drift_ppb * limit.local_ns / S  # noqa: E731
     return min(ceilings, key=level), max(floors, key=level)

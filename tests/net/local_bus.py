@@ -22,7 +22,7 @@ class _LocalQuery(NamedTuple):
     payload: bytes
     replies: BoundedRing[tuple[str, bytes]]
 
-    def answer(self, payload: bytes) -> None:
+    def reply(self, payload: bytes) -> None:
         self.replies.put((self.key, payload))
 
 
@@ -60,7 +60,7 @@ class LocalBus:
         self._sinks.append((key, lambda key, payload: ring.put((key, payload))))
         return ring
 
-    def stamped(
+    def stamped_inbox(
         self,
         key: str,
         now_ns: Callable[[], int],
@@ -68,13 +68,13 @@ class LocalBus:
         capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
         ring = StampingRing(now_ns, read, capacity)
-        self._sinks.append((key, lambda _, payload: ring.take(payload)))
+        self._sinks.append((key, lambda _, payload: ring.receive(payload)))
         return ring
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         self._sinks.append((key, callback))
 
-    def questions(self, key: str) -> QueryInbox:
+    def query_inbox(self, key: str) -> QueryInbox:
         ring = BoundedRing[Query]()
         self._responders.append((key, ring.put))
         return ring
@@ -83,11 +83,11 @@ class LocalBus:
         def answer_at_once(query: _LocalQuery) -> None:
             answered = answer(query.payload)
             if answered is not None:
-                query.answer(answered)
+                query.reply(answered)
 
         self._responders.append((key, answer_at_once))
 
-    def ask(self, key: str, payload: bytes = b"") -> Inbox:
+    def query(self, key: str, payload: bytes = b"") -> Inbox:
         replies = BoundedRing[tuple[str, bytes]]()
         for member in self._network.members:
             for answered, take in member._responders:

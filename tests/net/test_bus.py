@@ -129,17 +129,17 @@ def test_full_ring_loses_its_oldest_and_leaves_other_rings_alone(pair: tuple[Bus
 def test_everyone_who_answers_is_heard_once(network: Network) -> None:
     asker, *others = (network.join() for _ in range(3))
     rings = {
-        name: bus.questions(f"t/{name}/info") for name, bus in zip("ab", others, strict=True)
+        name: bus.query_inbox(f"t/{name}/info") for name, bus in zip("ab", others, strict=True)
     }
 
     def answers() -> list[tuple[str, bytes]]:
-        replies = asker.ask("t/*/info")
+        replies = asker.query("t/*/info")
         heard: list[tuple[str, bytes]] = []
 
         def all_answered() -> bool:
             for name, ring in rings.items():
                 while (question := ring.poll()) is not None:
-                    question.answer(name.encode())
+                    question.reply(name.encode())
             heard.extend(drained(replies))
             return len(heard) >= 2
 
@@ -154,11 +154,11 @@ def test_everyone_who_answers_is_heard_once(network: Network) -> None:
 
 def test_a_question_carries_what_was_sent_with_it(pair: tuple[Bus, Bus]) -> None:
     asker, other = pair
-    questions = other.questions("t/a/info")
+    questions = other.query_inbox("t/a/info")
     for sent in (b"", b"\x00\xff" * 2000, b"again"):
 
         def asked(sent: bytes = sent) -> bool:
-            asker.ask("t/*/info", sent)
+            asker.query("t/*/info", sent)
             question = questions.poll()
             # or one that was asked before
             return question is not None and question.payload == sent
@@ -181,7 +181,7 @@ def test_responder_may_keep_silent_and_then_only_others_are_heard(network: Netwo
     pending: list[Inbox] = []
 
     def both() -> bool:
-        pending.append(asker.ask("t/*/ping", b"?"))
+        pending.append(asker.query("t/*/ping", b"?"))
         for replies in pending:
             heard.extend(drained(replies))
         return bool(asked and heard)
@@ -194,11 +194,11 @@ def test_responder_may_keep_silent_and_then_only_others_are_heard(network: Netwo
 def test_nobody_answers_oneself(pair: tuple[Bus, Bus]) -> None:
     own, other = pair
     own.respond("t/a/ping", lambda _: b"own")
-    own_questions = own.questions("t/b/ping")
+    own_questions = own.query_inbox("t/b/ping")
     other.respond("t/c/ping", lambda _: b"theirs")
 
     def answers() -> list[tuple[str, bytes]]:
-        replies = own.ask("t/*/ping")
+        replies = own.query("t/*/ping")
         try:
             return [until(replies.poll, timeout_s=0.5), *drained(replies)]
         except AssertionError:
@@ -222,7 +222,7 @@ class Ticking:
 def test_every_message_is_stamped_once_as_it_comes(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
     clock = Ticking()
-    inbox, publish = receiver.stamped("t/a", clock, bytes), sender.publisher("t/a")
+    inbox, publish = receiver.stamped_inbox("t/a", clock, bytes), sender.publisher("t/a")
     opened(publish, inbox)
     before = clock.readings
     for number in NUMBERS:
@@ -234,7 +234,10 @@ def test_every_message_is_stamped_once_as_it_comes(pair: tuple[Bus, Bus]) -> Non
 
 def test_stamped_ring_that_is_full_loses_the_oldest(pair: tuple[Bus, Bus]) -> None:
     sender, receiver = pair
-    inbox, publish = receiver.stamped("t/a", Ticking(), bytes, 16), sender.publisher("t/a")
+    inbox, publish = (
+        receiver.stamped_inbox("t/a", Ticking(), bytes, 16),
+        sender.publisher("t/a"),
+    )
     done, finish = receiver.inbox("t/done"), sender.publisher("t/done")
     opened(publish, inbox)
     opened(finish, done)
@@ -256,7 +259,7 @@ def test_a_stamped_message_is_polled_waits_or_is_the_oldest(
         if take:
             taken += 1
             held.append(taken)
-            ring.take(bytes([taken]))
+            ring.receive(bytes([taken]))
             held = held[-capacity:]
         else:
             first = held.pop(0) if held else None
@@ -265,15 +268,15 @@ def test_a_stamped_message_is_polled_waits_or_is_the_oldest(
 
 def test_an_answer_after_the_asker_has_gone_harms_nobody(pair: tuple[Bus, Bus]) -> None:
     asker, other = pair
-    questions = other.questions("t/a/info")
+    questions = other.query_inbox("t/a/info")
 
     def asked() -> object:
-        asker.ask("t/*/info")
+        asker.query("t/*/info")
         return questions.poll()
 
     question = until(asked)
     asker.close()
-    question.answer(b"too late")
+    question.reply(b"too late")
     other.publisher("t/a")(b"still here")
 
 
@@ -307,7 +310,7 @@ def test_a_member_does_not_see_its_own_token(pair: tuple[Bus, Bus]) -> None:
 
 def test_rings_with_nothing_in_them_give_none(network: Network) -> None:
     bus = network.join()
-    rings = [bus.inbox("t/a"), bus.presence("t/*"), bus.questions("t/info"), bus.ask("t/*")]
+    rings = [bus.inbox("t/a"), bus.presence("t/*"), bus.query_inbox("t/info"), bus.query("t/*")]
     assert [ring.poll() for ring in rings for _ in range(3)] == [None] * 12
 
 

@@ -39,7 +39,7 @@ class Answering:
             "s", 1, scenario_sha256=scenario.sha256, scenario=scenario.text, running=running
         )
         self._publisher = EventPublisher(self._bus, SESSION, info)
-        questions = self._bus.questions(
+        questions = self._bus.query_inbox(
             topics.key(SESSION, "s" if not deaf else "x", topics.SET)
         )
         self._changes = ChangeServer(scenario, "s", questions)

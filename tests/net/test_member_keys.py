@@ -152,7 +152,7 @@ def test_nobody_answers_for_another(meeting: Meeting, folder: Path) -> None:
     attacker.respond(key("s", topics.INFO), lambda _: b"true")
     first = until(lambda: answered(meeting.m1, key("*", topics.INFO)))
     assert first == (key("s", topics.INFO), b"true")
-    answers = [reply[1] for reply in received(meeting.m1.ask(key("*", topics.INFO)), 1)]
+    answers = [reply[1] for reply in received(meeting.m1.query(key("*", topics.INFO)), 1)]
     assert answers == [b"true"]
 
 
@@ -504,10 +504,10 @@ def test_ended_keys_stop_arms_and_nothing_else(
     ):
         read_member_keys(folder / "m1")
     with two_members(folder, stops=True) as (site, peer):
-        questions = site.questions(key("m1", topics.STOP))
+        questions = site.query_inbox(key("m1", topics.STOP))
 
         def is_asked() -> bool:
-            peer.ask(key("m1", topics.STOP), b"stop")
+            peer.query(key("m1", topics.STOP), b"stop")
             return questions.poll() is not None
 
         until(is_asked)

@@ -60,7 +60,7 @@ def test_site_that_is_gone_is_waited_for_while_only() -> None:
     session.start(RECORDER)
     assert joined(session, LATE_GATHER_NS - 5 * STEP_NS) is None
     assert joined(session, 30 * STEP_NS) == epoch._replace(epochs={})
-    assert set(session.members[RECORDER].joining.membership.met) == {"m1", "m2"}
+    assert set(session.members[RECORDER].joining.membership.others) == {"m1", "m2"}
 
 
 def test_of_two_recorders_at_the_start_one_is_late() -> None:
@@ -119,7 +119,7 @@ def test_another_recorder_that_runs_is_nobody_to_learn_from() -> None:
     session.members["other"] = session.members.pop(RECORDER)
     session.start(RECORDER)
     assert joined(session, 2 * LATE_GATHER_NS) == epoch._replace(epochs={})
-    assert RECORDER not in session.members[RECORDER].joining.membership.met
+    assert RECORDER not in session.members[RECORDER].joining.membership.others
 
 
 def test_a_site_still_does_not_come_late() -> None:
@@ -136,7 +136,7 @@ def test_a_site_that_begins_anew_too_is_not_waited_for() -> None:
     session.kill("s")
     session.start(RECORDER)
     anew = {"member": "s", "boot": 99, "running": False, "boots": {}}
-    session.members[RECORDER].joining.membership.take(
+    session.members[RECORDER].joining.membership.receive_identity(
         msgspec.structs.replace(session.members["m1"].publisher.info, **anew), invited=False
     )
     assert joined(session, 30 * STEP_NS) == epoch._replace(epochs={})

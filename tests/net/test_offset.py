@@ -53,8 +53,8 @@ def test_true_offset_and_drift_are_inside_whatever_delays_were(
     for later_ns in (0, silence_ns):
         at_ns = latest_ns + later_ns
         truth = other.offset(at_ns)
-        for value in (estimate.offset_at(at_ns), estimate.offset_ns + 5_000_000):
-            assert abs(truth - value) <= estimate.bound_at(at_ns, value) + 2
+        for value in (estimate.extrapolate_ns(at_ns), estimate.offset_ns + 5_000_000):
+            assert abs(truth - value) <= estimate.error_bound_ns(at_ns, value) + 2
     assert estimate.low_ns - 2 <= estimate.offset_ns <= estimate.high_ns + 2
     assert estimate.drift_low <= other.drift_ppb <= estimate.drift_high
 
@@ -74,7 +74,7 @@ def test_one_exchange_gives_classical_offset_and_half_its_round_trip(
     classical = (sent.offset_ns + came.offset_ns) / 2
     spread_ns = 600e-6 * trip_ns + 2
     assert abs(estimate.offset_ns - classical) <= spread_ns
-    bound_ns = estimate.bound_at(estimate.at_ns, estimate.offset_ns)
+    bound_ns = estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns)
     assert trip_ns / 2 - spread_ns <= bound_ns <= trip_ns / 2 + spread_ns
 
 
@@ -95,7 +95,7 @@ def test_offset_and_drift_are_recovered(seed: int, offset_ns: int, drift_ppb: in
         if n >= 9:
             assert abs(estimate.offset_ns - other.offset(at_ns)) <= 40_000
             assert abs(estimate.drift - drift_ppb) <= 20_000
-            assert estimate.bound_at(at_ns, estimate.offset_ns) <= 200_000
+            assert estimate.error_bound_ns(at_ns, estimate.offset_ns) <= 200_000
     assert abs(estimate.drift - drift_ppb) <= 5_000
     assert estimate.drift_high - estimate.drift_low <= 20_000
 
@@ -108,7 +108,7 @@ def test_ways_that_are_unlike_bias_estimate_and_bound_says_so() -> None:
     assert estimate is not None
     error_ns = estimate.offset_ns - other.offset(20 * S)
     assert error_ns == pytest.approx(200_000, abs=20_000)  # half of what the ways differ by
-    assert abs(error_ns) <= estimate.bound_at(20 * S, estimate.offset_ns) <= 350_000
+    assert abs(error_ns) <= estimate.error_bound_ns(20 * S, estimate.offset_ns) <= 350_000
 
 
 def test_the_bound_is_of_the_quickest_messages_each_way() -> None:
@@ -117,7 +117,7 @@ def test_the_bound_is_of_the_quickest_messages_each_way() -> None:
     estimator.add(ceiling(other, 2_000_000, 900_000), floor(other, 3_000_000, 20_000))
     estimate = estimator.estimate(4_000_000)
     assert estimate is not None
-    assert estimate.bound_at(4_000_000, estimate.offset_ns) <= 15_000 + 3_000
+    assert estimate.error_bound_ns(4_000_000, estimate.offset_ns) <= 15_000 + 3_000
 
 
 def test_bad_minute_among_good_ones_does_not_move_drift() -> None:
@@ -184,23 +184,23 @@ def test_memory_is_bounded_and_the_oldest_goes_first() -> None:
     assert {len(limits) for limits in (estimator._ceilings, estimator._floors)} == {
         WINDOWS_KEPT
     }
-    assert estimator._ceilings[0].at_ns == 2 * WINDOWS_KEPT * S
+    assert estimator._ceilings[0].local_ns == 2 * WINDOWS_KEPT * S
 
 
 def test_one_clock_needs_no_estimate() -> None:
     one = exact_offset(0)
     course = SlewedOffset(one)
     for at_ns in (-S, 0, 10**16):
-        assert one.offset_at(at_ns) == course.at(at_ns) == 0
-        assert one.bound_at(at_ns, 0) == course.bound_at(at_ns) == 0
-        assert one.bound_at(at_ns, 7) == 7
+        assert one.extrapolate_ns(at_ns) == course.evaluate_ns(at_ns) == 0
+        assert one.error_bound_ns(at_ns, 0) == course.error_bound_ns(at_ns) == 0
+        assert one.error_bound_ns(at_ns, 7) == 7
 
 
 def test_what_contradicts_an_estimate_widens_it() -> None:
     one = exact_offset(5)
-    wider = one.including(OffsetLimit(0, -100), None)
+    wider = one.widen(OffsetLimit(0, -100), None)
     assert (wider.low_ns, wider.high_ns, wider.offset_ns) == (-100, 5, 5)
-    assert one.including(None, None) == one
+    assert one.widen(None, None) == one
 
 
 def test_people_read_seconds_and_microseconds() -> None:
@@ -225,11 +225,14 @@ def test_it_is_continuous_whatever_estimates_come_and_when(
     course, now_ns = SlewedOffset(exact_offset(5)), 0
     for estimate, passed_ns in bends:
         now_ns += passed_ns
-        before = course.at(now_ns)
-        course.slew_to(now_ns, estimate._replace(at_ns=now_ns))
-        assert abs(course.at(now_ns) - before) <= 1 + abs(estimate.offset_ns - before) * 1e-12
+        before = course.evaluate_ns(now_ns)
+        course.slew_to(now_ns, estimate._replace(local_ns=now_ns))
+        assert (
+            abs(course.evaluate_ns(now_ns) - before)
+            <= 1 + abs(estimate.offset_ns - before) * 1e-12
+        )
         for at_ns in (now_ns, now_ns + SLEW_NS // 3, now_ns + SLEW_NS, now_ns + 2 * SLEW_NS):
-            steps = [course.at(at_ns + n) for n in range(3)]
+            steps = [course.evaluate_ns(at_ns + n) for n in range(3)]
             assert max(steps) - min(steps) <= 3 + 3 * abs(estimate.offset_ns - before) / SLEW_NS
 
 
@@ -238,7 +241,7 @@ def test_it_reaches_an_estimate_in_its_time_and_follows_it(estimate: OffsetEstim
     course = SlewedOffset(exact_offset(0))
     course.slew_to(0, estimate)
     for at_ns in (SLEW_NS, 2 * SLEW_NS, 10 * SLEW_NS):
-        assert abs(course.at(at_ns) - estimate.offset_at(at_ns)) <= 2
+        assert abs(course.evaluate_ns(at_ns) - estimate.extrapolate_ns(at_ns)) <= 2
 
 
 @given(st.integers(0, 2**32), st.integers(-(10**12), 10**12), st.floats(-150_000, 150_000))
@@ -255,12 +258,15 @@ def test_the_truth_is_inside_its_bound_at_every_instant(
     for silence in (False,) * 8 + (True,):
         for _ in range(20):
             at_ns = now_ns + rnd.randrange(60 * S if silence else 3 * S)
-            assert abs(course.at(at_ns) - other.offset(at_ns)) <= course.bound_at(at_ns) + 3
+            assert (
+                abs(course.evaluate_ns(at_ns) - other.offset(at_ns))
+                <= course.error_bound_ns(at_ns) + 3
+            )
         estimator.add(*second(other, now_ns, queueing(100, 300), queueing(50, 100), rnd, 10))
         now_ns += S + rnd.randrange(S)
         estimate = estimator.estimate(now_ns)
         assert estimate is not None
         bent_ns = now_ns + rnd.randrange(1_000_000)
         course.slew_to(bent_ns, estimate)
-        assert course.bound_at(bent_ns + SLEW_NS) == course.bound_ns
+        assert course.error_bound_ns(bent_ns + SLEW_NS) == course.bound_ns
         now_ns = bent_ns

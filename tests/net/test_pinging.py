@@ -40,7 +40,7 @@ class Slow:
         self._bus, self._clock, self._there_ns, self._back_ns = bus, clock, there_ns, back_ns
         self.asked = 0
 
-    def ask(self, key: str, payload: bytes = b"") -> "Slow.Late":
+    def query(self, key: str, payload: bytes = b"") -> "Slow.Late":
         self.asked += 1
         return Slow.Late(self, key, payload, self._clock.monotonic_ns())
 
@@ -54,7 +54,7 @@ class Slow:
         def poll(self) -> tuple[str, bytes] | None:
             now_ns = self._slow._clock.monotonic_ns()
             if self._replies is None and now_ns >= self._asked_ns + self._slow._there_ns:
-                self._replies = self._slow._bus.ask(self._key, self._payload)
+                self._replies = self._slow._bus.query(self._key, self._payload)
                 self._answered_ns = now_ns
             if self._replies is None or now_ns < self._answered_ns + self._slow._back_ns:
                 return None
@@ -99,12 +99,12 @@ def test_a_clock_is_known_to_half_a_round_trip(
     world = World(there_ms * STEP_NS, back_ms * STEP_NS)
     clock = world.member("s", 7, offset_ns, drift_ppb)
     world.wait(400_000_000, 7)
-    assert world.pinger.know([7])
+    assert world.pinger.knows_clocks([7])
     estimate = world.pinger.estimate(7)
     world.clock.sleep_until(world.clock.monotonic_ns() + later_ns)
     now_ns = world.clock.monotonic_ns()
-    truth, value = clock.monotonic_ns() - now_ns, estimate.offset_at(now_ns)
-    assert abs(truth - value) <= estimate.bound_at(now_ns, value) + 2
+    truth, value = clock.monotonic_ns() - now_ns, estimate.extrapolate_ns(now_ns)
+    assert abs(truth - value) <= estimate.error_bound_ns(now_ns, value) + 2
     trip_ns = world.pinger.trips[7].shortest_ns
     assert trip_ns // STEP_NS in (
         there_ms + back_ms,
@@ -112,7 +112,8 @@ def test_a_clock_is_known_to_half_a_round_trip(
         there_ms + back_ms + 2,
     )
     assert (
-        estimate.bound_at(estimate.at_ns, estimate.offset_ns) <= trip_ns / 2 + 0.4 * S * 600e-6
+        estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns)
+        <= trip_ns / 2 + 0.4 * S * 600e-6
     )
 
 
@@ -122,9 +123,9 @@ def test_pings_come_fast_until_all_are_known_and_then_rarely() -> None:
     world.member("s", 7, 2 * S)
     world.wait(100_000_000, 5)
     assert world.bus.asked == 100_000_000 // PING_PACE_NS
-    assert not world.pinger.know([5])
+    assert not world.pinger.knows_clocks([5])
     world.wait(200_000_000, 5, 7)
-    assert world.pinger.know([5, 7])
+    assert world.pinger.knows_clocks([5, 7])
     asked = world.bus.asked
     world.wait(5 * S, 5, 7)
     assert world.bus.asked - asked == pytest.approx(5 * S / PING_REST_NS, abs=1)
@@ -134,7 +135,7 @@ def test_where_no_clock_is_another_one_nobody_is_asked() -> None:
     world = World()
     world.wait(S)
     assert world.bus.asked == 0
-    assert world.pinger.know([])
+    assert world.pinger.knows_clocks([])
     assert world.pinger.estimate(99) == exact_offset(0)
     assert world.pinger.estimator(99) is None
 
@@ -172,32 +173,32 @@ def test_answers_that_cannot_be_are_passed_over(payload: bytes) -> None:
     world = World()
     world.network.join().respond(topics.key(SESSION, "s", topics.PING), lambda _: payload)
     world.wait(S, 7)
-    assert not world.pinger.know([7])
+    assert not world.pinger.knows_clocks([7])
     assert all(not trips.rtts_ns for trips in world.pinger.trips.values())
 
 
 def test_a_stepping_clock_is_unknown_until_enough_messages_agree() -> None:
     trips = RoundTrips(PINGS)
     for n in range(PINGS):
-        trips.take(
+        trips.receive(
             n * STEP_NS,
             pong(came_ns=n * STEP_NS + 50, left_ns=n * STEP_NS + 50),
             n * STEP_NS + 100,
         )
-    assert trips.known
+    assert trips.is_known
     before = trips.latest
     far_ns = 10 * S
     for n in range(PINGS, PINGS + PINGS_PER_WINDOW):
         at_ns = n * STEP_NS
         came_ns = at_ns + 50 + far_ns * (n % 2)
-        trips.take(at_ns, pong(came_ns=came_ns, left_ns=came_ns), at_ns + 100)
-    assert not trips.known
+        trips.receive(at_ns, pong(came_ns=came_ns, left_ns=came_ns), at_ns + 100)
+    assert not trips.is_known
     assert trips.latest == before
 
 
 def test_an_answer_to_an_earlier_question_counts_for_that_question() -> None:
     clock, network = ManualClock(S), LocalNetwork()
-    questions = network.join().questions("t/a")
+    questions = network.join().query_inbox("t/a")
     asking = RepeatedQuery(network.join(), clock, "t/*")
     asked = []
     for _ in range(3):
@@ -206,7 +207,7 @@ def test_an_answer_to_an_earlier_question_counts_for_that_question() -> None:
         clock.sleep_until(clock.monotonic_ns() + S)
     waiting = [questions.poll() for _ in asked]
     for n in (2, 0, 1):
-        waiting[n].answer(bytes([n]))
+        waiting[n].reply(bytes([n]))
     answers = [asking.poll() for _ in asked]
     assert sorted(answers) == [(asked[n], "t/a", bytes([n])) for n in range(3)]
     assert asking.poll() is None
@@ -214,9 +215,9 @@ def test_an_answer_to_an_earlier_question_counts_for_that_question() -> None:
 
 def test_questions_that_are_too_old_are_forgotten() -> None:
     network = LocalNetwork()
-    questions = network.join().questions("t/a")
+    questions = network.join().query_inbox("t/a")
     asking = RepeatedQuery(network.join(), ManualClock(), "t/a")
     for _ in range(QUERIES_KEPT + 1):
         asking.repeat(0)
-    questions.poll().answer(b"late")
+    questions.poll().reply(b"late")
     assert asking.poll() is None

@@ -128,7 +128,7 @@ def test_a_member_lost_before_the_start_is_waited_for_again() -> None:
     session.kill("s")
     session.rounds(100)
     assert [member.epoch for member in session.members.values()] == [None, None]
-    assert session.members["m1"].joining.membership.missing() == ["s"]
+    assert session.members["m1"].joining.membership.list_missing() == ["s"]
     session.start("s")
     session.agreed()
 
@@ -149,7 +149,7 @@ def test_a_recorder_that_announces_itself_is_waited_for() -> None:
     session.stranger.announce(f"trilat/{SESSION}/{RECORDER}/alive/7")
     session.rounds(100)
     assert session.kinds() == []
-    assert session.members["m1"].joining.membership.missing() == [RECORDER]
+    assert session.members["m1"].joining.membership.list_missing() == [RECORDER]
     session.stranger.close()
     session.agreed()
 
@@ -167,10 +167,10 @@ def test_a_recorder_that_any_site_needs_is_waited_for(who: str) -> None:
 
 def test_missing_names_who_is_missing() -> None:
     session = party("m2")
-    assert session.members["m2"].joining.membership.missing() == ["m1", "s"]
+    assert session.members["m2"].joining.membership.list_missing() == ["m1", "s"]
     session.start("s")
     session.rounds(30)
-    assert session.members["m2"].joining.membership.missing() == ["m1"]
+    assert session.members["m2"].joining.membership.list_missing() == ["m1"]
 
 
 def test_another_scenario_is_refused_by_both_hashes_on_both_sides() -> None:
@@ -232,8 +232,8 @@ def test_two_leaders_that_do_not_meet_cannot_split_a_session() -> None:
     twins = [session.member("m1", boot=boot) for boot in (7, 9)]
     others = [session.member(name) for name in ("m2", "s")]
     for twin in twins:
-        take = twin.joining.membership.take
-        twin.joining.membership.take = lambda info, invited, take=take: (
+        take = twin.joining.membership.receive_identity
+        twin.joining.membership.receive_identity = lambda info, invited, take=take: (
             None if info.member == "m1" else take(info, invited=invited)
         )
     reasons = polled_until_refused(*twins, *others, clock=session.clock)
@@ -291,13 +291,13 @@ def test_nobody_is_ready_before_the_other_clocks_are_known() -> None:
     session = party("m1", "m2")
     session.start("s", on_clock=session.elsewhere(5_000_000_000))
     bus, deaf = session.members["m2"].bus, LocalNetwork().join().inbox("nothing")
-    ask = bus.ask
-    bus.ask = lambda key: deaf if key.endswith(topics.PING) else ask(key)
+    ask = bus.query
+    bus.query = lambda key: deaf if key.endswith(topics.PING) else ask(key)
     session.rounds(300)
     assert session.kinds().count("epoch") > 1
     assert {event.member for event in session.listen() if event.kind == "ready"} == {"s"}
     assert [member.epoch for member in session.members.values()] == [None] * 3
-    bus.ask = ask
+    bus.query = ask
     session.rounds(100)
     assert all(member.epoch for member in session.members.values())
 
@@ -307,7 +307,9 @@ def test_an_epoch_lies_further_ahead_where_the_network_is_slow() -> None:
     session = party("m1", "m2")
     session.start("s", on_clock=session.elsewhere(5_000_000_000))
     trip_ns = 15 * STEP_NS
-    session.members["m1"].bus.ask = later(session.members["m1"].bus.ask, session.clock, trip_ns)
+    session.members["m1"].bus.query = later(
+        session.members["m1"].bus.query, session.clock, trip_ns
+    )
     session.rounds(200)
     (announced,) = (event for event in session.listen() if event.kind == "epoch")
     assert re.search(
@@ -354,13 +356,13 @@ GARBAGE.append(bytes(70_000))
 @pytest.mark.parametrize("name", [*SITES, RECORDER, "nobody"])
 def test_garbage_keeps_no_session_from_beginning(name: str) -> None:
     session = party(*SITES)
-    asked = session.stranger.questions(topics.key(SESSION, name, topics.INFO))
+    asked = session.stranger.query_inbox(topics.key(SESSION, name, topics.INFO))
     for _ in range(30):
         query = asked.poll()
         for payload in GARBAGE:
             session.say(name, payload)
             if query is not None:
-                query.answer(payload)
+                query.reply(payload)
         session.round()
     session.agreed()
 
@@ -412,23 +414,23 @@ def test_events_that_fit_no_announcement_change_nothing(event: Event) -> None:
 
 def test_an_answer_under_the_key_of_another_counts_for_nobody() -> None:
     session = party("m1", "m2")
-    asked = session.stranger.questions(topics.key(SESSION, "nobody", topics.INFO))
+    asked = session.stranger.query_inbox(topics.key(SESSION, "nobody", topics.INFO))
     for _ in range(50):
         while (question := asked.poll()) is not None:
-            question.answer(encode(told("s", 1)))
+            question.reply(encode(told("s", 1)))
         session.round()
-    assert session.members["m1"].joining.membership.missing() == ["s"]
+    assert session.members["m1"].joining.membership.list_missing() == ["s"]
 
 
 def test_what_another_version_answers_is_remembered_for_the_error() -> None:
     session = party("m1", "m2")
-    asked = session.stranger.questions(topics.key(SESSION, "s", topics.INFO))
+    asked = session.stranger.query_inbox(topics.key(SESSION, "s", topics.INFO))
     newer: Info = told("s", 1, v=VERSION + 1)
     for _ in range(50):
         while (question := asked.poll()) is not None:
-            question.answer(encode(newer))
+            question.reply(encode(newer))
         session.round()
-    assert session.members["m1"].joining.membership.missing() == ["s"]
+    assert session.members["m1"].joining.membership.list_missing() == ["s"]
     assert f"version {VERSION + 1}" in session.members["m1"].joining.membership.unreadable["s"]
 
 

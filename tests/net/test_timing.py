@@ -73,7 +73,7 @@ class Session:
             )
             peer = PeerClock(NAMES[other], epochs[other], 0, first, OffsetEstimator())
             self.sites.append(Site(clocks[own], SiteTiming(epochs[own], RATE_HZ, [peer], "a")))
-            self.sites[-1].news += self.sites[-1].timing.opening()
+            self.sites[-1].news += self.sites[-1].timing.list_initial_notices()
 
     def run(self, seconds: float, cut: range = range(0)) -> None:
         queue: list[tuple[int, int, int, int, PeerSample | None]] = []
@@ -104,19 +104,19 @@ class Session:
         if n in self.step_at and k == self.step_at[n][0]:
             self.step[n] = self.step_at[n][1]
         now_ns = site.clock.monotonic_ns() + self.step[n]
-        echo = [list(entry) for entry in site.timing.echo()]
-        sent = sample(k, site.timing.sent(k, now_ns), echo)
+        echo = [list(entry) for entry in site.timing.pop_echo()]
+        sent = sample(k, site.timing.record_sent(k, now_ns), echo)
         if k % (RATE_HZ // 10) == 0:
-            site.stats.append(site.timing.measured(now_ns))
-            site.news += site.timing.settle(k + 1, now_ns)
+            site.stats.append(site.timing.pop_measurements(now_ns))
+            site.news += site.timing.update_clocks(k + 1, now_ns)
         return sent
 
     def _take(self, n: int, message: PeerSample, true_ns: int) -> None:
         site, other = self.sites[n], self.sites[1 - n]
         arrived_ns = site.clock.monotonic_ns() + self.step[n]
-        (meter,) = site.timing.meters
-        bound_ns = meter.offset.bound_at(arrived_ns)
-        delay_ns = meter.take(message, arrived_ns)
+        (meter,) = site.timing.monitors
+        bound_ns = meter.offset.error_bound_ns(arrived_ns)
+        delay_ns = meter.receive(message, arrived_ns)
         true_delay_ns = true_ns - other.ticked_ns[message.tick]
         site.errors_ns.append((message.tick, delay_ns - true_delay_ns, bound_ns))
 
@@ -205,7 +205,7 @@ def meter(estimator: OffsetEstimator | None = None) -> tuple[LinkTimingMonitor, 
 
 
 def figures(link: LinkTimingMonitor) -> tuple[int, ...]:
-    measured = link.measured(0)
+    measured = link.pop_measurements(0)
     return tuple(
         measured[name] for name in ("delay_us", "delay_max_us", "rtt_us", "clock_faults")
     )
@@ -213,8 +213,8 @@ def figures(link: LinkTimingMonitor) -> tuple[int, ...]:
 
 def test_on_one_clock_delays_and_round_trips_are_exact() -> None:
     link, sent = meter()
-    sent.put(7, 5_000)
-    assert link.take(sample(2, 9_000, [[0, 7, 1], [3, 7, 7_500]]), 12_000) == 2_000
+    sent.record(7, 5_000)
+    assert link.receive(sample(2, 9_000, [[0, 7, 1], [3, 7, 7_500]]), 12_000) == 2_000
     assert figures(link) == (2, 2, 5, 0)  # round trip (8 500 - 5 000) + 2 000 ns
     assert link.close(10**12, 10**12) is None
     assert link.offset.bound_ns == 0
@@ -223,17 +223,17 @@ def test_on_one_clock_delays_and_round_trips_are_exact() -> None:
 def test_echo_of_what_is_not_known_any_more_says_nothing() -> None:
     link, sent = meter()
     for tick in range(20):
-        sent.put(tick, tick)
-    link.take(sample(0, 0, [[3, 11, 5], [3, 99, 5], [3, -5, 5]]), 2_000)
-    assert link.measured(0)["rtt_us"] == -1
-    assert sent.at(12) == 12
-    assert sent.at(11) is None
+        sent.record(tick, tick)
+    link.receive(sample(0, 0, [[3, 11, 5], [3, 99, 5], [3, -5, 5]]), 2_000)
+    assert link.pop_measurements(0)["rtt_us"] == -1
+    assert sent.find_ns(12) == 12
+    assert sent.find_ns(11) is None
 
 
 def test_figures_are_of_the_last_window_and_faults_of_all() -> None:
     link, _ = meter()
     for n, delay_ns in enumerate((3_000, 1_000, 900_000, -5_000)):
-        link.take(sample(n, 0), 1000 + delay_ns)
+        link.receive(sample(n, 0), 1000 + delay_ns)
     assert figures(link) == (3, 900, -1, 1)
     assert figures(link) == (-1, -1, -1, 1)
     assert link.worst_ns == 5_000
@@ -242,12 +242,12 @@ def test_figures_are_of_the_last_window_and_faults_of_all() -> None:
 def test_the_echo_is_of_the_newest_sample_and_said_once() -> None:
     peers = [PeerClock(name, 0, 0, exact_offset(0), None) for name in ("b", "c")]
     timing = SiteTiming(0, 1000, peers, "a")
-    one, two = timing.meters
+    one, two = timing.monitors
     for tick, at_ns in ((4, 50), (6, 60), (5, 70)):
-        one.take(sample(tick, 0), at_ns)
-    two.take(sample(9, 0), 80)
-    assert timing.echo() == [(0, 6, 60), (1, 9, 80)]
-    assert timing.echo() == []
+        one.receive(sample(tick, 0), at_ns)
+    two.receive(sample(9, 0), 80)
+    assert timing.pop_echo() == [(0, 6, 60), (1, 9, 80)]
+    assert timing.pop_echo() == []
 
 
 def test_the_first_windows_are_short() -> None:
@@ -256,8 +256,8 @@ def test_the_first_windows_are_short() -> None:
     closed = []
     for n in range(400):
         now_ns = n * 10_000_000
-        sent.put(n, now_ns)
-        link.take(sample(n, now_ns - 1000, [[3, n, now_ns - 1000 + 500]]), now_ns + 500)
+        sent.record(n, now_ns)
+        link.receive(sample(n, now_ns - 1000, [[3, n, now_ns - 1000 + 500]]), now_ns + 500)
         if link.close(now_ns + 600, now_ns + 600):
             closed.append(now_ns)
     assert closed[:FIRST_WINDOWS] == [FIRST_WINDOW_NS * (n + 1) for n in range(FIRST_WINDOWS)]
@@ -267,8 +267,8 @@ def test_the_first_windows_are_short() -> None:
 def test_who_shares_the_leaders_clock_is_not_steered() -> None:
     timing = SiteTiming(5, 1000, [PeerClock("a", 5, 0, exact_offset(0), None)], "a")
     for k in range(0, 5000, 100):
-        timing.meters[0].take(sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
-        assert timing.settle(k + 1, 5 + k * 1_000_000 + 400_000) == []
+        timing.monitors[0].receive(sample(k, k * 1_000_000), 5 + k * 1_000_000 + 300_000)
+        assert timing.update_clocks(k + 1, 5 + k * 1_000_000 + 400_000) == []
     assert timing.schedule.due_ns(10_000) == 5 + 10 * S
     assert timing.schedule.slew == 0.0
 
@@ -306,7 +306,7 @@ def test_it_never_steps_and_never_slews_beyond_the_limit(
     for ticks, error_ns, drift in steers:
         k += ticks
         before = grid.due_ns(k)
-        grid.steer(k, error_ns, drift)
+        grid.adjust_rate(k, error_ns, drift)
         assert grid.due_ns(k) == before
         assert abs(grid.slew) <= SLEW_LIMIT == 200_000.0
         nominal_ns = tick_ns(k + rate_hz, rate_hz) - tick_ns(k, rate_hz)
@@ -328,7 +328,7 @@ def test_it_follows_the_leaders_grid_on_a_clock_that_drifts(
         due_ns = grid.due_ns(k)
         error_ns = leader.reads(due_ns) - tick_ns(k, 1000)
         errors.append(error_ns)
-        grid.steer(k, error_ns, drift_ppb)
+        grid.adjust_rate(k, error_ns, drift_ppb)
         assert grid.error_ns == error_ns
     assert abs(errors[0] - begin_ns) <= 1000
     assert max(map(abs, errors)) <= abs(begin_ns) + 1000

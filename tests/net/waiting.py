@@ -25,7 +25,7 @@ def drained(ring: PolledRing[T]) -> list[T]:
 
 
 def answered(asker: Bus, key: str, payload: bytes = b"?") -> tuple[str, bytes] | None:
-    replies = asker.ask(key, payload)
+    replies = asker.query(key, payload)
     try:
         return until(replies.poll, timeout_s=0.5)
     except AssertionError:

@@ -236,7 +236,7 @@ def test_only_a_participating_page_gives_orders_a_second_asks_first(
     network: LocalNetwork, server: PageServer
 ) -> None:
     site: LocalBus = network.join()
-    questions = site.questions("trilat/s1/s/set")
+    questions = site.query_inbox("trilat/s1/s/set")
     server.view.links = {"m1->s": {}}
     order = '{"do":"link","link":"m1->s","to":{"delay_ms":300,"deviation_ms":0,"loss":0}}'
     with socket(server) as first, socket(server) as second:
@@ -250,7 +250,7 @@ def test_only_a_participating_page_gives_orders_a_second_asks_first(
         while delays_ms[-1:] != [49.0]:  # the newest is asked for; of those before, hardly any
             query = until(questions.poll)
             delays_ms.append(decode(query.payload, ChangeRequest).to["delay_ms"])
-            query.answer(encode(ChangeReply(member="s", accepted=True, text="")))
+            query.reply(encode(ChangeReply(member="s", accepted=True, text="")))
         assert len(delays_ms) < 20
         second.send('{"do":"control","want":true}')
         second.send(order)
@@ -350,7 +350,7 @@ def test_any_page_stops_every_arm_past_what_waits_for_answer(
     network: LocalNetwork, server: PageServer
 ) -> None:
     site: LocalBus = network.join()
-    changes, stops = site.questions("trilat/s1/s/set"), site.questions("trilat/s1/s/stop")
+    changes, stops = site.query_inbox("trilat/s1/s/set"), site.query_inbox("trilat/s1/s/stop")
     server.view.sites, server.view.links = {"s": None}, {"m1->s": {}}  # type: ignore[dict-item]
     with socket(server) as first, socket(server) as second:
         hears(first), hears(second)
@@ -369,7 +369,7 @@ def test_an_experimenter_releases_arms_and_a_stop_takes_that_back(
     network: LocalNetwork, server: PageServer
 ) -> None:
     site: LocalBus = network.join()
-    changes, stops = site.questions("trilat/s1/s/set"), site.questions("trilat/s1/s/stop")
+    changes, stops = site.query_inbox("trilat/s1/s/set"), site.query_inbox("trilat/s1/s/stop")
     server.view.sites, server.view.links = {"s": None}, {"m1->s": {}}  # type: ignore[dict-item]
     with socket(server) as page:
         hears(page)
@@ -380,7 +380,7 @@ def test_an_experimenter_releases_arms_and_a_stop_takes_that_back(
         page.send('{"do":"release","order":"enable","sites":["s"]}')  # waits for that answer
         page.send('{"do":"stop"}')
         until(stops.poll)
-        query.answer(encode(ChangeReply(member="s", accepted=True, text="s: enable at tick 5")))
+        query.reply(encode(ChangeReply(member="s", accepted=True, text="s: enable at tick 5")))
         # is asked after whatever waits
         page.send('{"do":"link","link":"m1->s","to":{"delay_ms":1}}')
         query = until(changes.poll)
@@ -396,13 +396,13 @@ def test_a_stop_that_an_older_site_refuses_is_ordered_again(
     network: LocalNetwork, server: PageServer
 ) -> None:
     """It knows no source of an order, and refuses what names one."""
-    stops = network.join().questions("trilat/s1/s/stop")
+    stops = network.join().query_inbox("trilat/s1/s/stop")
     server.view.sites = {"s": None}  # type: ignore[dict-item]
     with socket(server) as page:
         hears(page)
         page.send('{"do":"stop"}')
         query = until(stops.poll)
-        query.answer(encode(ChangeReply(member="s", accepted=False, text="malformed")))
+        query.reply(encode(ChangeReply(member="s", accepted=False, text="malformed")))
         again = until(stops.poll)
         assert decode(again.payload, ChangeRequest) == ChangeRequest(order="stop")
 
@@ -514,7 +514,7 @@ def test_users_and_watchers_give_no_orders_but_stop(
 ) -> None:
     server, links = roles
     stops, changes = (
-        network.join().questions(f"trilat/s1/s/{kind}") for kind in ("stop", "set")
+        network.join().query_inbox(f"trilat/s1/s/{kind}") for kind in ("stop", "set")
     )
     with socket(server, link=links[who]) as page:
         server.view.sites, server.view.links = {"s": None}, {"m1->s": {}}  # type: ignore[dict-item]

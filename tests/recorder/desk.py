@@ -50,7 +50,7 @@ def states(name: str, boot: int | None = None, scenario: Scenario = SCENARIO) ->
 
 def statistics(name: str, tick: int = 0, scenario: Scenario = SCENARIO) -> bytes:
     site = Site(scenario.setup(name))
-    stats = LoopStats(site, BOOTS[name]).take(site.step(TickInput(0)))
+    stats = LoopStats(site, BOOTS[name]).pop_stats(site.step(TickInput(0)))
     t_ns = tick * S // scenario.sites[name].rate_hz
     return encode(msgspec.structs.replace(stats, tick=tick, t_ns=t_ns))
 
@@ -81,14 +81,14 @@ class Memory:
         self.oldest = dict.fromkeys(self.made, 0)
         self.asked: list[BackfillRequest] = []
         self.replies: Callable[[bytes], Sequence[bytes]] = lambda payload: [payload]
-        self._questions = network.join().questions(topics.key(SESSION, name, topics.PAST))
+        self._questions = network.join().query_inbox(topics.key(SESSION, name, topics.PAST))
 
     def answer(self) -> None:
         while (question := self._questions.poll()) is not None:
             wanted = decode(question.payload, BackfillRequest)
             self.asked.append(wanted)
             for payload in self.replies(encode(self.past(wanted))):
-                question.answer(payload)
+                question.reply(payload)
 
     def past(self, wanted: BackfillRequest) -> Backfill:
         made = self.made[wanted.channel]

@@ -346,7 +346,7 @@ def recorder_alone(folder: Path, relay: Relay, stop_ns: int) -> None:
             LogStorage(folder / "run.mcap"),
         )
         recorder = Recorder(*own, lambda: clock.monotonic_ns() > stop_ns, str)
-        met = recorder._joining.membership.met
+        met = recorder._joining.membership.others
         met["x"] = msgspec.structs.replace(told("m"), member="x", boot=5, scenario="garbage")
         met["m"] = told("m")
         recorder.record(EPOCH)

@@ -68,7 +68,7 @@ def test_it_fits_a_message_however_much_is_missing() -> None:
     desk = Desk(load_scenario("two_sites"))
     for key in desk.recording.accounts:
         for number in range(0, 10_000, 2):
-            desk.recording.accounts[key].take(number + 2**39)
+            desk.recording.accounts[key].receive(number + 2**39)
     for n in range(12):
         name = f"site-with-a-long-name-{n}"
         desk.recording.accounts[topics.key(SESSION, name, "state")] = desk.recording.accounts[

@@ -33,11 +33,11 @@ class Asked:
         network = LocalNetwork()
         self.scenario = scenario or load_scenario("paper")
         self._client: Bus = network.join()
-        asked, stops = (network.join().questions(key) for key in (KEY, STOP))
+        asked, stops = (network.join().query_inbox(key) for key in (KEY, STOP))
         self.changes = ChangeServer(self.scenario, "s", asked, mode, stops=stops)
 
     def send(self, payload: bytes, key: str = KEY) -> Inbox:
-        return self._client.ask(key, payload)
+        return self._client.query(key, payload)
 
     def ask(self, k: int, key: str = KEY, **order: Any) -> tuple[list[CoreChange], ChangeReply]:
         replies = self.send(encode(ChangeRequest(**order)), key)

@@ -297,7 +297,7 @@ class Switch:
     ) -> bool:
         """Hears of one program; returns whether it is held then."""
         self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
-        self.ring.take(encode(ArmEnable(site=site, boot=boot, n=n, held=held, sent_ns=0)))
+        self.ring.receive(encode(ArmEnable(site=site, boot=boot, n=n, held=held, sent_ns=0)))
         self.switch.poll()
         return self.switch.held
 
@@ -319,7 +319,7 @@ def test_a_switch_is_held_until_let_go_or_silent() -> None:
     assert hear(1, 6)
     assert not hear(1, 7, held=False)
     assert hear(2, 1)
-    ring.take(b"garbage")
+    ring.receive(b"garbage")
     switch.poll()
     assert one.dropped == {"stranger": 1, "old switch message": 1, "malformed": 1}
 
@@ -454,7 +454,7 @@ class Heard:
 
     def hear(self, *payloads: bytes) -> None:
         for payload in payloads:
-            self.ring.take(payload)
+            self.ring.receive(payload)
         self.arm.poll()
 
 

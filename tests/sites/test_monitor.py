@@ -21,7 +21,7 @@ from trilat_net.scenario import load_scenario
 
 SCENARIO = load_scenario("paper")
 SITE = Site(SCENARIO.setup("m1"))
-STATISTICS = LoopStats(SITE, 1).take(SITE.step(TickInput(0)))
+STATISTICS = LoopStats(SITE, 1).pop_stats(SITE.step(TickInput(0)))
 
 
 @pytest.mark.parametrize("terminal", [False, True])

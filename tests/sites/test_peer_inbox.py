@@ -50,7 +50,7 @@ class Desk:
         self.clock = ManualClock(EPOCH_NS)
         read = make_sample_readers(SETUP)
         rings = [
-            receiver.stamped(name, self.clock.monotonic_ns, one, capacity)
+            receiver.stamped_inbox(name, self.clock.monotonic_ns, one, capacity)
             for name, one in zip(PEERS, read, strict=True)
         ]
         self.send = [sender.publisher(name) for name in PEERS]

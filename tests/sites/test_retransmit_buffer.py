@@ -30,10 +30,10 @@ class Desk:
         network = LocalNetwork()
         self._asker = network.join()
         site: Any = SimpleNamespace(name="m1", rate_hz=rate_hz, layout=Layout())
-        self.history = RetransmitBuffer(site, BOOT, network.join().questions(KEY))
+        self.history = RetransmitBuffer(site, BOOT, network.join().query_inbox(KEY))
 
     def ask(self, payload: bytes) -> Inbox:
-        replies = self._asker.ask(KEY, payload)
+        replies = self._asker.query(KEY, payload)
         while self.history.answer_query():
             pass
         return replies

@@ -24,7 +24,7 @@ def test_everybody_is_seen_and_nobody_waits_for_the_visitor() -> None:
         (facts["same_clock"], facts["offset_ns"], facts["bound_us"]) == (True, 0, 0.0)
         for facts in found
     )
-    assert party.members["m"].joining.membership.missing() == ["s"]
+    assert party.members["m"].joining.membership.list_missing() == ["s"]
     party.start("s")
     party.agreed()
 
@@ -38,23 +38,23 @@ def test_a_clock_that_is_another_one_is_found() -> None:
     (_, facts) = probe.report().members
     assert not facts["same_clock"]
     estimate = probe.pinger.estimate(probe.infos["s"].boot)
-    bound_us = estimate.bound_at(estimate.at_ns, estimate.offset_ns) / 1000
+    bound_us = estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns) / 1000
     assert (facts["offset_ns"], facts["bound_us"]) == (estimate.offset_ns, bound_us)
     now_ns = party.clock.monotonic_ns()
     truth = away.monotonic_ns() - now_ns
-    value = estimate.offset_at(now_ns)
-    assert abs(truth - value) <= estimate.bound_at(now_ns, value) + 2
+    value = estimate.extrapolate_ns(now_ns)
+    assert abs(truth - value) <= estimate.error_bound_ns(now_ns, value) + 2
 
 
 def test_who_answers_no_ping_is_shown_without_any() -> None:
     party = Party(("m", "s"))
     party.start("m")
-    questions = party.stranger.questions(topics.key(SESSION, "s", topics.INFO))
+    questions = party.stranger.query_inbox(topics.key(SESSION, "s", topics.INFO))
     visit = Visit(party)
     for _ in range(20):
         visit.probe.poll()
         while (question := questions.poll()) is not None:
-            question.answer(encode(told("s", 9, clock="far away")))
+            question.reply(encode(told("s", 9, clock="far away")))
         party.clock.sleep_until(party.clock.monotonic_ns() + S // 10)
     facts = visit.look().report().members[-1]
     assert (facts["member"], facts["answers"]) == ("s", 0)

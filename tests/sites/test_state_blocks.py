@@ -151,7 +151,7 @@ def test_a_delay_made_short_finds_no_sample_held(at_ns: int, tmp_path: Path) -> 
             clock.sleep_until(clock.monotonic_ns() + 1_000_000)
         clock.sleep_until(clock.monotonic_ns() + 200_000_000 + at_ns)
         order = ChangeRequest(link="m->s", to={"delay_ms": 1.0})
-        answers = bus.ask(topics.key(SESSION, "s", topics.SET), encode(order))
+        answers = bus.query(topics.key(SESSION, "s", topics.SET), encode(order))
         while answers.poll() is None:
             clock.sleep_until(clock.monotonic_ns() + 1_000_000)
 

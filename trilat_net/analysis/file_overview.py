@@ -173,9 +173,9 @@ def _numbers(
     channel = where.channel
     rate_hz = rates_hz[where.member]
     for tick in sequence:
-        account.take(number_message(channel, tick, rate_hz))
+        account.receive(number_message(channel, tick, rate_hz))
     for first, last in absences.get(where.member, ()):  # not made: they are not missing
-        account.begin_anew(
+        account.mark_unpublished(
             *(count_messages(channel, ticks, rate_hz) for ticks in (last + 1, first))
         )
     gaps = account.gaps[:MOST_LISTED_GAPS]

@@ -370,7 +370,7 @@ class RerunSite:
         fits = self._site.layout.hand == self._part.layout.hand
         hand = find_recorded_hand(self._part, self._site, self.k) if fits else ()
         output = self._site.step(TickInput(self.k, arrivals[:MAX_ARRIVALS], changes, hand=hand))
-        stats = self._stats.take(output) if self._stats.due(self.k) else None
+        stats = self._stats.pop_stats(output) if self._stats.is_due(self.k) else None
         same = False
         if n is not None:
             state = self._part.states[n]

@@ -113,7 +113,7 @@ class SiteChannels:
     def _excuse_skipped(self, tick: int, cmd: Sequence[str]) -> None:
         if skipped := count_skipped_ticks(cmd):
             for channel in (topics.STATE, topics.LINK):
-                self.accounts[channel].begin_anew(
+                self.accounts[channel].mark_unpublished(
                     *skipped_numbers(channel, tick, skipped, self._rate_hz)
                 )
 
@@ -204,7 +204,7 @@ class SiteChannels:
 
     def write(self, entry: SiteEntry, writer: LogWriter, epoch_unix_ns: int = 0) -> None:
         """Writes an entry into a log."""
-        self.accounts[entry.channel].take(
+        self.accounts[entry.channel].receive(
             number_message(entry.channel, entry.sequence, self._rate_hz)
         )
         log_ns = min(max(0, epoch_unix_ns + entry.t_ns), MAX_TIME_NS)
@@ -215,7 +215,7 @@ class SiteChannels:
 def describe_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
     """Returns the accounts of all channels, by topic."""
     return {
-        f"/{site.keys[channel]}": f"{account.as_text()}, overflowed 0"
+        f"/{site.keys[channel]}": f"{account.describe()}, overflowed 0"
         for site in sites
         for channel, account in site.accounts.items()
     }
@@ -348,12 +348,12 @@ class _VirtualChannels(SiteChannels):
             late_us=0,
             busy_us=0,
         )
-        self.accounts[topics.STATE].take(output.tick)
+        self.accounts[topics.STATE].receive(output.tick)
         self._writer.add(
             self.keys[topics.STATE], payload, output.t_ns, output.t_ns, output.tick, output
         )
-        due = self._stats.due(output.tick, count_skipped_ticks(output.cmd))
-        stats = self._stats.take(output) if due else None
+        due = self._stats.is_due(output.tick, count_skipped_ticks(output.cmd))
+        stats = self._stats.pop_stats(output) if due else None
         for entry in self.follow(output, stats, self._runs.law_failure):
             self.write(entry, self._writer)
 

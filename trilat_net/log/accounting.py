@@ -100,7 +100,7 @@ class Account:
     """
 
     def __init__(self) -> None:
-        self.received = self.duplicate = self.reordered = self.refilled = self.unmade = 0
+        self.received = self.duplicate = self.reordered = self.refilled = self.unpublished = 0
         self.last = -1
         self.silence_ns = 0
         self._lost_below = 0  # missing numbers below this one cannot be had from any member
@@ -108,7 +108,7 @@ class Account:
         self._came_ns: int | None = None
         self._gaps = RangeSet(MAX_GAPS)
 
-    def take(self, number: int, came_ns: int | None = None) -> bool:
+    def receive(self, number: int, came_ns: int | None = None) -> bool:
         """Counts one message; returns False if its number is there already.
 
         It came at `came_ns`, on a clock that never steps.
@@ -135,39 +135,39 @@ class Account:
         self.received += new
         return new
 
-    def expect(self, made: int) -> None:
+    def add_expected(self, made: int) -> None:
         """Counts as missing what is not there of the first `made` messages."""
         if made > self.last + 1:
             self._gaps.insert(self.last + 1, made - 1)
             self.last = made - 1
 
-    def begin_anew(self, first: int, made: int = 0) -> int:
+    def mark_unpublished(self, first: int, published: int = 0) -> int:
         """Takes the gap just below a number for not made: another start of the sender begins
         with it.
 
         The start before had `made` as many messages at least; what is missing of those stays
         missing. Returns the lowest number of those not made, the given one without any.
         """
-        self.expect(first)
+        self.add_expected(first)
         gap = self._gaps.find(first - 1)
-        if gap is None or (begin := max(gap[0], made)) >= first:
+        if gap is None or (begin := max(gap[0], published)) >= first:
             return first
         self._gaps.remove(begin, first - 1)
-        self.unmade += first - begin
+        self.unpublished += first - begin
         return begin
 
-    def restore(self, first: int, last: int) -> None:
+    def mark_missing(self, first: int, last: int) -> None:
         """Counts as missing what was taken for not made."""
         self._gaps.insert(first, last)
-        self.unmade -= last + 1 - first
+        self.unpublished -= last + 1 - first
 
-    def give_up(self, below: int) -> None:
+    def abandon_below(self, below: int) -> None:
         """Marks what is missing below a number as lost for good; if it comes all the same, it
         counts.
         """
         self._lost_below = max(self._lost_below, below)
 
-    def wanted(self, number: int = 0) -> tuple[int, int] | None:
+    def find_requestable_gap(self, number: int = 0) -> tuple[int, int] | None:
         """Returns the first gap at or above a number that is not given up; None if there is
         none.
         """
@@ -176,7 +176,7 @@ class Account:
     @property
     def expected(self) -> int:
         """Number of messages that are known to exist."""
-        return self.last + 1 - self.unmade
+        return self.last + 1 - self.unpublished
 
     @property
     def missing(self) -> int:
@@ -193,7 +193,7 @@ class Account:
         """Number of messages that the largest gap has."""
         return max((last - first + 1 for first, last in self._gaps), default=0)
 
-    def as_text(self, *before: "Account") -> str:
+    def describe(self, *before: "Account") -> str:
         """Returns the account in one line, for the file and for people.
 
         It is together with those `before`, of earlier starts that counted their messages from 0
@@ -210,28 +210,28 @@ class Account:
                 "refilled",
             )
         }
-        gaps = self.gap_texts(SHOWN_GAPS)
+        gaps = self.format_gaps(SHOWN_GAPS)
         named = (
             f" ({' '.join(gaps)}{' ...' if len(self._gaps) > len(gaps) else ''})"
             if gaps
             else ""
         )
         silence = f", longest silence {self.silence_ns / 1e6:.1f} ms" if self.silence_ns else ""
-        unmade = f", not made {self.unmade}" if self.unmade else ""
+        unmade = f", not made {self.unpublished}" if self.unpublished else ""
         starts = f", of {count_nouns(len(before) + 1, 'start')}" if before else ""
         return (
             ", ".join(f"{name} {count}" for name, count in counts.items())
             + f", largest gap {self.largest_gap}{named}{silence}{unmade}{starts}"
         )
 
-    def gap_texts(self, most: int, base: int = 0) -> list[str]:
+    def format_gaps(self, most: int, base: int = 0) -> list[str]:
         """Returns the first gaps as "first-last", where number 0 stands for `base`."""
         pairs = zip(self._gaps, range(most), strict=False)
         return [f"{base + first}-{base + last}" for (first, last), _ in pairs]
 
     def _add(self, number: int) -> bool:
         if number > self.last:
-            self.expect(number)
+            self.add_expected(number)
             self.last = number
             return True
         return self._gaps.remove(number)
@@ -253,21 +253,21 @@ class StartGap:
         # first that did not come, was not made, of the later start
         self._silent = self._begin = self._first = -1
 
-    def begin_anew(self, first: int, made: int) -> None:
+    def begin_next_start(self, first: int, made: int) -> None:
         """The later start begins with a number; the one before stated how many messages it
         made, or 0.
         """
         if self._first < 0:
             self._first = first
-            self._silent = self._begin = self._account.begin_anew(first, made)
-            self.hear_of(self._heard)
+            self._silent = self._begin = self._account.mark_unpublished(first, made)
+            self.note_published(self._heard)
 
-    def hear_of(self, made: int) -> None:
+    def note_published(self, made: int) -> None:
         """Somebody knows of so many messages of the start before."""
         self._heard = max(self._heard, made)
         made = min(made, self._first)
         if made - self._silent > self._under_way and made > self._begin >= 0:
-            self._account.restore(self._begin, made - 1)
+            self._account.mark_missing(self._begin, made - 1)
             self._begin = made
 
 
@@ -383,13 +383,13 @@ class SessionAccounts:
     def _topic(self, member: str, channel: str) -> str:
         return "/" + topics.key(self._session, member, channel)
 
-    def open(self, topic: str) -> None:
+    def open_channel(self, topic: str) -> None:
         """Opens the account of a channel, if it is a numbered one of the session."""
         key = topics.parse_key(topic.removeprefix("/"))
         if key is not None and key.session == self._session and key.channel in self._numbered:
             self._accounts.setdefault(topic, Account())
 
-    def take(self, topic: str, sequence: int, payload: bytes = b"") -> None:
+    def receive(self, topic: str, sequence: int, payload: bytes = b"") -> None:
         """Counts a message by its sequence number; the payload of an event may state the number
         of ticks.
         """
@@ -407,11 +407,11 @@ class SessionAccounts:
         if event is None:
             self.count(topic, number)
         else:
-            self.take_event(topic, number, event)
+            self.receive_event(topic, number, event)
         if channel == topics.LINK:
             self._expect(member, topics.STATE, sequence + 1)
 
-    def take_event(self, topic: str, number: int, event: Event) -> bool:
+    def receive_event(self, topic: str, number: int, event: Event) -> bool:
         """Counts an event, and what it says of the ticks of a site; returns False if it is
         there already.
         """
@@ -421,51 +421,53 @@ class SessionAccounts:
             self._accounts[topic] = starts[event.boot]
         account = starts.get(event.boot, self._accounts[topic])
         is_first = account is next(iter(starts.values()))
-        new = self.count(topic, number, account) if is_first else account.take(number)
-        self.hear(event)
+        new = self.count(topic, number, account) if is_first else account.receive(number)
+        self.apply_event(event)
         return new
 
-    def hear(self, event: Event) -> None:
+    def apply_event(self, event: Event) -> None:
         """Counts what an event says of the ticks of a site."""
         if event.member not in self._rates_hz or event.ticks < 0:
             return
         if event.kind == "end":
             self._ends[event.member] = min(event.ticks, self._ticks[event.member])
-            self.expect(event.member, self._ends[event.member])
+            self.add_expected_ticks(event.member, self._ends[event.member])
         elif event.kind == "join" and event.ticks <= self._ticks[event.member]:
             made = self._ends.pop(event.member, 0)
             rate_hz = self._rates_hz[event.member]
             for channel, gap in self._find_start_gaps(event.member, event.boot):
                 base = self._bases.get(self._topic(event.member, channel), 0)
-                gap.begin_anew(
+                gap.begin_next_start(
                     *(count_messages(channel, n, rate_hz) - base for n in (event.ticks, made))
                 )
         elif event.kind == OVERRUN:
             for first, last in re.findall(r"(\d{1,12})-(\d{1,12})", event.command):
                 if int(first) <= int(last) < event.ticks:
-                    self.leave_out(event.member, int(last) + 1, int(last) + 1 - int(first))
+                    self.mark_skipped_ticks(
+                        event.member, int(last) + 1, int(last) + 1 - int(first)
+                    )
         elif event.kind == LAST and event.about in self._rates_hz:
             for channel, gap in self._find_start_gaps(
                 event.about, event.boots.get(event.about, 0)
             ):
                 base = self._bases.get(self._topic(event.about, channel), 0)
-                gap.hear_of(
+                gap.note_published(
                     number_message(channel, event.ticks, self._rates_hz[event.about]) - base
                 )
 
-    def leave_out(self, site: str, tick: int, skipped: int) -> None:
+    def mark_skipped_ticks(self, site: str, tick: int, skipped: int) -> None:
         """Counts nothing as missing of so many ticks before one, which a site did not make."""
         for channel in (topics.STATE, topics.LINK):
             topic = self._topic(site, channel)
             if topic in self._accounts:
                 base = self._bases.get(topic, 0)
                 numbers = skipped_numbers(channel, tick, skipped, self._rates_hz[site])
-                self._accounts[topic].begin_anew(*(number - base for number in numbers))
+                self._accounts[topic].mark_unpublished(*(number - base for number in numbers))
 
     def count(self, topic: str, number: int, account: Account | None = None) -> bool:
         """Counts a message by its number in its channel; returns False if it is there already."""
         base = self._bases.setdefault(topic, number if self._continued else 0)
-        return number < base or (account or self._accounts[topic]).take(number - base)
+        return number < base or (account or self._accounts[topic]).receive(number - base)
 
     def _find_start_gaps(self, site: str, boot: int) -> Iterator[tuple[str, StartGap]]:
         for channel in (topics.STATE, topics.LINK):
@@ -479,7 +481,7 @@ class SessionAccounts:
                 )
                 yield channel, self._start_gaps.setdefault((topic, boot), gap)
 
-    def expect(self, site: str, ticks: int) -> None:
+    def add_expected_ticks(self, site: str, ticks: int) -> None:
         """Counts as missing what a site published in so many ticks and is not there."""
         for channel in (topics.STATE, topics.LINK):
             self._expect(site, channel, count_messages(channel, ticks, self._rates_hz[site]))
@@ -487,13 +489,13 @@ class SessionAccounts:
     def _expect(self, member: str, channel: str, made: int) -> None:
         topic = self._topic(member, channel)
         if topic in self._accounts:
-            self._accounts[topic].expect(made - self._bases.get(topic, 0))
+            self._accounts[topic].add_expected(made - self._bases.get(topic, 0))
 
-    def texts(self) -> dict[str, str]:
+    def format_accounts(self) -> dict[str, str]:
         """Returns the accounts by topic, as a file holds them."""
         return {
             topic: (f"from {base} on: " if (base := self._bases.get(topic, 0)) else "")
-            + account.as_text(*list(self._starts.get(topic, {}).values())[:-1])
+            + account.describe(*list(self._starts.get(topic, {}).values())[:-1])
             for topic, account in self._accounts.items()
             if account.expected or topic.split("/")[-2] in self._rates_hz
         }
@@ -523,19 +525,19 @@ class SessionAccounts:
         }
         ticks = {
             site: min(most, self._ends.get(site, most))
-            - (account.unmade if account is not None else 0)
+            - (account.unpublished if account is not None else 0)
             for site, most in self._ticks.items()
             for account in [accounts.get(site)]
         }
         return Coverage(there, ticks)
 
-    def missing(self) -> Iterator[str]:
+    def describe_missing(self) -> Iterator[str]:
         """Yields a text per site that lacks records."""
         for site in self._rates_hz:
             topic = self._topic(site, topics.STATE)
             account = self._accounts.get(topic)
             if account is not None and account.missing:
-                gaps = account.gap_texts(SHOWN_GAPS, self._bases.get(topic, 0))
+                gaps = account.format_gaps(SHOWN_GAPS, self._bases.get(topic, 0))
                 more = " ..." if len(account.gaps) > len(gaps) else ""
                 yield (
                     f"{site}: {account.missing} of "
@@ -547,7 +549,7 @@ class SessionAccounts:
         """The sites whose event at their end is not there."""
         return [site for site in self._rates_hz if site not in self._ends]
 
-    def describe_tails(self) -> Iterator[str]:
+    def describe_unfinished_sites(self) -> Iterator[str]:
         """Yields a text per site whose end is unknown and whose records end before the scenario
         does.
         """

@@ -132,12 +132,12 @@ class ContentCheck:
         self._newest: dict[str, tuple[int, bytes]] = {}  # by topic: sequence number and payload
         self._log_ns = 0
 
-    def follow(self, topic: str, sequence: int, log_ns: int, payload: bytes) -> None:
+    def accept(self, topic: str, sequence: int, log_ns: int, payload: bytes) -> None:
         """Takes note of a message that a checksum covers; those after it must continue it."""
         self._newest[topic] = sequence, payload
         self._log_ns = max(self._log_ns, log_ns)
 
-    def owns(self, topic: str) -> bool:
+    def owns_channel(self, topic: str) -> bool:
         """True for a channel of the session's members."""
         key = topics.parse_key(topic.removeprefix("/"))
         if key is None or key.session != self._session or key.boot:
@@ -158,7 +158,7 @@ class ContentCheck:
                 continue
             identity = identify_message(message, 1)
             topic = "/" + topics.key(self._session, identity.sender, identity.channel)
-            return topic if self.owns(topic) else ""
+            return topic if self.owns_channel(topic) else ""
         return ""
 
     def describe_channel(self, topic: str) -> dict[str, str]:
@@ -198,11 +198,11 @@ class ContentCheck:
         if topic.startswith(VIZ_ROOT):
             if payload[:2] != CDR_HEAD:
                 raise UnreadableRecord(f"a message of {topic} is not CDR")
-        elif self.owns(topic):
+        elif self.owns_channel(topic):
             self._check_own(topic, sequence, publish_ns, payload)
         else:
             raise UnreadableRecord(f"a message of {topic[:80]!r} is none of this session")
-        self.follow(topic, sequence, log_ns, payload)
+        self.accept(topic, sequence, log_ns, payload)
 
     def _decode(self, topic: str, payload: bytes) -> tuple[AnyMessage, MessageIdentity]:
         member, channel = topic.split("/")[-2:]

@@ -167,7 +167,7 @@ class LogFile:
 
     Attributes:
         size: its bytes; all of them were flushed.
-        trouble: the first error of the disk, or None.
+        disk_error: the first error of the disk, or None.
 
     Raises:
         UsageError: it exists, or cannot be made.
@@ -187,7 +187,7 @@ class LogFile:
         self.path = path
         self.working = working or active_path(path)
         self.size = 0
-        self.trouble: OSError | None = None
+        self.disk_error: OSError | None = None
         self._force = force
         try:
             refuse_existing(path, force=force, unfinished=self.working)
@@ -224,16 +224,16 @@ class LogFile:
                 same if the reserved space sufficed. The end of the file may follow, and nothing
                 else.
         """
-        if self._broken and self.trouble:
-            raise self.trouble
+        if self._broken and self.disk_error:
+            raise self.disk_error
         try:
-            if self._pending and not self.trouble:
+            if self._pending and not self.disk_error:
                 self._room.grow(len(self._pending) + self._owed + RESERVE_MARGIN_BYTES)
             self._put()
-            if not self.trouble:
+            if not self.disk_error:
                 self._syncing.sync_new()
         except OSError as error:
-            self.trouble = self.trouble or error
+            self.disk_error = self.disk_error or error
             self._room.release()
             try:
                 self._put()
@@ -279,7 +279,7 @@ class LogFile:
             if self.whole:
                 os.fsync(self._raw.fileno())
         except OSError as error:
-            self.trouble = self.trouble or error
+            self.disk_error = self.disk_error or error
             raise
         finally:
             self._raw.close()
@@ -308,9 +308,9 @@ class LogFile:
         try:
             self.close()
         except OSError as failure:
-            raise self.refused(self.trouble or failure) from None
-        if isinstance(error, LogRefused) and self.trouble is not None:
-            raise self.refused(self.trouble) from None
+            raise self.refused(self.disk_error or failure) from None
+        if isinstance(error, LogRefused) and self.disk_error is not None:
+            raise self.refused(self.disk_error) from None
 
     def __enter__(self) -> "LogFile":
         return self
@@ -331,7 +331,7 @@ class LogFile:
         if not self.size:
             return LogRefused(f"{self.path}: {what}; nothing was written; {advice}")
         # another program has what it should replace open, on Windows
-        if self.whole and self.trouble is None:
+        if self.whole and self.disk_error is None:
             return LogRefused(
                 f"{self.path}: {what}; the finished log is {self.working}: give it a name"
             )

@@ -290,16 +290,16 @@ class Log(Result, Mapping[str, SiteLog]):
                 self._topic(name, topics.LINK): [stats.tick for stats in self.link_stats(name)],
             }
             for topic in (*sequences, self._topic(name, topics.EVENT)):
-                accounts.open(topic)
+                accounts.open_channel(topic)
             for topic, numbers in sequences.items():
                 for number in numbers:
-                    accounts.take(topic, number)
+                    accounts.receive(topic, number)
         for event in self.events:
             if event.member in self.sites and event.n >= 0:
-                accounts.take_event(self._topic(event.member, topics.EVENT), event.n, event)
+                accounts.receive_event(self._topic(event.member, topics.EVENT), event.n, event)
         for name, ticks in self._stated_ticks.items():
-            accounts.expect(name, ticks)
-        return {**accounts.texts(), **written}
+            accounts.add_expected_ticks(name, ticks)
+        return {**accounts.format_accounts(), **written}
 
     def account(self, site: str) -> str:
         """Returns what arrived of a site's records and what is missing; "" in an unfinished

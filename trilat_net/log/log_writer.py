@@ -158,7 +158,7 @@ class LogWriter:
     def most_bytes(self) -> int:
         """Largest length of the file without its accounts, if it were finished now."""
         views = self._views.most_bytes if self._views is not None else 0
-        return self._file.position + self._file.pending + self._file.owed + views
+        return self._file.position + self._file.open_chunk_bytes + self._file.end_bytes + views
 
     def add(
         self,
@@ -338,7 +338,7 @@ class LogParts:
         opened: opens a file by name; by default `LogFile`.
 
     Attributes:
-        so_far: returns the accounts for a part that is full.
+        current_accounts: returns the accounts for a part that is full.
 
     Raises:
         UsageError: the name is taken, or the file cannot be made.
@@ -354,7 +354,7 @@ class LogParts:
         self._opened = opened or (
             lambda path: LogFile(path, force=storage.force, durable=storage.durable)
         )
-        self.so_far: Callable[[], Mapping[str, str]] = dict
+        self.current_accounts: Callable[[], Mapping[str, str]] = dict
         self._storage = storage
         self._begin_log = begin
         self._number, self._previous = storage.first()
@@ -379,12 +379,14 @@ class LogParts:
             self._writer = self._begin_log(file, part)
         except LogRefused as error:
             file.discard()
-            raise (error if file.trouble is None else file.refused(file.trouble)) from None
+            raise (
+                error if file.disk_error is None else file.refused(file.disk_error)
+            ) from None
         self._since_ns = None
         self._previous = path.name
 
     def _roll(self) -> None:
-        self._writer.finish(self.so_far())
+        self._writer.finish(self.current_accounts())
         self._previous_digest = self._writer.records_digest
         self._before_bytes += self._writer.written_bytes
         self._file.end()

@@ -57,7 +57,9 @@ class FileCheck:
         ] = {}  # of the last chunk: log times and places, by channel
         self._unreadable = False  # something unreadable may have named a channel
 
-    def take(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
+    def check_record(
+        self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
+    ) -> None:
         """Checks one record of the file; `data` is what a chunk holds, empty if it cannot be
         unpacked.
         """

@@ -119,12 +119,12 @@ class McapWriter:
         return record
 
     @property
-    def owed(self) -> int:
+    def end_bytes(self) -> int:
         """Most bytes that `finish` will write besides the open chunk."""
         return sum(map(len, self._summary.values())) + 10 * len(self._counts) + _OWED_ALWAYS
 
     @property
-    def pending(self) -> int:
+    def open_chunk_bytes(self) -> int:
         """Most bytes that the open chunk will take."""
         if not self._open:
             return 0
@@ -212,7 +212,7 @@ class McapWriter:
         if self._open:
             self._close_chunk()
         if self._reserve is not None:
-            self._reserve(self.owed)
+            self._reserve(self.end_bytes)
         self._stream.flush()
 
     def close_digest(self) -> dict[str, str]:

@@ -125,7 +125,7 @@ class Recovery(Result):
             "digest_chain": str(self.chain) or None,
         }
 
-    def lose(self, what: str, size: int = 0) -> None:
+    def add_loss(self, what: str, size: int = 0) -> None:
         """Adds a loss of so many bytes."""
         self.lost.append(what)
         self.lost_bytes += size
@@ -222,8 +222,8 @@ def _recover(
         file.close()
     except BaseException:
         file.discard()
-        if file.trouble is not None:
-            raise file.refused(file.trouble) from None
+        if file.disk_error is not None:
+            raise file.refused(file.disk_error) from None
         raise
     return result
 
@@ -298,7 +298,7 @@ class _FileCopy:
             try:
                 self._define(opcode, content)
             except UnreadableRecord as error:
-                result.lose(f"a definition: {error}", len(content))
+                result.add_loss(f"a definition: {error}", len(content))
         for kind, number in sorted(self._defined):
             if kind == Opcode.CHANNEL and self._is_plausible(self._defined[kind, number].topic):
                 self._open_channel(number)  # with or without messages
@@ -338,14 +338,14 @@ class _FileCopy:
         try:
             self._take(frame, content, data)
         except UnreadableRecord as error:
-            self._result.lose(
+            self._result.add_loss(
                 f"{count_nouns(frame.size, 'byte')} at byte {frame.offset}: {error}", frame.size
             )
 
     def _report_damaged(self) -> None:
         for damage in self._scanner.damaged[self._reported :]:
             if damage.offset <= self._data_end:
-                self._result.lose(str(damage), damage.length)
+                self._result.add_loss(str(damage), damage.length)
         self._reported = len(self._scanner.damaged)
 
     def _take(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
@@ -389,7 +389,7 @@ class _FileCopy:
             problem = problem or "it is not that of this session"
         if problem:
             name = f"{name}{DAMAGED_SUFFIX}"
-            self._result.lose(f"attachment {entry.name}: {problem}; it is kept as {name}")
+            self._result.add_loss(f"attachment {entry.name}: {problem}; it is kept as {name}")
         self._out.add_attachment(
             create_time=entry.create_time,
             log_time=entry.log_time,
@@ -459,9 +459,9 @@ class _FileCopy:
             )
             self._is_empty = False
             if self._content is not None:
-                self._content.follow(new[1], sequence, log_ns, payload)
+                self._content.accept(new[1], sequence, log_ns, payload)
             if self._accounts is not None:
-                self._accounts.take(new[1], sequence, payload)
+                self._accounts.receive(new[1], sequence, payload)
 
     def _take_unproven(
         self, inner: Iterable[tuple[int, bytes]], span_ns: tuple[int, int]
@@ -515,7 +515,7 @@ class _FileCopy:
         members.
         """
         is_own = topic.startswith(f"/{topics.ROOT}/")
-        return self._content is None or not is_own or self._content.owns(topic)
+        return self._content is None or not is_own or self._content.owns_channel(topic)
 
     def _find_channel(self, number: int, payload: bytes) -> tuple[int, str] | None:
         """Returns the number of a channel in the new file, and its topic; None if nothing tells
@@ -577,10 +577,10 @@ class _FileCopy:
     def _keep_channel(self, number: int | None, channel: int, topic: str) -> tuple[int, str]:
         if number is not None:
             self._new_channels[number] = channel, topic
-        if self._content is not None and self._content.owns(topic):
+        if self._content is not None and self._content.owns_channel(topic):
             self._new_topics.setdefault(topic, (channel, topic))
         if self._accounts is not None:
-            self._accounts.open(topic)
+            self._accounts.open_channel(topic)
         return channel, topic
 
     def _take_torn(self, torn: mcap_records.Damage) -> None:
@@ -588,13 +588,13 @@ class _FileCopy:
         if not torn.length or opcode in _MADE_AGAIN or torn.offset > self._data_end:
             return
         if opcode != Opcode.CHUNK:
-            self._result.lose(str(torn), torn.length)
+            self._result.add_loss(str(torn), torn.length)
             return
         before = self._out.messages
         problem = self._salvage(torn.offset)
         self._result.salvaged = self._out.messages - before
         why = f" before {problem}" if problem else ""
-        self._result.lose(
+        self._result.add_loss(
             f"the end of a chunk that was cut off at byte {torn.offset}; of its "
             f"{count_nouns(torn.length, 'byte')} "
             f"{count_nouns(self._result.salvaged, 'message')} could be saved{why}",
@@ -619,17 +619,17 @@ class _FileCopy:
         result = self._result
         stated = self._survey.count
         for number, count in self._unnamed.items():
-            result.lose(
+            result.add_loss(
                 f"{count_nouns(count, 'message')} of channel {number}, which no record names"
             )
         for topic in self._bare:
-            result.lose(f"the schema of {topic}")
+            result.add_loss(f"the schema of {topic}")
         for topic in self._misnamed:
-            result.lose(
+            result.add_loss(
                 f"the definition of {topic}; its messages name it, and it was made again"
             )
         for number in self._contradicted:
-            result.lose(f"what channel or schema {number} is: the file says it in two ways")
+            result.add_loss(f"what channel or schema {number} is: the file says it in two ways")
         survey = self._survey
         has_head = SESSION in survey.metadata and SCENARIO in survey.attachments
         if self.is_session_log and not has_head:
@@ -642,7 +642,7 @@ class _FileCopy:
             # lists show the first losses
             result.lost.insert(0, f"{lacks}; {_UNOPENED}{advice}")
         if stated is not None and self._out.messages < stated and result.lossless:
-            result.lose(
+            result.add_loss(
                 f"{stated - self._out.messages} of the {count_nouns(stated, 'message')} that it says it has"
             )
 
@@ -655,10 +655,10 @@ class _FileCopy:
         if SESSION in self._survey.metadata:
             result.chain = self._judge_source()
         if accounts is not None:
-            result.missing = list(accounts.missing())
+            result.missing = list(accounts.describe_missing())
             # else the end is in a later part
             if not (result.finished and PART in self._survey.metadata):
-                result.missing += accounts.describe_tails()
+                result.missing += accounts.describe_unfinished_sites()
             result.coverage = accounts.coverage()
             before = self._survey.metadata.get(ACCOUNTS, {})
             alone = (
@@ -666,12 +666,12 @@ class _FileCopy:
             )
             if alone and any(
                 parse_counts(before.get(topic, "")) not in ({}, parse_counts(text))
-                for topic, text in accounts.texts().items()
+                for topic, text in accounts.format_accounts().items()
                 if topic.endswith(f"/{topics.STATE}")
             ):
                 result.chain = DigestState.CHANGED
             counts = {name: text for name, text in before.items() if not name.startswith("/")}
-            self._out.add_metadata(ACCOUNTS, {**accounts.texts(), **counts})
+            self._out.add_metadata(ACCOUNTS, {**accounts.format_accounts(), **counts})
         self._out.add_metadata(RECOVERED, result.facts())
         if accounts is not None:
             self._out.close_digest()

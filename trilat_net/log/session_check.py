@@ -220,7 +220,7 @@ class ChannelCheck:
                 )
             self._count(message, number, stored.publish_time_ns, offset)
         elif isinstance(message, messages.Event):
-            self._accounts.hear(message)
+            self._accounts.apply_event(message)
         self._check_times(stored, number, identity.sent_ns, offset)
 
     def _add(self, check: str, offset: int | None, text: str) -> None:
@@ -232,16 +232,16 @@ class ChannelCheck:
             return
         self.boots.add(message.boot)
         # parts may repeat a message, a file may not
-        if not self._in_file[message.boot].take(number):
+        if not self._in_file[message.boot].receive(number):
             self._add("sequence", offset, f"number {number} is there twice")
         if isinstance(message, messages.Event):
-            self.received += self._accounts.take_event(self._topic, number, message)
+            self.received += self._accounts.receive_event(self._topic, number, message)
         else:
             self.received += self.kind == topics.STATS or self._accounts.count(
                 self._topic, number
             )
         if self.rate_hz and isinstance(message, messages.State) and message.cmd:
-            self._accounts.leave_out(
+            self._accounts.mark_skipped_ticks(
                 self.member, message.tick, count_skipped_ticks(message.cmd)
             )
         place = (number, publish_ns)
@@ -306,7 +306,7 @@ class SessionCheck:
         """
         reader = McapReader(stream, file, progress, kept=False)
         structure = FileCheck(file, reader.scanner, self._findings)
-        reader.watch = structure.take
+        reader.watch = structure.check_record
         if reader.scanner.begins:
             self._read_messages(file, reader)
         structure.finish()
@@ -368,7 +368,9 @@ class SessionCheck:
             # events may tell of them first
             for name in self._scenario.names if self._scenario else ():
                 for channel in (topics.STATE, topics.LINK):
-                    self._counted.open("/" + topics.key(about["session"], name, channel))
+                    self._counted.open_channel(
+                        "/" + topics.key(about["session"], name, channel)
+                    )
 
     def _check_scenario(self, text: bytes) -> None:
         finding = self._findings["scenario"]
@@ -425,7 +427,7 @@ class SessionCheck:
         if topic not in self.channels:
             if self._scenario and key.member not in (*self._scenario.sites, topics.RECORDER):
                 finding.add(self._file, None, f"{topic[:80]}: the scenario has no such member")
-            self._counted.open(topic)
+            self._counted.open_channel(topic)
             of = self._about, self._scenario, self._findings, self._counted
             self.channels[topic] = ChannelCheck(key, *of)
         self.channels[topic].begin(self._file, channel)

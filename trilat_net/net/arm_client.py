@@ -101,7 +101,7 @@ class SiteClient:
         self._record: State | None = None
         self._came_ns = 0
         self._present = self._gone = False
-        self._records = bus.stamped(
+        self._records = bus.stamped_inbox(
             topics.key(session, site, topics.STATE), clock.monotonic_ns, bytes, 64
         )
         self._events = bus.inbox(topics.key(session, site, topics.EVENT), 256)

@@ -43,7 +43,7 @@ class Query(Protocol):
     def payload(self) -> bytes:
         """The payload of the query; b"" without one."""
 
-    def answer(self, payload: bytes) -> None:
+    def reply(self, payload: bytes) -> None:
         """Answers it."""
 
 
@@ -64,7 +64,7 @@ class Bus(Protocol):
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
         """Returns a ring of the messages that others publish under a key expression."""
 
-    def stamped(
+    def stamped_inbox(
         self,
         key: str,
         now_ns: Callable[[], int],
@@ -81,7 +81,7 @@ class Bus(Protocol):
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """Calls back with (key, payload) on arrival, in a thread of the bus."""
 
-    def questions(self, key: str) -> QueryInbox:
+    def query_inbox(self, key: str) -> QueryInbox:
         """Returns a ring of the queries of others under a key."""
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
@@ -90,7 +90,7 @@ class Bus(Protocol):
         `answer` is short, because messages wait meanwhile, and raises nothing.
         """
 
-    def ask(self, key: str, payload: bytes = b"") -> Inbox:
+    def query(self, key: str, payload: bytes = b"") -> Inbox:
         """Queries all who answer under a key expression; returns the ring of their answers."""
 
     def announce(self, key: str) -> None:
@@ -148,7 +148,7 @@ class StampingRing(BoundedRing[tuple[T, int]]):
         self._now_ns = now_ns
         self._read = read
 
-    def take(self, payload: bytes) -> None:
+    def receive(self, payload: bytes) -> None:
         """Stamps a message, reads it and appends it."""
         now_ns = self._now_ns()
         self._entries.append((self._read(payload), now_ns))

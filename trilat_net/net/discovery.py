@@ -186,7 +186,7 @@ def send_change(
 
 
 def _ask_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | None:
-    replies = bus.ask(key, encode(request))
+    replies = bus.query(key, encode(request))
     give_up_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
     while clock.monotonic_ns() < give_up_ns:
         clock.sleep_until(clock.monotonic_ns() + POLL_NS)

@@ -208,7 +208,7 @@ def _order(known: Sequence[KnownSite], sites: Sequence[str], keys: str) -> bool:
             if now_ns >= ask_ns:  # again: a question reaches those that are connected by then
                 ask_ns = now_ns + ASK_NS
                 keyed = [(site, topics.key(session, site, topics.STOP)) for site in left]
-                asked += [(site, bus.ask(key, known[0].stop), []) for site, key in keyed]
+                asked += [(site, bus.query(key, known[0].stop), []) for site, key in keyed]
             for site, inbox, answers in asked:
                 while (answer := inbox.poll()) is not None:
                     answers.append(msgspec.msgpack.decode(answer[1]))

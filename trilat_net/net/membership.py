@@ -84,7 +84,7 @@ class EventPublisher:
         self.published = 0
         self._keep = keep
         self._publish = bus.publisher(topics.key(session, info.member, topics.EVENT))
-        self._queries = bus.questions(topics.key(session, info.member, topics.INFO))
+        self._queries = bus.query_inbox(topics.key(session, info.member, topics.INFO))
 
     def publish(self, kind: str, text: str, **fields: object) -> Event:
         """Publishes a numbered event and returns it."""
@@ -103,7 +103,7 @@ class EventPublisher:
     def answer_queries(self) -> None:
         """Answers every query for the identity that waits."""
         while (query := self._queries.poll()) is not None:
-            query.answer(encode(self.info))
+            query.reply(encode(self.info))
 
 
 class MemberQuery:
@@ -164,7 +164,7 @@ class Membership:
         sites: Sequence[str],
         late: LateSites,
     ) -> None:
-        self.met: dict[str, Info] = {}
+        self.others: dict[str, Info] = {}
         self.alive: set[str] = set()
         self.gone: set[str] = set()
         self._session = session
@@ -177,14 +177,14 @@ class Membership:
         self._recorders: set[str] = set()
 
     @property
-    def own(self) -> Info:
+    def local_info(self) -> Info:
         """The member's own identity."""
         return self._publisher.info
 
     @property
-    def leads(self) -> bool:
+    def is_leader(self) -> bool:
         """True if this member is the first site of the scenario."""
-        return self._sites[:1] == (self.own.member,)
+        return self._sites[:1] == (self.local_info.member,)
 
     @property
     def unreadable(self) -> dict[str, str]:
@@ -196,43 +196,43 @@ class Membership:
 
     def boots(self) -> dict[str, int]:
         """Returns the boots of all members present, including its own."""
-        return {name: info.boot for name, info in self.met.items()} | {
-            self.own.member: self.own.boot
+        return {name: info.boot for name, info in self.others.items()} | {
+            self.local_info.member: self.local_info.boot
         }
 
     def clocks(self) -> dict[str, str]:
         """Returns the identities of their clocks."""
-        return {name: info.clock for name, info in self.met.items()} | {
-            self.own.member: self.own.clock
+        return {name: info.clock for name, info in self.others.items()} | {
+            self.local_info.member: self.local_info.clock
         }
 
-    def missing(self) -> list[str]:
+    def list_missing(self) -> list[str]:
         """Returns the members that have not been met."""
-        needed = any(info.needs_recorder for info in (self.own, *self.met.values()))
+        needed = any(info.needs_recorder for info in (self.local_info, *self.others.values()))
         recorder = [topics.RECORDER] if needed or self._recorders else []
         return [
             name
             for name in (*self._sites, *recorder)
-            if name != self.own.member
-            and name not in self.met
+            if name != self.local_info.member
+            and name not in self.others
             and name not in self._late.without
         ]
 
-    def begins_anew(self, name: str, boot: int) -> bool:
+    def has_restarted(self, name: str, boot: int) -> bool:
         """True if another start of a member is here, and the one of this boot is not."""
-        met = self.met.get(name)
+        met = self.others.get(name)
         return met is not None and met.boot != boot and str(boot) not in self.alive
 
-    def running(self) -> list[Info]:
+    def list_running(self) -> list[Info]:
         """Returns the sites of a running session that were met, of those that agree on its
         other members.
         """
         infos = [
             info
-            for _, info in sorted(self.met.items())
+            for _, info in sorted(self.others.items())
             if info.running and info.scenario and info.boots.get(info.member) == info.boot
         ]
-        own = {self.own.member: self.own.boot}  # some may have admitted it
+        own = {self.local_info.member: self.local_info.boot}  # some may have admitted it
         return [info for info in infos if info.boots | own == infos[0].boots | own]
 
     def poll(self, *, invited: bool) -> None:
@@ -244,23 +244,23 @@ class Membership:
             SessionError: this member cannot be part of the session.
         """
         for info in self._query.poll():
-            self.take(info, invited=invited)
+            self.receive_identity(info, invited=invited)
         for parts, alive in topics.read_presence(self._presence):
             if parts.member == topics.RECORDER:
                 (self._recorders.add if alive else self._recorders.discard)(parts.boot)
             (self.gone.discard if alive else self.gone.add)(parts.boot)
             (self.alive.add if alive else self.alive.discard)(parts.boot)
-            met = self.met.get(parts.member)
+            met = self.others.get(parts.member)
             if not alive and met is not None and str(met.boot) == parts.boot:
-                del self.met[parts.member]
+                del self.others[parts.member]
 
-    def take(self, info: Info, *, invited: bool) -> None:
+    def receive_identity(self, info: Info, *, invited: bool) -> None:
         """Takes the identity of a member.
 
         Raises:
             SessionError: this member cannot be part of the session.
         """
-        own = self.own
+        own = self.local_info
         if info.boot == own.boot or (not self._sites and info.member == topics.RECORDER):
             return
         comes_late = self._late.returns and info.member != own.member
@@ -281,23 +281,26 @@ class Membership:
                 )
             self._refuse(info)
             return
-        if info.member == topics.RECORDER and self.met.get(info.member, info).boot != info.boot:
+        if (
+            info.member == topics.RECORDER
+            and self.others.get(info.member, info).boot != info.boot
+        ):
             return  # of several recorders the first one met is the member
         if not self._sites or info.member in self._sites or info.member == topics.RECORDER:
-            self.met[info.member] = info
+            self.others[info.member] = info
 
     def _refuse(self, info: Info) -> None:
         """Leaves the session of a leader with another scenario; as the leader, publishes a
         refusal.
         """
-        own = self.own
+        own = self.local_info
         text = (
             f"another scenario: {info.member} has {info.scenario_sha256[:16]}, "
             f"{own.member} has {own.scenario_sha256[:16]}"
         )
-        if not self.leads and info.member == self._sites[0]:
+        if not self.is_leader and info.member == self._sites[0]:
             raise SessionError(f"{text}; the one of {info.member}, who leads, counts")
-        if self.leads and info.boot not in self._refused:
+        if self.is_leader and info.boot not in self._refused:
             self._refused.add(info.boot)
             self._publisher.publish("refused", text, about=info.member)
 

@@ -43,7 +43,7 @@ _ROUNDS = 3
 class OffsetLimit(NamedTuple):
     """Upper limit (ceiling) or lower limit (floor) of an offset at an instant of the own clock."""
 
-    at_ns: int
+    local_ns: int
     offset_ns: int
 
 
@@ -52,7 +52,7 @@ class OffsetEstimate(NamedTuple):
     their limits.
     """
 
-    at_ns: int
+    local_ns: int
     offset_ns: int
     drift: float
     low_ns: int
@@ -60,20 +60,20 @@ class OffsetEstimate(NamedTuple):
     drift_low: float
     drift_high: float
 
-    def offset_at(self, at_ns: int) -> int:
+    def extrapolate_ns(self, at_ns: int) -> int:
         """Returns the offset at another instant, ns."""
-        return self.offset_ns + round((at_ns - self.at_ns) * self.drift / NS_PER_S)
+        return self.offset_ns + round((at_ns - self.local_ns) * self.drift / NS_PER_S)
 
-    def including(self, *limits: OffsetLimit | None) -> "OffsetEstimate":
+    def widen(self, *limits: OffsetLimit | None) -> "OffsetEstimate":
         """Returns the same, widened to include limits that contradict it."""
         offsets = [limit.offset_ns for limit in limits if limit is not None]
         return self._replace(
             low_ns=min([self.low_ns, *offsets]), high_ns=max([self.high_ns, *offsets])
         )
 
-    def bound_at(self, at_ns: int, offset_ns: int) -> int:
+    def error_bound_ns(self, at_ns: int, offset_ns: int) -> int:
         """Returns the largest distance of the offset from a value at another instant, ns."""
-        passed_s = (at_ns - self.at_ns) / NS_PER_S
+        passed_s = (at_ns - self.local_ns) / NS_PER_S
         up = self.drift_high
         down = self.drift_low
         if passed_s < 0.0:
@@ -88,7 +88,7 @@ def exact_offset(offset_ns: int) -> OffsetEstimate:
     clock.
     """
     return OffsetEstimate(
-        at_ns=0,
+        local_ns=0,
         offset_ns=offset_ns,
         drift=0.0,
         low_ns=offset_ns,
@@ -163,7 +163,7 @@ class _Lines:
 
     def _columns(self, limits: deque[OffsetLimit]) -> tuple[Array, Array]:
         times = np.array(
-            [min(0, limit.at_ns - self._now_ns) for limit in limits], dtype=np.float64
+            [min(0, limit.local_ns - self._now_ns) for limit in limits], dtype=np.float64
         )
         values = np.array(
             [limit.offset_ns - self._base_ns for limit in limits], dtype=np.float64
@@ -181,7 +181,7 @@ class _Lines:
         high = np.min(self._widest - self.steepest * self._above_s)
         low = np.max(self._lowest - self.flattest * self._below_s)
         return OffsetEstimate(
-            at_ns=self._now_ns,
+            local_ns=self._now_ns,
             offset_ns=self._base_ns + round(middle),
             drift=slope,
             low_ns=self._base_ns + int(np.floor(low)),
@@ -227,24 +227,24 @@ class _SlewSegment:
         self.from_ns = from_ns
         self.estimate = estimate
         self._joined_ns = from_ns + SLEW_NS
-        self._joined_offset_ns = estimate.offset_at(self._joined_ns)
+        self._joined_offset_ns = estimate.extrapolate_ns(self._joined_ns)
         self._approach = (self._joined_offset_ns - offset_ns) / SLEW_NS
         self._drift = estimate.drift / NS_PER_S
         self.bound_ns = max(
-            estimate.bound_at(from_ns, offset_ns),
-            estimate.bound_at(self._joined_ns, self._joined_offset_ns),
+            estimate.error_bound_ns(from_ns, offset_ns),
+            estimate.error_bound_ns(self._joined_ns, self._joined_offset_ns),
         )
 
-    def at(self, at_ns: int) -> int:
+    def evaluate_ns(self, at_ns: int) -> int:
         passed_ns = at_ns - self._joined_ns
         return self._joined_offset_ns + int(
             passed_ns * (self._approach if passed_ns < 0 else self._drift)
         )
 
-    def bound_at(self, at_ns: int) -> int:
+    def error_bound_ns(self, at_ns: int) -> int:
         if self.from_ns <= at_ns <= self._joined_ns:
             return self.bound_ns
-        return self.estimate.bound_at(at_ns, self.at(at_ns))
+        return self.estimate.error_bound_ns(at_ns, self.evaluate_ns(at_ns))
 
 
 class SlewedOffset:
@@ -252,7 +252,7 @@ class SlewedOffset:
 
     def __init__(self, estimate: OffsetEstimate) -> None:
         self._segment = self._before = _SlewSegment(
-            estimate.at_ns, estimate.offset_ns, estimate
+            estimate.local_ns, estimate.offset_ns, estimate
         )
 
     @property
@@ -267,20 +267,24 @@ class SlewedOffset:
 
     def slew_to(self, at_ns: int, estimate: OffsetEstimate) -> None:
         """Slews to a new estimate from an instant of the own clock on."""
-        segment = _SlewSegment(at_ns, self.at(at_ns), estimate)
+        segment = _SlewSegment(at_ns, self.evaluate_ns(at_ns), estimate)
         self._before = self._segment
         self._segment = segment
 
-    def at(self, at_ns: int) -> int:
+    def evaluate_ns(self, at_ns: int) -> int:
         """Returns the offset at an instant, not before the last but one `slew_to`, ns."""
         segment = self._segment
-        return segment.at(at_ns) if at_ns >= segment.from_ns else self._before.at(at_ns)
+        return (
+            segment.evaluate_ns(at_ns)
+            if at_ns >= segment.from_ns
+            else self._before.evaluate_ns(at_ns)
+        )
 
-    def bound_at(self, at_ns: int) -> int:
+    def error_bound_ns(self, at_ns: int) -> int:
         """Returns its largest error at such an instant, ns."""
         segment = self._segment
         return (
-            segment.bound_at(at_ns)
+            segment.error_bound_ns(at_ns)
             if at_ns >= segment.from_ns
-            else self._before.bound_at(at_ns)
+            else self._before.error_bound_ns(at_ns)
         )

@@ -38,7 +38,7 @@ class RepeatedQuery:
         now_ns = self._clock.monotonic_ns()
         due = not self._open or now_ns - self._open[-1][0] >= every_ns
         if due:
-            self._open.append((now_ns, self._bus.ask(self._key)))
+            self._open.append((now_ns, self._bus.query(self._key)))
         return due
 
     def poll(self) -> tuple[int, str, bytes] | None:
@@ -105,7 +105,7 @@ def answer_backfill(
         "payloads": payloads,
         "made": made,
     }
-    query.answer(encode(Backfill(member=member, boot=boot, **found)))
+    query.reply(encode(Backfill(member=member, boot=boot, **found)))
     return len(payloads)
 
 
@@ -127,11 +127,11 @@ class RoundTrips:
         self._agreeing = 0
 
     @property
-    def known(self) -> bool:
+    def is_known(self) -> bool:
         """True once there are enough round trips that agree."""
         return self._agreeing >= self._enough
 
-    def take(self, asked_ns: int, pong: Pong, now_ns: int) -> None:
+    def receive(self, asked_ns: int, pong: Pong, now_ns: int) -> None:
         """Takes one round trip; ignores an impossible one."""
         rtt_ns = now_ns - asked_ns - (pong.left_ns - pong.came_ns)
         if rtt_ns < 0 or pong.left_ns < pong.came_ns:
@@ -149,7 +149,7 @@ class RoundTrips:
         drift = self.latest.drift / NS_PER_S if self.latest else 0.0
 
         def offset_now(limit: OffsetLimit) -> float:
-            return limit.offset_ns - drift * (limit.at_ns - now_ns)
+            return limit.offset_ns - drift * (limit.local_ns - now_ns)
 
         ceilings, floors = zip(*self._window, strict=True)
         self._window = []
@@ -173,7 +173,7 @@ class Pinger:
         """Sends a ping if it is due, and takes the answers that have arrived from the boots
         wanted.
         """
-        pace_ns = PING_REST_NS if self.know(wanted) else PING_PACE_NS
+        pace_ns = PING_REST_NS if self.knows_clocks(wanted) else PING_PACE_NS
         if wanted and self._query.repeat(pace_ns):
             self._glance_until_ns = (
                 self._clock.monotonic_ns() + 2 * self.slowest_ns() + _STRAGGLE_NS
@@ -188,11 +188,11 @@ class Pinger:
                 continue  # a stranger's
             if parts is not None and parts.member == pong.member and pong.boot in wanted:
                 trips = self.trips.setdefault(pong.boot, RoundTrips(self._enough))
-                trips.take(asked_ns, pong, now_ns)
+                trips.receive(asked_ns, pong, now_ns)
 
-    def know(self, boots: Collection[int]) -> bool:
+    def knows_clocks(self, boots: Collection[int]) -> bool:
         """True once the clocks of all these members are known."""
-        return all(boot in self.trips and self.trips[boot].known for boot in boots)
+        return all(boot in self.trips and self.trips[boot].is_known for boot in boots)
 
     def estimate(self, boot: int) -> OffsetEstimate:
         """Returns the latest estimate of a member's clock; exactly the own clock without pings
@@ -222,7 +222,7 @@ def describe_clocks(pinger: Pinger, boots: Mapping[str, int], at_ns: int) -> lis
     for name, boot in boots.items():
         if boot in pinger.trips:
             estimate = pinger.estimate(boot)
-            offset_ns = estimate.offset_at(at_ns)
-            offset = format_offset(offset_ns, estimate.bound_at(at_ns, offset_ns))
+            offset_ns = estimate.extrapolate_ns(at_ns)
+            offset = format_offset(offset_ns, estimate.error_bound_ns(at_ns, offset_ns))
             texts.append(f"clock of {name}: another one, {offset}")
     return texts

@@ -225,7 +225,7 @@ class TopicPublisher:
         self._number = 0
 
     @property
-    def heard(self) -> bool:
+    def has_subscribers(self) -> bool:
         """True while somebody listens, or may come later: else a message need not be made."""
         return self._latched or bool(self._declared.matching_status.matching)
 

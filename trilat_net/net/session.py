@@ -81,7 +81,9 @@ class SessionJoin:
     @property
     def reason(self) -> str:
         """Why this site has not joined a running session, "" if there is none or nobody said."""
-        lacking = sorted({info.member for info in self.membership.running()} - self._admitted)
+        lacking = sorted(
+            {info.member for info in self.membership.list_running()} - self._admitted
+        )
         if self._coming is None or not lacking:
             return self.refusal
         return self.refusal or f"{', '.join(lacking)} did not admit it to the running session"
@@ -106,17 +108,17 @@ class SessionJoin:
         membership = self.membership
         now_ns = self._clock.monotonic_ns()
         self._publisher.answer_queries()
-        membership.poll(invited=self._announced is not None and not membership.leads)
+        membership.poll(invited=self._announced is not None and not membership.is_leader)
         self.pinger.poll(self._other_clocks(membership.boots(), membership.clocks()))
         epoch = self._read_events()
         if epoch is None:
             self._reply_ready()
-            running = membership.running()
+            running = membership.list_running()
             if running and (self._late.returns or not self._sites):
                 # else `start` may be under way
                 if self._announced is None or now_ns >= self._epoch_ns:
                     epoch = self._join_late(running, now_ns)
-            elif membership.leads:
+            elif membership.is_leader:
                 epoch = self._lead()
             if not running:
                 self._met_ns = None
@@ -133,25 +135,25 @@ class SessionJoin:
         sites = {
             name
             for name, boot in running[0].boots.items()
-            if str(boot) not in found.gone and not found.begins_anew(name, boot)
+            if str(boot) not in found.gone and not found.has_restarted(name, boot)
         } - {topics.RECORDER, self._own.member}
         if {info.member for info in running} < sites and now_ns - self._met_ns < LATE_GATHER_NS:
             return None
         own = self._own.clock
         foreign = {info.boot for info in running if info.clock != own}
-        if self._sites and not self.pinger.know(foreign):
+        if self._sites and not self.pinger.knows_clocks(foreign):
             return None
         # ticks follow the grid of the first site
         places = {name: n for n, name in enumerate(self._sites)}
         for info in sorted(
             running, key=lambda info: (info.clock != own, places.get(info.member, -1))
         ):
-            if info.clock == own or self.pinger.know([info.boot]):
+            if info.clock == own or self.pinger.knows_clocks([info.boot]):
                 # as the clocks stand now: their drift apart since the epoch is unknown
                 offset_ns = (
                     0
                     if info.clock == own
-                    else self.pinger.estimate(info.boot).offset_at(now_ns)
+                    else self.pinger.estimate(info.boot).extrapolate_ns(now_ns)
                 )
                 epoch = Epoch(info.epoch_mono_ns - offset_ns, info.epoch_unix_ns, info.boots)
                 if not self._sites:
@@ -240,11 +242,11 @@ class SessionJoin:
         return None
 
     def _consider(self, event: Event) -> None:
-        if self.membership.leads or (self._sites and event.member != self._sites[0]):
+        if self.membership.is_leader or (self._sites and event.member != self._sites[0]):
             return
         if not self._sites and not any(
             info.scenario and event.boots.get(name) == info.boot
-            for name, info in self.membership.met.items()
+            for name, info in self.membership.others.items()
         ):
             return  # a recorder that has not learnt the scenario is not ready
         if event.boots.get(self._own.member) == self._own.boot:
@@ -269,13 +271,15 @@ class SessionJoin:
 
     def _reply_ready(self) -> None:
         event = self._offered
-        if event is None or not self.pinger.know(self._other_clocks(event.boots, event.clocks)):
+        if event is None or not self.pinger.knows_clocks(
+            self._other_clocks(event.boots, event.clocks)
+        ):
             return
         self._offered = None
         self._announced = event
         estimate = self.pinger.estimate(event.boot)
         about_ns = event.epoch_mono_ns - estimate.offset_ns
-        self._epoch_ns = event.epoch_mono_ns - estimate.offset_at(about_ns)
+        self._epoch_ns = event.epoch_mono_ns - estimate.extrapolate_ns(about_ns)
         self._publisher.publish(
             "ready",
             f"{self._own.member} is ready",
@@ -292,11 +296,15 @@ class SessionJoin:
         announced = self._announced
         if announced is None:
             other_clocks = self._other_clocks(membership.boots(), membership.clocks())
-            if not membership.missing() and self.pinger.know(other_clocks):
+            if not membership.list_missing() and self.pinger.knows_clocks(other_clocks):
                 self._announce(now_ns)
             return None
         decide_ns = self._epoch_ns - DECIDE_NS - self.pinger.slowest_ns()
-        if now_ns >= decide_ns or announced.boots != membership.boots() or membership.missing():
+        if (
+            now_ns >= decide_ns
+            or announced.boots != membership.boots()
+            or membership.list_missing()
+        ):
             self._announced = (
                 None  # a member was too late, is gone, or has come: another attempt
             )

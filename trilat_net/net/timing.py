@@ -56,7 +56,7 @@ class TickSchedule:
         passed_ns = k * NS_PER_S // self._rate_hz - self._from_ns
         return self._base_ns + passed_ns + int(passed_ns * self._slew_per_ns)
 
-    def steer(self, k: int, error_ns: int, drift: float) -> None:
+    def adjust_rate(self, k: int, error_ns: int, drift: float) -> None:
         """Slews towards the leader's schedule from a tick on, at or after the last one it was
         steered from.
 
@@ -86,13 +86,13 @@ class SentStamps:
         self._capacity = capacity
         self._entries = array("q", [-1, 0]) * capacity  # tick, time
 
-    def put(self, tick: int, at_ns: int) -> None:
+    def record(self, tick: int, at_ns: int) -> None:
         """Notes the time of sending of a record, on the own clock."""
         slot = 2 * (tick % self._capacity)
         self._entries[slot] = tick
         self._entries[slot + 1] = at_ns
 
-    def at(self, tick: int) -> int | None:
+    def find_ns(self, tick: int) -> int | None:
         """Returns the time of sending of a record, or None if it is no longer known."""
         slot = 2 * (tick % self._capacity)
         return self._entries[slot + 1] if self._entries[slot] == tick else None
@@ -144,7 +144,7 @@ class LinkTimingMonitor:
         self.offset = SlewedOffset(peer.estimate)
         self.newest: tuple[int, int] | None = None
         self.worst_ns = 0
-        self.contradicted = self.unheard = False
+        self.contradicted = self.is_unacknowledged = False
         self._heard_ns = self._acknowledged_ns = -1
         self._acknowledged = -1
         self._epoch_ns = peer.epoch_ns
@@ -161,25 +161,27 @@ class LinkTimingMonitor:
         self._ceiling: OffsetLimit | None = None
         self._floor: OffsetLimit | None = None
 
-    def take(self, sample: PeerSample, arrived_ns: int) -> int:
+    def receive(self, sample: PeerSample, arrived_ns: int) -> int:
         """Takes the stamps of one sample that arrived on the own clock; returns its one-way
         delay, ns.
         """
-        offset_ns = self.offset.at(arrived_ns) if self._shared_ns is None else self._shared_ns
+        offset_ns = (
+            self.offset.evaluate_ns(arrived_ns) if self._shared_ns is None else self._shared_ns
+        )
         sent_ns = sample.sent_ns + self._epoch_ns
         delay_ns = arrived_ns - sent_ns + offset_ns
         self._delays.append(delay_ns)
         if delay_ns < self._back_ns:
             self._back_ns = delay_ns
             self._floor = OffsetLimit(arrived_ns, sent_ns - arrived_ns)
-        if delay_ns < 0 and delay_ns < -self.offset.bound_at(arrived_ns):
+        if delay_ns < 0 and delay_ns < -self.offset.error_bound_ns(arrived_ns):
             self.faults += 1
             self.worst_ns = max(self.worst_ns, -delay_ns)
         if self.newest is None or sample.tick > self.newest[0]:
             self.newest = sample.tick, arrived_ns
         self._heard_ns = arrived_ns
         for place, tick, at_ns in sample.echo:
-            if place == self._place and (own_ns := self._sent.at(tick)) is not None:
+            if place == self._place and (own_ns := self._sent.find_ns(tick)) is not None:
                 if tick > self._acknowledged:
                     self._acknowledged = tick
                     self._acknowledged_ns = arrived_ns
@@ -192,16 +194,16 @@ class LinkTimingMonitor:
                     self._rtt_ns = there_ns + delay_ns
         return delay_ns
 
-    def is_heard(self, now_ns: int) -> bool:
+    def is_receiving(self, now_ns: int) -> bool:
         """True if a sample of the peer arrived within UNHEARD_NS."""
         return self._heard_ns >= 0 and now_ns - self._heard_ns <= UNHEARD_NS
 
-    def hears(self, now_ns: int) -> bool | None:
+    def is_acknowledged(self, now_ns: int) -> bool | None:
         """True if the peer acknowledged a newer sample within UNHEARD_NS.
 
         None before its first acknowledgement, and while it is silent itself.
         """
-        if self._acknowledged < 0 or not self.is_heard(now_ns):
+        if self._acknowledged < 0 or not self.is_receiving(now_ns):
             return None
         return self._heard_ns - self._acknowledged_ns <= UNHEARD_NS
 
@@ -226,21 +228,21 @@ class LinkTimingMonitor:
             self.faults += 1
             self.contradicted = True
         if estimate is None:  # no stamps, or contradictory ones: a clock has stepped
-            estimate = self.offset.estimate.including(self._ceiling, self._floor)
+            estimate = self.offset.estimate.widen(self._ceiling, self._floor)
             self._windows = 0
         self._open_window()
         self.offset.slew_to(from_ns, estimate)
         return estimate
 
-    def measured(self, now_ns: int) -> dict[str, int]:
+    def pop_measurements(self, now_ns: int) -> dict[str, int]:
         """Returns the link's timing fields of `LinkStats` since the last call."""
         delays = sorted(self._delays)
         rtt_ns = self._rtt_ns
         self._delays = []
         self._rtt_ns = _FAR_NS
         return {
-            "offset_us": self.offset.at(now_ns) // 1000,
-            "bound_us": -(-self.offset.bound_at(now_ns) // 1000),
+            "offset_us": self.offset.evaluate_ns(now_ns) // 1000,
+            "bound_us": -(-self.offset.error_bound_ns(now_ns) // 1000),
             "delay_us": delays[len(delays) // 2] // 1000 if delays else -1,
             "delay_max_us": delays[-1] // 1000 if delays else -1,
             "rtt_us": -1 if rtt_ns == _FAR_NS else rtt_ns // 1000,
@@ -298,22 +300,22 @@ class SiteTiming:
         self._epoch_ns = epoch_ns
         self._rate_hz = rate_hz
         self._sent = SentStamps()
-        self.meters = [LinkTimingMonitor(peer, self._sent) for peer in peers]
-        for meter in self.meters:
+        self.monitors = [LinkTimingMonitor(peer, self._sent) for peer in peers]
+        for meter in self.monitors:
             meter.offset.slew_to(epoch_ns, meter.peer.estimate)
         self._leader_name = leader
         self._turn = 0
         self._faults_ns = [-FAULT_EVERY_NS] * len(peers)
 
-    def deadline(self, k: int) -> int:
+    def deadline_ns(self, k: int) -> int:
         """Returns when the site is to wake up for tick k, on its clock, ns: on the grid, and in
         its turn.
         """
         return self.schedule.due_ns(k) + self.turn_ns
 
-    def opening(self) -> list[ClockNotice]:
+    def list_initial_notices(self) -> list[ClockNotice]:
         """Returns the events about the peers' clocks before tick 0."""
-        meters = (meter for meter in self.meters if not meter.peer.is_own)
+        meters = (meter for meter in self.monitors if not meter.peer.is_own)
         return [_estimate_notice(meter, 0, self._epoch_ns) for meter in meters]
 
     def admit(
@@ -328,7 +330,7 @@ class SiteTiming:
             epoch_ns: the epoch on its clock, as it counts.
             bound_ns: how far it may be wrong about that; None if its clock is this site's.
         """
-        meter = self.meters[index]
+        meter = self.monitors[index]
         known = meter.peer._replace(epoch_ns=epoch_ns, estimate=exact_offset(0), estimator=None)
         if bound_ns is None:
             meter.admit(known)
@@ -342,59 +344,61 @@ class SiteTiming:
         meter.admit(known._replace(estimate=estimate, estimator=OffsetEstimator()))
         return [_estimate_notice(meter, k, at_ns)]
 
-    def sent(self, tick: int, now_ns: int) -> int:
+    def record_sent(self, tick: int, now_ns: int) -> int:
         """Notes the time of sending of a record; returns it since the epoch, ns."""
-        self._sent.put(tick, now_ns)
+        self._sent.record(tick, now_ns)
         return now_ns - self._epoch_ns
 
-    def echo(self) -> list[tuple[int, int, int]]:
+    def pop_echo(self) -> list[tuple[int, int, int]]:
         """Returns each peer's newest sample since the last call: (peer, tick, arrival), see
         `State`.
         """
         echo = []
-        for index, meter in enumerate(self.meters):
+        for index, meter in enumerate(self.monitors):
             if meter.newest is not None:
                 tick, arrived_ns = meter.newest
                 meter.newest = None
                 echo.append((index, tick, arrived_ns - self._epoch_ns))
         return echo
 
-    def settle(self, k: int, now_ns: int) -> list[ClockNotice]:
+    def update_clocks(self, k: int, now_ns: int) -> list[ClockNotice]:
         """Estimates one clock, steers the schedule from tick k on, returns the events; ten
         times a second.
         """
         notices: list[ClockNotice] = []
         due_ns = self.schedule.due_ns(k)
-        for _ in self.meters:  # one estimate at a time, in turn: it takes a part of a tick
-            self._turn = (self._turn + 1) % len(self.meters)
-            meter = self.meters[self._turn]
+        for _ in self.monitors:  # one estimate at a time, in turn: it takes a part of a tick
+            self._turn = (self._turn + 1) % len(self.monitors)
+            meter = self.monitors[self._turn]
             if meter.close(now_ns, due_ns) is not None:
                 notices.append(_estimate_notice(meter, k, due_ns))
                 break
-        for n, meter in enumerate(self.meters):
+        for n, meter in enumerate(self.monitors):
             faulty = bool(meter.worst_ns) or meter.contradicted
             if faulty and now_ns - self._faults_ns[n] >= FAULT_EVERY_NS:
                 self._faults_ns[n] = now_ns
                 notices.append(_fault_notice(meter))
                 meter.worst_ns = 0
                 meter.contradicted = False
-            if meter.unheard is meter.hears(now_ns):  # None, of a silent peer, is neither
-                meter.unheard = not meter.unheard
+            if meter.is_unacknowledged is meter.is_acknowledged(
+                now_ns
+            ):  # None, of a silent peer, is neither
+                meter.is_unacknowledged = not meter.is_unacknowledged
                 notices.append(_hearing_notice(meter, k))
             if meter.peer.name == self._leader_name and not meter.peer.is_own:
-                leader_ns = due_ns + meter.offset.at(due_ns) - meter.peer.epoch_ns
+                leader_ns = due_ns + meter.offset.evaluate_ns(due_ns) - meter.peer.epoch_ns
                 error_ns = leader_ns - k * NS_PER_S // self._rate_hz
-                self.schedule.steer(k, error_ns, meter.offset.estimate.drift)
+                self.schedule.adjust_rate(k, error_ns, meter.offset.estimate.drift)
         return notices
 
-    def measured(self, now_ns: int) -> dict[str, Any]:
+    def pop_measurements(self, now_ns: int) -> dict[str, Any]:
         """Returns the timing fields of `LinkStats` since the last call."""
         stats: dict[str, Any] = {
             "grid_error_us": self.schedule.error_ns // 1000,
             "slew_ppb": round(self.schedule.slew),
         }
-        for meter in self.meters:
-            for field, value in meter.measured(now_ns).items():
+        for meter in self.monitors:
+            for field, value in meter.pop_measurements(now_ns).items():
                 stats.setdefault(field, {})[meter.peer.name] = value
         return stats
 
@@ -403,7 +407,7 @@ def _estimate_notice(meter: LinkTimingMonitor, k: int, at_ns: int) -> ClockNotic
     offset = meter.offset
     estimate = meter.offset.estimate
     name = meter.peer.name
-    offset_ns = offset.at(at_ns)
+    offset_ns = offset.evaluate_ns(at_ns)
     drift_bound = max(estimate.drift_high - estimate.drift, estimate.drift - estimate.drift_low)
     told = (
         f"{format_offset(offset_ns, offset.bound_ns)}, drift {estimate.drift / 1000:+.2f} ppm"
@@ -439,7 +443,7 @@ def _fault_notice(meter: LinkTimingMonitor) -> ClockNotice:
 
 def _hearing_notice(meter: LinkTimingMonitor, k: int) -> ClockNotice:
     name = meter.peer.name
-    if meter.unheard:
+    if meter.is_unacknowledged:
         text = f"{name} is heard and does not hear: for {UNHEARD_NS // 1_000_000} ms it acknowledged nothing"
         return {"kind": "unheard", "text": text, "about": name, "ticks": k}
     return {"kind": "heard", "text": f"{name} hears again", "about": name, "ticks": k}
@@ -465,7 +469,7 @@ class LoopStats:
         self.dropped: Counter[str] = Counter()
         self.overruns = 0
 
-    def tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
+    def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
         """Counts one tick: its lateness, the computing time of the one before, and how many
         were not made.
         """
@@ -476,13 +480,15 @@ class LoopStats:
             self._busy_max_us = busy_us
         self.overruns += late_us >= self._period_us
 
-    def due(self, k: int, skipped: int = 0) -> bool:
+    def is_due(self, k: int, skipped: int = 0) -> bool:
         """True at the ticks after which statistics are published; one stands for the skipped
         ones before.
         """
         return k % self._every <= skipped
 
-    def take(self, output: TickRecord, measured: Mapping[str, Any] | None = None) -> LinkStats:
+    def pop_stats(
+        self, output: TickRecord, measured: Mapping[str, Any] | None = None
+    ) -> LinkStats:
         """Returns the statistics as of a record's tick, with the timing fields that were
         measured if any.
 

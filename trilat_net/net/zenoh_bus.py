@@ -105,7 +105,7 @@ class _ZenohQuery(NamedTuple):
     def payload(self) -> bytes:
         return b"" if self.query.payload is None else self.query.payload.to_bytes()
 
-    def answer(self, payload: bytes) -> None:
+    def reply(self, payload: bytes) -> None:
         with self.query as query:  # a query ends for its sender only when it is dropped
             query.reply(self.key, payload)
 
@@ -196,7 +196,7 @@ class ZenohBus:
         """See `Bus`."""
         return _ZenohRing(self._subscribe(key, handlers.RingChannel(capacity)), _read_sample)
 
-    def stamped(
+    def stamped_inbox(
         self,
         key: str,
         now_ns: Callable[[], int],
@@ -205,7 +205,7 @@ class ZenohBus:
     ) -> StampedInbox[T]:
         """See `Bus`."""
         ring = StampingRing(now_ns, read, capacity)
-        take = ring.take
+        take = ring.receive
         handler = _handle_samples(lambda sample: take(sample.payload.to_bytes()))
         self._kept.append(self._subscribe(key, handler))
         return ring
@@ -215,7 +215,7 @@ class ZenohBus:
         handler = _handle_samples(lambda sample: callback(*_read_sample(sample)))
         self._kept.append(self._subscribe(key, handler))
 
-    def questions(self, key: str) -> QueryInbox:
+    def query_inbox(self, key: str) -> QueryInbox:
         """See `Bus`; a look into a ring of our own costs a loop less than one into Zenoh's."""
         ring: BoundedRing[_ZenohQuery] = BoundedRing(64)
         handler: Any = handlers.Callback(
@@ -235,7 +235,7 @@ class ZenohBus:
 
         self._kept.append(self._serve(key, handlers.Callback(answer_at_once, indirect=False)))
 
-    def ask(self, key: str, payload: bytes = b"") -> Inbox:
+    def query(self, key: str, payload: bytes = b"") -> Inbox:
         """See `Bus`."""
         replies = self._session.get(
             key,

@@ -73,7 +73,7 @@ class Hall:
         self.always()
 
     def ask(self, member: str, channel: str, payload: bytes = b"") -> Inbox:
-        return self.watcher.ask(topics.key(self.options.session, member, channel), payload)
+        return self.watcher.query(topics.key(self.options.session, member, channel), payload)
 
     def play(self) -> PlaybackSummary:
         self.facts, block = preload_messages([self.log], self.selection, 1 << 28)
