@@ -1,24 +1,32 @@
-"""Offset and drift of another clock, estimated from stamps that crossed a network, and the
-slewed offset.
+"""Estimation of the offset and drift of another clock, and the slewed offset in use.
 
-Invariant: stamps prove every bound, for any delays, however unequal the two directions. A
-message is never received before it was sent, so with offset = other clock - own clock
+The estimate uses time stamps of messages that crossed a network. A message is never received
+before it was sent. With
 
-    offset <= (their reading on receiving) - (own reading on sending): a ceiling, when the own
-    clock sent; offset >= (their reading on sending) - (own reading on receiving): a floor, when
-    the own clock received.
+    offset = other clock - local clock,
 
-A ceiling and a floor of one exchange t1..t4 are the classical (t2 - t1) and (t3 - t4): their
-mean is the offset, their distance the round trip, half of that the bound. Each window keeps its
-lowest ceiling and its highest floor; these may come from different exchanges, so the bound is
-half the shortest way out plus half the shortest way back. Over the windows the offset is a
-line; the lines through all ceilings and floors are admissible, and their spread now is the
-bound. Assumed: clocks drift apart by less than DRIFT_LIMIT, and over the kept windows along a
-line to within WANDER.
+every message therefore limits the offset at one instant of the local clock:
 
-The offset in use never steps: it is continuous and piecewise linear, reaches each new estimate
-within SLEW_NS and then follows the estimate's drift. Its bound covers the estimate's interval
-also on the way.
+    ceiling (local side sent):      offset <= other reading on receipt - local reading on sending
+    floor   (local side received):  offset >= other reading on sending - local reading on receipt
+
+The stamps t1 (local sending), t2 (other receiving), t3 (other sending) and t4 (local receiving)
+of one exchange give the ceiling t2 - t1 and the floor t3 - t4. Their mean is the classical
+estimate of the offset, their difference the round trip, and half of that the error bound.
+
+Each window keeps its lowest ceiling and its highest floor. These may come from different
+exchanges, so the bound is half the shortest way out plus half the shortest way back. Over the
+windows the offset is modelled as a straight line. The lines below all ceilings and above all
+floors are admissible, and their spread at present is the bound.
+
+Assumptions: two clocks drift apart by less than DRIFT_LIMIT, and along a line to within WANDER
+over the windows that are kept.
+
+Invariant:
+    - The stamps prove every bound, for any delays, however unequal the two directions are.
+    - The offset in use never steps: it is continuous and piecewise linear. It reaches each new
+      estimate within SLEW_NS and then follows the estimate's drift.
+    - The bound of the offset in use covers the estimate's interval also during the slew.
 """
 
 import math
@@ -36,20 +44,36 @@ DRIFT_LIMIT = 500_000.0
 WANDER = 1_000.0
 """Largest deviation of the drift from its mean over the windows kept, ns/s."""
 _NOISE_NS = 3_000.0
-_PRIOR = 100_000.0  # of the drift, ns/s: decides only while the windows span less than a second
-_ROUNDS = 3
+"""Excess over the tightest limit at which the weight of a limit falls to a quarter, in ns."""
+_PRIOR_DRIFT = 100_000.0
+"""Standard deviation of the drift's prior around 0, ns/s.
+
+The prior decides only while the windows span less than a second.
+"""
+_WEIGHTING_ROUNDS = 3
 
 
 class OffsetLimit(NamedTuple):
-    """Upper limit (ceiling) or lower limit (floor) of an offset at an instant of the own clock."""
+    """Upper limit (ceiling) or lower limit (floor) of an offset.
+
+    Attributes:
+        local_ns: the instant of the local clock for which the limit holds.
+        offset_ns: the limit, in ns.
+    """
 
     local_ns: int
     offset_ns: int
 
 
 class OffsetEstimate(NamedTuple):
-    """Another clock minus the own one at an instant of the own, and its growth, ns/s, with
-    their limits.
+    """Estimate of the offset and drift of another clock against the local clock.
+
+    Attributes:
+        local_ns: the instant of the local clock for which the estimate holds.
+        offset_ns: the other clock minus the local clock at that instant.
+        drift: growth of the offset, ns/s.
+        low_ns, high_ns: limits of the offset at that instant.
+        drift_low, drift_high: limits of the drift, ns/s.
     """
 
     local_ns: int
@@ -60,32 +84,38 @@ class OffsetEstimate(NamedTuple):
     drift_low: float
     drift_high: float
 
-    def extrapolate_ns(self, at_ns: int) -> int:
-        """Returns the offset at another instant, ns."""
-        return self.offset_ns + round((at_ns - self.local_ns) * self.drift / NS_PER_S)
+    def extrapolate_ns(self, local_ns: int) -> int:
+        """Returns the estimated offset at another instant of the local clock, in ns."""
+        return self.offset_ns + round((local_ns - self.local_ns) * self.drift / NS_PER_S)
 
     def widen(self, *limits: OffsetLimit | None) -> "OffsetEstimate":
-        """Returns the same, widened to include limits that contradict it."""
+        """Returns the estimate with its interval widened to include contradicting limits."""
         offsets = [limit.offset_ns for limit in limits if limit is not None]
-        return self._replace(
-            low_ns=min([self.low_ns, *offsets]), high_ns=max([self.high_ns, *offsets])
-        )
+        low_ns = min([self.low_ns, *offsets])
+        high_ns = max([self.high_ns, *offsets])
+        return self._replace(low_ns=low_ns, high_ns=high_ns)
 
-    def error_bound_ns(self, at_ns: int, offset_ns: int) -> int:
-        """Returns the largest distance of the offset from a value at another instant, ns."""
-        passed_s = (at_ns - self.local_ns) / NS_PER_S
-        up = self.drift_high
-        down = self.drift_low
+    def error_bound_ns(self, local_ns: int, offset_ns: int) -> int:
+        """Returns the largest possible error of a value of the offset, in ns.
+
+        Args:
+            local_ns: instant of the local clock.
+            offset_ns: value that is used for the offset at that instant.
+        """
+        passed_s = (local_ns - self.local_ns) / NS_PER_S
+        upper_drift = self.drift_high
+        lower_drift = self.drift_low
         if passed_s < 0.0:
-            up, down = down, up
-        above = self.high_ns - offset_ns + passed_s * up
-        below = offset_ns - self.low_ns - passed_s * down
-        return max(0, math.ceil(max(above, below)))
+            upper_drift, lower_drift = lower_drift, upper_drift
+        error_above = self.high_ns - offset_ns + passed_s * upper_drift
+        error_below = offset_ns - self.low_ns - passed_s * lower_drift
+        return max(0, math.ceil(max(error_above, error_below)))
 
 
 def exact_offset(offset_ns: int) -> OffsetEstimate:
-    """Returns the estimate of an offset that is exact for ever, as of two readings of one
-    clock.
+    """Returns the estimate of a constant offset that is known exactly.
+
+    Two readings of one clock have such an offset.
     """
     return OffsetEstimate(
         local_ns=0,
@@ -99,16 +129,17 @@ def exact_offset(offset_ns: int) -> OffsetEstimate:
 
 
 def format_offset(offset_ns: int, bound_ns: int) -> str:
-    """Returns an offset and its bound as text."""
+    """Returns an offset and its error bound as text."""
     return f"offset {offset_ns / 1e9:.6f} s +- {-(-bound_ns // 1000)} us"
 
 
 class OffsetEstimator:
-    """The ceilings and floors of one clock, and the line between them.
+    """Estimator of another clock's offset from the ceilings and floors of the latest windows.
 
     Attributes:
-        broken: how often the limits contradicted each other, so that the older ones were
-            dropped: a clock stepped, or was slewed harder than DRIFT_LIMIT.
+        broken: number of times at which the limits contradicted each other, so that the older
+            limits were dropped. Then a clock has stepped, or was slewed by more than
+            DRIFT_LIMIT.
     """
 
     def __init__(self) -> None:
@@ -117,31 +148,39 @@ class OffsetEstimator:
         self._floors: deque[OffsetLimit] = deque(maxlen=WINDOWS_KEPT)
 
     def add(self, ceiling: OffsetLimit | None, floor: OffsetLimit | None) -> None:
-        """Takes the limits of one window; None if nothing arrived in that direction."""
+        """Adds the limits of one window; None if no message arrived in that direction."""
         if ceiling is not None:
             self._ceilings.append(ceiling)
         if floor is not None:
             self._floors.append(floor)
 
     def estimate(self, now_ns: int) -> OffsetEstimate | None:
-        """Returns the estimate now, at or after every window; None while one direction has no
-        limit.
+        """Returns the estimate for the present, or None if a direction has no limit yet.
+
+        Args:
+            now_ns: present reading of the local clock, not before the end of any window.
         """
         while self._ceilings and self._floors:
-            lines = _Lines(self._ceilings, self._floors, now_ns)
-            if lines.possible:
+            lines = _AdmissibleLines(self._ceilings, self._floors, now_ns)
+            if lines.exist:
                 return lines.estimate()
             self.broken += 1
-            kept = max(len(self._ceilings), len(self._floors)) // 2
+            kept_limits = max(len(self._ceilings), len(self._floors)) // 2
             for limits in (self._ceilings, self._floors):
-                while len(limits) > kept:
+                while len(limits) > kept_limits:
                     limits.popleft()
         return None
 
 
-class _Lines:
-    """All lines under every ceiling and over every floor; times are s from now, values ns from
-    a base.
+class _AdmissibleLines:
+    """All straight lines below every ceiling and above every floor.
+
+    Times are in s from the present, offsets in ns from the offset of the latest ceiling. The
+    small numbers keep the precision that differences of 64-bit instants would lose.
+
+    Attributes:
+        exist: True if there is an admissible line.
+        steepest, flattest: limits of the admissible slopes, ns/s.
     """
 
     def __init__(
@@ -149,37 +188,40 @@ class _Lines:
     ) -> None:
         self._now_ns = now_ns
         self._base_ns = ceilings[-1].offset_ns
-        self._above_s, self._above = self._columns(ceilings)
-        self._below_s, self._below = self._columns(floors)
-        self._widest = self._above - WANDER * self._above_s
-        self._lowest = self._below + WANDER * self._below_s
-        apart_s = self._above_s[:, None] - self._below_s[None, :]
-        room = self._widest[:, None] - self._lowest[None, :]
-        slopes = np.divide(room, apart_s, out=np.zeros_like(room), where=apart_s != 0.0)
-        self.steepest = float(np.min(slopes, where=apart_s > 0.0, initial=DRIFT_LIMIT))
-        self.flattest = float(np.max(slopes, where=apart_s < 0.0, initial=-DRIFT_LIMIT))
-        touching = np.min(room, where=apart_s == 0.0, initial=0.0)
-        self.possible = bool(touching >= 0.0 and self.flattest <= self.steepest)
+        self._ceiling_times_s, self._ceilings = self._read_columns(ceilings)
+        self._floor_times_s, self._floors = self._read_columns(floors)
+        # Times are negative: each limit is relaxed by WANDER for every second of its age.
+        self._relaxed_ceilings = self._ceilings - WANDER * self._ceiling_times_s
+        self._relaxed_floors = self._floors + WANDER * self._floor_times_s
+        intervals_s = self._ceiling_times_s[:, None] - self._floor_times_s[None, :]
+        gaps = self._relaxed_ceilings[:, None] - self._relaxed_floors[None, :]
+        slopes = np.divide(gaps, intervals_s, out=np.zeros_like(gaps), where=intervals_s != 0.0)
+        # A ceiling after a floor limits the slope from above, a ceiling before one from below.
+        self.steepest = float(np.min(slopes, where=intervals_s > 0.0, initial=DRIFT_LIMIT))
+        self.flattest = float(np.max(slopes, where=intervals_s < 0.0, initial=-DRIFT_LIMIT))
+        simultaneous_gap = np.min(gaps, where=intervals_s == 0.0, initial=0.0)
+        self.exist = bool(simultaneous_gap >= 0.0 and self.flattest <= self.steepest)
 
-    def _columns(self, limits: deque[OffsetLimit]) -> tuple[Array, Array]:
-        times = np.array(
+    def _read_columns(self, limits: deque[OffsetLimit]) -> tuple[Array, Array]:
+        """Returns the times (s from now) and the offsets (ns from the base) of limits."""
+        times_ns = np.array(
             [min(0, limit.local_ns - self._now_ns) for limit in limits], dtype=np.float64
         )
-        values = np.array(
+        offsets_ns = np.array(
             [limit.offset_ns - self._base_ns for limit in limits], dtype=np.float64
         )
-        return times / NS_PER_S, values
+        return times_ns / NS_PER_S, offsets_ns
 
     def estimate(self) -> OffsetEstimate:
-        """Returns the line in the middle, and the span of all lines now."""
-        slope = min(max(self._slope(), self.flattest), self.steepest)
-        middle = 0.5 * (
-            np.min(self._widest - slope * self._above_s)
-            + np.max(self._lowest - slope * self._below_s)
-        )
-        # now lies behind every limit: the highest value is the steepest line's, the lowest the flattest's
-        high = np.min(self._widest - self.steepest * self._above_s)
-        low = np.max(self._lowest - self.flattest * self._below_s)
+        """Returns the line in the middle, with the spread of all admissible lines now."""
+        slope = min(max(self._estimate_slope(), self.flattest), self.steepest)
+        lowest_ceiling = np.min(self._relaxed_ceilings - slope * self._ceiling_times_s)
+        highest_floor = np.max(self._relaxed_floors - slope * self._floor_times_s)
+        middle = 0.5 * (lowest_ceiling + highest_floor)
+        # The present lies after every limit: the steepest line has the highest value there, and
+        # the flattest line the lowest.
+        high = np.min(self._relaxed_ceilings - self.steepest * self._ceiling_times_s)
+        low = np.max(self._relaxed_floors - self.flattest * self._floor_times_s)
         return OffsetEstimate(
             local_ns=self._now_ns,
             offset_ns=self._base_ns + round(middle),
@@ -190,26 +232,27 @@ class _Lines:
             drift_high=self.steepest + WANDER,
         )
 
-    def _slope(self) -> float:
-        """Returns the drift: least squares of one slope for ceilings and floors.
+    def _estimate_slope(self) -> float:
+        """Returns the drift: weighted least squares of one slope for ceilings and floors, ns/s.
 
-        A window of slow messages tells little: its weight falls with its distance from the best
-        one, which depends on the slope, hence some rounds.
+        A window of slow messages says little, so the weight of a limit falls with its distance
+        from the tightest one. That distance depends on the slope, so the weights are computed
+        anew in each of some rounds (iteratively reweighted least squares).
         """
         slope = 0.0
-        drift_weight = _PRIOR**-2
-        for n in range(_ROUNDS):
+        prior_weight = _PRIOR_DRIFT**-2
+        for round_index in range(_WEIGHTING_ROUNDS):
             numerator = 0.0
-            denominator = drift_weight
-            for times, values, side in (
-                (self._above_s, self._above, 1.0),
-                (self._below_s, self._below, -1.0),
+            denominator = prior_weight
+            for times, values, sign in (
+                (self._ceiling_times_s, self._ceilings, 1.0),
+                (self._floor_times_s, self._floors, -1.0),
             ):
-                level = side * (values - slope * times)
-                excess = (level - level.min()) if n else np.zeros_like(level)
+                level = sign * (values - slope * times)
+                excess = (level - level.min()) if round_index else np.zeros_like(level)
                 weights = (excess + _NOISE_NS) ** -2.0
-                total = weights.sum()
-                from_mean = times - (weights * times).sum() / total
+                total_weight = weights.sum()
+                from_mean = times - (weights * times).sum() / total_weight
                 numerator += float((weights * from_mean * values).sum())
                 denominator += float((weights * from_mean**2).sum())
             slope = numerator / denominator
@@ -217,74 +260,84 @@ class _Lines:
 
 
 SLEW_NS = 1_000_000_000
-"""Time to reach a new estimate."""
+"""Time in which the offset in use reaches a new estimate, in ns."""
 
 
 class _SlewSegment:
-    """The slew from an instant and a value to one estimate, and on along it."""
+    """The offset in use from one instant on: a slew to an estimate, then along the estimate.
 
-    def __init__(self, from_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
-        self.from_ns = from_ns
+    Args:
+        start_ns: instant of the local clock at which the slew begins.
+        offset_ns: offset in use at that instant.
+        estimate: the estimate to reach within SLEW_NS.
+
+    Attributes:
+        bound_ns: largest error of the offset in use during the slew.
+    """
+
+    def __init__(self, start_ns: int, offset_ns: int, estimate: OffsetEstimate) -> None:
+        self.start_ns = start_ns
         self.estimate = estimate
-        self._joined_ns = from_ns + SLEW_NS
+        self._joined_ns = start_ns + SLEW_NS
         self._joined_offset_ns = estimate.extrapolate_ns(self._joined_ns)
-        self._approach = (self._joined_offset_ns - offset_ns) / SLEW_NS
-        self._drift = estimate.drift / NS_PER_S
+        self._approach_rate = (self._joined_offset_ns - offset_ns) / SLEW_NS
+        self._drift_per_ns = estimate.drift / NS_PER_S
+        # The bound is convex over the slew, so it is largest at one of the two ends.
         self.bound_ns = max(
-            estimate.error_bound_ns(from_ns, offset_ns),
+            estimate.error_bound_ns(start_ns, offset_ns),
             estimate.error_bound_ns(self._joined_ns, self._joined_offset_ns),
         )
 
-    def evaluate_ns(self, at_ns: int) -> int:
-        passed_ns = at_ns - self._joined_ns
-        return self._joined_offset_ns + int(
-            passed_ns * (self._approach if passed_ns < 0 else self._drift)
-        )
+    def evaluate_ns(self, local_ns: int) -> int:
+        """Returns the offset in use at an instant of the local clock, in ns."""
+        passed_ns = local_ns - self._joined_ns
+        rate = self._approach_rate if passed_ns < 0 else self._drift_per_ns
+        return self._joined_offset_ns + int(passed_ns * rate)
 
-    def error_bound_ns(self, at_ns: int) -> int:
-        if self.from_ns <= at_ns <= self._joined_ns:
+    def error_bound_ns(self, local_ns: int) -> int:
+        """Returns the largest possible error of the offset in use at an instant, in ns."""
+        if self.start_ns <= local_ns <= self._joined_ns:
             return self.bound_ns
-        return self.estimate.error_bound_ns(at_ns, self.evaluate_ns(at_ns))
+        return self.estimate.error_bound_ns(local_ns, self.evaluate_ns(local_ns))
 
 
 class SlewedOffset:
-    """The offset in use over time, the other clock minus the own one."""
+    """The offset in use over time: the other clock minus the local clock, without steps."""
 
     def __init__(self, estimate: OffsetEstimate) -> None:
-        self._segment = self._before = _SlewSegment(
-            estimate.local_ns, estimate.offset_ns, estimate
-        )
+        segment = _SlewSegment(estimate.local_ns, estimate.offset_ns, estimate)
+        self._segment = segment
+        self._previous_segment = segment
 
     @property
     def estimate(self) -> OffsetEstimate:
-        """The estimate that it slews to."""
+        """The estimate to which the offset slews."""
         return self._segment.estimate
 
     @property
     def bound_ns(self) -> int:
-        """Its largest error, for SLEW_NS from the last `slew_to` on; then it grows."""
+        """Largest error of the offset during SLEW_NS from the last `slew_to`; then it grows."""
         return self._segment.bound_ns
 
-    def slew_to(self, at_ns: int, estimate: OffsetEstimate) -> None:
-        """Slews to a new estimate from an instant of the own clock on."""
-        segment = _SlewSegment(at_ns, self.evaluate_ns(at_ns), estimate)
-        self._before = self._segment
+    def slew_to(self, local_ns: int, estimate: OffsetEstimate) -> None:
+        """Starts to slew to a new estimate at an instant of the local clock."""
+        segment = _SlewSegment(local_ns, self.evaluate_ns(local_ns), estimate)
+        self._previous_segment = self._segment
         self._segment = segment
 
-    def evaluate_ns(self, at_ns: int) -> int:
-        """Returns the offset at an instant, not before the last but one `slew_to`, ns."""
-        segment = self._segment
-        return (
-            segment.evaluate_ns(at_ns)
-            if at_ns >= segment.from_ns
-            else self._before.evaluate_ns(at_ns)
-        )
+    def evaluate_ns(self, local_ns: int) -> int:
+        """Returns the offset in use at an instant of the local clock, in ns.
 
-    def error_bound_ns(self, at_ns: int) -> int:
-        """Returns its largest error at such an instant, ns."""
-        segment = self._segment
-        return (
-            segment.error_bound_ns(at_ns)
-            if at_ns >= segment.from_ns
-            else self._before.error_bound_ns(at_ns)
-        )
+        The instant must not precede the last call but one of `slew_to`.
+        """
+        return self._select_segment(local_ns).evaluate_ns(local_ns)
+
+    def error_bound_ns(self, local_ns: int) -> int:
+        """Returns the largest possible error of the offset in use at an instant, in ns.
+
+        The instant must not precede the last call but one of `slew_to`.
+        """
+        return self._select_segment(local_ns).error_bound_ns(local_ns)
+
+    def _select_segment(self, local_ns: int) -> _SlewSegment:
+        return self._segment if local_ns >= self._segment.start_ns else self._previous_segment

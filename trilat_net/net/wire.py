@@ -1,11 +1,14 @@
-"""Encoding and decoding of messages.
+"""Encoding and decoding of the messages that members exchange and logs store.
 
-Invariant: decoding never trusts its input. A payload yields a message of this schema version
-with finite numbers in range, or a `WireError` whose reason is counted; encoding refuses what
-decoding would.
+A payload is a MessagePack map with string keys and plain lists. The types in `messages` and
+`requests` define its fields.
 
-Payloads are MessagePack maps with string keys and plain lists, as the types of `messages` and
-`requests`.
+Invariant:
+    - Decoding never trusts its input. Every payload yields either a message of an accepted
+      schema version, with finite numbers within their ranges, or a `WireError`.
+    - The reason of a `WireError` is one of a few short texts, because receivers count
+      refused payloads by reason.
+    - Encoding a record or a sample refuses numbers that are not finite, as decoding does.
 """
 
 import math
@@ -36,35 +39,49 @@ from .messages import (
 from .requests import BACKFILL_BYTES, ArmMeasurement, Backfill, HandMessage, Request
 
 MAX_BYTES = 65_536
+"""Largest payload of a message, in bytes, except for `Info` and `Backfill`."""
 MAX_INFO_BYTES = 64 * 1024 * 1024
+"""Largest payload of an `Info`, which holds a whole scenario with its traces, in bytes."""
 MAX_PAST_BYTES = 2 * MAX_BYTES
-"""Largest message; largest `Info`, which holds a whole scenario with its traces; largest
-`Backfill`.
-"""
+"""Largest payload of a `Backfill`, in bytes."""
 SAMPLE_BYTES = 2_048
+"""Largest size of a `PeerSample` without the numbers of its vectors, in bytes."""
 NUMBER_BYTES = 9
-"""Of a sample, besides its vectors; of one of their numbers."""
+"""Size of an encoded floating-point number, in bytes."""
 
-_Sent = LinkStats | Event | Info | RecorderStats | Request
-_KINDS: list[type[msgspec.Struct]] = [State, PeerSample, LinkStats, Event, Info, RecorderStats]
+_Sendable = LinkStats | Event | Info | RecorderStats | Request
+_MESSAGE_KINDS: list[type[msgspec.Struct]] = [
+    State,
+    PeerSample,
+    LinkStats,
+    Event,
+    Info,
+    RecorderStats,
+]
 _DECODERS = {
-    kind: msgspec.msgpack.Decoder(kind) for kind in [*_KINDS, *Request.__subclasses__()]
+    kind: msgspec.msgpack.Decoder(kind) for kind in [*_MESSAGE_KINDS, *Request.__subclasses__()]
 }
-_LIMITS: dict[type[msgspec.Struct], int] = {Info: MAX_INFO_BYTES, Backfill: MAX_PAST_BYTES}
+_SIZE_LIMITS: dict[type[msgspec.Struct], int] = {
+    Info: MAX_INFO_BYTES,
+    Backfill: MAX_PAST_BYTES,
+}
 _isfinite = math.isfinite
 _encode = msgspec.msgpack.Encoder().encode
 
 
 @cache
-def _vectors(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
+def _list_vector_lengths(kind: type[msgspec.Struct], layout: Layout) -> dict[str, int]:
+    """Returns the names of the vectors in a kind of message, with their lengths."""
     if kind is State:
         return dict.fromkeys(STATE_VECTORS, 0) | layout.lengths()
     if kind is PeerSample:
         return dict.fromkeys(("q", "qd", "tau_x"), layout.shared) | {"ch": layout.sent}
     if kind is HandMessage:
-        # its receiver knows which of them it takes
+        # The lengths are not checked here: the receiver knows which of the vectors it reads.
         return dict.fromkeys(("target", "force"), 0)
-    return dict.fromkeys(("q", "qd"), layout.joints) if kind is ArmMeasurement else {}
+    if kind is ArmMeasurement:
+        return dict.fromkeys(("q", "qd"), layout.joints)
+    return {}
 
 
 def encode_state(
@@ -78,10 +95,19 @@ def encode_state(
     sent_ns: int | None = None,
     echo: Sequence[Sequence[int]] = (),
 ) -> bytes:
-    """Returns the payload of one record.
+    """Returns the payload of the `State` record of one tick.
 
-    The arguments are the fields of `State`. Without `sent_ns`, in virtual time, it is the
-    nominal time.
+    Args:
+        site: name of the sending site.
+        boot: random number of the sender's process start.
+        peers: names of the site's peers, in the order of the tick record's `used`.
+        output: the tick record of the site.
+        arrivals: samples that the tick received, in the order accepted.
+        late_us: wake-up minus deadline of this tick.
+        busy_us: computing time of the previous tick.
+        sent_ns: sending time since the epoch on the sender's clock. None, as in virtual time,
+            stands for the nominal time of the tick.
+        echo: the newest sample received from each peer, see `State.echo`.
 
     Raises:
         WireError: a number is not finite.
@@ -101,11 +127,12 @@ def encode_state(
         rx_crc,
         cmd,
         mem,
-        *task,
+        *optional_vectors,
     ) = output
-    x, xd, wrench, ch, hand, bodies = task
-    vectors = (q, qd, q_des, qd_des, tau, tau_x, theta_hat, mem, *task)
-    # a sum is finite only if its terms are; the second check is for finite terms whose sum overflows
+    x, xd, wrench, ch, hand, bodies = optional_vectors
+    vectors = (q, qd, q_des, qd_des, tau, tau_x, theta_hat, mem, *optional_vectors)
+    # A sum is finite only if all of its terms are, and one sum is faster than a check of each
+    # term. The second check accepts finite terms whose sum overflows.
     if not _isfinite(sum(map(sum, vectors))) and not all(
         map(_isfinite, chain.from_iterable(vectors))
     ):
@@ -125,7 +152,7 @@ def encode_state(
         "tau_x": tau_x,
         "theta_hat": theta_hat,
         "used": dict(zip(peers, used, strict=True)),
-        "rx": [(a.peer, a.tick, a.latency_us) for a in arrivals],
+        "rx": [(arrival.peer, arrival.tick, arrival.latency_us) for arrival in arrivals],
         "rx_crc": rx_crc,
         "cmd": cmd,
         "mem": mem,
@@ -148,7 +175,14 @@ def encode_state(
 def encode_sample(
     site: str, boot: int, output: TickRecord, sent_ns: int, echo: Sequence[Sequence[int]]
 ) -> bytes:
-    """Returns the payload of a tick's `PeerSample`; the arguments are those of `encode_state`.
+    """Returns the payload of the `PeerSample` of one tick.
+
+    Args:
+        site: name of the sending site.
+        boot: random number of the sender's process start.
+        output: the tick record of the site.
+        sent_ns: sending time since the epoch on the sender's clock.
+        echo: the newest sample received from each peer, see `State.echo`.
 
     Raises:
         WireError: a number is not finite.
@@ -156,6 +190,7 @@ def encode_sample(
     (q, qd, tau_x) = output.shared()
     ch = output.ch
     total = sum(q) + sum(qd) + sum(tau_x) + sum(ch)
+    # See `encode_state` for the reason of the two checks.
     if not _isfinite(total) and not all(map(_isfinite, [*q, *qd, *tau_x, *ch])):
         raise WireError("not finite", f"{site} at tick {output.tick}")
     fields = {
@@ -169,12 +204,15 @@ def encode_sample(
         "sent_ns": sent_ns,
         "echo": echo,
     }
-    return _encode({**fields, "ch": ch} if ch else fields)
+    if ch:
+        fields["ch"] = ch
+    return _encode(fields)
 
 
 def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
-    """Yields blocks of records, one record behind the other, no longer than an answer of a
-    site's buffer.
+    """Yields blocks of consecutive records, each of at most `BACKFILL_BYTES`.
+
+    A block with a single longer record is longer.
     """
     block: list[bytes] = []
     size = 0
@@ -190,10 +228,10 @@ def join_states(payloads: Sequence[bytes]) -> Iterator[bytes]:
 
 
 def split_states(block: bytes) -> Iterator[bytes]:
-    """Yields the payloads of a block, which are not yet checked.
+    """Yields the payloads of the records in a block, without decoding them.
 
     Raises:
-        WireError: the block is oversized, or ends in the middle of a record.
+        WireError: the block is too large, or ends in the middle of a record.
     """
     if len(block) > MAX_BYTES:
         raise WireError("oversized", f"{count_nouns(len(block), 'byte')}, at most {MAX_BYTES}")
@@ -210,8 +248,8 @@ def split_states(block: bytes) -> Iterator[bytes]:
         start = end
 
 
-def encode(message: _Sent) -> bytes:
-    """Returns the payload of any message but a `State`."""
+def encode(message: _Sendable) -> bytes:
+    """Returns the payload of a message other than a `State` or a `PeerSample`."""
     return _encode(message)
 
 
@@ -224,14 +262,17 @@ def decode(
     versions: Collection[int] = (VERSION,),
     layout: Layout | None = None,
 ) -> M:
-    """Returns the message of a payload, of the present schema version or of those that a file
-    may have.
+    """Returns the message in a payload.
 
-    Without the `layout` of its sender vectors may have any length.
+    Args:
+        payload: the encoded message.
+        kind: the expected type of the message.
+        versions: accepted schema versions. Logs may also hold older versions, see `READABLE`.
+        layout: lengths of the sender's vectors. Without a layout, any length is accepted.
 
     Raises:
-        WireError: it is oversized, malformed, of another version, not finite, or of the wrong
-            length.
+        WireError: the payload is too large or malformed, has another schema version, holds a
+            number that is not finite, or has a vector of the wrong length.
     """
     return make_decoder(kind, tuple(versions), layout)(payload)  # type: ignore[no-any-return]
 
@@ -242,16 +283,20 @@ def make_decoder(
     versions: tuple[int, ...] = (VERSION,),
     layout: Layout | None = None,
 ) -> Callable[[bytes], Any]:
-    """Returns `decode` for one kind of message, with all that it needs at hand."""
-    limit = _LIMITS.get(kind, MAX_BYTES)
-    parse = _DECODERS[kind].decode
-    if kind is PeerSample and layout is not None:  # thousands may wait
-        limit = SAMPLE_BYTES + NUMBER_BYTES * (3 * layout.shared + layout.sent)
-    names = _vectors(kind, layout or Layout())
-    vectors_of = attrgetter(*names) if names else None
-    lengths = list(names.values()) if layout else None
+    """Returns a function that decodes payloads of one kind of message, as `decode` does.
 
-    def read(payload: bytes) -> Any:
+    The decoder, the limits and the vector lengths are looked up once, not for every payload.
+    """
+    limit = _SIZE_LIMITS.get(kind, MAX_BYTES)
+    parse = _DECODERS[kind].decode
+    if kind is PeerSample and layout is not None:
+        # Thousands of samples may wait in a ring, so their size is limited more tightly.
+        limit = SAMPLE_BYTES + NUMBER_BYTES * (3 * layout.shared + layout.sent)
+    vector_lengths = _list_vector_lengths(kind, layout or Layout())
+    get_vectors = attrgetter(*vector_lengths) if vector_lengths else None
+    lengths = list(vector_lengths.values()) if layout else None
+
+    def decode_payload(payload: bytes) -> Any:
         if len(payload) > limit:
             raise WireError(
                 "oversized", f"{count_nouns(len(payload), 'byte')}, at most {limit}"
@@ -262,28 +307,24 @@ def make_decoder(
             raise WireError("malformed", str(error)) from None
         if message.v not in versions:
             raise WireError("version", f"schema version {message.v}, this is {VERSION}")
-        if vectors_of is not None:
-            vectors = vectors_of(message)
+        if get_vectors is not None:
+            vectors = get_vectors(message)
             if lengths is not None and [*map(len, vectors)] != lengths:
-                _check_lengths(vectors, names)
-            # a sum is finite only if its terms are; finite terms whose sum overflows pass the second check
+                _check_lengths(vectors, vector_lengths)
+            # See `encode_state`: finite terms whose sum overflows pass the second check.
             if not _isfinite(sum(map(sum, vectors))):
-                for name, vector in zip(names, vectors, strict=True):
-                    if not all(map(_isfinite, vector)):
-                        number = (
-                            message.n if kind in (ArmMeasurement, HandMessage) else message.tick
-                        )
-                        raise WireError("not finite", f"{name} of {message.site} at {number}")
+                _check_finite(message, vectors, vector_lengths)
         return message
 
-    return read
+    return decode_payload
 
 
 def make_reader(
     kind: type[msgspec.Struct], layout: Layout
 ) -> Callable[[bytes], Any | WireError]:
-    """Returns a decoder that returns its error: for threads of the bus, in which nothing may be
-    raised.
+    """Returns a function that decodes a payload, and returns its `WireError` if there is one.
+
+    The function serves threads of the bus, in which nothing may be raised.
     """
     decoder = make_decoder(kind, layout=layout)
 
@@ -297,12 +338,24 @@ def make_reader(
 
 
 def _check_lengths(vectors: tuple[list[float], ...], lengths: dict[str, int]) -> None:
+    """Raises a `WireError` for the first vector whose length is not the required one."""
     for vector, (name, length) in zip(vectors, lengths.items(), strict=True):
-        if (count := len(vector)) != length:
-            joints = name == "q" and 1 <= count <= MAX_JOINTS  # so that reasons are few
-            reason = (
-                f"of {count_nouns(count, 'joint')}; the scenario has {length}"
-                if joints
-                else "malformed"
-            )
-            raise WireError(reason, f"{name} has {count_nouns(count, 'number')}, not {length}")
+        count = len(vector)
+        if count == length:
+            continue
+        reason = "malformed"
+        # Only possible numbers of joints are named, so that the number of reasons is limited.
+        if name == "q" and 1 <= count <= MAX_JOINTS:
+            reason = f"of {count_nouns(count, 'joint')}; the scenario has {length}"
+        raise WireError(reason, f"{name} has {count_nouns(count, 'number')}, not {length}")
+
+
+def _check_finite(
+    message: Any, vectors: tuple[list[float], ...], names: Collection[str]
+) -> None:
+    """Raises a `WireError` for the first vector with a number that is not finite."""
+    for name, vector in zip(names, vectors, strict=True):
+        if not all(map(_isfinite, vector)):
+            is_request = isinstance(message, ArmMeasurement | HandMessage)
+            number = message.n if is_request else message.tick
+            raise WireError("not finite", f"{name} of {message.site} at {number}")
