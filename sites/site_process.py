@@ -226,7 +226,7 @@ class RunningSite:
             PeerClock(
                 name=peer,
                 epoch_ns=epoch.epochs.get(peer, epoch.mono_ns),
-                place=scenario.peers(peer).index(parts.name),
+                index_at_peer=scenario.peers(peer).index(parts.name),
                 estimate=pinger.estimate(boot),
                 estimator=pinger.estimator(boot),
             )

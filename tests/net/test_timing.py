@@ -216,7 +216,7 @@ def test_on_one_clock_delays_and_round_trips_are_exact() -> None:
     sent.record(7, 5_000)
     assert link.receive(sample(2, 9_000, [[0, 7, 1], [3, 7, 7_500]]), 12_000) == 2_000
     assert figures(link) == (2, 2, 5, 0)  # round trip (8 500 - 5 000) + 2 000 ns
-    assert link.close(10**12, 10**12) is None
+    assert link.close_window(10**12, 10**12) is None
     assert link.offset.bound_ns == 0
 
 
@@ -258,7 +258,7 @@ def test_the_first_windows_are_short() -> None:
         now_ns = n * 10_000_000
         sent.record(n, now_ns)
         link.receive(sample(n, now_ns - 1000, [[3, n, now_ns - 1000 + 500]]), now_ns + 500)
-        if link.close(now_ns + 600, now_ns + 600):
+        if link.close_window(now_ns + 600, now_ns + 600):
             closed.append(now_ns)
     assert closed[:FIRST_WINDOWS] == [FIRST_WINDOW_NS * (n + 1) for n in range(FIRST_WINDOWS)]
     assert closed[FIRST_WINDOWS] - closed[FIRST_WINDOWS - 1] == S

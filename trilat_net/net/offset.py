@@ -7,8 +7,8 @@ before it was sent. With
 
 every message therefore limits the offset at one instant of the local clock:
 
-    ceiling (local side sent):      offset <= other reading on receipt - local reading on sending
-    floor   (local side received):  offset >= other reading on sending - local reading on receipt
+    ceiling (local side sent):     offset <= other reading on receipt - local reading on sending
+    floor   (local side received): offset >= other reading on sending - local reading on receipt
 
 The stamps t1 (local sending), t2 (other receiving), t3 (other sending) and t4 (local receiving)
 of one exchange give the ceiling t2 - t1 and the floor t3 - t4. Their mean is the classical
