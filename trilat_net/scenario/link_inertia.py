@@ -42,7 +42,7 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
     com_m: ThreeReals | None = None
     inertia_kg_m2: TensorEntries | None = None
 
-    def list_keys(self) -> list[str]:
+    def list_given_keys(self) -> list[str]:
         """Returns the keys that are given."""
         return [
             key for key in fields.field_names(LinkInertia) if getattr(self, key) is not None

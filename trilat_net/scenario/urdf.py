@@ -566,7 +566,7 @@ def _note_given(name: str, given: LinkInertia) -> str:
     if given.mass_kg == 0.0:
         return f"{_link(name)}: the scenario leaves its mass out"
     return (
-        f"{_link(name)}: {', '.join(given.list_keys())} of the scenario, in place of the file's"
+        f"{_link(name)}: {', '.join(given.list_given_keys())} of the scenario, in place of the file's"
     )
 
 
@@ -741,13 +741,13 @@ def _read_inertial(link: Element, name: str, given: LinkInertia | None) -> _Iner
     given = given or LinkInertia()
     inertial = _child(link, "inertial", _link(name))
     if given.mass_kg == 0.0:
-        for key in given.list_keys()[1:]:
+        for key in given.list_given_keys()[1:]:
             raise ScenarioError(
                 "is of a link without mass: leave it out", path=f"{_key(name)}.{key}"
             )
         return None
     if inertial is None and given.mass_kg is None:
-        if given.list_keys():
+        if given.list_given_keys():
             problem = f"is missing: the file states no mass of {_link(name)}"
             raise ScenarioError(problem, path=f"{_key(name)}.mass_kg")
         return None

@@ -22,7 +22,7 @@ from ...errors import ScenarioError
 from ..distributions import Draws
 
 
-class Holding(NamedTuple):
+class HeldArm(NamedTuple):
     """What an operator who takes hold of an arm meets.
 
     Attributes:
@@ -54,7 +54,7 @@ class ActorBase(fields.Frozen, frozen=True, tag_field="kind"):
 
     @classmethod
     def complete(
-        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str
+        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: HeldArm, path: str
     ) -> None:
         """Fills in what an author's entry left to the arm; errors call the entry `path`."""
 
@@ -172,7 +172,7 @@ _SHOWN = 60
 def resolve_operators(
     written: Any,
     kinds: Mapping[str, type[ActorBase]],
-    holding: Holding,
+    holding: HeldArm,
     path: str,
 ) -> list[fields.TomlTable]:
     """Returns a site's operators or environments, complete, of the kinds that it may hold.

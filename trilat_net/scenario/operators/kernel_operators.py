@@ -20,7 +20,7 @@ from ...core.live_hand import HandReach, HandRules
 from ...core.site_setup import MotionLimits
 from ...errors import ScenarioError, count_nouns
 from ..arms import ArmModel
-from ..operators import ActorBase, Holding, SampledActor, TimedActor
+from ..operators import ActorBase, HeldArm, SampledActor, TimedActor
 
 Frequency = Annotated[float, Meta(gt=0.0, le=1000.0)]
 RecordedPoint = Annotated[
@@ -88,7 +88,7 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
         cls,
         table: fields.TomlTable,
         entry: fields.TomlTable,  # noqa: ARG003 - all kinds have the same arguments
-        holding: Holding,
+        holding: HeldArm,
         path: str,
     ) -> None:
         """Holds the arm as it starts where no target is given."""
@@ -311,7 +311,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
 
     @classmethod
     def complete(
-        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str
+        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: HeldArm, path: str
     ) -> None:
         """Leaves out what another mode has; refuses what the author wrote of that."""
         mode = entry.get("mode", "tip")

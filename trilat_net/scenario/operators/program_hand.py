@@ -26,7 +26,7 @@ from ..imported_code import (
     import_class,
     read_code,
 )
-from ..operators import Holding
+from ..operators import HeldArm
 from .kernel_operators import LiveHand
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ class ProgramHand(
 
     @classmethod
     def complete(
-        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: Holding, path: str
+        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: HeldArm, path: str
     ) -> None:
         """Names the file of its class by a hash, and does as a live hand."""
         code = table.get("class")
