@@ -1,9 +1,12 @@
-"""Which samples of a peer a site uses, and which its user is shown, at its ticks, drawn as a
-run draws them.
+"""Compute which samples of a peer a site uses, and which samples its user is shown.
 
-Invariant: the draws are those of the link's key, so that what is said before a run holds in the
-run. What a user is shown is a function of scenario, seed and ticks: a log has it without a word
-of it.
+Delays and losses are drawn as a run draws them, so that a forecast before a run holds in the
+run.
+
+Invariant:
+    - The draws are those of the link's key.
+    - The samples that a user is shown are a function of scenario, seed and ticks. A log
+      therefore need not record them.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -22,30 +25,32 @@ from .delay_models import LinkBase
 from .scenario_types import Scenario
 
 _BLOCK = 8192
+"""Samples that are scheduled at once."""
 
 
 class LinkSchedule:
-    """When the samples of a link are due, one after the other: by a row of the core's link.
+    """The due times of the samples of a link, computed with a row of the core's link.
 
-    Ordered changes hold from a time at which no sample had been decided, so all can stand there
-    at once.
+    All models and outages stand in the row from the start: a model applies from its first stamp
+    on, which no sample has reached yet.
 
     Attributes:
-        models: the link's, in the order of their first stamps.
-        row: its state in the core.
+        models: the models of the link, in the order of their first stamps.
+        row: the state of the link in the core.
     """
 
-    def __init__(self, setup: LinkSetup, ordered: Sequence[LinkModel] = ()) -> None:
+    def __init__(self, setup: LinkSetup, changed_models: Sequence[LinkModel] = ()) -> None:
         points: list[tuple[int, int]] = []
-        placed = []
+        models: list[LinkModel] = []
         for model, trace in zip(setup.models, setup.traces, strict=True):
             if trace is not None:
                 model = model._replace(trace_first=len(points), trace_count=len(trace))
                 points += [(int(t_us), int(delay_us)) for t_us, delay_us in trace]
-            placed.append(model)
-        self.models = np.array(
-            sorted([*placed, *ordered], key=lambda one: one.from_ns), LINK_MODEL_DTYPE
-        )
+            models.append(model)
+        models += changed_models
+        # Stable: of two models with one first stamp the changed one applies.
+        models.sort(key=lambda model: model.from_ns)
+        self.models = np.array(models, LINK_MODEL_DTYPE)
         self._points = np.array([*points, *setup.outages], dtype=np.int64).reshape(-1, 2)
         row: Row = np.zeros(1, link_dtype(0))[0]
         row.rate_hz = setup.rate_hz
@@ -59,8 +64,9 @@ class LinkSchedule:
         self._block = np.empty(_BLOCK, dtype=np.int64)
 
     def draw(self, end: int) -> IntArray:
-        """Returns when the samples are due that follow those of the last call, up to one, ns;
-        or LOST.
+        """Returns the due times of the next samples, before sample `end`, ns; LOST if lost.
+
+        The first of them is the sample after the last one of the previous call.
         """
         first = int(self.row.foreseen) + 1
         due_ns = np.empty(max(0, end - first), dtype=np.int64)
@@ -76,15 +82,23 @@ class LinkSchedule:
             due_ns[start - first : stop - first] = self._block[np.arange(start, stop) % _BLOCK]
         return due_ns
 
-    def draw_releases(self, end: int, own_hz: int) -> tuple[IntArray, IntArray]:
-        """Returns those of the same samples that are not lost, and the receiver's ticks that
-        release them.
+    def draw_releases(self, end: int, receiver_hz: int) -> tuple[IntArray, IntArray]:
+        """Returns the next samples that are not lost, and the ticks at which they are released.
+
+        Args:
+            end: the sample after the last one to draw.
+            receiver_hz: the tick rate of the receiving site, Hz.
+
+        Returns:
+            Numbers of samples, and the receiver's first tick at or after each due time.
         """
-        sample = np.arange(int(self.row.foreseen) + 1, end)
+        samples = np.arange(int(self.row.foreseen) + 1, end)
         due_ns = self.draw(end)
-        stamp_ns = sample * NS_PER_S // int(self.row.rate_hz)
-        ticks = first_ticks(np.maximum(due_ns, stamp_ns + 1), own_hz)
-        return sample[due_ns != LOST], ticks[due_ns != LOST]
+        stamp_ns = samples * NS_PER_S // int(self.row.rate_hz)
+        # A sample is never released at its own stamp.
+        ticks = first_ticks(np.maximum(due_ns, stamp_ns + 1), receiver_hz)
+        is_delivered = due_ns != LOST
+        return samples[is_delivered], ticks[is_delivered]
 
 
 def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
@@ -94,88 +108,128 @@ def first_ticks(due_ns: IntArray, rate_hz: int) -> IntArray:
 
 @lru_cache(maxsize=256)
 def draw_used_samples(
-    link: LinkBase, key: int, own_hz: int, peer_hz: int, duration_s: float
+    link: LinkBase, key: int, receiver_hz: int, sender_hz: int, duration_s: float
 ) -> IntArray:
-    """Returns the sample in use at every tick of a site with nothing but this link, -1 before
-    the first.
+    """Returns the sample in use at every tick of a site that has only this link.
+
+    Args:
+        link: the link.
+        key: the key of its random draws.
+        receiver_hz: the tick rate of the site, Hz.
+        sender_hz: the tick rate of the peer, Hz.
+        duration_s: the duration of the run, s.
+
+    Returns:
+        Numbers of samples, shape (ticks,); -1 before the first sample is in use.
     """
     setup = LinkSetup(
         peer="peer",
         alpha=1.0,
-        rate_hz=peer_hz,
+        rate_hz=sender_hz,
         q0=(),
         key=key,
         models=(link.to_core_model(),),
         traces=(link.points,),
     )
-    released = LinkSchedule(setup).draw_releases(round(duration_s * peer_hz), own_hz)
-    used = _find_newest(*released, max(2, round(duration_s * own_hz)))
+    samples, releases = LinkSchedule(setup).draw_releases(
+        round(duration_s * sender_hz), receiver_hz
+    )
+    ticks = max(2, round(duration_s * receiver_hz))
+    used = _list_newest(samples, releases, ticks)
     used.flags.writeable = False
     return used
 
 
-def _find_newest(sample: IntArray, release: IntArray, ticks: int) -> IntArray:
+def _list_newest(samples: IntArray, releases: IntArray, ticks: int) -> IntArray:
+    """Returns the newest sample released at or before each tick, -1 before the first."""
     newest = np.full(ticks, -1, dtype=np.int64)
-    np.maximum.at(newest, release[release < ticks], sample[release < ticks])
+    is_within = releases < ticks
+    np.maximum.at(newest, releases[is_within], samples[is_within])
     return np.maximum.accumulate(newest)
 
 
-def count_silences(used: IntArray, own_hz: int, silence_ns: int) -> int:
-    """Returns how often none came into use for longer than `silence_ns`, after the first."""
-    came = np.flatnonzero(np.diff(used, prepend=-1) > 0)
-    gaps_ns = np.diff(came, append=len(used)) * NS_PER_S // own_hz
-    return int(np.count_nonzero(gaps_ns - NS_PER_S // own_hz > silence_ns)) if len(came) else 0
+def count_silences(used: IntArray, receiver_hz: int, silence_ns: int) -> int:
+    """Returns how often no new sample came into use for longer than `silence_ns`.
+
+    The time before the first sample does not count.
+
+    Args:
+        used: the sample in use at every tick, -1 before the first.
+        receiver_hz: the tick rate of the site, Hz.
+        silence_ns: the longest time that is not a silence, ns.
+    """
+    new_sample_ticks = np.flatnonzero(np.diff(used, prepend=-1) > 0)
+    if not len(new_sample_ticks):
+        return 0
+    gaps_ns = np.diff(new_sample_ticks, append=len(used)) * NS_PER_S // receiver_hz
+    return int(np.count_nonzero(gaps_ns - NS_PER_S // receiver_hz > silence_ns))
 
 
 class PictureDelay:
-    """Which tick of each peer a site's user is shown: `[sites.NAME.view]`, a link beside the
-    haptic one.
+    """The delay of the picture in which a site's user sees its peers: `[sites.NAME.view]`.
 
-    A peer's sample is shown from the site's first tick at or after its arrival over that link
-    (L2), drawn by a key of its own (L4), until a newer one is. Without a view the samples in
-    use are shown.
+    The picture has a link of its own beside the haptic link. A peer's sample is shown from the
+    site's first tick at or after its arrival over that link (L2), drawn by a key of its own
+    (L4), until a newer sample is shown. Without a view the samples in use are shown.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
-        self._own_hz = scenario.sites[site].rate_hz
-        view = scenario.sites[site].view
+        self._receiver_hz = scenario.sites[site].rate_hz
         self._links: dict[str, tuple[int, LinkSchedule]] = {}
-        for peer in scenario.peers(site) if view is not None else ():
+        view = scenario.sites[site].view
+        peers = scenario.peers(site) if view is not None else ()
+        for peer in peers:
             assert view is not None
-            key = link_key(scenario.seed, f"view {peer}->{site}")
             rate_hz = scenario.sites[peer].rate_hz
-            outages = tuple((round(a * 1e9), round(b * 1e9)) for a, b in view.outages_s)
+            outages = tuple(
+                (round(start_s * 1e9), round(end_s * 1e9)) for start_s, end_s in view.outages_s
+            )
             setup = LinkSetup(
                 peer=peer,
                 alpha=1.0,
                 rate_hz=rate_hz,
                 q0=(),
-                key=key,
+                key=link_key(scenario.seed, f"view {peer}->{site}"),
                 models=(view.to_core_model(),),
                 traces=(view.points,),
                 outages=outages,
             )
-            self._links[peer] = rate_hz, LinkSchedule(setup)
+            self._links[peer] = (rate_hz, LinkSchedule(setup))
+        # Rows of samples and their releases that lie after the tick of the last call.
         self._waiting = {peer: np.empty((2, 0), dtype=np.int64) for peer in self._links}
         self._shown = dict.fromkeys(self._links, -1)
 
     def advance_to(self, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns the peers' ticks that are shown at a tick of the site, -1 before the first.
+        """Returns the sample of each peer that is shown at a tick of the site.
 
         Args:
-            tick: never before that of the last call.
-            used: the samples in use then.
+            tick: the tick; never before that of the last call.
+            used: the sample in use of each peer at that tick.
+
+        Returns:
+            Ticks of the peers; -1 before the first.
         """
-        for peer, waiting in self._draw(tick):
-            sample, release = np.concatenate((self._waiting[peer], waiting), axis=1)
-            self._waiting[peer] = np.stack((sample, release))[:, release > tick]
-            self._shown[peer] = max([self._shown[peer], *sample[release <= tick][-1:].tolist()])
+        for peer, releases in self._draw_until(tick):
+            samples, ticks = np.concatenate((self._waiting[peer], releases), axis=1)
+            self._waiting[peer] = np.stack((samples, ticks))[:, ticks > tick]
+            last_released = samples[ticks <= tick][-1:].tolist()
+            self._shown[peer] = max([self._shown[peer], *last_released])
         return {**used, **self._shown}
 
     def list_shown_samples(self, ticks: int) -> dict[str, IntArray]:
-        """Returns the same for the first ticks of a run, shape (K,) each; {} without a view."""
-        return {peer: _find_newest(*drawn, ticks) for peer, drawn in self._draw(ticks - 1)}
+        """Returns the samples that are shown at the first ticks of a run.
 
-    def _draw(self, tick: int) -> Iterator[tuple[str, tuple[IntArray, IntArray]]]:
-        for peer, (rate_hz, schedule) in self._links.items():  # none is shown at its own stamp
-            yield peer, schedule.draw_releases(-(-tick * rate_hz // self._own_hz), self._own_hz)
+        Returns:
+            For each peer an array of shape (ticks,), -1 before the first; {} without a view.
+        """
+        return {
+            peer: _list_newest(samples, releases, ticks)
+            for peer, (samples, releases) in self._draw_until(ticks - 1)
+        }
+
+    def _draw_until(self, tick: int) -> Iterator[tuple[str, tuple[IntArray, IntArray]]]:
+        """Yields each peer with the samples that it sent before `tick`, and their releases."""
+        for peer, (rate_hz, schedule) in self._links.items():
+            # A sample that is stamped at the tick itself is not shown yet.
+            end = -(-tick * rate_hz // self._receiver_hz)
+            yield peer, schedule.draw_releases(end, self._receiver_hz)

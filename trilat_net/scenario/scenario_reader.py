@@ -1,7 +1,8 @@
-"""Scenarios by name, by path or from a log, with overrides applied.
+"""Load scenarios by name, by path, from tables or from a log, with overrides applied.
 
-Invariant: text from a log or a peer is not trusted: it names no file, its laws may not run, and
-it writes out what it has.
+Invariant:
+    - The text of a log or a peer is not trusted: it may not name a file, its laws may not run
+      until a person allows it, and it must write out its traces.
 """
 
 import re
@@ -24,40 +25,40 @@ from .scenario_types import Scenario, SiteSpec
 from .validate import build_scenario
 
 MAX_KEY_PARTS = 32
-"""Parts of a key, as in sites.m1.arm; a scenario needs four."""
+"""Largest number of parts of a key; a scenario needs four, as in sites.m1.arm.l1_m."""
+_MAX_NAME_LENGTH = 80
 
 
 def list_shipped() -> list[str]:
-    """Returns the names of the scenarios that come with the package; the command is `trilat
-    scenario list`.
+    """Returns the names of the scenarios in the package, as `trilat scenario list` does.
 
     >>> "paper" in tn.list_shipped()
     True
     """
-    names = (entry.name for entry in SHIPPED_FOLDER.iterdir())
+    files = [entry.name for entry in SHIPPED_FOLDER.iterdir()]
     return sorted(
-        n.removesuffix(".toml") for n in names if n.endswith(".toml") and not n.startswith("_")
+        file.removesuffix(".toml")
+        for file in files
+        if file.endswith(".toml") and not file.startswith("_")
     )
 
 
 def read_shipped(name: str) -> str:
-    """Returns the TOML text of a shipped scenario, of one that is not listed too: its name
-    begins with _.
-    """
-    if name not in list_shipped() and not (
-        len(name) < 80 and (SHIPPED_FOLDER / f"{name}.toml").is_file()
-    ):
+    """Returns the TOML text of a shipped scenario, or of an unlisted one named _NAME."""
+    file = SHIPPED_FOLDER / f"{name}.toml"
+    shipped_names = list_shipped()
+    if name not in shipped_names and not (len(name) < _MAX_NAME_LENGTH and file.is_file()):
         raise ScenarioError(
-            f"no scenario of that name{suggest_nearest(name, list_shipped())}; "
-            f"shipped are {', '.join(list_shipped())}; a file is named by its path, as in ./mine.toml",
+            f"no scenario of that name{suggest_nearest(name, shipped_names)}; "
+            f"shipped are {', '.join(shipped_names)}; a file is named by its path, as in "
+            "./mine.toml",
             source=name,
         )
-    return (SHIPPED_FOLDER / f"{name}.toml").read_text(encoding="utf-8")
+    return file.read_text(encoding="utf-8")
 
 
 def read_template() -> str:
-    """Returns the commented template of a scenario, valid as it stands; as `trilat scenario
-    new`.
+    """Returns the commented template of `trilat scenario new`, a valid scenario.
 
     >>> tn.load_scenario(tn.read_template()).names
     ('m1', 'm2', 's')
@@ -78,10 +79,10 @@ def load_scenario(
     ('m1', 'm2', 's')
 
     Args:
-        source: the name of a shipped scenario, a path, a TOML text of several lines, its
-            tables, a scenario, or a run or log, which has one.
-        overrides: as in `{"control.Kd": 5}` or `["control.Kd=5"]`; in a scenario a key of a
-            group applies to all (`override`).
+        source: the name of a shipped scenario, a path, a TOML text of several lines, tables, a
+            scenario, or a run or log, which has a scenario.
+        overrides: as in `{"control.Kd": 5}` or `["control.Kd=5"]`. If `source` is a scenario, a
+            key of a group applies to all sites or links, see `override`.
         duration_s: the duration, s; by default the scenario's.
         seed: the seed; by default the scenario's.
 
@@ -89,37 +90,52 @@ def load_scenario(
         ScenarioError: the source cannot be read or is not a valid scenario.
     """
     source = getattr(source, "scenario", source)
-    given = {"duration_s": duration_s, "seed": seed}
-    more = {key: value for key, value in given.items() if value is not None}
-    if isinstance(overrides, Mapping):
-        overrides = {**overrides, **more}
-    else:
-        listed = overrides if isinstance(overrides, list | tuple) else [overrides]
-        overrides = [*listed, *(f"{key}={value}" for key, value in more.items())]
+    pairs = _join_overrides(overrides, duration_s, seed)
     if isinstance(source, Scenario):
-        try:
-            expanded = expand_overrides(source, parse_overrides(overrides))
-            changed = (
-                parse_scenario(source.text, source.name, expanded) if overrides else source
-            )
-            # of laws, hands and plants
-            named = re.findall(r"[\w.]+:\w+", repr(list(expanded.values())))
-            return allow_own_code(changed, named, source)
-        except ScenarioError as error:
-            raise ScenarioError(error.problem, path=error.path, source=source.name) from None
-    found = read_experiment(source)
-    in_file = not isinstance(source, Mapping) and "\n" not in str(source)
-    called = found.label if in_file else "scenario"
-    return allow_own_code(parse_scenario(found.text, called, overrides, found.folder))
+        return _change_scenario(source, pairs)
+    experiment = read_experiment(source)
+    is_text = isinstance(source, Mapping) or "\n" in str(source)
+    label = "scenario" if is_text else experiment.label
+    return allow_own_code(parse_scenario(experiment.text, label, pairs, experiment.folder))
+
+
+def _join_overrides(
+    overrides: Mapping[str, Any] | Sequence[str], duration_s: float | None, seed: int | None
+) -> Mapping[str, Any] | Sequence[str]:
+    """Returns overrides together with a duration and a seed, unless these are None."""
+    options = {"duration_s": duration_s, "seed": seed}
+    chosen_options = {key: value for key, value in options.items() if value is not None}
+    if isinstance(overrides, Mapping):
+        return {**overrides, **chosen_options}
+    texts = overrides if isinstance(overrides, list | tuple) else [overrides]
+    return [*texts, *(f"{key}={value}" for key, value in chosen_options.items())]
+
+
+def _change_scenario(
+    scenario: Scenario, overrides: Mapping[str, Any] | Sequence[str]
+) -> Scenario:
+    """Returns a scenario with overrides; a key of a group applies to all sites or links."""
+    try:
+        expanded = expand_overrides(scenario, parse_overrides(overrides))
+        changed = scenario
+        if overrides:
+            changed = parse_scenario(scenario.text, scenario.name, expanded)
+        # A person who names the class of a law, hand or plant in an override allows its code.
+        named_classes = re.findall(r"[\w.]+:\w+", repr(list(expanded.values())))
+        return allow_own_code(changed, named_classes, scenario)
+    except ScenarioError as error:
+        raise ScenarioError(error.problem, path=error.path, source=scenario.name) from None
 
 
 class ExperimentText(NamedTuple):
     """An experiment as its author wrote it.
 
     Attributes:
-        label: what a command calls it: a shipped name or a path; of one that is in no file the
-            path at which a command would look for it.
-        folder: of the files that it names; None: it is resolved, and names none.
+        label: the name of the experiment in a command: a shipped name or a path. An experiment
+            that is not in a file has the path at which a command would look for it.
+        text: its TOML text.
+        folder: the folder of the files that it names; None: the text is a resolved scenario,
+            which does not name files.
     """
 
     label: str
@@ -127,10 +143,10 @@ class ExperimentText(NamedTuple):
     folder: Path | None
 
     def load(self, overrides: Sequence[str] = ()) -> Scenario:
-        """Returns it with overrides.
+        """Returns the scenario of the text with overrides.
 
         Raises:
-            ScenarioError: it is not valid with them.
+            ScenarioError: the scenario is not valid with them.
         """
         if self.folder is None:
             return load_scenario(parse_scenario(self.text, self.label, folder=None), overrides)
@@ -141,15 +157,14 @@ def read_experiment(source: str | Path | Mapping[str, Any] | Scenario) -> Experi
     """Returns the text of a shipped name, a path, a TOML text, tables, or a scenario.
 
     Raises:
-        ScenarioError: it cannot be read.
+        ScenarioError: the source cannot be read.
     """
     if isinstance(source, Scenario):
         return ExperimentText(f"./{source.name}.toml", source.text, None)
     if isinstance(source, Mapping):
-        named = str(source.get("name", "scenario"))
-        return ExperimentText(
-            f"./{named}.toml", tomli_w.dumps(name_law_classes(source)), Path()
-        )
+        name = str(source.get("name", "scenario"))
+        text = tomli_w.dumps(name_law_classes(source))
+        return ExperimentText(f"./{name}.toml", text, Path())
     if isinstance(source, str) and "\n" in source:
         return ExperimentText("./scenario.toml", source, Path())
     text, folder = read_source(source)
@@ -160,20 +175,20 @@ def reseed_scenario(scenario: Scenario, seed: int) -> Scenario:
     """Returns the same experiment with another seed, which draws its random numbers again.
 
     Raises:
-        ScenarioError: the seed is not valid, or draws a number that its key does not take.
+        ScenarioError: the seed is not valid, or a number that it draws is out of range.
     """
     return load_scenario(scenario, {"seed": seed}) if scenario.seed != seed else scenario
 
 
 def read_source(source: str | Path) -> tuple[str, Path]:
-    """Returns the TOML text of a shipped name or a path, and the folder of the files that it
-    names.
+    """Returns the TOML text of a shipped name or a path, and the folder of the named files.
 
     Raises:
-        ScenarioError: it cannot be read.
+        ScenarioError: the source cannot be read.
     """
     name = str(source)
-    if not (isinstance(source, Path) or name.endswith(".toml") or "/" in name or "\\" in name):
+    is_path = isinstance(source, Path) or name.endswith(".toml") or "/" in name or "\\" in name
+    if not is_path:
         return read_shipped(name), Path()
     try:
         with open_regular(Path(source), encoding="utf-8") as stream:
@@ -187,7 +202,7 @@ def find_site(scenario: Scenario, name: str) -> SiteSpec:
     """Returns a site of a scenario.
 
     Raises:
-        ScenarioError: it has no site of that name.
+        ScenarioError: the scenario has no site of that name.
     """
     if name not in scenario.sites:
         hint = suggest_nearest(name, scenario.names)
@@ -198,8 +213,8 @@ def find_site(scenario: Scenario, name: str) -> SiteSpec:
     return scenario.sites[name]
 
 
-_TURN = RLock()
-"""msgspec crashes where two threads are the first to use a type (0.22)."""
+_PARSE_LOCK = RLock()
+"""Held while a scenario is parsed: msgspec 0.22 crashes if two threads use a type first."""
 
 
 def parse_scenario(
@@ -208,28 +223,28 @@ def parse_scenario(
     overrides: Mapping[str, Any] | Sequence[str] = (),
     folder: Path | None = Path(),
 ) -> Scenario:
-    """Returns the scenario that a TOML text describes; errors call it `source`.
+    """Returns the scenario that a TOML text describes.
 
-    The files that it names are in `folder`; None: it may name none.
+    Args:
+        text: the TOML text.
+        source: the name of the text in errors.
+        overrides: overrides of its keys.
+        folder: the folder of the files that the text names; None: it may not name any file.
 
     Raises:
         ScenarioError: with the path of the offending key.
     """
-    with _TURN:
+    with _PARSE_LOCK:
         try:
             _refuse_long_keys(text)
-            try:
-                tables = tomllib.loads(text)
-            except (
-                ValueError
-            ) as error:  # TOMLDecodeError is one; a number of 5000 digits is another
-                raise ScenarioError(f"is not TOML: {error}") from None
-            own, of_entries = split_entries(tables, parse_overrides(overrides))
-            apply_overrides(tables, own)
+            tables = _parse_toml(text)
+            pairs, entry_pairs = split_entries(tables, parse_overrides(overrides))
+            apply_overrides(tables, pairs)
             scenario = build_scenario(resolve_scenario(tables, folder))
-            if of_entries:
+            if entry_pairs:
+                # The vectors of these entries exist only in the resolved scenario.
                 tables = tomllib.loads(scenario.text)
-                apply_overrides(tables, expand_overrides(scenario, of_entries))
+                apply_overrides(tables, expand_overrides(scenario, entry_pairs))
                 scenario = build_scenario(resolve_scenario(tables, folder))
             return scenario
         except ScenarioError as error:
@@ -238,14 +253,23 @@ def parse_scenario(
             raise ScenarioError("is nested too deep", source=source) from None
 
 
+def _parse_toml(text: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    # TOMLDecodeError is a ValueError; a number of 5000 digits raises another one.
+    except ValueError as error:
+        raise ScenarioError(f"is not TOML: {error}") from None
+
+
 _KEY_PART = re.compile(
     r"""(?P<word>[\w-]+|"[^"]*"|'[^']*')|(?P<dot>\s{0,9}\.\s{0,9})|(?P<other>.)"""
 )
 
 
 def _refuse_long_keys(text: str) -> None:
-    """Refuses keys of very many parts: the time of a parser grows by more than the square of
-    their number.
+    """Refuses keys of very many parts.
+
+    The time of a TOML parser grows faster than the square of the number of parts.
 
     Raises:
         ScenarioError: with the line of the key.
@@ -254,11 +278,15 @@ def _refuse_long_keys(text: str) -> None:
         if line.count(".") < MAX_KEY_PARTS:
             continue
         dots = 0
-        before = ""
-        for found in _KEY_PART.finditer(line):
-            kind = found.lastgroup or ""
-            dots = dots + (kind == "dot") if {kind, before} == {"word", "dot"} else 0
-            before = kind
+        previous_kind = ""
+        for part in _KEY_PART.finditer(line):
+            kind = part.lastgroup or ""
+            # A key alternates words and dots; any other pair ends it.
+            if {kind, previous_kind} == {"word", "dot"}:
+                dots += kind == "dot"
+            else:
+                dots = 0
+            previous_kind = kind
             if dots >= MAX_KEY_PARTS:
                 raise ScenarioError(f"line {number}: a key has more than {MAX_KEY_PARTS} parts")
 
@@ -267,21 +295,21 @@ def parse_embedded(text: str, source: str = "") -> Scenario:
     """Returns the resolved scenario of a log or a peer, which is not trusted.
 
     Raises:
-        ScenarioError: it is not valid, or names a file, or would fill the memory by its
-            defaults.
+        ScenarioError: the scenario is not valid, names a file, or would fill the memory because
+            a default repeats a trace for many links.
     """
     scenario = parse_scenario(text, source, folder=None)
-    changed = (change.after for change in scenario.timeline if change.link)
-    traces = sum(
-        len(getattr(link, "trace", "")) for link in (*scenario.links.values(), *changed)
-    )
-    if traces > len(text):
+    changed_links = [change.after for change in scenario.timeline if change.link]
+    links = [*scenario.links.values(), *changed_links]
+    trace_length = sum(len(getattr(link, "trace", "")) for link in links)
+    if trace_length > len(text):
         raise ScenarioError("its traces are not written out, link by link", source=source)
     return scenario
 
 
 def embedded_names_reader(source: str) -> Callable[[str], tuple[str, ...]]:
-    """Returns the function that reads the sites' names of embedded scenarios; errors call these
-    `source`.
+    """Returns a function that reads the names of the sites from the text of a scenario.
+
+    The scenario is not trusted, see `parse_embedded`; errors call it `source`.
     """
     return lambda text: parse_embedded(text, source).names

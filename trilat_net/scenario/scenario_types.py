@@ -34,9 +34,9 @@ from .arms import (
     Arm,
     ArmModel,
     Task,
-    add_credible_box,
+    bound_estimates,
     build_arm,
-    find_rest_gains,
+    compute_rest_gains,
     start_margin,
 )
 from .delay_models import Link, LinkBase
@@ -561,7 +561,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         gains = spec.control.gains(arm.theta)
         if spec.on_stale.action != "glide":
             return gains
-        return add_credible_box(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
+        return bound_estimates(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
     def _rest_gains(self, site: str) -> site_setup.RestGains:
         spec = self.sites[site]
@@ -571,10 +571,10 @@ class Scenario(Frozen, frozen=True, dict=True):
         own: Array = np.zeros(arm.counts.joints) + gains.Kp + gains.d
         limit = spec.limits.tau_limit_nm
         known = spec.arm.known
-        return find_rest_gains(
+        return compute_rest_gains(
             arm=arm,
             q0=spec.q0_rad,
-            own_damping=own,
+            law_damping=own,
             limit_nm=limit,
             rate_hz=spec.rate_hz,
             known=known,
