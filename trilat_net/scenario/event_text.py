@@ -1,6 +1,4 @@
-"""What people read of an event: its text, and for a change a sentence, also in logs of older
-programs.
-"""
+"""Render an event as a sentence for people, also from the logs of older programs."""
 
 from contextlib import suppress
 
@@ -13,9 +11,8 @@ from .scenario_types import Change
 def describe_event(kind: str, text: str, command: str) -> str:
     """Returns the sentence of an event for people.
 
-    Sites once quoted the JSON of a change in the event's text. That text is replaced by the
-    sentence of the change, so that pages, timelines and views of old logs read as those of new
-    ones.
+    Older sites quoted the JSON of a change in the text of its event. The sentence of the change
+    replaces such a text, so that pages, timelines and views of old and new logs read alike.
 
     Args:
         kind: kind of the event.
@@ -23,7 +20,7 @@ def describe_event(kind: str, text: str, command: str) -> str:
         command: JSON of the change that the event reports; empty for other events.
     """
     if kind == "change" and command and command in text:
-        # The command of a stranger may be no change, or lack the keys of one: its text stays.
+        # The command of an untrusted log may lack the keys of a change: the text then stays.
         with suppress(msgspec.MsgspecError, KeyError, TypeError, ValueError):
             return describe_change(msgspec.json.decode(command, type=Change))
     return text

@@ -197,5 +197,5 @@ def test_a_command_is_a_change_like_a_scripted_one() -> None:
 
 def test_a_change_that_is_none_is_the_files_fault() -> None:
     change = lambda s: logs.replaced(s, cmd=["{}"] if s.tick == 5 else [])  # noqa: E731
-    with pytest.raises(LogError, match="a command that is none"):
+    with pytest.raises(LogError, match="a command that cannot be read"):
         certify(logs.rewritten(logs.simulated("paper"), change=change))
