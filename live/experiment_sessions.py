@@ -253,7 +253,7 @@ def run_with_people(
                 return result
 
             def ends() -> bool:
-                return interrupt.requested() or page.end_requested.is_set()
+                return interrupt.is_requested() or page.end_requested.is_set()
 
             if ExperimentSessions(
                 experiment=experiment,
@@ -264,7 +264,7 @@ def run_with_people(
                 say=say,
             ).run():
                 clock.sleep_until(clock.monotonic_ns() + GOODBYE_NS)
-    return interrupt.exit_code if interrupt.requested() else 0
+    return interrupt.exit_code if interrupt.is_requested() else 0
 
 
 @contextmanager

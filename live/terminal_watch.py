@@ -53,7 +53,7 @@ def watch_session(
     """
     with Interrupt() as interrupt:
         names = embedded_names_reader(session)
-        stopped = interrupt.requested
+        stopped = interrupt.is_requested
         reached = connect_to_session(
             connection, clock, session, names, stopped=stopped, timeout_s=timeout_s, say=say
         )

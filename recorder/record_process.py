@@ -245,7 +245,7 @@ def record_session(
                 clock,
                 session,
                 embedded_names_reader(session),
-                stopped=interrupt.requested,
+                stopped=interrupt.is_requested,
                 timeout_s=join_timeout_s,
                 say=lambda text: say(f"recorder: {text}"),
                 recorder_boot=boot,
@@ -260,9 +260,9 @@ def record_session(
             session=session,
             boot=boot,
             storage=storage,
-            stopped=interrupt.insists,
+            stopped=interrupt.is_repeated,
             say=say,
-            is_ending=interrupt.requested,
+            is_ending=interrupt.is_requested,
         )
         process.freeze_gc()  # in a session its pauses would be time that a crash can lose
         epoch = recorder.join(join_timeout_s)
@@ -271,10 +271,10 @@ def record_session(
             return interrupt.exit_code
         recording = recorder.record(epoch)
         say("\n".join(recording.render_summary()))
-        if not interrupt.requested():
+        if not interrupt.is_requested():
             with suppress(KeyboardInterrupt), interrupt.raising():
                 afterwards()
-    if interrupt.requested():
+    if interrupt.is_requested():
         return interrupt.exit_code
     if problem := recording.describe_problem():
         raise RunFailed(problem)

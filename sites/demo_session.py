@@ -241,7 +241,7 @@ def run_demo(
             with closing(ZenohBus([], endpoints)) as bus, attending as is_enough:
                 monitor = SessionMonitor(bus, session, scenario, display)
                 while not (
-                    interrupt.requested()
+                    interrupt.is_requested()
                     or is_enough()
                     or _is_over([*sites, *recorder], result)
                 ):
@@ -349,14 +349,16 @@ def _end_all(
         "the sites keep their last records until the recorder has them, 10 s at most; "
         "Ctrl-C a second time ends it at once",
     )
-    _end_group(starter=starter, group=sites, clock=clock, insists=interrupt.insists, tell=tell)
+    _end_group(
+        starter=starter, group=sites, clock=clock, insists=interrupt.is_repeated, tell=tell
+    )
     sites_left_ns = clock.monotonic_ns()
 
     def may_insist() -> bool:
         """True once the recorder has had its time: without sites there is nothing that it could
         ask for.
         """
-        return interrupt.insists() or clock.monotonic_ns() - sites_left_ns > RECORDER_NS
+        return interrupt.is_repeated() or clock.monotonic_ns() - sites_left_ns > RECORDER_NS
 
     _end_group(
         starter=starter, group=recorder, clock=clock, insists=may_insist, tell=lambda: None

@@ -27,7 +27,7 @@ from trilat_net.core.jit import is_core_cached
 from trilat_net.core.site_step import Site
 from trilat_net.core.ticks import NS_PER_S, Arrival, TickInput, TickRecord
 from trilat_net.errors import RunFailed, SessionError, UsageError, count_nouns
-from trilat_net.files import find_rights_of_others
+from trilat_net.files import read_foreign_permissions
 from trilat_net.net.clock import Clock, SystemClock
 from trilat_net.net.connection import (
     ENCRYPTED,
@@ -130,7 +130,7 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
         yield DoctorFinding("keys", "warn", f"{text}: soon; renew them with trilat keys renew")
     else:
         yield DoctorFinding("keys", "ok", text)
-    if find_rights_of_others(folder):
+    if read_foreign_permissions(folder):
         yield DoctorFinding(
             "keys", "warn", f"others can look into {folder}: chmod 700 {folder}"
         )

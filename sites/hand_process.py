@@ -134,7 +134,7 @@ def run_hand(
         )
     program = make_hand_program(at)
     clock = SystemClock()
-    stopped = interrupt.requested
+    stopped = interrupt.is_requested
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
     bus = open_bus(
         connection=connection, clock=clock, stopped=stopped, timeout_s=timeout_s, say=say

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand, free_hand
+from trilat_net.core.live_hand import HandCommand, HandMemory, advance_hand, empty_hand_vector
 from trilat_net.core.site_arrays import SiteArrays
 from trilat_net.core.site_setup import MotionLimits
 from trilat_net.core.site_step import Site
@@ -73,7 +73,7 @@ class HandServer:
         self._rules = hand.make_rules(site.rate_hz, arm, limits)
         self._place = lambda: site.q if hand.mode == "joint" else arm.end_effector(site.q)
         self._memory = HandMemory()
-        self._free = free_hand(self._rules.size)
+        self._free = empty_hand_vector(self._rules.size)
         self._names: dict[int, str] = {}
         self.news: list[tuple[int, str]] = []
 
@@ -108,7 +108,7 @@ class HandServer:
             self._dropped[
                 f"hand: no {'force' if pushes else 'target'} of {count_nouns(self._rules.size, 'number')}"
             ] += 1
-        elif message.grip and math.hypot(*target) > self._rules.farthest:
+        elif message.grip and math.hypot(*target) > self._rules.max_goal_norm:
             self._dropped["hand: out of range"] += 1
         else:
             if len(self._names) > MESSAGES_KEPT and message.boot not in self._names:
@@ -187,14 +187,16 @@ class RemoteHand(HandPlayer):
         return _read_messages(self._inbox, self._site, self._dropped, self._source)
 
     def _decide(self, k: int, message: HandMessage) -> None:
-        asked = message.n * self.hand.every
+        asked = message.n * self.hand.period_ticks
         # that it is here may come after the first question, and decides nothing
         is_here = message.n == 0 and not message.grip
         if self.failure or is_here or asked > self._asked:
             return
-        self._dropped.update(["hand: late"] * (asked + self.hand.delay < k))
+        self._dropped.update(["hand: late"] * (asked + self.hand.delay_ticks < k))
         try:
-            self.hand.decide(asked, (message.target or message.force) if message.grip else None)
+            self.hand.accept_decision(
+                asked, (message.target or message.force) if message.grip else None
+            )
         except ValueError as error:
             self.fail(k, str(error))
 

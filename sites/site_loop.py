@@ -43,7 +43,7 @@ def make_sample_readers(setup: SiteSetup) -> list[Callable[[bytes], PeerSample |
     """Returns for each peer of a site what reads its samples, in threads that nothing may raise
     in.
     """
-    layouts = [setup.layout._replace(sent=link.channel.floats) for link in setup.links]
+    layouts = [setup.layout._replace(sent=link.channel.record_size) for link in setup.links]
     return [make_reader(PeerSample, layout) for layout in layouts]
 
 
@@ -136,7 +136,7 @@ class PeerInbox:
             self._dropped["missing"] += sample.tick - self._last[index] - 1
         self._last[index] = max(self._last[index], sample.tick)
         delay_ns = self._monitors[index].receive(sample, arrived_ns)
-        ch = link.channel.part(sample.ch, link.place) if sample.ch else ()
+        ch = link.channel.select_for_peer(sample.ch, link.place) if sample.ch else ()
         return Arrival(
             peer=index,
             tick=sample.tick,

@@ -291,7 +291,9 @@ def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord])
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None
     for k in range(WARM_UP_TICKS):
         arrivals = [
-            Arrival(j, k - 1, link.q0, (0.0,) * len(link.q0), ch=(0.0,) * link.channel.received)
+            Arrival(
+                j, k - 1, link.q0, (0.0,) * len(link.q0), ch=(0.0,) * link.channel.received_size
+            )
             for j, link in enumerate(setup.links)
             if k > 0
         ]

@@ -101,7 +101,7 @@ def run_site(
         bus = open_bus(
             connection=options.connection,
             clock=clock,
-            stopped=interrupt.requested,
+            stopped=interrupt.is_requested,
             timeout_s=timeout_s,
             say=named,
         )
@@ -131,7 +131,7 @@ def take_part(parts: SiteParts) -> int:
         RunFailed: the run ended badly.
     """
     give_up_ns = parts.clock.monotonic_ns() + int(parts.options.join_timeout_s * 1e9)
-    waits = parts.interrupt.requested, give_up_ns, parts.say
+    waits = parts.interrupt.is_requested, give_up_ns, parts.say
     for awaited in (parts.arm, parts.hand):
         if isinstance(awaited, ExternalArm | RemoteHand) and not awaited.wait_for_first(*waits):
             return parts.interrupt.exit_code
@@ -168,7 +168,7 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
     pinger = joining.pinger
     parts.say(f"waiting for {', '.join(membership.list_missing()) or 'the epoch'}")
     begins = 0
-    while not parts.interrupt.requested():
+    while not parts.interrupt.is_requested():
         epoch = joining.poll()
         if epoch is not None:
             since_ns = parts.clock.monotonic_ns() - epoch.mono_ns
@@ -322,7 +322,7 @@ class RunningSite:
             if input_ is not None:
                 input_.poll()
         ended = self._failure or parts.monitor.ended_by or parts.changes.stopped
-        return bool(ended) or parts.interrupt.requested() or self._given_up
+        return bool(ended) or parts.interrupt.is_requested() or self._given_up
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
         """Steps the site; None if its law failed, which ends the run."""
@@ -551,7 +551,9 @@ class RunningSite:
         self._publish(
             "end", f"{parts.name} made {count_nouns(self._ticks, 'tick')}{why}", about=about
         )
-        code = interrupt.exit_code if interrupt.requested() else 0  # later signals end the wait
+        code = (
+            interrupt.exit_code if interrupt.is_requested() else 0
+        )  # later signals end the wait
         parts.monitor.watch(self._publisher, self._t_ns)
         if topics.RECORDER in parts.monitor.boots or parts.monitor.recorders:
             self._await_recorders()
@@ -591,7 +593,7 @@ class RunningSite:
             return "", ", as many as it was asked for"
         if self._ticks == parts.scenario.ticks(parts.name):
             return "", ""
-        if parts.interrupt.requested():
+        if parts.interrupt.is_requested():
             return parts.name, f", ended by {signal.Signals(parts.interrupt.number).name}"
         return next(iter(monitor.away), ""), f": {self._away}"
 
@@ -613,7 +615,7 @@ class RunningSite:
         queried_ns = 0
         is_announced = False
         while clock.monotonic_ns() < give_up_ns and not self._may_leave():
-            while not parts.interrupt.insists() and parts.buffer.answer_query():
+            while not parts.interrupt.is_repeated() and parts.buffer.answer_query():
                 queried_ns = clock.monotonic_ns()
                 give_up_ns = max(give_up_ns, queried_ns + LINGER_NS)
             self._publisher.answer_queries()
@@ -637,4 +639,6 @@ class RunningSite:
     def _may_leave(self) -> bool:
         """True if the user insists, or wants the end and every recorder present has stored all."""
         interrupt = self._parts.interrupt
-        return interrupt.insists() or (self._parts.monitor.all_stored and interrupt.requested())
+        return interrupt.is_repeated() or (
+            self._parts.monitor.all_stored and interrupt.is_requested()
+        )

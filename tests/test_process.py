@@ -17,15 +17,21 @@ from tests.live.processes import is_running
 from tests.net.waiting import until
 from tests.other_systems import replace_os
 from trilat_net import process
-from trilat_net.process import ENDING_SIGNALS, Interrupt, hold_sigint, join_words, worker_pool
+from trilat_net.process import (
+    ENDING_SIGNALS,
+    Interrupt,
+    hold_sigint,
+    join_arguments,
+    worker_pool,
+)
 
 
 def test_a_signal_is_remembered_and_ends_nothing() -> None:
     with Interrupt() as interrupt:
-        assert not interrupt.requested()
+        assert not interrupt.is_requested()
         os.kill(os.getpid(), signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGINT)
-        assert interrupt.requested()
+        assert interrupt.is_requested()
         assert interrupt.exit_code == 128 + signal.SIGTERM  # the first counts
 
 
@@ -35,12 +41,12 @@ def test_only_a_later_second_signal_insists(monkeypatch: pytest.MonkeyPatch) -> 
     with Interrupt() as interrupt:
         for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGINT, signal.SIGINT):
             os.kill(os.getpid(), number)
-            assert not interrupt.insists()
+            assert not interrupt.is_repeated()
         now_s += 1.0
         os.kill(os.getpid(), signal.SIGHUP)
-        assert not interrupt.insists()
+        assert not interrupt.is_repeated()
         os.kill(os.getpid(), signal.SIGTERM)
-        assert interrupt.insists()
+        assert interrupt.is_repeated()
 
 
 def test_handlers_are_put_back() -> None:
@@ -58,7 +64,7 @@ def test_a_terminals_end_is_a_signal_unless_ignored(handler: signal.Handlers) ->
     try:
         with Interrupt() as interrupt:
             os.kill(os.getpid(), signal.SIGHUP)
-            assert interrupt.requested() is (handler is signal.SIG_DFL)
+            assert interrupt.is_requested() is (handler is signal.SIG_DFL)
         assert signal.getsignal(signal.SIGHUP) is handler
     finally:
         signal.signal(signal.SIGHUP, before)
@@ -75,7 +81,7 @@ def test_long_work_is_broken_off_at_once() -> None:
     with Interrupt() as interrupt, pytest.raises(KeyboardInterrupt):
         work(interrupt)
     assert reached == []
-    assert interrupt.requested()
+    assert interrupt.is_requested()
 
 
 def test_a_signal_that_python_swallowed_breaks_off_at_the_end() -> None:
@@ -92,7 +98,7 @@ def test_a_block_without_a_signal_ends_as_any_other() -> None:
         with interrupt.raising():
             pass
         os.kill(os.getpid(), signal.SIGINT)
-        assert interrupt.requested()
+        assert interrupt.is_requested()
 
 
 @pytest.fixture(autouse=True)
@@ -162,8 +168,8 @@ def test_a_ctrl_c_while_workers_start_arrives_afterwards(elsewhere: bool) -> Non
                 thread.join()
             else:
                 interrupt_itself()
-            assert not interrupt.requested()
-        assert interrupt.requested()
+            assert not interrupt.is_requested()
+        assert interrupt.is_requested()
 
 
 def unmasked(act: Callable[[], None]) -> None:
@@ -184,10 +190,10 @@ WINDOWS_WORDS = [
 
 
 def test_a_command_is_quoted_as_the_shell_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert shlex.split(join_words(WINDOWS_WORDS)) == WINDOWS_WORDS
+    assert shlex.split(join_arguments(WINDOWS_WORDS)) == WINDOWS_WORDS
     monkeypatch.setattr(process, "os", replace_os())
     plain = r'trilat sweep "my runs\\one" "m1->s" "say \"no\"" C:\\runs --set a=-1.5'
-    assert join_words(WINDOWS_WORDS) == plain
+    assert join_arguments(WINDOWS_WORDS) == plain
 
 
 class ProcessEndedError(Exception):

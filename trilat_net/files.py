@@ -192,7 +192,7 @@ def digest_file(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def find_rights_of_others(path: Path) -> int:
+def read_foreign_permissions(path: Path) -> int:
     """Returns the bits of a file's mode that let others in; 0 on Windows, where a list says who
     may.
     """

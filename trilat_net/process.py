@@ -156,14 +156,14 @@ class Interrupt:
             yield
         finally:
             self.raises = False
-        if self.requested():
+        if self.is_requested():
             raise KeyboardInterrupt
 
-    def requested(self) -> bool:
+    def is_requested(self) -> bool:
         """True once a signal has arrived."""
         return self.number != 0
 
-    def insists(self) -> bool:
+    def is_repeated(self) -> bool:
         """True once a second SIGINT or SIGTERM has arrived, later than one that a parent passes
         on.
         """
@@ -175,7 +175,7 @@ class Interrupt:
         return 128 + self.number
 
 
-def let_signals_kill() -> Callable[[], None]:
+def end_process_at_signals() -> Callable[[], None]:
     """Lets signals end the process at once where they may break off work; the function returned
     ends that.
 
@@ -227,7 +227,7 @@ def _breaks_off(owner: object) -> bool:
     return isinstance(owner, Interrupt) and (owner.raises or owner.compiles)
 
 
-def join_words(words: Iterable[str]) -> str:
+def join_arguments(words: Iterable[str]) -> str:
     """Returns a command as it is typed into a shell of this system."""
     if os.name != "nt":
         return shlex.join(words)

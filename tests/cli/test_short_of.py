@@ -14,7 +14,7 @@ import pytest
 
 from tests.cli.running import COMMAND, PLAIN, trilat
 from trilat_net.core.jit import COMPILING
-from trilat_net.process import ENDING_SIGNALS, Interrupt, let_signals_kill
+from trilat_net.process import ENDING_SIGNALS, Interrupt, end_process_at_signals
 
 LOG = Path(__file__).parents[1] / "golden" / "v3.mcap"
 WITHOUT_COMPILING = {**PLAIN, "NUMBA_DISABLE_JIT": "1", "PYTHONDONTWRITEBYTECODE": "1"}
@@ -229,7 +229,7 @@ def test_signals_kill_while_the_compiler_runs_only_where_they_may() -> None:
 
     def released() -> bool:
         before = handlers()
-        restore = let_signals_kill()
+        restore = end_process_at_signals()
         during = handlers()
         restore()
         assert handlers() == before

@@ -25,8 +25,8 @@ from trilat_net.core.live_hand import (
     HandRules,
     HandStep,
     advance_hand,
+    empty_hand_vector,
     find_stopping_speed,
-    free_hand,
 )
 
 RULES = HandRules(size=2, rate_hz=1000, speed_limit=1.5)
@@ -69,7 +69,7 @@ def at(
 def test_it_begins_at_arm_without_force_and_its_grip_grows() -> None:
     steps = run(at(10, (1.2, 0.5)), 150)
     before, first, *rest = hands(steps)[9:]
-    assert before == HandInForce.read(free_hand(2))
+    assert before == HandInForce.read(empty_hand_vector(2))
     assert first.target == ARM
     assert first.grip == 0.0
     assert steps[10].changes == ((7, TAKEN),)
@@ -126,10 +126,12 @@ def test_who_lets_go_is_followed_by_whoever_takes_hold_next() -> None:
 
 
 @pytest.mark.parametrize("source", [7, 9], ids=["the same", "another"])
-@pytest.mark.parametrize("from_arm", [True, False], ids=["a target", "a force"])
-def test_who_takes_hold_of_fading_grip_goes_on_from_it(source: int, from_arm: bool) -> None:
+@pytest.mark.parametrize("starts_at_arm", [True, False], ids=["a target", "a force"])
+def test_who_takes_hold_of_fading_grip_goes_on_from_it(
+    source: int, starts_at_arm: bool
+) -> None:
     """After 20 ms of fading the grip was 0.79, and fell to 0 in one tick."""
-    rules = RULES._replace(from_arm=from_arm)
+    rules = RULES._replace(starts_at_arm=starts_at_arm)
     again = {220: [HandCommand(source, 220, True, (1.0, 0.6), 0)]}
     steps = run(
         at(0, (1.1, 0.5)) | at(150, (1.1, 0.5), n=0) | at(199, (), grip=False) | again,
@@ -154,7 +156,7 @@ def test_a_message_that_was_overtaken_changes_nothing() -> None:
     }
     steps = run(at(10, (1.1, 0.5)) | at(50, (), n=50, grip=False) | late, 200)
     assert steps[30].refused == steps[70].refused == (OUT_OF_ORDER,)
-    assert steps[-1].vector == free_hand(2)
+    assert steps[-1].vector == empty_hand_vector(2)
 
 
 def test_hand_that_wakes_up_takes_hold_again_with_same_goal() -> None:
@@ -163,7 +165,7 @@ def test_hand_that_wakes_up_takes_hold_again_with_same_goal() -> None:
 
 
 def test_a_force_begins_at_zero() -> None:
-    rules = HandRules(size=2, rate_hz=1000, from_arm=False)
+    rules = HandRules(size=2, rate_hz=1000, starts_at_arm=False)
     steps = hands(run(at(0, (8.0, 0.0)), 120, rules))
     assert steps[0].target == (0.0, 0.0)
     assert steps[-1].target == pytest.approx((8.0, 0.0))

@@ -15,13 +15,13 @@ PLACE = (0.5, -0.25)
 EVERY, DELAY, TICKS = 20, 30, 400
 
 
-def make_hand(delay: int = DELAY, *, from_arm: bool = True) -> OwnHand:
-    rules = HandRules(2, 1000, 1.5, from_arm, 100.0)
+def make_hand(delay: int = DELAY, *, starts_at_arm: bool = True) -> OwnHand:
+    rules = HandRules(2, 1000, 1.5, starts_at_arm, 100.0)
     return OwnHand(rules, EVERY, delay, lambda _: PLACE)
 
 
 def acted(hand: OwnHand, k: int) -> HandInForce:
-    return HandInForce.read(hand.advance(k, lambda: PLACE).vector)
+    return HandInForce.read(hand.advance_to(k, lambda: PLACE).vector)
 
 
 def run(
@@ -32,7 +32,7 @@ def run(
     found = []
     for k in range(TICKS):
         for asked, goal in (one for at, one in decisions.items() if at == k):
-            hand.decide(asked, goal)
+            hand.accept_decision(asked, goal)
         found.append(acted(hand, k))
     return found
 
@@ -81,9 +81,9 @@ def test_none_lets_go_and_the_grip_fades() -> None:
 
 def test_it_says_when_it_needs_the_arm() -> None:
     hand = make_hand(delay=50)
-    assert [hand.find_next(k) for k in (0, 19, 20)] == [20, 20, 40]
-    hand.decide(0, (0.6, -0.25))
-    assert [hand.find_next(k) for k in (41, 49, 50)] == [50, 50, 60]
+    assert [hand.find_next_event(k) for k in (0, 19, 20)] == [20, 20, 40]
+    hand.accept_decision(0, (0.6, -0.25))
+    assert [hand.find_next_event(k) for k in (41, 49, 50)] == [50, 50, 60]
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_it_says_when_it_needs_the_arm() -> None:
 def test_a_goal_that_is_none_is_refused(goal: tuple[float, ...], problem: str) -> None:
     hand = make_hand()
     with pytest.raises(ValueError, match=problem):
-        hand.decide(0, goal)
+        hand.accept_decision(0, goal)
     assert acted(hand, 0).source == 0
 
 
@@ -124,21 +124,21 @@ def test_compiled_spans_are_the_ticks_bit_for_bit(
         2,
         1000,
         speed_limit,
-        from_arm=True,
-        farthest=100.0,
+        starts_at_arm=True,
+        max_goal_norm=100.0,
         acceleration_limit=acceleration_limit,
     )
     by_tick, by_span = (OwnHand(rules, EVERY, delay, lambda _: PLACE) for _ in range(2))
     singles = []
     for k in range(EVERY * len(goals) + 500):
         if k % EVERY == 0 and k // EVERY < len(goals):
-            by_tick.decide(k, goals[k // EVERY])
-        singles.append(by_tick.advance(k, lambda: PLACE).vector)
+            by_tick.accept_decision(k, goals[k // EVERY])
+        singles.append(by_tick.advance_to(k, lambda: PLACE).vector)
     k, spans = 0, []
     while k < len(singles):
         if k % EVERY == 0 and k // EVERY < len(goals):
-            by_span.decide(k, goals[k // EVERY])
-        rows = by_span.advance_until(k, len(singles), lambda: PLACE)
+            by_span.accept_decision(k, goals[k // EVERY])
+        rows = by_span.advance_span(k, len(singles), lambda: PLACE)
         spans += rows.tolist()
         k += len(rows)
     assert np.array(spans).tobytes() == np.array(singles).tobytes()

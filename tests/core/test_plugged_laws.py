@@ -35,7 +35,7 @@ def run_by_hand(scenario: Scenario, ticks: int = TICKS) -> dict[str, list[TickRe
             arrivals = []
             for j, link in enumerate(setups[name].links if k else ()):
                 r = records[link.peer][k - 1]
-                part = link.channel.part(r.ch, link.place)
+                part = link.channel.select_for_peer(r.ch, link.place)
                 arrivals.append(Arrival(j, k - 1, r.q, r.qd, 0, r.tau_x, part))
             records[name].append(site.step(TickInput(k, arrivals)))
     return records
@@ -114,8 +114,8 @@ def test_names_of_several_senders_are_joined() -> None:
     b = LawChannel((SentVector("F", "N m", 2), SentVector("E", "J", 1)), 2)
     vectors = join_received([a, b])
     assert [one.name for one in vectors] == ["E", "u", "F"]
-    assert a.find_places(vectors) == [0, 1, 2, -1, -1]
-    assert b.find_places(vectors) == [2, -1, -1, 0, 1]
+    assert a.find_columns(vectors) == [0, 1, 2, -1, -1]
+    assert b.find_columns(vectors) == [2, -1, -1, 0, 1]
     with pytest.raises(ValueError, match="E of 1 and of 3 numbers"):
         join_received([a, LawChannel((SentVector("E", "J", 3),), 2)])
 

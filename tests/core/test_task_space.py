@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 from tests.core.task_sites import PLACE, POSE, build
 from trilat_net.core.chain import place_joints
 from trilat_net.core.rotation import (
+    angular_velocity,
     arctan,
+    relative_rotation,
     rotation_matrix,
     rotation_vector,
-    turn_between,
-    turn_rate,
-    turning_velocity,
+    rotation_vector_rate,
 )
 from trilat_net.core.site_arrays import SiteArrays
 from trilat_net.core.site_setup import TaskSetup
@@ -51,7 +51,10 @@ def test_rotations_are_those_of_scipy(vector: tuple[float, float, float]) -> Non
     assert np.abs(np.array(rows) - wanted.as_matrix()).max() <= 1e-14
     turned_back = Rotation.from_rotvec(rotation_vector(rows)) * wanted.inv()
     assert turned_back.magnitude() <= 1e-14
-    assert np.abs(np.array(turn_between(rows, rotation_matrix((0.0, 0.0, 0.0))))).max() <= np.pi
+    assert (
+        np.abs(np.array(relative_rotation(rows, rotation_matrix((0.0, 0.0, 0.0))))).max()
+        <= np.pi
+    )
 
 
 @given(vector=vectors, rate=vectors, shorter=st.sampled_from([1.0, 1e-2, 3e-3, 1e-3, 1e-6]))
@@ -63,11 +66,11 @@ def test_velocity_of_turn_is_limit_of_differences_and_is_undone(
     after, before = (
         Rotation.from_rotvec(np.array(turn) + h * np.array(rate)) for h in (1e-5, -1e-5)
     )
-    velocity = turning_velocity(turn, rate)
+    velocity = angular_velocity(turn, rate)
     assert np.array(velocity) == pytest.approx(
         (after * before.inv()).as_rotvec() / 2e-5, abs=1e-8
     )
-    assert turn_rate(turn, velocity) == pytest.approx(rate, abs=1e-11)
+    assert rotation_vector_rate(turn, velocity) == pytest.approx(rate, abs=1e-11)
 
 
 @given(x=st.floats(0.0, 1.0))

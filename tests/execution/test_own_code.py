@@ -81,8 +81,8 @@ def test_a_hand_sees_its_peers_after_the_delay() -> None:
     player = HandPlayer(at, Follower(at.describe()))
 
     def take(site: Site, k: int) -> list[float]:
-        if player.hand.is_asked(k):
-            seen.append(player.hand.view(k, site.arrays, scenario.layout("m2")))
+        if player.hand.is_decision_tick(k):
+            seen.append(player.hand.build_view(k, site.arrays, scenario.layout("m2")))
         return player.track(site, k)
 
     log = simulate_scenario(scenario, hands={"m2": take})

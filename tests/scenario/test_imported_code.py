@@ -195,21 +195,27 @@ def test_what_a_law_sends_stands_in_the_scenario(folder: Path) -> None:
     to_all = (SentVector("E", "J", 1), SentVector("w", "", 2))
     channel = LawChannel((*to_all, SentVector("u", "sqrt(W)", 2, per_peer=True)), peers=2)
     assert all(scenario.channel(site) == channel for site in scenario.names)
-    assert channel.floats == scenario.layout("s").lengths()["ch"] == 3 + 2 * 2
+    assert channel.record_size == scenario.layout("s").lengths()["ch"] == 3 + 2 * 2
     for site in scenario.names:
         setup = scenario.setup(site)
         assert setup.channel == channel
         for link in setup.links:  # what is sent to this site is found in the peer's record
-            record = list(range(channel.floats))
+            record = list(range(channel.record_size))
             first = 3 + 2 * scenario.peers(link.peer).index(site)
-            assert link.channel.part(record, link.place) == [0, 1, 2, first, first + 1]
+            assert link.channel.select_for_peer(record, link.place) == [
+                0,
+                1,
+                2,
+                first,
+                first + 1,
+            ]
 
 
 def test_law_that_sends_nothing_leaves_its_scenario_as_it_was(folder: Path) -> None:
     scenario = load_sending(folder, "{}")
     assert "sends" not in scenario.text
     assert "ch" not in scenario.layout("s").lengths()
-    assert scenario.setup("s").channel.floats == 0
+    assert scenario.setup("s").channel.record_size == 0
 
 
 @pytest.mark.parametrize(
@@ -263,4 +269,4 @@ def test_a_site_is_built_with_its_named_law_and_scheme(
     scenario = load_scenario(load_scenario(named), overrides)
     with pytest.raises(ScenarioError, match=fact or "OSError"):
         Site(scenario.setup("s"))
-    assert load_scenario(scenario, {"control.law": "adaptive"}).channel("s").floats == 0
+    assert load_scenario(scenario, {"control.law": "adaptive"}).channel("s").record_size == 0

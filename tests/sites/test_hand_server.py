@@ -13,7 +13,7 @@ from sites.hand_server import MESSAGES_KEPT, HandServer
 from sites.running_session import open_hand
 from tests.net.local_bus import LocalNetwork
 from tests.net.manual_clock import ManualClock
-from trilat_net.core.live_hand import ANOTHER_HOLDS, HandInForce, free_hand
+from trilat_net.core.live_hand import ANOTHER_HOLDS, HandInForce, empty_hand_vector
 from trilat_net.errors import UsageError
 from trilat_net.execution.verify import verify
 from trilat_net.execution.virtual_comparison import compare_with_virtual
@@ -160,7 +160,7 @@ def message(**fields: Any) -> bytes:
 )
 def test_a_hostile_message_is_refused_and_counted(payload: bytes, reason: str) -> None:
     served = Served()
-    assert served.take(payload) == HandInForce.read(free_hand(2))
+    assert served.take(payload) == HandInForce.read(empty_hand_vector(2))
     assert served.dropped == {reason: 1}
 
 

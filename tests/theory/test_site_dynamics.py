@@ -91,7 +91,7 @@ def test_the_field_is_what_a_tick_computes(seed: int, law: str) -> None:
 def test_its_jacobian_is_the_limit_of_differences(seed: int, law: str) -> None:
     """Away from the surfaces of walls, where there is none."""
     rng = np.random.default_rng(seed)
-    one = site(rng, law, [actor for actor in actors(rng) if actor.acts is not TorqueKind.WALL])
+    one = site(rng, law, [actor for actor in actors(rng) if actor.kind is not TorqueKind.WALL])
     x = rng.uniform(-1, 1, AT.arguments)
     step = 1e-5
     found = differentiate_site_rates(one, x)

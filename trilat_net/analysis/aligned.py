@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.safeguards import BLEND_S
-from ..core.task_space import PLACE, POSE
+from ..core.task_space import POSE, POSITION
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..log.log_reader import Log
@@ -283,7 +283,7 @@ class PeerTrajectory:
         vb = rate[low + 1]
         # between two rotation vectors of different branches lies nothing
         if self.records.x.shape[1] == POSE:
-            qb[:, PLACE:] = choose_nearest_vectors(qb[:, PLACE:], qa[:, PLACE:])
+            qb[:, POSITION:] = choose_nearest_vectors(qb[:, POSITION:], qa[:, POSITION:])
         q = qa + x * (
             h * va
             + x * (3 * (qb - qa) - h * (2 * va + vb) + x * (2 * (qa - qb) + h * (va + vb)))

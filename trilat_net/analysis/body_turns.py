@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.task_space import PLACE
+from ..core.task_space import POSITION
 from ..core.vectors import Array
 from ..log.orientations import QUATERNION_AXES, QuaternionSigns
 
@@ -24,7 +24,7 @@ class BodyTurns:
         """Returns poses, shape (7 b,), as given: x, y, z, m, and the unit quaternion w, x, y, z
         of each.
         """
-        poses = np.array(bodies, dtype=np.float64).reshape(-1, PLACE + len(QUATERNION_AXES))
+        poses = np.array(bodies, dtype=np.float64).reshape(-1, POSITION + len(QUATERNION_AXES))
         for body, pose in enumerate(poses):
-            pose[PLACE:] = self._signs[body].align(pose[PLACE:].tolist())
+            pose[POSITION:] = self._signs[body].align(pose[POSITION:].tolist())
         return poses.ravel()

@@ -529,7 +529,7 @@ def _find_disagreement(
 ) -> Iterable[str]:
     for group in find_coupled_sites(scenario):
         names = [scenario.names[n] for n in group]
-        places = any(scenario.sites[name].control.compares_places for name in names)
+        places = any(scenario.sites[name].control.compares_positions for name in names)
         if len(group) < 2 or places or any(scenario.arms[name].shares_pose for name in names):
             continue  # e says if they agree
         q = np.array([columns[n][:, 2] for n in group])
@@ -567,8 +567,8 @@ def _find_held_sites(
     for n, (spec, tau_x) in enumerate(zip(scenario.sites.values(), trace.tau_x, strict=True)):
         touched = spec.environment if np.abs(tau_x).max() > FORCE_NM else ()
         for actor in (one.actor for one in (*spec.hands, *touched)):
-            stiffness = actor.K[joint : joint + 1] if actor.acts == TorqueKind.HAND else actor.K
-            stiff = any(stiffness) or actor.acts in OWN_KINDS
+            stiffness = actor.K[joint : joint + 1] if actor.kind == TorqueKind.HAND else actor.K
+            stiff = any(stiffness) or actor.kind in OWN_KINDS
             held[n] |= actor.start_s <= end_s < actor.end_s and stiff
     return held
 
@@ -612,7 +612,7 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
     for name, spec in scenario.sites.items():
         start = np.array([spec.q0_rad])
         J = build_arm_rows(scenario, name).place_end_effector(start, 0.0 * start).J[0]
-        for source in (one.actor for one in spec.hands if one.actor.acts not in LIVE_KINDS):
+        for source in (one.actor for one in spec.hands if one.actor.kind not in LIVE_KINDS):
             script = compute_operator_script(
                 source, t_s, np.eye(len(source.a)) if source.a else J
             )

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 import numpy as np
 
 from ..core.exogenous import TorqueSource
-from ..core.task_space import PLACE, POSE
+from ..core.task_space import POSE, POSITION
 from ..log.log_reader import Log
 from ..log.orientations import compute_continuous_vectors
 from ..scenario import Scenario
@@ -123,6 +123,6 @@ def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
         script = script @ (follows.inverse[0] @ follows.J[0]).T
     x = records.x
     if x.shape[1] == POSE:  # metrics compare poses of different times
-        x = np.hstack([x[:, :PLACE], compute_continuous_vectors(x[:, PLACE:])])
+        x = np.hstack([x[:, :POSITION], compute_continuous_vectors(x[:, POSITION:])])
     places = records._replace(q=axes * x, qd=axes * records.xd, tau_x=axes * records.wrench)
     return SiteRun(places, forces._replace(script=script), dominance)

@@ -26,7 +26,7 @@ SCRIPT_TORQUE_TOLERANCE = 1e-8
 
 def list_walls(spec: SiteSpec) -> list[TorqueSource]:
     """Returns the walls of a site, in scenario order."""
-    return [one.actor for one in spec.environment if one.actor.acts is TorqueKind.WALL]
+    return [one.actor for one in spec.environment if one.actor.kind is TorqueKind.WALL]
 
 
 def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
@@ -83,23 +83,23 @@ def compute_source_torque(
     Raises:
         ValueError: it is another source: a scripted torque is no function of the state.
     """
-    if source.acts is TorqueKind.WALL:
+    if source.kind is TorqueKind.WALL:
         force = wall_force(source, t_s, end_effector)[:, None] * np.array(source.b)
         pushed = np.einsum("kij,ki->kj", end_effector.J, force)
-    elif source.acts is TorqueKind.VISCOUS:
+    elif source.kind is TorqueKind.VISCOUS:
         pushed = -np.array(source.B) * qd
-    elif source.acts is TorqueKind.HAND:
+    elif source.kind is TorqueKind.HAND:
         pushed = compute_spring_effort(source, t_s, q, qd)
-    elif source.acts is TorqueKind.TASK_HAND:
+    elif source.kind is TorqueKind.TASK_HAND:
         effort = compute_spring_effort(source, t_s, end_effector.position, end_effector.speed)
         pushed = np.einsum("kij,ki->kj", end_effector.J, effort)
-    elif source.acts is TorqueKind.OWN_JOINTS:
+    elif source.kind is TorqueKind.OWN_JOINTS:
         pushed = source.model.effort(t_s, q, qd)
-    elif source.acts is TorqueKind.OWN_TIP:
+    elif source.kind is TorqueKind.OWN_TIP:
         effort = source.model.effort(t_s, end_effector.position, end_effector.speed)
         pushed = np.einsum("kij,ki->kj", end_effector.J, effort)
     else:
-        raise ValueError(f"{source.acts.name} is no function of the state")
+        raise ValueError(f"{source.kind.name} is no function of the state")
     there = (t_s >= source.start_s) & (t_s < source.end_s)
     return np.where(there[:, None], pushed, 0.0)
 
@@ -113,10 +113,10 @@ def compute_live_torque(
     size = (hand.shape[1] - 3) // 2
     target = hand[:, 3 : 3 + size]
     rate = hand[:, 3 + size :]
-    at_joints = source.acts is TorqueKind.LIVE_JOINT
+    at_joints = source.kind is TorqueKind.LIVE_JOINT
     at, speed = (q, qd) if at_joints else (end_effector.position, end_effector.speed)
     pull = target
-    if source.acts is not TorqueKind.LIVE_FORCE:
+    if source.kind is not TorqueKind.LIVE_FORCE:
         pull = np.array(source.K) * (target - at) + np.array(source.B) * (rate - speed)
     norm = np.linalg.norm(pull, axis=1)
     share = hand[:, 0] * np.where(
@@ -167,7 +167,7 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     def add(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
         total = np.zeros_like(records.q)
         for source in (one.actor for one in sources if one.actor.sampled is sampled):
-            if source.acts in LIVE_KINDS:
+            if source.kind in LIVE_KINDS:
                 torque = compute_live_torque(
                     source=source,
                     hand=records.hand,
@@ -208,32 +208,32 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
     Jacobian J of one pose, shape (2, 2) or (3, n); of an own kind what it does to an arm at
     zero, at rest. It moves if and only if the operator does.
     """
-    if source.acts is TorqueKind.PULSE:
+    if source.kind is TorqueKind.PULSE:
         x = np.clip((t_s - source.start_s) / (source.end_s - source.start_s), 0.0, 1.0)
         intent = np.sin(np.pi * x)[:, None] ** 2 * np.array(source.a)
-    elif source.acts is TorqueKind.RECORDED and source.table is not None:
+    elif source.kind is TorqueKind.RECORDED and source.table is not None:
         at_s = source.table[:, 0]
         rows = source.table[:, 1:]
         columns = [np.interp(t_s, at_s, column, left=0.0, right=0.0) for column in rows.T]
         intent = np.stack(columns, axis=1)
-    elif source.acts is TorqueKind.CHIRP:
+    elif source.kind is TorqueKind.CHIRP:
         span_s = source.move_end_s - source.move_start_s
         (first_hz, last_hz) = source.b
         x = np.mod(t_s - source.start_s, span_s)
         turns = first_hz * x + (last_hz - first_hz) * x**2 / (2.0 * span_s)
         intent = np.sin(2.0 * np.pi * turns)[:, None] * np.array(source.a)
-    elif source.acts is TorqueKind.MULTISINE and source.table is not None:
+    elif source.kind is TorqueKind.MULTISINE and source.table is not None:
         turns = np.outer(t_s - source.start_s, source.table[:, 0]) + source.table[:, 1]
         intent = np.sin(2.0 * np.pi * turns).sum(axis=1)[:, None] * np.array(source.a)
-    elif source.acts in OWN_KINDS:
-        at_tip = source.acts is TorqueKind.OWN_TIP
+    elif source.kind in OWN_KINDS:
+        at_tip = source.kind is TorqueKind.OWN_TIP
         origin = np.zeros((len(t_s), J.shape[0 if at_tip else 1]))
         pull = source.model.effort(t_s, origin, origin)
         intent = pull @ J if at_tip else pull
     else:
         origin = np.zeros((len(t_s), len(source.a)))
         pull = compute_spring_effort(source, t_s, origin, origin)
-        intent = pull @ J if source.acts is TorqueKind.TASK_HAND else pull
+        intent = pull @ J if source.kind is TorqueKind.TASK_HAND else pull
     acting = (t_s >= source.start_s) & (t_s < source.end_s)
     return np.where(acting[:, None], intent, 0.0)
 
@@ -250,7 +250,7 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
     expected = np.zeros_like(records.q)
     scripts = np.zeros_like(records.q)
     for source in (one.actor for one in spec.hands):
-        if source.acts in LIVE_KINDS:
+        if source.kind in LIVE_KINDS:
             at_start = np.broadcast_to(records.q[0], records.q.shape)
             still = build_arm_rows(scenario, records.site).place_end_effector(
                 at_start, 0.0 * at_start
@@ -265,7 +265,7 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
             continue
         script = compute_operator_script(source, t_s, split.end_effector.J[0])
         scripts = scripts + script
-        if source.acts in SCRIPTED_KINDS:
+        if source.kind in SCRIPTED_KINDS:
             expected = expected + script
         elif not source.sampled:
             torque = compute_source_torque(
@@ -355,7 +355,7 @@ def _find_own_damping(spec: SiteSpec, wall: TorqueSource, J: Array, t_s: Array) 
     """
     actors = [one.actor for one in spec.environment]
     lasting = [one for one in actors if one.start_s <= t_s[0] and one.end_s > t_s[-1]]
-    viscous = [one.B for one in lasting if one.acts is TorqueKind.VISCOUS and not one.sampled]
+    viscous = [one.B for one in lasting if one.kind is TorqueKind.VISCOUS and not one.sampled]
     D = np.sum(viscous, axis=0) if viscous else np.zeros(J.shape[2])
     arms = np.einsum("kij,i->kj", J, np.array(wall.b)) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):

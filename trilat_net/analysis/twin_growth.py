@@ -636,7 +636,7 @@ def _find_linear_sizes(
                 for one in growth.pushes
             )
             acts = {
-                one.actor.acts for site in scenario.sites.values() for one in site.environment
+                one.actor.kind for site in scenario.sites.values() for one in site.environment
             }
             does = "saturates" if grows and apart[at] < 0.0 else "goes another way"
             does += " (there is a wall)" if TorqueKind.WALL in acts else ""

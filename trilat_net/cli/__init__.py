@@ -46,7 +46,7 @@ class _Commands(TyperGroup):
             except KeyboardInterrupt:
                 err.print("interrupted")
                 raise typer.Exit(
-                    interrupt.exit_code if interrupt.requested() else 130
+                    interrupt.exit_code if interrupt.is_requested() else 130
                 ) from None
 
 

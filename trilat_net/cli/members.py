@@ -167,7 +167,7 @@ def hand_command(
             say=terminal.print_line,
             timeout_s=join_timeout,
         )
-    if interrupt.requested():
+    if interrupt.is_requested():
         raise typer.Exit(interrupt.exit_code)
     return None
 
@@ -182,8 +182,8 @@ def _lead_by_device(
     opened = open_device(device)
     say = terminal.print_line
     with Interrupt() as interrupt:
-        running.lead(name, opened, stopped=interrupt.requested, say=say, timeout_s=timeout_s)
-    if interrupt.requested():
+        running.lead(name, opened, stopped=interrupt.is_requested, say=say, timeout_s=timeout_s)
+    if interrupt.is_requested():
         raise typer.Exit(interrupt.exit_code)
 
 
@@ -416,7 +416,7 @@ def replay_command(
             options=play,
             connection=connection,
             clock=clock,
-            stopped=interrupt.requested,
+            stopped=interrupt.is_requested,
             say=tell,
             show=_line(clock),
         )
@@ -427,7 +427,7 @@ def replay_command(
     else:
         _show_playback(outcome)
     _warn_of(outcome, reported)
-    if interrupt.requested():
+    if interrupt.is_requested():
         terminal.err.print("interrupted")
         raise typer.Exit(interrupt.exit_code)
     if outcome.cut or outcome.strays:
@@ -599,7 +599,7 @@ def router_command(
         bus = open_bus(
             connection=connection,
             clock=clock,
-            stopped=interrupt.requested,
+            stopped=interrupt.is_requested,
             timeout_s=None,
             say=terminal.print_line,
         )
@@ -612,11 +612,11 @@ def router_command(
             run_router(
                 bus=bus,
                 clock=clock,
-                stopped=interrupt.requested,
+                stopped=interrupt.is_requested,
                 say=_say_of_router,
                 until_idle_s=until_idle,
             )
-        raise typer.Exit(interrupt.exit_code if interrupt.requested() else 0)
+        raise typer.Exit(interrupt.exit_code if interrupt.is_requested() else 0)
 
 
 def _say_of_router(text: str) -> None:
@@ -681,9 +681,9 @@ def ros2_command(
             open_graph=open_graph,
             rate_hz=rate,
             table=table,
-            stopped=interrupt.requested,
+            stopped=interrupt.is_requested,
             say=terminal.print_line,
             timeout_s=timeout,
         )
-    if interrupt.requested():
+    if interrupt.is_requested():
         raise typer.Exit(interrupt.exit_code)

@@ -43,9 +43,9 @@ def sim_command(
     views_hz = parse_viz_rate(views)
     with Interrupt(compiles=True) as interrupt:
         within = record_virtual(
-            chosen, path, force=force, stopped=interrupt.requested, views_hz=views_hz
+            chosen, path, force=force, stopped=interrupt.is_requested, views_hz=views_hz
         )
-    if interrupt.requested():
+    if interrupt.is_requested():
         terminal.err.print(
             f"interrupted; {path} holds the records so far", markup=False, soft_wrap=True
         )

@@ -231,7 +231,7 @@ def ping_command(
             session=options.check_session_name(session),
             count=count,
             timeout_s=timeout,
-            stopped=interrupt.requested,
+            stopped=interrupt.is_requested,
         )
         if found is None:
             raise typer.Exit(interrupt.exit_code)
@@ -314,7 +314,11 @@ def _ping_topic(
     )
     with graph, Interrupt() as interrupt:
         found = ping_topic(
-            graph=graph, clock=clock, topic=name, lasts_s=lasts_s, stopped=interrupt.requested
+            graph=graph,
+            clock=clock,
+            topic=name,
+            lasts_s=lasts_s,
+            stopped=interrupt.is_requested,
         )
     terminal.print_result(found, as_json=as_json)
 
@@ -327,12 +331,12 @@ def _answer(
     from sites.network_benchmark import run_far_end
 
     with Interrupt() as interrupt:
-        stopped = interrupt.requested
+        stopped = interrupt.is_requested
         last_s = seconds or inf
         run_far_end(
             endpoints, keys, stopped, last_s, insecure=insecure, say=terminal.print_line
         )
-    if interrupt.requested():
+    if interrupt.is_requested():
         raise typer.Exit(interrupt.exit_code)
 
 

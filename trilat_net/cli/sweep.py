@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ..errors import UsageError, count_nouns
-from ..process import join_words
+from ..process import join_arguments
 from ..reporting import terminal_output as terminal
 from . import options
 from .options import flag, value
@@ -181,7 +181,7 @@ def _run_in_folder(
                 folder=folder, jobs=jobs, progress=progress, known=expected.entries, on=on
             )
     except KeyboardInterrupt:
-        resume = join_words(["trilat", "sweep", "--resume", str(folder.path)])
+        resume = join_arguments(["trilat", "sweep", "--resume", str(folder.path)])
         kept = (
             f"{count_nouns(len(folder.read_done()), 'run is', 'runs are')} done and "
             f"kept; go on with: {resume}"

@@ -13,8 +13,8 @@ from .delay import (
     DelayKind,
     clamp_delay_us,
     draw_delay_us,
+    draw_user_delay_us,
     next_correlated,
-    own_delay_us,
     sine_delay_us,
     trace_delay_us,
 )
@@ -84,7 +84,9 @@ def _delay_us(
         return clamp_delay_us(model.location + model.scale * link.memory)
     if model.kind == _OWN:
         return clamp_delay_us(
-            own_delay_us(key=key, sample=sample, stamp_ns=stamp_ns, model=model, points=points)
+            draw_user_delay_us(
+                key=key, sample=sample, stamp_ns=stamp_ns, model=model, points=points
+            )
         )
     return clamp_delay_us(draw_delay_us(key, sample, DELAY, model))
 

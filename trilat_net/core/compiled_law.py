@@ -25,7 +25,7 @@ from .jit import bind_leaf, compile_named, leaf
 from .law_channel import SentVector
 from .law_view import PlainLaw, update_law_view
 from .link import ChannelArrays
-from .plugged import call_at, digest_beside, find_address
+from .plugged import call_address, digest_sibling_sources, find_address
 from .site_arrays import SiteArrays
 from .site_setup import SiteSetup
 from .user_law import (
@@ -95,7 +95,7 @@ def law_stage(
     update_law_view(k=k, t_ns=t_ns, site=site, links=links, chain=chain)
     s: Row = site[0]
     s.asked = 1
-    call_at(address, (law, site, links, channel.received, sent))
+    call_address(address, (law, site, links, channel.received, sent))
     if not (_all_finite(s.tau[: s.joints]) and _all_finite(s.theta_hat) and _all_finite(sent)):
         raise FloatingPointError
     if not _all_finite(law[: s.remembered]):
@@ -186,7 +186,7 @@ def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
     rows = [kinds.typeof(np.zeros(1, dtype)) for dtype in (form.site, form.link)]
     floats = types.float64
     signature = types.none(floats[::1], *rows, floats[:, ::1], floats[::1])
-    if made_of := digest_beside(torque):
+    if made_of := digest_sibling_sources(torque):
         name = hashlib.sha256(
             f"{made_of} {torque.__module__} {torque.__qualname__} {form}".encode()
         )
@@ -290,8 +290,8 @@ class CompiledLaw:
             site=arrays.site.dtype,
             link=arrays.links.dtype,
             received=_vectors_dtype(setup.received_vectors, received),
-            to_all=_vectors_dtype(setup.channel.of(per_peer=False)),
-            sent=_vectors_dtype(setup.channel.of(per_peer=True)),
+            to_all=_vectors_dtype(setup.channel.select_vectors(per_peer=False)),
+            sent=_vectors_dtype(setup.channel.select_vectors(per_peer=True)),
             peers=len(setup.links),
         )
         try:
@@ -342,7 +342,7 @@ class CompiledLaw:
         memory: list[float] = self.row[: self._remembered].tolist()
         return memory
 
-    def recall(self, memory: Sequence[float]) -> None:
+    def restore(self, memory: Sequence[float]) -> None:
         """Restores the law from its memory."""
         self.row[: self._remembered] = memory
 

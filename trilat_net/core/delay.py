@@ -14,7 +14,7 @@ import numpy as np
 
 from .jit import leaf
 from .philox import DrawKey, standard_gamma, standard_normal, uniforms
-from .plugged import call_at
+from .plugged import call_address
 from .vectors import Points, Row, count_begun
 
 MAX_DELAY_US = 10_000_000
@@ -247,7 +247,9 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 
 
 @leaf
-def own_delay_us(key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points) -> float:
+def draw_user_delay_us(
+    key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
+) -> float:
     """Returns the delay of an own kind, us, not rounded; its numbers stand in the table, two a
     row.
     """
@@ -256,7 +258,9 @@ def own_delay_us(key: DrawKey, sample: int, stamp_ns: int, model: Row, points: P
     model.stamp_ns = stamp_ns
     first = model.trace_first
     count = model.trace_count
-    call_at(model.call, (points[first : first + count].reshape(-1).view(np.float64), model))
+    call_address(
+        model.call, (points[first : first + count].reshape(-1).view(np.float64), model)
+    )
     drawn_us: float = min(model.drawn_us, model.location)
     return drawn_us
 

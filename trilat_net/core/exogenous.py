@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .chain import Three, dot, place_end_effector, three
 from .elementary import sincos
 from .jit import leaf
-from .plugged import call_at, list_numbers, plug
+from .plugged import call_address, compile_to_address, list_numbers
 from .two_link_arm import end_effector_jacobian, forward_kinematics
 from .vectors import Array, Pair, Row, RowArray, Vector, count_begun
 
@@ -64,7 +64,7 @@ class TorqueSource(NamedTuple):
     """One operator or environment; the meaning of its vectors depends on its kind.
 
     Attributes:
-        acts: its kind.
+        kind: how it acts.
         start_s: when it begins to act, s since the epoch.
         end_s: when it ends, s.
         move_start_s: when its target begins to move, s; CHIRP: beginning of its first sweep.
@@ -86,7 +86,7 @@ class TorqueSource(NamedTuple):
         model: of an own kind what its numbers and its function `act` are of; see `plugged`.
     """
 
-    acts: TorqueKind
+    kind: TorqueKind
     start_s: float = -math.inf
     end_s: float = math.inf
     move_start_s: float = 0.0
@@ -117,7 +117,7 @@ def torque_source_dtype(width: int) -> np.dtype[np.void]:
     fields = [
         *(
             (name, "i8")
-            for name in ("acts", "sampled", "table_first", "table_count", "call", "coordinates")
+            for name in ("kind", "sampled", "table_first", "table_count", "call", "coordinates")
         ),
         *((name, "f8") for name in (*_SCALARS, "t_s")),
         *((name, "f8", (width,)) for name in (*_NUMBERS, "at", "speed", "effort")),
@@ -159,12 +159,12 @@ def torque_source_rows(
             row[name] = getattr(actor, name)
         for name in _NUMBERS:
             row[name][: len(getattr(actor, name))] = getattr(actor, name)
-        row.acts = int(actor.acts)
+        row.kind = int(actor.kind)
         row.sampled = int(actor.sampled)
-        row.coordinates = axes if actor.acts is TorqueKind.OWN_TIP else joints
+        row.coordinates = axes if actor.kind is TorqueKind.OWN_TIP else joints
         given = actor.table
-        if actor.acts in OWN_KINDS:
-            row.call = plug(actor.model, "act", rows.dtype)
+        if actor.kind in OWN_KINDS:
+            row.call = compile_to_address(actor.model, "act", rows.dtype)
             numbers = list_numbers(actor.model)
             given = np.resize(numbers, (-(-len(numbers) // (1 + joints)), 1 + joints))
         if given is not None:
@@ -209,7 +209,7 @@ def _spring_along(
 @leaf
 def _target_progress(actor: Row, t_s: float) -> Pair:
     """Returns how far a target has moved from `a` to `b`, and its rate, 1/s."""
-    if actor.acts >= _LIVE_TIP:
+    if actor.kind >= _LIVE_TIP:
         return 0.0, 1.0
     return minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
 
@@ -230,9 +230,9 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
     progress, rate = _target_progress(actor, t_s)
     x = _spring_along(actor=actor, i=0, progress=progress, rate=rate, at=at[0], speed=speed[0])
     y = _spring_along(actor=actor, i=1, progress=progress, rate=rate, at=at[1], speed=speed[1])
-    if actor.acts < _LIVE_TIP:
+    if actor.kind < _LIVE_TIP:
         return x, y
-    if actor.acts == _LIVE_FORCE:
+    if actor.kind == _LIVE_FORCE:
         x = actor.a[0]
         y = actor.a[1]
     share = _live_share(actor, x * x + y * y)
@@ -298,11 +298,11 @@ def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
     A pulse is sin^2(pi (t - start) / (end - start)): smooth at both ends, as in Fig. 3 of the
     paper, whose numbers are not printed.
     """
-    if actor.acts == _PULSE:
+    if actor.kind == _PULSE:
         s, _ = sincos(math.pi * (t_s - actor.start_s) / (actor.end_s - actor.start_s))
         return s * s
     return (
-        _chirp_size(actor, t_s) if actor.acts == _CHIRP else _multisine_size(actor, t_s, table)
+        _chirp_size(actor, t_s) if actor.kind == _CHIRP else _multisine_size(actor, t_s, table)
     )
 
 
@@ -319,7 +319,7 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
 
 @leaf
 def _is_at_end_effector(actor: Row) -> bool:
-    acts: int = actor.acts
+    acts: int = actor.kind
     return acts in (_TASK_HAND, _WALL, _OWN_TIP, _LIVE_TIP, _LIVE_FORCE)
 
 
@@ -330,7 +330,7 @@ def _ask_own(actor: Row, t_s: float, table: TorqueTable) -> None:
     for i in range(actor.coordinates):
         actor.effort[i] = 0.0
     first = actor.table_first
-    call_at(actor.call, (table[first : first + actor.table_count].reshape(-1), actor))
+    call_address(actor.call, (table[first : first + actor.table_count].reshape(-1), actor))
 
 
 @leaf
@@ -354,10 +354,10 @@ def _end_effector_torque(
     x, y = end_effector_jacobian(lengths, q)
     speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
     wall_n = 0.0
-    if actor.acts == _WALL:
+    if actor.kind == _WALL:
         force = _wall_force(actor, at, speed)
         wall_n = math.sqrt(force[0] * force[0] + force[1] * force[1])
-    elif actor.acts == _OWN_TIP:
+    elif actor.kind == _OWN_TIP:
         force = _own_pair(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
     else:
         force = _spring_force(actor, t_s, at, speed)
@@ -371,13 +371,13 @@ def source_torque(
     """Returns the torque of one actor ON the planar arm at time t."""
     if not actor.start_s <= t_s < actor.end_s:
         return 0.0, 0.0, 0.0
-    if actor.acts == _HAND or actor.acts == _LIVE_JOINT:
+    if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
         torque = _spring_force(actor, t_s, q, qd)
-    elif actor.acts == _VISCOUS:
+    elif actor.kind == _VISCOUS:
         torque = -actor.B[0] * qd[0], -actor.B[1] * qd[1]
-    elif actor.acts == _RECORDED:
+    elif actor.kind == _RECORDED:
         torque = _recorded_torque(actor, t_s, table)
-    elif actor.acts == _OWN_JOINTS:
+    elif actor.kind == _OWN_JOINTS:
         torque = _own_pair(actor=actor, t_s=t_s, at=q, speed=qd, table=table)
     elif _is_at_end_effector(actor):
         return _end_effector_torque(
@@ -422,13 +422,13 @@ def _force_in_space(
     """Returns the force of a spring, a wall or an own kind on an end effector in three
     dimensions, N.
     """
-    if actor.acts == _OWN_TIP:
+    if actor.kind == _OWN_TIP:
         for i in range(3):
             actor.at[i] = at[i]
             actor.speed[i] = speed[i]
         _ask_own(actor, t_s, table)
         return three(actor.effort)
-    if actor.acts != _WALL:
+    if actor.kind != _WALL:
         progress, rate = _target_progress(actor, t_s)
         x = _spring_along(
             actor=actor, i=0, progress=progress, rate=rate, at=at[0], speed=speed[0]
@@ -439,9 +439,9 @@ def _force_in_space(
         z = _spring_along(
             actor=actor, i=2, progress=progress, rate=rate, at=at[2], speed=speed[2]
         )
-        if actor.acts == _TASK_HAND:
+        if actor.kind == _TASK_HAND:
             return x, y, z
-        if actor.acts == _LIVE_FORCE:
+        if actor.kind == _LIVE_FORCE:
             x, y, z = three(actor.a)
         share = _live_share(actor, x * x + y * y + z * z)
         return share * x, share * y, share * z
@@ -465,11 +465,11 @@ def _add_joint_torque(
     torque: Array,
 ) -> None:
     """Adds the torque of an actor that acts on the joints themselves."""
-    if actor.acts == _HAND or actor.acts == _LIVE_JOINT:
+    if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
         progress, rate = _target_progress(actor, t_s)
         share = 1.0
         square = 0.0
-        if actor.acts == _LIVE_JOINT:
+        if actor.kind == _LIVE_JOINT:
             for i in range(joints):
                 pull = _spring_along(
                     actor=actor, i=i, progress=progress, rate=rate, at=q[i], speed=qd[i]
@@ -480,15 +480,15 @@ def _add_joint_torque(
             torque[i] += share * _spring_along(
                 actor=actor, i=i, progress=progress, rate=rate, at=q[i], speed=qd[i]
             )
-    elif actor.acts == _VISCOUS:
+    elif actor.kind == _VISCOUS:
         for i in range(joints):
             torque[i] -= actor.B[i] * qd[i]
-    elif actor.acts == _RECORDED:
+    elif actor.kind == _RECORDED:
         low, high, x = _table_place(actor, t_s, table)
         if low >= 0:
             for i in range(joints):
                 torque[i] += table[low, 1 + i] + x * (table[high, 1 + i] - table[low, 1 + i])
-    elif actor.acts == _OWN_JOINTS:
+    elif actor.kind == _OWN_JOINTS:
         for i in range(joints):
             actor.at[i] = q[i]
             actor.speed[i] = qd[i]
@@ -554,6 +554,6 @@ def put_torque_on_chain(
         force = _force_in_space(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
         for i in range(n):
             torque[i] += dot(three(chain[i].J_lin), force)
-        if actor.acts == _WALL:
+        if actor.kind == _WALL:
             largest_n = max(largest_n, math.sqrt(dot(force, force)))
     return largest_n

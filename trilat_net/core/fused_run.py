@@ -16,7 +16,7 @@ from .jit import leaf
 from .kernel import act_stages, channel_of, reference_stages, torque_stage
 from .link import LinkArrays, accept_sample, recall_sample
 from .site_arrays import SiteArrays
-from .task_space import PLACE
+from .task_space import POSITION
 from .ticks import BUCKETS_PER_S, Mode, tick_ns
 from .vectors import Array, IntArray, Row, RowArray
 
@@ -171,7 +171,7 @@ def _update_peaks(
         e = speed = angle = 0.0
         if i < s.shared:
             e = row[here + i] - row[2 * s.joints + i]
-            if i >= PLACE and s.task:  # of an orientation
+            if i >= POSITION and s.task:  # of an orientation
                 e = s.e[i]
         if i < s.joints:
             speed = abs(row[s.joints + i])

@@ -31,7 +31,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 
-from ..process import let_signals_kill
+from ..process import end_process_at_signals
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -107,7 +107,7 @@ class _CompilingNotice(event.Listener):
 
     def on_start(self, begun: Any) -> None:
         """Says so as anything of the core is compiled."""
-        self._restore.append(let_signals_kill())
+        self._restore.append(end_process_at_signals())
         if not self.said and begun.data["dispatcher"].py_func.__module__.startswith(
             __package__
         ):

@@ -69,25 +69,27 @@ class LawChannel(NamedTuple):
     vectors: tuple[SentVector, ...] = ()
     peers: int = 0
 
-    def of(self, *, per_peer: bool) -> tuple[SentVector, ...]:
+    def select_vectors(self, *, per_peer: bool) -> tuple[SentVector, ...]:
         """Returns the vectors that go to each peer alone, or to all."""
         return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
 
-    def numbers(self, *, per_peer: bool) -> int:
+    def count_numbers(self, *, per_peer: bool) -> int:
         """Returns how many numbers go to each peer alone, or to all."""
-        return sum(vector.length for vector in self.of(per_peer=per_peer))
+        return sum(vector.length for vector in self.select_vectors(per_peer=per_peer))
 
     @property
-    def received(self) -> int:
+    def received_size(self) -> int:
         """How many numbers one peer gets."""
         return sum(vector.length for vector in self.vectors)
 
     @property
-    def floats(self) -> int:
+    def record_size(self) -> int:
         """How many numbers stand in a record."""
-        return self.numbers(per_peer=False) + self.peers * self.numbers(per_peer=True)
+        return self.count_numbers(per_peer=False) + self.peers * self.count_numbers(
+            per_peer=True
+        )
 
-    def find_places(self, vectors: Sequence[SentVector]) -> list[int]:
+    def find_columns(self, vectors: Sequence[SentVector]) -> list[int]:
         """Returns where each number of some vectors stands in a peer's part; -1: it is not
         sent.
         """
@@ -112,10 +114,10 @@ class LawChannel(NamedTuple):
                     if vector.per_peer is per_peer:
                         yield from (SentEntry(vector, peer, n) for n in range(vector.length))
 
-    def part(self, sent: Sequence[float], place: int) -> Sequence[float]:
+    def select_for_peer(self, sent: Sequence[float], place: int) -> Sequence[float]:
         """Returns what the peer at a place among the sender's peers gets of a record's numbers."""
-        own = self.numbers(per_peer=True)
-        common = self.numbers(per_peer=False)
+        own = self.count_numbers(per_peer=True)
+        common = self.count_numbers(per_peer=False)
         if not own:
             return sent
         first = common + place * own

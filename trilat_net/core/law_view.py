@@ -99,10 +99,11 @@ class PlainLaw:
         self._received = None if arrays.channel is None else arrays.channel.received
         self._receives = setup.received_vectors
         self._sends = {
-            per_peer: setup.channel.of(per_peer=per_peer) for per_peer in (False, True)
+            per_peer: setup.channel.select_vectors(per_peer=per_peer)
+            for per_peer in (False, True)
         }
-        self._common = setup.channel.numbers(per_peer=False)
-        self._own = setup.channel.numbers(per_peer=True)
+        self._common = setup.channel.count_numbers(per_peer=False)
+        self._own = setup.channel.count_numbers(per_peer=True)
 
     def bind(self) -> None:
         """Compiles what `compute` calls, and looks up its types once for all."""
@@ -130,7 +131,7 @@ class PlainLaw:
         """What the law remembers now."""
         return read_memory(self._law)
 
-    def recall(self, memory: Sequence[float]) -> None:
+    def restore(self, memory: Sequence[float]) -> None:
         """Restores the law from its memory."""
         restore_law(self._law, self._setup.name, memory)
 

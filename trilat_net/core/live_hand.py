@@ -93,9 +93,9 @@ class HandRules(NamedTuple):
         size: how many numbers its target has: one per axis, or per joint.
         rate_hz: tick rate of the site.
         speed_limit: largest speed of the target, m/s or rad/s.
-        from_arm: true: the target begins where the arm is; false: it is a force, which begins
+        starts_at_arm: true: the target begins where the arm is; false: it is a force, which begins
             at 0.
-        farthest: largest norm of a goal that is taken, m, rad or N.
+        max_goal_norm: largest norm of a goal that is taken, m, rad or N.
         acceleration_limit: largest change of the target's velocity in a second, m/s^2 or
             rad/s^2; inf: none.
         reach: where goals may lie.
@@ -104,8 +104,8 @@ class HandRules(NamedTuple):
     size: int
     rate_hz: int
     speed_limit: float = math.inf
-    from_arm: bool = True
-    farthest: float = math.inf
+    starts_at_arm: bool = True
+    max_goal_norm: float = math.inf
     acceleration_limit: float = math.inf
     reach: "HandReach" = HandReach()
 
@@ -139,7 +139,7 @@ class HandMemory(NamedTuple):
         goal: where it goes to.
         arrives_ns: when it arrives there, ns since the epoch.
         sent_ns: when the message of that goal was sent.
-        heard_ns: the tick that took in the newest message, ns since the epoch.
+        received_ns: the tick that took in the newest message, ns since the epoch.
         before: who let go last, and the number of that message.
     """
 
@@ -151,7 +151,7 @@ class HandMemory(NamedTuple):
     goal: tuple[float, ...] = ()
     arrives_ns: int = 0
     sent_ns: int = 0
-    heard_ns: int = 0
+    received_ns: int = 0
     before: tuple[int, int] = (0, -1)
 
 
@@ -203,12 +203,12 @@ class HandStep(NamedTuple):
     changes: tuple[tuple[int, str], ...] = ()
 
 
-def hand_numbers(size: int) -> int:
+def count_hand_numbers(size: int) -> int:
     """Returns how many numbers the field `hand` of a record has, for a target of so many."""
     return 3 + 2 * size
 
 
-def free_hand(size: int) -> list[float]:
+def empty_hand_vector(size: int) -> list[float]:
     """Returns the field `hand` of a tick in which nobody holds the arm."""
     return [0.0, -1.0, 0.0, *[0.0] * (2 * size)]
 
@@ -247,11 +247,11 @@ def advance_hand(
             changes.append((command.source, outcome))
         elif outcome:
             refused.append(outcome)
-    if now.source and t_ns - now.heard_ns > SILENCE_NS:
+    if now.source and t_ns - now.received_ns > SILENCE_NS:
         changes.append((now.source, SILENT))
         now = _let_go(now, now.number - 1)
     if not now.target:
-        return HandStep(now, free_hand(rules.size), tuple(refused), tuple(changes))
+        return HandStep(now, empty_hand_vector(rules.size), tuple(refused), tuple(changes))
     now = now._replace(
         rate=_find_rate(rules, now, t_ns) if now.source else _find_fading_rate(rules, now)
     )
@@ -385,7 +385,7 @@ def _take_command(
         return (_let_go(memory, command.number), RELEASED) if memory.source else (memory, "")
     if not memory.source:
         still = (0.0,) * rules.size
-        start = memory.target or (tuple(map(float, place())) if rules.from_arm else still)
+        start = memory.target or (tuple(map(float, place())) if rules.starts_at_arm else still)
         held = HandMemory(
             source=command.source,
             number=command.number,
@@ -393,9 +393,9 @@ def _take_command(
             target=start,
             rate=memory.rate or still,
         )
-        held = held._replace(heard_ns=t_ns, before=memory.before)
+        held = held._replace(received_ns=t_ns, before=memory.before)
         return _aim(rules, held, command, t_ns + GLIDE_NS), TAKEN
-    memory = memory._replace(heard_ns=t_ns)
+    memory = memory._replace(received_ns=t_ns)
     if command.number == memory.number:
         return memory, ""
     period_ns = 1_000_000_000 // rules.rate_hz

@@ -9,8 +9,8 @@ what is left, and with who is back.
 
 from .chain import add, scale, three
 from .jit import leaf
-from .rotation import length, rotation_matrix, turn_between
-from .task_space import has_orientation, straight_coordinates
+from .rotation import length, relative_rotation, rotation_matrix
+from .task_space import count_linear_coordinates, has_orientation
 from .ticks import LifeReason
 from .vectors import Row, RowArray
 
@@ -64,11 +64,11 @@ def _is_turned_little(back: int, site: Row, links: RowArray) -> bool:
     for j in range(links.shape[0]):
         link: Row = links[j]
         if link.gone == 0.0:
-            turn = turn_between(own, rotation_matrix(three(link.q[3:])))
+            turn = relative_rotation(own, rotation_matrix(three(link.q[3:])))
             sum_of_turns = add(sum_of_turns, scale(link.alpha, turn))
             whole += link.alpha
     link = links[back]
-    turn = turn_between(own, rotation_matrix(three(link.q[3:])))
+    turn = relative_rotation(own, rotation_matrix(three(link.q[3:])))
     away = add(turn, scale(-1.0 / whole, sum_of_turns))
     near: bool = length(away) * link.alpha / (whole + link.alpha) <= site.align_limit
     return near
@@ -81,7 +81,7 @@ def _is_near(back: int, site: Row, links: RowArray) -> bool:
     """
     if has_orientation(site) and not _is_turned_little(back, site, links):
         return False
-    for i in range(straight_coordinates(site)):
+    for i in range(count_linear_coordinates(site)):
         rest = whole = 0.0
         for j in range(links.shape[0]):
             link: Row = links[j]

@@ -128,25 +128,25 @@ class OwnHand:
         place: Callable[[Sequence[float]], Sequence[float]],
     ) -> None:
         self._rules = rules
-        self.every = every
-        self.delay = delay
+        self.period_ticks = every
+        self.delay_ticks = delay
         self._place = place
         self._due: deque[tuple[int, HandCommand]] = deque()
         self._memory = HandMemory()
         self._newest = -1
 
-    def is_asked(self, k: int) -> bool:
+    def is_decision_tick(self, k: int) -> bool:
         """True if it decides at this tick."""
-        return k % self.every == 0
+        return k % self.period_ticks == 0
 
-    def find_next(self, k: int) -> int:
+    def find_next_event(self, k: int) -> int:
         """Returns the first tick after this one at which it is asked, or what it decided begins
         to act.
         """
-        asked = (k // self.every + 1) * self.every
+        asked = (k // self.period_ticks + 1) * self.period_ticks
         return min([asked, *(due for due, _ in self._due if due > k)])
 
-    def view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
+    def build_view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
         """Returns what it sees at tick k, which its site is about to make."""
         own = np.asarray(arrays.site)
         links = np.asarray(arrays.links)  # records are slow to read
@@ -176,7 +176,7 @@ class OwnHand:
             peers=peers,
         )
 
-    def decide(self, k: int, goal: Sequence[float] | None) -> None:
+    def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
         """Takes in what it decided by what it saw at tick k.
 
         One that is older than the newest is passed over.
@@ -191,36 +191,36 @@ class OwnHand:
             )
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"it acts with {list(numbers)}, which is not finite")
-        if (size := math.hypot(*numbers)) > self._rules.farthest:
+        if (size := math.hypot(*numbers)) > self._rules.max_goal_norm:
             raise ValueError(
-                f"it acts with a norm of {size:g}, at most {self._rules.farthest:g} is taken"
+                f"it acts with a norm of {size:g}, at most {self._rules.max_goal_norm:g} is taken"
             )
         if k <= self._newest:
             return
         self._newest = k
-        due = k + self.delay
+        due = k + self.delay_ticks
         command = HandCommand(
             source=PROGRAM,
-            number=k // self.every,
+            number=k // self.period_ticks,
             grip=goal is not None,
             target=numbers,
             sent_ns=tick_ns(due, self._rules.rate_hz),
         )
         self._due.append((due, command))
 
-    def let_go(self, k: int) -> None:
+    def release(self, k: int) -> None:
         """Lets go at tick k, whatever was decided before."""
         self._due.clear()
         command = HandCommand(
             source=PROGRAM,
-            number=k // self.every,
+            number=k // self.period_ticks,
             grip=False,
             target=(),
             sent_ns=tick_ns(k, self._rules.rate_hz),
         )
         self._due.append((k, command))
 
-    def advance(self, k: int, angles: Callable[[], Sequence[float]]) -> HandStep:
+    def advance_to(self, k: int, angles: Callable[[], Sequence[float]]) -> HandStep:
         """Returns what it does in tick k, see `advance_hand`; `angles` returns those of the
         joints, rad.
         """
@@ -238,19 +238,19 @@ class OwnHand:
         self._memory = step.memory
         return step
 
-    def advance_until(self, k: int, end: int, angles: Callable[[], Sequence[float]]) -> Array:
+    def advance_span(self, k: int, end: int, angles: Callable[[], Sequence[float]]) -> Array:
         """Returns what it does from tick k until it needs the arm again, before tick `end`.
 
-        Of each tick there is a row, as `HandInForce`. The same as `advance` tick by tick, bit
+        Of each tick there is a row, as `HandInForce`. The same as `advance_to` tick by tick, bit
         for bit.
         """
         size = self._rules.size
         rate_hz = self._rules.rate_hz
-        first = self.advance(k, angles).vector
-        rows = np.zeros((max(min(self.find_next(k), end), k + 1) - k, 3 + 2 * size))
+        first = self.advance_to(k, angles).vector
+        rows = np.zeros((max(min(self.find_next_event(k), end), k + 1) - k, 3 + 2 * size))
         rows[0] = first
         held = self._memory
-        if held.source and tick_ns(k + len(rows) - 1, rate_hz) - held.heard_ns <= SILENCE_NS:
+        if held.source and tick_ns(k + len(rows) - 1, rate_hz) - held.received_ns <= SILENCE_NS:
             goal, target, rate = (np.array(one) for one in (held.goal, held.target, held.rate))
             grip = glide(
                 first=k + 1,
@@ -270,5 +270,5 @@ class OwnHand:
             self._memory = held._replace(grip=grip, target=ends[0], rate=ends[1])
         else:
             for n in range(1, len(rows)):
-                rows[n] = self.advance(k + n, angles).vector
+                rows[n] = self.advance_to(k + n, angles).vector
         return rows

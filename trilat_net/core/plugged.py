@@ -45,13 +45,13 @@ def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
     _PLAIN[address](*arguments)
 
 
-call_at: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
+call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
 """Calls the function at an address with a tuple of arguments; what it raises goes on to the
 caller.
 """
 
 
-def digest_beside(function: Callable[..., Any]) -> str:
+def digest_sibling_sources(function: Callable[..., Any]) -> str:
     """Returns a hash of the sources beside a function of this package; "": it is from
     elsewhere.
     """
@@ -102,7 +102,7 @@ def _compile(
         return call
     kinds: Any = numba
     signature = types.none(types.float64[::1], kinds.from_dtype(row))
-    if made_of := digest_beside(function):
+    if made_of := digest_sibling_sources(function):
         name = hashlib.sha256(
             f"{made_of} {function.__module__} {function.__qualname__} {form} {row}".encode()
         )
@@ -110,7 +110,7 @@ def _compile(
     return numba.njit(signature, **_OPTIONS)(call)
 
 
-def plug(model: Any, name: str, row: np.dtype[np.void]) -> int:
+def compile_to_address(model: Any, name: str, row: np.dtype[np.void]) -> int:
     """Returns the address of a function of a model, called with its numbers and a row of that
     layout.
     """

@@ -108,7 +108,7 @@ def rotation_vector(R: Array | Matrix) -> Three:
 
 
 @leaf
-def turn_between(R: Array | Matrix, other: Array | Matrix) -> Three:
+def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
     """Returns the vector of R other': the turn from the other orientation to this one, in base
     axes.
     """
@@ -134,13 +134,13 @@ def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
 
 
 @leaf
-def add_turn(turn: Three, vector: Three) -> Three:
+def compose_rotations(turn: Three, vector: Three) -> Three:
     """Returns the orientation `vector` turned by another rotation vector, in base axes."""
-    return turn_between(rotation_matrix(turn), rotation_matrix(scale(-1.0, vector)))
+    return relative_rotation(rotation_matrix(turn), rotation_matrix(scale(-1.0, vector)))
 
 
 @leaf
-def rotate_by(turn: Three, vector: Three) -> Three:
+def rotate_by_vector(turn: Three, vector: Three) -> Three:
     """Returns a vector turned by a rotation vector."""
     x, y, z = rotation_matrix(turn)
     return _times_rows(vector, x, y, z)
@@ -153,7 +153,7 @@ def length(vector: Three) -> float:
 
 
 @leaf
-def turning_velocity(turn: Three, rate: Three) -> Three:
+def angular_velocity(turn: Three, rate: Three) -> Three:
     """Returns the angular velocity of a turn whose vector has this derivative."""
     angle = length(turn)
     a2 = angle * angle
@@ -169,9 +169,9 @@ def turning_velocity(turn: Three, rate: Three) -> Three:
 
 
 @leaf
-def turn_rate(turn: Three, velocity: Three) -> Three:
+def rotation_vector_rate(turn: Three, velocity: Three) -> Three:
     """Returns the derivative of a turn's vector at this angular velocity: undoes
-    `turning_velocity`.
+    `angular_velocity`.
     """
     angle = length(turn)
     a2 = angle * angle

@@ -8,8 +8,8 @@ from math import inf, isfinite
 
 from .chain import put_three, scale, three
 from .jit import leaf
-from .rotation import add_turn, rotation_matrix, turn_between
-from .task_space import has_orientation, straight_coordinates
+from .rotation import compose_rotations, relative_rotation, rotation_matrix
+from .task_space import count_linear_coordinates, has_orientation
 from .vectors import Row
 
 BLEND_S = 0.1
@@ -26,7 +26,7 @@ def limit_reference(k: int, site: Row) -> None:
             site.q_followed[i] = site.x[i] if site.task else site.q[i]
     if has_orientation(site) and site.qd_des_limit[3] < inf:
         _limit_turn(site)
-    for i in range(min(site.shared, straight_coordinates(site))):
+    for i in range(min(site.shared, count_linear_coordinates(site))):
         limit = site.qd_des_limit[i]
         if limit == inf:
             continue
@@ -44,14 +44,16 @@ def limit_reference(k: int, site: Row) -> None:
 def _limit_turn(site: Row) -> None:
     """Holds the orientation of the reference back to the limit of its speed about each axis."""
     before = rotation_matrix(three(site.q_followed[3:]))
-    turn = turn_between(rotation_matrix(three(site.q_des[3:])), before)
+    turn = relative_rotation(rotation_matrix(three(site.q_des[3:])), before)
     share = 1.0
     for i in range(3):
         most = site.qd_des_limit[3 + i] / site.rate_hz
         if abs(turn[i]) * share > most:
             share = most / abs(turn[i])
     if share < 1.0:
-        put_three(site.q_des[3:], add_turn(scale(share, turn), three(site.q_followed[3:])))
+        put_three(
+            site.q_des[3:], compose_rotations(scale(share, turn), three(site.q_followed[3:]))
+        )
         put_three(site.qd_des[3:], scale(share * site.rate_hz, turn))
     for i in range(3, 6):
         limit = site.qd_des_limit[i]

@@ -22,15 +22,15 @@ from .chain import add, put_three, scale, subtract, three
 from .jit import leaf
 from .resting import advance_rest_reference, begin_rest, put_rest_reference, rests
 from .rotation import (
-    add_turn,
+    angular_velocity,
+    compose_rotations,
     length,
-    rotate_by,
+    relative_rotation,
+    rotate_by_vector,
     rotation_matrix,
-    turn_between,
-    turn_rate,
-    turning_velocity,
+    rotation_vector_rate,
 )
-from .task_space import has_orientation, straight_coordinates
+from .task_space import count_linear_coordinates, has_orientation
 from .ticks import LifeOrder, LifeReason, Mode, tick_ns
 from .vectors import Array, Row, RowArray, put
 
@@ -95,7 +95,7 @@ def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
 def _align_s(site: Row) -> float:
     """Returns how long the way that is left at its beginning, `q_held`, takes."""
     way = 0.0
-    for i in range(straight_coordinates(site)):
+    for i in range(count_linear_coordinates(site)):
         way = max(way, abs(site.q_held[i]))
     if has_orientation(site):
         way = max(way, length(three(site.q_held[3:])))
@@ -110,17 +110,19 @@ def _begin_aligning(t_ns: int, site: Row, reason: int, q: Array, qd: Array) -> N
     """
     turn = rate = (0.0, 0.0, 0.0)
     if has_orientation(site):
-        turn = turn_between(
+        turn = relative_rotation(
             rotation_matrix(three(q[3:])), rotation_matrix(three(site.q_des[3:]))
         )
-        rate = turn_rate(turn, subtract(three(qd[3:]), rotate_by(turn, three(site.qd_des[3:]))))
+        rate = rotation_vector_rate(
+            turn, subtract(three(qd[3:]), rotate_by_vector(turn, three(site.qd_des[3:])))
+        )
     near = length(turn) <= site.align_limit
-    for i in range(straight_coordinates(site)):
+    for i in range(count_linear_coordinates(site)):
         near = near and abs(q[i] - site.q_des[i]) <= site.align_limit
     if not near:
         site.reason = _ALIGN_LIMIT
         return
-    for i in range(straight_coordinates(site)):
+    for i in range(count_linear_coordinates(site)):
         site.q_held[i] = q[i] - site.q_des[i]
         site.qd_held[i] = qd[i] - site.qd_des[i]
     if has_orientation(site):
@@ -143,11 +145,11 @@ def _leave_rest(t_ns: int, site: Row, reason: int) -> None:
 def _carry_on(site: Row) -> None:
     """Moves the reference of the tick before to where its rate takes it until now."""
     h_s = 1.0 / site.rate_hz
-    for i in range(straight_coordinates(site)):
+    for i in range(count_linear_coordinates(site)):
         site.q_followed[i] += h_s * site.qd_followed[i]
     if has_orientation(site):
         turn = scale(h_s, three(site.qd_followed[3:]))
-        put_three(site.q_followed[3:], add_turn(turn, three(site.q_followed[3:])))
+        put_three(site.q_followed[3:], compose_rotations(turn, three(site.q_followed[3:])))
 
 
 @leaf
@@ -276,7 +278,7 @@ def _find_way(t_ns: int, takes_s: float, site: Row, i: int) -> tuple[float, floa
 def _put_aligning(t_ns: int, site: Row) -> None:
     """Adds what is left of the way to the peers' reference, and its rate."""
     takes_s = _align_s(site)
-    for i in range(straight_coordinates(site)):
+    for i in range(count_linear_coordinates(site)):
         left, rate = _find_way(t_ns, takes_s, site, i)
         site.q_des[i] += left
         site.qd_des[i] += rate
@@ -285,6 +287,6 @@ def _put_aligning(t_ns: int, site: Row) -> None:
         y, wy = _find_way(t_ns, takes_s, site, 4)
         z, wz = _find_way(t_ns, takes_s, site, 5)
         turn = (x, y, z)
-        carried = rotate_by(turn, three(site.qd_des[3:]))
-        put_three(site.q_des[3:], add_turn(turn, three(site.q_des[3:])))
-        put_three(site.qd_des[3:], add(turning_velocity(turn, (wx, wy, wz)), carried))
+        carried = rotate_by_vector(turn, three(site.qd_des[3:]))
+        put_three(site.q_des[3:], compose_rotations(turn, three(site.q_des[3:])))
+        put_three(site.qd_des[3:], add(angular_velocity(turn, (wx, wy, wz)), carried))

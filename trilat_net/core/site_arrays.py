@@ -200,7 +200,7 @@ def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
     """Returns the buffers of a site."""
     layout = setup.layout
     shape = (MAX_ARRIVALS, layout.shared)
-    most = 0 if setup.own is None else max(link.channel.received for link in setup.links)
+    most = 0 if setup.own is None else max(link.channel.received_size for link in setup.links)
     return TickBuffers(
         np.zeros(MAX_ARRIVALS, arrival_dtype(layout.shared)),
         np.zeros(shape),
@@ -504,7 +504,7 @@ def _stack_channels(
     for setup, channel in zip(setups, channels, strict=True):
         for link, places in zip(setup.links, channel.places, strict=True):
             common, own = (
-                link.channel.numbers(per_peer=per_peer) for per_peer in (False, True)
+                link.channel.count_numbers(per_peer=per_peer) for per_peer in (False, True)
             )
             places[places >= common] += link.place * own
     waiting, received, places = map(_stack_padded, zip(*channels, strict=True))
@@ -591,7 +591,7 @@ def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
     vectors = setup.received_vectors
     links = setup.links
     numbers = sum(vector.length for vector in vectors)
-    places = np.array([link.channel.find_places(vectors) for link in links], dtype=np.int64)
+    places = np.array([link.channel.find_columns(vectors) for link in links], dtype=np.int64)
     shape = (len(links), numbers)
     return ChannelArrays(
         np.zeros((len(links), pages, numbers)), np.zeros(shape), places.reshape(shape)

@@ -15,7 +15,7 @@ from .chain import LINK_PARAMETERS, ChainJoint, Matrix, Three
 from .delay import LinkModel
 from .exogenous import LIVE_KINDS, TorqueKind, TorqueSource
 from .law_channel import LawChannel, SentVector, join_received
-from .live_hand import hand_numbers
+from .live_hand import count_hand_numbers
 from .ticks import DominanceRamp
 from .two_link_arm import JOINTS, PARAMETERS
 from .user_law import LawContext, UserLawFactory
@@ -181,7 +181,7 @@ class Layout(NamedTuple):
         parameters: one per dynamic parameter of the arm.
         chain: true: the arm is a chain of joints, else the planar two-link arm.
         task: true: the coordinates are those of the end effector, else the joint angles.
-        sent: numbers that the law sends in a record, see `LawChannel.floats`.
+        sent: numbers that the law sends in a record, see `LawChannel.record_size`.
         hand: numbers that a live hand has in a record, see `live_hand`; 0: the site has none.
         bodies: numbers of the poses of its plant's bodies, see `TickRecord.bodies`.
     """
@@ -203,9 +203,9 @@ class Layout(NamedTuple):
         sends so much.
         """
         n = JOINTS if chain is None else len(chain.joints)
-        live = next((actor.acts for actor in actors if actor.acts in LIVE_KINDS), None)
+        live = next((actor.kind for actor in actors if actor.kind in LIVE_KINDS), None)
         size = n if live is TorqueKind.LIVE_JOINT else 2 if chain is None else 3
-        hand = 0 if live is None else hand_numbers(size)
+        hand = 0 if live is None else count_hand_numbers(size)
         if chain is None:
             return cls(sent=sent, hand=hand)
         task = chain.task
@@ -418,7 +418,7 @@ class SiteSetup(NamedTuple):
     @property
     def layout(self) -> Layout:
         """How many numbers its vectors have."""
-        return Layout.of_arm(self.chain, self.channel.floats, self.actors)._replace(
+        return Layout.of_arm(self.chain, self.channel.record_size, self.actors)._replace(
             bodies=7 * self.bodies
         )
 

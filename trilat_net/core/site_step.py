@@ -28,7 +28,7 @@ from .kernel import (
     sense_stages,
     site_tick,
 )
-from .live_hand import HandInForce, free_hand
+from .live_hand import HandInForce, empty_hand_vector
 from .site_arrays import (
     MAX_CHANGES,
     MAX_RAMPS,
@@ -99,9 +99,9 @@ class Site:
         self._force_bytes = self._buffers.forces.view(np.uint8).reshape(-1).data
         self._sent = self._buffers.record[self.layout.floats - self.layout.sent :]
         self._plug_law(setup)
-        live = [n for n, actor in enumerate(setup.actors) if actor.acts in LIVE_KINDS]
+        live = [n for n, actor in enumerate(setup.actors) if actor.kind in LIVE_KINDS]
         self._hand = self._find_hand(live[0]) if live else None
-        counts = [link.channel.received for link in setup.links]
+        counts = [link.channel.received_size for link in setup.links]
         self._received_counts = counts if self._user_law is not None and any(counts) else None
         self._glides = setup.on_stale.action is StaleAction.GLIDE
         self._degrades = setup.on_stale.degrades
@@ -248,7 +248,7 @@ class Site:
             self._law_memory = self._law.compute(k, t_ns)
         except LawFailed as failure:
             self.law_failure = failure
-            self._law.recall(self._law_memory)
+            self._law.restore(self._law_memory)
             s.tau = math.nan
         return self._law_memory
 
@@ -286,7 +286,7 @@ class Site:
         if self._hand is None:
             return ()
         grip, target, ahead = self._hand
-        taken = list(vector) or free_hand(len(target))
+        taken = list(vector) or empty_hand_vector(len(target))
         hand = HandInForce.read(taken)
         grip[0] = hand.grip
         target[:] = hand.target
@@ -393,7 +393,7 @@ class Site:
         self._sent[:] = last.ch or 0.0
         self._take_hand(last.hand)
         if self._law is not None:
-            self._law.recall(rest)
+            self._law.restore(rest)
             self._law_memory = list(rest)
         resume_stages(last.tick, self._arrays)
 

@@ -24,10 +24,10 @@ Measurement, and Control 108 (1986).
 
 from .chain import Three, add, cross, place_end_effector, put_three, scale, subtract, three
 from .jit import leaf
-from .rotation import add_turn, rotation_matrix, turn_between
+from .rotation import compose_rotations, relative_rotation, rotation_matrix
 from .vectors import Array, Row, RowArray
 
-PLACE = 3
+POSITION = 3
 POSE = 6
 """Numbers of a task without and with an orientation."""
 TINY = 1e-12
@@ -42,11 +42,11 @@ def has_orientation(s: Row) -> bool:
 
 
 @leaf
-def straight_coordinates(s: Row) -> int:
+def count_linear_coordinates(s: Row) -> int:
     """Returns how many of the first coordinates have differences: all but those of an
     orientation.
     """
-    return PLACE if has_orientation(s) else s.q_des.shape[0]
+    return POSITION if has_orientation(s) else s.q_des.shape[0]
 
 
 @leaf
@@ -55,7 +55,7 @@ def update_pose(s: Row, chain: RowArray) -> None:
     place = place_end_effector(chain, s.tip)
     put_three(s.x[:3], scale(s.scale, place))
     if s.shared == POSE:
-        put_three(s.x[3:], turn_between(chain[chain.shape[0] - 1].R_base, s.tip_back))
+        put_three(s.x[3:], relative_rotation(chain[chain.shape[0] - 1].R_base, s.tip_back))
     for j in range(s.shared):
         s.xd[j] = 0.0
     for i in range(chain.shape[0]):
@@ -108,12 +108,12 @@ def update_orientation_reference(s: Row, links: RowArray) -> None:
     apart = rate = (0.0, 0.0, 0.0)
     for j in range(links.shape[0]):
         link: Row = links[j]
-        turn = turn_between(own, rotation_matrix(three(link.q[3:])))
+        turn = relative_rotation(own, rotation_matrix(three(link.q[3:])))
         apart = add(apart, scale(link.alpha, turn))
         rate = add(
             rate, add(scale(link.alpha, three(link.qd[3:])), scale(-link.alpha_rate, turn))
         )
-    put_three(s.q_des[3:], add_turn(scale(-1.0, apart), three(s.x[3:])))
+    put_three(s.q_des[3:], compose_rotations(scale(-1.0, apart), three(s.x[3:])))
     put_three(s.qd_des[3:], rate)
 
 
@@ -179,7 +179,7 @@ def update_task_errors(s: Row) -> None:
         s.ed[j] = s.xd[j] - s.qd_des[j]
     if m == POSE:
         reference = rotation_matrix(three(s.q_des[3:]))
-        put_three(s.e[3:], turn_between(rotation_matrix(three(s.x[3:])), reference))
+        put_three(s.e[3:], relative_rotation(rotation_matrix(three(s.x[3:])), reference))
     for j in range(m):
         s.e[j] *= s.axes[j]
         s.ed[j] *= s.axes[j]

@@ -113,7 +113,7 @@ class Arrival(NamedTuple):
         qd: its joint velocities, rad/s.
         latency_us: its time under way, microseconds; telemetry, enters no formula.
         tau_x: the exogenous torque of the peer's record, N m; laws that reflect force use it.
-        ch: what the peer's law sent to this site besides, see `LawChannel.part`.
+        ch: what the peer's law sent to this site besides, see `LawChannel.select_for_peer`.
     """
 
     peer: int
@@ -185,7 +185,7 @@ class TickInput(NamedTuple):
         arrivals: the samples since the tick before, in order.
         commands: the changes ordered since then.
         measured: the present state of an external plant; None: unchanged.
-        hand: what a live hand does in this tick, see `live_hand.free_hand`; empty: nobody holds
+        hand: what a live hand does in this tick, see `live_hand.empty_hand_vector`; empty: nobody holds
             the arm.
     """
 

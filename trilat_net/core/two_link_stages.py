@@ -161,14 +161,14 @@ def _acceleration(
     theta: Vector,
     g: float,
     lengths: Vector,
-    acts: TorqueSourceRows,
+    actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> Pair:
     """Returns qdd at one stage: under the held u, and the actors at that stage's time and
     state.
     """
     on_arm = torque_on_arm(
-        t_s=t_s, q=q, qd=qd, lengths=lengths, actors=acts, table=table, sampled=0
+        t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=0
     )
     return forward_dynamics(
         theta=theta, g=g, q=q, qd=qd, torque=(on_arm[0] + u[0], on_arm[1] + u[1])
@@ -185,7 +185,7 @@ def rk4_step(
     theta: Vector,
     g: float,
     lengths: Vector,
-    acts: TorqueSourceRows,
+    actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> tuple[Pair, Pair]:
     """Returns q and qd one period of h_s later, Eq. (8).
@@ -197,7 +197,7 @@ def rk4_step(
     q1 = (q[0], q[1])
     v1 = (qd[0], qd[1])
     a1 = _acceleration(
-        t_s=t_s, q=q1, qd=v1, u=u, theta=theta, g=g, lengths=lengths, acts=acts, table=table
+        t_s=t_s, q=q1, qd=v1, u=u, theta=theta, g=g, lengths=lengths, actors=actors, table=table
     )
     q2 = add_scaled(q1, half, v1)
     v2 = add_scaled(v1, half, a1)
@@ -209,7 +209,7 @@ def rk4_step(
         theta=theta,
         g=g,
         lengths=lengths,
-        acts=acts,
+        actors=actors,
         table=table,
     )
     q3 = add_scaled(q1, half, v2)
@@ -222,7 +222,7 @@ def rk4_step(
         theta=theta,
         g=g,
         lengths=lengths,
-        acts=acts,
+        actors=actors,
         table=table,
     )
     q4 = add_scaled(q1, h_s, v3)
@@ -235,7 +235,7 @@ def rk4_step(
         theta=theta,
         g=g,
         lengths=lengths,
-        acts=acts,
+        actors=actors,
         table=table,
     )
     v_sum = (
@@ -265,7 +265,7 @@ def advance_arm(
         theta=five(s.theta),
         g=s.g,
         lengths=pair(s.lengths),
-        acts=actors,
+        actors=actors,
         table=table,
     )
     if not (isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])):

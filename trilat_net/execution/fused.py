@@ -255,12 +255,12 @@ class FusedRun:
         self._law_arrays: LawArrays | None = None
         if tables.channel is None:
             return
-        sent = np.zeros((count, max(setup.channel.floats for setup in setups)))
+        sent = np.zeros((count, max(setup.channel.record_size for setup in setups)))
         for i, setup in enumerate(setups):
             if setup.own is not None:
                 own = select_site(tables, i, setup.layout)
                 law = setup.own(setup.law_context())
-                self._laws[i] = plug_law(law, setup, own, sent[i, : setup.channel.floats])
+                self._laws[i] = plug_law(law, setup, own, sent[i, : setup.channel.record_size])
         compiled = {i: law for i, law in self._laws.items() if isinstance(law, CompiledLaw)}
         addresses = np.zeros(count, dtype=np.int64)
         rows = np.zeros((count, max((len(one.row) for one in compiled.values()), default=0)))
@@ -449,7 +449,7 @@ class FusedRun:
             if isinstance(law, PlainLaw):
                 own = np.array(law.memory)
                 its = np.array(other._laws[i].memory)
-                law.recall((its + factor * (own - its)).tolist())
+                law.restore((its + factor * (own - its)).tolist())
 
     def arrays(self, i: int) -> SiteArrays:
         """Returns what a site is made of, as its next tick will find it; to be read, not
@@ -681,4 +681,4 @@ def _write_actions(acts: Array, k: int, block: Array) -> None:
 
 def _find_live_row(setup: SiteSetup) -> int:
     """Returns which of a site's torque sources is its live hand; -1: it has none."""
-    return next((n for n, one in enumerate(setup.actors) if one.acts in LIVE_KINDS), -1)
+    return next((n for n, one in enumerate(setup.actors) if one.kind in LIVE_KINDS), -1)

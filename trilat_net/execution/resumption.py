@@ -79,7 +79,7 @@ def select_peer_channels(
     peers.
     """
     return [
-        one._replace(ch=links[one.peer].channel.part(one.ch, links[one.peer].place))
+        one._replace(ch=links[one.peer].channel.select_for_peer(one.ch, links[one.peer].place))
         if one.ch
         else one
         for one in arrivals

@@ -54,7 +54,7 @@ class Adaptive(ControlLaw):
         "Kd": ERROR_DAMPING,
         "Gamma": ADAPTATION,
     }
-    told: ClassVar = "gravity, as its first estimate"
+    known_facts: ClassVar = "gravity, as its first estimate"
 
     def compute_torque(self, Y: Array, theta_hat: Array, r: Array, ed: Array) -> Array:
         """Returns the torque of each joint before the torque limits, N m, Eq. (13).

@@ -35,7 +35,7 @@ class AdaptiveBox(Adaptive):
     theta_low: Parameters = (-MAX_QUANTITY,)
     theta_high: Parameters = (MAX_QUANTITY,)
 
-    told: ClassVar = "gravity, as its first estimate; the box is around it"
+    known_facts: ClassVar = "gravity, as its first estimate; the box is around it"
 
     def advance_estimate(self, theta_hat: Array, Yr: Array, gain_s: float) -> Array:
         """Returns the estimate after a step by Eq. (15), projected into the box.

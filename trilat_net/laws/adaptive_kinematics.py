@@ -119,7 +119,7 @@ class AdaptiveKinematics(ControlLaw):
     most_m: Positive = 3.0
 
     planar: ClassVar = True
-    compares_places: ClassVar = True
+    compares_positions: ClassVar = True
     sends: ClassVar[dict[str, Any]] = {
         "x": {"unit": "m", "length": 2},
         "xd": {"unit": "m/s", "length": 2},
@@ -131,7 +131,7 @@ class AdaptiveKinematics(ControlLaw):
         "Kd": (*ERROR_DAMPING[:2], "N s/m"),
         "Gamma": ADAPTATION,
     }
-    told: ClassVar = "gravity, as its first estimate, and no length"
+    known_facts: ClassVar = "gravity, as its first estimate, and no length"
 
     def begin(self, facts: LawContext) -> None:
         """Makes both estimates and their rates."""

@@ -63,7 +63,7 @@ class AdaptiveRobust(AdaptiveBox):
         """
         rho = np.array(self.rho_nm)
         width = np.array(self.width_rad_s)
-        adaptive = AdaptiveBox.compute_torque(self, Y, theta_hat, r, ed)
+        adaptive: Array = AdaptiveBox.compute_torque(self, Y, theta_hat, r, ed)
         uncompensated = (1.0 - self.friction) * joint_friction
         robust = rho * (r / np.sqrt(r * r + width * width))
         torque: Array = adaptive - uncompensated - robust

@@ -146,13 +146,15 @@ def judge_position_exchange(
         return StabilityCondition(
             False, "shares that are not reversible: some heavy arms are unstable at any d"
         )
-    share = max(-least, _find_common_share(2.0 * T / h + 1.0) if h else COMMON_MOTION_SHARE)
+    share = max(
+        -least, _find_common_motion_share(2.0 * T / h + 1.0) if h else COMMON_MOTION_SHARE
+    )
     bound = 0.5 * h * K[0] + share * K[0] * (T + 0.5 * h)
     text = f"d > {'K h / 2 + ' if h else ''}{share:.4g} K {'(T + h / 2)' if h else 'T'} = {bound.max():.4g}"
     return StabilityCondition(bool((d[0] > bound).all()), f"{text} ({scope})")
 
 
-def _find_common_share(count: float) -> float:
+def _find_common_motion_share(count: float) -> float:
     """Returns -min sin(n x) / (n sin x), the common motion's share over n = 2 T / h + 1 halves
     of a tick.
     """

@@ -48,7 +48,7 @@ class Impedance(ControlLaw):
     }
     remembers: ClassVar = ("start",)
     tune: ClassVar = {"M": INERTIA, "B": DAMPING, "K": STIFFNESS}
-    told: ClassVar = "gravity AND inertia exactly: more than the others"
+    known_facts: ClassVar = "gravity AND inertia exactly: more than the others"
     needs_theta: ClassVar = True
     needs_model: ClassVar = True
 

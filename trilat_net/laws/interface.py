@@ -71,7 +71,7 @@ class LawSettings(Frozen, frozen=True):
     """True: the paper's functional V belongs to it."""
     planar: ClassVar[bool] = False
     """True: it has the regressor of the planar arm, and is for no chain."""
-    compares_places: ClassVar[bool] = False
+    compares_positions: ClassVar[bool] = False
     """True: it compares where end effectors are, whatever the joints do."""
 
     @property
@@ -135,7 +135,7 @@ class LawSettings(Frozen, frozen=True):
         """
         return False
 
-    def at_shares(self, names: Sequence[str], alpha: Array) -> Any:  # noqa: ARG002
+    def resolve_shares(self, names: Sequence[str], alpha: Array) -> Any:  # noqa: ARG002
         """Returns the law with what it takes of the dominance factors at the start, alpha,
         shape (N, N).
         """
@@ -150,7 +150,7 @@ class LawSettings(Frozen, frozen=True):
         """What the law sends to its peers."""
         return convert_sends(getattr(self.kind, "sends", {}), self.kind.__name__, "control")
 
-    def maker(self, sites: int, scheme: str) -> UserLawFactory | None:
+    def build_factory(self, sites: int, scheme: str) -> UserLawFactory | None:
         """Returns the factory of the law, for a site of an experiment of so many sites.
 
         None: the kernel computes it.
@@ -159,7 +159,7 @@ class LawSettings(Frozen, frozen=True):
             return None
 
         def make(context: LawContext) -> UserLaw:
-            check_law_class_at(
+            check_law_class(
                 kind=self.kind, code=self.tag, context=context, sites=sites, scheme=scheme
             )
             law: UserLaw = make_instance(self.kind, self.tag, context, asdict(self))
@@ -168,7 +168,7 @@ class LawSettings(Frozen, frozen=True):
         return make
 
 
-def name_of_class(tag: str) -> str:
+def format_class_name(tag: str) -> str:
     """Returns the name of the class in the file of a law: FourChannel of four_channel."""
     return "".join(word.capitalize() for word in tag.split("_"))
 
@@ -180,17 +180,17 @@ class ControlLaw:
         Settings: its gains as a scenario holds them. sends, remembers, schemes, sites,
         needs_theta, needs_model: as of any law, see docs/own-controller.md.
         tune: of the gains that are tuned their ranges, by name.
-        told: what it uses of what all laws are told, in words.
+        known_facts: what it uses of what all laws are told, in words.
     """
 
     Settings: ClassVar[type[LawSettings]] = LawSettings
     remembers: ClassVar[tuple[str, ...]] = ()
     tune: ClassVar[Mapping[str, GainRange]] = {}
-    told: ClassVar[str] = "gravity"
+    known_facts: ClassVar[str] = "gravity"
 
     def __init_subclass__(cls) -> None:
         tag = cls.__module__.rpartition(".")[2]
-        if cls.__name__ == name_of_class(tag):
+        if cls.__name__ == format_class_name(tag):
             cls.Settings = _derive_settings(cls, tag)
 
     def __init__(self, facts: LawContext, **gains: Any) -> None:
@@ -272,9 +272,7 @@ def _speaks_of_gains(name: str, value: Any) -> bool:
     return name in LawSettings.__annotations__
 
 
-def check_law_class_at(
-    kind: Any, code: str, context: LawContext, sites: int, scheme: str
-) -> None:
+def check_law_class(kind: Any, code: str, context: LawContext, sites: int, scheme: str) -> None:
     """Refuses a class that is no law, or none for such a site.
 
     A law may say what it is for: `sites = 2` or `sites = (2, 4)`, `schemes = ("digital",)`, and

@@ -80,14 +80,14 @@ def check_sends(channel: LawChannel, joints: int, path: str) -> None:
         else:
             continue
         raise ScenarioError(problem, path=f"{path}.sends.{name}")
-    if (count := channel.received) > (most := MAX_SENT * joints):
+    if (count := channel.received_size) > (most := MAX_SENT * joints):
         problem = (
             f"sends {count_nouns(count, 'number')} to each peer, and at most {most} "
             f"are taken, {MAX_SENT} per joint"
         )
         raise ScenarioError(problem, path=f"{path}.sends")
-    if channel.floats > MAX_RECORD_SENT:
-        count = channel.floats
+    if channel.record_size > MAX_RECORD_SENT:
+        count = channel.record_size
         most = MAX_RECORD_SENT
         problem = (
             f"sends {count_nouns(count, 'number')} to "

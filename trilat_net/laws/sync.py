@@ -45,7 +45,7 @@ class Sync(ControlLaw):
     planar: ClassVar = True
     remembers: ClassVar = ("theta_hat", "Yr")
     tune: ClassVar = {"Lambda": CONVERGENCE, "Kp": DAMPING, "Gamma": ADAPTATION}
-    told: ClassVar = "gravity, as its first estimate"
+    known_facts: ClassVar = "gravity, as its first estimate"
 
     def begin(self, facts: LawContext) -> None:
         """Makes the estimate and its rate."""

@@ -350,7 +350,7 @@ class Tdpa(EnergyLaw):
     )
     needs_model: ClassVar = True
     tune: ClassVar = {"K": STIFFNESS, "B": DAMPING}
-    told: ClassVar = "gravity, and inertia for two ticks"
+    known_facts: ClassVar = "gravity, and inertia for two ticks"
     controlled = True
     """False: it watches only, for comparison."""
 

@@ -359,7 +359,7 @@ class Wave(EnergyLaw):
             )
         return None
 
-    def at_shares(self, names: Sequence[str], alpha: Array) -> Any:
+    def resolve_shares(self, names: Sequence[str], alpha: Array) -> Any:
         """Returns the law with its lines as numbers: b_ij = D_i alpha_ij, D_i alpha_ij = D_j
         alpha_ji.
         """
@@ -387,7 +387,7 @@ class Wave(EnergyLaw):
         return f"lines share as b_ij / sum b_ik{'' if own else ', as the shares of sites are not reversible'}"
 
     def find_impedances(self, site: str, peer: str) -> tuple[float, ...]:
-        """Returns the impedance of a line at each joint, N m s/rad; as `at_shares` left it."""
+        """Returns the impedance of a line at each joint, N m s/rad; as `resolve_shares` left it."""
         line = find_line({} if self.lines == "shares" else self.lines, site, peer)
         return self.b if line is None else tuple(np.broadcast_to(line, len(self.b)).tolist())
 

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.chain import LINK_PARAMETERS
-from ..core.task_space import PLACE, POSE
+from ..core.task_space import POSE, POSITION
 from ..core.ticks import NS_PER_S
 from ..errors import LogError
 from ..files import import_extra
@@ -239,14 +239,14 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
     for field in (*(name for name in _JOINT_VECTORS if name not in task), *task):
         if field in task:
             is_pose = field in _POSES and arm.counts.shared == POSE
-            for n, axis in enumerate(TASK_AXES[: PLACE if is_pose else arm.counts.shared]):
+            for n, axis in enumerate(TASK_AXES[: POSITION if is_pose else arm.counts.shared]):
                 text = f"{docs[field].text}, along {axis}"
                 yield _make_number_column(
                     site=site,
                     field=field,
                     n=n,
                     stem=f"{field}_{axis}",
-                    unit=task[field][n >= PLACE],
+                    unit=task[field][n >= POSITION],
                     text=text,
                 )
             if is_pose:
@@ -274,7 +274,7 @@ def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[
     """Yields the orientation of a pose as a quaternion; its source is the record's rotation
     vector.
     """
-    quaternions = compute_quaternions(getattr(site, field)[:, PLACE:])
+    quaternions = compute_quaternions(getattr(site, field)[:, POSITION:])
     for name, values in zip(QUATERNION_AXES, quaternions.T, strict=True):
         meaning = f"{text}, {name[1]} of its orientation as {_STEADY_QUATERNION}"
         yield Column(
@@ -282,7 +282,7 @@ def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[
             values=np.ascontiguousarray(values),
             unit="",
             meaning=meaning,
-            source=f"{field}[{PLACE}:{POSE}]",
+            source=f"{field}[{POSITION}:{POSE}]",
         )
 
 
@@ -349,7 +349,7 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
             source=f"hand[{n}]",
             known=held,
         )
-    names = arm.joint_names if mode == "joint" else TASK_AXES[:PLACE]
+    names = arm.joint_names if mode == "joint" else TASK_AXES[:POSITION]
     units = {"tip": ("m", "m/s"), "joint": ("rad", "rad/s"), "force": ("N", "")}[mode]
     size = (site.layout.hand - 3) // 2
     what = "force" if mode == "force" else "target"
@@ -369,13 +369,13 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
 
 def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Column]:
     for number, body in enumerate(bodies):
-        first = (PLACE + len(QUATERNION_AXES)) * number
+        first = (POSITION + len(QUATERNION_AXES)) * number
         for n, axis in enumerate("xyz", first):
             text = f"{axis} of the place of {body}, a body of its plant"
             yield _make_number_column(
                 site=site, field="bodies", n=n, stem=f"{body}_{axis}", unit="m", text=text
             )
-        first += PLACE
+        first += POSITION
         quaternions = align_signs(site.bodies[:, first : first + len(QUATERNION_AXES)])
         for n, (name, values) in enumerate(
             zip(QUATERNION_AXES, quaternions.T, strict=True), first

@@ -22,7 +22,13 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import (
 )
 
 from ..errors import LogError, UsageError, count_nouns
-from ..files import find_rights_of_others, open_regular, reading, refuse_existing, write_whole
+from ..files import (
+    open_regular,
+    read_foreign_permissions,
+    reading,
+    refuse_existing,
+    write_whole,
+)
 from .findings import Finding
 from .mcap_reader import McapReader, Progress
 from .running_digest import DIGESTS, DigestState, Integrity
@@ -104,7 +110,7 @@ def sign_log(
         Ed25519PrivateKey,
         "private Ed25519 key; make a pair with: trilat keys pair NAME",
     )
-    if find_rights_of_others(key_file):
+    if read_foreign_permissions(key_file):
         raise UsageError(f"{key_file}: can be read by others: chmod 600 {key_file}")
     made = path.with_name((path.name or "log") + SUFFIX)
     refuse_existing(made, force=force)

@@ -23,7 +23,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..core.task_space import PLACE, POSE
+from ..core.task_space import POSE, POSITION
 from ..core.vectors import Array
 from ..scenario.arms import TASK_AXES
 
@@ -31,7 +31,7 @@ QUATERNION_AXES = ("qw", "qx", "qy", "qz")
 """Names of the four numbers of an orientation in a table."""
 MATRIX_ENTRIES = ("r11", "r21", "r31", "r12", "r22", "r32")
 """Names of the six numbers of an orientation: row and column of the rotation matrix."""
-SIX_AXES = (*TASK_AXES[:PLACE], *MATRIX_ENTRIES)
+SIX_AXES = (*TASK_AXES[:POSITION], *MATRIX_ENTRIES)
 """Names of the numbers of a pose with six numbers for its orientation."""
 
 
@@ -100,7 +100,7 @@ def expand_poses(x: Array) -> Array:
     """
     if x.shape[-1] != POSE:
         return x
-    return np.concatenate([x[..., :PLACE], compute_matrix_columns(x[..., PLACE:])], axis=-1)
+    return np.concatenate([x[..., :POSITION], compute_matrix_columns(x[..., POSITION:])], axis=-1)
 
 
 def choose_nearest_vectors(turns: Array, references: Array) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 from .. import process
 from ..core.law_channel import LawChannel
 from ..core.site_setup import Layout
-from ..core.task_space import PLACE, POSE
+from ..core.task_space import POSE, POSITION
 from ..core.ticks import NS_PER_S
 from ..core.vectors import Array
 from ..errors import LogError, WireError, count_nouns
@@ -67,8 +67,8 @@ def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
     It is 0 along an axis that the site does not follow: `axes` has 0 there and 1 elsewhere.
     """
     e: Array = x - x_des
-    if e.shape[1] > PLACE:
-        e[:, PLACE:] = _find_turns(x[:, PLACE:], x_des[:, PLACE:])
+    if e.shape[1] > POSITION:
+        e[:, POSITION:] = _find_turns(x[:, POSITION:], x_des[:, POSITION:])
     e *= np.array(axes)
     return e
 
@@ -414,7 +414,7 @@ class SiteLog:
     def _make_orientation(self, poses: Array) -> Array:
         if not self.layout.task or self.layout.shared != POSE:
             return freeze(np.zeros((len(self), 0)))
-        return freeze(compute_quaternions(poses[:, PLACE:]))
+        return freeze(compute_quaternions(poses[:, POSITION:]))
 
     @cached_property
     def body_poses(self) -> Array:
@@ -423,9 +423,9 @@ class SiteLog:
 
         Each quaternion is nearest to the one before, whichever sign the plant gave it.
         """
-        poses = self.bodies.reshape(len(self), -1, PLACE + 4).copy()
+        poses = self.bodies.reshape(len(self), -1, POSITION + 4).copy()
         for body in range(poses.shape[1]):
-            poses[:, body, PLACE:] = align_signs(poses[:, body, PLACE:])
+            poses[:, body, POSITION:] = align_signs(poses[:, body, POSITION:])
         return freeze(poses)
 
     @property

@@ -402,7 +402,7 @@ class Hand(SiteClient):
         operator = self._operator
         hand = HandInForce.read(record.hand)
         pull = list(hand.target)
-        if operator.acts is not TorqueKind.LIVE_FORCE:
+        if operator.kind is not TorqueKind.LIVE_FORCE:
             at = self._place(record.q)
             speed = self._find_speed(record)
             pull = [
@@ -429,7 +429,7 @@ class Hand(SiteClient):
         return record
 
     def _send(self, what: str, numbers: Sequence[float]) -> int:
-        does = _DOES[self._operator.acts]
+        does = _DOES[self._operator.kind]
         if what != does:
             raise UsageError(
                 f"the hand of {self._site} can {does}, not {what}: see its mode in the scenario"

@@ -28,7 +28,13 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ..errors import UsageError
-from ..files import find_rights_of_others, make_folder, open_regular, stage_output, write_whole
+from ..files import (
+    make_folder,
+    open_regular,
+    read_foreign_permissions,
+    stage_output,
+    write_whole,
+)
 from .zenoh_config import MOST_SESSIONS, PROTOCOLS, make_access_rules
 
 AUTHORITY = "authority.pem"
@@ -411,7 +417,7 @@ def _find_fault(
     now = datetime.datetime.now(datetime.UTC)
     for fault, text in (
         (
-            find_rights_of_others(private),
+            read_foreign_permissions(private),
             f"{PRIVATE_KEY} can be read by others: chmod 600 {private}",
         ),
         (

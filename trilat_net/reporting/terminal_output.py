@@ -20,7 +20,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from ..errors import count_nouns
-from ..process import join_words
+from ..process import join_arguments
 
 if TYPE_CHECKING:
     from ..log.log_reader import Log
@@ -160,8 +160,8 @@ def conclude_files(
         with progress_bar("executing and drawing") as progress:
             conclusion = conclude(log, folder, progress, png=png)
     except KeyboardInterrupt:
-        files = join_words(map(str, paths))
-        later = f"trilat report {files} -o {join_words([str(folder)])} --force"
+        files = join_arguments(map(str, paths))
+        later = f"trilat report {files} -o {join_arguments([str(folder)])} --force"
         print_note(f"the log is kept: {files}; its report can be drawn later: {later}")
         raise
     print_result(conclusion, as_json=as_json)

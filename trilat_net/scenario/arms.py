@@ -33,7 +33,7 @@ from ..core.chain import (
     place_joints,
 )
 from ..core.live_hand import HandReach
-from ..core.rotation import rotation_matrix, turn_between
+from ..core.rotation import relative_rotation, rotation_matrix
 from ..core.site_setup import ChainSetup, Gains, Law, MotionLimits, RestGains, TaskSetup
 from ..core.two_link_arm import ArmLinks, is_positive_definite, theta_from_links
 from ..core.vectors import Array, RowArray, Vector
@@ -303,7 +303,7 @@ class ArmModel(NamedTuple):
         rows = self._place_links(q)
         # Fills R_base, which turns base axes into those of each link.
         place_end_effector(rows, np.array(self.chain.tip_m))
-        return turn_between(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
+        return relative_rotation(rows[-1]["R_base"], np.array(self.chain.tip_rotation).T)
 
     @property
     def reach(self) -> HandReach:

@@ -26,7 +26,7 @@ from ..core.user_law import LawContext, UserLaw, UserLawFactory
 from ..errors import CodeWithheld, ScenarioError
 from ..fields import suggest_nearest
 from ..files import find_page, open_regular
-from ..laws.interface import LawSettings, check_law_class_at, make_instance
+from ..laws.interface import LawSettings, check_law_class, make_instance
 from ..laws.sent_vectors import SentVectorSpecs, convert_sends, parse_classes
 
 CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
@@ -194,14 +194,14 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     settings: dict[str, Any] = field(default_factory=dict)
     sends: SentVectorSpecs = field(default_factory=dict)
 
-    def maker(self, sites: int, scheme: str) -> UserLawFactory:
+    def build_factory(self, sites: int, scheme: str) -> UserLawFactory:
         """Returns the factory of the law, for a site of an experiment of so many sites."""
 
         def make(context: LawContext) -> UserLaw:
             path = f"sites.{context.site}.control"
             kind = import_class(CodeKey.of(self), f"{path}.law")
             # before anything of it is called
-            check_law_class_at(
+            check_law_class(
                 kind=kind, code=self.code, context=context, sites=sites, scheme=scheme
             )
             declared = convert_sends(getattr(kind, "sends", {}), self.code, path)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Union
 
-from ..laws.interface import ControlLaw, LawSettings, name_of_class
+from ..laws.interface import ControlLaw, LawSettings, format_class_name
 from .imported_code import ImportedLaw
 
 _ROOM = "trilat_net.laws"
@@ -18,7 +18,9 @@ _ROOM = "trilat_net.laws"
 
 def _find_laws() -> Iterator[type[ControlLaw]]:
     for found in pkgutil.iter_modules(import_module(_ROOM).__path__):
-        kind = getattr(import_module(f"{_ROOM}.{found.name}"), name_of_class(found.name), None)
+        kind = getattr(
+            import_module(f"{_ROOM}.{found.name}"), format_class_name(found.name), None
+        )
         if isinstance(kind, type) and issubclass(kind, ControlLaw):
             yield kind
 

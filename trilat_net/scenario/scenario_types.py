@@ -348,7 +348,7 @@ class Scenario(Frozen, frozen=True, dict=True):
     def controls(self) -> tuple[ChosenLaw, ...]:
         """The law of every site, with what it takes of the dominance factors at the start."""
         laws = [spec.control for spec in self.sites.values()]
-        return tuple(law.at_shares(self.names, self.alpha) for law in laws)
+        return tuple(law.resolve_shares(self.names, self.alpha) for law in laws)
 
     @property
     def beta(self) -> Array | None:
@@ -479,7 +479,7 @@ class Scenario(Frozen, frozen=True, dict=True):
         live = self.sites[site].find_live_hand()
         actors = () if live is None else (live.actor,)
         found = site_setup.Layout.of_arm(
-            self.arms[site].chain, self.channel(site).floats, actors
+            self.arms[site].chain, self.channel(site).record_size, actors
         )
         return found._replace(bodies=7 * len(self.bodies_m(site)))
 
@@ -512,7 +512,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             ramps=tuple(self.scripted_ramps(site)),
             on_stale=spec.on_stale.rule,
             external=spec.plant != "simulated",
-            own=control.maker(len(self.sites), self.scheme),
+            own=control.build_factory(len(self.sites), self.scheme),
             theta_known=spec.arm.known,
             chain=arm.chain,
             channel=self.channel(site),

@@ -178,7 +178,7 @@ class ActedHand(HandPlayer):
 
     def ask(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - whoever acts has seen it
         """Decides by the action of the step."""
-        self.hand.decide(k, self._actions[k // self.hand.every].tolist())
+        self.hand.accept_decision(k, self._actions[k // self.hand.period_ticks].tolist())
 
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):

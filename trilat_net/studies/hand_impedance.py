@@ -211,7 +211,7 @@ def _find_hand_force(records: AlignedRecords, scenario: Scenario) -> tuple[Array
     split = split_torque(records, scenario)
     torque = np.zeros_like(records.q)
     for source in (one.actor for one in scenario.sites[records.site].hands):
-        if source.acts in SCRIPTED_KINDS:
+        if source.kind in SCRIPTED_KINDS:
             torque += compute_operator_script(
                 source, records.nominal_s, split.end_effector.J[0]
             )

@@ -25,14 +25,14 @@ from ..core.fingerprint import compute_fingerprint
 from ..errors import ScenarioError
 from ..files import describe_write_error, extend_file
 from ..log.log_layout import collect_provenance
-from ..process import join_words
+from ..process import join_arguments
 from ..scenario.imported_code import name_law_classes
 from .executor import Progress, WorkerPool
 
 
 def format_command(*words: str) -> str:
     """Returns a command of the program."""
-    return join_words(["trilat", *words])
+    return join_arguments(["trilat", *words])
 
 
 def set_options(overrides: Iterable[str]) -> list[str]:

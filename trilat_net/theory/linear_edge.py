@@ -63,7 +63,7 @@ def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
     for n, name in enumerate(scenario.names):
         site = scenario.setup(name)
         for wall in site.actors:
-            if wall.acts is TorqueKind.WALL and wall.sampled:
+            if wall.kind is TorqueKind.WALL and wall.sampled:
                 at = place_arm(site, q[:, n, : site.layout.joints].T).end_effector_position()
                 depth_m = np.maximum(depth_m, (np.array(wall.a) - at.T) @ np.array(wall.b))
     deepest = int(depth_m.argmax())

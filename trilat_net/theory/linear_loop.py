@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, qr
 
 from ..core.site_setup import SiteSetup
-from ..core.task_space import PLACE
+from ..core.task_space import POSITION
 from ..core.vectors import Array
 from ..laws.conditions import LinearForm, Place
 from . import site_dynamics
@@ -164,7 +164,7 @@ def differentiate_references(
     for i, shares in enumerate(conditions.alpha):
         for j in np.flatnonzero(shares).tolist():
             derivatives[i, j] = shares[j] * np.eye(len(poses[i]))
-        has_orientation = len(poses[i]) > PLACE and conditions.sites[i].layout.task
+        has_orientation = len(poses[i]) > POSITION and conditions.sites[i].layout.task
         if not has_orientation:
             continue
         for j in {i, *np.flatnonzero(shares).tolist()}:

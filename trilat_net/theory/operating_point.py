@@ -394,7 +394,7 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
             f"an operator at {name} still moves at the end: "
             "the end of that motion is used as the operator's target"
         )
-    if any(actor.acts in _PERIODIC for actor in present):
+    if any(actor.kind in _PERIODIC for actor in present):
         notes.append(
             f"an operator at {name} still swings at the end: "
             "this torque is left out, because its mean is zero"
@@ -402,7 +402,7 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
     scripted = [
         actor
         for actor in present
-        if actor.acts in SCRIPTED_KINDS and actor.acts not in _PERIODIC
+        if actor.kind in SCRIPTED_KINDS and actor.kind not in _PERIODIC
     ]
     constant = [actor._replace(a=_evaluate_script(actor, end_s)) for actor in scripted]
     if any(any(actor.a) for actor in constant):

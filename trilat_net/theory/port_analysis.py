@@ -26,7 +26,7 @@ from ..analysis.arm_rows import build_arm_rows
 from ..analysis.dominance_history import compute_lyapunov_weights
 from ..core.exogenous import TorqueKind, TorqueSource
 from ..core.site_setup import Law, SiteSetup
-from ..core.task_space import PLACE
+from ..core.task_space import POSITION
 from ..core.vectors import Array
 from ..errors import UsageError, count_nouns
 from ..results import finite_or_none
@@ -86,7 +86,7 @@ def build_proof_output(
         site.gains.law is not Law.ADAPTIVE or site.gains.absolute for site in conditions.sites
     ):
         return None
-    if conditions.sites[0].layout.task and conditions.sites[0].layout.shared > PLACE:
+    if conditions.sites[0].layout.task and conditions.sites[0].layout.shared > POSITION:
         return None
     C = loop.C.copy()
     delays_s = conditions.age_s[conditions.alpha != 0.0]
@@ -197,9 +197,11 @@ class PortAnalysis(NamedTuple):
 
     def impedance_unit(self, number: int = 0) -> str:
         """Returns the unit of an impedance at the ports of a number; 0: at all of them."""
-        turns = not self.axes or max(self.axes) > PLACE
+        turns = not self.axes or max(self.axes) > POSITION
         units = {
-            "N s/m" if self.axes and port <= PLACE else "N m s/rad" for port in [number] if port
+            "N s/m" if self.axes and port <= POSITION else "N m s/rad"
+            for port in [number]
+            if port
         }
         return " and ".join(units or (["N s/m"] if self.axes else []) + ["N m s/rad"] * turns)
 

@@ -318,13 +318,13 @@ def _evaluate_actor(
     An operator's motion has ended, and a scripted torque has the constant value `a`. A
     user-written model keeps the parameters that it has at `move_end_s`.
     """
-    if actor.acts in SCRIPTED_KINDS:
+    if actor.kind in SCRIPTED_KINDS:
         return _as_columns(actor.a, q)
     stiffness = _as_columns(actor.K, q)
     damping = _as_columns(actor.B, q)
-    if actor.acts is TorqueKind.VISCOUS:
+    if actor.kind is TorqueKind.VISCOUS:
         return -damping * qd
-    if actor.acts is TorqueKind.HAND:
+    if actor.kind is TorqueKind.HAND:
         torque: Numbers = stiffness * (_as_columns(actor.b, q) - q) - damping * qd
         return torque
     J = arm.position_jacobian()

@@ -33,7 +33,7 @@ from ..analysis.arm_rows import Numbers, multiply_columns, solve_columns
 from ..analysis.following import find_task_reference
 from ..core.chain import COULOMB_SPEED, LINK_PARAMETERS, ChainJoint
 from ..core.site_setup import ChainSetup, SiteSetup, TaskSetup
-from ..core.task_space import PLACE
+from ..core.task_space import POSITION
 from ..core.vectors import Array
 
 _EPSILON = np.zeros((3, 3, 3))
@@ -352,16 +352,16 @@ def evaluate_reference(shares: Array, own: Numbers, shared: Sequence[Numbers]) -
     followed = [
         (share, pose) for share, pose in zip(shares.tolist(), shared, strict=True) if share
     ]
-    places = sum(share * pose[:PLACE] for share, pose in followed)
-    if len(own) == PLACE:
+    places = sum(share * pose[:POSITION] for share, pose in followed)
+    if len(own) == POSITION:
         return np.asarray(places)
-    R = rotation_from_vector(own[PLACE:])
+    R = rotation_from_vector(own[POSITION:])
     apart = sum(
-        share * turn_from(rotation_from_vector(pose[PLACE:]), R) for share, pose in followed
+        share * turn_from(rotation_from_vector(pose[POSITION:]), R) for share, pose in followed
     )
     reference = _multiply(rotation_from_vector(-np.asarray(apart)), R)
     return np.concatenate(
-        [np.asarray(places) + 0.0 * own[:PLACE], vector_from_rotation(reference)]
+        [np.asarray(places) + 0.0 * own[:POSITION], vector_from_rotation(reference)]
     )
 
 
@@ -422,7 +422,7 @@ def share_pose(task: TaskSetup, arm: PlacedChain) -> Numbers:
     (m, ...).
     """
     place = task.scale * arm.end_effector_position()
-    if len(task.axes) == PLACE:
+    if len(task.axes) == POSITION:
         return place
     return np.concatenate([place, vector_from_rotation(arm.end_effector_orientation())])
 
@@ -446,15 +446,15 @@ def follow_in_task(
     x = share_pose(task, arm)
     one = (1,) * (q.ndim - 1)
     axes = np.array(task.axes).reshape(m, *one)
-    scales = np.array([task.scale] * PLACE + [1.0] * PLACE)[:m].reshape(m, 1, *one)
+    scales = np.array([task.scale] * POSITION + [1.0] * POSITION)[:m].reshape(m, 1, *one)
     whole, whole_rate = (
         scales * J[:m] for J in (arm.pose_jacobian(), arm.pose_jacobian_rate(qd))
     )
     xd = multiply_columns(whole, qd)
     e = x - x_des
-    if m > PLACE:
-        R, R_des = (rotation_from_vector(pose[PLACE:]) for pose in (x, x_des + 0.0 * x))
-        e = np.concatenate([e[:PLACE], turn_from(R_des, R)])
+    if m > POSITION:
+        R, R_des = (rotation_from_vector(pose[POSITION:]) for pose in (x, x_des + 0.0 * x))
+        e = np.concatenate([e[:POSITION], turn_from(R_des, R)])
     e = axes * e
     ed = axes * (xd - xd_des)
     J = axes[:, np.newaxis] * whole

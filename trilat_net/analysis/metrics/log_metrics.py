@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...core.task_space import PLACE
+from ...core.task_space import POSITION
 from ...errors import count_nouns
 from ...fields import suggest_nearest
 from ...log.log_reader import Log
@@ -86,7 +86,9 @@ class LogMetrics(Result):
     def unit(self, of_joint: str, number: int) -> str:
         """Returns the unit of a joint's quantity, or of that along an axis of a place."""
         return (
-            _ALONG_AXES.get(of_joint, of_joint) if self.axes and number <= PLACE else of_joint
+            _ALONG_AXES.get(of_joint, of_joint)
+            if self.axes and number <= POSITION
+            else of_joint
         )
 
     def headline(self) -> str:
@@ -290,7 +292,7 @@ def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
 
 def _name_axis(metrics: LogMetrics, entry: dict[str, Any]) -> dict[str, Any]:
     number = entry.pop("joint")
-    endings = (("_nm_rad", "_n_m"), ("_nm", "_n"), ("_rad", "_m")) if number <= PLACE else ()
+    endings = (("_nm_rad", "_n_m"), ("_nm", "_n"), ("_rad", "_m")) if number <= POSITION else ()
     renamed = {}
     for key, value in entry.items():
         ending = next((pair for pair in endings if key.endswith(pair[0])), ("", ""))

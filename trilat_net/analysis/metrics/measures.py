@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ...core.task_space import PLACE
+from ...core.task_space import POSITION
 from ...core.vectors import Array
 from ..run_view import RunView
 
@@ -78,7 +78,9 @@ def measure_shared(
         parts = [("rad", slice(None))]
     else:
         found = unavailable(group, "sites share places, not angles", applies=False)
-        parts = [("m", slice(0, PLACE)), ("rad", slice(PLACE, None))][: 1 + (space == "pose")]
+        parts = [("m", slice(0, POSITION)), ("rad", slice(POSITION, None))][
+            : 1 + (space == "pose")
+        ]
     for unit, columns in parts:
         part = off[:, columns]
         values = metric(rms(part)), metric(peak(part)), metric(peak(part[at_end]), none)

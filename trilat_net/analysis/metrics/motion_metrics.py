@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...core.site_setup import Law
-from ...core.task_space import PLACE, POSE
+from ...core.task_space import POSE, POSITION
 from ...core.vectors import Array
 from ...log.orientations import choose_nearest_vectors
 from ...log.site_log import compute_task_errors
@@ -111,8 +111,8 @@ def measure_spread(view: RunView, _run: str) -> MetricValues:
     there = np.stack(poses)[:, known]
     # of vectors on both sides of half a turn the difference is a whole turn
     if sites[0].x.shape[1] == POSE:
-        for turns in there[1:, :, PLACE:]:
-            turns[:] = choose_nearest_vectors(turns, there[0, :, PLACE:])
+        for turns in there[1:, :, POSITION:]:
+            turns[:] = choose_nearest_vectors(turns, there[0, :, POSITION:])
     apart = np.ptp(there, axis=0)
     axes = [records.axes for records in sites]
     if all(axes):

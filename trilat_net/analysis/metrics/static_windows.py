@@ -342,7 +342,7 @@ def _holding_rank(scenario: Scenario, site: str, at_s: float) -> tuple[bool, boo
     springs = (
         one.actor
         for one in spec.hands
-        if one.actor.acts in (TorqueKind.HAND, TorqueKind.TASK_HAND)
+        if one.actor.kind in (TorqueKind.HAND, TorqueKind.TASK_HAND)
     )
     held = any(spring.start_s <= at_s < spring.end_s for spring in springs)
     return held and not spec.environment, spec.role == "master"

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from ...core.task_space import PLACE
+from ...core.task_space import POSITION
 from ..aligned import AlignedRecords, find_common_rows, find_latest_rows
 from ..dominance_history import (
     RAMP_TIME_TOLERANCE_S,
@@ -153,7 +153,7 @@ def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
     sizes = np.abs(torques).sum(axis=0)
     cancels = 0.5 * (sizes - np.abs(torques.sum(axis=0)))
     whole = sizes.sum()
-    places = PLACE if runs[0].records.x.size else 0
+    places = POSITION if runs[0].records.x.size else 0
     found = {
         "internal_share": metric(2.0 * cancels.sum() / whole)
         if whole
@@ -182,7 +182,7 @@ def _compare_steps(records: AlignedRecords, spans: list[tuple[float, float]]) ->
     """Returns the largest step of q_id from tick to tick while shares change, over that of the
     rest.
     """
-    places = records.q_des[:, :PLACE] if records.x.size else records.q_des
+    places = records.q_des[:, :POSITION] if records.x.size else records.q_des
     follows = records.known & records.follows
     steps = np.abs(np.diff(places, axis=0)).max(axis=1)
     begins = records.t_s[:-1] - RAMP_TIME_TOLERANCE_S

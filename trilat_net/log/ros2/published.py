@@ -10,7 +10,7 @@ Invariant:
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
-from ...core.task_space import PLACE, POSE
+from ...core.task_space import POSE, POSITION
 from ...net.messages import LinkStats, State
 from ...scenario import Scenario
 from ..orientations import QuaternionSigns
@@ -172,26 +172,26 @@ class SiteMessages:
                 yield topic, cdr.pack_frame_vectors(stamp_ns, self.frame, *numbers)
             twist = topic.replace("pose", "twist")
             if self._arm.shares_pose and wanted(twist):
-                linear = [one / self._scale for one in rate[:PLACE]]
-                angular = [*rate[PLACE:], *_NO_TURN][:PLACE]
+                linear = [one / self._scale for one in rate[:POSITION]]
+                angular = [*rate[POSITION:], *_NO_TURN][:POSITION]
                 yield twist, cdr.pack_frame_vectors(stamp_ns, self.frame, *linear, *angular)
         if self._arm.shares_pose and wanted("tip_wrench"):
-            force = [-self._scale * one for one in record.wrench[:PLACE]]
-            torque = [-one for one in [*record.wrench[PLACE:], *_NO_TURN][:PLACE]]
+            force = [-self._scale * one for one in record.wrench[:POSITION]]
+            torque = [-one for one in [*record.wrench[POSITION:], *_NO_TURN][:POSITION]]
             yield "tip_wrench", cdr.pack_frame_vectors(stamp_ns, self.frame, *force, *torque)
 
     def _find_place(self, record: State, pose: Sequence[float]) -> Sequence[float]:
         """Returns the place of a pose that is shared, or of the end effector in joint space, m."""
         if pose:
-            return [one / self._scale for one in pose[:PLACE]]
-        return [*self._arm.end_effector(record.q), 0.0][:PLACE]
+            return [one / self._scale for one in pose[:POSITION]]
+        return [*self._arm.end_effector(record.q), 0.0][:POSITION]
 
     def _find_turn(self, record: State, pose: Sequence[float]) -> tuple[float, float, float]:
         """Returns the rotation vector of a pose, rad; of one without orientation the end
         effector's own.
         """
         if len(pose) == POSE:
-            return pose[PLACE], pose[PLACE + 1], pose[PLACE + 2]
+            return pose[POSITION], pose[POSITION + 1], pose[POSITION + 2]
         return self._arm.end_effector_orientation(record.q)
 
     def _pack_arrays(

@@ -15,7 +15,7 @@ import numpy as np
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
-from ...core.task_space import PLACE
+from ...core.task_space import POSITION
 from ...core.ticks import TickRecord
 from ...files import reading
 from ...net.messages import MODE_WORDS, Event, LinkStats, State
@@ -301,7 +301,7 @@ def stack_signals(records: Sequence[Record]) -> list[SignalRow]:
     error = [
         [a - b for a, b in zip(*pair, strict=True)] for pair in zip(here, there, strict=True)
     ]
-    if len(error) > PLACE and task:
+    if len(error) > POSITION and task:
         x, x_des = (np.array(columns).T for columns in (here, there))
         error = compute_task_errors(x, x_des, [1.0] * len(error)).T.tolist()
     modes = [m.mode for m in records]

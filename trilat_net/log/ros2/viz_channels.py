@@ -84,7 +84,7 @@ class _SiteBuckets:
         names = [*shapes.joints, *(f"{name}_ref" for name in shapes.joints)]
         self._states = JointStatePacker(names)
         joints = len(shapes.joints)
-        sent = scenario.channel(site).floats
+        sent = scenario.channel(site).record_size
         self.most_pending_bytes = (
             MAX_PENDING_BYTES * -(-joints // 2) + SENT_PENDING_BYTES * sent
         )

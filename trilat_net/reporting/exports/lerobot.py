@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ...analysis.arm_rows import build_arm_rows
 from ...analysis.dominance_history import find_user_shares, find_users, trace_dominance
-from ...core.task_space import PLACE
+from ...core.task_space import POSITION
 from ...core.ticks import NS_PER_S
 from ...core.vectors import Array
 from ...errors import LogError, UsageError, count_nouns
@@ -207,7 +207,7 @@ def _read_commands(
         return tips, [f"{axis}.pos" for axis in TASK_AXES[: tips[0].shape[1]]]
     if not actions and log[users[0]].layout.task:
         poses = [expand_poses(log[user].x[rows[user]]) for user in users]
-        places = [f"{axis}.pos" for axis in TASK_AXES[:PLACE]]
+        places = [f"{axis}.pos" for axis in TASK_AXES[:POSITION]]
         turned = [f"{entry}.rot" for entry in MATRIX_ENTRIES]
         return poses, [*places, *turned][: poses[0].shape[1]]
     joints = {

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Meta
 
 from ...core.delay import LINK_MODEL_DTYPE, MAX_DELAY_US, DelayKind, LinkModel
-from ...core.plugged import list_numbers, plug
+from ...core.plugged import compile_to_address, list_numbers
 from ...core.vectors import Points
 from ...fields import Frozen, KeyProblem, TomlTable, find_kinds
 
@@ -227,7 +227,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         compiled here.
         """
         return (
-            super().to_core_model(from_ns)._replace(call=plug(self, "draw", LINK_MODEL_DTYPE))
+            super().to_core_model(from_ns)._replace(call=compile_to_address(self, "draw", LINK_MODEL_DTYPE))
         )
 
 

@@ -343,7 +343,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
         if self.mode == "force":
             strongest = STRONGEST * self.force_limit_n
             return HandRules(
-                arm.counts.axes, rate_hz, math.inf, from_arm=False, farthest=strongest
+                arm.counts.axes, rate_hz, math.inf, starts_at_arm=False, max_goal_norm=strongest
             )
         if self.mode == "joint":
             size = arm.counts.joints
@@ -359,7 +359,7 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
             size,
             rate_hz,
             speed_limit,
-            farthest=FARTHEST,
+            max_goal_norm=FARTHEST,
             acceleration_limit=acceleration if acceleration < fields.MAX_QUANTITY else math.inf,
             reach=reach if self.is_open else HandReach(),
         )

@@ -163,7 +163,7 @@ class HandPlayer:
 
     def track(self, site: Site, k: int) -> list[float]:
         """Returns what it does in tick k, which its site is about to make; see `HandInForce`."""
-        step = self.hand.advance(k, self._begin(k, site.arrays))
+        step = self.hand.advance_to(k, self._begin(k, site.arrays))
         self.news += [(k, self._tell(k, change)) for _, change in step.changes]
         return step.vector
 
@@ -171,24 +171,24 @@ class HandPlayer:
         """Returns what it does from tick k until it needs the arm again, before tick `end`, a
         row a tick.
         """
-        return self.hand.advance_until(k, end, self._begin(k, arrays))
+        return self.hand.advance_span(k, end, self._begin(k, arrays))
 
     def _begin(self, k: int, arrays: SiteArrays) -> Callable[[], list[float]]:
         """Asks, if it is time to; returns what reads the angles of the joints, rad."""
-        if self.hand.is_asked(k) and not self.failure:
+        if self.hand.is_decision_tick(k) and not self.failure:
             self.ask(k, arrays)
         angles: Array = arrays.site[0]["q"][: self._layout.joints]
         return angles.tolist
 
     def view(self, k: int, arrays: SiteArrays) -> HandView:
         """Returns what it sees at tick k."""
-        return self.hand.view(k, arrays, self._layout)
+        return self.hand.build_view(k, arrays, self._layout)
 
     def ask(self, k: int, arrays: SiteArrays) -> None:
         """Asks its class at tick k."""
         view = self.view(k, arrays)
         try:
-            self.hand.decide(k, self._watch(k, lambda: self._program.act(view)))
+            self.hand.accept_decision(k, self._watch(k, lambda: self._program.act(view)))
         except (Exception, SystemExit) as error:  # the user's code
             self.fail(k, f"{type(error).__name__}: {error}")
 
@@ -196,7 +196,7 @@ class HandPlayer:
         """Lets go at tick k, for good."""
         self.failure = f"{self._site}: its hand {self._code} failed at tick {k}: {problem}"
         self.news.append((k, f"{self.failure}; it lets go and is not asked again"))
-        self.hand.let_go(k)
+        self.hand.release(k)
 
     def _tell(self, k: int, change: str) -> str:
         return f"{self._site}: {self._code} {change} at t = {tick_ns(k, self._rate_hz) / NS_PER_S:.3f} s"

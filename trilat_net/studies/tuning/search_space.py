@@ -215,7 +215,7 @@ def _list_search_spaces() -> Iterator[SearchSpace]:
             for gain, tune in kind.tune.items()
         )
         if knobs:
-            yield SearchSpace(name, knobs, kind.told, kind)
+            yield SearchSpace(name, knobs, kind.known_facts, kind)
         if name == "adaptive":
             told = "gravity, AND inertia exactly: more than the others"
             yield SearchSpace(
