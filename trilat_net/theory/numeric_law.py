@@ -221,7 +221,7 @@ class NumericLaw:
         else:
             chain_stages.place_chain(row, arrays.chain)
         remembered = x[2 * n : 2 * n + self._remembered_count]
-        self._plugged_law.recall(remembered.tolist())
+        self._plugged_law.restore(remembered.tolist())
         memory = self._plugged_law.compute(_TICK, tick_ns(_TICK, self._rate_hz))
         return np.concatenate([row.tau, memory])
 

@@ -388,7 +388,7 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
     setup = scenario.setup(name)
     end_s = scenario.duration_s
     present = [actor for actor in setup.actors if actor.start_s <= end_s < actor.end_s]
-    hands = [actor for actor in present if actor.acts in _HANDS]
+    hands = [actor for actor in present if actor.kind in _HANDS]
     if any(hand.move_end_s > end_s for hand in hands):
         notes.append(
             f"an operator at {name} still moves at the end: "
@@ -410,10 +410,10 @@ def _select_final_actors(scenario: Scenario, name: str, notes: list[str]) -> Sit
             f"a scripted torque acts on {name} at the end: its value then is kept constant"
         )
     user_written = [
-        actor._replace(move_end_s=end_s) for actor in present if actor.acts in OWN_KINDS
+        actor._replace(move_end_s=end_s) for actor in present if actor.kind in OWN_KINDS
     ]
     special_kinds = (*SCRIPTED_KINDS, *OWN_KINDS, *LIVE_KINDS)
-    others = [actor for actor in present if actor.acts not in special_kinds]
+    others = [actor for actor in present if actor.kind not in special_kinds]
     return setup._replace(actors=(*others, *user_written, *constant))
 
 

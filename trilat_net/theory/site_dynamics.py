@@ -331,11 +331,11 @@ def _evaluate_actor(
     J_transposed = np.swapaxes(J, 0, 1)
     position = arm.end_effector_position()
     velocity = multiply_columns(J, qd)
-    if actor.acts is TorqueKind.OWN_TIP:
+    if actor.kind is TorqueKind.OWN_TIP:
         return multiply_columns(J_transposed, _evaluate_model(actor, position, velocity))
-    if actor.acts in OWN_KINDS:
+    if actor.kind in OWN_KINDS:
         return _evaluate_model(actor, q, qd)
-    if actor.acts is TorqueKind.TASK_HAND:
+    if actor.kind is TorqueKind.TASK_HAND:
         force = stiffness * (_as_columns(actor.b, q) - position) - damping * velocity
     else:
         normal = _as_columns(actor.b, q)
@@ -359,7 +359,7 @@ def describe_switching_points(site: SiteSetup, x: Array) -> Iterator[str]:
     """Yields a sentence for each switching point at x, where the Jacobian is one-sided."""
     layout = lay_out_arguments(site)
     position = place_arm(site, x[layout.q]).end_effector_position()
-    walls = [actor for actor in site.actors if actor.acts is TorqueKind.WALL]
+    walls = [actor for actor in site.actors if actor.kind is TorqueKind.WALL]
     for n, wall in enumerate(walls):
         depth_m = float((np.array(wall.a) - position) @ np.array(wall.b))
         if abs(depth_m) < SWITCHING_TOLERANCE:
