@@ -14,7 +14,7 @@ OUTSIDE = {"sites.s.plant": "external", "sites.s.arm.known": False}
     ("name", "overrides", "path", "fact"),
     [
         ("paper", {"sites.s.arm.known": False}, "sites.s.arm.known", "plant = 'external'"),
-        ("paper", {"control.law": "p_f"}, "sites.m1.control.law", "here are 3 sites"),
+        ("paper", {"control.law": "p_f"}, "sites.m1.control.law", "the scenario has 3 sites"),
         (
             "two_sites",
             {**OUTSIDE, "sites.s.control.law": "p_d"},

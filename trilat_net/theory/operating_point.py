@@ -342,8 +342,8 @@ def compute_effective_delay(
     used = draw_used_samples(
         link=link,
         key=link_key(scenario.seed, f"{peer}->{site}"),
-        own_hz=site_hz,
-        peer_hz=peer_hz,
+        receiver_hz=site_hz,
+        sender_hz=peer_hz,
         duration_s=duration_s,
     )
     if used[-1] < 0:
