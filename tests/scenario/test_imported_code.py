@@ -74,7 +74,7 @@ def test_name_that_is_none_is_refused_as_scenario_is_read(law: str, fact: str) -
         ({"control.law": "tests.laws:Missing"}, "defines no class Missing"),
         ({"control.law": "tests.laws:NoLaw"}, "NoLaw is no law: it has no torque"),
         ({"control.law": LAW, "control.Kdd": 2}, "cannot be made with Kdd = 2: TypeError"),
-        ({"control.law": "tests.laws:Pair"}, "is for 2 sites, and here are 3"),
+        ({"control.law": "tests.laws:Pair"}, "is for 2 sites, and the scenario has 3"),
         ({"control.law": "tests.laws:Odd"}, "sites must be as in 2 or (2, 4), is 'many'"),
     ],
 )

@@ -1,6 +1,9 @@
-"""The built-in control laws, one a file: a file, its class and its name in a scenario are one.
+"""The built-in control laws, one per file.
 
-Invariant: a law is written as a user writes one (docs/own-controller.md), `torque` for a
-compiler: loops over numbers, no lists made. What else knows laws finds them here, see
-`catalogue`.
+Invariant:
+    - File, class and scenario name of a law correspond: `four_channel.py` holds `FourChannel`,
+      and a scenario writes law = "four_channel".
+    - A law is written as a user writes one (docs/own-controller.md). Its `torque` is compiled:
+      it loops over numbers and creates no lists.
+    - Other modules find the laws by listing this folder, see `scenario.laws`.
 """

@@ -71,7 +71,7 @@ class AdaptiveBox(Adaptive):
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns the [control] table of a site: gains, first estimate and the box around it."""
+        """Returns the [control] table of a site: gains, first estimate, and its box."""
         control = Adaptive.write_control(gains, at)
         low, high = at.box
         return {**control, "theta_low": low, "theta_high": high}

@@ -1,10 +1,10 @@
-"""Shared authority of two users over a slave, without force from the environment.
+"""Shared authority of two users over a slave, without feedback of the environment's force.
 
     slave    tau = G + K (sum_j alpha_j q_j - q) - d qd
     user i   tau = G + K alpha_ij (q_j - q_i) - d qd_i,    j: the other user
 
-A user with the share a has alpha_ij = 1 - a: who leads less is guided more. What a user hears
-of the slave is left out.
+A user whose share of the authority is a has alpha_ij = 1 - a, so the user with less authority
+is guided more. A user's torque does not depend on the slave.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ from .interface import DAMPING, STIFFNESS, ControlLaw, TuningSite
 
 @compiled
 class Authority(ControlLaw):
-    """Two users share the authority over a slave, and feel each other but not the environment.
+    """Two users share the authority over a slave and feel each other, not the environment.
 
     After Nudehi, Mukherjee and Ghodoussi, "A shared-control approach to haptic interface design
     for minimally invasive telesurgical training", IEEE T-CST, 2005.
@@ -37,8 +37,8 @@ class Authority(ControlLaw):
     Attributes:
         K: stiffness per joint, N m/rad.
         d: damping of the arm's velocity, per joint, N m s/rad.
-        leads: true of a user, false of the slave.
-        gravity: share of gravity that it knows, 1: exactly.
+        leads: true for a user, false for the slave.
+        gravity: share of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveJoints = (10.0,)
@@ -51,59 +51,56 @@ class Authority(ControlLaw):
     needs_theta: ClassVar = True
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque; tells its peers if it leads."""
+        """Writes the torque, and sends to the peers whether this site leads."""
         now.to_all.leads[0] = 1.0 if self.leads else 0.0
         for i in range(now.joints):
             tau = self.gravity * now.gravity[i] - self.d[i] * now.qd[i]
             for j in range(len(now.peers)):
-                share = now.peers[j].alpha * now.received[j].leads[0]
-                tau += self.K[i] * share * (now.peers[j].q[i] - now.q[i])
+                peer = now.peers[j]
+                share = peer.alpha * now.received[j].leads[0]
+                tau += self.K[i] * share * (peer.q[i] - now.q[i])
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns its damping and its gravity."""
-        return Gains(Law.KNOWN, d=self.d, known=(theta * self.gravity).tolist())
+        """Returns the law of known gravity with the damping alone."""
+        known = (theta * self.gravity).tolist()
+        return Gains(Law.KNOWN, d=self.d, known=known)
 
     def linear_form(self, at: LinearSituation) -> LinearForm | None:
-        """Returns the springs to the users."""
+        """Returns the springs towards the users."""
         form = LinearForm(len(at.inertia))
         for j in at.peers:
-            share = (
-                at.alpha[at.site, j]
-                * float(getattr(at.laws[j], "leads", False))
-                * np.array(self.K)
-            )
-            form.add("tau", "q", -share)
-            form.add("tau", ("from", j), share)
+            leads = float(getattr(at.laws[j], "leads", False))
+            stiffness = at.alpha[at.site, j] * leads * np.array(self.K)
+            form.add("tau", "q", -stiffness)
+            form.add("tau", ("from", j), stiffness)
             form.add(("to", j), "q", 1.0)
         return form
 
     def explain_idle_shares(self, at: LawSituation) -> str:
-        """Returns whom a user does not feel: those who do not lead."""
+        """Returns which sites a user does not feel, because they do not lead, or ""."""
         idle = [
             name
             for name, law in zip(at.names, at.laws, strict=True)
             if not getattr(law, "leads", False)
         ]
-        return (
-            f"users feel those who lead alone, not {', '.join(idle)}"
-            if self.leads and idle
-            else ""
-        )
+        if not self.leads or not idle:
+            return ""
+        return f"users feel those who lead alone, not {', '.join(idle)}"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition of P+d among the users; the slave follows them and closes no
-        loop.
+        """Returns the condition of P+d among the users.
+
+        The slave follows the users and closes no loop.
         """
         users = [n for n, law in enumerate(situation.laws) if getattr(law, "leads", False)]
         if situation.site not in users:
             return StabilityCondition(
                 True, "it follows and closes no loop: stable for every delay and d > 0"
             )
-        among = situation.restrict(users)
-        return judge_position_exchange(among, "K", "d")
+        return judge_position_exchange(situation.restrict(users), "K", "d")
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Users lead."""
+        """Returns the [control] table of a site for tuned gains; users lead."""
         return {**gains, "leads": at.role == "master", "gravity": at.gravity}

@@ -1,10 +1,12 @@
-"""What a control law says of itself at a site of a scenario: what its stability rests on, its
-small motions.
+"""The statements of a control law about its stability and its small motions at a site.
 
-Invariant: a law states both once, as methods of its type. A condition, which `trilat scenario
-check` and `trilat linear` print, says if it is only sufficient, and who proved it. Small
-motions are blocks of a matrix, of a law that has states, or sends more than its peers' samples
-have; what it has in common with a law of known gravity (`linear_gains`) is no part of them.
+Invariant:
+    - A law states both once, as methods of its `Settings`.
+    - A condition, which `trilat scenario check` and `trilat linear` print, says if it is only
+      sufficient, and who proved it.
+    - The small motions of a law with states, or of a law that sends more than the motion, are
+      blocks of a matrix. The part that the law shares with a law of known gravity
+      (`linear_gains`) is not among these blocks.
 """
 
 from collections.abc import Sequence
@@ -16,29 +18,29 @@ from ..core.dominance import find_balancing_weights
 from ..core.vectors import Array
 
 PASSIVE_OUTSIDE = "operators and environments are passive (*sufficient*)"
-"""What every law that keeps account of energy asks for."""
+"""The premise of each law that balances energy."""
 COMMON_MOTION_SHARE = 0.21723362821
-"""-min sin x / x: the share of K T that the common motion of all sites asks for, at its worst
-mass.
+"""-min sin x / x: the damping per K T that the common motion of all sites needs at its most
+critical mass.
 """
 
 
 class LawSituation(NamedTuple):
-    """What a law's condition may be made of.
+    """The facts on which a law's stability condition may depend.
 
     Attributes:
         site: the index of the site.
-        names: of the sites.
+        names: the names of the sites.
         laws: the control of each site.
         alpha: dominance matrix, shape (N, N).
         delay_s: delay of the link from j to i, row i, column j, at least one tick, s; NaN if it
             varies.
         tau_limit_nm: largest torques of the site's joints, N m.
         rate_hz: tick rate of the site, Hz.
-        gravity_nm: largest torque by which the site's planar arm is held, N m per joint; () of
-            a chain.
-        hold_s: for how long a torque is held, s: a tick of the scheme `digital`, NaN if sites
-            have several rates; else 0, as in continuous time.
+        gravity_nm: largest gravity torque of the site's planar arm, N m per joint; () for a
+            chain.
+        hold_s: duration for which a torque is held, s: one tick with the scheme `digital`, NaN
+            if sites have several rates, otherwise 0 as in continuous time.
     """
 
     site: int
@@ -53,11 +55,11 @@ class LawSituation(NamedTuple):
 
     @property
     def longest_s(self) -> float:
-        """The longest delay of links with a dominance factor, s; NaN if one of them varies."""
+        """The longest delay of links with a dominance factor, s; NaN if any of them varies."""
         return float(np.max(self.delay_s[self.alpha > 0.0], initial=0.0))
 
     def restrict(self, sites: Sequence[int]) -> "LawSituation":
-        """Returns the situation of the same site among some of the sites alone."""
+        """Returns the situation of the same site with only some of the sites."""
         part = np.ix_(sites, sites)
         return self._replace(
             site=list(sites).index(self.site),
@@ -69,11 +71,11 @@ class LawSituation(NamedTuple):
 
 
 class StabilityCondition(NamedTuple):
-    """A law's condition at a site.
+    """The stability condition of a law at a site.
 
     Attributes:
-        holds: None if it cannot be said.
-        text: the condition with its numbers, what it rests on, and if it is sufficient or
+        holds: None if it cannot be decided.
+        text: the condition with its numbers, its premises, and whether it is sufficient or
             sharp.
     """
 
@@ -82,62 +84,80 @@ class StabilityCondition(NamedTuple):
 
 
 def find_least_reversible(alpha: Array) -> float | None:
-    """Returns the least eigenvalue of reversible shares, which bounds d by K T; None: they are
-    not.
+    """Returns the least eigenvalue of reversible shares, or None if they are not reversible.
+
+    The eigenvalue bounds the ratio d / (K T).
     """
-    return (
-        None
-        if find_balancing_weights(alpha) is None
-        else float(np.linalg.eigvals(alpha).real.min())
-    )
+    if find_balancing_weights(alpha) is None:
+        return None
+    return float(np.linalg.eigvals(alpha).real.min())
 
 
 def judge_position_exchange(
     situation: LawSituation, stiffness: str, damping: str
 ) -> StabilityCondition:
-    """Returns the condition of P+d, whatever the arms weigh; the keys of a law's K and d are
-    named.
+    """Returns the condition of P+d, for arms of any mass.
 
-    Nuno, Basanez, Ortega and Spong, IJRR 28, 2009, for two sites; of more than two the shares
-    must be reversible, K and d one for all and the delays one T: docs/errata.md, 13. Torques
-    that are held for h act h / 2 later: d is K h / 2 less and T is h / 2 more, for arms whose
+    Two sites: Nuno, Basanez, Ortega and Spong, IJRR 28, 2009. More than two sites need
+    reversible shares, one K, one d and one delay T (docs/errata.md, 13). A torque that is held
+    for h acts h / 2 later: d is reduced by K h / 2 and T increased by h / 2, for arms whose
     least inertia is above d h / 2 (docs/laws.md).
+
+    Args:
+        situation: the situation of the site.
+        stiffness: the name of the law's attribute with K.
+        damping: the name of the law's attribute with d.
     """
-    T = situation.longest_s
     laws = situation.laws
-    h = situation.hold_s
-    K, d = (
-        np.array([getattr(law, key, [np.nan]) for law in laws]) for key in (stiffness, damping)
-    )
-    if np.isnan(T) or np.isnan(K).any():
+    hold_s = situation.hold_s
+    K = np.array([getattr(law, stiffness, [np.nan]) for law in laws])
+    d = np.array([getattr(law, damping, [np.nan]) for law in laws])
+    if np.isnan(situation.longest_s) or np.isnan(K).any():
         return StabilityCondition(
             None, "known for constant delays, and with this law at all sites"
         )
-    if np.isnan(h):
+    if np.isnan(hold_s):
         return StabilityCondition(None, "known of held torques for sites of one tick rate")
-    scope = (
-        f"sufficient for arms above d h / 2 = {0.5 * float(d.max()) * h:.3g} kg m^2"
-        if h
-        else ""
-    )
-    if h and any(np.any(getattr(law, "Kd", 0.0)) for law in laws):
-        scope = "sufficient for heavy arms"
-    scope = scope or "sufficient whatever the masses"
-    own = d - 0.5 * K * h
+    scope = "sufficient whatever the masses"
+    if hold_s:
+        least_inertia = 0.5 * float(d.max()) * hold_s
+        scope = f"sufficient for arms above d h / 2 = {least_inertia:.3g} kg m^2"
+        if any(np.any(getattr(law, "Kd", 0.0)) for law in laws):
+            scope = "sufficient for heavy arms"
     if len(laws) == 2:
-        both = float(situation.delay_s.sum()) + h
-        pulls = situation.alpha[0, 1] * situation.alpha[1, 0] * K[0] * K[1]
-        excess = float((4.0 * own[0] * own[1] - both**2 * pulls).min())
-        text = f"4 d1 d2 >= (T1 + T2)^2 K1 K2, T1 + T2 = {1e3 * both:.4g} ms"
-        if h:
-            text = f"4 (d1 - K1 h / 2) (d2 - K2 h / 2) >= (T1 + T2 + h)^2 K1 K2, the last {1e3 * both:.4g} ms"
-        holds = excess >= -1e-9 * float(d.max()) ** 2 and bool((own >= 0.0).all())
-        return StabilityCondition(holds, f"{text} ({scope})")
-    if (
-        np.ptp(K, axis=0).any()
-        or np.ptp(d, axis=0).any()
-        or np.ptp(situation.delay_s[situation.alpha > 0.0])
-    ):
+        return _judge_two_sites(situation, K, d, scope)
+    return _judge_several_sites(situation, K, d, scope)
+
+
+def _judge_two_sites(
+    situation: LawSituation, K: Array, d: Array, scope: str
+) -> StabilityCondition:
+    """Returns the condition of two sites, 4 d1 d2 >= (T1 + T2)^2 K1 K2."""
+    hold_s = situation.hold_s
+    effective_d = d - 0.5 * K * hold_s
+    round_trip_s = float(situation.delay_s.sum()) + hold_s
+    coupling = situation.alpha[0, 1] * situation.alpha[1, 0] * K[0] * K[1]
+    excess = float((4.0 * effective_d[0] * effective_d[1] - round_trip_s**2 * coupling).min())
+    round_trip_ms = f"{1e3 * round_trip_s:.4g} ms"
+    text = f"4 d1 d2 >= (T1 + T2)^2 K1 K2, T1 + T2 = {round_trip_ms}"
+    if hold_s:
+        text = (
+            "4 (d1 - K1 h / 2) (d2 - K2 h / 2) >= (T1 + T2 + h)^2 K1 K2, "
+            f"the last {round_trip_ms}"
+        )
+    is_met = excess >= -1e-9 * float(d.max()) ** 2
+    holds = is_met and bool((effective_d >= 0.0).all())
+    return StabilityCondition(holds, f"{text} ({scope})")
+
+
+def _judge_several_sites(
+    situation: LawSituation, K: Array, d: Array, scope: str
+) -> StabilityCondition:
+    """Returns the condition of more than two sites, d > share K T."""
+    T = situation.longest_s
+    hold_s = situation.hold_s
+    delays_s = situation.delay_s[situation.alpha > 0.0]
+    if np.ptp(K, axis=0).any() or np.ptp(d, axis=0).any() or np.ptp(delays_s):
         return StabilityCondition(
             None, "known of more than two sites for one K, one d and one delay"
         )
@@ -146,36 +166,44 @@ def judge_position_exchange(
         return StabilityCondition(
             False, "shares that are not reversible: some heavy arms are unstable at any d"
         )
-    share = max(
-        -least, _find_common_motion_share(2.0 * T / h + 1.0) if h else COMMON_MOTION_SHARE
-    )
-    bound = 0.5 * h * K[0] + share * K[0] * (T + 0.5 * h)
-    text = f"d > {'K h / 2 + ' if h else ''}{share:.4g} K {'(T + h / 2)' if h else 'T'} = {bound.max():.4g}"
+    common_share = COMMON_MOTION_SHARE
+    if hold_s:
+        common_share = _find_common_motion_share(2.0 * T / hold_s + 1.0)
+    share = max(-least, common_share)
+    bound = 0.5 * hold_s * K[0] + share * K[0] * (T + 0.5 * hold_s)
+    first_term = "K h / 2 + " if hold_s else ""
+    delay = "(T + h / 2)" if hold_s else "T"
+    text = f"d > {first_term}{share:.4g} K {delay} = {bound.max():.4g}"
     return StabilityCondition(bool((d[0] > bound).all()), f"{text} ({scope})")
 
 
 def _find_common_motion_share(count: float) -> float:
-    """Returns -min sin(n x) / (n sin x), the common motion's share over n = 2 T / h + 1 halves
-    of a tick.
+    """Returns the damping per K T that the common motion needs when torques are held.
+
+        -min sin(n x) / (n sin x)
+
+    Args:
+        count: n = 2 T / h + 1, the delay in halves of a tick.
     """
     x = np.linspace(np.pi, 2.0 * np.pi, 1001)[1:-1] / count
     return float(-(np.sin(count * x) / (count * np.sin(x))).min())
 
 
-Place = str | tuple[str, int]
-"""A row or column of a form. Rows: "tau"; the rate of a state, by its name; ("to", j): what
-peer j is sent.
-Columns: "q", "qd", "q_des", "qd_des", a state, ("from", j): what came from peer j, and "tau_h"
-ON the arm.
+BlockKey = str | tuple[str, int]
+"""A row or a column of a linear form.
+
+Rows: "tau"; the name of a state, for its derivative; ("to", j) for the vector sent to peer j.
+Columns: "q", "qd", "q_des", "qd_des", a state, ("from", j) for the vector received from peer j,
+and "tau_h" for the torque ON the arm.
 """
 
 
 class LinearSituation(NamedTuple):
-    """What the small motions of a law may depend on.
+    """The facts on which a law's small motions may depend.
 
     Attributes:
         site: the index of the site.
-        names: of the sites.
+        names: the names of the sites.
         laws: the control of each site.
         alpha: dominance matrix in force, shape (N, N).
         inertia: M(q) of the site's arm, shape (n, n), kg m^2.
@@ -194,17 +222,16 @@ class LinearSituation(NamedTuple):
 
 
 class LinearForm:
-    """The small motions of a law at a site with n joints; every row and column stands for n
-    numbers.
+    """The small motions of a law at a site, as blocks of n rows and n columns, n joints.
 
     Args:
-        joints: n.
-        states: names of its states.
-        sends_acceleration: what it sends is the acceleration of its arm, and not what its rows
-            say.
+        joints: n, the number of joints.
+        states: the names of the law's states.
+        sends_acceleration: True if the law sends the acceleration of its arm; then the rows
+            ("to", j) only name the receivers.
 
     Attributes:
-        blocks: by row and column, shape (n, n).
+        blocks: the blocks by row and column, shape (n, n) each.
     """
 
     def __init__(
@@ -213,15 +240,21 @@ class LinearForm:
         self.joints = joints
         self.states = tuple(states)
         self.sends_acceleration = sends_acceleration
-        self.blocks: dict[tuple[Place, Place], Array] = {}
+        self.blocks: dict[tuple[BlockKey, BlockKey], Array] = {}
 
-    def add(self, row: Place, column: Place, gain: Any) -> None:
-        """Adds a gain per joint, one of all, or a matrix, to a block."""
+    def add(self, row: BlockKey, column: BlockKey, gain: Any) -> None:
+        """Adds a gain to a block.
+
+        Args:
+            row: the row of the block.
+            column: the column of the block.
+            gain: one number for all joints, a number per joint, or a matrix, shape (n, n).
+        """
         block = np.asarray(gain, dtype=np.float64)
         if block.ndim < 2:
             block = np.diag(np.broadcast_to(block, self.joints))
         self.blocks[row, column] = self.blocks.get((row, column), 0.0) + block
 
     def list_receivers(self) -> list[int]:
-        """Returns the peers to which it sends."""
+        """Returns the indices of the peers that the law sends to."""
         return sorted({int(row[1]) for row, _ in self.blocks if isinstance(row, tuple)})

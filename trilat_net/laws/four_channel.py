@@ -1,10 +1,11 @@
-"""Positions and forces both ways: the four-channel law, and its relatives of fewer channels.
+"""The four-channel law, which exchanges positions and forces in both directions.
 
-q_des, qd_des, qdd_des and felt are weighted by dominance; tau_h is the torque ON an arm. With
-two sites, in Lawrence's symbols, C2 and C6 are gains of the master, C3 and C5 of the slave.
+q_des, qd_des, qdd_des and felt are the peers' motion and torque, weighted by dominance; tau_h
+is the torque ON an arm. With two sites, in Lawrence's symbols, C2 and C6 are gains of the
+master, C3 and C5 gains of the slave. Zero gains give the laws with fewer channels.
 
-Invariant: the acceleration that is sent is that of the arm's model under the torques of its
-tick.
+Invariant:
+    - The law sends the acceleration that the arm's model has under the torques of the tick.
 """
 
 from typing import Any, ClassVar
@@ -20,24 +21,52 @@ from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCond
 from .interface import DAMPING, STIFFNESS, ControlLaw
 
 _LLEWELLYN = (
-    "transparent without delay only; with delay no bound is known that holds for every operator and "
-    "environment: Llewellyn's condition decides, see trilat ports"
+    "transparent without delay only; with delay no bound is known that holds for every "
+    "operator and environment: Llewellyn's condition decides, see trilat ports"
 )
 
 _NEUTRAL = (
-    "acceleration = 1 and any delay, one tick included, leave high frequencies undamped (the neutral part of "
-    "the loop has radius 1): take less than 1, which is necessary and not sufficient"
+    "acceleration = 1 and any delay, one tick included, leave high frequencies undamped (the "
+    "neutral part of the loop has radius 1): take less than 1, which is necessary and not "
+    "sufficient"
 )
+
+
+@compiled
+def send_acceleration(law: Any, now: LawInput) -> None:
+    """Sends the solution qdd of M qdd = tau - tau_x - bias, with tau within the limits."""
+    n = now.joints
+    rows = law.rows
+    width = n + 1
+    for i in range(n):
+        for j in range(n):
+            rows[i * width + j] = now.inertia[i][j]
+        applied = min(max(now.tau[i], -law.limit[i]), law.limit[i])
+        rows[i * width + n] = applied - now.tau_x[i] - now.bias[i]
+    # Gaussian elimination; M is positive definite, so pivoting is not needed.
+    for column in range(n):
+        pivot = rows[column * width + column]
+        for i in range(column + 1, n):
+            factor = rows[i * width + column] / pivot
+            for j in range(column, width):
+                rows[i * width + j] -= factor * rows[column * width + j]
+    for i in range(n - 1, -1, -1):
+        remainder = rows[i * width + n]
+        for j in range(i + 1, n):
+            remainder -= rows[i * width + j] * now.to_all.qdd[j]
+        now.to_all.qdd[i] = remainder / rows[i * width + i]
 
 
 @compiled
 class FourChannel(ControlLaw):
     """Positions and forces both ways, with known gravity.
 
-    tau = G + K (q_des - q) + B (qd_des - qd) + acceleration M qdd_des + force_peer felt +
-    force_own tau_h. Ideal transparency without delay: force_peer = 1 + force_own at both sites,
-    acceleration = 1. Lawrence, IEEE T-RA 9, 1993; local force feedback: Hashtrudi-Zaad and
-    Salcudean, IEEE T-RA 18, 2002.
+        tau = G + K (q_des - q) + B (qd_des - qd) + acceleration M qdd_des
+              + force_peer felt + force_own tau_h
+
+    Without delay the coupling is ideally transparent if force_peer = 1 + force_own at both
+    sites and acceleration = 1. Lawrence, IEEE T-RA 9, 1993; local force feedback after
+    Hashtrudi-Zaad and Salcudean, IEEE T-RA 18, 2002.
 
     Attributes:
         K: stiffness per joint, N m/rad.
@@ -45,7 +74,7 @@ class FourChannel(ControlLaw):
         force_peer: gain of the peers' torque, C2 or C3, per joint, dimensionless.
         force_own: gain of the torque on the arm itself, C6 or C5, per joint, dimensionless.
         acceleration: share of the peers' acceleration that is fed forward.
-        gravity: share of gravity that it knows, 1: exactly.
+        gravity: share of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveJoints = (100.0,)
@@ -60,14 +89,14 @@ class FourChannel(ControlLaw):
     needs_theta: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Makes room for the arm's model."""
+        """Creates the torque limits and the work space for the arm's equation of motion."""
         self.needs_model = self.acceleration > 0.0
         self.limit = (np.zeros(facts.joints) + facts.tau_limit_nm).tolist()
-        # M and the torque that accelerates it
+        # The equations M qdd = torque, row by row: n entries of M and the torque.
         self.rows = [0.0] * (facts.joints * (facts.joints + 1))
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque; sends the acceleration that it makes."""
+        """Writes the torque, and sends the acceleration that the torque causes."""
         n = now.joints
         for i in range(n):
             tau = self.gravity * now.gravity[i] + self.K[i] * (now.q_des[i] - now.q[i])
@@ -76,51 +105,33 @@ class FourChannel(ControlLaw):
             if self.acceleration > 0.0:
                 for p in range(len(now.peers)):
                     for j in range(n):
-                        share = self.acceleration * now.peers[p].alpha * now.inertia[i][j]
-                        tau += share * now.received[p].qdd[j]
+                        inertia = self.acceleration * now.peers[p].alpha * now.inertia[i][j]
+                        tau += inertia * now.received[p].qdd[j]
             now.tau[i] = tau
-        if self.acceleration == 0.0:
-            return
-        rows = self.rows
-        width = n + 1
-        for i in range(n):
-            for j in range(n):
-                rows[i * width + j] = now.inertia[i][j]
-            held = min(max(now.tau[i], -self.limit[i]), self.limit[i])
-            rows[i * width + n] = held - now.tau_x[i] - now.bias[i]
-        for c in range(n):  # elimination; M is positive definite and needs no pivots
-            for i in range(c + 1, n):
-                share = rows[i * width + c] / rows[c * width + c]
-                for j in range(c, width):
-                    rows[i * width + j] -= share * rows[c * width + j]
-        for i in range(n - 1, -1, -1):
-            rest = rows[i * width + n]
-            for j in range(i + 1, n):
-                rest -= rows[i * width + j] * now.to_all.qdd[j]
-            now.to_all.qdd[i] = rest / rows[i * width + i]
+        if self.acceleration > 0.0:
+            send_acceleration(self, now)
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the same law as one of known gravity, which has neither qdd nor the arm's own
-        torque.
-        """
+        """Returns the law of known gravity without the terms in qdd_des and tau_h."""
         known = (theta * self.gravity).tolist()
-        return Gains(Law.KNOWN, K=self.K, Kd=self.B, d=(0.0,), k_f=self.force_peer, known=known)
+        return Gains(
+            law=Law.KNOWN, K=self.K, Kd=self.B, d=(0.0,), k_f=self.force_peer, known=known
+        )
 
     def linear_form(self, at: LinearSituation) -> LinearForm | None:
-        """Returns what acceleration and the arm's own torque add."""
+        """Returns the terms in qdd_des and tau_h, or None if both gains are zero."""
         if not self.acceleration and not any(self.force_own):
             return None
         form = LinearForm(len(at.inertia), sends_acceleration=self.acceleration > 0.0)
         form.add("tau", "tau_h", self.force_own)
         for j in at.peers:
-            form.add("tau", ("from", j), self.acceleration * at.alpha[at.site, j] * at.inertia)
+            gain = self.acceleration * at.alpha[at.site, j]
+            form.add("tau", ("from", j), gain * at.inertia)
             form.add(("to", j), "q", 0.0)
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns that acceleration = 1 is unstable with any delay; else Llewellyn's condition
-        decides.
-        """
+        """Returns that acceleration = 1 is unstable, or that Llewellyn's condition decides."""
         if self.acceleration >= 1.0:
             return StabilityCondition(False, _NEUTRAL)
         return StabilityCondition(None, _LLEWELLYN)

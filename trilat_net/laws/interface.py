@@ -1,9 +1,11 @@
-"""What a built-in control law is made of, and the gains of a law as a scenario holds them.
+"""The parts of a built-in control law, and the gains of a law as a scenario holds them.
 
-Invariant: a law is one class. Its annotations are its gains, with their ranges and defaults: of
-them the frozen `Settings` of a scenario are made, with the methods of the class that speak of
-gains; at a site an instance computes torques. The kernel's own laws have `gains` in place of
-`torque`.
+Invariant:
+    - A law is one class. The annotations of the class are its gains, with ranges and defaults.
+    - The frozen `Settings` of a scenario are derived from these annotations. They take over the
+      methods of the class that depend on gains alone.
+    - At a site, an instance of the class computes torques. The laws that the kernel computes
+      have `gains` instead of `torque`.
 """
 
 import ast
@@ -27,8 +29,8 @@ from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCond
 from .sent_vectors import SentVectorSpecs, convert_sends
 
 GainRange = tuple[float, float, str] | tuple[float, float, str, str]
-"""Of a gain that is tuned: the least and the largest value, the unit, and the role of sites
-that have it.
+"""Range of a gain that is tuned: least value, largest value, unit and, optionally, the role of
+the sites that have the gain.
 """
 STIFFNESS = (1.0, 1000.0, "N m/rad")
 DAMPING = (0.5, 200.0, "N m s/rad")
@@ -39,13 +41,13 @@ INERTIA = (0.1, 10.0, "kg m^2")
 
 
 class TuningSite(NamedTuple):
-    """What a law is told at a site when its gains are tuned: of each law the same.
+    """The facts about a site that each law gets when its gains are tuned.
 
     Attributes:
         role: "master" or "slave".
-        gravity: share of the true gravity.
-        estimate: first estimate of theta, shape (P,): gravity by that share, inertia unknown.
-        box: lower and upper sides of a box around it, shape (P,) each.
+        gravity: share of the true gravity that the law compensates.
+        estimate: first estimate of theta, shape (P,): that share of gravity, no inertia.
+        box: lower and upper bounds around the estimate, shape (P,) each.
         longest_ms: half of the longest mean round trip, ms.
     """
 
@@ -57,103 +59,110 @@ class TuningSite(NamedTuple):
 
 
 class LawSettings(Frozen, frozen=True):
-    """The gains of a law, and what the law says of itself with these; a law has its own of
-    these methods.
+    """The gains of a law, and the properties of the law that follow from them.
+
+    A law may override each of these methods.
     """
 
     kind: ClassVar[Any] = None
-    """The class of the law; of an imported one None."""
+    """The class of the law; None for an imported law."""
     linear_note: ClassVar[str] = ""
-    """What its small motions leave out."""
+    """The effect that the law's linear form leaves out."""
     fixed_shares: ClassVar[bool] = False
-    """True: it takes the dominance factors of the start alone."""
+    """True if the law uses only the dominance factors at the start."""
     has_functional: ClassVar[bool] = False
-    """True: the paper's functional V belongs to it."""
+    """True if the paper's functional V applies to the law."""
     planar: ClassVar[bool] = False
-    """True: it has the regressor of the planar arm, and is for no chain."""
+    """True if the law uses the planar arm's regressor and cannot control a chain."""
     compares_positions: ClassVar[bool] = False
-    """True: it compares where end effectors are, whatever the joints do."""
+    """True if the law compares positions of end effectors, independent of the joints."""
 
     @property
     def plugged(self) -> bool:
-        """True if the core asks the law for its torque, and is no law of the kernel."""
+        """True if the law computes its torque itself, False if the kernel computes it."""
         return hasattr(self.kind, "torque")
 
     @property
     def books_energy(self) -> bool:
-        """True if it keeps account of energy together with the laws of its peers: then all
-        sites have it.
-        """
+        """True if the law balances energy together with its peers; then all sites have it."""
         return self.plugged and issubclass(self.kind, EnergyLaw)
 
     @property
     def tag(self) -> str:
-        """What a scenario calls the law."""
+        """The law's name in a scenario."""
         return str(self.__struct_config__.tag)
 
     def check(self, path: str, sites: int) -> None:
-        """Refuses gains that contradict each other, and a number of sites; errors call the law
-        `path`.
+        """Refuses gains that contradict each other, and an unsuitable number of sites.
+
+        Args:
+            path: the path of the law's table, for errors.
+            sites: the number of sites in the scenario.
 
         Raises:
             ScenarioError: with the path of the key.
         """
 
     def find_problem(self, rates_hz: Mapping[str, int]) -> KeyProblem | None:  # noqa: ARG002
-        """Returns what a site's law has against sites of such tick rates, or None."""
+        """Returns the key that is unsuitable for these tick rates of the sites, or None."""
         return None
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the laws of the kernel
-        """Returns the gains for the core, for an arm of parameters theta."""
+        """Returns the gains for the kernel, for an arm with parameters theta."""
         return Gains(Law.OWN)
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns the law of known gravity, or the adaptive one, whose small motions are this
-        law's.
+        """Returns gains of a kernel law with the same small motions, or None.
 
-        With those of `linear_form`, if it has any; None: there is none.
+        The blocks of `linear_form`, if there are any, are added to these small motions.
         """
-        return self.gains(theta) if self.kind is not None and not self.plugged else None
+        if self.kind is None or self.plugged:
+            return None
+        return self.gains(theta)
 
     def linear_form(self, at: LinearSituation) -> LinearForm | None:  # noqa: ARG002
-        """Returns its small motions beyond those of `linear_gains`."""
+        """Returns the law's small motions beyond those of `linear_gains`, or None."""
         return None
 
     def explain_no_linear_form(self) -> str:
-        """Returns why it cannot be linearised, if `linear_gains` has nothing."""
+        """Returns why the law cannot be linearised if `linear_gains` returns None."""
         return ""
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns what the stability of the law at a site rests on; None if that is not known
-        here.
-        """
+        """Returns the stability condition of the law at a site, or None if it is not known."""
         return None
 
     def exchanges_positions(self) -> bool:
-        """True if the law is a spring between poses, with known gravity: shares have to be
-        reversible.
+        """True if the law is a spring between poses with exactly known gravity.
+
+        The shares have to be reversible for such a law.
         """
         return False
 
     def resolve_shares(self, names: Sequence[str], alpha: Array) -> Any:  # noqa: ARG002
-        """Returns the law with what it takes of the dominance factors at the start, alpha,
-        shape (N, N).
+        """Returns the law with the settings filled in that follow from the dominance matrix.
+
+        Args:
+            names: the names of the sites.
+            alpha: the dominance matrix at the start, shape (N, N).
         """
         return self
 
     def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
-        """Returns why the dominance factors of a site have no effect; "": they have one."""
+        """Returns why a site's dominance factors have no effect, or "" if they have one."""
         return ""
 
     @property
     def sends(self) -> SentVectorSpecs:
-        """What the law sends to its peers."""
+        """The vectors that the law sends to its peers."""
         return convert_sends(getattr(self.kind, "sends", {}), self.kind.__name__, "control")
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory | None:
-        """Returns the factory of the law, for a site of an experiment of so many sites.
+        """Returns the factory of the law, or None if the kernel computes the law.
 
-        None: the kernel computes it.
+        Args:
+            sites: the number of sites in the scenario.
+            scheme: the scenario's scheme, "second_order" or "digital".
         """
         if not self.plugged:
             return None
@@ -169,18 +178,20 @@ class LawSettings(Frozen, frozen=True):
 
 
 def format_class_name(tag: str) -> str:
-    """Returns the name of the class in the file of a law: FourChannel of four_channel."""
+    """Returns the class name that belongs to a law's file: FourChannel for four_channel."""
     return "".join(word.capitalize() for word in tag.split("_"))
 
 
 class ControlLaw:
-    """A built-in control law; what `LawSettings` has besides, a law may have of its own.
+    """Base class of the built-in control laws.
+
+    A law may also define the methods of `LawSettings`.
 
     Attributes:
-        Settings: its gains as a scenario holds them. sends, remembers, schemes, sites,
-        needs_theta, needs_model: as of any law, see docs/own-controller.md.
-        tune: of the gains that are tuned their ranges, by name.
-        known_facts: what it uses of what all laws are told, in words.
+        Settings: the gains as a scenario holds them.
+        sends, remembers, schemes, sites, needs_theta, needs_model: see docs/own-controller.md.
+        tune: ranges of the gains that are tuned, by name.
+        known_facts: which of the facts that every law gets this law uses, in words.
     """
 
     Settings: ClassVar[type[LawSettings]] = LawSettings
@@ -194,36 +205,46 @@ class ControlLaw:
             cls.Settings = _derive_settings(cls, tag)
 
     def __init__(self, facts: LawContext, **gains: Any) -> None:
-        """Makes the law of a site with these gains; `facts` is what is known before the run."""
+        """Creates the law of a site.
+
+        Args:
+            facts: the facts that are known before the run.
+            gains: the gains by name.
+
+        Raises:
+            TypeError: the law has no gain of that name.
+        """
         for name, value in gains.items():
-            if not isinstance(
-                getattr(type(self), name, None), bool | float | int | str | tuple | dict
-            ):
+            default = getattr(type(self), name, None)
+            if not isinstance(default, bool | float | int | str | tuple | dict):
                 raise TypeError(f"it has no gain {name!r}")
             setattr(self, name, value)
         self.begin(facts)
 
     def begin(self, facts: LawContext) -> None:
-        """Makes what `torque` uses beside the gains."""
+        """Creates the attributes that `torque` uses besides the gains."""
 
     @classmethod
     def explain_misfit(cls, roles: Sequence[str]) -> str:
-        """Returns why the law is none for sites of such roles, or ""."""
-        wanted = getattr(cls, "sites", None)
-        if wanted in (None, len(roles)):
+        """Returns why the law does not fit sites with these roles, or ""."""
+        required = getattr(cls, "sites", None)
+        if required in (None, len(roles)):
             return ""
-        return f"is for {wanted} sites, and this has {len(roles)}: leave it out"
+        return f"is for {required} sites, and this has {len(roles)}: leave it out"
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns the [control] of a site for tuned gains."""
-        told = {"gravity": at.gravity} if "gravity" in cls.Settings.__struct_fields__ else {}
-        return {**gains, **told}
+        """Returns the [control] table of a site for tuned gains."""
+        if "gravity" in cls.Settings.__struct_fields__:
+            return {**gains, "gravity": at.gravity}
+        return {**gains}
 
 
 class EnergyLaw(ControlLaw):
-    """A law that keeps account of energy: what one end sends, the other books, so that all
-    sites have it.
+    """A law that balances energy.
+
+    The energy that one end sends is accounted for at the other end, so all sites must have the
+    same law.
     """
 
     gravity: NotNegative = 1.0
@@ -231,25 +252,20 @@ class EnergyLaw(ControlLaw):
 
 
 def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
-    """Returns the gains of a law as a type of a scenario."""
+    """Returns the type that holds the gains of a law in a scenario."""
     bases = [base for base in reversed(kind.__mro__) if issubclass(base, ControlLaw)][1:]
-    hints = {
-        name: hint
-        for base in bases
-        for name, hint in inspect.get_annotations(base).items()
-        if not _is_class_variable(hint)
-    }
-    said = {
-        name: value
-        for base in bases
-        for name, value in vars(base).items()
-        if _speaks_of_gains(name, value)
-    }
-    made: Any = msgspec.defstruct(
+    hints: dict[str, Any] = {}
+    inherited: dict[str, Any] = {}
+    for base in bases:
+        annotations = inspect.get_annotations(base).items()
+        hints |= {name: hint for name, hint in annotations if not _is_class_variable(hint)}
+        attributes = vars(base).items()
+        inherited |= {key: value for key, value in attributes if _depends_on_gains(key, value)}
+    settings: Any = msgspec.defstruct(
         "Settings",
         [(name, hint, getattr(kind, name)) for name, hint in hints.items()],
         bases=(LawSettings,),
-        namespace={**said, "kind": kind, "__doc__": kind.__doc__},
+        namespace={**inherited, "kind": kind, "__doc__": kind.__doc__},
         module=kind.__module__,
         frozen=True,
         kw_only=True,
@@ -257,8 +273,8 @@ def _derive_settings(kind: type[ControlLaw], tag: str) -> type[LawSettings]:
         tag_field="law",
         tag=tag,
     )
-    made.__qualname__ = f"{kind.__qualname__}.Settings"
-    return cast(type[LawSettings], made)
+    settings.__qualname__ = f"{kind.__qualname__}.Settings"
+    return cast(type[LawSettings], settings)
 
 
 def _is_class_variable(hint: Any) -> bool:
@@ -266,102 +282,132 @@ def _is_class_variable(hint: Any) -> bool:
     return origin is ClassVar
 
 
-def _speaks_of_gains(name: str, value: Any) -> bool:
+def _depends_on_gains(name: str, value: Any) -> bool:
+    """True for an attribute of a law's class that its `Settings` take over."""
     if inspect.isfunction(value) or isinstance(value, property):
-        return name not in ("begin", "torque", "energies") and not name.startswith("__")
+        is_of_instance = name in ("begin", "torque", "energies") or name.startswith("__")
+        return not is_of_instance
     return name in LawSettings.__annotations__
 
 
 def check_law_class(kind: Any, code: str, context: LawContext, sites: int, scheme: str) -> None:
-    """Refuses a class that is no law, or none for such a site.
+    """Refuses a class that is not a control law, or that does not suit the site.
 
-    A law may say what it is for: `sites = 2` or `sites = (2, 4)`, `schemes = ("digital",)`, and
+    A law may restrict its use: `sites = 2` or `sites = (2, 4)`, `schemes = ("digital",)`, and
     `needs_theta = True`.
+
+    Args:
+        kind: the class.
+        code: the law's name for errors, as in "mylaws:Spring".
+        context: the facts about the site.
+        sites: the number of sites in the scenario.
+        scheme: the scenario's scheme.
 
     Raises:
         ScenarioError: with the path of the key.
     """
     path = f"sites.{context.site}.control.law"
-    keeps = any(hasattr(kind, name) for name in ("memory", "recall")) and not hasattr(
-        kind, "remembers"
-    )
-    methods = ("torque", "memory", "recall") if keeps else ("torque",)
-    missing = [name for name in methods if not callable(getattr(kind, name, None))]
-    if missing:
+    _check_methods(kind, code, path)
+    _check_site_count(kind, code, path, sites)
+    schemes = getattr(kind, "schemes", None) or (scheme,)
+    if scheme not in schemes:
+        allowed = " or ".join(map(repr, schemes))
         raise ScenarioError(
-            f"{code} has no {', '.join(missing)}; see {find_page('own-controller.md')}",
-            path=path,
-        )
-    if not (keeps or hasattr(kind, "remembers")) and (written := _find_written(kind)):
-        raise ScenarioError(
-            f"{code} writes self.{written[0]}: where torque needs that at the next tick, its class has "
-            f"remembers = ({written[0]!r},), else remembers = (); see {find_page('own-controller.md')}",
-            path=path,
-        )
-    stated = getattr(kind, "sites", None)
-    ends = (
-        (2, sys.maxsize)
-        if stated is None
-        else (stated, stated)
-        if isinstance(stated, int)
-        else stated
-    )
-    if not (
-        isinstance(ends, tuple | list)
-        and len(ends) == 2
-        and all(isinstance(n, int) for n in ends)
-    ):
-        raise ScenarioError(
-            f"{code}: sites must be as in 2 or (2, 4), is {stated!r}", path=path
-        )
-    least, most = ends
-    if not least <= sites <= most:
-        wanted = f"{least}" if least == most else f"{least} to {most}"
-        raise ScenarioError(f"{code} is for {wanted} sites, and here are {sites}", path=path)
-    if scheme not in (schemes := getattr(kind, "schemes", None) or (scheme,)):
-        wanted = " or ".join(map(repr, schemes))
-        raise ScenarioError(
-            f"{code} is for scheme = {wanted}, and here it is {scheme!r}", path=path
+            f"{code} is for scheme = {allowed}, and here it is {scheme!r}", path=path
         )
     if getattr(kind, "needs_theta", False) and not context.theta:
         raise ScenarioError(
-            f"{code} needs the arm's parameters, which are unknown (arm.known = false): identify the arm "
-            "and leave known out, or choose a law that learns them",
+            f"{code} needs the arm's parameters, which are unknown (arm.known = false): "
+            "identify the arm and leave known out, or choose a law that learns them",
             path=path,
         )
 
 
-def _find_written(kind: Any) -> list[str]:
-    """Returns what a class writes of itself after `__init__`, unless by calls, as of append."""
-    methods = [
-        one for base in kind.__mro__ for one in vars(base).values() if inspect.isfunction(one)
-    ]
-    sources = [
-        textwrap.dedent(inspect.getsource(one)) for one in methods if one.__name__ != "__init__"
-    ]
-    nodes = (node for text in sources for node in ast.walk(ast.parse(text)))
-    written = [
-        ast.unparse(node) for node in nodes if isinstance(getattr(node, "ctx", None), ast.Store)
-    ]
-    return [found[1] for one in written if (found := re.match(r"self\.(\w+)", one))]
+def _check_methods(kind: Any, code: str, path: str) -> None:
+    """Refuses a class without `torque`, or one whose memory is not declared."""
+    is_declared = hasattr(kind, "remembers")
+    has_memory_methods = any(hasattr(kind, name) for name in ("memory", "recall"))
+    if has_memory_methods and not is_declared:
+        required = ("torque", "memory", "recall")
+    else:
+        required = ("torque",)
+    missing = [name for name in required if not callable(getattr(kind, name, None))]
+    page = find_page("own-controller.md")
+    if missing:
+        raise ScenarioError(f"{code} has no {', '.join(missing)}; see {page}", path=path)
+    if is_declared or has_memory_methods:
+        return
+    written = _find_written_attributes(kind)
+    if written:
+        raise ScenarioError(
+            f"{code} writes self.{written[0]}: where torque needs that at the next tick, its "
+            f"class has remembers = ({written[0]!r},), else remembers = (); see {page}",
+            path=path,
+        )
+
+
+def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
+    """Refuses a number of sites outside of the range that the class states."""
+    stated = getattr(kind, "sites", None)
+    bounds = stated
+    if stated is None:
+        bounds = (2, sys.maxsize)
+    elif isinstance(stated, int):
+        bounds = (stated, stated)
+    is_pair = isinstance(bounds, tuple | list) and len(bounds) == 2
+    if not is_pair or not all(isinstance(bound, int) for bound in bounds):
+        raise ScenarioError(
+            f"{code}: sites must be as in 2 or (2, 4), is {stated!r}", path=path
+        )
+    least, most = bounds
+    if not least <= sites <= most:
+        allowed = f"{least}" if least == most else f"{least} to {most}"
+        raise ScenarioError(
+            f"{code} is for {allowed} sites, and the scenario has {sites}", path=path
+        )
+
+
+def _find_written_attributes(kind: Any) -> list[str]:
+    """Returns the attributes that a class assigns to itself outside of `__init__`.
+
+    Changes by method calls, as of a list's `append`, are not found.
+    """
+    written = []
+    for base in kind.__mro__:
+        for function in vars(base).values():
+            if not inspect.isfunction(function) or function.__name__ == "__init__":
+                continue
+            source = textwrap.dedent(inspect.getsource(function))
+            for node in ast.walk(ast.parse(source)):
+                if not isinstance(getattr(node, "ctx", None), ast.Store):
+                    continue
+                match = re.match(r"self\.(\w+)", ast.unparse(node))
+                if match:
+                    written.append(match[1])
+    return written
 
 
 def make_instance(
     kind: Any, code: str, context: Any, settings: dict[str, Any], path: str = ""
 ) -> Any:
-    """Returns a law, or what else a class makes of its context and settings; errors call the
-    key `path`.
+    """Returns an instance of a user's class, made from its context and settings.
+
+    Args:
+        kind: the class.
+        code: the class's name for errors.
+        context: the first argument of the class.
+        settings: its keyword arguments.
+        path: the path of the key for errors; by default the site's [control] table.
 
     Raises:
-        ScenarioError: it raised.
+        ScenarioError: the class raised an exception.
     """
     try:
         return kind(context, **settings)
-    except (Exception, SystemExit) as error:  # the user's code
-        given = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
-        problem = (
-            f"cannot be made with {given or 'no settings'}: {type(error).__name__}: {error}"
-        )
+    except (Exception, SystemExit) as error:  # the user's code may raise anything
+        arguments = ", ".join(f"{key} = {value!r}" for key, value in settings.items())
         raise ScenarioError(
-            f"{code} {problem}", path=path or f"sites.{context.site}.control"
+            f"{code} cannot be made with {arguments or 'no settings'}: "
+            f"{type(error).__name__}: {error}",
+            path=path or f"sites.{context.site}.control",
         ) from None

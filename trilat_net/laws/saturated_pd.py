@@ -1,6 +1,7 @@
-"""P+d whose coupling torque saturates, towards each peer by itself.
+"""P+d whose coupling torque saturates separately for each peer.
 
-Invariant: no peer pulls with more than alpha_ij P, whatever it does.
+Invariant:
+    - No peer pulls with more than alpha_ij P, at any distance.
 """
 
 from typing import ClassVar
@@ -19,8 +20,9 @@ from .interface import DAMPING, STIFFNESS, ControlLaw
 
 @compiled
 class SaturatedPd(ControlLaw):
-    """P+d whose pull towards each peer saturates: tau = G - sum alpha_ij P tanh(K (q - q_j) /
-    P) - d qd.
+    """P+d whose pull towards each peer saturates.
+
+        tau = G - sum_j alpha_ij P tanh(K (q - q_j) / P) - d qd
 
     Zakerimanesh, Hashemzadeh and Ghiasi, "Dual-user nonlinear teleoperation subjected to
     varying time delay and bounded inputs", ISA Transactions 68, 2017.
@@ -29,7 +31,7 @@ class SaturatedPd(ControlLaw):
         K: stiffness of small errors, per joint, N m/rad.
         P: largest pull of all peers together, per joint, N m.
         d: damping of the arm's velocity, per joint, N m s/rad.
-        gravity: share of gravity that it knows, 1: exactly.
+        gravity: share of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveJoints = (10.0,)
@@ -37,43 +39,47 @@ class SaturatedPd(ControlLaw):
     d: NotNegativeJoints = (3.0,)
     gravity: NotNegative = 1.0
 
-    linear_note: ClassVar = "saturated_pd has the slope K of small errors: where sites disagree at rest it pulls less"
+    linear_note: ClassVar = (
+        "saturated_pd has the slope K of small errors: "
+        "where sites disagree at rest it pulls less"
+    )
     tune: ClassVar = {"K": STIFFNESS, "P": (0.5, 50.0, "N m"), "d": DAMPING}
     needs_theta: ClassVar = True
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque."""
+        """Writes the torque of each joint."""
         for i in range(now.joints):
             tau = self.gravity * now.gravity[i] - self.d[i] * now.qd[i]
             for j in range(len(now.peers)):
                 peer = now.peers[j]
-                tau -= (
-                    peer.alpha
-                    * self.P[i]
-                    * tanh(self.K[i] * (now.q[i] - peer.q[i]) / self.P[i])
-                )
+                stretch = self.K[i] * (now.q[i] - peer.q[i]) / self.P[i]
+                tau -= peer.alpha * self.P[i] * tanh(stretch)
             now.tau[i] = tau
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns P+d, with the stiffness of small errors."""
-        return Gains(Law.KNOWN, K=self.K, d=self.d, known=(theta * self.gravity).tolist())
+        """Returns the gains of P+d, with the stiffness of small errors."""
+        known = (theta * self.gravity).tolist()
+        return Gains(Law.KNOWN, K=self.K, d=self.d, known=known)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns the condition of P+d (the slope is nowhere above K), and what the torque
-        limit leaves.
+        """Returns the condition of P+d, and the speed up to which torques keep their limit.
+
+        The condition of P+d applies because the slope is nowhere above K.
         """
-        found = judge_position_exchange(situation, "K", "d")
+        condition = judge_position_exchange(situation, "K", "d")
         if not situation.gravity_nm:
-            return found._replace(
-                text=f"{found.text}; and tau_limit_nm above gravity + P + d |qd|"
-            )
+            text = f"{condition.text}; and tau_limit_nm above gravity + P + d |qd|"
+            return condition._replace(text=text)
         gravity = self.gravity * np.array(situation.gravity_nm)
-        room = np.array(situation.tau_limit_nm) - gravity - np.array(self.P)
-        if room.min() <= 0.0:
-            n = int(room.argmin())
-            lacks = f"tau_limit_nm of joint {n + 1} is {-room[n]:.3g} N m below gravity + P"
-            return StabilityCondition(False, f"{lacks}: it would cut the pull off")
+        margin = np.array(situation.tau_limit_nm) - gravity - np.array(self.P)
+        if margin.min() <= 0.0:
+            n = int(margin.argmin())
+            text = (
+                f"tau_limit_nm of joint {n + 1} is {-margin[n]:.3g} N m below gravity + P: "
+                "it would cut the pull off"
+            )
+            return StabilityCondition(False, text)
         with np.errstate(divide="ignore"):
-            most = float(np.min(room / np.array(self.d)))
-        within = f"; gravity + P + d |qd| is within tau_limit_nm up to {most:.3g} rad/s"
-        return found._replace(text=found.text + within)
+            speed = float(np.min(margin / np.array(self.d)))
+        limit = f"gravity + P + d |qd| is within tau_limit_nm up to {speed:.3g} rad/s"
+        return condition._replace(text=f"{condition.text}; {limit}")

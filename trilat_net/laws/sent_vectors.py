@@ -1,7 +1,9 @@
-"""What a control law sends to its peers, as its class declares it.
+"""The vectors that a control law sends to its peers, as the law's class declares them.
 
-Invariant: a declaration is a literal in the class of the law, so that nothing of a user's code
-runs to read it; it stands in the resolved scenario, which is enough to read the law's records.
+Invariant:
+    - A declaration is a literal in the class of the law, so reading it runs no user code.
+    - The declaration is part of the resolved scenario, so the scenario suffices to read the
+      law's records.
 """
 
 import ast
@@ -18,17 +20,16 @@ from ..core.chain import MAX_JOINTS
 from ..core.law_channel import MAX_RECORD_SENT, MAX_SENT, LawChannel, SentVector
 from ..core.site_setup import Layout
 from ..errors import ScenarioError, count_nouns
-from ..fields import Frozen, reword_problem
+from ..fields import Frozen, reword_problem, split_refusal
 
 
 class SentVectorSpec(Frozen, frozen=True):
     """A vector that a law sends at every tick, see `core.law_channel`.
 
     Attributes:
-        unit: of its numbers, as in "J"; "" for those without.
-        length: how many numbers it has: "joints", "coordinates" (that sites share), or a
-            number.
-        per_peer: true: another one for each peer; false: the same for all.
+        unit: unit of its numbers, as in "J"; "" for dimensionless numbers.
+        length: count of its numbers: "joints", "coordinates" (that sites share), or a number.
+        per_peer: true: each peer gets its own vector; false: all peers get the same vector.
     """
 
     unit: Annotated[str, Meta(max_length=24, pattern=r"^[ -~]*$")] = ""
@@ -44,64 +45,77 @@ SentVectorSpecs = dict[str, SentVectorSpec]
 def build_channel(
     sends: Mapping[str, SentVectorSpec], layout: Layout, peers: int
 ) -> LawChannel:
-    """Returns the channel of a law at a site with vectors of such lengths and with so many
-    peers.
+    """Returns the channel of a law at a site.
+
+    Args:
+        sends: the declared vectors by name.
+        layout: the counts of the site's joints and coordinates.
+        peers: the number of the site's peers.
     """
     counts = {"joints": layout.joints, "coordinates": layout.shared}
-    vectors = [
-        SentVector(
-            name,
-            one.unit,
-            one.length if isinstance(one.length, int) else counts[one.length],
-            one.per_peer,
-        )
-        for name, one in sends.items()
-    ]
-    return LawChannel(tuple(sorted(vectors, key=lambda vector: vector.per_peer)), peers)
+    vectors = []
+    for name, spec in sends.items():
+        length = spec.length if isinstance(spec.length, int) else counts[spec.length]
+        vectors.append(SentVector(name, spec.unit, length, spec.per_peer))
+    common_first = sorted(vectors, key=lambda vector: vector.per_peer)
+    return LawChannel(tuple(common_first), peers)
 
 
 def check_sends(channel: LawChannel, joints: int, path: str) -> None:
-    """Refuses names that no attribute can have, and more numbers than a sample holds; `path`:
-    of the law.
+    """Refuses unsuitable names of vectors, and more numbers than a sample or record can hold.
+
+    Args:
+        channel: all that the law sends.
+        joints: the number of the site's joints.
+        path: the path of the law's table, for errors.
 
     Raises:
         ScenarioError: with the path of the key.
     """
-    for name, *_ in channel.vectors:
-        if (
-            not name.isidentifier()
-            or keyword.iskeyword(name)
-            or name.startswith("_")
-            or len(name) > 24
-        ):
-            problem = "is no name for a vector: a letter, then letters, digits and _, at most 24 of them"
-        elif hasattr(np.record, name) or hasattr(tuple, name):
-            problem = "is taken: every record of numbers has an attribute of that name; choose another"
-        else:
-            continue
-        raise ScenarioError(problem, path=f"{path}.sends.{name}")
-    if (count := channel.received_size) > (most := MAX_SENT * joints):
-        problem = (
-            f"sends {count_nouns(count, 'number')} to each peer, and at most {most} "
-            f"are taken, {MAX_SENT} per joint"
+    for vector in channel.vectors:
+        problem = _find_name_problem(vector.name)
+        if problem:
+            raise ScenarioError(problem, path=f"{path}.sends.{vector.name}")
+    most = MAX_SENT * joints
+    if channel.received_size > most:
+        count = count_nouns(channel.received_size, "number")
+        raise ScenarioError(
+            f"sends {count} to each peer, and at most {most} are accepted, "
+            f"{MAX_SENT} per joint",
+            path=f"{path}.sends",
         )
-        raise ScenarioError(problem, path=f"{path}.sends")
     if channel.record_size > MAX_RECORD_SENT:
-        count = channel.record_size
-        most = MAX_RECORD_SENT
-        problem = (
-            f"sends {count_nouns(count, 'number')} to "
-            f"{count_nouns(channel.peers, 'peer')} together, and a record holds at most {most}"
+        count = count_nouns(channel.record_size, "number")
+        receivers = count_nouns(channel.peers, "peer")
+        raise ScenarioError(
+            f"sends {count} to {receivers} together, and a record holds at most "
+            f"{MAX_RECORD_SENT}",
+            path=f"{path}.sends",
         )
-        raise ScenarioError(problem, path=f"{path}.sends")
+
+
+def _find_name_problem(name: str) -> str:
+    """Returns why a name is unsuitable for a vector, or ""."""
+    is_attribute = name.isidentifier() and not keyword.iskeyword(name)
+    if not is_attribute or name.startswith("_") or len(name) > 24:
+        return (
+            "is no name for a vector: a letter, then letters, digits and _, at most 24 of them"
+        )
+    if hasattr(np.record, name) or hasattr(tuple, name):
+        return "is taken: every record of numbers has an attribute of that name; choose another"
+    return ""
 
 
 def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDef]:
-    """Returns the classes that a file defines at its top level, by their names; nothing of it
-    runs.
+    """Returns the classes at the top level of a file, by name, without running the file.
+
+    Args:
+        source: the content of the file.
+        file: the file, for errors.
+        path: the path of the key, for errors.
 
     Raises:
-        ScenarioError: it is no Python.
+        ScenarioError: the file is not valid Python.
     """
     try:
         tree = ast.parse(source)
@@ -111,46 +125,55 @@ def parse_classes(source: bytes, file: Path, path: str) -> dict[str, ast.ClassDe
 
 
 def read_sends(source: bytes, file: Path, code: str, path: str) -> SentVectorSpecs:
-    """Returns what the class of a law declares that it sends, as its file writes it, without
-    running it.
+    """Returns the vectors that a law's class declares in a file, without running the file.
+
+    Args:
+        source: the content of the file.
+        file: the file, for errors.
+        code: the law's name, as in "mylaws:Line".
+        path: the path of the key, for errors.
 
     Raises:
-        ScenarioError: the file is no Python, or the declaration is no literal, or none of
-            vectors.
+        ScenarioError: the file is not valid Python, or the declaration is not a literal that
+            describes vectors.
     """
-    found: Any = {}
-    law = parse_classes(source, file, path).get(code.partition(":")[2])
-    for node in (
-        line
-        for line in (law.body if law else ())
-        if isinstance(line, ast.Assign | ast.AnnAssign)
-    ):
-        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-        if node.value is None or "sends" not in {
-            one.id for one in targets if isinstance(one, ast.Name)
-        }:
+    sends: Any = {}
+    class_name = code.partition(":")[2]
+    law = parse_classes(source, file, path).get(class_name)
+    for node in law.body if law else ():
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
             continue
-        where = f"{code}: sends in line {node.lineno} of {file.name}"
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        names = {target.id for target in targets if isinstance(target, ast.Name)}
+        if "sends" not in names:
+            continue
+        location = f"{code}: sends in line {node.lineno} of {file.name}"
         try:
-            found = ast.literal_eval(node.value)
+            sends = ast.literal_eval(node.value)
         except (ValueError, TypeError, RecursionError):
-            problem = f"{where} must be written out, as it is read and not run"
+            problem = f"{location} must be written out, as it is read and not run"
             raise ScenarioError(problem, path=path) from None
-        if isinstance(node.value, ast.Dict) and len(found) < len(node.value.keys):
-            raise ScenarioError(f"{where} has a name twice", path=path)
-    return convert_sends(found, code, path)
+        if isinstance(node.value, ast.Dict) and len(sends) < len(node.value.keys):
+            raise ScenarioError(f"{location} has a name twice", path=path)
+    return convert_sends(sends, code, path)
 
 
 def convert_sends(sends: Any, code: str, path: str) -> SentVectorSpecs:
-    """Returns the declaration of a law's class as types.
+    """Returns the declaration of a law's class, converted to `SentVectorSpec`.
+
+    Args:
+        sends: the value of the class attribute `sends`.
+        code: the law's name, for errors.
+        path: the path of the key, for errors.
 
     Raises:
-        ScenarioError: it is none.
+        ScenarioError: the value does not describe vectors.
     """
     try:
         return msgspec.convert(sends, SentVectorSpecs)
     except msgspec.ValidationError as error:
-        problem, _, place = str(error).partition(" - at ")
-        text = f"{code}: sends{place.strip('`$')}: {reword_problem(problem)}, as in"
+        problem, key = split_refusal(error)
         example = "{'energy': {'unit': 'J', 'length': 'joints', 'per_peer': True}}"
-        raise ScenarioError(f"{text} {example}", path=path) from None
+        raise ScenarioError(
+            f"{code}: sends{key}: {reword_problem(problem)}, as in {example}", path=path
+        ) from None

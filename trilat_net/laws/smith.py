@@ -1,13 +1,16 @@
 """P+d of a master and a slave with a Smith predictor at the master.
 
-    slave    tau = G - K (q_s - q_m(t - T)) - d qd_s,  sends w = q_s - x,  x: the model under
-    q_m(t - T) master   tau = G - K (q_m - x - w(t - T)) - d qd_m,  x: the model under q_m now
+    slave    tau = G - K (q_s - q_m(t - T)) - d qd_s
+             sends w = q_s - x, where the model x is driven by q_m(t - T)
+    master   tau = G - K (q_m - x - w(t - T)) - d qd_m, where the model x is driven by q_m
     model    inertia x'' = K (q_m - x) - d x'
 
-Both ends run the same model, so that nothing of the past is kept, however long a delay is: w is
-what the model misses, as of contact. A master is told apart by what it leads.
+Both ends run the same model. Therefore the law stores no past values, however long the delay
+is; w is the part of the slave's motion that the model misses, for example in contact. The
+setting `predicts` distinguishes the master.
 
-Invariant: the model moves as an arm does whose torque is held over a tick (`digital`).
+Invariant:
+    - The model moves like an arm whose torque is held over a tick (`digital`).
 """
 
 from collections.abc import Mapping
@@ -29,15 +32,15 @@ class Smith(ControlLaw):
     """P+d of a master and a slave with a Smith predictor of the slave at the master.
 
     Smith, "Closer control of loops with dead time", Chemical Engineering Progress 53, 1957
-    (from memory).
+    (cited from memory).
 
     Attributes:
         K: stiffness per joint, N m/rad.
         d: damping of the arm's velocity, per joint, N m s/rad.
-        inertia: of the model of the slave, per joint, kg m^2; K, d and inertia are alike at
-            both sites.
-        predicts: true of the master.
-        gravity: share of gravity that it knows, 1: exactly.
+        inertia: inertia of the slave's model, per joint, kg m^2. K, d and inertia are the same
+            at both sites.
+        predicts: true for the master.
+        gravity: share of the true gravity that the law compensates; 1 is exact.
     """
 
     K: PositiveJoints = (10.0,)
@@ -53,12 +56,12 @@ class Smith(ControlLaw):
     needs_theta: ClassVar = True
 
     def begin(self, facts: LawContext) -> None:
-        """Makes the model."""
+        """Creates the model's position x and velocity xd."""
         self.x = [0.0] * facts.joints
         self.xd = [0.0] * facts.joints
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque, sends what the model misses, and moves the model on by a tick."""
+        """Writes the torque, sends w, and advances the model by a tick."""
         h_s = now.h_s
         for i in range(now.joints):
             if now.k == 0:
@@ -70,29 +73,28 @@ class Smith(ControlLaw):
                 - self.d[i] * now.qd[i]
             )
             now.to_all.w[i] = 0.0 if self.predicts else now.q[i] - self.x[i]
-            leads = now.q[i] if self.predicts else goal
-            pull = self.K[i] * (leads - self.x[i]) - self.d[i] * self.xd[i]
-            acceleration = pull / self.inertia[i]
+            master_q = now.q[i] if self.predicts else goal
+            model_torque = self.K[i] * (master_q - self.x[i]) - self.d[i] * self.xd[i]
+            acceleration = model_torque / self.inertia[i]
             self.x[i] += h_s * self.xd[i] + 0.5 * h_s * h_s * acceleration
             self.xd[i] += h_s * acceleration
 
     def linear_gains(self, theta: Array) -> Gains | None:
-        """Returns its damping and its gravity; of the slave, which is P+d, its stiffness too."""
+        """Returns the law of known gravity with d, and at the slave also with K."""
         K = (0.0,) if self.predicts else self.K
-        return Gains(Law.KNOWN, K=K, d=self.d, known=(theta * self.gravity).tolist())
+        known = (theta * self.gravity).tolist()
+        return Gains(Law.KNOWN, K=K, d=self.d, known=known)
 
     def linear_form(self, at: LinearSituation) -> LinearForm | None:
-        """Returns the model, which the master has under its own pose and the slave under what
-        came.
-        """
+        """Returns the model, driven by the master's own pose or by the pose that it sent."""
         (peer,) = at.peers
         K = np.array(self.K)
-        m = np.array(self.inertia)
+        inertia = np.array(self.inertia)
         form = LinearForm(len(at.inertia), ("x", "xd"))
         form.add("x", "xd", 1.0)
-        form.add("xd", "x", -K / m)
-        form.add("xd", "xd", -np.array(self.d) / m)
-        form.add("xd", "q" if self.predicts else "q_des", K / m)
+        form.add("xd", "x", -K / inertia)
+        form.add("xd", "xd", -np.array(self.d) / inertia)
+        form.add("xd", "q" if self.predicts else "q_des", K / inertia)
         if self.predicts:
             form.add("tau", "q", -K)
             form.add("tau", "x", K)
@@ -103,22 +105,22 @@ class Smith(ControlLaw):
         return form
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns that the model decides: with the true one the loop is that without delay."""
+        """Returns that an exact model makes the loop one without delay."""
         laws = situation.laws
         if [getattr(law, "predicts", None) for law in laws].count(True) != 1:
             return StabilityCondition(False, "one of the two sites has predicts = true")
-        if any(
-            getattr(law, key, None) != getattr(self, key)
-            for law in laws
-            for key in ("K", "d", "inertia")
-        ):
-            return StabilityCondition(False, "K, d and inertia must be alike at both sites")
-        text = "a slave in free motion whose inertia is the model's makes the loop one without delay (d > 0)"
-        return StabilityCondition(
-            None, f"{text}; contact, and an inertia that changes, the model does not have"
+        for law in laws:
+            for key in ("K", "d", "inertia"):
+                if getattr(law, key, None) != getattr(self, key):
+                    text = "K, d and inertia must be alike at both sites"
+                    return StabilityCondition(False, text)
+        text = (
+            "a slave in free motion whose inertia is the model's makes the loop one without "
+            "delay (d > 0); contact, and an inertia that changes, the model does not have"
         )
+        return StabilityCondition(None, text)
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """The master predicts."""
+        """Returns the [control] table of a site for tuned gains; the master predicts."""
         return {**gains, "predicts": at.role == "master", "gravity": at.gravity}

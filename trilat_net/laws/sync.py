@@ -1,9 +1,10 @@
-"""Adaptive synchronisation of outputs r = qd + Lambda q, with its defect under gravity.
+"""Adaptive synchronisation of the outputs r = qd + Lambda q, with its defect under gravity.
 
-r has the absolute pose in it. With gravity every equilibrium has Y_G' r = 0, so the arms end at
-q = 0.
+The output r contains the absolute pose. With gravity each equilibrium has Y_G' r = 0, where Y_G
+is the regressor of gravity, so the arms end at q = 0.
 
-Invariant: the estimate advances by the trapezoid rule, as that of the adaptive law.
+Invariant:
+    - The estimate advances by the trapezoid rule, like the estimate of the adaptive law.
 """
 
 from collections.abc import Mapping
@@ -25,14 +26,16 @@ from .interface import ADAPTATION, CONVERGENCE, DAMPING, ControlLaw, TuningSite
 class Sync(ControlLaw):
     """Adaptive synchronisation of r = qd + Lambda q: under gravity all arms end at q = 0.
 
-    tau = Y(q, qd, -Lambda q, -Lambda qd) theta_hat + K (sum alpha_ij r_j - r), theta_hat' =
-    -Gamma Y' r. For planar arms. Chopra, Spong and Lozano, "Synchronization of bilateral
-    teleoperators with time delay", Automatica 44, 2008; the defect: Nuno, Ortega and Basanez,
-    Automatica 46, 2010.
+        tau = Y(q, qd, -Lambda q, -Lambda qd) theta_hat + K (sum_j alpha_ij r_j - r)
+        theta_hat' = -Gamma Y' r
+
+    The law is for planar arms. Chopra, Spong and Lozano, "Synchronization of bilateral
+    teleoperators with time delay", Automatica 44, 2008; the defect is described in Nuno, Ortega
+    and Basanez, Automatica 46, 2010.
 
     Attributes:
-        Lambda: per joint, 1/s.
-        K: per joint, N m s/rad.
+        Lambda: weight of the pose in r, per joint, 1/s.
+        K: gain towards the peers' outputs, per joint, N m s/rad.
         Gamma: adaptation gain per parameter.
         theta_hat0: first estimate of theta, Eq. (24).
     """
@@ -48,26 +51,24 @@ class Sync(ControlLaw):
     known_facts: ClassVar = "gravity, as its first estimate"
 
     def begin(self, facts: LawContext) -> None:
-        """Makes the estimate and its rate."""
+        """Creates the estimate and Y' r of the tick before."""
         self.theta_hat = list(self.theta_hat0)
         self.Yr = [0.0] * len(self.theta_hat)
         self.g_m_s2 = facts.g_m_s2
 
     def torque(self, now: LawInput) -> None:
         """Writes the torque and the estimate."""
-        q0 = now.q[0]
-        q1 = now.q[1]
-        w0 = now.qd[0]
-        w1 = now.qd[1]
-        v = (-self.Lambda[0] * q0, -self.Lambda[1] * q1)
-        a = (-self.Lambda[0] * w0, -self.Lambda[1] * w1)
-        first, second = regressor(g=self.g_m_s2, q=(q0, q1), qd=(w0, w1), v=v, a=a)
-        r0 = w0 - v[0]
-        r1 = w1 - v[1]
-        now.tau[0] = self.K[0] * (now.qd_des[0] + self.Lambda[0] * now.q_des[0] - r0)
-        now.tau[1] = self.K[1] * (now.qd_des[1] + self.Lambda[1] * now.q_des[1] - r1)
+        q = (now.q[0], now.q[1])
+        qd = (now.qd[0], now.qd[1])
+        v = (-self.Lambda[0] * q[0], -self.Lambda[1] * q[1])
+        a = (-self.Lambda[0] * qd[0], -self.Lambda[1] * qd[1])
+        first, second = regressor(g=self.g_m_s2, q=q, qd=qd, v=v, a=a)
+        r = (qd[0] - v[0], qd[1] - v[1])
+        for i in range(2):
+            peer_output = now.qd_des[i] + self.Lambda[i] * now.q_des[i]
+            now.tau[i] = self.K[i] * (peer_output - r[i])
         for p in range(len(self.Yr)):
-            Yr = first[p] * r0 + second[p] * r1
+            Yr = first[p] * r[0] + second[p] * r[1]
             if now.k > 0:
                 self.theta_hat[p] -= 0.5 * now.h_s * self.Gamma[p] * (self.Yr[p] + Yr)
             self.Yr[p] = Yr
@@ -76,25 +77,37 @@ class Sync(ControlLaw):
             now.tau[1] += second[p] * self.theta_hat[p]
 
     def linear_gains(self, theta: Array) -> Gains | None:  # noqa: ARG002
-        """Returns the adaptive law whose r is that of the absolute pose."""
-        gains = Gains(
-            Law.ADAPTIVE, self.Lambda, self.K, Gamma=self.Gamma, theta_hat0=self.theta_hat0
+        """Returns the adaptive law with r = qd + Lambda q instead of qd + Lambda e."""
+        return Gains(
+            law=Law.ADAPTIVE,
+            Lambda=self.Lambda,
+            Kp=self.K,
+            Gamma=self.Gamma,
+            theta_hat0=self.theta_hat0,
+            absolute=True,
         )
-        return gains._replace(absolute=True)
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:
-        """Returns that every constant delay is allowed, and what it then does."""
+        """Returns that any constant delay is allowed, and where the arms end under gravity."""
         if np.isnan(situation.longest_s):
             return StabilityCondition(
                 None, "proved for constant delays, and a delay here varies"
             )
-        text = "r of all sites agree for every constant delay, any Lambda, K and Gamma > 0 (sufficient)"
-        return StabilityCondition(
-            True, f"{text}; but under gravity the arms end at q = 0, wherever they are led"
+        text = (
+            "r of all sites agree for every constant delay, any Lambda, K and Gamma > 0 "
+            "(sufficient); but under gravity the arms end at q = 0, wherever they are led"
         )
+        return StabilityCondition(True, text)
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
-        """Returns tuned gains, of which K is called as that of the other adaptive laws, Kp."""
-        told = {"Lambda": gains["Lambda"], "K": gains["Kp"], "Gamma": gains["Gamma"]}
-        return {**told, "theta_hat0": at.estimate}
+        """Returns the [control] table of a site for tuned gains.
+
+        The tuned gain is called Kp, as in the other adaptive laws, and is this law's K.
+        """
+        return {
+            "Lambda": gains["Lambda"],
+            "K": gains["Kp"],
+            "Gamma": gains["Gamma"],
+            "theta_hat0": at.estimate,
+        }

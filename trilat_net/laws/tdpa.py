@@ -1,13 +1,17 @@
-"""Time-domain passivity control: each end of a coupling watches what it takes out, and limits
-it.
+"""Time-domain passivity control: each end of a coupling limits the energy that it takes.
 
-Invariant: in every directed coupling of a follower to a leader each end books, cumulatively and
-per joint, the energy that it puts in; the other end takes out no more than it knows of.
+A follower is moved by the force of a spring and a damper towards a goal,
 
-A follower is moved by F = K (goal - q) + B (v - qd), goal += h v, v = sum alpha_j v_j: the
-velocities of the peers by dominance. Peer j feels -alpha_j F. Where all sites follow there is a
-coupling each way. While a site waits, aligns or holds, what its reference lacks of the way to
-the peers adds to the goal, at no cost.
+    F = K (goal - q) + B (v - qd),    goal' = v,    v = sum_j alpha_j v_j
+
+where v_j are the velocities of the peers, weighted by dominance. Peer j feels -alpha_j F. If
+all sites follow, there is one coupling in each direction. While a site waits, aligns or holds,
+the difference between its reference and its peers is added to the goal without an energy cost.
+
+Invariant:
+    - In each directed coupling of a follower to a leader, each end accounts cumulatively, per
+      joint, for the energy that it puts in.
+    - The other end takes no more energy out than it knows to have been put in.
 """
 
 import math
@@ -23,23 +27,32 @@ from .conditions import PASSIVE_OUTSIDE, LawSituation, StabilityCondition
 from .interface import DAMPING, STIFFNESS, EnergyLaw
 
 SWEEPS = 3
-"""How often joints and couplings settle what each leaves of its torque, as these move one
-another.
+"""Number of iterations in which joints and couplings settle their limited torques, since these
+influence one another.
 """
 AHEAD = 2.0
-"""Ticks of a leader's motion that are paid for beforehand: in one a joint turns back, in two it
-rests.
+"""Ticks of a leader's motion that are paid for in advance: a joint needs one tick to reverse
+and two to come to rest.
 """
 SPENT_S = 0.1
-"""Drift compensation spends what is left at such a rate that it lasts for this time, s."""
+"""Time for which the remaining energy lasts at the rate of drift compensation, s."""
 _SLACK_NM = 1e-9
-"""A torque that gives a follower's controller nothing to act on."""
+"""Below this torque a follower's controller has nothing to act on, N m."""
 
 
 @compiled
-def book(now: LawInput, j: int, i: int, torque: float, step: float) -> float:
-    """Books what a leader's arm gives to a coupling; returns what it takes out, as a negative
-    number.
+def book_leader_work(now: LawInput, j: int, i: int, torque: float, step: float) -> float:
+    """Books the energy that a leader's arm puts into a coupling.
+
+    Args:
+        now: the law's input; E_led of peer j is increased by positive work.
+        j: the peer that follows.
+        i: the joint.
+        torque: torque of the coupling, N m.
+        step: motion of the joint, rad.
+
+    Returns:
+        The energy that the arm takes out of the coupling, J, zero or negative.
     """
     now.sent[j].E_led[i] += max(torque * step, 0.0)
     taken: float = min(torque * step, 0.0)
@@ -48,24 +61,23 @@ def book(now: LawInput, j: int, i: int, torque: float, step: float) -> float:
 
 @compiled
 def observe_leader(law: Any, now: LawInput, j: int, i: int) -> None:
-    """Brings what the leader's end knows of the coupling by which peer j follows up to the
-    present.
-    """
-    at = j * now.joints + i
+    """Updates the energy W_led that the leader's end knows in its coupling to follower j."""
+    index = j * now.joints + i
     sent = now.sent[j]
+    received = now.received[j]
     observed = sent.W_led[i] if now.k > 0 else law.reserve_J
-    observed += now.received[j].E_followed[i] - law.E_known[at]
-    law.E_known[at] = now.received[j].E_followed[i]
-    if law.by_step:  # of the period before, which is over
-        observed += book(
-            now=now, j=j, i=i, torque=law.F_led[at], step=now.q[i] - now.q_before[i]
-        )
+    observed += received.E_followed[i] - law.E_known[index]
+    law.E_known[index] = received.E_followed[i]
+    if law.by_step:
+        # The step of the previous period, which is known now.
+        step = now.q[i] - now.q_before[i]
+        observed += book_leader_work(now=now, j=j, i=i, torque=law.F_led[index], step=step)
     sent.W_led[i] = observed
 
 
 @compiled
 def invert_inertia(law: Any, now: LawInput) -> None:
-    """Writes M^-1 by elimination; zeros where the arm's parameters are unknown."""
+    """Writes M^-1 by Gauss-Jordan elimination; zeros if the arm's parameters are unknown."""
     n = now.joints
     inverse = law.inverse
     for i in range(n):
@@ -87,246 +99,319 @@ def invert_inertia(law: Any, now: LawInput) -> None:
 
 
 @compiled
-def lead(law: Any, now: LawInput, j: int, i: int) -> None:
-    """Writes the torque that the leader's end of that coupling feels.
+def limit_leader_torque(law: Any, now: LawInput, j: int, i: int) -> None:
+    """Writes the torque that the leader feels in its coupling to follower j.
 
-    The controller leaves of the follower's torque what the known energy pays for in the time
-    ahead. In it the joint goes on as before, and farther by what torques of this tick add to
-    those of the tick before, its own included. A deficit is repaid by damping.
+    The controller reduces the follower's torque to a magnitude that the known energy pays for
+    during the next `AHEAD` ticks. The prediction assumes that the joint continues its motion,
+    and adds the effect of the torques that this tick changes, the coupling's own torque
+    included. An energy deficit is repaid by damping.
     """
     n = now.joints
     h = now.h_s
-    asked = now.received[j].F[i]
-    at = j * n + i
-    spare = max(now.sent[j].W_led[i] - law.floor, 0.0)
-    sign = 1.0 if asked > 0.0 else -1.0
-    most = abs(asked)
+    index = j * n + i
+    requested = now.received[j].F[i]
+    known_J = now.sent[j].W_led[i]
+    available_J = max(known_J - law.floor, 0.0)
+    sign = 1.0 if requested > 0.0 else -1.0
+    magnitude = abs(requested)
     step = now.qd[i] * h
-    own = 0.0
+    step_per_torque = 0.0
     half = 0.5 * h * h
     if law.by_step:
         half *= AHEAD * AHEAD
-        own = half * law.inverse[i * n + i] / law.beta
-        step = AHEAD * step + AHEAD**2 * (law.ahead[i] - step)
-        for one in range(n):
-            step += half * law.inverse[i * n + one] * law.change[one]
-    # without a torque here
-    away = half * law.acceleration_rad_s2 - sign * step - own * sign * law.F_now[at]
-    if most * (away + own * most) > spare:
-        if own > 0.0:
-            most = max(math.sqrt(away * away + 4.0 * own * spare) - away, 0.0) / (2.0 * own)
+        step_per_torque = half * law.inverse[i * n + i] / law.beta
+        step = AHEAD * step + AHEAD**2 * (law.predicted_step[i] - step)
+        for m in range(n):
+            step += half * law.inverse[i * n + m] * law.torque_change[m]
+    # The step against the torque that the joint would make without this coupling's torque.
+    current = law.F_now[index]
+    free_step = half * law.acceleration_rad_s2 - sign * step - step_per_torque * sign * current
+    if magnitude * (free_step + step_per_torque * magnitude) > available_J:
+        if step_per_torque > 0.0:
+            square = free_step * free_step + 4.0 * step_per_torque * available_J
+            root = max(math.sqrt(square) - free_step, 0.0)
+            magnitude = root / (2.0 * step_per_torque)
         else:
-            most = spare / away
-    torque = asked if not law.controlled else sign * most
-    owed = law.floor - now.sent[j].W_led[i]
-    if law.controlled and own > 0.0 and owed > 0.0 and now.qd[i] * law.ahead[i] > 0.0:
-        damping = 0.25 * h * AHEAD**2 / (n * len(now.peers) * own)
-        torque += now.qd[i] * min(0.1 * owed / (now.qd[i] * law.ahead[i]), damping)
-    law.change[i] -= (torque - law.F_now[at]) / law.beta
-    law.F_now[at] = torque
+            magnitude = available_J / free_step
+    torque = requested if not law.controlled else sign * magnitude
+    deficit_J = law.floor - known_J
+    if law.controlled and step_per_torque > 0.0 and deficit_J > 0.0:
+        squared_step = now.qd[i] * law.predicted_step[i]
+        if squared_step > 0.0:
+            most = 0.25 * h * AHEAD**2 / (n * len(now.peers) * step_per_torque)
+            torque += now.qd[i] * min(0.1 * deficit_J / squared_step, most)
+    law.torque_change[i] -= (torque - current) / law.beta
+    law.F_now[index] = torque
 
 
 @compiled
-def control_follower(
+def find_known_energy(law: Any, now: LawInput, j: int, i: int) -> float:
+    """Returns the energy that the follower's end of a coupling may still take out, J.
+
+    Half of the reserve is kept for steps that cost more than planned.
+    """
+    index = j * now.joints + i
+    received_J = now.received[j].E_led[i]
+    known: float = received_J + 0.5 * law.reserve_J - law.E_moved[index] + law.E_yielded[index]
+    return known
+
+
+@compiled
+def limit_follower_velocity(
     law: Any, now: LawInput, j: int, i: int, force: float, price: float
 ) -> float:
-    """Sets the velocity by which peer j is followed: its own, less what cannot be paid; returns
-    what is left.
+    """Writes the velocity by which peer j is followed: its own, reduced to the known energy.
 
-    `price` is what the period is expected to cost beyond the work of that velocity.
+    Args:
+        law: the law.
+        now: its input.
+        j: the peer that is followed.
+        i: the joint.
+        force: the part of the following force that belongs to the peer, N m.
+        price: expected cost of the period beyond the work of the peer's velocity, J.
+
+    Returns:
+        The energy that remains, J; negative if the peer's velocity costs more than is known.
     """
-    at = j * now.joints + i
+    index = j * now.joints + i
     h = now.h_s
     peer = now.peers[j]
-    known = now.received[j].E_led[i] + 0.5 * law.reserve_J - law.E_moved[at] + law.E_yielded[at]
-    if law.by_step:  # half of the reserve is for what steps cost more than planned
-        known = max(known - price, 0.0)
-    law.v_led[at] = peer.qd[i]
-    left: float = known - max(force * peer.qd[i] * h, 0.0)
-    if law.controlled and left < 0.0 and abs(force) > _SLACK_NM:
-        law.v_led[at] += left / (force * h)
-    return left
+    known_J = find_known_energy(law, now, j, i)
+    if law.by_step:
+        known_J = max(known_J - price, 0.0)
+    law.v_led[index] = peer.qd[i]
+    remaining_J: float = known_J - max(force * peer.qd[i] * h, 0.0)
+    if law.controlled and remaining_J < 0.0 and abs(force) > _SLACK_NM:
+        law.v_led[index] += remaining_J / (force * h)
+    return remaining_J
 
 
 @compiled
-def correct_drift(law: Any, now: LawInput, i: int, error: float, room: float) -> float:
-    """Returns the velocity that takes the goal to where the peers are, as far as couplings pay
-    for it.
+def compute_drift_velocity(
+    law: Any, now: LawInput, i: int, error: float, available_J: float
+) -> float:
+    """Returns the velocity that moves the goal back to the peers, as far as energy allows.
 
-    `room` is what they have left together. The goal moves for all peers: the work of the torque
-    counts, by steps that of the damper and the spring which answer, and what these do with the
-    peers' velocities too.
+    The goal moves for all peers together, so the work of the torque counts. With energies by
+    step, the reactions of the damper and the spring count too, also in connection with the
+    peers' velocities.
+
+    Args:
+        law: the law.
+        now: its input.
+        i: the joint.
+        error: difference between the peers' position and the goal, rad.
+        available_J: the energy that remains in all couplings together, J.
     """
     h = now.h_s
-    more = max(-law.drift_rad_s, min(law.drift_rad_s, error / now.h_s))
-    linear = law.force[i] * (1.0 if more > 0.0 else -1.0)
+    velocity = max(-law.drift_rad_s, min(law.drift_rad_s, error / now.h_s))
+    linear = law.force[i] * (1.0 if velocity > 0.0 else -1.0)
     square = 0.0
-    most = abs(more)
-    power = room / h
+    magnitude = abs(velocity)
+    power = available_J / h
     if law.by_step:
-        power = room / max(SPENT_S, h)
+        power = available_J / max(SPENT_S, h)
         square = law.B[i] + 0.5 * law.K[i] * h
         for j in range(len(now.peers)):
-            linear += law.B[i] * now.peers[j].alpha * abs(now.peers[j].qd[i])
+            peer = now.peers[j]
+            linear += law.B[i] * peer.alpha * abs(peer.qd[i])
+    # The largest magnitude with linear v + square v^2 <= power.
     if square > 0.0:
-        most = (math.sqrt(linear * linear + 4.0 * square * power) - linear) / (2.0 * square)
+        root = math.sqrt(linear * linear + 4.0 * square * power)
+        magnitude = (root - linear) / (2.0 * square)
     elif linear > 0.0:
-        most = power / linear
-    return float(max(-most, min(most, more)))
+        magnitude = power / linear
+    return float(max(-magnitude, min(magnitude, velocity)))
 
 
 @compiled
-def afford(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
-    """Returns the velocity of the goal by peer j, less where that costs more than is known."""
-    at = j * now.joints + i
+def find_affordable_velocity(law: Any, now: LawInput, j: int, i: int, force: float) -> float:
+    """Returns the goal's velocity by peer j, reduced where it costs more than is known."""
+    index = j * now.joints + i
     work = now.peers[j].alpha * force * now.h_s
-    known = now.received[j].E_led[i] + 0.5 * law.reserve_J - law.E_moved[at] + law.E_yielded[at]
-    known = max(known, 0.0)
-    velocity = float(law.v_led[at])
-    return known / work if law.controlled and work * velocity > known else velocity
+    known_J = max(find_known_energy(law, now, j, i), 0.0)
+    velocity = float(law.v_led[index])
+    return known_J / work if law.controlled and work * velocity > known_J else velocity
 
 
 @compiled
 def book_follower(law: Any, now: LawInput, j: int, i: int, force: float, drift: float) -> None:
-    """Books the follower's end of the coupling to peer j, and its part of what drift
-    compensation takes.
+    """Books the energy at the follower's end of the coupling to peer j.
 
-    By steps, the torque is that of the velocity in use, and the energy too; as it is published,
-    both are those of the leader's velocity, and what the controller changes is booked apart.
-    What drift compensation gives back stays here.
+    With energies by step, torque and energy belong to the velocity in use. With the published
+    law (energies by velocity), both belong to the leader's velocity, and the change by the
+    controller is booked separately.
+
+    Args:
+        law: the law.
+        now: its input.
+        j: the peer that is followed.
+        i: the joint.
+        force: the part of the following force that belongs to the peer, N m.
+        drift: the coupling's part of the energy that drift compensation takes, J. Energy that
+            drift compensation returns stays at this end.
     """
-    at = j * now.joints + i
+    index = j * now.joints + i
     h = now.h_s
-    velocity = law.v_led[at] if law.by_step else now.peers[j].qd[i]
+    sent = now.sent[j]
+    velocity = law.v_led[index] if law.by_step else now.peers[j].qd[i]
     energy = force * velocity * h
     if energy >= 0.0:
-        law.E_moved[at] += energy
+        law.E_moved[index] += energy
     else:
-        now.sent[j].E_followed[i] -= energy
-    law.E_yielded[at] += force * (velocity - law.v_led[at]) * h - drift
-    now.sent[j].W_followed[i] = (
-        now.received[j].E_led[i] + law.reserve_J - law.E_moved[at] + law.E_yielded[at]
-    )
+        sent.E_followed[i] -= energy
+    law.E_yielded[index] += force * (velocity - law.v_led[index]) * h - drift
+    received_J = now.received[j].E_led[i]
+    sent.W_followed[i] = received_J + law.reserve_J - law.E_moved[index] + law.E_yielded[index]
 
 
 @compiled
-def charge_unpaid(law: Any, now: LawInput, i: int, spring: float) -> None:
-    """Charges what the spring and the arm got in the period before, beyond what couplings paid,
-    to them.
+def charge_unpaid_energy(law: Any, now: LawInput, i: int, spring: float) -> None:
+    """Charges the couplings for the energy of the previous period that they have not paid.
 
-    What the damper takes in other periods repays that, and no more.
+    This is energy that the spring and the arm received beyond the couplings' payments. Energy
+    that the damper takes in other periods repays the charge, up to its amount.
+
+    Args:
+        law: the law.
+        now: its input.
+        i: the joint.
+        spring: energy of the joint's spring now, J.
     """
-    moved = now.q[i] - now.q_before[i] - law.aligned[i]
+    moved = now.q[i] - now.q_before[i] - law.alignment_step[i]
     unpaid = law.force[i] * moved + spring - law.spring[i] - law.paid[i]
     for j in range(len(now.peers)):
-        at = j * now.joints + i
+        index = j * now.joints + i
         if law.by_step and now.k > 0:
-            charged = max(now.peers[j].alpha * unpaid, -law.lent[at])
-            law.E_moved[at] += charged
-            law.lent[at] += charged
-        law.E_settled[at] = law.E_moved[at] - law.E_yielded[at]
+            charged = max(now.peers[j].alpha * unpaid, -law.lent[index])
+            law.E_moved[index] += charged
+            law.lent[index] += charged
+        law.E_settled[index] = law.E_moved[index] - law.E_yielded[index]
     law.spring[i] = spring
 
 
 @compiled
 def settle_follower(
-    law: Any, now: LawInput, i: int, stretch: float, more: float, room: float
+    law: Any, now: LawInput, i: int, stretch: float, drift_velocity: float, available_J: float
 ) -> None:
-    """Settles torque and velocities of a joint that follows, `more` that of drift compensation,
-    and books.
+    """Settles the torque and the velocities of a joint that follows, and books the energies.
 
-    By steps, the torque is that of velocities which pay for it; several peers share one torque.
+    With energies by step, the torque results from velocities that pay for it. Since several
+    peers share one torque, torque and velocities are computed in a few sweeps.
+
+    Args:
+        law: the law.
+        now: its input.
+        i: the joint.
+        stretch: elongation of the spring, rad.
+        drift_velocity: velocity of drift compensation, rad/s.
+        available_J: the energy that remains in all couplings together, J.
     """
     n = now.joints
     h = now.h_s
+    peers = len(now.peers)
     force = law.force[i]
     velocity = 0.0
     for sweep in range(1 + SWEEPS * law.by_step):
         if sweep > 0:
             force = law.K[i] * stretch + law.B[i] * (velocity - now.qd[i])
             force = max(law.low[i], min(law.high[i], force))
-            more = room / (force * h) if force * more * h > room else more
-        velocity = more
-        for j in range(len(now.peers)):
+            if force * drift_velocity * h > available_J:
+                drift_velocity = available_J / (force * h)
+        velocity = drift_velocity
+        for j in range(peers):
+            index = j * n + i
             if sweep > 0:
-                law.v_led[j * n + i] = afford(law=law, now=now, j=j, i=i, force=force)
-            velocity += now.peers[j].alpha * law.v_led[j * n + i]
-    for j in range(len(now.peers)):
-        part = law.left[j * n + i] / room if room > 0.0 else 0.0
-        book_follower(
-            law=law,
-            now=now,
-            j=j,
-            i=i,
-            force=now.peers[j].alpha * force,
-            drift=part * force * more * h,
-        )
+                law.v_led[index] = find_affordable_velocity(
+                    law=law, now=now, j=j, i=i, force=force
+                )
+            velocity += now.peers[j].alpha * law.v_led[index]
+    for j in range(peers):
+        share = law.left_J[j * n + i] / available_J if available_J > 0.0 else 0.0
+        drift = share * force * drift_velocity * h
+        peer_force = now.peers[j].alpha * force
+        book_follower(law=law, now=now, j=j, i=i, force=peer_force, drift=drift)
     law.goal[i] += h * velocity
     law.force[i] = force
-    law.paid[i] = force * velocity * h + force * law.aligned[i]
+    law.paid[i] = force * velocity * h + force * law.alignment_step[i]
 
 
 @compiled
-def follow(law: Any, now: LawInput, i: int) -> None:
-    """Moves the goal of a joint by the velocities of the peers, and writes the torque that
-    follows it.
-    """
+def follow_peers(law: Any, now: LawInput, i: int) -> None:
+    """Moves the goal of a joint with the peers' velocities, and writes the following torque."""
     n = now.joints
     h = now.h_s
     K = law.K[i]
     B = law.B[i]
-    target = velocity = 0.0
-    for j in range(len(now.peers)):
-        target += now.peers[j].alpha * now.peers[j].q[i]
-        velocity += now.peers[j].alpha * now.peers[j].qd[i]
+    peers = len(now.peers)
+    target = 0.0
+    velocity = 0.0
+    for j in range(peers):
+        peer = now.peers[j]
+        target += peer.alpha * peer.q[i]
+        velocity += peer.alpha * peer.qd[i]
     if now.k == 0:
         law.goal[i] = target
-    way = now.q_des[i] - target
-    # in half a period
-    law.aligned[i] = 0.5 * h * (now.qd_des[i] - velocity) if way != 0.0 else 0.0
-    stretch = law.goal[i] + way - now.q[i]
-    pull = max(law.low[i], min(law.high[i], K * stretch))
-    charge_unpaid(law, now, i, pull * (stretch - 0.5 * pull / K) if K > 0.0 else 0.0)
-    law.force[i] = max(law.low[i], min(law.high[i], K * stretch + B * (velocity - now.qd[i])))
-    gap = velocity * h - law.ahead[i]  # by which the spring is expected to become longer
-    price = max((0.5 * K * gap - B * (velocity - now.qd[i])) * gap, 0.0)
-    more = room = least = 0.0
-    for j in range(len(now.peers)):
+    offset = now.q_des[i] - target
+    # The motion of the offset in half a period.
+    law.alignment_step[i] = 0.5 * h * (now.qd_des[i] - velocity) if offset != 0.0 else 0.0
+    stretch = law.goal[i] + offset - now.q[i]
+    spring_torque = max(law.low[i], min(law.high[i], K * stretch))
+    spring_J = spring_torque * (stretch - 0.5 * spring_torque / K) if K > 0.0 else 0.0
+    charge_unpaid_energy(law, now, i, spring_J)
+    damper_torque = B * (velocity - now.qd[i])
+    law.force[i] = max(law.low[i], min(law.high[i], K * stretch + damper_torque))
+    # The expected elongation of the spring in this period.
+    elongation = velocity * h - law.predicted_step[i]
+    price = max((0.5 * K * elongation - damper_torque) * elongation, 0.0)
+    available_J = 0.0
+    least_J = 0.0
+    for j in range(peers):
         alpha = now.peers[j].alpha
         now.sent[j].F[i] = alpha * law.force[i]
-        left = control_follower(
+        remaining_J = limit_follower_velocity(
             law=law, now=now, j=j, i=i, force=alpha * law.force[i], price=alpha * price
         )
-        law.left[j * n + i] = max(left, 0.0) * (alpha > 0.0)
-        room += law.left[j * n + i]
-        least = min(least, left)
-    if law.drift_rad_s > 0.0 and room > 0.0 and least >= 0.0:
-        more = correct_drift(
-            law=law, now=now, i=i, error=target - law.goal[i] - h * velocity, room=room
+        law.left_J[j * n + i] = max(remaining_J, 0.0) * (alpha > 0.0)
+        available_J += law.left_J[j * n + i]
+        least_J = min(least_J, remaining_J)
+    drift_velocity = 0.0
+    if law.drift_rad_s > 0.0 and available_J > 0.0 and least_J >= 0.0:
+        error = target - law.goal[i] - h * velocity
+        drift_velocity = compute_drift_velocity(
+            law=law, now=now, i=i, error=error, available_J=available_J
         )
-    settle_follower(law=law, now=now, i=i, stretch=stretch, more=more, room=room)
+    settle_follower(
+        law=law,
+        now=now,
+        i=i,
+        stretch=stretch,
+        drift_velocity=drift_velocity,
+        available_J=available_J,
+    )
 
 
 @compiled
 class Tdpa(EnergyLaw):
-    """Time-domain passivity control with delay: each end watches the energy of its coupling,
-    and damps.
+    """Time-domain passivity control with delay: each end monitors its coupling, and damps.
 
-    Every site follows by K and B towards the integral of its peers' velocities, mixed by
-    dominance, and the peers feel that torque; K = 0 and B = 0 make a site lead only. After Ryu,
-    Artigas and Preusche (2010); of several sites after Panzirsch and others (2012).
+    Each site follows, by K and B, the integral of its peers' velocities, weighted by dominance,
+    and the peers feel that torque. With K = 0 and B = 0 a site only leads. After Ryu, Artigas
+    and Preusche (2010); of several sites after Panzirsch and others (2012).
 
     Attributes:
-        K: spring by which the site follows, per joint, N m/rad; 0: it follows nobody.
-        B: damper by which it follows, per joint, N m s/rad.
-        acceleration_rad_s2: by which torques that are not the law's change a joint's
-            acceleration from tick to tick, as far as leaders' controllers cover it beforehand;
-            half of the reserve covers it too.
-        drift_rad_s: largest velocity by which positions are made to agree again; 0: they drift.
-        reserve_J: energy per joint and peer with which an end begins.
-        energy: "step": what the arm gets, torque times the step in q; "velocity": torque times
-            velocity times period, as it is published.
-        beta: the site's torque is divided by it, dimensionless: who feels whom.
+        K: spring by which the site follows, per joint, N m/rad; 0: the site follows nobody.
+        B: damper by which the site follows, per joint, N m s/rad.
+        acceleration_rad_s2: largest change per tick of a joint's acceleration by torques other
+            than the law's, as far as the leaders' controllers cover it in advance. Half of the
+            reserve covers it too.
+        drift_rad_s: largest velocity by which positions are brought to agreement again; 0: they
+            drift.
+        reserve_J: initial energy of an end per joint and peer, J.
+        energy: "step": energy that the arm receives, torque times the step in q; "velocity":
+            torque times velocity times period, as published.
+        beta: divisor of the site's torque, dimensionless: it weights whom each user feels.
     """
 
     K: NotNegativeJoints = (100.0,)
@@ -341,125 +426,153 @@ class Tdpa(EnergyLaw):
         "F": {"unit": "N m", "length": "joints", "per_peer": True},
         "E_led": {"unit": "J", "length": "joints", "per_peer": True},
         "E_followed": {"unit": "J", "length": "joints", "per_peer": True},
-        "W_led": {"unit": "J", "length": "joints", "per_peer": True},  # observed here, for logs
+        # The energies observed at this end. Peers do not need them, but the log shows them.
+        "W_led": {"unit": "J", "length": "joints", "per_peer": True},
         "W_followed": {"unit": "J", "length": "joints", "per_peer": True},
     }
     remembers: ClassVar = (
-        *("goal", "F_led", "E_known", "E_moved", "E_yielded", "lent"),
-        *("carried", "spring", "force", "paid", "E_settled"),
+        "goal",
+        "F_led",
+        "E_known",
+        "E_moved",
+        "E_yielded",
+        "lent",
+        "carried",
+        "spring",
+        "force",
+        "paid",
+        "E_settled",
     )
     needs_model: ClassVar = True
     tune: ClassVar = {"K": STIFFNESS, "B": DAMPING}
     known_facts: ClassVar = "gravity, and inertia for two ticks"
     controlled = True
-    """False: it watches only, for comparison."""
+    """False switches the controllers off, for comparison: energies are only observed."""
 
     def begin(self, facts: LawContext) -> None:
-        """Makes the books of both ends of each coupling."""
+        """Creates the energy accounts of both ends of each coupling, and the work space."""
         n = facts.joints
-        peers = len(facts.peers)
+        couplings = n * len(facts.peers)
         self.by_step = self.energy == "step"
         self.controlled = bool(self.controlled)
         self.floor = 0.5 * self.reserve_J if self.by_step else 0.0
         self.tau_limit = (np.zeros(n) + facts.tau_limit_nm).tolist()
         self.goal = [0.0] * n
-        self.ahead = [0.0] * n
+        self.predicted_step = [0.0] * n
         self.low = [0.0] * n
         self.high = [0.0] * n
-        self.change = [0.0] * n
-        self.aligned = [0.0] * n
-        self.F_led, self.F_now, self.v_led, self.E_known = (
-            [0.0] * (n * peers) for _ in range(4)
-        )
-        self.E_moved, self.E_yielded, self.lent, self.E_settled = (
-            [0.0] * (n * peers) for _ in range(4)
-        )
-        self.carried, self.spring, self.force, self.paid = ([0.0] * n for _ in range(4))
+        self.torque_change = [0.0] * n
+        self.alignment_step = [0.0] * n
+        self.F_led = [0.0] * couplings
+        self.F_now = [0.0] * couplings
+        self.v_led = [0.0] * couplings
+        self.E_known = [0.0] * couplings
+        self.E_moved = [0.0] * couplings
+        self.E_yielded = [0.0] * couplings
+        self.lent = [0.0] * couplings
+        self.E_settled = [0.0] * couplings
+        self.left_J = [0.0] * couplings
+        self.carried = [0.0] * n
+        self.spring = [0.0] * n
+        self.force = [0.0] * n
+        self.paid = [0.0] * n
         self.inverse = [0.0] * (n * n)
-        self.left = [0.0] * (n * peers)
 
     def torque(self, now: LawInput) -> None:
-        """Writes the torque; sends torques and energies."""
+        """Writes the torque, and sends torques and energies."""
         n = now.joints
         peers = len(now.peers)
         invert_inertia(self, now)
         for i in range(n):
-            self.change[i] = self.carried[i] - now.tau_before[i]
+            self.torque_change[i] = self.carried[i] - now.tau_before[i]
             self.carried[i] = self.gravity * now.gravity[i]
             self.low[i] = self.beta * (-self.tau_limit[i] - self.carried[i])
             self.high[i] = self.beta * (self.tau_limit[i] - self.carried[i])
-            self.ahead[i] = now.qd[i] * now.h_s
+            self.predicted_step[i] = now.qd[i] * now.h_s
             if now.k > 0:
-                self.ahead[i] += self.ahead[i] - (now.q[i] - now.q_before[i])
-            follow(self, now, i)
-            self.change[i] += self.force[i] / self.beta
+                last_step = now.q[i] - now.q_before[i]
+                self.predicted_step[i] += self.predicted_step[i] - last_step
+            follow_peers(self, now, i)
+            self.torque_change[i] += self.force[i] / self.beta
             for j in range(peers):
+                index = j * n + i
                 observe_leader(self, now, j, i)
-                self.F_now[j * n + i] = self.F_led[j * n + i]
-                self.change[i] -= self.F_now[j * n + i] / self.beta
+                self.F_now[index] = self.F_led[index]
+                self.torque_change[i] -= self.F_now[index] / self.beta
         for _ in range(SWEEPS):
             for i in range(n):
                 for j in range(peers):
-                    lead(self, now, j, i)
+                    limit_leader_torque(self, now, j, i)
         for i in range(n):
             felt = 0.0
             force = self.force[i]
             for j in range(peers):
                 felt += self.F_now[j * n + i]
-            within = max(force - self.high[i], min(force - self.low[i], felt))
-            share = 1.0 if within == felt else within / felt
+            # The part of the felt torque that keeps the joint's torque within its limits.
+            applied = max(force - self.high[i], min(force - self.low[i], felt))
+            share = 1.0 if applied == felt else applied / felt
+            step = now.qd[i] * now.h_s
             for j in range(peers):
-                at = j * n + i
-                self.F_led[at] = share * self.F_now[at]
+                index = j * n + i
+                self.F_led[index] = share * self.F_now[index]
                 if not self.by_step:
-                    now.sent[j].W_led[i] += book(
-                        now=now, j=j, i=i, torque=self.F_led[at], step=now.qd[i] * now.h_s
+                    now.sent[j].W_led[i] += book_leader_work(
+                        now=now, j=j, i=i, torque=self.F_led[index], step=step
                     )
-            now.tau[i] = self.carried[i] + (force - within) / self.beta
+            now.tau[i] = self.carried[i] + (force - applied) / self.beta
 
     def energies(self, seen: LawRecords) -> LawEnergies:
-        """Returns the energies of both ends of all couplings, those of following up to the
-        period before.
+        """Returns the energies of both ends of all couplings.
+
+        Energies of following are those up to the period before.
         """
         gave = []
         took = []
         observed = []
         n = seen.q.shape[1]
         for j, peer in enumerate(seen.peers):
-            came = peer.received
+            received = peer.received
             sent = peer.sent
             followed = np.vstack([np.zeros(n), sent["E_followed"][:-1]])
             gave.append(np.hstack([sent["E_led"], followed]))
             settled = seen.memory["E_settled"][:, j * n : (j + 1) * n]
-            took.append(
-                np.hstack([settled - self.reserve_J, came["E_followed"] - sent["W_led"]])
-            )
+            taken_by_follower = settled - self.reserve_J
+            taken_by_leader = received["E_followed"] - sent["W_led"]
+            took.append(np.hstack([taken_by_follower, taken_by_leader]))
             observed.append(np.hstack([sent["W_led"], sent["W_followed"]]))
-        port = -self.beta * sum_work(seen.tau - seen.memory["carried"], seen.q)
         return LawEnergies(
-            *(gave, took, port, seen.memory["spring"]),
+            gave=gave,
+            took=took,
+            port=-self.beta * sum_work(seen.tau - seen.memory["carried"], seen.q),
+            store=seen.memory["spring"],
             observed=observed,
             weight=self.beta,
             gravity=self.gravity,
         )
 
     def explain_no_linear_form(self) -> str:
-        """Returns why it cannot be linearised."""
+        """Returns why the law cannot be linearised."""
         return (
             "its controllers act by the energy observed, which is of second order in the motion"
         )
 
     def explain_idle_shares(self, at: LawSituation) -> str:  # noqa: ARG002
-        """Returns that a site without K and B follows nobody."""
+        """Returns that a site without K and B follows nobody, or ""."""
         return "" if any(self.K) or any(self.B) else "K = 0 and B = 0 follow nobody"
 
     def condition(self, situation: LawSituation) -> StabilityCondition | None:  # noqa: ARG002
-        """Returns that the couplings are passive, as far as motion can be foretold."""
-        text = f"couplings are passive for any delays, jitter, loss and shares, where {PASSIVE_OUTSIDE}, "
+        """Returns that the couplings are passive as far as motion can be predicted."""
+        text = (
+            "couplings are passive for any delays, jitter, loss and shares, where "
+            f"{PASSIVE_OUTSIDE}, "
+        )
         if self.energy == "velocity":
             return StabilityCondition(True, f"{text}in books that leak tau qdd h^2 / 2 a tick")
-        beyond = (
-            f" beyond {self.acceleration_rad_s2:g} rad/s^2" if self.acceleration_rad_s2 else ""
+        beyond = ""
+        if self.acceleration_rad_s2:
+            beyond = f" beyond {self.acceleration_rad_s2:g} rad/s^2"
+        text += (
+            "while half of reserve_J pays for what other torques change accelerations by in a "
+            f"tick{beyond}"
         )
-        paid = f"while half of reserve_J pays for what other torques change accelerations by in a tick{beyond}"
-        return StabilityCondition(True, f"{text}{paid}")
+        return StabilityCondition(True, text)

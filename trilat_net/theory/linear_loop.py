@@ -26,7 +26,7 @@ from scipy.linalg import block_diag, qr
 from ..core.site_setup import SiteSetup
 from ..core.task_space import POSITION
 from ..core.vectors import Array
-from ..laws.conditions import LinearForm, Place
+from ..laws.conditions import BlockKey, LinearForm
 from . import site_dynamics
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions
@@ -449,7 +449,7 @@ def add_law_forms(
     )
 
 
-_StateBlocks = dict[tuple[int, Place], slice]
+_StateBlocks = dict[tuple[int, BlockKey], slice]
 """The states of each signal of a law, by the site's index and the signal's name."""
 
 
@@ -466,7 +466,7 @@ def _index_form_states(
             blocks[i, kind] = slice(first, first + joints)
         if form is None:
             continue
-        labels: dict[Place, str] = {state: state for state in form.states}
+        labels: dict[BlockKey, str] = {state: state for state in form.states}
         for j in form.list_receivers():
             labels["to", j] = f"to_{conditions.names[j]}_"
         for signal, label in labels.items():
