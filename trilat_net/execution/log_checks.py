@@ -1,7 +1,10 @@
-"""The checks of a log, one line each: complete, executed again, scenario hash, compared with
-virtual time.
+"""Check a log by executing it again: one finding for each check.
 
-Invariant: every claim rests on an execution made just now.
+The checks are: records complete, integrity, user laws, executed again, external arms, scenario
+hash, and comparison with virtual time.
+
+Invariant:
+    - Every finding on an execution rests on an execution made by this process.
 """
 
 import itertools
@@ -20,15 +23,20 @@ from .verify import VerifyResult, verify
 from .virtual_comparison import RecordComparison, compare_with_virtual
 
 MAX_GAPS_NAMED = 60
-"""Gaps that a line names."""
+"""Largest number of gaps that a finding lists."""
 
 
 @dataclass(frozen=True, repr=False)
 class LogCheckReport(CheckReport):
-    """The result of executing a log again, and a finding for that and for every other check.
+    """The findings of all checks of a log.
 
-    It passed if the log is as it was made, enough of it was judged, and every execution agreed
-    with it.
+    The report passes if the log is as it was written, enough records were judged, and every
+    execution agrees with the log.
+
+    Attributes:
+        log: the log.
+        result: the result of executing the log again.
+        findings: one finding per check.
     """
 
     log: Log
@@ -37,20 +45,24 @@ class LogCheckReport(CheckReport):
 
     @property
     def records(self) -> int:
-        """How many records were executed again."""
+        """Number of records that were executed again."""
         return self.result.records
 
     @property
     def identical(self) -> int:
-        """How many of them agree in every computed field."""
+        """Number of executed records that agree with the log in every computed field."""
         return self.result.identical
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat verify --json`: every gap, the first
-        difference.
-        """
+        """Returns plain values, with the keys of `trilat verify --json`."""
         result = self.result
-        first = self.result.first
+        first_difference = None
+        if result.first is not None:
+            first_difference = {
+                **result.first._asdict(),
+                "logged": repr(result.first.logged),
+                "computed": repr(result.first.computed),
+            }
         return {
             "files": list(self.log.sources),
             "passed": self.passed,
@@ -64,19 +76,16 @@ class LogCheckReport(CheckReport):
             "min_coverage": result.min_coverage,
             "judged": result.coverage.to_json(),
             "integrity": result.integrity.state.name.lower(),
-            "gaps": [{"site": site, "first": a, "last": b} for site, a, b in result.gaps],
-            "not_made": [
-                {"site": site, "first": a, "last": b} for site, a, b in result.absences
-            ],
-            "first_difference": None
-            if first is None
-            else {
-                **first._asdict(),
-                "logged": repr(first.logged),
-                "computed": repr(first.computed),
-            },
+            "gaps": list(map(_to_range, result.gaps)),
+            "not_made": list(map(_to_range, result.absences)),
+            "first_difference": first_difference,
             "checks": self.to_rows(),
         }
+
+
+def _to_range(gap: tuple[str, int, int]) -> dict[str, Any]:
+    site, first, last = gap
+    return {"site": site, "first": first, "last": last}
 
 
 def run_log_checks(
@@ -87,26 +96,36 @@ def run_log_checks(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> LogCheckReport:
-    """Executes a log again, and compares it with virtual time if `virtual` is set.
+    """Executes a log again and returns the findings of all checks.
 
-    A log of which too little can be judged fails, though its execution shows nothing wrong.
+    Args:
+        log: the log.
+        virtual: whether the log is also compared with virtual time.
+        progress: called now and then with the amount of work done and the total.
+        min_coverage: smallest share of the ticks of every site that must be judged; a log with
+            a smaller share fails even if all judged records agree.
+        resume_every: see `verify`.
 
     Raises:
         LogError: a record cannot be read.
-        ScenarioError: a user law that may run cannot be made.
+        ScenarioError: a user law that may run cannot be constructed.
     """
     result = verify(log, progress, min_coverage=min_coverage, resume_every=resume_every)
-    return LogCheckReport(
-        log, result, list(_checks(log, result, virtual=virtual, progress=progress))
-    )
+    findings = list(_check_log(log, result, virtual=virtual, progress=progress))
+    return LogCheckReport(log, result, findings)
 
 
 def check_log_files(
     sources: Sequence[str], min_coverage: float, allowed: CodeConsents
 ) -> list[Finding]:
-    """Returns a line per check of a log in files, in a worker where `allowed` laws may run.
+    """Checks a log in files, in a worker process, and returns the findings.
 
-    A user law that cannot be made fails one.
+    A user law that cannot be constructed is a failed finding.
+
+    Args:
+        sources: the files.
+        min_coverage: smallest share of the ticks of every site that must be judged.
+        allowed: the code from outside that may run in this process.
     """
     allowed_code.update(allowed)
     log = open_log(*sources)
@@ -116,19 +135,19 @@ def check_log_files(
         return [Finding("executed again", f"cannot be: {error}", False)]
 
 
-def _checks(
+def _check_log(
     log: Log, result: VerifyResult, *, virtual: bool, progress: Progress | None
 ) -> Iterator[Finding]:
-    # of an open-loop rerun
+    # the recorded sites of an open-loop rerun
     others = [name for name in log.sites if name not in log.executed_sites]
-    recorded = (
-        f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}" if others else ""
-    )
-    yield _records_line(log, result)
+    recorded = ""
+    if others:
+        recorded = f"{' and '.join(others)} {'stand' if len(others) > 1 else 'stands'}"
+    yield _check_coverage(log, result)
     yield Finding("integrity", result.integrity.text, result.integrity.passed)
     for law in find_user_laws(log.scenario):
         yield Finding("user law", str(law), law.allowed, law.allowed)
-    yield _verify_line(result, recorded)
+    yield _check_execution(result, recorded)
     if log.scenario.external:
         arms = " and ".join(log.scenario.external)
         yield Finding(
@@ -140,43 +159,55 @@ def _checks(
         yield Finding(
             "scenario", "is not the one whose hash the log names: it was changed", False
         )
-    if virtual and result.withheld:
-        why = f"the law of {' and '.join(result.withheld)} may not run"
-        yield Finding("virtual time", f"not compared: {why}", False, judged=False)
-    elif virtual and recorded:
+    if not virtual:
+        return
+    if result.withheld:
+        reason = f"the law of {' and '.join(result.withheld)} may not run"
+        yield Finding("virtual time", f"not compared: {reason}", False, judged=False)
+    elif recorded:
         yield Finding(
             "virtual time", f"is another run: {recorded} as recorded, and did not react", True
         )
-    elif virtual and log.absences:
-        away = " and ".join(log.absences)
+    elif log.absences:
+        sites = " and ".join(log.absences)
         yield Finding(
-            "virtual time", f"is another run: {away} left, or came while it ran", True
+            "virtual time", f"is another run: {sites} left, or came while it ran", True
         )
-    elif virtual:
-        twins = compare_with_virtual(log, progress)
-        # what arrived there is unknown
-        gap = min((first for _, first, _ in result.gaps), default=None)
-        yield _virtual_line("virtual time fed with the log's arrivals", twins.fed, gap)
-        why = "a link was measured, not modelled" if log.scenario.measured else ""
-        why = "an arm was external" if log.scenario.external else why
-        if why and log.driver != "virtual":
-            yield Finding("plain virtual time", f"is another run: {why}", True)
-            return
-        late = twins.late
-        gone = twins.lost
-        came = f"{count_nouns(len(late), 'late sample')}" + (
-            f", the first: {late[0]}" if late else ""
-        )
-        lost = f"; {len(gone)} lost on the way, the first: {gone[0]}" if gone else ""
-        yield _virtual_line(
-            f"plain virtual time ({came}{lost})", twins.plain, twins.excused_from
-        )
+    else:
+        yield from _check_virtual_time(log, result, progress)
 
 
-def _records_line(log: Log, result: VerifyResult) -> Finding:
-    have = sum(len(log[name]) for name in result.coverage.expected)
+def _check_virtual_time(
+    log: Log, result: VerifyResult, progress: Progress | None
+) -> Iterator[Finding]:
+    comparison = compare_with_virtual(log, progress)
+    # the arrivals in a gap are unknown, so a difference after it is excused
+    first_gap = min((first for _, first, _ in result.gaps), default=None)
+    label = "virtual time fed with the log's arrivals"
+    yield _check_comparison(label, comparison.fed, first_gap)
+    reason = ""
+    if log.scenario.external:
+        reason = "an arm was external"
+    elif log.scenario.measured:
+        reason = "a link was measured, not modelled"
+    if reason and log.driver != "virtual":
+        yield Finding("plain virtual time", f"is another run: {reason}", True)
+        return
+    late = comparison.late
+    lost = comparison.lost
+    absent = count_nouns(len(late), "late sample")
+    if late:
+        absent += f", the first: {late[0]}"
+    if lost:
+        absent += f"; {len(lost)} lost on the way, the first: {lost[0]}"
+    label = f"plain virtual time ({absent})"
+    yield _check_comparison(label, comparison.plain, comparison.excused_from)
+
+
+def _check_coverage(log: Log, result: VerifyResult) -> Finding:
     coverage = result.coverage
-    text = f"{have}/{sum(coverage.expected.values())} in the file"
+    in_file = sum(len(log[name]) for name in coverage.expected)
+    text = f"{in_file}/{sum(coverage.expected.values())} in the file"
     text += f"; {coverage.describe(result.min_coverage)}" if coverage.expected else ""
     text += f"; {', '.join(result.withheld)} not judged" if result.withheld else ""
     if log.unknown_ends:
@@ -185,23 +216,19 @@ def _records_line(log: Log, result: VerifyResult) -> Finding:
         text += f"; damaged in {len(log.damaged)} place{'s' * (len(log.damaged) > 1)}"
     elif not log.complete:
         text += "; the file was not finished"
-    passed = (
-        not coverage.expected or coverage.share >= result.min_coverage
-    ) and not log.damaged
-    return Finding("records", text, passed)
+    enough = not coverage.expected or coverage.share >= result.min_coverage
+    return Finding("records", text, enough and not log.damaged)
 
 
-def _verify_line(result: VerifyResult, recorded: str) -> Finding:
-    how = (
-        "whole runs, bit for bit"
-        if result.whole_run
-        else "tick by tick to 1e-9: another platform made it"
-    )
-    text = f"{result.identical}/{count_nouns(result.records, 'record')} identical ({how})"
+def _check_execution(result: VerifyResult, recorded: str) -> Finding:
+    method = "tick by tick to 1e-9: another platform made it"
+    if result.whole_run:
+        method = "whole runs, bit for bit"
+    text = f"{result.identical}/{count_nouns(result.records, 'record')} identical ({method})"
     if result.gaps:
-        text += f"; no records of {_gaps_text(result.gaps)}"
+        text += f"; no records of {_describe_gaps(result.gaps)}"
     if result.absences:
-        text += f"; not made, between two starts: {_gaps_text(result.absences)}"
+        text += f"; not made, between two starts: {_describe_gaps(result.absences)}"
     if recorded:
         text += f"; {recorded} as recorded"
         if result.coverage.share < result.min_coverage:
@@ -215,22 +242,25 @@ def _verify_line(result: VerifyResult, recorded: str) -> Finding:
     return Finding("executed again", text, result.agreed)
 
 
-def _gaps_text(gaps: Sequence[tuple[str, int, int]]) -> str:
+def _describe_gaps(gaps: Sequence[tuple[str, int, int]]) -> str:
+    """Returns the ranges of ticks of each site, `MAX_GAPS_NAMED` of them at most."""
     texts = []
-    left = MAX_GAPS_NAMED
+    remaining = MAX_GAPS_NAMED
     for site, group in itertools.groupby(gaps, key=lambda gap: gap[0]):
         ranges = [f"{first}-{last}" if last > first else f"{first}" for _, first, last in group]
-        if left > 0:
-            texts.append(f"{site} {', '.join(ranges[:left])}")
-        left -= len(ranges)
-    more = f" and {count_nouns(-left, 'more range')}, which --json names" if left < 0 else ""
-    return "; ".join(texts) + more
+        if remaining > 0:
+            texts.append(f"{site} {', '.join(ranges[:remaining])}")
+        remaining -= len(ranges)
+    text = "; ".join(texts)
+    if remaining < 0:
+        text += f" and {count_nouns(-remaining, 'more range')}, which --json names"
+    return text
 
 
-def _virtual_line(
+def _check_comparison(
     label: str, comparison: RecordComparison, excused_from: int | None
 ) -> Finding:
-    """Excuses a difference only from the tick at which the first late or lost sample was due."""
+    """Returns the finding of a comparison; a difference at or after `excused_from` passes."""
     first = comparison.first
     text = f"{comparison.identical}/{count_nouns(comparison.records, 'record')} identical"
     if first is None:

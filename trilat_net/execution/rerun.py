@@ -1,16 +1,19 @@
-"""What-if on a log: executes one or more sites again with changed settings and compares them
-with the log.
+"""Execute sites of a log again with changed settings and compare the result with the log.
 
-    again = rerun("run.mcap", replace=["s"], set={"control.Kd": 5})
-    again.sites["s"].error_rms_rad, again.after["s"].q
+    result = rerun("run.mcap", replace=["s"], set={"control.Kd": 5})
+    result.sites["s"].error_rms_rad, result.after["s"].q
 
-Invariants: in open loop the recorded sites do not react; in closed loop every site is executed
-over the network of the log. Without changes both give the log, bit for bit. Both sides of every
-figure cover the same instants: records of the log that the rerun executed too.
+In open loop only the replaced sites are executed, and the recorded sites do not react to them.
+In closed loop every site is executed, over the network that the log recorded.
+
+Invariant:
+    - Without changes, open loop and closed loop both reproduce the log, bit for bit.
+    - Both values of a figure, in the log and in the rerun, cover the same instants: those at
+      which the log has a record and the rerun executed a tick.
 """
 
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from heapq import merge
@@ -49,36 +52,39 @@ from .rerun_execution import (
 )
 from .resumption import read_output
 from .verify import RecordDifference
-from .virtual import SiteChannels, SiteEntry, describe_accounts
+from .virtual import SiteChannels, SiteEntry, render_accounts
 
 
 class LogAndRerun(NamedTuple):
-    """One figure in the log and in the rerun."""
+    """One figure: its value in the log (`before`) and its value in the rerun (`after`)."""
 
     before: float
     after: float
 
 
 class SiteEffect(NamedTuple):
-    """The effect of a rerun on one site. Figures are None if nothing could be compared.
+    """The effect of a rerun on one site. Figures are None if no instant could be compared.
 
     Attributes:
-        executed: executed ticks.
-        compared: of those, the ones at whose time the log has a record.
-        identical: of those, the ones of which every computed field has the same bits (with
-            changes: except the CRC of the arrivals).
-        stands: records of the log that stand, since too little is known to execute them.
-        assumed: executed ticks without a record: their arrivals are assumed.
-        lacking: samples that arrived and are not in the log.
-        first: the first difference, or None; also None if rates changed.
-        diverged_at_s: time at which it left its limits, or None.
-        q_rms_rad: root mean square of q minus q in the log, of the joint for which it is
-            largest.
-        q_max_rad: the largest such difference.
-        q_max_at_s: its time.
-        error_rms_rad: root mean square of e, Eq. (9), of the joint for which it is largest.
-        error_max_rad: largest |e|.
-        torque_max_nm: largest |tau|, Eq. (13).
+        site: name of the site.
+        executed: number of executed ticks.
+        compared: number of executed ticks at whose time the log has a record.
+        identical: number of compared ticks whose computed fields all have the bits of the
+            record. With changed settings the CRC of the arrivals is not compared.
+        stands: number of records that are kept as they are, because the log does not hold
+            enough to execute their ticks.
+        assumed: number of executed ticks without a record, whose arrivals are assumed.
+        lacking: number of samples that arrived and whose content is not in the log.
+        first: the first difference from the log; None if there is no difference or if rates
+            changed.
+        diverged_at_s: time at which the site left its limits, s; None if it did not.
+        q_rms_rad: root mean square of q minus the logged q, of the joint with the largest
+            value, rad.
+        q_max_rad: largest |q minus the logged q| of any joint, rad.
+        q_max_at_s: time of that largest difference, s.
+        error_rms_rad: root mean square of e, Eq. (9), of the joint with the largest value, rad.
+        error_max_rad: largest |e| of any joint, rad.
+        torque_max_nm: largest |tau| of any joint, Eq. (13), N m.
     """
 
     site: str
@@ -99,11 +105,14 @@ class SiteEffect(NamedTuple):
 
 
 class LinkEffect(NamedTuple):
-    """Age of the sample in use on one link of an executed site, over the ticks at which both
-    had one.
+    """The effect of a rerun on one link: the age of the sample that the receiver uses.
+
+    Ages cover the ticks at which a sample is in use both in the log and in the rerun.
 
     Attributes:
-        link: as in "m1->s".
+        link: name of the link, as in "m1->s".
+        age_mean_ms: mean age, ms.
+        age_max_ms: largest age, ms.
     """
 
     link: str
@@ -112,101 +121,139 @@ class LinkEffect(NamedTuple):
 
     @property
     def differs(self) -> bool:
-        """True if samples had another age than in the log."""
+        """True if the ages of samples differ from those in the log."""
         return any(pair.before != pair.after for pair in (self.age_mean_ms, self.age_max_ms))
+
+
+class _CommonRecords(NamedTuple):
+    """The records of a site in a log and in its rerun, paired by their times.
+
+    Attributes:
+        before: the records of the log.
+        after: the records of the rerun.
+        before_rows: rows of `before` whose time `after` has as well, shape (K,).
+        after_rows: the rows of `after` of the same times, shape (K,).
+    """
+
+    before: SiteLog
+    after: SiteLog
+    before_rows: Ints
+    after_rows: Ints
+
+    def compare(self, figure: Callable[[Array], float], field: str) -> LogAndRerun:
+        """Returns a figure of a field of the paired records, in the log and in the rerun."""
+        before = figure(getattr(self.before, field)[self.before_rows])
+        after = figure(getattr(self.after, field)[self.after_rows])
+        return LogAndRerun(before, after)
 
 
 def compare_site_rerun(
     log: Log, request: RerunRequest, site: RerunSite, ticks: Sequence[RerunTick]
 ) -> tuple[SiteEffect, list[LinkEffect]]:
-    """Returns the effect of a rerun on a site after its last tick, and on the links on which it
-    receives.
+    """Returns the effect of a rerun on a site and on the links over which it receives.
+
+    Args:
+        log: the log.
+        request: the rerun.
+        site: the executed site, after its last tick.
+        ticks: the ticks of that site.
     """
-    before = log[site.name]
     executed = [tick for tick in ticks if not tick.kept]
-    rate_hz = request.scenario.sites[site.name].rate_hz
-    payloads = [tick.payload for tick in executed]
-    layout = request.scenario.layout(site.name)
-    axes = request.scenario.arms[site.name].axes
-    after = SiteLog(
-        name=site.name,
-        peers=before.peers,
-        rate_hz=rate_hz,
-        payloads=payloads,
-        source="rerun",
-        layout=layout,
-        axes=axes,
-    )
-    _, rows, rows_here = np.intersect1d(before.t_ns, after.t_ns, return_indices=True)
-    last = executed[-1] if executed else None
+    records = _pair_records(log, request, site.name, executed)
+    diverged_at_s = None
+    if executed and executed[-1].mode is Mode.DIVERGED:
+        diverged_at_s = executed[-1].t_ns / NS_PER_S
     effect = SiteEffect(
         site.name,
         executed=len(executed),
-        compared=len(rows),
+        compared=len(records.before_rows),
         identical=sum(tick.same for tick in executed),
         stands=len(ticks) - len(executed),
         assumed=sum(tick.tick in site.deliveries.unrecorded for tick in executed),
         lacking=site.lacking,
         first=site.first,
-        diverged_at_s=last.t_ns / NS_PER_S
-        if last is not None and last.mode is Mode.DIVERGED
-        else None,
+        diverged_at_s=diverged_at_s,
     )
-    if not len(rows):
+    if not len(records.before_rows):
         return effect, []
-    links = _compare_links(
-        log=log, request=request, before=before, after=after, rows=rows, rows_here=rows_here
-    )
+    links = _compare_links(log, request, records)
     with np.errstate(over="ignore"):  # a damaged log holds any finite numbers
-        moved = after.q[rows_here] - before.q[rows]
-        place = int(np.abs(moved).max(axis=1).argmax())
-        errors = (before.e[rows], after.e[rows_here])
-        torques = (before.tau[rows], after.tau[rows_here])
-        return effect._replace(
-            q_rms_rad=_rms(moved),
-            q_max_rad=_largest(moved),
-            q_max_at_s=float(before.t_s[rows[place]]),
-            error_rms_rad=LogAndRerun(*map(_rms, errors)),
-            error_max_rad=LogAndRerun(*map(_largest, errors)),
-            torque_max_nm=LogAndRerun(*map(_largest, torques)),
-        ), links
+        before_q = records.before.q[records.before_rows]
+        after_q = records.after.q[records.after_rows]
+        differences = after_q - before_q
+        largest = int(np.abs(differences).max(axis=1).argmax())
+        effect = effect._replace(
+            q_rms_rad=_compute_rms(differences),
+            q_max_rad=_find_largest(differences),
+            q_max_at_s=float(records.before.t_s[records.before_rows[largest]]),
+            error_rms_rad=records.compare(_compute_rms, "e"),
+            error_max_rad=records.compare(_find_largest, "e"),
+            torque_max_nm=records.compare(_find_largest, "tau"),
+        )
+    return effect, links
 
 
-def _rms(values: Array) -> float:
-    largest = _largest(values)
+def _pair_records(
+    log: Log, request: RerunRequest, name: str, executed: Sequence[RerunTick]
+) -> _CommonRecords:
+    before = log[name]
+    after = SiteLog(
+        name=name,
+        peers=before.peers,
+        rate_hz=request.scenario.sites[name].rate_hz,
+        payloads=[tick.payload for tick in executed],
+        source="rerun",
+        layout=request.scenario.layout(name),
+        axes=request.scenario.arms[name].axes,
+    )
+    _, before_rows, after_rows = np.intersect1d(before.t_ns, after.t_ns, return_indices=True)
+    return _CommonRecords(before, after, before_rows, after_rows)
+
+
+def _compute_rms(values: Array) -> float:
+    """Returns the root mean square of the column for which it is largest; `values` (K, n)."""
+    largest = _find_largest(values)
     if not 0.0 < largest < np.inf:
         return largest
-    return largest * float(np.sqrt(np.mean(np.square(values / largest), axis=0)).max())
+    # scaled by the largest value, so that no square overflows
+    mean_squares = np.mean(np.square(values / largest), axis=0)
+    return largest * float(np.sqrt(mean_squares).max())
 
 
-def _largest(values: Array) -> float:
+def _find_largest(values: Array) -> float:
     return float(np.abs(values).max())
 
 
 def _compare_links(
-    log: Log,
-    request: RerunRequest,
-    before: SiteLog,
-    after: SiteLog,
-    rows: Ints,
-    rows_here: Ints,
+    log: Log, request: RerunRequest, records: _CommonRecords
 ) -> list[LinkEffect]:
-    found = []
-    for peer in before.peers:
-        before_ms = 1e3 * before.age_s(peer, log.scenario.sites[peer].rate_hz)[rows]
-        after_ms = 1e3 * after.age_s(peer, request.scenario.sites[peer].rate_hz)[rows_here]
-        both = ~(np.isnan(before_ms) | np.isnan(after_ms))
-        if both.any():
-            mean = LogAndRerun(float(before_ms[both].mean()), float(after_ms[both].mean()))
-            largest = LogAndRerun(float(before_ms[both].max()), float(after_ms[both].max()))
-            found.append(LinkEffect(f"{peer}->{before.name}", mean, largest))
-    return found
+    effects = []
+    for peer in records.before.peers:
+        before_hz = log.scenario.sites[peer].rate_hz
+        after_hz = request.scenario.sites[peer].rate_hz
+        before_ms = 1e3 * records.before.age_s(peer, before_hz)[records.before_rows]
+        after_ms = 1e3 * records.after.age_s(peer, after_hz)[records.after_rows]
+        known = ~(np.isnan(before_ms) | np.isnan(after_ms))
+        if not known.any():
+            continue
+        before_ms = before_ms[known]
+        after_ms = after_ms[known]
+        mean = LogAndRerun(float(before_ms.mean()), float(after_ms.mean()))
+        largest = LogAndRerun(float(before_ms.max()), float(after_ms.max()))
+        effects.append(LinkEffect(f"{peer}->{records.before.name}", mean, largest))
+    return effects
 
 
 @dataclass(frozen=True, repr=False)
 class Rerun(Result):
-    """A log and its rerun: every executed tick, and the effects per executed site and per link
-    to it.
+    """A log and its rerun.
+
+    Attributes:
+        before: the log.
+        request: the sites that were executed, with which changes.
+        ticks: every tick of every executed site, in the order of execution.
+        sites: the effect on each executed site, by name.
+        links: the effect on each link to an executed site, by the name of the link.
     """
 
     before: Log
@@ -216,76 +263,79 @@ class Rerun(Result):
     links: dict[str, LinkEffect]
 
     def headline(self) -> str:
-        """Returns what was executed with which changes, in one line."""
-        changed = "; ".join(describe_rerun_changes(self.request)) or "nothing changed"
+        """Returns the mode of the rerun, its executed sites and its changes in one line."""
+        changes = "; ".join(describe_rerun_changes(self.request)) or "nothing changed"
         executed = f"{self.request.mode}, {', '.join(self.request.replaced)} executed"
-        return f"{self.before.source}: {executed}, {changed}"
+        return f"{self.before.source}: {executed}, {changes}"
 
     @cached_property
     def after(self) -> Log:
-        """The rerun as a log: the executed sites, and the others as recorded."""
+        """The rerun as a log: the executed sites as computed, other sites as recorded."""
         stream = io.BytesIO()
         self.write(stream)
         stream.seek(0)
         return open_log(stream)
 
     def write(self, stream: Sink, views_hz: float = 0.0) -> None:
-        """Writes the rerun as a log into a stream, which stays open; see `LogWriter` for the
-        views.
+        """Writes the rerun as a log into a stream, which stays open.
 
-        Executed sites are written anew, recorded sites byte for byte. The file names its source
-        log by SHA-256, the executed sites and the changes; its scenario is the one that holds
-        in it. Executed sites have no measured values (timing, round trips).
+        Executed sites are written as they were computed, without measured values (timing, round
+        trips). Recorded sites are copied byte for byte. The file names its source log by its
+        SHA-256, the executed sites and the changes. The scenario in the file is that of the
+        rerun.
+
+        Args:
+            stream: where the log is written.
+            views_hz: rate of the standard channels for viewers, Hz, see `LogWriter`.
 
         Raises:
-            LogError: the log's epoch is no time.
-            LogRefused: the disk refused.
+            LogError: the epoch that the log states is not a time.
+            LogRefused: the disk refused to store the log.
         """
         log = self.before
         request = self.request
         session = log.session["session"]
-        epoch = log.session.get("epoch_unix_ns", "0")
-        if not epoch.isdecimal() or (epoch_unix_ns := int(epoch)) > MAX_TIME_NS:
-            raise LogError(f"{log.source}: its epoch_unix_ns is no time: {epoch[:40]!r}")
-        metadata = rerun_metadata(log, request)
+        epoch_unix_ns = _parse_epoch(log)
         writer = LogWriter(
             stream=stream,
             scenario=request.scenario,
             session=session,
             driver=RERUN_DRIVER,
             epoch_unix_ns=epoch_unix_ns,
-            facts=metadata,
+            facts=collect_rerun_metadata(log, request),
             views_hz=views_hz,
         )
-        channels = {}
+        channels: dict[str, SiteChannels] = {}
         entries = []
         for name in log.sites:
             boot = log[name].states[0].boot if len(log[name]) else 0
-            own = channels[name] = SiteChannels(request.scenario, session, name, boot)
+            channels[name] = SiteChannels(request.scenario, session, name, boot)
             if name in request.recorded:
-                entries.append(_copy_recorded(log, name, own))
+                entries.append(_copy_recorded(log, name, channels[name]))
             else:
-                entries.append(
-                    _encode_executed([tick for tick in self.ticks if tick.site == name], own)
-                )
+                site_ticks = [tick for tick in self.ticks if tick.site == name]
+                entries.append(_make_executed_entries(site_ticks, channels[name]))
         for entry in merge(*entries, key=lambda entry: entry.t_ns):
             channels[entry.site].write(entry, writer, epoch_unix_ns)
-        writer.finish(describe_accounts(channels.values()))
+        writer.finish(render_accounts(channels.values()))
 
     def save(self, path: Path, *, force: bool = False) -> None:
-        """Writes the rerun as a log with standard channels into a file; `force` lets it replace
-        one.
+        """Writes the rerun, with the standard channels for viewers, as a log into a file.
+
+        Args:
+            path: the file.
+            force: whether an existing file is replaced.
 
         Raises:
-            UsageError: the file exists, or cannot be made.
-            LogRefused: the disk refused.
+            UsageError: the file exists, or cannot be created.
+            LogRefused: the disk refused to store the log.
         """
         with LogFile(path, force=force) as stream:
             self.write(stream, VIZ_HZ)
 
     @property
     def diverged(self) -> bool:
-        """True if a site left its limits that had not left them in the log."""
+        """True if a site left its limits in the rerun that had not left them in the log."""
         return any(
             effect.diverged_at_s is not None and self.before[name].states[-1].mode != "diverged"
             for name, effect in self.sites.items()
@@ -298,14 +348,19 @@ class Rerun(Result):
 
     @property
     def broken(self) -> bool:
-        """True if the rerun must equal the log, bit for bit, and does not."""
+        """True if the rerun differs from the log although it must equal it, bit for bit.
+
+        It must if the log is of this platform, nothing was changed, and no executed site is a
+        recorded site of an earlier rerun.
+        """
         same_platform = self.before.session.get("fingerprint") == compute_fingerprint()
-        whole = set(self.request.replaced) <= set(self.before.executed_sites)
-        return same_platform and whole and not self.request.changes and not self.identical
+        executable = set(self.request.replaced) <= set(self.before.executed_sites)
+        must_equal = same_platform and executable and not self.request.changes
+        return must_equal and not self.identical
 
     @property
     def notes(self) -> list[str]:
-        """Limits of the answer, a sentence each."""
+        """Limits of the result, a sentence each."""
         return list(_describe_limits(self))
 
     def to_rows(self) -> list[dict[str, Any]]:
@@ -313,18 +368,18 @@ class Rerun(Result):
         return list(self.to_dict()["sites"].values())
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the keys of `trilat rerun --json`; they end in their unit."""
+        """Returns plain values, with the keys of `trilat rerun --json`, which end in a unit."""
         return {
             "log": self.before.source,
             "mode": self.request.mode,
             "replaced": list(self.request.replaced),
             "recorded": list(self.request.recorded),
-            "changes": [changed._asdict() for changed in self.request.changes],
-            "without_effect": [changed.key for changed in self.request.without_effect],
+            "changes": [change._asdict() for change in self.request.changes],
+            "without_effect": [change.key for change in self.request.without_effect],
             "identical": self.identical,
             "diverged": self.diverged,
-            "sites": {name: _nest(effect) for name, effect in self.sites.items()},
-            "links": {name: _nest(effect) for name, effect in self.links.items()},
+            "sites": {name: _to_plain_value(effect) for name, effect in self.sites.items()},
+            "links": {name: _to_plain_value(effect) for name, effect in self.links.items()},
             "notes": self.notes,
         }
 
@@ -337,24 +392,24 @@ def rerun(
     closed_loop: bool = False,
     progress: Progress | None = None,
 ) -> Rerun:
-    """Executes sites of a log again and compares them with it; the command is `trilat rerun`.
+    """Executes sites of a log again and compares them with it, as `trilat rerun` does.
 
-    >>> again = tn.rerun(tn.simulate("two_sites", duration_s=0.1), ["s"], {"control.Kd": 5})
-    >>> again.identical
+    >>> result = tn.rerun(tn.simulate("two_sites", duration_s=0.1), ["s"], {"control.Kd": 5})
+    >>> result.identical
     False
 
     Args:
         log: the log, or its path.
-        replace: the sites to execute; the others stay as recorded and do not react.
-        set: their changes, as in `{"control.Kd": 5}`.
-        closed_loop: executes all sites.
-        progress: called now and then with the ticks done and the most there will be.
+        replace: the sites to execute; all other sites stay as recorded and do not react.
+        set: changes of settings of these sites, as in `{"control.Kd": 5}`.
+        closed_loop: whether all sites are executed.
+        progress: called now and then with the number of executed ticks and an upper bound of
+            their total.
 
     Raises:
-        LogError: the log cannot be read, or does not tell enough.
-        UsageError: the sites are not named, or in two ways.
-        ScenarioError: there is no such site, or an override is not valid or cannot have an
-            effect.
+        LogError: the log cannot be read, or does not hold enough to execute the sites.
+        UsageError: the sites are not named, or are named in two ways.
+        ScenarioError: there is no such site, or a change is not valid or cannot have an effect.
         CodeWithheld: the law of an executed site is code from outside that may not run.
     """
     before = log if isinstance(log, Log) else open_log(log)
@@ -366,15 +421,23 @@ def rerun(
         execution = RerunExecution(before, request)
         ticks = list(execution.run(progress))
         for name, site in execution.sites.items():
-            own = [tick for tick in ticks if tick.site == name]
-            sites[name], over = compare_site_rerun(before, request, site, own)
-            links |= {link.link: link for link in over}
+            site_ticks = [tick for tick in ticks if tick.site == name]
+            sites[name], effects = compare_site_rerun(before, request, site, site_ticks)
+            links.update({effect.link: effect for effect in effects})
     return Rerun(before, request, ticks, sites, links)
 
 
-def rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
-    """Returns the session metadata that name the source log and the changes."""
-    files = filter(Path.is_file, map(Path, log.sources))  # a log in memory has none
+def _parse_epoch(log: Log) -> int:
+    """Returns the Unix time of tick 0 that a log states, ns."""
+    text = log.session.get("epoch_unix_ns", "0")
+    if not text.isdecimal() or int(text) > MAX_TIME_NS:
+        raise LogError(f"{log.source}: its epoch_unix_ns is no time: {text[:40]!r}")
+    return int(text)
+
+
+def collect_rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
+    """Returns the session metadata that name the source log, the executed sites and changes."""
+    files = filter(Path.is_file, map(Path, log.sources))  # a log in memory has no file
     digests = {path: digest_file(path) for path in files}
     return {
         "rerun_mode": request.mode,
@@ -387,86 +450,107 @@ def rerun_metadata(log: Log, request: RerunRequest) -> dict[str, str]:
 
 
 def _copy_recorded(log: Log, name: str, channels: SiteChannels) -> Iterator[SiteEntry]:
+    """Yields the entries of a recorded site, in order of time."""
     part = log[name]
     events = [event for event in log.events if event.member == name]
-    events.sort(key=lambda event: event.t_ns)  # those before the epoch come first
-    return merge(
-        (
-            channels.record(state, payload)
-            for state, payload in zip(part.states, part.payloads, strict=True)
-        ),
-        (channels.stats(stats) for stats in log.link_stats(name)),
-        (channels.event(event, n) for n, event in enumerate(events)),
-        key=lambda entry: entry.t_ns,
+    events.sort(key=lambda event: event.t_ns)  # events before the epoch come first
+    record_entries = (
+        channels.make_record_entry(state, payload)
+        for state, payload in zip(part.states, part.payloads, strict=True)
     )
+    stats_entries = map(channels.make_stats_entry, log.link_stats(name))
+    event_entries = (
+        channels.make_event_entry(event, number) for number, event in enumerate(events)
+    )
+    return merge(record_entries, stats_entries, event_entries, key=lambda entry: entry.t_ns)
 
 
-def _encode_executed(ticks: Sequence[RerunTick], channels: SiteChannels) -> Iterator[SiteEntry]:
+def _make_executed_entries(
+    ticks: Sequence[RerunTick], channels: SiteChannels
+) -> Iterator[SiteEntry]:
+    """Yields the entries of an executed site, in order of time."""
     for tick in ticks:
         state = decode(tick.payload, State, READABLE)
-        yield channels.record(state, tick.payload)
-        yield from channels.follow(read_output(state, channels.peers), tick.stats)
-    yield channels.end()
+        yield channels.make_record_entry(state, tick.payload)
+        output = read_output(state, channels.peers)
+        yield from channels.make_tick_entries(output, tick.stats)
+    yield channels.make_end_entry()
 
 
-def _nest(value: Any) -> Any:
-    """Returns a value for JSON: every tuple with names spelt out, and every number beyond JSON
-    as None.
-    """
+def _to_plain_value(value: Any) -> Any:
+    """Returns a value for JSON: named tuples as dicts, infinite numbers and NaN as None."""
     if hasattr(value, "_asdict"):
-        return {key: _nest(one) for key, one in value._asdict().items()}
+        return {key: _to_plain_value(item) for key, item in value._asdict().items()}
     return finite_or_none(value) if isinstance(value, float) else value
 
 
-def _describe_limits(again: Rerun) -> Iterator[str]:
-    log = again.before
-    request = again.request
+def _describe_limits(result: Rerun) -> Iterator[str]:
+    """Yields sentences on what the result of a rerun does not cover."""
+    log = result.before
+    request = result.request
     if request.recorded and request.changes:
         sites = " and ".join(request.recorded)
         are, do = ("are", "they do") if len(request.recorded) > 1 else ("is", "it does")
         yield f"{sites} {are} as recorded: nothing is changed there, and {do} not react"
-    if others := [name for name in request.replaced if name not in log.executed_sites]:
-        yield f"this file is a rerun itself: its {', '.join(others)} met samples that are not in it"
-    foreign = log.session.get("fingerprint") != compute_fingerprint()
-    if foreign and not request.changes and not again.identical:
-        yield "the log was made with another platform's arithmetic: equal bits cannot be expected"
+    foreign_sites = [name for name in request.replaced if name not in log.executed_sites]
+    if foreign_sites:
+        yield (
+            f"this file is a rerun itself: its {', '.join(foreign_sites)} received samples "
+            "that are not in it"
+        )
+    other_platform = log.session.get("fingerprint") != compute_fingerprint()
+    if other_platform and not request.changes and not result.identical:
+        yield (
+            "the log was made with another platform's arithmetic: equal bits cannot be expected"
+        )
     if not log.complete:
         yield "the log was not finished: it is executed as far as it goes"
     for law in find_user_laws(request.scenario):
         if law.changed and any(site in request.replaced for site in law.sites):
             yield f"executed as its file is now: {law}"
-    yield from _describe_later_changes(again)
-    for effect in again.sites.values():
-        name = effect.site
-        if effect.stands:
-            kept = count_nouns(
-                effect.stands, "record stands as it is", "records stand as they are"
-            )
-            yield f"{name}: {kept}: too little is known to execute more"
-        if effect.assumed:
-            unknown = count_nouns(effect.assumed, "tick has", "ticks have")
-            yield f"{name}: {unknown} no record in the log: the arrivals are assumed"
-        if away := again.before.absent_ticks(name):
-            yield f"{name}: {away} of them it did not make: it was away, and is executed as if it were not"
-        if effect.lacking:
-            lost = count_nouns(
-                effect.lacking, "sample that arrived is", "samples that arrived are"
-            )
-            yield f"{name}: {lost} not in the log: executed without"
-        if not effect.executed:
-            yield f"{name}: nothing could be executed"
+    yield from _describe_later_changes(result)
+    for effect in result.sites.values():
+        yield from _describe_site_limits(effect, log.absent_ticks(effect.site))
 
 
-def _describe_later_changes(again: Rerun) -> Iterator[str]:
-    keys = [changed.key for changed in again.request.changes]
-    during = [change.link or change.dominance for change in again.request.scenario.timeline]
-    for name in again.request.replaced:
-        for commands in again.before.commands(name).values():
+def _describe_site_limits(effect: SiteEffect, absent_ticks: int) -> Iterator[str]:
+    name = effect.site
+    if effect.stands:
+        kept = count_nouns(effect.stands, "record stands as it is", "records stand as they are")
+        yield f"{name}: {kept}: too little is known to execute more"
+    if effect.assumed:
+        unknown = count_nouns(effect.assumed, "tick has", "ticks have")
+        yield f"{name}: {unknown} no record in the log: the arrivals are assumed"
+    if absent_ticks:
+        ticks = count_nouns(absent_ticks, "tick")
+        yield (
+            f"{name}: {ticks} of the run it did not make, because it was away; they are "
+            "executed as if it had been there"
+        )
+    if effect.lacking:
+        lost = count_nouns(effect.lacking, "sample that arrived is", "samples that arrived are")
+        yield f"{name}: {lost} not in the log: executed without"
+    if not effect.executed:
+        yield f"{name}: nothing could be executed"
+
+
+def _describe_later_changes(result: Rerun) -> Iterator[str]:
+    """Yields sentences on changed links and shares that change again during the run."""
+    keys = [change.key for change in result.request.changes]
+    owners = [change.link or change.dominance for change in result.request.scenario.timeline]
+    for name in result.request.replaced:
+        for commands in result.before.commands(name).values():
             for command in commands:
-                peer = again.before[name].peers[command.peer]
-                if command.order is None:
-                    during.append(name if command.peer < 0 else f"{peer}->{name}")
-    for owner in dict.fromkeys(during):
+                if command.order is not None:
+                    continue
+                if command.peer < 0:
+                    owners.append(name)
+                else:
+                    owners.append(f"{result.before[name].peers[command.peer]}->{name}")
+    for owner in dict.fromkeys(owners):
         prefix = f"links.{owner}." if "->" in owner else f"dominance.{owner}."
         if any(key.startswith(prefix) for key in keys):
-            yield f"{owner} changes during the run, in the log as here: from then on that holds"
+            yield (
+                f"{owner} changes during the run, in the log and in the rerun: from that "
+                "change on the setting of the run holds"
+            )

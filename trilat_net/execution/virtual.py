@@ -1,11 +1,15 @@
-"""The virtual-time driver: a counter in place of the clock, a simulated network in place of the
-bus.
+"""Run a scenario in virtual time: without clocks, processes or a real network.
 
-Invariant: sites advance by `Site.step` alone, in order of nominal time and then of the
-scenario, so that two runs of one scenario and seed give the same file, byte for byte.
+A counter replaces the clock and a simulated network replaces the message bus. The log of the
+run holds the records, link statistics and events of every site, as the log of a live session
+does.
 
-What it writes of a site are records, link statistics and events. Messages of older schema
-versions are written in the present one; a message of the present version keeps its bytes.
+Invariant:
+    - A site advances only by `Site.step`. Ticks run in order of nominal time; ticks of the same
+      time run in the order in which the scenario lists the sites.
+    - Two runs of one scenario with one seed therefore write the same file, byte for byte.
+    - A message of an older schema version is written in the present version. A message of the
+      present version keeps its bytes.
 """
 
 import bisect
@@ -55,7 +59,17 @@ from .virtual_network import Network, PromptNetwork
 
 
 class SiteEntry(NamedTuple):
-    """One message of the file; entries are written in order of `t_ns`, ns since the epoch."""
+    """One message to be written into a log. Entries are written in order of `t_ns`.
+
+    Attributes:
+        site: name of the site that sends the message.
+        t_ns: nominal time of the message, ns since the epoch.
+        sent_ns: time at which the site sent the message, ns since the epoch.
+        channel: channel of the site: "state", "link" or "event".
+        sequence: tick of a record or of statistics, number of an event.
+        payload: the encoded message.
+        message: the decoded message.
+    """
 
     site: str
     t_ns: int
@@ -67,98 +81,121 @@ class SiteEntry(NamedTuple):
 
 
 class SiteChannels:
-    """Turns the ticks and messages of one site into entries, writes them, and keeps their
-    accounts.
+    """The channels of one site in a log that is written now, and their accounts.
+
+    The `make_…` methods turn ticks and messages into entries, and `write` writes an entry.
+
+    Args:
+        scenario: the scenario of the log.
+        session: name of the session of the log.
+        site: name of the site.
+        boot: number of the site's start, which every message of the site states.
+
+    Attributes:
+        peers: names of the site's peers, in scenario order.
+        keys: key of each channel.
+        accounts: account of the messages of each channel.
+        ticks: number of ticks that the site has executed.
     """
 
     def __init__(self, scenario: Scenario, session: str, site: str, boot: int) -> None:
+        spec = scenario.sites[site]
         self.peers = scenario.peers(site)
-        rate_hz = scenario.sites[site].rate_hz
-        self._glides = scenario.sites[site].on_stale.action == "glide"
-        self._site = site
-        self._boot = boot
-        self._rate_hz = rate_hz
         self.keys = {channel: topics.key(session, site, channel) for channel in SITE_CHANNELS}
         self.accounts = {channel: Account() for channel in SITE_CHANNELS}
-        self._mode = Mode.RUN
-        self._events = 0
-        self._t_ns = 0
         self.ticks = 0
+        self._site = site
+        self._boot = boot
+        self._rate_hz = spec.rate_hz
+        self._glides = spec.on_stale.action == "glide"
+        self._mode = Mode.RUN
+        self._event_count = 0
+        self._last_ns = 0
 
-    def follow(
+    def make_tick_entries(
         self, output: TickRecord, stats: LinkStats | None, law_failure: Exception | None = None
     ) -> Sequence[SiteEntry]:
-        """Returns the entries after the record of an executed tick: statistics if any, change
-        of mode.
+        """Returns the entries that follow the record of an executed tick.
+
+        Args:
+            output: the record of the tick.
+            stats: the link statistics of the tick, if statistics are due.
+            law_failure: the error of the user law that changed the site's mode, if any.
+
+        Returns:
+            The entry of the statistics and the entry of an event that states a change of mode,
+            as far as the tick has them.
         """
         self.ticks = output.tick + 1
-        self._t_ns = output.t_ns
-        self._excuse_skipped(output.tick, output.cmd)
-        entries = [] if stats is None else [self.stats(stats)]
+        self._last_ns = output.t_ns
+        self._exclude_skipped_ticks(output.tick, output.cmd)
+        entries = []
+        if stats is not None:
+            entries.append(self.make_stats_entry(stats))
         if output.mode is not self._mode:
             self._mode = output.mode
-            diverged = output.mode is Mode.DIVERGED
-            text = (
-                describe_divergence(self._site, output)
-                if diverged
-                else describe_mode(
-                    self._site, output, glides=self._glides, law_failure=law_failure
-                )
-            )
-            entries.append(
-                self.new_event("diverged" if diverged else "mode", text, output.t_ns)
-            )
+            entries.append(self._make_mode_entry(output, law_failure))
         return entries
 
-    def _excuse_skipped(self, tick: int, cmd: Sequence[str]) -> None:
-        if skipped := count_skipped_ticks(cmd):
-            for channel in (topics.STATE, topics.LINK):
-                self.accounts[channel].mark_unpublished(
-                    *skipped_numbers(channel, tick, skipped, self._rate_hz)
-                )
+    def _make_mode_entry(self, output: TickRecord, law_failure: Exception | None) -> SiteEntry:
+        if output.mode is Mode.DIVERGED:
+            text = describe_divergence(self._site, output)
+            return self.make_new_event_entry("diverged", text, output.t_ns)
+        text = describe_mode(self._site, output, glides=self._glides, law_failure=law_failure)
+        return self.make_new_event_entry("mode", text, output.t_ns)
 
-    def end(self, t_ns: int | None = None) -> SiteEntry:
-        """Returns the entry of the event that ends the site's run, by default at its last tick."""
-        when_ns = self._t_ns if t_ns is None else t_ns
-        return self.new_event(
-            "end", f"{self._site} made {count_nouns(self.ticks, 'tick')}", when_ns
-        )
+    def _exclude_skipped_ticks(self, tick: int, cmd: Sequence[str]) -> None:
+        """Excludes from the accounts the ticks before `tick` that the site skipped by `cmd`."""
+        skipped = count_skipped_ticks(cmd)
+        if not skipped:
+            return
+        for channel in (topics.STATE, topics.LINK):
+            numbers = skipped_numbers(channel, tick, skipped, self._rate_hz)
+            self.accounts[channel].mark_unpublished(*numbers)
 
-    def new_event(self, kind: str, text: str, t_ns: int) -> SiteEntry:
-        """Returns the entry of a new event of the site."""
-        n = self._events
-        self._events += 1
+    def make_end_entry(self, t_ns: int | None = None) -> SiteEntry:
+        """Returns the entry of the end event, by default at the time of the last tick."""
+        end_ns = self._last_ns if t_ns is None else t_ns
+        text = f"{self._site} made {count_nouns(self.ticks, 'tick')}"
+        return self.make_new_event_entry("end", text, end_ns)
+
+    def make_new_event_entry(self, kind: str, text: str, t_ns: int) -> SiteEntry:
+        """Returns the entry of a new event of the site, which gets the next event number."""
+        number = self._event_count
+        self._event_count += 1
         event = Event(
             member=self._site,
             boot=self._boot,
-            n=n,
+            n=number,
             kind=kind,
             text=text,
             t_ns=t_ns,
             ticks=self.ticks,
         )
-        return self.event(event, n)
+        return self.make_event_entry(event, number)
 
-    def record(self, state: State, payload: bytes) -> SiteEntry:
-        """Returns the entry of a record of the source log."""
-        self._excuse_skipped(state.tick, state.cmd)
+    def make_record_entry(self, state: State, payload: bytes) -> SiteEntry:
+        """Returns the entry of a record, which is encoded again if its version is older.
+
+        Args:
+            state: the record.
+            payload: the bytes of the record.
+        """
+        self._exclude_skipped_ticks(state.tick, state.cmd)
         sent_ns = state.sent_ns if state.v >= SENT_TIME_SINCE else state.t_ns
         if state.v != VERSION:
             arrivals = [
                 Arrival(peer=peer, tick=tick, q=(), qd=(), latency_us=us)
                 for peer, tick, us in state.rx
             ]
-            output = read_output(state, self.peers)
-            late_us = state.late_us
-            busy_us = state.busy_us
             payload = encode_state(
                 site=state.site,
                 boot=state.boot,
                 peers=self.peers,
-                output=output,
+                output=read_output(state, self.peers),
                 arrivals=arrivals,
-                late_us=late_us,
-                busy_us=busy_us,
+                late_us=state.late_us,
+                busy_us=state.busy_us,
                 sent_ns=sent_ns,
                 echo=state.echo,
             )
@@ -172,26 +209,26 @@ class SiteChannels:
             message=state,
         )
 
-    def stats(self, stats: LinkStats) -> SiteEntry:
+    def make_stats_entry(self, stats: LinkStats) -> SiteEntry:
         """Returns the entry of link statistics."""
-        payload = encode(
-            stats if stats.v == VERSION else msgspec.structs.replace(stats, v=VERSION)
-        )
+        present = stats
+        if stats.v != VERSION:
+            present = msgspec.structs.replace(stats, v=VERSION)
         return SiteEntry(
             site=self._site,
             t_ns=stats.t_ns,
             sent_ns=stats.t_ns,
             channel=topics.LINK,
             sequence=stats.tick,
-            payload=payload,
+            payload=encode(present),
             message=stats,
         )
 
-    def event(self, event: Event, n: int) -> SiteEntry:
-        """Returns the entry of an event; `n` is its number if it has none of its own."""
-        numbered = event if event.n >= 0 else msgspec.structs.replace(event, n=n)
+    def make_event_entry(self, event: Event, number: int) -> SiteEntry:
+        """Returns the entry of an event. An event without a number gets `number`."""
+        numbered = event if event.n >= 0 else msgspec.structs.replace(event, n=number)
         payload = encode(msgspec.structs.replace(numbered, v=VERSION))
-        t_ns = max(event.t_ns, 0)
+        t_ns = max(event.t_ns, 0)  # a log has no times before the epoch
         return SiteEntry(
             site=self._site,
             t_ns=t_ns,
@@ -203,17 +240,16 @@ class SiteChannels:
         )
 
     def write(self, entry: SiteEntry, writer: LogWriter, epoch_unix_ns: int = 0) -> None:
-        """Writes an entry into a log."""
-        self.accounts[entry.channel].receive(
-            number_message(entry.channel, entry.sequence, self._rate_hz)
-        )
+        """Writes an entry into a log whose epoch is `epoch_unix_ns`, and counts the message."""
+        number = number_message(entry.channel, entry.sequence, self._rate_hz)
+        self.accounts[entry.channel].receive(number)
         log_ns = min(max(0, epoch_unix_ns + entry.t_ns), MAX_TIME_NS)
         key = self.keys[entry.channel]
         writer.add(key, entry.payload, entry.sent_ns, log_ns, entry.sequence, entry.message)
 
 
-def describe_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
-    """Returns the accounts of all channels, by topic."""
+def render_accounts(sites: Iterable[SiteChannels]) -> dict[str, str]:
+    """Returns the texts of the accounts of all channels of these sites, by topic."""
     return {
         f"/{site.keys[channel]}": f"{account.describe()}, overflowed 0"
         for site in sites
@@ -230,19 +266,21 @@ class SiteTick(NamedTuple):
 
 
 ChangeSchedule = Mapping[str, Mapping[int, Sequence[CoreChange]]]
-"""Per site and tick the changes that take effect then."""
+"""Changes by site and by the tick at which they take effect."""
 PlantSchedule = Mapping[str, Mapping[int, PlantState]]
-"""Per site with an external arm, and per tick, the measured state of that arm."""
+"""Measured state of each external arm, by site and tick."""
 HandTracks = Mapping[str, Callable[[Site, int], Sequence[float]]]
-"""Per site with a live hand what that does at a tick of the site, which is about to make it."""
+"""Per site with a live hand: a function that returns the action of the hand at the site's next
+tick, from the site and the number of that tick.
+"""
 
 
 def check_virtual(scenario: Scenario) -> None:
-    """Refuses a scenario that virtual time cannot run, before anything is written.
+    """Checks that virtual time can run a scenario, before anything is written.
 
     Raises:
-        ScenarioError: an arm is outside of the program, or a user law cannot be made, or its
-            file has another hash.
+        ScenarioError: an arm is outside of the program, a user law cannot be constructed, or
+            the file of a user law has another hash than the scenario states.
     """
     refuse_external_arms(scenario, set(scenario.external) - set(scenario.outside))
     for name, spec in scenario.sites.items():
@@ -251,7 +289,15 @@ def check_virtual(scenario: Scenario) -> None:
 
 
 def find_skips(commands: Mapping[int, Sequence[CoreChange]]) -> dict[int, int]:
-    """Returns the tick that follows, by each first one of those that a site did not make."""
+    """Returns the ranges of ticks that a site skipped.
+
+    Args:
+        commands: the changes of the site, by tick; a change states how many ticks were skipped
+            before its own tick.
+
+    Returns:
+        The first tick after each range, by the first tick of the range.
+    """
     return {
         tick - change.skipped: tick
         for tick, changes in commands.items()
@@ -269,76 +315,105 @@ def execute_virtual(
     hands: HandTracks = {},  # noqa: B006
     plants: Mapping[str, PlantPlayer] = {},
 ) -> Iterator[SiteTick]:
-    """Yields every tick of every site: in order of nominal time, then of the scenario.
+    """Executes all sites of a scenario in virtual time and yields every tick of every site.
 
-    A site whose network is not ready lets the others go first; by default every sample arrives
-    at the next tick. A run that diverges ends with the ticks of that instant. `ends` holds the
-    last tick of sites that make fewer than the scenario has. Live hands do what `hands` says;
-    else nobody holds an arm.
+    Ticks run in order of nominal time; ticks of the same time run in scenario order. A site
+    whose network is not ready waits while other sites run. A run that diverges ends with the
+    ticks of that instant.
+
+    Args:
+        scenario: the scenario.
+        network: the network between the sites; by default every sample arrives at the first
+            tick after its stamp.
+        commands: changes that take effect during the run.
+        measured: measured states of external arms.
+        ends: last tick of each site that executes fewer ticks than the scenario has.
+        hands: actions of live hands; a live hand without an entry does not hold its arm.
+        plants: plants that move the external arms of sites.
 
     Raises:
-        ScenarioError: an arm is external and `measured` and `plants` lack it.
+        ScenarioError: an arm is external and neither `measured` nor `plants` has it.
         LawFailed: a user law failed.
-        PlantFailed: a plant of one's own did.
+        PlantFailed: a user's plant failed.
     """
     refuse_external_arms(scenario, {**measured, **plants})
-    joined = network or PromptNetwork(
-        {name: spec.rate_hz for name, spec in scenario.sites.items()}
-    )
+    if network is None:
+        rates_hz = {name: spec.rate_hz for name, spec in scenario.sites.items()}
+        network = PromptNetwork(rates_hz)
     setups = [scenario.setup(name) for name in scenario.names]
     sites = [Site(setup) for setup in setups]
-    ticks = [min(scenario.ticks(n), ends.get(n, scenario.ticks(n)) + 1) for n in scenario.names]
-    # (t_ns, order, k) of each site's next tick
-    pending = [(0, index, 0) for index in range(len(sites)) if ticks[index]]
+    tick_counts = [
+        min(scenario.ticks(name), ends.get(name, scenario.ticks(name)) + 1)
+        for name in scenario.names
+    ]
     skips = [find_skips(commands.get(name, {})) for name in scenario.names]
+    pending = [(0, index, 0) for index in range(len(sites)) if tick_counts[index]]
     last_ns = round(scenario.duration_s * NS_PER_S)
     while pending and pending[0][0] <= last_ns:
-        place = 0
-        if not joined.is_ready(sites[pending[0][1]].name, pending[0][2]):
-            place = next(
-                (n for n, (_, i, k) in enumerate(pending) if joined.is_ready(sites[i].name, k)),
-                0,
-            )
-        t_ns, index, k = pending.pop(place)
+        t_ns, index, k = pending.pop(_find_ready(pending, sites, network))
         site = sites[index]
-        arrivals = select_peer_channels(joined.deliver(site.name, k), setups[index].links)
-        ordered = commands.get(site.name, {})
-        arm = measured.get(site.name, {})
-        hand = hands[site.name](site, k) if site.name in hands else ()
-        plant = plants.get(site.name)
-        at = arm.get(k) if plant is None else plant.state
-        output = site.step(
-            TickInput(
-                k=k, arrivals=arrivals, commands=ordered.get(k, ()), measured=at, hand=hand
-            )
+        name = site.name
+        arrivals = select_peer_channels(network.deliver(name, k), setups[index].links)
+        hand = hands[name](site, k) if name in hands else ()
+        plant = plants.get(name)
+        plant_state = measured.get(name, {}).get(k) if plant is None else plant.state
+        tick_input = TickInput(
+            k=k,
+            arrivals=arrivals,
+            commands=commands.get(name, {}).get(k, ()),
+            measured=plant_state,
+            hand=hand,
         )
+        output = site.step(tick_input)
         if plant is not None:
             plant.move(k, output.tau)
-        joined.send(site.name, output)
+        network.send(name, output)
         yield SiteTick(site, arrivals, output)
         if output.mode is Mode.DIVERGED:
             last_ns = t_ns
-        after = skips[index].get(k + 1, k + 1)
-        if after < ticks[index]:
-            bisect.insort(pending, (after * NS_PER_S // site.rate_hz, index, after))
+        next_tick = skips[index].get(k + 1, k + 1)
+        if next_tick < tick_counts[index]:
+            next_ns = next_tick * NS_PER_S // site.rate_hz
+            bisect.insort(pending, (next_ns, index, next_tick))
+
+
+def _find_ready(
+    pending: Sequence[tuple[int, int, int]], sites: Sequence[Site], network: Network
+) -> int:
+    """Returns the position in `pending` of the first site that can execute its next tick.
+
+    Args:
+        pending: the next tick of each site, as (t_ns, index of the site, tick), in order of
+            time.
+        sites: the sites, by index.
+        network: the network between the sites.
+
+    Returns:
+        The position; 0 if the network is ready for no site, so that the run always goes on.
+    """
+    for position, (_, index, k) in enumerate(pending):
+        if network.is_ready(sites[index].name, k):
+            return position
+    return 0
 
 
 def compute_boot(scenario: Scenario, site: str) -> int:
-    """Returns the boot of a site in virtual time: a function of scenario and name."""
+    """Returns the boot number of a site in virtual time."""
     return compute_virtual_boot(scenario.sha256, site)
 
 
 class _VirtualChannels(SiteChannels):
-    """The channels of one site of a virtual run, written as it is executed."""
+    """The channels of one site of a virtual run, written while the run is executed."""
 
     def __init__(self, scenario: Scenario, site: Site, writer: LogWriter) -> None:
         boot = compute_boot(scenario, site.name)
         super().__init__(scenario, scenario.name, site.name, boot)
         self._writer = writer
-        self._runs = site
+        self._executed_site = site
         self._stats = LoopStats(site, boot)
 
-    def tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
+    def write_tick(self, arrivals: list[Arrival], output: TickRecord) -> None:
+        """Writes the record of a tick and the entries that follow the record."""
         payload = encode_state(
             site=self._site,
             boot=self._boot,
@@ -354,15 +429,15 @@ class _VirtualChannels(SiteChannels):
         )
         due = self._stats.is_due(output.tick, count_skipped_ticks(output.cmd))
         stats = self._stats.pop_stats(output) if due else None
-        for entry in self.follow(output, stats, self._runs.law_failure):
+        law_failure = self._executed_site.law_failure
+        for entry in self.make_tick_entries(output, stats, law_failure):
             self.write(entry, self._writer)
 
-    def tell(self, news: list[tuple[int, str]]) -> None:
-        """Writes what a hand has done as events."""
+    def write_hand_events(self, news: list[tuple[int, str]]) -> None:
+        """Writes the events of a live hand, given as (tick, text), and empties the list."""
         for k, text in news:
-            self.write(
-                self.new_event("hand", text, k * NS_PER_S // self._rate_hz), self._writer
-            )
+            t_ns = k * NS_PER_S // self._rate_hz
+            self.write(self.make_new_event_entry("hand", text, t_ns), self._writer)
         news.clear()
 
 
@@ -376,25 +451,35 @@ def write_virtual_log(
     hands: HandTracks = {},  # noqa: B006
     commands: ChangeSchedule = {},  # noqa: B006
 ) -> bool:
-    """Runs a scenario in virtual time and writes its log, which is finished however the run
-    ends.
+    """Runs a scenario in virtual time and writes the log of the run.
 
-    The stream stays open. Once `stopped` is True the run ends, and the file is finished with
-    what there is. `views_hz` is the rate of the standard channels, Hz, see
-    `log.ros2.viz_channels`; `network`, `hands` and `commands` are as for `execute_virtual`.
+    The log is finished however the run ends: after the last tick, by `stopped`, or by an error.
+
+    Args:
+        scenario: the scenario.
+        stream: where the log is written; the stream stays open.
+        network: the network between the sites, see `execute_virtual`.
+        stopped: the run ends after the first tick at which this returns True.
+        views_hz: rate of the standard channels for viewers, Hz, see `log.ros2.viz_channels`.
+        hands: actions of live hands, see `execute_virtual`; they replace hands that the
+            scenario names as programs.
+        commands: changes that take effect during the run.
 
     Returns:
         True if the run stayed within its limits, False if it diverged.
 
     Raises:
-        LogError: the disk refused.
+        LogError: the disk refused to store the log.
         ScenarioError: virtual time cannot run the scenario; nothing is written.
         LawFailed: a user law failed; the log holds an event with the reason.
     """
     check_virtual(scenario)
-    own = make_hand_players(scenario)
+    hand_players = make_hand_players(scenario)
     plants = make_plant_players(scenario)
-    acts = {**{name: player.track for name, player in own.items()}, **hands}
+    tracks: dict[str, Callable[[Site, int], Sequence[float]]] = {
+        name: player.track for name, player in hand_players.items()
+    }
+    tracks.update(hands)
     writer = LogWriter(
         stream=stream,
         scenario=scenario,
@@ -404,38 +489,39 @@ def write_virtual_log(
         views_hz=views_hz,
     )
     members: dict[str, _VirtualChannels] = {}
-    within = True
+    within_limits = True
     t_ns = 0
     try:
         with process.pause_gc():
             ticks = execute_virtual(
-                scenario, network, commands=commands, hands=acts, plants=plants
+                scenario, network, commands=commands, hands=tracks, plants=plants
             )
             for site, arrivals, output in ticks:
                 if site.name not in members:
                     members[site.name] = _VirtualChannels(scenario, site, writer)
-                members[site.name].tick(arrivals, output)
-                if site.name in own:
-                    members[site.name].tell(own[site.name].news)
-                within &= output.mode is not Mode.DIVERGED
+                members[site.name].write_tick(arrivals, output)
+                if site.name in hand_players:
+                    members[site.name].write_hand_events(hand_players[site.name].news)
+                within_limits &= output.mode is not Mode.DIVERGED
                 t_ns = output.t_ns
                 if stopped():
                     break
-    except CodeFailed as failed:
-        if failed.site not in members:
-            without_law = Site(scenario.setup(failed.site)._replace(own=None))
-            members[failed.site] = _VirtualChannels(scenario, without_law, writer)
-        member = members[failed.site]
-        member.write(member.new_event("failed", str(failed), t_ns), writer)
+    except CodeFailed as failure:
+        if failure.site not in members:
+            # the event needs a site, and the law that failed cannot be constructed again
+            without_law = Site(scenario.setup(failure.site)._replace(own=None))
+            members[failure.site] = _VirtualChannels(scenario, without_law, writer)
+        member = members[failure.site]
+        member.write(member.make_new_event_entry("failed", str(failure), t_ns), writer)
         raise
-    finally:  # the file is finished however the run ends
+    finally:
         try:
             for member in members.values():
                 if not writer.ended:
-                    member.write(member.end(t_ns), writer)
+                    member.write(member.make_end_entry(t_ns), writer)
         finally:
-            writer.finish(describe_accounts(members.values()))
-    return within
+            writer.finish(render_accounts(members.values()))
+    return within_limits
 
 
 def record_virtual(
@@ -447,14 +533,24 @@ def record_virtual(
     views_hz: float = VIZ_HZ,
     hands: HandTracks = {},  # noqa: B006
 ) -> bool:
-    """Runs a scenario in virtual time into a file, see `write_virtual_log`; `force` lets it
-    replace one.
+    """Runs a scenario in virtual time and writes the log of the run into a file.
+
+    Args:
+        scenario: the scenario.
+        path: the file.
+        force: whether an existing file is replaced.
+        stopped: the run ends after the first tick at which this returns True.
+        views_hz: rate of the standard channels for viewers, Hz.
+        hands: actions of live hands, see `execute_virtual`.
+
+    Returns:
+        True if the run stayed within its limits, False if it diverged.
 
     Raises:
-        UsageError: the file exists, or cannot be made.
-        LogRefused: the disk refused; the error names what is kept.
-        ScenarioError: virtual time cannot run the scenario; there is no file.
-        LawFailed: a user law failed; the file is finished with the ticks before.
+        UsageError: the file exists, or cannot be created.
+        LogRefused: the disk refused to store the log; the error names the part that is kept.
+        ScenarioError: virtual time cannot run the scenario; no file is written.
+        LawFailed: a user law failed; the file is finished with the ticks before the failure.
     """
     with LogFile(path, force=force) as stream:
         return write_virtual_log(
@@ -463,38 +559,47 @@ def record_virtual(
 
 
 class SimulatedLog(Log):
-    """The log of a run in virtual time, which `save` makes a file of.
+    """The log of a run in virtual time, held in memory. `save` writes it into a file.
 
     Args:
-        make: makes it, into a stream and with views at a rate, Hz.
+        write: runs the scenario and writes its log into a stream, with the standard channels
+            for viewers at a rate, Hz.
     """
 
-    def __init__(self, make: Callable[[Sink, float], object]) -> None:
+    def __init__(self, write: Callable[[Sink, float], object]) -> None:
         stream = io.BytesIO()
-        make(stream, 0.0)
+        write(stream, 0.0)
         stream.seek(0)
         super().__init__(read_contents(stream, "log", own=True))
-        self._make = make
+        self._write = write
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
-        """Writes the file that `trilat sim -o` writes, and returns its path; `force` lets it
-        replace one.
+        """Writes the log into a file, as `trilat sim -o` does, and returns its path.
 
-        The run is made once more, with the standard channels that viewers show.
+        The scenario runs a second time, because the file also has the standard channels for
+        viewers.
+
+        Args:
+            path: the file.
+            force: whether an existing file is replaced.
 
         Raises:
-            UsageError: the file exists, or cannot be made.
-            LogRefused: the disk refused it.
+            UsageError: the file exists, or cannot be created.
+            LogRefused: the disk refused to store the log.
         """
         with LogFile(Path(path), force=force) as stream:
-            self._make(stream, VIZ_HZ)
+            self._write(stream, VIZ_HZ)
         return Path(path)
 
 
-def simulate_scenario(scenario: Scenario, *, hands: HandTracks = {}) -> SimulatedLog:  # noqa: B006
+def simulate_scenario(
+    scenario: Scenario,
+    *,
+    hands: HandTracks = {},  # noqa: B006
+) -> SimulatedLog:
     """Runs a scenario in virtual time and returns its log, see `write_virtual_log`."""
 
-    def make(stream: Sink, views_hz: float) -> None:
+    def write(stream: Sink, views_hz: float) -> None:
         write_virtual_log(scenario, stream, views_hz=views_hz, hands=hands)
 
-    return SimulatedLog(make)
+    return SimulatedLog(write)

@@ -1,8 +1,9 @@
-"""Compares a log with virtual time and finds the samples that arrived late.
+"""Compare a log with virtual time, and find the samples that arrived late or were lost.
 
-Invariant (L2): virtual time fed with a log's arrivals equals that log on every tick, always;
-plain virtual time equals it until the first sample arrives after its due tick, or is lost on
-the way.
+Invariant (L2):
+    - A run in virtual time that gets the arrivals of a log equals that log at every tick.
+    - A plain run in virtual time, over a prompt network, equals the log until the first sample
+      arrives after its due tick or is lost in the network.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,10 +20,12 @@ from ..core.ticks import NS_PER_S, PlantState, TickRecord
 from ..errors import LawFailed, LogError
 from ..log.log_reader import Log
 from ..log.mcap_reader import Progress
+from ..log.site_log import SiteLog
 from ..scenario import Scenario
 from . import virtual
 from .resumption import ArrivalEntry, find_recorded_hand
 from .verify import (
+    PROGRESS_EVERY,
     RecordDifference,
     describe_law_failure,
     equal_bits,
@@ -33,8 +36,12 @@ from .virtual_network import Network, RecordedNetwork, complete_deliveries, read
 
 
 class RecordComparison(NamedTuple):
-    """Agreement of a log with another execution: equal bits, and the first difference by tick,
-    then site.
+    """Agreement of the records of a log with another execution.
+
+    Attributes:
+        records: number of compared records.
+        identical: number of records whose computed fields all have equal bits.
+        first: the difference at the earliest tick; None if all records are identical.
     """
 
     records: int
@@ -43,10 +50,15 @@ class RecordComparison(NamedTuple):
 
 
 class LateSample(NamedTuple):
-    """A sample of a peer that was not at a site when it was due; the last two are the site's
-    ticks.
+    """A sample of a peer that had not arrived at a site when it was due.
 
-    A sample that was lost on the way, not by its link's model, has no `arrived_tick`.
+    Attributes:
+        site: name of the receiver.
+        peer: name of the sender.
+        tick: tick of the sample, at the rate of the sender.
+        due_tick: tick of the receiver at which the sample was due.
+        arrived_tick: tick of the receiver at which the sample arrived; None if it was lost in
+            the network. Samples that the model of the link loses are not late.
     """
 
     site: str
@@ -56,20 +68,26 @@ class LateSample(NamedTuple):
     arrived_tick: int | None
 
     def __str__(self) -> str:
-        how = "never came" if self.arrived_tick is None else f"came at tick {self.arrived_tick}"
-        return f"sample {self.tick} of {self.peer} was due at tick {self.due_tick} of {self.site} and {how}"
+        outcome = "never came"
+        if self.arrived_tick is not None:
+            outcome = f"came at tick {self.arrived_tick}"
+        sample = f"sample {self.tick} of {self.peer}"
+        return f"{sample} was due at tick {self.due_tick} of {self.site} and {outcome}"
 
 
 def compare_records(
     log: Log, executed: Iterable[tuple[str, TickRecord]], *, arrivals: bool
 ) -> RecordComparison:
-    """Compares every record of a log with another execution, (site, record) in any order, bit
-    for bit.
+    """Compares every record of a log with another execution, bit for bit.
 
-    Without `arrivals` only what was computed from them must be equal.
+    Args:
+        log: the log.
+        executed: the name of the site and the record of every executed tick, in any order.
+        arrivals: whether the arrivals (their CRC) have to be equal as well.
     """
     by_tick = {name: log[name].by_tick for name in log.sites}
-    records = identical = 0
+    records = 0
+    identical = 0
     first: RecordDifference | None = None
     try:
         for site, output in executed:
@@ -85,77 +103,89 @@ def compare_records(
             difference = find_first_difference(state, computed, peers, equal_bits)
             if first is None or (difference is not None and difference.tick < first.tick):
                 first = difference
-    except LawFailed as failed:  # now, and not when the log was made
-        first = first or describe_law_failure(failed)
+    except LawFailed as failure:  # the law did not fail when the log was recorded
+        first = first or describe_law_failure(failure)
     return RecordComparison(records, identical, first)
 
 
 def find_absent_samples(log: Log) -> list[LateSample]:
-    """Returns every sample that was not there when it was due, by the tick at which it was due.
+    """Returns every sample that had not arrived when it was due, in order of due ticks.
 
-    One that never came counts as lost if a record at that tick, or after it, still has an older
-    one in use.
+    A sample that never arrived counts as lost if the first record at or after its due tick
+    still uses an older sample.
     """
-    absent = []
+    absent: list[LateSample] = []
     for name in log.sites:
-        # only its links matter: no law runs
-        site = Site(log.scenario.setup(name)._replace(own=None))
-        part = log[name]
-        ordered = log.commands(name)
-        _, rows = part.arrivals
-        ticks = [log.scenario.ticks(peer) for peer in part.peers]
-        came = [set(rows[rows[:, 0] == j, 1].tolist()) for j in range(len(part.peers))]
-        asked = [0] * len(part.peers)
-        for state in part.states:
-            for command in ordered.get(state.tick, ()):
-                site.order(command, state.t_ns)
-            for peer, tick, _ in state.rx:
-                # a damaged record names any
-                made = 0 <= peer < len(ticks) and 0 <= tick < ticks[peer]
-                due = site.release_tick(peer, tick) if made else None
-                if due is not None and due < state.tick and not site.measures(peer):
-                    absent.append(
-                        LateSample(
-                            site=name,
-                            peer=site.peers[peer],
-                            tick=tick,
-                            due_tick=due,
-                            arrived_tick=state.tick,
-                        )
-                    )
-            for j, sender in enumerate(part.peers):
-                sent = (
-                    min(state.t_ns * site.peer_rate_hz(j) // NS_PER_S, log.last_ticks[sender])
-                    + 1
-                )
-                for tick in range(asked[j], sent):
-                    due = (
-                        None
-                        if tick in came[j] or site.measures(j)
-                        else site.release_tick(j, tick)
-                    )
-                    if due is None:
-                        continue
-                    place = int(np.searchsorted(part.tick, due))
-                    if (part.used[sender][place : place + 1] < tick).any():
-                        absent.append(
-                            LateSample(
-                                site=name,
-                                peer=sender,
-                                tick=tick,
-                                due_tick=due,
-                                arrived_tick=None,
-                            )
-                        )
-                asked[j] = max(asked[j], sent)
+        absent += _find_absent_at_site(log, name)
     return sorted(absent, key=lambda sample: sample.due_tick)
 
 
-class VirtualComparison(NamedTuple):
-    """A log against virtual time: equal if fed with its arrivals, else until the first late or
-    lost sample.
+def _find_absent_at_site(log: Log, name: str) -> list[LateSample]:
+    part = log[name]
+    commands = log.commands(name)
+    peer_ticks = [log.scenario.ticks(peer) for peer in part.peers]
+    _, arrivals = part.arrivals
+    arrived = [
+        set(arrivals[arrivals[:, 0] == peer, 1].tolist()) for peer in range(len(part.peers))
+    ]
+    # only the links of the site are used, so its law is left out
+    site = Site(log.scenario.setup(name)._replace(own=None))
+    checked = [0] * len(part.peers)  # per peer the number of samples looked at so far
+    absent = []
+    for state in part.states:
+        for command in commands.get(state.tick, ()):
+            site.order(command, state.t_ns)
+        for peer, tick, _ in state.rx:
+            # a damaged record may list any peer and tick
+            exists = 0 <= peer < len(peer_ticks) and 0 <= tick < peer_ticks[peer]
+            due_tick = site.release_tick(peer, tick) if exists else None
+            if due_tick is None or due_tick >= state.tick or site.measures(peer):
+                continue
+            absent.append(
+                LateSample(
+                    site=name,
+                    peer=site.peers[peer],
+                    tick=tick,
+                    due_tick=due_tick,
+                    arrived_tick=state.tick,
+                )
+            )
+        for peer, sender in enumerate(part.peers):
+            newest = state.t_ns * site.peer_rate_hz(peer) // NS_PER_S
+            sent = min(newest, log.last_ticks[sender]) + 1
+            for tick in range(checked[peer], sent):
+                if tick in arrived[peer] or site.measures(peer):
+                    continue
+                due_tick = site.release_tick(peer, tick)
+                if due_tick is None or not _uses_older(part, sender, tick, due_tick):
+                    continue
+                absent.append(
+                    LateSample(
+                        site=name,
+                        peer=sender,
+                        tick=tick,
+                        due_tick=due_tick,
+                        arrived_tick=None,
+                    )
+                )
+            checked[peer] = max(checked[peer], sent)
+    return absent
 
-    The plain one is empty if an arm is external: there is no such run.
+
+def _uses_older(part: SiteLog, sender: str, tick: int, due_tick: int) -> bool:
+    """True if the first record from `due_tick` on uses a sample older than `tick`."""
+    row = int(np.searchsorted(part.tick, due_tick))
+    return bool((part.used[sender][row : row + 1] < tick).any())
+
+
+class VirtualComparison(NamedTuple):
+    """A log compared with two runs of its scenario in virtual time.
+
+    Attributes:
+        fed: comparison with the run that gets the arrivals of the log. They must be equal.
+        plain: comparison with the run over a prompt network, which is equal until the first
+            late or lost sample. Empty if an arm is external, because no plain run exists.
+        absent: samples that arrived late or never, in order of due ticks.
     """
 
     fed: RecordComparison
@@ -164,77 +194,81 @@ class VirtualComparison(NamedTuple):
 
     @property
     def late(self) -> list[LateSample]:
-        """The samples that came late."""
+        """The samples that arrived late."""
         return [sample for sample in self.absent if sample.arrived_tick is not None]
 
     @property
     def lost(self) -> list[LateSample]:
-        """The samples that never came."""
+        """The samples that never arrived."""
         return [sample for sample in self.absent if sample.arrived_tick is None]
 
     @property
     def excused_from(self) -> int | None:
-        """The tick from which plain virtual time may differ; None if every sample was there in
-        time.
-        """
+        """First tick at which plain virtual time may differ; None if no sample was late."""
         return self.absent[0].due_tick if self.absent else None
 
 
 def compare_with_virtual(log: Log, progress: Progress | None = None) -> VirtualComparison:
-    """Runs a log's scenario again in virtual time, with its arrivals and without, and compares.
+    """Compares a log with its scenario in virtual time, with its arrivals and without.
 
-    Nothing runs beyond the log's last record. `progress` gets the ticks done and their total.
+    Both runs end at the last record of the log.
+
+    Args:
+        log: the log.
+        progress: called now and then with the number of executed ticks and their total.
     """
-    scenario = _recorded_scenario(log)
+    scenario = _cut_to_records(log)
     total = 2 * sum(map(scenario.ticks, scenario.names))
     peers = {name: scenario.peers(name) for name in scenario.names}
-    arms = {
-        name: {s.tick: PlantState(s.q, s.qd, s.tau_x, s.bodies) for s in log[name].states}
+    arm_states = {
+        name: {
+            state.tick: PlantState(state.q, state.qd, state.tau_x, state.bodies)
+            for state in log[name].states
+        }
         for name in log.scenario.external
     }
     with process.pause_gc():
-        ordered = {name: log.commands(name) for name in scenario.names}
+        commands = {name: log.commands(name) for name in scenario.names}
         hands = {name: partial(find_recorded_hand, log[name]) for name in scenario.names}
 
         def execute(network: Network | None, before: int) -> Iterator[tuple[str, TickRecord]]:
             ticks = virtual.execute_virtual(
                 scenario=scenario,
                 network=network,
-                commands=ordered,
-                measured=arms,
+                commands=commands,
+                measured=arm_states,
                 ends=log.last_ticks,
                 hands=hands,
             )
-            for n, (site, _, output) in enumerate(ticks):
-                if progress is not None and n % 256 == 0:
-                    progress(before + n, total)
+            for count, (site, _, output) in enumerate(ticks):
+                if progress is not None and count % PROGRESS_EVERY == 0:
+                    progress(before + count, total)
                 yield site.name, output
 
-        recorded = RecordedNetwork(
-            {name: _complete_arrivals(log, name) for name in log.sites}, peers
-        )
-        fed = compare_records(log, execute(recorded, 0), arrivals=True)
-        if arms:
+        arrivals = {name: _read_arrivals(log, name) for name in log.sites}
+        fed = compare_records(log, execute(RecordedNetwork(arrivals, peers), 0), arrivals=True)
+        if arm_states:
             plain = RecordComparison(0, 0, None)
         else:
             plain = compare_records(log, execute(None, total // 2), arrivals=False)
         return VirtualComparison(fed, plain, find_absent_samples(log))
 
 
-def _complete_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
-    """Returns the arrivals of a site by tick; in gaps those that are assumed, if not too much
-    is missing.
+def _read_arrivals(log: Log, name: str) -> Mapping[int, Sequence[ArrivalEntry]]:
+    """Returns the arrivals at a site by tick.
+
+    Arrivals in gaps are assumed, unless too many records are missing.
     """
     part = log[name]
     rates_hz = [log.scenario.sites[peer].rate_hz for peer in part.peers]
+    ends = [log.last_ticks[peer] for peer in part.peers]
     with suppress(LogError):
-        return complete_deliveries(
-            part, rates_hz, [log.last_ticks[peer] for peer in part.peers]
-        ).entries
+        return complete_deliveries(part, rates_hz, ends).entries
     return read_deliveries(part).entries
 
 
-def _recorded_scenario(log: Log) -> Scenario:
+def _cut_to_records(log: Log) -> Scenario:
+    """Returns the scenario of a log with a duration that ends at the last record."""
     ends_s = [
         (log[name].last_tick + 1) / log[name].rate_hz for name in log.sites if len(log[name])
     ]
@@ -243,5 +277,5 @@ def _recorded_scenario(log: Log) -> Scenario:
 
 
 def simulate_without_operators(log: Log) -> Log:
-    """Returns the log's experiment in virtual time without operators."""
-    return virtual.simulate_scenario(_recorded_scenario(log).without_hands())
+    """Runs the experiment of a log in virtual time without operators and returns that log."""
+    return virtual.simulate_scenario(_cut_to_records(log).without_hands())

@@ -1,10 +1,16 @@
-"""Networks of an execution: the receiver's tick at which each sample arrives, prompt or as a
-log recorded it.
+"""Simulated networks: at which tick of the receiver each sample arrives.
 
-Invariant (L2): delay belongs to the link. A network only decides at which tick a sample
-arrives; as long as that precedes the tick at which the sample is due, the numbers do not depend
-on it. A rerun delivers a sample where the log says that it arrived, never where the log
-excludes it; in ticks without a record an arrival is assumed, and counted as such.
+`PromptNetwork` delivers a sample at the first tick after its stamp. `RecordedNetwork` delivers
+samples at the ticks that a log recorded (`read_deliveries`), completes where records are
+missing (`complete_deliveries`), or moves to other tick rates (`retime_deliveries`).
+
+Invariant:
+    - Delay belongs to the link (L2). A network only decides at which tick a sample arrives. If
+      a sample arrives before the tick at which it is due, the numbers of the run do not depend
+      on that tick.
+    - A recorded sample is delivered at the tick at which the log says that it arrived.
+    - A sample is never delivered at a tick at which the log excludes its arrival. At ticks
+      without a record an arrival is assumed, and the tick counts as unrecorded.
 """
 
 from bisect import bisect_left
@@ -22,44 +28,47 @@ from .resumption import ArrivalEntry, make_arrival
 
 
 class Network(Protocol):
-    """Joins the sites of a virtual run."""
+    """The network between the sites of a virtual run."""
 
     def send(self, sender: str, output: TickRecord) -> None:
-        """Takes the record of one tick from its sender."""
+        """Accepts the record of one tick of a sender for delivery to its peers."""
 
     def is_ready(self, receiver: str, k: int) -> bool:
-        """True where everything that arrives for tick k of a receiver has been sent."""
+        """True if every sample that arrives at tick `k` of a receiver has been sent."""
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """Returns what arrives for tick k of a receiver, in order."""
+        """Returns the samples that arrive at tick `k` of a receiver, in order."""
 
 
 class PromptNetwork:
-    """Every sample arrives at the first tick of the receiver after its stamp; `rates` by site,
-    Hz.
+    """Delivers every sample at the first tick of the receiver after the sample's stamp.
+
+    Args:
+        rates: tick rate of each site, Hz.
     """
 
     def __init__(self, rates: Mapping[str, int]) -> None:
         self._rates = rates
-        self._under_way: dict[str, dict[str, deque[TickRecord]]] = {
-            i: {j: deque() for j in rates if j != i} for i in rates
+        self._in_transit: dict[str, dict[str, deque[TickRecord]]] = {
+            receiver: {sender: deque() for sender in rates if sender != receiver}
+            for receiver in rates
         }
 
     def send(self, sender: str, output: TickRecord) -> None:
         """See `Network`."""
-        for receiver, queues in self._under_way.items():
+        for receiver, queues in self._in_transit.items():
             if receiver != sender:
                 queues[sender].append(output)
 
     def is_ready(self, receiver: str, k: int) -> bool:  # noqa: ARG002 - see `Network`
-        """See `Network`: in order of time, always true."""
+        """Returns True: the sites run in order of time, so every earlier sample was sent."""
         return True
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
         """See `Network`."""
         now_ns = k * NS_PER_S // self._rates[receiver]
         arrivals = []
-        for index, queue in enumerate(self._under_way[receiver].values()):
+        for index, queue in enumerate(self._in_transit[receiver].values()):
             while queue and queue[0].t_ns < now_ns:
                 sample = queue.popleft()
                 latency_us = (now_ns - sample.t_ns) // 1000
@@ -68,8 +77,11 @@ class PromptNetwork:
 
 
 class RecordedNetwork:
-    """Samples arrive where a log says that they did, per site and tick; running sites make
-    their content.
+    """Delivers samples at the ticks that a log recorded, with the content of the running sites.
+
+    Args:
+        schedule: the arrivals of each site, by tick.
+        peers: the peers of each site, in scenario order.
     """
 
     def __init__(
@@ -80,41 +92,55 @@ class RecordedNetwork:
         self._schedule = schedule
         self._peers = peers
         self._sent: dict[tuple[str, int], TickRecord] = {}
-        self._came = dict.fromkeys(schedule, (0, 0))
+        # per receiver the tick checked last, and how many of its arrivals were sent by then
+        self._checked = dict.fromkeys(schedule, (0, 0))
 
     def send(self, sender: str, output: TickRecord) -> None:
         """See `Network`."""
         self._sent[sender, output.tick] = output
 
     def is_ready(self, receiver: str, k: int) -> bool:
-        """See `Network`. A loop that was late received samples of ticks ahead of its own."""
+        """See `Network`.
+
+        A site whose loop ran late in the log received samples of later times than its own tick,
+        so the senders of these samples have to run first.
+        """
         peers = self._peers[receiver]
         entries = self._schedule[receiver].get(k, ())
-        asked, came = self._came[receiver]
-        n = came if asked == k else 0
-        while n < len(entries) and (peers[entries[n][0]], entries[n][1]) in self._sent:
-            n += 1
-        self._came[receiver] = k, n
-        return n == len(entries)
+        checked_tick, sent_count = self._checked[receiver]
+        if checked_tick != k:
+            sent_count = 0
+        for peer, tick, _ in entries[sent_count:]:
+            if (peers[peer], tick) not in self._sent:
+                break
+            sent_count += 1
+        self._checked[receiver] = (k, sent_count)
+        return sent_count == len(entries)
 
     def deliver(self, receiver: str, k: int) -> list[Arrival]:
-        """See `Network`. A sample that its sender never made does not arrive.
+        """See `Network`. A sample that its sender did not produce does not arrive.
 
-        Behind a gap of the log more may be assumed to arrive than a tick takes: the newest do.
+        After a gap of the log more samples may be assumed to arrive than a tick accepts
+        (`MAX_ARRIVALS`); then the newest of them arrive.
         """
+        peers = self._peers[receiver]
         arrivals = []
-        for j, tick, latency_us in self._schedule[receiver].get(k, ()):
-            sample = self._sent.get((self._peers[receiver][j], tick))
+        for peer, tick, latency_us in self._schedule[receiver].get(k, ()):
+            sample = self._sent.get((peers[peer], tick))
             if sample is not None:
-                arrivals.append(make_arrival(j, tick, sample, latency_us))
+                arrivals.append(make_arrival(peer, tick, sample, latency_us))
         return arrivals[-MAX_ARRIVALS:]
 
 
 class Deliveries(NamedTuple):
-    """The arrivals of one site per tick, in order, from the first tick with a record to the
-    last, or -1.
+    """The arrivals at one site, by tick.
 
-    In the `unrecorded` ticks between them arrivals are assumed.
+    Attributes:
+        entries: the arrivals of each tick, in order.
+        unrecorded: ticks between `first` and `last` that have no record, so that their arrivals
+            are assumed.
+        first: first tick with a record.
+        last: last tick with a record; -1 without records.
     """
 
     entries: dict[int, Sequence[ArrivalEntry]]
@@ -124,88 +150,141 @@ class Deliveries(NamedTuple):
 
 
 def read_deliveries(part: SiteLog) -> Deliveries:
-    """Returns the arrivals of a site that its records list."""
+    """Returns the arrivals at a site that its records list."""
     counts, rows = part.arrivals
-    entries = rows.tolist()
-    at: dict[int, Sequence[ArrivalEntry]] = {}
+    arrivals = rows.tolist()
+    entries: dict[int, Sequence[ArrivalEntry]] = {}
     start = 0
     for tick, stop in zip(part.tick.tolist(), np.cumsum(counts).tolist(), strict=True):
-        at[tick] = [entry for entry in entries[start:stop] if 0 <= entry[0] < len(part.peers)]
+        # a damaged record may list a peer that the site does not have
+        entries[tick] = [
+            entry for entry in arrivals[start:stop] if 0 <= entry[0] < len(part.peers)
+        ]
         start = stop
-    return Deliveries(at, frozenset(), min(at, default=0), max(at, default=-1))
+    return Deliveries(
+        entries=entries,
+        unrecorded=frozenset(),
+        first=min(entries, default=0),
+        last=max(entries, default=-1),
+    )
 
 
 def complete_deliveries(
     part: SiteLog, rates_hz: Sequence[int], ends: Sequence[int]
 ) -> Deliveries:
-    """Returns the arrivals of a site at every tick from its first record to its last.
+    """Returns the arrivals at a site for every tick from its first record to its last.
 
-    At ticks without a record those samples arrive that no record lists and that can have
-    arrived there: after they were sent, after the last earlier sample that a record lists,
-    before the first later one, as near as possible to the median delay of their link. `ends`
-    are the last ticks that the peers made.
+    At a tick without a record, samples are assumed to arrive that no record lists and that can
+    have arrived there: after the sample was sent, after the last earlier sample that a record
+    lists, and before the first later sample that a record lists. Among these ticks the nearest
+    to the median delay of the link is chosen.
+
+    Args:
+        part: the records of the site.
+        rates_hz: tick rates of its peers, Hz.
+        ends: last ticks of its peers.
 
     Raises:
-        LogError: fewer than half of those ticks have a record.
+        LogError: fewer than half of these ticks have a record.
     """
-    known = read_deliveries(part)
-    at = known.entries
-    ticks = known.last + 1 - known.first
-    if len(at) == ticks:
-        return known
-    if 2 * len(at) < ticks:
+    recorded = read_deliveries(part)
+    ticks = recorded.last + 1 - recorded.first
+    if len(recorded.entries) == ticks:
+        return recorded
+    if 2 * len(recorded.entries) < ticks:
         raise LogError(
-            f"{part.name} has records of {len(at)} of {count_nouns(ticks, 'tick')}: too few "
-            "to execute what lies between"
+            f"{part.name} has records of {len(recorded.entries)} of "
+            f"{count_nouns(ticks, 'tick')}: too few to execute what lies between"
         )
-    missing = [tick for tick in range(known.first, known.last) if tick not in at]
+    unrecorded = [
+        tick for tick in range(recorded.first, recorded.last) if tick not in recorded.entries
+    ]
     assumed: dict[int, list[list[int]]] = {}
     for peer, (peer_hz, end) in enumerate(zip(rates_hz, ends, strict=True)):
-        for tick, entry in _assume_arrivals(
-            known=known,
-            missing=missing,
+        arrivals = _assume_arrivals(
+            recorded=recorded,
+            unrecorded=unrecorded,
             rate_hz=part.rate_hz,
             peer=peer,
             peer_hz=peer_hz,
             end=end,
-        ):
+        )
+        for tick, entry in arrivals:
             assumed.setdefault(tick, []).append(entry)
-    filled = at | {tick: sorted(entries) for tick, entries in assumed.items()}
-    return known._replace(entries=filled, unrecorded=frozenset(missing))
+    entries = dict(recorded.entries)
+    for tick, tick_entries in assumed.items():
+        entries[tick] = sorted(tick_entries)
+    return recorded._replace(entries=entries, unrecorded=frozenset(unrecorded))
 
 
 def _find_first_arrivals(deliveries: Deliveries, peer: int) -> dict[int, tuple[int, int]]:
-    first: dict[int, tuple[int, int]] = {}
+    """Returns when each sample of a peer arrived first.
+
+    Returns:
+        By the tick of the sample: the tick of its first arrival, and its latency, us.
+    """
+    first_arrivals: dict[int, tuple[int, int]] = {}
     for k in sorted(deliveries.entries):
-        for j, tick, us in deliveries.entries[k]:
-            if j == peer and tick >= 0:
-                first.setdefault(tick, (k, us))
-    return first
+        for sender, tick, latency_us in deliveries.entries[k]:
+            if sender == peer and tick >= 0:
+                first_arrivals.setdefault(tick, (k, latency_us))
+    return first_arrivals
 
 
 def _assume_arrivals(
-    known: Deliveries, missing: list[int], rate_hz: int, peer: int, peer_hz: int, end: int
+    recorded: Deliveries,
+    unrecorded: list[int],
+    rate_hz: int,
+    peer: int,
+    peer_hz: int,
+    end: int,
 ) -> Iterator[tuple[int, list[int]]]:
-    first = _find_first_arrivals(known, peer)
-    listed = sorted(first)
-    lags_ns = [first[m][0] * NS_PER_S // rate_hz - m * NS_PER_S // peer_hz for m in listed]
+    """Yields the assumed arrivals of the samples of one peer that no record lists.
+
+    Args:
+        recorded: the arrivals that the records list.
+        unrecorded: the ticks without a record, ascending.
+        rate_hz: tick rate of the receiver, Hz.
+        peer: index of the sender among the receiver's peers.
+        peer_hz: tick rate of the sender, Hz.
+        end: last tick of the sender.
+
+    Yields:
+        The tick of the arrival, and its entry as in a record's `rx`.
+    """
+    first_arrivals = _find_first_arrivals(recorded, peer)
+    listed = sorted(first_arrivals)
+    lags_ns = []
+    for sample in listed:
+        arrival_ns = first_arrivals[sample][0] * NS_PER_S // rate_hz
+        lags_ns.append(arrival_ns - sample * NS_PER_S // peer_hz)
     lag_ns = median_low(lags_ns) if lags_ns else NS_PER_S // rate_hz
-    delay_us = median_low(us for _, us in first.values()) if first else 0
-    newest = min(end, known.last * peer_hz // rate_hz)
-    for m in range(newest + 1):
-        due = -(-(m * NS_PER_S // peer_hz + lag_ns) * rate_hz // NS_PER_S)
-        if m in first or due < known.first:
+    latencies_us = [latency_us for _, latency_us in first_arrivals.values()]
+    latency_us = median_low(latencies_us) if latencies_us else 0
+    newest = min(end, recorded.last * peer_hz // rate_hz)
+    for sample in range(newest + 1):
+        stamp_ns = sample * NS_PER_S // peer_hz
+        due = -(-(stamp_ns + lag_ns) * rate_hz // NS_PER_S)  # rounded up to a tick
+        if sample in first_arrivals or due < recorded.first:
             continue
-        place = bisect_left(listed, m)
-        before = first[listed[place - 1]][0] if place else known.first
-        after = first[listed[place]][0] if place < len(listed) else known.last
-        sent = m * rate_hz // peer_hz + 1  # nothing arrives before it was sent
-        start = bisect_left(missing, max(min(before, after), sent))
-        stop = bisect_left(missing, max(before, after) + 1)
+        # the arrivals of the samples before and after it, which may have overtaken each other
+        index = bisect_left(listed, sample)
+        before = recorded.first
+        if index > 0:
+            before = first_arrivals[listed[index - 1]][0]
+        after = recorded.last
+        if index < len(listed):
+            after = first_arrivals[listed[index]][0]
+        earliest = max(min(before, after), sample * rate_hz // peer_hz + 1)
+        start = bisect_left(unrecorded, earliest)
+        stop = bisect_left(unrecorded, max(before, after) + 1)
         if start < stop:
-            nearest = min(max(bisect_left(missing, due), start), stop - 1)
-            candidates = (missing[nearest], missing[max(nearest - 1, start)])
-            yield min(candidates, key=lambda tick: abs(tick - due)), [peer, m, delay_us]
+            position = min(max(bisect_left(unrecorded, due), start), stop - 1)
+            tick = unrecorded[position]
+            previous_tick = unrecorded[max(position - 1, start)]
+            if abs(previous_tick - due) < abs(tick - due):
+                tick = previous_tick
+            yield tick, [peer, sample, latency_us]
 
 
 def retime_deliveries(
@@ -217,20 +296,34 @@ def retime_deliveries(
 ) -> Deliveries:
     """Returns the arrivals over the same network for sites that tick at other rates.
 
-    A sample is under way for as long as the last sample of the log that was not stamped later,
-    from its stamp to the tick that received it; if that one never arrived, neither does this
-    one. Rates, Hz: the site's and its peers', in the log and in the rerun.
+    Each sample of the rerun has a model: the last sample of the log that was not stamped later.
+    The sample takes as long from its stamp to the tick that receives it as its model did. If
+    the model never arrived, the sample does not arrive either.
+
+    Args:
+        deliveries: the arrivals at the site in the log.
+        rate_hz: tick rate of the site in the log, Hz.
+        new_rate_hz: tick rate of the site in the rerun, Hz.
+        rates_hz: tick rates of its peers in the log, Hz.
+        new_rates_hz: tick rates of its peers in the rerun, Hz.
     """
     end_ns = deliveries.last * NS_PER_S // rate_hz
-    at: dict[int, list[ArrivalEntry]] = {}
+    entries: dict[int, list[ArrivalEntry]] = {}
     for peer, (old_hz, new_hz) in enumerate(zip(rates_hz, new_rates_hz, strict=True)):
-        first = _find_first_arrivals(deliveries, peer)
-        for m in range(end_ns * new_hz // NS_PER_S + 1):
-            stamp_ns = m * NS_PER_S // new_hz
+        first_arrivals = _find_first_arrivals(deliveries, peer)
+        for sample in range(end_ns * new_hz // NS_PER_S + 1):
+            stamp_ns = sample * NS_PER_S // new_hz
             model = ((stamp_ns + 1) * old_hz - 1) // NS_PER_S
-            if model in first:
-                k, us = first[model]
-                lag_ns = k * NS_PER_S // rate_hz - model * NS_PER_S // old_hz
-                tick = -(-(stamp_ns + lag_ns) * new_rate_hz // NS_PER_S)
-                at.setdefault(tick, []).append((peer, m, us))
-    return Deliveries(dict(at), frozenset(), 0, end_ns * new_rate_hz // NS_PER_S)
+            if model not in first_arrivals:
+                continue
+            arrival_tick, latency_us = first_arrivals[model]
+            arrival_ns = arrival_tick * NS_PER_S // rate_hz
+            lag_ns = arrival_ns - model * NS_PER_S // old_hz
+            tick = -(-(stamp_ns + lag_ns) * new_rate_hz // NS_PER_S)  # rounded up to a tick
+            entries.setdefault(tick, []).append((peer, sample, latency_us))
+    return Deliveries(
+        entries=dict(entries),
+        unrecorded=frozenset(),
+        first=0,
+        last=end_ns * new_rate_hz // NS_PER_S,
+    )
