@@ -129,8 +129,8 @@ def test_it_must_be_said_which_sites_once(
         (["links.s->m1.delay_ms=5"], ["links.s->m1", "receiver", "replace m1"]),
         (["dominance.m2.s=1"], ["dominance.m2", "replace m2"]),
         (["duration_s=30"], ["duration_s", "0.12 s", "not known"]),
-        (["name=other"], ["name", "nothing that is executed"]),
-        (["expect.stable=true"], ["expect.stable", "nothing that is executed"]),
+        (["name=other"], ["name", "only describes the scenario"]),
+        (["expect.stable=true"], ["expect.stable", "only describes the scenario"]),
     ],
     ids=str,
 )

@@ -1,12 +1,16 @@
-"""Executes the sites of a rerun in turn, each against the samples that arrived at it.
+"""Resolve a request for a rerun, and execute its sites over the network of the log.
 
-Invariants: a site advances by `Site.step` alone. It receives the samples of recorded peers as
-logged and those of executed peers as computed now, each at the tick at which the log says that
-it arrived. Without changes a site resumes after a gap from two consecutive records, and the
-record stands where too little is known; with changes its own steps carry it through gaps.
+Only executed sites can be changed. A setting that concerns no executed site is refused. A
+setting that concerns executed and recorded sites changes only the executed sites, and the
+result reports that.
 
-Only executed sites can be changed. A key that affects no executed site is refused; one that
-affects recorded sites too changes nothing of theirs, and the result reports it.
+Invariant:
+    - A site advances only by `Site.step`.
+    - A site receives the samples of recorded peers as logged and the samples of executed peers
+      as computed now, each at the tick at which the log says that it arrived.
+    - Without changes a site resumes after a gap from two consecutive records. Where the log
+      does not hold enough to execute a tick, its record is kept.
+    - With changes a site executes the ticks of a gap, with assumed arrivals.
 """
 
 import bisect
@@ -48,12 +52,20 @@ from .virtual_network import (
 )
 
 RerunOverrides = Mapping[str, Any] | Sequence[str]
+"""Changed settings, as a mapping from keys to values or as texts "KEY=VALUE"."""
 
 _TEXT_KEYS = ("name", "title", "about", "assumed", "expect")
+"""Keys of a scenario that describe it and have no effect on a run."""
 
 
 class ChangedValue(NamedTuple):
-    """One value that the rerun changes, by its dotted path in the resolved scenario."""
+    """A value that a rerun changes.
+
+    Attributes:
+        key: dotted path of the value in the resolved scenario.
+        before: the value in the log.
+        after: the value in the rerun.
+    """
 
     key: str
     before: Any
@@ -65,10 +77,13 @@ class RerunRequest:
     """A rerun: its sites, its scenario and its changes.
 
     Attributes:
-        scenario: the scenario of the rerun: changed for the executed sites, the log's for the
-            others.
+        original: the scenario of the log.
+        scenario: the scenario of the rerun: with changes for the executed sites, and that of
+            the log for the recorded sites.
         replaced: the executed sites, in scenario order.
-        without_effect: requested changes of recorded sites, which change nothing.
+        recorded: the recorded sites, in scenario order.
+        changes: the changed values.
+        without_effect: requested changes of recorded sites, which have no effect.
     """
 
     original: Scenario
@@ -80,22 +95,24 @@ class RerunRequest:
 
     @property
     def mode(self) -> str:
-        """The mode in words: "closed loop" if every site is executed, so that each reacts to
-        the others.
-        """
+        """The mode: "closed loop" if every site is executed, else "open loop"."""
         return "open loop" if self.recorded else "closed loop"
 
 
 def resolve_rerun_request(
     log: Log, replace: Sequence[str], overrides: RerunOverrides, *, closed_loop: bool
 ) -> RerunRequest:
-    """Checks a request for a rerun and resolves its scenario, with overrides as `load_scenario`
-    takes them.
+    """Validates a request for a rerun and resolves its scenario.
+
+    Args:
+        log: the log.
+        replace: names of the sites to execute.
+        overrides: changed settings, as `load_scenario` accepts them.
+        closed_loop: whether all sites are executed.
 
     Raises:
-        UsageError: the sites are not named, or in two ways.
-        ScenarioError: there is no such site, or an override is not valid or cannot have an
-            effect.
+        UsageError: the sites are not named, or are named in two ways.
+        ScenarioError: there is no such site, or a change is not valid or cannot have an effect.
     """
     original = log.scenario
     names = original.names
@@ -109,92 +126,118 @@ def resolve_rerun_request(
     for name in replace:
         find_site(original, name)
     replaced = tuple(name for name in names if closed_loop or name in replace)
-    for name in [name for name in original.external if name in replaced]:
-        others = [other for other in names if other not in original.external]
-        raise ScenarioError(
-            "is external: how that arm would have moved otherwise is not known; execute other sites"
-            + (f", as in --replace {others[0]}" if others else ""),
-            path=f"sites.{name}.plant",
-        )
+    _refuse_external_sites(original, replaced)
     recorded = tuple(name for name in names if name not in replaced)
     for text in overrides:  # keys of a mapping, or texts like KEY=VALUE
         key = text if isinstance(overrides, Mapping) else text.partition("=")[0].strip()
         _check_key(key, replaced, recorded)
-    wanted = load_scenario(original, overrides)
-    _check_frame(original, wanted, recorded)
-    scenario = _join_scenarios(original, wanted, recorded) if recorded else wanted
+    requested = load_scenario(original, overrides)
+    _check_frame(original, requested, recorded)
+    scenario = requested
+    if recorded:
+        scenario = _join_scenarios(original, requested, recorded)
     changes = _find_changes(original, scenario)
-    without = [changed for changed in _find_changes(original, wanted) if changed not in changes]
+    requested_changes = _find_changes(original, requested)
     return RerunRequest(
         original=original,
         scenario=scenario,
         replaced=replaced,
         recorded=recorded,
         changes=changes,
-        without_effect=without,
+        without_effect=[change for change in requested_changes if change not in changes],
     )
+
+
+def _refuse_external_sites(original: Scenario, replaced: Sequence[str]) -> None:
+    for name in original.external:
+        if name not in replaced:
+            continue
+        problem = (
+            "is external: how that arm would have moved otherwise is not known; execute other "
+            "sites"
+        )
+        others = [other for other in original.names if other not in original.external]
+        if others:
+            problem += f", as in --replace {others[0]}"
+        raise ScenarioError(problem, path=f"sites.{name}.plant")
 
 
 def _check_key(key: str, replaced: Sequence[str], recorded: Sequence[str]) -> None:
+    """Refuses a key that has no effect in a rerun."""
     group, _, rest = key.partition(".")
     if group in _TEXT_KEYS:
         raise ScenarioError(
-            "is nothing that is executed: it has no effect in a rerun", path=key
+            "only describes the scenario: it has no effect in a rerun", path=key
         )
     if group == "rate_hz" or rest.endswith(".rate_hz"):
-        return  # `_check_frame` judges what comes of it
-    member = rest.partition(".")[0]
-    concerned = {"sites": member, "dominance": member, "links": member.partition("->")[2]}.get(
-        group, ""
-    )
+        return  # `_check_frame` checks the rates of the resolved scenario
+    owner = rest.partition(".")[0]
+    if group == "links":
+        concerned = owner.partition("->")[2]
+    elif group in ("sites", "dominance"):
+        concerned = owner
+    else:
+        return
     if concerned in recorded:
-        why = f"{concerned} stays as recorded{', and a link belongs to its receiver' * (group == 'links')}"
-        only = f"only {', '.join(replaced)} is executed"
+        reason = f"{concerned} stays as recorded"
+        if group == "links":
+            reason += ", and a link belongs to its receiver"
+        executed = f"only {', '.join(replaced)} is executed"
         raise ScenarioError(
-            f"has no effect: {why}; {only}: add --replace {concerned}", path=key
+            f"has no effect: {reason}; {executed}: add --replace {concerned}", path=key
         )
 
 
-def _check_frame(original: Scenario, wanted: Scenario, recorded: Sequence[str]) -> None:
-    if wanted.names != original.names:
+def _check_frame(original: Scenario, requested: Scenario, recorded: Sequence[str]) -> None:
+    """Refuses other sites, a longer duration, and other tick rates in open loop."""
+    if requested.names != original.names:
         raise ScenarioError(
             f"a rerun has the sites of the log, {', '.join(original.names)}", path="sites"
         )
-    if wanted.duration_s > original.duration_s:
+    if requested.duration_s > original.duration_s:
         raise ScenarioError(
-            f"the experiment of the log lasts {original.duration_s:g} s: what the network would have done "
-            f"until {wanted.duration_s:g} s is not known",
+            f"the experiment of the log lasts {original.duration_s:g} s: what the network "
+            f"would have done until {requested.duration_s:g} s is not known",
             path="duration_s",
         )
-    for name in original.names if recorded else ():
-        if wanted.sites[name].rate_hz != original.sites[name].rate_hz:
+    if not recorded:
+        return
+    for name in original.names:
+        if requested.sites[name].rate_hz != original.sites[name].rate_hz:
             raise ScenarioError(
-                "cannot change in an open loop: samples come at the ticks of the log; use --closed-loop",
+                "cannot change in an open loop: samples come at the ticks of the log; "
+                "use --closed-loop",
                 path=f"sites.{name}.rate_hz",
             )
 
 
-def _join_scenarios(original: Scenario, wanted: Scenario, recorded: Sequence[str]) -> Scenario:
+def _join_scenarios(
+    original: Scenario, requested: Scenario, recorded: Sequence[str]
+) -> Scenario:
+    """Returns the requested scenario, with the original settings of the recorded sites."""
 
-    def source(name: str) -> Scenario:
-        return original if name in recorded else wanted
+    def choose(site: str) -> Scenario:
+        return original if site in recorded else requested
 
     timeline = [change for change in original.timeline if find_owner(change) in recorded]
-    timeline += [change for change in wanted.timeline if find_owner(change) not in recorded]
+    timeline += [change for change in requested.timeline if find_owner(change) not in recorded]
+    links = {}
+    for link in original.links:
+        receiver = link.partition("->")[2]
+        links[link] = choose(receiver).links[link]
     joined = msgspec.structs.replace(
-        wanted,
-        sites={name: source(name).sites[name] for name in original.names},
-        dominance={name: source(name).dominance[name] for name in original.names},
-        links={name: source(name.partition("->")[2]).links[name] for name in original.links},
+        requested,
+        sites={name: choose(name).sites[name] for name in original.names},
+        dominance={name: choose(name).dominance[name] for name in original.names},
+        links=links,
         timeline=tuple(sorted(timeline, key=lambda change: change.at_s)),
     )
     return parse_scenario(joined.text, original.name)
 
 
 def _find_changes(original: Scenario, other: Scenario) -> list[ChangedValue]:
-    before, after = (
-        dict(flatten_table(msgspec.to_builtins(scenario))) for scenario in (original, other)
-    )
+    before = dict(flatten_table(msgspec.to_builtins(original)))
+    after = dict(flatten_table(msgspec.to_builtins(other)))
     return [
         ChangedValue(key, before.get(key), after.get(key))
         for key in before | after
@@ -203,55 +246,65 @@ def _find_changes(original: Scenario, other: Scenario) -> list[ChangedValue]:
 
 
 def describe_rerun_changes(request: RerunRequest) -> list[str]:
-    """Returns the changes in words, a line for each, with all its owners."""
+    """Returns the changes as lines of text; equal changes of several owners share a line."""
     owners: dict[tuple[str, str], list[str]] = {}
-    for subject, owner, change in _describe_parts(request):
+    for subject, owner, change in _describe_changes(request):
         owners.setdefault((subject, change), []).append(owner)
     lines = []
     for (subject, change), names in owners.items():
-        if subject == "link":
-            every = len(names) == len(request.scenario.links)
-            lines.append(f"{'every link' if every else ', '.join(names)}: {change}")
+        if subject == "link" and len(names) == len(request.scenario.links):
+            lines.append(f"every link: {change}")
+        elif subject == "link":
+            lines.append(f"{', '.join(names)}: {change}")
+        elif all(names):
+            lines.append(f"{subject} of {', '.join(names)}: {change}")
         else:
-            lines.append(
-                f"{subject}{' of ' + ', '.join(names) if all(names) else ''}: {change}"
-            )
+            lines.append(f"{subject}: {change}")
     return lines
 
 
-def _describe_parts(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
-    done: set[str] = set()
-    for changed in request.changes:
-        group, _, rest = changed.key.partition(".")
+def _describe_changes(request: RerunRequest) -> Iterator[tuple[str, str, str]]:
+    """Yields subject, owner ("" for the whole scenario) and text of every change."""
+    described: set[str] = set()
+    for change in request.changes:
+        group, _, rest = change.key.partition(".")
         owner, _, key = rest.partition(".")
-        whole = _describe_whole(request, group, owner, key)
-        if whole is None:
-            values = f"{_shorten(changed.before)} -> {_shorten(changed.after)}"
-            yield (key, owner, values) if group == "sites" else (changed.key, "", values)
-        elif f"{group}.{owner}" not in done:
-            done.add(f"{group}.{owner}")
-            yield whole
+        replacement = _describe_replacement(request, group, owner, key)
+        if replacement is None:
+            values = f"{_shorten(change.before)} -> {_shorten(change.after)}"
+            if group == "sites":
+                yield key, owner, values
+            else:
+                yield change.key, "", values
+        elif f"{group}.{owner}" not in described:
+            described.add(f"{group}.{owner}")
+            yield replacement
 
 
-def _describe_whole(
+def _describe_replacement(
     request: RerunRequest, group: str, owner: str, key: str
 ) -> tuple[str, str, str] | None:
-    """Describes a link, or a law of another kind, as a whole; None if single values say it all."""
+    """Returns subject, owner and text if a link or a law is replaced as a whole; else None.
+
+    A link is described as a whole if its description differs, a law if its kind differs.
+    """
     before = request.original
     after = request.scenario
     if group == "links":
-        links = [scenario.links[owner].describe() for scenario in (before, after)]
-        return None if links[0] == links[1] else ("link", owner, " -> ".join(links))
+        before_text = before.links[owner].describe()
+        after_text = after.links[owner].describe()
+        if before_text != after_text:
+            return "link", owner, f"{before_text} -> {after_text}"
     if group == "sites" and key.startswith("control."):
-        laws = [
-            msgspec.to_builtins(scenario.sites[owner].control) for scenario in (before, after)
-        ]
-        same = laws[0]["law"] == laws[1]["law"]
-        return None if same else ("control", owner, " -> ".join(map(describe_law, laws)))
+        before_law = msgspec.to_builtins(before.sites[owner].control)
+        after_law = msgspec.to_builtins(after.sites[owner].control)
+        if before_law["law"] != after_law["law"]:
+            return "control", owner, f"{describe_law(before_law)} -> {describe_law(after_law)}"
     return None
 
 
 def _shorten(value: object) -> str:
+    """Returns a value as text; of a list of tables only their number."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return f"{len(value)} {'entry' if len(value) == 1 else 'entries'}"
     return describe_value(value)
@@ -261,11 +314,16 @@ class RerunTick(NamedTuple):
     """One tick of an executed site.
 
     Attributes:
-        payload: its record as it would be published; the log's own if `kept`.
-        same: True if the log has a record of that tick of which every computed field has the
-            same bits.
-        kept: True if the log's record stands, because too little is known to execute it.
-        stats: its statistics, at the ticks that have some.
+        site: name of the site.
+        tick: number of the tick.
+        t_ns: nominal time, ns since the epoch.
+        mode: mode of the site.
+        payload: the record as it would be published; the record of the log if `kept`.
+        same: True if the log has a record of the tick whose computed fields all have the same
+            bits.
+        kept: True if the record of the log is kept, because the log does not hold enough to
+            execute the tick.
+        stats: the statistics of the tick, if statistics are due.
     """
 
     site: str
@@ -279,14 +337,24 @@ class RerunTick(NamedTuple):
 
 
 class RerunSite:
-    """One site, executed again against its deliveries.
+    """One executed site of a rerun.
 
-    Samples of executed peers appear in `samples` as they are computed.
+    Args:
+        log: the log.
+        request: the rerun.
+        name: name of the site.
+        deliveries: the arrivals at the site.
+        samples: the samples of all sites, by site and tick. Samples of executed peers appear
+            while they are computed.
 
     Attributes:
-        deliveries: what arrives at it.
-        first: the first difference from the log's records.
+        name: name of the site.
+        k: the next tick.
+        output: record of the last tick.
+        deliveries: the arrivals at the site.
+        first: the first difference from the records of the log.
         lacking: number of samples that arrived and are not in the log.
+        diverged: True once the site left its limits.
     """
 
     output: TickRecord
@@ -299,18 +367,18 @@ class RerunSite:
         deliveries: Deliveries,
         samples: Mapping[str, Mapping[int, ReceivedMotion]],
     ) -> None:
-        self.name = name
-        scenario = request.scenario
         part = log[name]
+        scenario = request.scenario
+        setup = scenario.setup(name)
+        self.name = name
         self.k = deliveries.first
+        self.deliveries = deliveries
         self.first: RecordDifference | None = None
         self.lacking = 0
         self.diverged = False
-        setup = scenario.setup(name)
         self._site = Site(setup)
         self._channel = setup.channel
         self._part = part
-        self.deliveries = deliveries
         self._changed = bool(request.changes)
         self._inputs = RecordedInputs(
             part=part,
@@ -319,74 +387,85 @@ class RerunSite:
             changes=log.commands(name),
             links=setup.links,
         )
-        self._last = min(deliveries.last, scenario.ticks(name) - 1)
+        self._last_tick = min(deliveries.last, scenario.ticks(name) - 1)
+        # at another rate no tick has the time of a record
         same_rate = self._site.rate_hz == part.rate_hz
-        self._recorded: list[int] = part.tick.tolist() if same_rate else []
-        self._places = {tick: n for n, tick in enumerate(self._recorded)}
+        self._recorded_ticks: list[int] = part.tick.tolist() if same_rate else []
+        self._rows = {tick: row for row, tick in enumerate(self._recorded_ticks)}
         self._boot = part.states[0].boot if len(part) else 0
         self._stats = LoopStats(self._site, self._boot)
-        self._certain = deliveries.first == 0
+        self._certain = deliveries.first == 0  # whether the state of the site is known
 
     @property
-    def done(self) -> bool:
-        """True if it makes no more ticks."""
-        return self.diverged or self.k > self._last
+    def is_done(self) -> bool:
+        """True if the site executes no more ticks."""
+        return self.diverged or self.k > self._last_tick
 
     @property
     def t_ns(self) -> int:
-        """Nominal time of its next tick, ns since the epoch."""
+        """Nominal time of the next tick, ns since the epoch."""
         return self.k * NS_PER_S // self._site.rate_hz
 
     def execute_tick(self) -> RerunTick:
-        """Executes one tick.
+        """Executes the next tick, or keeps the record of the log.
 
         Raises:
-            LogError: the log orders more changes than a site takes, or holds an impossible
+            LogError: the log lists more changes than a site accepts, or holds an impossible
                 record.
         """
-        n = self._places.get(self.k)
+        row = self._rows.get(self.k)
         try:
-            if n is not None and not self._certain and self._inputs.can_resume(n):
-                missed = self._inputs.pop_changes(self.k - 1)
-                self._inputs.resume(self._site, n, [change for _, change in missed])
+            if row is not None and not self._certain and self._inputs.can_resume(row):
+                changes = [change for _, change in self._inputs.pop_changes(self.k - 1)]
+                self._inputs.resume(self._site, row, changes)
                 self._certain = True
-            made = self._execute(n) if self._certain or n is None else self._keep(n)
+            if self._certain or row is None:
+                tick = self._execute(row)
+            else:
+                tick = self._keep_record(row)
         except (ValueError, OverflowError) as error:
             raise LogError(f"{self.name}, tick {self.k}: {error}") from None
-        self.diverged = made.mode is Mode.DIVERGED
+        self.diverged = tick.mode is Mode.DIVERGED
         self.k += 1
-        # on to the next record
-        if not (self._changed and self._certain) and self.k not in self._places:
-            place = bisect.bisect_right(self._recorded, self.k)
-            self.k = self._recorded[place] if place < len(self._recorded) else self._last + 1
-            self._certain = False
-        return made
+        if not (self._changed and self._certain) and self.k not in self._rows:
+            self._skip_gap()
+        return tick
 
-    def _execute(self, n: int | None) -> RerunTick:
+    def _skip_gap(self) -> None:
+        """Continues at the next record, or ends after the last record."""
+        index = bisect.bisect_right(self._recorded_ticks, self.k)
+        self.k = self._last_tick + 1
+        if index < len(self._recorded_ticks):
+            self.k = self._recorded_ticks[index]
+        self._certain = False
+
+    def _execute(self, row: int | None) -> RerunTick:
+        """Executes the next tick and compares it with its record, if the log has a record."""
         arrivals, missing = self._inputs.find_arrivals(self.deliveries.entries.get(self.k, ()))
+        arrivals = arrivals[:MAX_ARRIVALS]
         self._inputs.add_lacking(missing)
         self.lacking += len(missing)
         changes = [change for _, change in self._inputs.pop_changes(self.k)]
-        fits = self._site.layout.hand == self._part.layout.hand
-        hand = find_recorded_hand(self._part, self._site, self.k) if fits else ()
-        output = self._site.step(TickInput(self.k, arrivals[:MAX_ARRIVALS], changes, hand=hand))
+        hand: Sequence[float] = ()
+        if self._site.layout.hand == self._part.layout.hand:
+            hand = find_recorded_hand(self._part, self._site, self.k)
+        output = self._site.step(TickInput(self.k, arrivals, changes, hand=hand))
         stats = self._stats.pop_stats(output) if self._stats.is_due(self.k) else None
         same = False
-        if n is not None:
-            state = self._part.states[n]
-            peers = self._part.peers
-            # arrivals have another CRC if peers are changed or the log lacks a sample
-            comparable = (
-                output._replace(rx_crc=state.rx_crc) if self._changed or missing else output
-            )
-            same = equal_record(state, comparable, peers)
+        if row is not None:
+            state = self._part.states[row]
+            comparable = output
+            if self._changed or missing:
+                # the CRC covers samples that are changed or that the log lacks
+                comparable = output._replace(rx_crc=state.rx_crc)
+            same = equal_record(state, comparable, self._part.peers)
             if not same and not self._changed and self._inputs.is_uncertain(state, output):
-                return self._keep(n)
+                return self._keep_record(row)
             if not same and self.first is None:
                 self.first = find_first_difference(
                     logged=state,
                     computed=comparable,
-                    peers=peers,
+                    peers=self._part.peers,
                     equal=equal_bits,
                     channel=self._channel,
                 )
@@ -396,7 +475,7 @@ class RerunSite:
             boot=self._boot,
             peers=self._part.peers,
             output=output,
-            arrivals=arrivals[:MAX_ARRIVALS],
+            arrivals=arrivals,
             late_us=0,
             busy_us=0,
         )
@@ -411,16 +490,17 @@ class RerunSite:
             stats=stats,
         )
 
-    def _keep(self, n: int) -> RerunTick:
+    def _keep_record(self, row: int) -> RerunTick:
+        """Returns the tick of a record of the log, which is not executed."""
         self._certain = False
-        self.output = output = read_output(self._part.states[n], self._part.peers)
-        payload = self._part.payloads[n]
+        output = read_output(self._part.states[row], self._part.peers)
+        self.output = output
         return RerunTick(
             site=self.name,
             tick=output.tick,
             t_ns=output.t_ns,
             mode=output.mode,
-            payload=payload,
+            payload=self._part.payloads[row],
             same=False,
             kept=True,
             stats=None,
@@ -428,14 +508,22 @@ class RerunSite:
 
 
 MEMORY_S = 120
-"""Longest time that a computed sample may be under way, s: longer than any queue holds one."""
+"""Time for which computed samples are kept for delivery, s. No queue holds a sample for longer.
+"""
 
 
 class RerunExecution:
-    """The sites of a rerun, executed.
+    """The execution of all sites of a rerun.
+
+    Args:
+        log: the log.
+        request: the rerun.
+
+    Attributes:
+        sites: the executed sites, by name.
 
     Raises:
-        LogError: the log does not tell enough.
+        LogError: the log does not hold enough to execute the sites.
     """
 
     def __init__(self, log: Log, request: RerunRequest) -> None:
@@ -445,7 +533,7 @@ class RerunExecution:
         samples: dict[str, Mapping[int, ReceivedMotion]] = {
             name: log[name].by_tick for name in request.recorded
         }
-        samples |= self._recent  # filled as they are computed
+        samples |= self._recent  # filled while the sites are executed
         self.sites = {
             name: RerunSite(
                 log=log,
@@ -463,66 +551,78 @@ class RerunExecution:
         scenario = self._request.scenario
         if not self._request.changes:
             return read_deliveries(part)
-        before = [original.sites[peer].rate_hz for peer in part.peers]
-        after = [scenario.sites[peer].rate_hz for peer in part.peers]
-        found = complete_deliveries(
-            part, before, [self._log.last_ticks[peer] for peer in part.peers]
-        )
-        rate_hz = scenario.sites[name].rate_hz
-        if (part.rate_hz, before) == (rate_hz, after):
-            return found
-        if found.first > 0:
+        rates_hz = [original.sites[peer].rate_hz for peer in part.peers]
+        new_rates_hz = [scenario.sites[peer].rate_hz for peer in part.peers]
+        new_rate_hz = scenario.sites[name].rate_hz
+        ends = [self._log.last_ticks[peer] for peer in part.peers]
+        deliveries = complete_deliveries(part, rates_hz, ends)
+        if part.rate_hz == new_rate_hz and rates_hz == new_rates_hz:
+            return deliveries
+        if deliveries.first > 0:
             raise LogError(
-                f"{self._log.source}: the records of {name} begin at tick {found.first}: "
+                f"{self._log.source}: the records of {name} begin at tick {deliveries.first}: "
                 "a site that begins in the middle keeps its rate, and so do its peers"
             )
         return retime_deliveries(
-            deliveries=found,
+            deliveries=deliveries,
             rate_hz=part.rate_hz,
-            new_rate_hz=rate_hz,
-            rates_hz=before,
-            new_rates_hz=after,
+            new_rate_hz=new_rate_hz,
+            rates_hz=rates_hz,
+            new_rates_hz=new_rates_hz,
         )
 
     def run(self, progress: Progress | None = None) -> Iterator[RerunTick]:
-        """Yields every tick of every executed site, in order of time as far as arrivals allow.
+        """Executes all sites and yields every tick, in order of time as far as arrivals allow.
 
-        A site that left its limits makes no more ticks. With changes, the others end with it.
+        A site that left its limits executes no more ticks. With changes all sites end at that
+        time.
+
+        Args:
+            progress: called now and then with the number of executed ticks and an upper bound
+                of their total.
         """
         sites = list(self.sites.values())
         total = sum(site.deliveries.last + 1 - site.deliveries.first for site in sites)
+        # (t_ns, index of the site, tick) of each site's next tick, in order of time
         pending = sorted(
-            (site.t_ns, place, site.k) for place, site in enumerate(sites) if not site.done
+            (site.t_ns, index, site.k) for index, site in enumerate(sites) if not site.is_done
         )
-        done = 0
+        executed = 0
         last_ns = None
         while pending and (last_ns is None or pending[0][0] <= last_ns):
-            first = next(
-                (n for n, (_, at, k) in enumerate(pending) if self._is_ready(at, k)), 0
-            )
-            t_ns, place, _ = pending.pop(first)
-            site = sites[place]
-            made = site.execute_tick()
-            output = site.output
-            recent = self._recent[site.name]
-            recent[output.tick] = make_arrival(0, output.tick, output)
-            if len(recent) > MEMORY_S * self._request.scenario.sites[site.name].rate_hz:
-                del recent[next(iter(recent))]
-            yield made
+            t_ns, index, _ = pending.pop(self._find_ready(pending))
+            site = sites[index]
+            tick = site.execute_tick()
+            self._keep_sample(site)
+            yield tick
             if site.diverged and self._request.changes:
                 last_ns = t_ns
-            if not site.done:
-                bisect.insort(pending, (site.t_ns, place, site.k))
-            done += 1
-            if progress is not None and done % PROGRESS_EVERY == 0:
-                progress(done, total)
+            if not site.is_done:
+                bisect.insort(pending, (site.t_ns, index, site.k))
+            executed += 1
+            if progress is not None and executed % PROGRESS_EVERY == 0:
+                progress(executed, total)
 
-    def _is_ready(self, place: int, k: int) -> bool:
-        """True if every sample of a site's next tick, k, has been computed, or never will be."""
-        receiver = self._request.replaced[place]
+    def _keep_sample(self, site: RerunSite) -> None:
+        """Keeps the last record of a site for its peers, and drops the oldest sample."""
+        output = site.output
+        recent = self._recent[site.name]
+        recent[output.tick] = make_arrival(0, output.tick, output)
+        if len(recent) > MEMORY_S * self._request.scenario.sites[site.name].rate_hz:
+            del recent[next(iter(recent))]
+
+    def _find_ready(self, pending: Sequence[tuple[int, int, int]]) -> int:
+        """Returns the position of the first tick whose arrivals are computed; else 0."""
+        for position, (_, index, k) in enumerate(pending):
+            if self._is_ready(self._request.replaced[index], k):
+                return position
+        return 0
+
+    def _is_ready(self, receiver: str, k: int) -> bool:
+        """True if every arrival of a site's next tick is computed, or never will be."""
         peers = self._log[receiver].peers
         for peer, tick, _ in self.sites[receiver].deliveries.entries.get(k, ()):
             sender = self.sites.get(peers[peer])
-            if sender is not None and not sender.done and tick >= sender.k:
+            if sender is not None and not sender.is_done and tick >= sender.k:
                 return False
         return True

@@ -1,15 +1,15 @@
-"""The inputs of one site as its log recorded them, and its state in the middle of the log.
+"""Read the inputs of a site from its log, and restore its state in the middle of the log.
 
-Invariant (L3): two consecutive records and the contents of the links suffice to resume.
-Arrivals at ticks without a record are unknown; samples that no record lists are assumed to have
-arrived there.
+Invariant (L3):
+    - Two consecutive records and the contents of the links suffice to restore a site.
+    - Arrivals at ticks without a record are unknown. Samples that no record lists are assumed
+      to have arrived at these ticks.
 """
 
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from operator import attrgetter
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -21,35 +21,65 @@ from ..log.site_log import SiteLog
 from ..net.messages import MODES, RESTING_MODES, State
 
 _LOOK_BACK = 100
-"""Records before a gap in which to look for the newest sample that had arrived."""
+"""Number of records before a gap that are searched for the newest sample that had arrived."""
 
 Change = TypeVar("Change")
 
 ArrivalEntry = Sequence[int]
-"""As in a record's `rx`: index of the peer, tick of its sample, us."""
+"""An arrival as in a record's `rx`: index of the peer, tick of its sample, latency in us."""
 
 
 ReceivedMotion = State | Arrival
 """A sample of a peer, as it was recorded or as it is computed now."""
 
 
-_MOTION = attrgetter("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
-_REST = attrgetter("x", "xd", "wrench", "ch", "hand", "bodies")
-
-
 def read_output(state: State, peers: tuple[str, ...]) -> TickRecord:
-    """Returns a record in the form in which `Site.step` returned it."""
-    begin = state.tick, state.t_ns, MODES.get(state.mode, MODES["diverged"]).mode
-    taken = [state.used.get(peer, -1) for peer in peers], state.rx_crc, state.cmd
+    """Returns a record in the form in which `Site.step` returned it.
+
+    Args:
+        state: the record, as it was published.
+        peers: names of the site's peers, in scenario order.
+    """
+    mode = MODES.get(state.mode, MODES["diverged"]).mode
+    # a complete memory has more numbers than the pose with which it begins
     mem = state.mem if len(state.mem) > len(state.q_des) else []
-    return TickRecord._make([*begin, *_MOTION(state), *taken, mem, *_REST(state)])
+    return TickRecord(
+        tick=state.tick,
+        t_ns=state.t_ns,
+        mode=mode,
+        q=state.q,
+        qd=state.qd,
+        q_des=state.q_des,
+        qd_des=state.qd_des,
+        tau=state.tau,
+        tau_x=state.tau_x,
+        theta_hat=state.theta_hat,
+        used=[state.used.get(peer, -1) for peer in peers],
+        rx_crc=state.rx_crc,
+        cmd=state.cmd,
+        mem=mem,
+        x=state.x,
+        xd=state.xd,
+        wrench=state.wrench,
+        ch=state.ch,
+        hand=state.hand,
+        bodies=state.bodies,
+    )
 
 
 def make_arrival(
     peer: int, tick: int, sample: ReceivedMotion | TickRecord, latency_us: int = 0
 ) -> Arrival:
-    """Returns the arrival of a peer's sample, whose numbers are those of its record, see
-    `select_peer_channels`.
+    """Returns the arrival of a peer's sample.
+
+    The arrival has the numbers for all receivers; `select_peer_channels` reduces them to the
+    numbers for one receiver.
+
+    Args:
+        peer: index of the sender among the receiver's peers.
+        tick: tick of the sample.
+        sample: the record of that tick, or an arrival of the sample.
+        latency_us: time from the stamp to the arrival, us.
     """
     if isinstance(sample, Arrival) or not sample.x:
         return Arrival(
@@ -61,6 +91,7 @@ def make_arrival(
             tau_x=sample.tau_x,
             ch=sample.ch,
         )
+    # in task space the sites share the motion of the end effector
     return Arrival(
         peer=peer,
         tick=tick,
@@ -75,36 +106,57 @@ def make_arrival(
 def select_peer_channels(
     arrivals: Sequence[Arrival], links: Sequence[LinkSetup]
 ) -> list[Arrival]:
-    """Returns the arrivals of whole samples as a site takes them in: without what is for other
-    peers.
+    """Returns arrivals with only those numbers of the law channel that are for this site.
+
+    Args:
+        arrivals: the arrivals, with the whole channel of their senders.
+        links: the links of the receiver, by the index of the peer.
     """
-    return [
-        one._replace(ch=links[one.peer].channel.select_for_peer(one.ch, links[one.peer].place))
-        if one.ch
-        else one
-        for one in arrivals
-    ]
+    selected = []
+    for arrival in arrivals:
+        if arrival.ch:
+            link = links[arrival.peer]
+            arrival = arrival._replace(ch=link.channel.select_for_peer(arrival.ch, link.place))
+        selected.append(arrival)
+    return selected
 
 
 def find_recorded_hand(part: SiteLog, site: Site, k: int) -> list[float]:
-    """Returns what a live hand did at a tick, by the latest record until then; [] without a
-    live hand.
+    """Returns the action of a live hand at tick `k`, from the newest record until that time.
+
+    Args:
+        part: the records of the site in the log.
+        site: the executed site, whose tick rate may differ from the log's.
+        k: the tick of the executed site.
+
+    Returns:
+        The action, as `HandInForce`; [] if the site has no live hand.
     """
-    until = (
-        np.searchsorted(part.t_ns, k * NS_PER_S // site.rate_hz, side="right")
-        if part.layout.hand
-        else 0
-    )
-    found: list[float] = part.hand[int(until) - 1].tolist() if until else []
-    return found
+    if not part.layout.hand:
+        return []
+    t_ns = k * NS_PER_S // site.rate_hz
+    count = int(np.searchsorted(part.t_ns, t_ns, side="right"))
+    if not count:
+        return []
+    action: list[float] = part.hand[count - 1].tolist()
+    return action
 
 
 class RecordedInputs(Generic[Change]):
-    """Arrivals, changes and resumption of one site, from its records and those of its peers.
+    """The recorded inputs of one site: its arrivals and its changes.
+
+    Args:
+        part: the records of the site.
+        samples: the records or arrivals of all sites, by site and tick.
+        ends: last tick of each site.
+        changes: the changes of the site, by tick.
+        links: the links of the site, by the index of the peer.
 
     Attributes:
-        assumed: per peer the samples that are assumed to have arrived where no record is.
-        lacking: per peer the samples that arrived and whose own record is missing.
+        samples: the samples of each peer, by tick.
+        ends: last tick of each peer.
+        assumed: per peer the ticks of samples that are assumed to have arrived in a gap.
+        lacking: per peer the ticks of samples that arrived and whose own record is missing.
     """
 
     def __init__(
@@ -124,25 +176,27 @@ class RecordedInputs(Generic[Change]):
         self.lacking: list[set[int]] = [set() for _ in part.peers]
 
     def pop_changes(self, tick: int) -> list[tuple[int, Change]]:
-        """Returns the changes up to a tick that have not been taken yet, each with its own
-        tick.
-        """
-        taken: list[tuple[int, Change]] = []
+        """Returns the changes up to a tick and removes them; each with its own tick."""
+        popped: list[tuple[int, Change]] = []
         while self._changes and self._changes[-1][0] <= tick:
-            named, changes = self._changes.pop()
-            taken += [(named, change) for change in changes]
-        return taken
+            change_tick, changes = self._changes.pop()
+            popped += [(change_tick, change) for change in changes]
+        return popped
 
     def find_arrivals(
         self, entries: Sequence[ArrivalEntry]
     ) -> tuple[list[Arrival], list[ArrivalEntry]]:
-        """Returns the arrivals that entries list, and the entries whose sample no record holds."""
+        """Returns the arrivals of entries, and the entries whose sample is missing.
+
+        Args:
+            entries: arrivals as in a record's `rx`.
+        """
         arrivals: list[Arrival] = []
         missing: list[ArrivalEntry] = []
-        samples = self.samples
         for entry in entries:
             peer, tick, latency_us = entry
-            sample = samples[peer].get(tick) if 0 <= peer < len(samples) else None
+            is_peer = 0 <= peer < len(self.samples)
+            sample = self.samples[peer].get(tick) if is_peer else None
             if sample is None:
                 missing.append(entry)
             else:
@@ -150,120 +204,165 @@ class RecordedInputs(Generic[Change]):
         return select_peer_channels(arrivals, self._links), missing
 
     def add_lacking(self, entries: Sequence[ArrivalEntry]) -> None:
-        """Notes samples that arrived and whose own record is missing."""
+        """Notes samples that arrived and whose own record is missing, as entries of `rx`."""
         for peer, tick, _ in entries:
             self.lacking[peer].add(tick)
 
-    def can_resume(self, n: int, *, apart: bool = False) -> bool:
-        """True if the two records before record n are consecutive and the samples in use are
-        known.
+    def can_resume(self, row: int, *, detached: bool = False) -> bool:
+        """True if the site can be restored at a record, see `resume`.
 
-        Those that are not known do not matter to a site that holds, `apart` from its peers, by
-        a reference of its own.
+        The two records before the record have to be consecutive, and the samples in use have to
+        be known. Unknown samples do not matter to a site that rests by a reference of its own.
+
+        Args:
+            row: row of the record.
+            detached: whether the site follows a reference of its own while it rests.
         """
         states = self._part.states
-        if n < 2 or [s.tick for s in states[n - 2 : n]] != [
-            states[n].tick - 2,
-            states[n].tick - 1,
-        ]:
+        if row < 2:
             return False
-        in_use = read_output(states[n - 1], self._part.peers).used
-        if apart and states[n - 1].mode in RESTING_MODES:
+        ticks = [state.tick for state in states[row - 2 : row]]
+        if ticks != [states[row].tick - 2, states[row].tick - 1]:
+            return False
+        if detached and states[row - 1].mode in RESTING_MODES:
             return True
+        in_use = read_output(states[row - 1], self._part.peers).used
         return all(
             used < 0 or used in known for used, known in zip(in_use, self.samples, strict=True)
         )
 
-    def resume(self, site: Site, n: int, changes: Sequence[CoreChange] = ()) -> None:
-        """Brings a site into its state at record n, after `changes`, if it `can_resume` there."""
+    def resume(self, site: Site, row: int, changes: Sequence[CoreChange] = ()) -> None:
+        """Restores the state of a site before the tick of a record, where it `can_resume`.
+
+        Args:
+            site: the site.
+            row: row of the record.
+            changes: changes that the site applied since its last executed tick.
+        """
         states = self._part.states
         peers = self._part.peers
         for change in changes:
-            site.order(change, states[n].t_ns)
-        before, last = (read_output(states[m], peers) for m in (n - 2, n - 1))
+            site.order(change, states[row].t_ns)
+        before = read_output(states[row - 2], peers)
+        last = read_output(states[row - 1], peers)
         in_use: list[Arrival | None] = []
         waiting: list[Arrival] = []
-        for j, used in enumerate(last.used):
-            sample = self.samples[j].get(used)
-            if sample is None and used >= 0:  # see `can_resume`
-                unknown = (0.0,) * len(last.q_des)
-                sample = Arrival(j, used, unknown, unknown)
-                self.lacking[j].add(used)
-            in_use += (
-                [None]
-                if sample is None
-                else select_peer_channels([make_arrival(j, used, sample)], self._links)
-            )
-            # a sample older than the one in use is never used any more
-            self.lacking[j] = {tick for tick in self.lacking[j] if tick >= used}
-            certain, self.assumed[j] = self._find_waiting(n, j, used, site.peer_rate_hz(j))
-            arrived, missing = self.find_arrivals(
-                [(j, tick, 0) for tick in sorted(certain | self.assumed[j])]
-            )
+        for peer, used in enumerate(last.used):
+            in_use.append(self._find_in_use(peer, used, len(last.q_des)))
+            # a sample older than the one in use is never used again
+            self.lacking[peer] = {tick for tick in self.lacking[peer] if tick >= used}
+            rate_hz = site.peer_rate_hz(peer)
+            certain, self.assumed[peer] = self._find_waiting(row, peer, used, rate_hz)
+            waiting_ticks = sorted(certain | self.assumed[peer])
+            arrivals, missing = self.find_arrivals([(peer, tick, 0) for tick in waiting_ticks])
             self.add_lacking(missing)
-            waiting += arrived
-        site.prime(states[n].tick, in_use, waiting[-MAX_ARRIVALS:])
+            waiting += arrivals
+        site.prime(states[row].tick, in_use, waiting[-MAX_ARRIVALS:])
         site.resume(before, last)
 
+    def _find_in_use(self, peer: int, used: int, size: int) -> Arrival | None:
+        """Returns the sample of a peer that is in use, or None before the first sample.
+
+        Args:
+            peer: index of the peer.
+            used: tick of the sample; -1 before the first sample.
+            size: number of coordinates of the sample.
+        """
+        sample = self.samples[peer].get(used)
+        if sample is None:
+            if used < 0:
+                return None
+            # only a site that rests by a reference of its own can resume without the sample
+            unknown = (0.0,) * size
+            sample = Arrival(peer, used, unknown, unknown)
+            self.lacking[peer].add(used)
+        return select_peer_channels([make_arrival(peer, used, sample)], self._links)[0]
+
     def is_uncertain(self, state: State, output: TickRecord) -> bool:
-        """True if a sample is in use whose arrival or content the log does not tell."""
-        return any(
-            output.used[j] in self.assumed[j]
-            or state.used.get(peer, -1) in self.assumed[j]
-            or state.used.get(peer, -1) in self.lacking[j]
-            for j, peer in enumerate(self._part.peers)
-        )
+        """True if a sample is in use whose arrival or content is not in the log.
+
+        Args:
+            state: a record of the site.
+            output: the same tick as executed.
+        """
+        for peer, name in enumerate(self._part.peers):
+            logged = state.used.get(name, -1)
+            if output.used[peer] in self.assumed[peer] or logged in self.assumed[peer]:
+                return True
+            if logged in self.lacking[peer]:
+                return True
+        return False
 
     def _find_waiting(
-        self, n: int, peer: int, used: int, rate_hz: int
+        self, row: int, peer: int, used: int, rate_hz: int
     ) -> tuple[set[int], set[int]]:
-        """Returns the samples newer than the one in use that arrived before record n: (certain,
-        probable).
+        """Returns the samples newer than the one in use that arrived before a record.
 
-        Certain are those that a record before n lists. Probable are those that no record lists
-        and that are older than record n, or than the first sample that arrived after it.
+        Args:
+            row: row of the record.
+            peer: index of the peer.
+            used: tick of the sample in use.
+            rate_hz: tick rate of the peer, Hz.
+
+        Returns:
+            Ticks of samples that certainly arrived: an earlier record lists them. Ticks of
+            samples that probably arrived: no record lists them, and they are older than the
+            record or than the first sample that a later record lists.
         """
         states = self._part.states
-        first_listed, records, ticks = self._listing[peer]
-        place = bisect_left(records, n)
-        next_listed = ticks[place] if place < len(records) else self.ends[peer] + 1
-        newest = max(-(-states[n].t_ns * rate_hz // NS_PER_S) - 1, next_listed - 1)
-        before = (
-            tick
-            for state in states[max(0, n - _LOOK_BACK) : n]
-            for j, tick, _ in state.rx
-            if j == peer
-        )
-        highest = max(before, default=-1)
+        t_ns = states[row].t_ns
+        listing = self._listings[peer]
+        position = bisect_left(listing.rows, row)
+        next_listed = self.ends[peer] + 1
+        if position < len(listing.rows):
+            next_listed = listing.first_ticks[position]
+        last_sent = -(-t_ns * rate_hz // NS_PER_S) - 1
+        newest_probable = max(last_sent, next_listed - 1)
+        newest_listed = -1
+        for state in states[max(0, row - _LOOK_BACK) : row]:
+            for sender, tick, _ in state.rx:
+                if sender == peer:
+                    newest_listed = max(newest_listed, tick)
+        # a sample waits no longer than the longest delay of any link
+        oldest = (t_ns - MAX_DELAY_US * 1000) * rate_hz // NS_PER_S
+        start = max(used + 1, oldest)
+        newest = min(max(newest_probable, newest_listed), self.ends[peer])
         certain: set[int] = set()
         probable: set[int] = set()
-        # a waiting sample was sent within the longest delay there is
-        oldest = (states[n].t_ns - MAX_DELAY_US * 1000) * rate_hz // NS_PER_S
-        for tick in range(
-            max(used + 1, oldest), min(max(newest, highest), self.ends[peer]) + 1
-        ):
-            listed = first_listed.get(tick)
-            if listed is None and tick <= newest:
-                probable.add(tick)
-            elif listed is not None and listed < n:
+        for tick in range(start, newest + 1):
+            first_row = listing.first_rows.get(tick)
+            if first_row is None:
+                if tick <= newest_probable:
+                    probable.add(tick)
+            elif first_row < row:
                 certain.add(tick)
         return certain, probable
 
     @cached_property
-    def _listing(self) -> list[tuple[dict[int, int], list[int], list[int]]]:
-        """Per peer the first record (by its place) that lists each sample.
-
-        Beside it the records that list any sample of it, and the first that each of them lists.
-        """
-        listing: list[tuple[dict[int, int], list[int], list[int]]] = [
-            ({}, [], []) for _ in self.samples
-        ]
-        for m, state in enumerate(self._part.states):
+    def _listings(self) -> "list[_PeerListing]":
+        """Which records list the samples of each peer."""
+        listings = [_PeerListing({}, [], []) for _ in self.samples]
+        for row, state in enumerate(self._part.states):
             for peer, tick, _ in state.rx:
-                if 0 <= peer < len(listing):
-                    first_listed, records, ticks = listing[peer]
-                    first_listed.setdefault(tick, m)
-                    if not records or records[-1] != m:
-                        records.append(m)
-                        ticks.append(tick)
-        return listing
+                if not 0 <= peer < len(listings):
+                    continue  # a damaged record
+                listing = listings[peer]
+                listing.first_rows.setdefault(tick, row)
+                if not listing.rows or listing.rows[-1] != row:
+                    listing.rows.append(row)
+                    listing.first_ticks.append(tick)
+        return listings
+
+
+class _PeerListing(NamedTuple):
+    """The records of a site that list samples of one peer.
+
+    Attributes:
+        first_rows: row of the first record that lists a sample, by the tick of the sample.
+        rows: rows of the records that list a sample of the peer, ascending.
+        first_ticks: per row of `rows` the tick of the first sample that the record lists.
+    """
+
+    first_rows: dict[int, int]
+    rows: list[int]
+    first_ticks: list[int]

@@ -1,10 +1,14 @@
-"""Executes every site again from its log and compares every computed field of every record.
+"""Verify a log: execute every site again and compare every computed field of every record.
 
-Invariant (L3, L5): the log alone feeds `Site.step`, besides user control laws that it names by
-hash. On the platform that made the log (by fingerprint) whole runs are executed and must agree
-bit for bit; elsewhere each tick is recomputed from the two records before it, to 1e-9 (1 +
-|a|). A gap is reported; execution resumes after it from two consecutive records, and records
-that cannot be judged are counted, never reported as differences.
+Invariant (L3, L5):
+    - `Site.step` gets its inputs from the log alone, besides user control laws, which the log
+      names by hash.
+    - On the platform that recorded the log (equal fingerprint) whole runs are executed, and
+      they must agree bit for bit.
+    - On another platform each tick is recomputed from the two records before it, and numbers a
+      and b agree if |a - b| <= 1e-9 (1 + |a|).
+    - A gap is reported. After a gap the execution resumes from two consecutive records. Records
+      that cannot be judged are counted, never reported as differences.
 """
 
 from array import array
@@ -42,10 +46,19 @@ TOLERANCE = 1e-9
 """Across platforms, a and b count as equal if |a - b| <= TOLERANCE (1 + |a|)."""
 
 NumberEquality = Callable[[float, float], bool]
+"""Decides whether a logged and a computed number count as equal."""
 
 
 class RecordDifference(NamedTuple):
-    """A field of a record, with the index of the number in it, that differs from the execution."""
+    """A field of a record that differs from the execution.
+
+    Attributes:
+        site: name of the site.
+        tick: tick of the record.
+        field: name of the field; of a vector with the index of the number, as in "q[1]".
+        logged: the value in the record.
+        computed: the value of the execution.
+    """
 
     site: str
     tick: int
@@ -54,13 +67,15 @@ class RecordDifference(NamedTuple):
     computed: Any
 
     def __str__(self) -> str:
-        logged, computed = (
-            f"{value!r} ({value.hex()})" if isinstance(value, float) else repr(value)
-            for value in (self.logged, self.computed)
-        )
-        return (
-            f"{self.site}, tick {self.tick}, {self.field}: logged {logged}, computed {computed}"
-        )
+        logged = _format_value(self.logged)
+        computed = _format_value(self.computed)
+        place = f"{self.site}, tick {self.tick}, {self.field}"
+        return f"{place}: logged {logged}, computed {computed}"
+
+
+def _format_value(value: object) -> str:
+    """Returns a value as text; of a float with its bits."""
+    return f"{value!r} ({value.hex()})" if isinstance(value, float) else repr(value)
 
 
 def equal_bits(a: float, b: float) -> bool:
@@ -69,38 +84,42 @@ def equal_bits(a: float, b: float) -> bool:
 
 
 def equal_to_tolerance(a: float, b: float) -> bool:
-    """True if two numbers agree as well as two platforms can."""
+    """True if two numbers agree to `TOLERANCE`, as on two platforms."""
     return abs(a - b) <= TOLERANCE * (1.0 + abs(a))
 
 
-def describe_law_failure(failed: LawFailed) -> RecordDifference:
-    """Returns the difference of a user law that fails now and did not when the log was made."""
+def describe_law_failure(failure: LawFailed) -> RecordDifference:
+    """Returns the difference of a user law that fails now but did not fail in the log."""
     return RecordDifference(
-        site=failed.site,
-        tick=failed.tick or 0,
+        site=failure.site,
+        tick=failure.tick or 0,
         field="record",
         logged="is there",
-        computed=failed.problem,
+        computed=failure.problem,
     )
 
 
-_vectors_of = attrgetter(*STATE_VECTORS, "mem")
+_get_vectors = attrgetter(*STATE_VECTORS, "mem")
 
 
-def _pack(a: State | TickRecord) -> bytes:
-    return array("d", chain.from_iterable(_vectors_of(a))).tobytes()
+def _pack_vectors(record: State | TickRecord) -> bytes:
+    return array("d", chain.from_iterable(_get_vectors(record))).tobytes()
 
 
 def equal_record(logged: State, computed: TickRecord, peers: tuple[str, ...]) -> bool:
-    """True if every computed field of a record has the same bits; fast, for the common case."""
-    a = logged
-    b = computed
+    """True if every computed field of a record has the same bits as in the execution.
+
+    This comparison is fast, because nearly all records are identical. `find_first_difference`
+    names the field of a record that is not.
+    """
     return (
-        _pack(a) == _pack(b)
-        and a.used == dict(zip(peers, b.used, strict=True))
-        and (a.tick, a.t_ns, a.rx_crc) == (b.tick, b.t_ns, b.rx_crc)
-        and a.mode == MODE_WORDS[b.mode]
-        and a.cmd == b.cmd
+        _pack_vectors(logged) == _pack_vectors(computed)
+        and logged.used == dict(zip(peers, computed.used, strict=True))
+        and logged.tick == computed.tick
+        and logged.t_ns == computed.t_ns
+        and logged.rx_crc == computed.rx_crc
+        and logged.mode == MODE_WORDS[computed.mode]
+        and logged.cmd == computed.cmd
     )
 
 
@@ -113,14 +132,24 @@ def find_first_difference(
 ) -> RecordDifference | None:
     """Returns the first field in which a record differs from an execution, or None.
 
-    `channel` has the names of what the site's law sends.
+    Args:
+        logged: the record in the log.
+        computed: the record of the execution.
+        peers: names of the site's peers, in scenario order.
+        equal: decides whether two numbers count as equal.
+        channel: the names of the numbers that the site's law sends.
     """
-    for name, a, b, same in _compare_fields(
+    comparisons = _compare_fields(
         logged=logged, computed=computed, peers=peers, equal=equal, channel=channel
-    ):
-        if not same:
+    )
+    for name, logged_value, computed_value, is_equal in comparisons:
+        if not is_equal:
             return RecordDifference(
-                site=logged.site, tick=logged.tick, field=name, logged=a, computed=b
+                site=logged.site,
+                tick=logged.tick,
+                field=name,
+                logged=logged_value,
+                computed=computed_value,
             )
     return None
 
@@ -132,49 +161,59 @@ def _compare_fields(
     equal: NumberEquality,
     channel: LawChannel,
 ) -> Iterator[tuple[str, Any, Any, bool]]:
+    """Yields name, logged value, computed value and equality of every field of a record."""
     mode = MODE_WORDS[computed.mode]
     yield "tick", logged.tick, computed.tick, logged.tick == computed.tick
     yield "t_ns", logged.t_ns, computed.t_ns, logged.t_ns == computed.t_ns
     yield "mode", logged.mode, mode, logged.mode == mode
-    sent = [f"ch.{entry}" for entry in channel.entries(peers)]
+    channel_names = [f"ch.{entry}" for entry in channel.entries(peers)]
     for vector in STATE_VECTORS:
-        before = getattr(logged, vector)
-        now = getattr(computed, vector)
-        if len(before) != len(now):
-            yield f"{vector} (how many numbers)", len(before), len(now), False
+        logged_numbers = getattr(logged, vector)
+        computed_numbers = getattr(computed, vector)
+        logged_count = len(logged_numbers)
+        computed_count = len(computed_numbers)
+        if logged_count != computed_count:
+            yield f"{vector} (how many numbers)", logged_count, computed_count, False
             continue
-        for n, (a, b) in enumerate(zip(before, now, strict=True)):
-            name = sent[n] if vector == "ch" and n < len(sent) else f"{vector}[{n}]"
+        names = [f"{vector}[{n}]" for n in range(logged_count)]
+        if vector == "ch":
+            names[: len(channel_names)] = channel_names[:logged_count]
+        for name, a, b in zip(names, logged_numbers, computed_numbers, strict=True):
             yield name, float(a), b, equal(float(a), b)
     used = dict(zip(peers, computed.used, strict=True))
     for peer in sorted({*logged.used, *used}):
-        a = logged.used.get(peer)
-        b = used.get(peer)
-        yield f"used[{peer}]", a, b, a == b
+        logged_tick = logged.used.get(peer)
+        computed_tick = used.get(peer)
+        yield f"used[{peer}]", logged_tick, computed_tick, logged_tick == computed_tick
     yield "rx (its CRC-32)", logged.rx_crc, computed.rx_crc, logged.rx_crc == computed.rx_crc
     yield "cmd", logged.cmd, computed.cmd, logged.cmd == computed.cmd
-    alike = all(
+    same_numbers = all(
         equal(float(a), float(b)) for a, b in zip(logged.mem, computed.mem, strict=False)
     )
-    yield "mem", logged.mem, computed.mem, alike and len(logged.mem) == len(computed.mem)
+    same_length = len(logged.mem) == len(computed.mem)
+    yield "mem", logged.mem, computed.mem, same_numbers and same_length
 
 
 @dataclass(slots=True)
 class VerifyResult:
-    """The result of executing a log again, in numbers of records.
+    """The result of executing a log again. Counts are numbers of records.
 
     Attributes:
-        whole_run: True if whole runs were executed and bits compared; False if tick by tick, to
-            1e-9.
-        coverage: ticks by site: those that were executed and compared, and those of the run.
-        min_coverage: the least share of them that passes.
-        integrity: whether the log is as it was made.
-        unjudged: records behind gaps that could not be judged.
-        first: the difference of the earliest tick.
-        gaps: missing ticks: (site, first, last).
-        absences: ticks that a site did not make between two of its starts, likewise.
-        withheld: sites whose law may not run, which were not executed; all else is of the
-            others.
+        whole_run: True if whole runs were executed and bits compared; False if single ticks
+            were executed and numbers compared to 1e-9.
+        coverage: per site the number of judged ticks and the number of ticks of the run.
+        min_coverage: smallest share of the ticks of every site that must be judged.
+        integrity: whether the log is as it was written.
+        records: records that were looked at.
+        identical: records that agree with the execution in every computed field.
+        unjudged: records after gaps that could not be judged.
+        differing: records that differ from the execution.
+        first: the difference at the earliest tick.
+        gaps: ranges of missing ticks, as (site, first, last).
+        absences: ranges of ticks between two starts of a site, which the site did not execute,
+            as (site, first, last).
+        withheld: sites that were not executed, because their law may not run. All other
+            numbers cover only the other sites.
     """
 
     whole_run: bool
@@ -192,29 +231,24 @@ class VerifyResult:
 
     @property
     def agreed(self) -> bool:
-        """True if no record differs, however few were judged."""
+        """True if no judged record differs, even if few records were judged."""
         return self.first is None
 
     @property
     def passed(self) -> bool:
-        """True if no record differs, enough of every site was judged, and the log is as it was
-        made.
-        """
+        """True if the log agrees with its execution, is covered enough, and is as written."""
         enough = not self.withheld and self.coverage.share >= self.min_coverage
         return self.agreed and enough and self.integrity.passed
 
     def add(self, other: "VerifyResult") -> None:
         """Adds the result of other sites, which were executed from another log."""
-        for name in (
-            "records",
-            "identical",
-            "unjudged",
-            "differing",
-            "gaps",
-            "absences",
-            "withheld",
-        ):
-            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.records += other.records
+        self.identical += other.identical
+        self.unjudged += other.unjudged
+        self.differing += other.differing
+        self.gaps = self.gaps + other.gaps
+        self.absences = self.absences + other.absences
+        self.withheld = self.withheld + other.withheld
         for name in other.withheld:
             self.coverage.expected.pop(name, None)
         self.whole_run &= other.whole_run
@@ -234,17 +268,25 @@ class VerifyResult:
 
 
 PROGRESS_EVERY = 256
-"""Records between two reports of progress."""
+"""Number of records between two reports of progress."""
 
 
 class SiteVerifier:
-    """One site, executed from its records.
+    """Executes one site from its records and compares each record with the execution.
 
-    While it is `certain`, the site's state follows from the records before. A gap ends that,
-    and so does the use of a sample that the log lacks; two consecutive records restore it.
-    Arrivals inside a gap are unknown: samples that no record lists are assumed to have arrived
-    there, and while one of them is in use a difference counts as unjudged. The same holds for a
-    sample that arrived but whose own record is missing.
+    The state of the executed site is certain while it follows from the records before. It
+    becomes uncertain at a gap, and when the site uses a sample that the log lacks; two
+    consecutive records make it certain again. Arrivals inside a gap are unknown: samples that
+    no record lists are assumed to have arrived there. While such a sample is in use, a
+    difference counts as unjudged. The same holds for a sample that arrived and whose own record
+    is missing.
+
+    Args:
+        log: the log.
+        site: name of the site.
+        by_tick: the records of all sites, by site and tick.
+        result: receives the counts and differences.
+        resume_every: see `verify`.
     """
 
     def __init__(
@@ -255,26 +297,27 @@ class SiteVerifier:
         result: VerifyResult,
         resume_every: int = 0,
     ) -> None:
-        self._resume_every = resume_every
-        self._first = 0
-        self._taken: list[CoreChange] = []
-        self._setup = setup = log.scenario.setup(site)
-        self._site = Site(setup)
-        self._channel = setup.channel
-        self._starts = {boot: first for first, boot in log.starts.get(site, ())}
-        self._absences = {last + 1: first for first, last in log.absences.get(site, ())}
-        reflects = setup.own is not None or any(setup.gains.k_f)
-        self._apart = setup.on_stale.action is StaleAction.GLIDE and not reflects
-        self._boot: int | None = None
-        self._began = 0  # the place of the first record of this start
+        self._result = result
         self._scenario = log.scenario
         self._log = log[site]
-        self._result = result
+        self._setup = setup = log.scenario.setup(site)
+        self._channel = setup.channel
+        self._site = Site(setup)
         self._external = site in log.scenario.external
-        self._law_failed = False
-        self._own_end = log.last_ticks[site]
+        # a site that glides holds by a reference of its own, unless its law reflects forces
+        reflects = setup.own is not None or any(setup.gains.k_f)
+        self._detached = setup.on_stale.action is StaleAction.GLIDE and not reflects
+        self._starts = {boot: first for first, boot in log.starts.get(site, ())}
+        self._absences = {last + 1: first for first, last in log.absences.get(site, ())}
+        self._last_tick = log.last_ticks[site]
+        self._boot: int | None = None
+        self._start_row = 0  # row of the first record of the present start of the site
+        self._start_tick = 0
+        self._applied: list[CoreChange] = []  # changes since that start
+        self._resume_every = resume_every
         self._equal = equal_bits if result.whole_run else equal_to_tolerance
         self._certain = True
+        self._law_failed = False
         self._inputs = RecordedInputs(
             part=log[site],
             samples=by_tick,
@@ -284,150 +327,164 @@ class SiteVerifier:
         )
 
     def run(self, report: Callable[[int], None] | None = None) -> None:
-        """Executes every record; `report` gets the number of records of all sites so far, now
-        and then.
+        """Executes every record of the site.
+
+        Args:
+            report: called now and then with the number of records of all sites so far.
         """
         result = self._result
-        states = self._log.states
         name = self._log.name
-        before = result.records - result.unjudged
-        expected = 0
-        for n, state in enumerate(states):
-            if report is not None and n % PROGRESS_EVERY == 0:
+        judged_before = result.records - result.unjudged
+        next_tick = 0
+        for row, state in enumerate(self._log.states):
+            if report is not None and row % PROGRESS_EVERY == 0:
                 report(result.records)
             result.records += 1
-            if state.tick == expected - 1 and state.boot not in self._starts:
+            if state.tick == next_tick - 1 and state.boot not in self._starts:
                 result.add_difference(
-                    RecordDifference(
-                        site=state.site,
-                        tick=state.tick,
-                        field="tick",
-                        logged=state.tick,
-                        computed=expected,
-                    )
+                    self._make_difference(state, "tick", state.tick, next_tick)
                 )
                 continue
-            if self._boot is None or (state.boot != self._boot and state.boot in self._starts):
-                expected = self._begin_start(n, expected)
-            if state.tick != expected + count_skipped_ticks(state.cmd):
-                result.gaps.append((name, expected, state.tick - 1))
+            is_other_boot = state.boot != self._boot and state.boot in self._starts
+            if self._boot is None or is_other_boot:
+                next_tick = self._change_start(row, next_tick)
+            if state.tick != next_tick + count_skipped_ticks(state.cmd):
+                result.gaps.append((name, next_tick, state.tick - 1))
                 self._certain = False
-            expected = state.tick + 1
-            try:
-                if self._resume_every and state.tick % self._resume_every == 0:
-                    self._start_afresh(n, state)
-                resumes = not self._certain and not self._law_failed and n - 2 >= self._began
-                if resumes and self._inputs.can_resume(n, apart=self._apart):
-                    missed, _ = self._parse_changes(state.tick - 1)  # ordered in the gap
-                    self._inputs.resume(self._site, n, missed)
-                    self._certain = True
-                if self._certain and not self._law_failed:
-                    self._verify_record(n, state)
-                elif other := self._find_other_sender(state):
-                    result.add_difference(other)
-                else:
-                    result.unjudged += 1
-            except LawFailed as failed:
-                self._law_failed = True
-                result.add_difference(describe_law_failure(failed)._replace(tick=state.tick))
-            except ValueError as error:  # no site takes so many changes
-                self._certain = False
-                result.add_difference(
-                    RecordDifference(
-                        site=name,
-                        tick=state.tick,
-                        field="cmd",
-                        logged="here",
-                        computed=str(error),
-                    )
-                )
-        result.coverage.judged[name] = result.records - result.unjudged - before
-        if expected <= self._own_end:
-            result.gaps.append((name, expected, self._own_end))
+            next_tick = state.tick + 1
+            self._execute_record(row, state)
+        result.coverage.judged[name] = result.records - result.unjudged - judged_before
+        if next_tick <= self._last_tick:
+            result.gaps.append((name, next_tick, self._last_tick))
 
-    def _begin_start(self, n: int, expected: int) -> int:
-        """Goes over to the start of the site that made record n; returns its first tick."""
-        self._boot = self._log.states[n].boot
-        self._began = n
+    def _execute_record(self, row: int, state: State) -> None:
+        """Executes a record if the state of the site is certain, and counts the record."""
+        result = self._result
+        try:
+            if self._resume_every and state.tick % self._resume_every == 0:
+                self._replace_site(row, state)
+            if not self._certain and self._can_resume(row):
+                changes_in_gap, _ = self._parse_changes(state.tick - 1)
+                self._inputs.resume(self._site, row, changes_in_gap)
+                self._certain = True
+            if self._certain and not self._law_failed:
+                self._verify_record(row, state)
+            elif difference := self._find_other_sender(state):
+                result.add_difference(difference)
+            else:
+                result.unjudged += 1
+        except LawFailed as failure:
+            self._law_failed = True
+            result.add_difference(describe_law_failure(failure)._replace(tick=state.tick))
+        except ValueError as error:  # more changes than a site accepts
+            self._certain = False
+            difference = RecordDifference(
+                site=self._log.name,
+                tick=state.tick,
+                field="cmd",
+                logged="here",
+                computed=str(error),
+            )
+            result.add_difference(difference)
+
+    def _can_resume(self, row: int) -> bool:
+        """True if the records before a record suffice to restore the state of the site."""
+        if self._law_failed or row - 2 < self._start_row:
+            return False
+        return self._inputs.can_resume(row, detached=self._detached)
+
+    def _change_start(self, row: int, next_tick: int) -> int:
+        """Changes to the start of the site that sent a record.
+
+        Args:
+            row: row of the record.
+            next_tick: the tick expected next.
+
+        Returns:
+            The tick expected next: the first tick of the start, if the log states that tick.
+        """
+        name = self._log.name
+        self._boot = self._log.states[row].boot
+        self._start_row = row
         first = self._starts.get(self._boot)
-        if first is None or first < expected:
-            return expected
-        absent = max(self._absences.get(first, first), expected)
-        if expected < absent:
-            self._result.gaps.append((self._log.name, expected, absent - 1))
+        if first is None or first < next_tick:
+            return next_tick
+        absent = max(self._absences.get(first, first), next_tick)
+        if next_tick < absent:
+            self._result.gaps.append((name, next_tick, absent - 1))
         if absent < first:
-            self._result.absences.append((self._log.name, absent, first - 1))
-        self._inputs.pop_changes(first - 1)  # the start before took them in
+            self._result.absences.append((name, absent, first - 1))
+        self._inputs.pop_changes(first - 1)  # these concern the start before
+        self._applied.clear()
         self._site = Site(self._setup)
-        self._certain = True
-        self._first = first
-        self._taken.clear()
         self._site.begin_at(first)
+        self._start_tick = first
+        self._certain = True
         return first
 
-    def _start_afresh(self, n: int, state: State) -> None:
-        """Has record n made by a site that knows the records before it alone, if they tell
-        enough.
+    def _replace_site(self, row: int, state: State) -> None:
+        """Replaces the site by a new site that is restored from the records before a record.
+
+        State that a law keeps besides its `memory` is lost by that, so the log shows it.
         """
-        known = self._certain and n - 2 >= self._began
-        if not known or self._law_failed or not self._inputs.can_resume(n, apart=self._apart):
+        if not self._certain or not self._can_resume(row):
             return
         self._site = Site(self._setup)
         self._certain = False
-        if self._first:
-            self._site.begin_at(self._first)
-        for change in self._taken:
+        if self._start_tick:
+            self._site.begin_at(self._start_tick)
+        for change in self._applied:
             self._site.order(change, state.t_ns)
 
-    def _find_other_sender(self, state: State) -> RecordDifference | None:
-        name = self._log.name
-        if state.boot != (boot := self._boot):
-            return RecordDifference(
-                site=name, tick=state.tick, field="boot", logged=state.boot, computed=boot
-            )
-        return (
-            None
-            if state.site == name
-            else RecordDifference(
-                site=name, tick=state.tick, field="site", logged=state.site, computed=name
-            )
+    def _make_difference(
+        self, state: State, field: str, logged: Any, computed: Any
+    ) -> RecordDifference:
+        return RecordDifference(
+            site=state.site, tick=state.tick, field=field, logged=logged, computed=computed
         )
 
-    def _verify_record(self, n: int, state: State) -> None:
+    def _find_other_sender(self, state: State) -> RecordDifference | None:
+        """Returns the difference if a record is of another start or site; else None."""
+        name = self._log.name
+        if state.boot != self._boot:
+            difference = self._make_difference(state, "boot", state.boot, self._boot)
+            return difference._replace(site=name)
+        if state.site != name:
+            return self._make_difference(state, "site", state.site, name)._replace(site=name)
+        return None
+
+    def _verify_record(self, row: int, state: State) -> None:
+        """Executes the tick of a record and compares the record with the execution."""
         result = self._result
         states = self._log.states
         peers = self._log.peers
         difference = self._find_other_sender(state)
-        if (
-            not result.whole_run
-            and n - 2 >= self._began
-            and states[n - 2].tick == state.tick - 2
-        ):
-            self._site.resume(
-                read_output(states[n - 2], peers), read_output(states[n - 1], peers)
-            )
+        follows_two = row - 2 >= self._start_row and states[row - 2].tick == state.tick - 2
+        if follows_two and not result.whole_run:
+            before = read_output(states[row - 2], peers)
+            last = read_output(states[row - 1], peers)
+            self._site.resume(before, last)
         arrivals, missing = self._inputs.find_arrivals(state.rx)
-        invalid = None
+        invalid_arrival = None
         if missing:
-            entries, invalid = self._check_arrivals(state)
+            entries, invalid_arrival = self._check_arrivals(state)
             arrivals, missing = self._inputs.find_arrivals(entries)
             self._inputs.add_lacking(missing)
         changes, invalid_change = self._parse_changes(state.tick)
-        plant = (
-            PlantState(state.q, state.qd, state.tau_x, state.bodies) if self._external else None
+        plant_state = None
+        if self._external:
+            plant_state = PlantState(state.q, state.qd, state.tau_x, state.bodies)
+        tick_input = TickInput(
+            k=state.tick,
+            arrivals=arrivals[:MAX_ARRIVALS],
+            commands=changes,
+            measured=plant_state,
+            hand=state.hand,
         )
-        output = self._site.step(
-            TickInput(
-                k=state.tick,
-                arrivals=arrivals[:MAX_ARRIVALS],
-                commands=changes,
-                measured=plant,
-                hand=state.hand,
-            )
-        )
+        output = self._site.step(tick_input)
         if missing:  # the CRC of a sample that the log lacks cannot be checked
             output = output._replace(rx_crc=state.rx_crc)
-        difference = invalid_change or invalid or difference
+        difference = invalid_change or invalid_arrival or difference
         if difference is None and not equal_record(state, output, peers):
             difference = find_first_difference(
                 logged=state,
@@ -446,43 +503,47 @@ class SiteVerifier:
             result.add_difference(difference)
 
     def _parse_changes(self, tick: int) -> tuple[list[CoreChange], RecordDifference | None]:
-        """Returns the changes up to a tick that were not executed yet; an invalid one is a
-        difference.
+        """Returns the changes up to a tick that were not executed yet.
+
+        Returns:
+            The changes before the first invalid change, and the difference of that change, if
+            there is an invalid change.
         """
         changes: list[CoreChange] = []
-        for named, text in self._inputs.pop_changes(tick):
+        for change_tick, text in self._inputs.pop_changes(tick):
             try:
                 changes.append(parse_core_change(self._scenario, self._log.name, text))
             except ScenarioError:
-                valid = "a change of one of its links or of its shares"
-                return changes, RecordDifference(
-                    site=self._log.name, tick=named, field="cmd", logged=text, computed=valid
+                difference = RecordDifference(
+                    site=self._log.name,
+                    tick=change_tick,
+                    field="cmd",
+                    logged=text,
+                    computed="a change of one of its links or of its shares",
                 )
-        self._taken += changes[:MAX_RAMPS]
+                return changes, difference
+        self._applied += changes[:MAX_RAMPS]
         return changes[:MAX_RAMPS], None
 
     def _check_arrivals(
         self, state: State
     ) -> tuple[Sequence[ArrivalEntry], RecordDifference | None]:
+        """Returns the arrivals of a record that are possible.
+
+        Returns:
+            The arrivals before the first impossible arrival, and the difference of that
+            arrival, if there is an impossible arrival.
+        """
+        samples = self._inputs.samples
+        ends = self._inputs.ends
         for n, (peer, tick, _) in enumerate(state.rx):
-            if not 0 <= peer < len(self._inputs.samples):
-                invalid = RecordDifference(
-                    site=state.site,
-                    tick=state.tick,
-                    field="rx (peer)",
-                    logged=peer,
-                    computed="an index of a peer",
-                )
-                return state.rx[:n], invalid
-            if (
-                tick not in self._inputs.samples[peer]
-                and not 0 <= tick <= self._inputs.ends[peer]
-            ):
-                valid = f"a tick from 0 to {self._inputs.ends[peer]}"
-                where = f"rx[{self._log.peers[peer]}]"
-                return state.rx[:n], RecordDifference(
-                    site=state.site, tick=state.tick, field=where, logged=tick, computed=valid
-                )
+            if not 0 <= peer < len(samples):
+                valid = "an index of a peer"
+                return state.rx[:n], self._make_difference(state, "rx (peer)", peer, valid)
+            if tick not in samples[peer] and not 0 <= tick <= ends[peer]:
+                valid = f"a tick from 0 to {ends[peer]}"
+                field_name = f"rx[{self._log.peers[peer]}]"
+                return state.rx[:n], self._make_difference(state, field_name, tick, valid)
         return state.rx, None
 
 
@@ -493,20 +554,24 @@ def verify(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> VerifyResult:
-    """Executes every site of a log again; `progress` gets the records done and their total.
+    """Executes every site of a log again and compares the records with the execution.
+
+    The recorded sites of an open-loop rerun are compared with the log of which the rerun was
+    made, and are executed from that log, if that log is beside this log.
 
     Args:
         log: the log.
-        progress: called now and then.
-        min_coverage: the least share of every site's ticks that must be judged to pass.
-        resume_every: at every tick that it divides a site starts afresh from the records, so
-            that what a law knows besides shows; 0: at none.
+        progress: called now and then with the number of executed records and their total.
+        min_coverage: smallest share of the ticks of every site that must be judged.
+        resume_every: at every tick divisible by this number the site is replaced by a new site
+            that is restored from the records, which reveals state that a law keeps besides its
+            `memory`; 0: never.
 
     Raises:
         LogError: a record cannot be read.
-        ScenarioError: a user law that may run cannot be made.
+        ScenarioError: a user law that may run cannot be constructed.
     """
-    result = _begin(log, min_coverage)
+    result = _make_result(log, min_coverage)
     with process.pause_gc():
         sites = log.executed_sites
         total = sum(len(log[name]) for name in sites)
@@ -515,18 +580,18 @@ def verify(
             log=log, sites=sites, result=result, report=report, resume_every=resume_every
         )
         others = [name for name in log.sites if name not in sites]
-        if others and (source := open_rerun_source(log)) is not None:
+        source = open_rerun_source(log) if others else None
+        if source is not None:
             for name in others:
                 _compare_with_source(log[name], source[name], result)
-            theirs = _begin(source, min_coverage)
-            _execute_sites(
-                source, [name for name in source.executed_sites if name in others], theirs
-            )
-            result.add(theirs)
+            source_result = _make_result(source, min_coverage)
+            source_sites = [name for name in source.executed_sites if name in others]
+            _execute_sites(source, source_sites, source_result)
+            result.add(source_result)
     return result
 
 
-def _begin(log: Log, min_coverage: float) -> VerifyResult:
+def _make_result(log: Log, min_coverage: float) -> VerifyResult:
     return VerifyResult(
         whole_run=log.session.get("fingerprint") == compute_fingerprint(),
         coverage=Coverage({}, {site: log.expected_ticks(site) for site in log.sites}),
@@ -543,46 +608,53 @@ def _execute_sites(
     resume_every: int = 0,
 ) -> None:
     by_tick = {name: log[name].by_tick for name in log.sites}
-    laws = find_user_laws(log.scenario)
-    withheld = [name for law in laws if not law.allowed for name in law.sites if name in sites]
+    withheld_laws = [law for law in find_user_laws(log.scenario) if not law.allowed]
+    withheld = [name for law in withheld_laws for name in law.sites if name in sites]
     result.withheld += withheld
     for name in withheld:
         result.coverage.expected.pop(name, None)
-    for name in (name for name in sites if name not in withheld):
-        SiteVerifier(
+    for name in sites:
+        if name in withheld:
+            continue
+        verifier = SiteVerifier(
             log=log, site=name, by_tick=by_tick, result=result, resume_every=resume_every
-        ).run(report)
+        )
+        verifier.run(report)
 
 
 def _compare_with_source(recorded: SiteLog, source: SiteLog, result: VerifyResult) -> None:
+    """Adds the first difference between a recorded site of a rerun and its source log."""
     if recorded.payloads == source.payloads:
         return
-    for ours, theirs in zip_longest(recorded.states, source.states):
-        if ours is None or theirs is None or ours != msgspec.structs.replace(theirs, v=ours.v):
-            tick = (ours or theirs).tick
-            result.add_difference(
-                RecordDifference(
-                    site=recorded.name,
-                    tick=tick,
-                    field="record",
-                    logged="here",
-                    computed="in its log",
-                )
-            )
-            return
+    for copied, original in zip_longest(recorded.states, source.states):
+        is_pair = copied is not None and original is not None
+        # the rerun may have written records in a newer version
+        if is_pair and copied == msgspec.structs.replace(original, v=copied.v):
+            continue
+        difference = RecordDifference(
+            site=recorded.name,
+            tick=(copied or original).tick,
+            field="record",
+            logged="here",
+            computed="in its log",
+        )
+        result.add_difference(difference)
+        return
 
 
 def open_rerun_source(log: Log) -> Log | None:
-    """Returns the log that a rerun was made of, if it stands beside it and is the same file;
-    else None.
+    """Returns the log of which a rerun was made.
+
+    Returns:
+        The log in the folder of the rerun, if its files have the names and digests that the
+        rerun states; else None.
     """
-    names, digests = (
-        log.session.get(key, "").split() for key in ("rerun_of", "rerun_of_sha256")
-    )
+    names = log.session.get("rerun_of", "").split()
+    digests = log.session.get("rerun_of_sha256", "").split()
     files = [Path(log.sources[0]).with_name(Path(name).name) for name in names]
     if not files or len(files) != len(digests) or not all(map(Path.is_file, files)):
         return None
-    if [*map(digest_file, files)] != digests:
+    if list(map(digest_file, files)) != digests:
         return None
     source = open_log(*files)
     return source if source.sites == log.sites else None
