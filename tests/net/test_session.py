@@ -233,8 +233,8 @@ def test_two_leaders_that_do_not_meet_cannot_split_a_session() -> None:
     others = [session.member(name) for name in ("m2", "s")]
     for twin in twins:
         take = twin.joining.membership.receive_identity
-        twin.joining.membership.receive_identity = lambda info, invited, take=take: (
-            None if info.member == "m1" else take(info, invited=invited)
+        twin.joining.membership.receive_identity = lambda info, may_have_started, take=take: (
+            None if info.member == "m1" else take(info, may_have_started=may_have_started)
         )
     reasons = polled_until_refused(*twins, *others, clock=session.clock)
     assert len(reasons) == 1

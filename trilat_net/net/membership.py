@@ -1,11 +1,18 @@
-"""Session membership: boots, liveliness tokens, events, and who is present.
+"""Membership of a session: who takes part, and who is present.
 
-Invariant: a different scenario, a running session and a second start of the same member are
-refused at the first exchange; replies of strangers are ignored and kept for the error message.
-A recorder may join a running session, and several recorders may be present. It then takes
-identities, epoch and boots from the running members, waits for those that are present and can
-be pinged, and not for those that left. A site joins late only if it `returns`: if every site of
-the scenario waits for its peers and aligns with them.
+A member is a site or a recorder. Each start of a member has its own boot, a random number; a
+liveliness token under that boot shows others that the member is present. Members learn one
+another's identities (`Info`) by queries.
+
+Invariant:
+    - A different scenario, a running session, and a second start of a present member are
+      refused at the first exchange. Replies of strangers are ignored, and kept for the error
+      message.
+    - A recorder may join a running session, and several recorders may be present. A recorder
+      that joins late reads identities, epoch and boots from the running members. It waits for
+      the members that are present and answer pings, and not for those that left.
+    - A site joins a running session only if `LateSites.may_join_late` is True, which requires
+      that every site of the scenario waits for its peers and aligns with them.
 """
 
 import hashlib
@@ -29,24 +36,33 @@ from .wire import M, decode, encode, split_states
 
 
 def new_boot() -> int:
-    """Returns a random 64-bit number that names one start of one process."""
+    """Returns a random 64-bit number that identifies one start of one process."""
     return secrets.randbits(64)
 
 
 def describe_member(
     member: str, boot: int, clock: Clock, scenario: str = "", **fields: object
 ) -> Info:
-    """Returns the identity of a member on this machine, with the text of its scenario, "" for
-    none.
+    """Returns the identity of a member on this machine.
+
+    Args:
+        member: name of the member.
+        boot: random number of the process start.
+        clock: clock of the member.
+        scenario: text of the member's scenario; "" if the member has none.
+        **fields: further fields of `Info`.
     """
     digest = hashlib.sha256(scenario.encode()).hexdigest() if scenario else ""
-    about = {"member": member, "boot": boot, "scenario_sha256": digest, "scenario": scenario}
-    machine = {
+    facts = {
+        "member": member,
+        "boot": boot,
+        "scenario_sha256": digest,
+        "scenario": scenario,
         "host": platform.node(),
         "clock": clock.identity(),
         "fingerprint": compute_fingerprint(),
     }
-    return msgspec.convert({**about, **machine, **fields}, Info)
+    return msgspec.convert({**facts, **fields}, Info)
 
 
 def liveliness_token(session: str, member: str, boot: int) -> str:
@@ -55,15 +71,17 @@ def liveliness_token(session: str, member: str, boot: int) -> str:
 
 
 def read_messages(inbox: Inbox, kind: type[M]) -> Iterator[M]:
-    """Yields the messages of a kind that wait in a ring; skips other payloads."""
+    """Yields the messages of one kind that wait in a ring, and skips other payloads."""
     while (message := inbox.poll()) is not None:
-        with suppress(WireError):  # a stranger's; the sites and the recorder count them
+        # Payloads of strangers are skipped here; sites and recorder count them.
+        with suppress(WireError):
             yield decode(message[1], kind)
 
 
 def read_records(inbox: Inbox, layout: Layout | None = None) -> Iterator[State]:
-    """Yields the records that wait in a ring; skips other payloads, and of a block what follows
-    one.
+    """Yields the records that wait in a ring.
+
+    Other payloads are skipped, and so is the rest of a block after an unreadable record.
     """
     while (message := inbox.poll()) is not None:
         with suppress(WireError):
@@ -72,9 +90,17 @@ def read_records(inbox: Inbox, layout: Layout | None = None) -> Iterator[State]:
 
 
 class EventPublisher:
-    """Publishes a member's events and answers queries for its identity.
+    """Publishes a member's events, and replies to queries for the member's identity.
 
-    It answers with `info`; `keep` takes the payload of every event.
+    Args:
+        bus: connection of the member.
+        session: name of the session.
+        info: identity of the member.
+        keep: receives the payload of every published event.
+
+    Attributes:
+        info: identity with which queries are replied to.
+        published: number of events published so far.
     """
 
     def __init__(
@@ -87,9 +113,15 @@ class EventPublisher:
         self._queries = bus.query_inbox(topics.key(session, info.member, topics.INFO))
 
     def publish(self, kind: str, text: str, **fields: object) -> Event:
-        """Publishes a numbered event and returns it."""
-        own = {"member": self.info.member, "boot": self.info.boot, "n": self.published}
-        event = msgspec.convert({**own, "kind": kind, "text": text, **fields}, Event)
+        """Publishes an event with the next number, and returns the event."""
+        facts = {
+            "member": self.info.member,
+            "boot": self.info.boot,
+            "n": self.published,
+            "kind": kind,
+            "text": text,
+        }
+        event = msgspec.convert({**facts, **fields}, Event)
         self.published += 1
         payload = encode(event)
         self._keep(payload)
@@ -101,14 +133,22 @@ class EventPublisher:
         self.info = msgspec.structs.replace(self.info, **fields)
 
     def answer_queries(self) -> None:
-        """Answers every query for the identity that waits."""
+        """Replies to all waiting queries for the identity."""
         while (query := self._queries.poll()) is not None:
             query.reply(encode(self.info))
 
 
 class MemberQuery:
-    """Asks the members of a session for their identities, again and again; notes why one is
-    unreadable.
+    """Repeated query for the identities of a session's members.
+
+    Args:
+        bus: connection of the member that queries.
+        clock: clock of that member.
+        session: name of the session.
+        member: name of the member to query; "*" for all members.
+
+    Attributes:
+        unreadable: why a reply cannot be read, by member.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, member: str = "*") -> None:
@@ -116,7 +156,7 @@ class MemberQuery:
         self._query = RepeatedQuery(bus, clock, topics.key(session, member, topics.INFO))
 
     def poll(self) -> Iterator[Info]:
-        """Yields the answers that have arrived; repeats the query when it is due."""
+        """Yields the identities that have arrived, and repeats the query when it is due."""
         while (reply := self._query.poll()) is not None:
             _, key, payload = reply
             parts = topics.parse_key(key)
@@ -133,26 +173,36 @@ class MemberQuery:
 
 
 class LateSites(NamedTuple):
-    """Which sites may join a session that runs, as one of its sites knows it.
+    """Rules for sites that join late, as one site of a session knows them.
 
     Attributes:
-        returns: True if this site may: every one of the scenario waits for its peers and aligns
-            with them.
-        without: sites without which the session begins, if this one leads.
+        may_join_late: True if this site may join a running session. Then every site of the
+            scenario waits for its peers and aligns with them.
+        not_awaited: sites without which the session starts, if this site is the leader.
+        rate_hz: tick rate of this site.
     """
 
-    returns: bool = False
-    without: tuple[str, ...] = ()
+    may_join_late: bool = False
+    not_awaited: tuple[str, ...] = ()
     rate_hz: int = 1
 
 
 class Membership:
-    """The other members of a session, as one member knows them; a recorder, without sites,
-    learns these.
+    """The other members of a session, as one member knows them.
+
+    Args:
+        bus: connection of this member.
+        clock: clock of this member.
+        session: name of the session.
+        publisher: publishes the events of this member.
+        sites: sites of the scenario, the leader first. Empty for a recorder, which learns the
+            sites from the members.
+        late: rules for sites that join late.
 
     Attributes:
-        met: identities of the others, by name.
-        alive, gone: boots of the members that are present, and of those that have disappeared.
+        others: identities of the other members that are known and present, by name.
+        alive: boots of the members that are present, as text.
+        gone: boots of the members that have disappeared, as text.
     """
 
     def __init__(
@@ -173,12 +223,12 @@ class Membership:
         self._late = late
         self._presence = bus.presence(topics.presence_key(session, "*"))
         self._query = MemberQuery(bus, clock, session)
-        self._refused: set[int] = set()
-        self._recorders: set[str] = set()
+        self._refused_boots: set[int] = set()
+        self._recorder_boots: set[str] = set()
 
     @property
     def local_info(self) -> Info:
-        """The member's own identity."""
+        """Identity of this member."""
         return self._publisher.info
 
     @property
@@ -188,120 +238,136 @@ class Membership:
 
     @property
     def unreadable(self) -> dict[str, str]:
-        """By name of a member of the session, why its answer cannot be read."""
+        """Why the replies of members of the session cannot be read, by member."""
         members = (*self._sites, topics.RECORDER)
         return {
             name: reason for name, reason in self._query.unreadable.items() if name in members
         }
 
     def boots(self) -> dict[str, int]:
-        """Returns the boots of all members present, including its own."""
-        return {name: info.boot for name, info in self.others.items()} | {
-            self.local_info.member: self.local_info.boot
-        }
+        """Returns the boots of all members present, including this member."""
+        boots = {name: info.boot for name, info in self.others.items()}
+        return boots | {self.local_info.member: self.local_info.boot}
 
     def clocks(self) -> dict[str, str]:
-        """Returns the identities of their clocks."""
-        return {name: info.clock for name, info in self.others.items()} | {
-            self.local_info.member: self.local_info.clock
-        }
+        """Returns the clock identities of all members present, including this member."""
+        clocks = {name: info.clock for name, info in self.others.items()}
+        return clocks | {self.local_info.member: self.local_info.clock}
 
     def list_missing(self) -> list[str]:
-        """Returns the members that have not been met."""
-        needed = any(info.needs_recorder for info in (self.local_info, *self.others.values()))
-        recorder = [topics.RECORDER] if needed or self._recorders else []
-        return [
-            name
-            for name in (*self._sites, *recorder)
-            if name != self.local_info.member
-            and name not in self.others
-            and name not in self._late.without
-        ]
+        """Returns the members that the session waits for and that are not known yet."""
+        needs_recorder = any(
+            info.needs_recorder for info in (self.local_info, *self.others.values())
+        )
+        recorder = [topics.RECORDER] if needs_recorder or self._recorder_boots else []
+        not_missing = {self.local_info.member, *self.others, *self._late.not_awaited}
+        return [name for name in (*self._sites, *recorder) if name not in not_missing]
 
     def has_restarted(self, name: str, boot: int) -> bool:
-        """True if another start of a member is here, and the one of this boot is not."""
-        met = self.others.get(name)
-        return met is not None and met.boot != boot and str(boot) not in self.alive
+        """True if a member is present with another boot, and not with this boot."""
+        info = self.others.get(name)
+        return info is not None and info.boot != boot and str(boot) not in self.alive
 
     def list_running(self) -> list[Info]:
-        """Returns the sites of a running session that were met, of those that agree on its
-        other members.
-        """
+        """Returns the running sites that agree on the members of the session, by name."""
         infos = [
             info
             for _, info in sorted(self.others.items())
             if info.running and info.scenario and info.boots.get(info.member) == info.boot
         ]
-        own = {self.local_info.member: self.local_info.boot}  # some may have admitted it
-        return [info for info in infos if info.boots | own == infos[0].boots | own]
+        # Some of the sites may have admitted this member already: its boot is left out.
+        local_boot = {self.local_info.member: self.local_info.boot}
+        return [
+            info for info in infos if info.boots | local_boot == infos[0].boots | local_boot
+        ]
 
-    def poll(self, *, invited: bool) -> None:
-        """Takes answers, repeats the query, and forgets members that are gone.
+    def poll(self, *, may_have_started: bool) -> None:
+        """Receives identities, repeats the query, and forgets members that are gone.
 
-        Once this member is invited, has sent `ready`, others may begin before it knows.
+        Args:
+            may_have_started: True if this member has sent `ready`: then other members may run
+                before this member knows that the session has started.
 
         Raises:
             SessionError: this member cannot be part of the session.
         """
         for info in self._query.poll():
-            self.receive_identity(info, invited=invited)
-        for parts, alive in topics.read_presence(self._presence):
-            if parts.member == topics.RECORDER:
-                (self._recorders.add if alive else self._recorders.discard)(parts.boot)
-            (self.gone.discard if alive else self.gone.add)(parts.boot)
-            (self.alive.add if alive else self.alive.discard)(parts.boot)
-            met = self.others.get(parts.member)
-            if not alive and met is not None and str(met.boot) == parts.boot:
-                del self.others[parts.member]
+            self.receive_identity(info, may_have_started=may_have_started)
+        for parts, is_alive in topics.read_presence(self._presence):
+            self._update_presence(parts.member, parts.boot, is_alive=is_alive)
 
-    def receive_identity(self, info: Info, *, invited: bool) -> None:
-        """Takes the identity of a member.
+    def _update_presence(self, member: str, boot: str, *, is_alive: bool) -> None:
+        if is_alive:
+            self.alive.add(boot)
+            self.gone.discard(boot)
+        else:
+            self.alive.discard(boot)
+            self.gone.add(boot)
+        if member == topics.RECORDER and is_alive:
+            self._recorder_boots.add(boot)
+        elif member == topics.RECORDER:
+            self._recorder_boots.discard(boot)
+        info = self.others.get(member)
+        if not is_alive and info is not None and str(info.boot) == boot:
+            del self.others[member]
+
+    def receive_identity(self, info: Info, *, may_have_started: bool) -> None:
+        """Receives the identity of a member; see `poll` for `may_have_started`.
 
         Raises:
             SessionError: this member cannot be part of the session.
         """
-        own = self.local_info
-        if info.boot == own.boot or (not self._sites and info.member == topics.RECORDER):
+        local = self.local_info
+        is_second_recorder = not self._sites and info.member == topics.RECORDER
+        if info.boot == local.boot or is_second_recorder:
             return
-        comes_late = self._late.returns and info.member != own.member
-        if info.running and not invited and (not comes_late if self._sites else not info.boots):
+        if info.running and not may_have_started and not self._may_join(info):
             raise SessionError(
                 f"session {self._session!r} is running; {info.member} is at tick {info.ticks}"
             )
-        if info.member == own.member:
-            if info.boot < own.boot:
+        if info.member == local.member:
+            # Of two starts of one member the one with the lower boot stays.
+            if info.boot < local.boot:
                 raise SessionError(
-                    f"there is a {own.member} in session {self._session!r} already"
+                    f"there is already a {local.member} in session {self._session!r}"
                 )
             return
-        if self._sites and info.scenario_sha256 and info.scenario_sha256 != own.scenario_sha256:
-            if info.running and not invited:
+        has_other_scenario = info.scenario_sha256 not in ("", local.scenario_sha256)
+        if self._sites and has_other_scenario:
+            if info.running and not may_have_started:
                 raise SessionError(
-                    f"session {self._session!r} runs another scenario, {info.member} says"
+                    f"session {self._session!r} runs another scenario, "
+                    f"according to {info.member}"
                 )
             self._refuse(info)
             return
-        if (
-            info.member == topics.RECORDER
-            and self.others.get(info.member, info).boot != info.boot
-        ):
-            return  # of several recorders the first one met is the member
+        known = self.others.get(info.member, info)
+        if info.member == topics.RECORDER and known.boot != info.boot:
+            return  # of several recorders, the first one counts as the member
         if not self._sites or info.member in self._sites or info.member == topics.RECORDER:
             self.others[info.member] = info
 
+    def _may_join(self, info: Info) -> bool:
+        """True if this member may join the running session that a member is part of."""
+        if not self._sites:
+            return bool(info.boots)
+        return self._late.may_join_late and info.member != self.local_info.member
+
     def _refuse(self, info: Info) -> None:
-        """Leaves the session of a leader with another scenario; as the leader, publishes a
-        refusal.
+        """Refuses a member with another scenario; leaves the session if the leader has one.
+
+        Raises:
+            SessionError: the member is the leader, whose scenario counts.
         """
-        own = self.local_info
+        local = self.local_info
         text = (
             f"another scenario: {info.member} has {info.scenario_sha256[:16]}, "
-            f"{own.member} has {own.scenario_sha256[:16]}"
+            f"{local.member} has {local.scenario_sha256[:16]}"
         )
         if not self.is_leader and info.member == self._sites[0]:
-            raise SessionError(f"{text}; the one of {info.member}, who leads, counts")
-        if self.is_leader and info.boot not in self._refused:
-            self._refused.add(info.boot)
+            raise SessionError(f"{text}; that of the leader {info.member} counts")
+        if self.is_leader and info.boot not in self._refused_boots:
+            self._refused_boots.add(info.boot)
             self._publisher.publish("refused", text, about=info.member)
 
 
@@ -309,12 +375,13 @@ class Epoch(NamedTuple):
     """Tick 0 of a session, and the first tick of a site that joins late.
 
     Attributes:
-        mono_ns: on this process's monotonic clock.
-        unix_ns: in Unix time, as the leader read it.
-        epochs: the same instant on every member's own clock; empty for a recorder that joins
-            late.
+        mono_ns: the epoch on this process's monotonic clock.
+        unix_ns: the epoch in Unix time, as the leader read it.
+        boots: boots of the members, by name.
+        epochs: the epoch on every member's own clock; empty for a recorder that joins late.
         first: the first tick of this site.
-        coming: what it says who joins late, until all acknowledge its samples.
+        coming: the event with which a site that joins late announces itself. The site repeats
+            the event until all peers acknowledge its samples.
     """
 
     mono_ns: int

@@ -108,13 +108,15 @@ class SessionJoin:
         membership = self.membership
         now_ns = self._clock.monotonic_ns()
         self._publisher.answer_queries()
-        membership.poll(invited=self._announced is not None and not membership.is_leader)
+        membership.poll(
+            may_have_started=self._announced is not None and not membership.is_leader
+        )
         self.pinger.poll(self._other_clocks(membership.boots(), membership.clocks()))
         epoch = self._read_events()
         if epoch is None:
             self._reply_ready()
             running = membership.list_running()
-            if running and (self._late.returns or not self._sites):
+            if running and (self._late.may_join_late or not self._sites):
                 # else `start` may be under way
                 if self._announced is None or now_ns >= self._epoch_ns:
                     epoch = self._join_late(running, now_ns)
