@@ -70,9 +70,9 @@ class Flipping:
 
 def main(folder: Path) -> None:
     (place,) = (one.replace("tcp", "tls") for one in find_free_endpoints(1))
-    receiver = ZenohBus([place], own=read_member_keys(folder / "m1").settings)
+    receiver = ZenohBus([place], settings=read_member_keys(folder / "m1").settings)
     wire = Flipping(place)
-    sender = ZenohBus([], [wire.place], own=read_member_keys(folder / "m2").settings)
+    sender = ZenohBus([], [wire.place], settings=read_member_keys(folder / "m2").settings)
     key = topics.key("x", "m2", topics.EVENT)
     try:
         inbox, say = receiver.inbox(key), sender.publisher(key)

@@ -60,7 +60,9 @@ class Mesh(Connected):
     def join(self) -> Bus:
         seat = len(self._members)
         return self._enter(
-            ZenohBus(self._endpoints[seat : seat + 1], self._endpoints[:seat], own=self.own)
+            ZenohBus(
+                self._endpoints[seat : seat + 1], self._endpoints[:seat], settings=self.own
+            )
         )
 
 

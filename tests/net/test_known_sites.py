@@ -92,7 +92,7 @@ def test_endpoints_are_known_as_the_member_reaches_them() -> None:
 
 
 def test_site_with_settings_of_its_user_is_for_nobody_else() -> None:
-    with make_site_known("t", "s", SITES, 7, replace(HERE, own={"x": 1}), b"order"):
+    with make_site_known("t", "s", SITES, 7, replace(HERE, settings={"x": 1}), b"order"):
         assert find_known_sites("t") == []
 
 
@@ -120,7 +120,7 @@ def test_it_says_at_once_that_it_tries(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_keys_that_are_missing_are_said(capsys: pytest.CaptureFixture[str]) -> None:
     with make_site_known(
-        "t", "s", SITES, 7, replace(HERE, keys_of="operator", own={"x": 1}), b"order"
+        "t", "s", SITES, 7, replace(HERE, keys_of="operator", settings={"x": 1}), b"order"
     ):
         assert stop_at_once(["--session", "t"]) == 2
     assert "have keys: add --keys DIR" in capsys.readouterr().err

@@ -78,7 +78,7 @@ class Meeting:
         places = [place.replace("tcp", "tls") for place in find_free_endpoints(3)]
         self._places, self._mode = (places[2:], "client") if routed else (places[:2], "peer")
         if routed:
-            self.members.append(ZenohBus(places[2:], mode="router", own=self._own(ROUTER)))
+            self.members.append(ZenohBus(places[2:], mode="router", settings=self._own(ROUTER)))
         listens = [[], []] if routed else [[place] for place in places[:2]]
         self.m1 = self._enter(listens[0], places[2:] if routed else [], self._own("m1"))
         self.m2 = self._enter(listens[1], places[2:] if routed else places[:1], self._own("m2"))
@@ -237,9 +237,9 @@ def test_a_member_whose_name_was_taken_out_is_denied_everything(
     listed = [name for name in ALL if name != "s"]
     (tmp_path / MEMBERS).write_text(json.dumps({"member": "m1", "members": listed}))
     (place,) = (one.replace("tcp", "tls") for one in find_free_endpoints(1))
-    m1 = ZenohBus([place], own=read_member_keys(tmp_path).settings)
+    m1 = ZenohBus([place], settings=read_member_keys(tmp_path).settings)
     others = {
-        name: ZenohBus([], [place], own=read_member_keys(folder / name).settings)
+        name: ZenohBus([], [place], settings=read_member_keys(folder / name).settings)
         for name in ("s", "m2")
     }
     try:
@@ -376,10 +376,12 @@ def test_without_keys_nobody_listens_at_a_network(listen: str, open_: bool) -> N
 
 def test_ones_own_mutual_tls_is_as_good_as_keys() -> None:
     own = {"transport": {"link": {"tls": {"enable_mtls": True}}}}
-    safe = Connection(["tls/192.0.2.1:7447"], own=own)
+    safe = Connection(["tls/192.0.2.1:7447"], settings=own)
     assert secure_connection(safe, None, insecure=False) == safe
     with pytest.raises(UsageError, match="insecure=True"):
-        secure_connection(Connection(["tcp/192.0.2.1:7447"], own=own), None, insecure=False)
+        secure_connection(
+            Connection(["tcp/192.0.2.1:7447"], settings=own), None, insecure=False
+        )
 
 
 def test_with_keys_links_are_encrypted(folder: Path) -> None:
@@ -401,7 +403,7 @@ def test_with_keys_links_are_encrypted(folder: Path) -> None:
             secure_connection(Connection([], [plain]), keys, insecure=True)
     with pytest.raises(UsageError, match="one place"):
         secure_connection(
-            Connection(own={"access_control": {"enabled": True}}), keys, insecure=False
+            Connection(settings={"access_control": {"enabled": True}}), keys, insecure=False
         )
 
 
@@ -472,8 +474,8 @@ def two_members(folder: Path, *, stops: bool = False) -> Iterator[tuple[ZenohBus
         for member in ("m1", "s")
     }
     with (
-        closing(ZenohBus([place], own=own["m1"])) as site,
-        closing(ZenohBus([], [place], own=own["s"])) as peer,
+        closing(ZenohBus([place], settings=own["m1"])) as site,
+        closing(ZenohBus([], [place], settings=own["s"])) as peer,
     ):
         yield site, peer
 

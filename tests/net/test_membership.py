@@ -137,6 +137,7 @@ def test_a_site_that_begins_anew_too_is_not_waited_for() -> None:
     session.start(RECORDER)
     anew = {"member": "s", "boot": 99, "running": False, "boots": {}}
     session.members[RECORDER].joining.membership.receive_identity(
-        msgspec.structs.replace(session.members["m1"].publisher.info, **anew), may_have_started=False
+        msgspec.structs.replace(session.members["m1"].publisher.info, **anew),
+        may_have_started=False,
     )
     assert joined(session, 30 * STEP_NS) == epoch._replace(epochs={})

@@ -61,7 +61,7 @@ def test_stranger_without_certificate_of_authority_does_not_get_in(tmp_path: Pat
         (tmp_path / folder).mkdir()
     ours, theirs = (encrypted("tls", tmp_path / folder) for folder in ("ours", "theirs"))
     (endpoint,) = (place.replace("tcp", "tls") for place in find_free_endpoints(1))
-    router = ZenohBus([endpoint], mode="router", own=ours.own)
+    router = ZenohBus([endpoint], mode="router", settings=ours.own)
     try:
         for own in (theirs.own, None):
             with pytest.raises(RouterSilent):
@@ -95,7 +95,7 @@ def test_a_router_admits_by_password_and_passes_what_is_allowed(tmp_path: Path) 
     users.write_text("lab:secret\n")
     file.write_text(ACCESS.replace("USERS", str(users)))
     endpoints = find_free_endpoints(1)
-    router = ZenohBus(endpoints, mode="router", own=read_zenoh_file(file).settings)
+    router = ZenohBus(endpoints, mode="router", settings=read_zenoh_file(file).settings)
     members: list[ZenohBus] = []
 
     def enter(password: str) -> ZenohBus:

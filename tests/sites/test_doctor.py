@@ -89,7 +89,7 @@ def links(
 
 @contextmanager
 def member(folder: Path, place: str) -> Iterator[None]:
-    bus = ZenohBus([place], own=read_member_keys(folder).settings)
+    bus = ZenohBus([place], settings=read_member_keys(folder).settings)
     try:
         yield
     finally:

@@ -255,7 +255,7 @@ def test_reasons_that_strangers_invent_are_counted_and_not_kept() -> None:
 class Topic(list[bytes]):
     """A topic to which somebody listens, and what came on it."""
 
-    heard = True
+    has_subscribers = True
     put = list.append
 
 

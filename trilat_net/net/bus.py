@@ -1,11 +1,13 @@
-"""The bus: the Protocol of a member's network connection, and the rings in which messages wait.
+"""The bus: the protocol of a member's network connection, and the rings of waiting messages.
 
-Invariant: an arriving message triggers no more in a site than a stamp, its reading, an append
-or a short reply; what reads it raises nothing. Messages wait in bounded rings until the loop
-polls them; on overflow the oldest is dropped, which the receiver sees in the numbers of the
-messages. Only the recorder takes callbacks.
+`zenoh_bus` implements the protocol over Eclipse Zenoh.
 
-`zenoh_bus` implements it.
+Invariant:
+    - An arriving message costs a site's bus thread no more than a time stamp, the decoding, and
+      an append or a short reply. The decoding function raises nothing.
+    - Messages wait in bounded rings until the loop polls them. On overflow the oldest message
+      is dropped; the receiver notices the gap by the numbers of the messages.
+    - Only the recorder uses callbacks (`Bus.tap`).
 """
 
 import re
@@ -22,7 +24,7 @@ Polled = TypeVar("Polled", covariant=True)
 
 
 class PolledRing(Protocol[Polled]):
-    """A bounded ring of what has arrived."""
+    """A bounded ring of entries that have arrived."""
 
     def poll(self) -> Polled | None:
         """Returns the oldest entry, or None; never waits."""
@@ -31,38 +33,39 @@ class PolledRing(Protocol[Polled]):
 Inbox = PolledRing[tuple[str, bytes]]
 """Messages: (key, payload)."""
 PresenceInbox = PolledRing[tuple[str, bool]]
-"""Liveliness changes: (key, whether it is alive now)."""
+"""Liveliness changes: (key, True if the token is alive now)."""
 StampedInbox = PolledRing[tuple[Polled, int]]
-"""Messages with the instants of their arrival: (what was read, ns)."""
+"""Messages with their arrival times: (decoded message, ns)."""
 
 
 class Query(Protocol):
-    """A query that waits for an answer."""
+    """A query that waits for a reply."""
 
     @property
     def payload(self) -> bytes:
-        """The payload of the query; b"" without one."""
+        """The payload of the query; b"" if the query has no payload."""
 
     def reply(self, payload: bytes) -> None:
-        """Answers it."""
+        """Replies to the query."""
 
 
 QueryInbox = PolledRing[Query]
 
 
 class Bus(Protocol):
-    """One member's connection."""
+    """Network connection of one member."""
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
-        """Returns a function that publishes a payload under a key and drops it rather than
-        wait.
+        """Returns a function that publishes payloads under a key.
 
-        A patient one waits for room, some seconds at most: for a sender without ticks that must
-        lose nothing.
+        Args:
+            key: the key.
+            patient: False to drop a payload rather than wait for room. True to wait for room,
+                for at most some seconds: for senders without ticks that must lose nothing.
         """
 
     def inbox(self, key: str, capacity: int = RING_CAPACITY) -> Inbox:
-        """Returns a ring of the messages that others publish under a key expression."""
+        """Returns a ring of the messages that other members publish under a key expression."""
 
     def stamped_inbox(
         self,
@@ -71,59 +74,70 @@ class Bus(Protocol):
         read: Callable[[bytes], T],
         capacity: int = RING_CAPACITY,
     ) -> StampedInbox[T]:
-        """Returns a ring whose messages are stamped by `now_ns` on arrival, and then read, in a
-        bus thread.
+        """Returns a ring whose messages are stamped and decoded on arrival, in a bus thread.
 
-        `read` turns a payload into the entry (`bytes`: itself); it is short, and raises
-        nothing.
+        Args:
+            key: key expression of the messages.
+            now_ns: clock that stamps the arrivals.
+            read: decodes a payload, and raises nothing; `bytes` keeps the payload as it is.
+            capacity: number of messages that the ring holds.
         """
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
-        """Calls back with (key, payload) on arrival, in a thread of the bus."""
+        """Calls `callback(key, payload)` for every arriving message, in a thread of the bus."""
 
     def query_inbox(self, key: str) -> QueryInbox:
-        """Returns a ring of the queries of others under a key."""
+        """Returns a ring of the queries that other members send under a key."""
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
-        """Answers queries under a key at once, in a thread of the bus; None is no answer.
+        """Replies to queries under a key at once, in a thread of the bus.
 
-        `answer` is short, because messages wait meanwhile, and raises nothing.
+        Args:
+            key: the key.
+            answer: returns the reply to a payload, or None for no reply. It must be short,
+                because messages wait meanwhile, and must raise nothing.
         """
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
-        """Queries all who answer under a key expression; returns the ring of their answers."""
+        """Queries all members under a key expression, and returns the ring of their replies."""
 
     def announce(self, key: str) -> None:
-        """Declares a liveliness token, which disappears with the member."""
+        """Declares a liveliness token, which disappears together with this member."""
 
     def presence(self, key: str) -> PresenceInbox:
-        """Returns a ring of tokens that appear and disappear, beginning with the present ones."""
+        """Returns a ring of the tokens that appear and disappear; present tokens come first."""
 
     def close(self) -> None:
-        """Leaves; may be called again."""
+        """Closes the connection; repeated calls have no effect."""
 
 
 @lru_cache(256)
 def _compile_expression(expression: str) -> re.Pattern[str]:
-    chunks = []
+    patterns = []
     for chunk in expression.split("/"):
         literals = map(re.escape, chunk.split("$*"))
-        chunks.append(
-            {"**": "(?:/[^/]+)*", "*": "/[^/]+"}.get(chunk, "/" + "[^/]*".join(literals))
-        )
-    return re.compile("".join(chunks))
+        if chunk == "**":
+            patterns.append("(?:/[^/]+)*")
+        elif chunk == "*":
+            patterns.append("/[^/]+")
+        else:
+            patterns.append("/" + "[^/]*".join(literals))
+    return re.compile("".join(patterns))
 
 
 def matches_key(expression: str, key: str) -> bool:
-    """True if a key expression includes a key: `*` is one chunk, `**` any number, `$*` part of
-    one.
+    """True if a key expression matches a key.
+
+    In an expression, `*` stands for one chunk, `**` for any number of chunks, and `$*` for any
+    part of a chunk.
     """
     return _compile_expression(expression).fullmatch("/" + key) is not None
 
 
 class BoundedRing(Generic[T]):
-    """A bounded ring; on overflow it drops the oldest entry. `put` may run in another thread
-    than `poll`.
+    """A bounded ring, which drops its oldest entry on overflow.
+
+    One thread may call `put` while another one calls `poll`.
     """
 
     def __init__(self, capacity: int = RING_CAPACITY) -> None:
@@ -139,7 +153,10 @@ class BoundedRing(Generic[T]):
 
 
 class StampingRing(BoundedRing[tuple[T, int]]):
-    """The `StampedInbox` of every bus; `take` may run in another thread than `poll`."""
+    """The `StampedInbox` of every bus.
+
+    One thread may call `receive` while another one calls `poll`.
+    """
 
     def __init__(
         self, now_ns: Callable[[], int], read: Callable[[bytes], T], capacity: int
@@ -149,6 +166,6 @@ class StampingRing(BoundedRing[tuple[T, int]]):
         self._read = read
 
     def receive(self, payload: bytes) -> None:
-        """Stamps a message, reads it and appends it."""
+        """Stamps an arriving message, decodes it and appends it."""
         now_ns = self._now_ns()
         self._entries.append((self._read(payload), now_ns))

@@ -104,7 +104,7 @@ class Connection:
         connect: endpoints to connect to; a client takes the first that answers. None: still to
             be found.
         mode: peer of the other members, client of a router, or a router.
-        own: Zenoh settings of a user's file, or of a member's keys.
+        settings: Zenoh settings of a user's file, or of a member's keys.
         keys_of: the member whose keys it has: links are encrypted, and both ends prove by
             certificates who they are; "": none.
         keys_end: when these keys end, in UTC; None: there are none.
@@ -113,7 +113,7 @@ class Connection:
     listen: Sequence[Endpoint] = ()
     connect: Sequence[Endpoint] | None = ()
     mode: ZenohMode = "peer"
-    own: Mapping[str, Any] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
     keys_of: str = ""
     keys_end: datetime | None = None
 
@@ -134,7 +134,7 @@ class Connection:
         """
         listen, connect = (self.reach(side or ()) for side in (self.listen, self.connect))
         check_hosts(find_endpoint_addresses([*listen, *connect]))
-        return ZenohBus(listen, connect, self.mode, self.own)
+        return ZenohBus(listen, connect, self.mode, self.settings)
 
     def require_keys_until(self, left_s: float) -> None:
         """Refuses keys that end before a session does.
@@ -191,7 +191,7 @@ def secure_connection(
         from .member_keys import read_member_keys  # loads what makes certificates
 
         keys = read_member_keys(keys)
-    own = connection.own
+    own = connection.settings
     named = (*connection.listen, *(connection.connect or ()))
     if udp := [place for place in find_endpoint_addresses(named) if place.startswith("udp/")]:
         raise UsageError(
@@ -219,7 +219,7 @@ def secure_connection(
             )
         return replace(
             connection,
-            own=merge_settings(keys.settings, own),
+            settings=merge_settings(keys.settings, own),
             keys_of=keys.member,
             keys_end=keys.ends,
         )

@@ -76,7 +76,7 @@ def make_site_known(
     here = (os.getpid(), SystemClock().identity())
     known = KnownSite(session, site, sites, *how, places, stop, *here)
     with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
-        if connection.keys_of or not connection.own:
+        if connection.keys_of or not connection.settings:
             _find_folder().mkdir(mode=0o700, parents=True, exist_ok=True)
             with os.fdopen(
                 os.open(_find_folder() / f"{boot:016x}.json", _NEW_FILE, 0o600), "wb"

@@ -1,13 +1,16 @@
-"""Queries: repeated over a slow network, for missed messages, and pings, which tell of clocks.
+"""Repeated queries over a slow network, and pings, which measure the clocks of members.
 
-Invariant: a reply counts however many queries later it arrives, as long as its query is one of
-the last QUERIES_KEPT. A member answers a ping at once, in a thread of its bus, with its clock's
-reading; the asker then knows that clock to half the round trip, however far the clocks differ.
+A member replies to a ping at once, in a thread of its bus, with the readings of its clock on
+receiving and on sending. The member that pinged then knows that clock to half the round trip,
+however far the two clocks differ.
+
+Invariant:
+    - A reply counts however late it arrives, as long as its query is one of the last
+      QUERIES_KEPT.
 """
 
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
-from typing import Any
 
 from ..core.ticks import NS_PER_S
 from ..errors import WireError
@@ -20,66 +23,74 @@ from .requests import Backfill, BackfillRequest, Pong
 from .wire import decode, encode
 
 QUERIES_KEPT = 128
-QUERY_EVERY_NS = 200_000_000
-"""Between two queries for identities."""
+"""Number of queries whose replies still count."""
+QUERY_PERIOD_NS = 200_000_000
+"""Time between two queries for identities, in ns."""
 
 
 class RepeatedQuery:
-    """A query that is sent again and again; answers to the last QUERIES_KEPT of them count."""
+    """A query that is sent periodically; replies to its last QUERIES_KEPT copies count."""
 
     def __init__(self, bus: Bus, clock: Clock, key: str) -> None:
         self._bus = bus
         self._clock = clock
         self._key = key
-        self._open: deque[tuple[int, Inbox]] = deque(maxlen=QUERIES_KEPT)
+        self._pending: deque[tuple[int, Inbox]] = deque(maxlen=QUERIES_KEPT)
 
-    def repeat(self, every_ns: int = QUERY_EVERY_NS) -> bool:
-        """Sends the query if the last one is that long ago; True if so."""
+    def repeat(self, period_ns: int = QUERY_PERIOD_NS) -> bool:
+        """Sends the query if a period has passed since the last; returns True if it was sent."""
         now_ns = self._clock.monotonic_ns()
-        due = not self._open or now_ns - self._open[-1][0] >= every_ns
-        if due:
-            self._open.append((now_ns, self._bus.query(self._key)))
-        return due
+        is_due = not self._pending or now_ns - self._pending[-1][0] >= period_ns
+        if is_due:
+            self._pending.append((now_ns, self._bus.query(self._key)))
+        return is_due
 
     def poll(self) -> tuple[int, str, bytes] | None:
-        """Returns when a query was sent, ns, and key and payload of its answer; None without.
-        Never waits.
+        """Returns the next reply, or None if there is none yet; never waits.
+
+        Returns:
+            The sending time of the query in ns, and the key and the payload of the reply.
         """
-        for asked_ns, inbox in self._open:
-            if (reply := inbox.poll()) is not None:
-                return asked_ns, *reply
+        for queried_ns, inbox in self._pending:
+            reply = inbox.poll()
+            if reply is not None:
+                key, payload = reply
+                return queried_ns, key, payload
         return None
 
 
 PINGS = 20
-"""Round trips until a member's clock counts as known."""
+"""Number of round trips after which a member's clock counts as known."""
 PINGS_PER_WINDOW = 5
-"""Round trips of which the tightest limits are kept."""
+"""Number of round trips in a window, of which the tightest limits are kept."""
 PING_PACE_NS = 10_000_000
-"""Between two pings until all clocks are known."""
+"""Time between two pings until all clocks are known, in ns."""
 PING_REST_NS = 250_000_000
-"""Between two pings afterwards, so that the estimates stay fresh."""
+"""Time between two pings afterwards, so that the estimates stay fresh, in ns."""
 GLANCE_NS = 100_000
-"""Between two polls while an answer is under way: polling stamps it."""
+"""Time between two polls while a reply is under way, in ns.
+
+It is short because replies are stamped when they are polled.
+"""
 _ROUND_TRIPS_KEPT = 10_000
-_STRAGGLE_NS = 20_000_000
+_LATE_REPLY_NS = 20_000_000
+"""Time added to two round trips in which a reply is expected, in ns."""
 
 
 def answer_pings(bus: Bus, clock: Clock, session: str, info: Info) -> None:
-    """Answers pings until the bus is closed."""
+    """Replies to pings of a member, in a thread of the bus, until the bus is closed."""
 
     def answer(_: bytes) -> bytes:
-        came_ns = clock.monotonic_ns()
-        left_ns = clock.monotonic_ns()
-        return encode(
-            Pong(
-                member=info.member,
-                boot=info.boot,
-                clock=info.clock,
-                came_ns=came_ns,
-                left_ns=left_ns,
-            )
+        received_ns = clock.monotonic_ns()
+        sent_ns = clock.monotonic_ns()
+        pong = Pong(
+            member=info.member,
+            boot=info.boot,
+            clock=info.clock,
+            came_ns=received_ns,
+            left_ns=sent_ns,
         )
+        return encode(pong)
 
     bus.respond(topics.key(session, info.member, topics.PING), answer)
 
@@ -90,35 +101,50 @@ def answer_backfill(
     boot: int,
     find: Callable[[BackfillRequest], tuple[int, list[bytes], int]],
 ) -> int:
-    """Answers a recorder's query for messages that it missed; returns how many it gets.
+    """Replies to a recorder's query for missing messages.
 
-    `find` returns the number of the first one, the messages, and how many the member has made.
+    Args:
+        query: the query of the recorder.
+        member: name of the replying member.
+        boot: boot of that member.
+        find: returns the number of the first message found, the payloads of the messages, and
+            the number of messages that the member has published.
+
+    Returns:
+        The number of messages sent; 0 for an unreadable query, which gets no reply.
     """
     try:
-        wanted = decode(query.payload, BackfillRequest)
+        request = decode(query.payload, BackfillRequest)
     except WireError:
-        return 0  # a stranger's: it gets no answer
-    first, payloads, made = find(wanted)
-    found: dict[str, Any] = {
-        "channel": wanted.channel,
-        "first": first,
-        "payloads": payloads,
-        "made": made,
-    }
-    query.reply(encode(Backfill(member=member, boot=boot, **found)))
+        return 0  # a query of a stranger
+    first, payloads, published = find(request)
+    backfill = Backfill(
+        member=member,
+        boot=boot,
+        channel=request.channel,
+        first=first,
+        payloads=payloads,
+        made=published,
+    )
+    query.reply(encode(backfill))
     return len(payloads)
 
 
 class RoundTrips:
-    """The round trips to one start of a member; its clock counts as known after `enough` that
-    agree.
+    """The round trips of pings to one start of a member.
+
+    Args:
+        required: number of agreeing round trips after which the member's clock is known.
 
     Attributes:
-        rtts_ns: the latest round trips, without the time that the member held them.
+        rtts_ns: the latest round trips, without the time between the member's two stamps.
+        shortest_ns: the shortest round trip; 0 before the first.
+        estimator: limits of the offset of the member's clock.
+        latest: the latest estimate of that offset; None before the first.
     """
 
-    def __init__(self, enough: int) -> None:
-        self._enough = enough
+    def __init__(self, required: int) -> None:
+        self._required = required
         self.rtts_ns: deque[int] = deque(maxlen=_ROUND_TRIPS_KEPT)
         self.shortest_ns = 0
         self.estimator = OffsetEstimator()
@@ -128,81 +154,106 @@ class RoundTrips:
 
     @property
     def is_known(self) -> bool:
-        """True once there are enough round trips that agree."""
-        return self._agreeing >= self._enough
+        """True once enough round trips agree."""
+        return self._agreeing >= self._required
 
-    def receive(self, asked_ns: int, pong: Pong, now_ns: int) -> None:
-        """Takes one round trip; ignores an impossible one."""
-        rtt_ns = now_ns - asked_ns - (pong.left_ns - pong.came_ns)
+    def receive(self, pinged_ns: int, pong: Pong, now_ns: int) -> None:
+        """Receives the reply to a ping; an impossible reply is ignored.
+
+        Args:
+            pinged_ns: sending time of the ping, on the local clock.
+            pong: the reply.
+            now_ns: arrival of the reply, on the local clock.
+        """
+        rtt_ns = now_ns - pinged_ns - (pong.left_ns - pong.came_ns)
         if rtt_ns < 0 or pong.left_ns < pong.came_ns:
             return
         self.shortest_ns = min(self.shortest_ns, rtt_ns) if self.rtts_ns else rtt_ns
         self.rtts_ns.append(rtt_ns)
-        self._window.append(
-            (
-                OffsetLimit(asked_ns, pong.came_ns - asked_ns),
-                OffsetLimit(now_ns, pong.left_ns - now_ns),
-            )
-        )
-        if len(self._window) < PINGS_PER_WINDOW:
-            return
-        drift = self.latest.drift / NS_PER_S if self.latest else 0.0
+        ceiling = OffsetLimit(pinged_ns, pong.came_ns - pinged_ns)
+        floor = OffsetLimit(now_ns, pong.left_ns - now_ns)
+        self._window.append((ceiling, floor))
+        if len(self._window) == PINGS_PER_WINDOW:
+            self._close_window(now_ns)
 
-        def offset_now(limit: OffsetLimit) -> float:
-            return limit.offset_ns - drift * (limit.local_ns - now_ns)
+    def _close_window(self, now_ns: int) -> None:
+        """Adds the tightest limits of the window to the estimator, and estimates the offset."""
+        drift_per_ns = self.latest.drift / NS_PER_S if self.latest else 0.0
+
+        def extrapolate_limit(limit: OffsetLimit) -> float:
+            return limit.offset_ns - drift_per_ns * (limit.local_ns - now_ns)
 
         ceilings, floors = zip(*self._window, strict=True)
         self._window = []
-        self.estimator.add(min(ceilings, key=offset_now), max(floors, key=offset_now))
+        lowest_ceiling = min(ceilings, key=extrapolate_limit)
+        highest_floor = max(floors, key=extrapolate_limit)
+        self.estimator.add(lowest_ceiling, highest_floor)
         estimate = self.estimator.estimate(now_ns)
-        self._agreeing = self._agreeing + PINGS_PER_WINDOW if estimate else 0
-        self.latest = estimate or self.latest
+        if estimate is None:  # the clock has stepped: earlier round trips do not count
+            self._agreeing = 0
+            return
+        self._agreeing += PINGS_PER_WINDOW
+        self.latest = estimate
 
 
 class Pinger:
-    """Pings every member of a session, by its boot; call `poll` again and again."""
+    """Pings the members of a session; call `poll` regularly.
 
-    def __init__(self, bus: Bus, clock: Clock, session: str, enough: int = PINGS) -> None:
+    Args:
+        bus: connection of this member.
+        clock: clock of this member.
+        session: name of the session.
+        required: number of agreeing round trips after which a clock is known.
+
+    Attributes:
+        trips: round trips by boot of the member.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, session: str, required: int = PINGS) -> None:
         self.trips: dict[int, RoundTrips] = {}
         self._clock = clock
-        self._enough = enough
+        self._required = required
         self._query = RepeatedQuery(bus, clock, topics.key(session, "*", topics.PING))
-        self._glance_until_ns = 0
+        self._reply_expected_until_ns = 0
 
-    def poll(self, wanted: Collection[int]) -> None:
-        """Sends a ping if it is due, and takes the answers that have arrived from the boots
-        wanted.
+    def poll(self, boots: Collection[int]) -> None:
+        """Sends a ping if it is due, and receives the replies of members.
+
+        Args:
+            boots: boots of the members whose replies count.
         """
-        pace_ns = PING_REST_NS if self.knows_clocks(wanted) else PING_PACE_NS
-        if wanted and self._query.repeat(pace_ns):
-            self._glance_until_ns = (
-                self._clock.monotonic_ns() + 2 * self.slowest_ns() + _STRAGGLE_NS
-            )
+        period_ns = PING_REST_NS if self.knows_clocks(boots) else PING_PACE_NS
+        if boots and self._query.repeat(period_ns):
+            expected_ns = 2 * self.slowest_ns() + _LATE_REPLY_NS
+            self._reply_expected_until_ns = self._clock.monotonic_ns() + expected_ns
         while (reply := self._query.poll()) is not None:
-            asked_ns, key, payload = reply
+            pinged_ns, key, payload = reply
             now_ns = self._clock.monotonic_ns()
             parts = topics.parse_key(key)
             try:
                 pong = decode(payload, Pong)
             except WireError:
-                continue  # a stranger's
-            if parts is not None and parts.member == pong.member and pong.boot in wanted:
-                trips = self.trips.setdefault(pong.boot, RoundTrips(self._enough))
-                trips.receive(asked_ns, pong, now_ns)
+                continue  # a reply of a stranger
+            if parts is not None and parts.member == pong.member and pong.boot in boots:
+                trips = self.trips.setdefault(pong.boot, RoundTrips(self._required))
+                trips.receive(pinged_ns, pong, now_ns)
 
     def knows_clocks(self, boots: Collection[int]) -> bool:
-        """True once the clocks of all these members are known."""
+        """True if the clocks of all members with these boots are known."""
         return all(boot in self.trips and self.trips[boot].is_known for boot in boots)
 
     def estimate(self, boot: int) -> OffsetEstimate:
-        """Returns the latest estimate of a member's clock; exactly the own clock without pings
-        to it.
+        """Returns the latest estimate of the offset of a member's clock.
+
+        Without any round trip, the member counts as sharing the local clock.
         """
         trips = self.trips.get(boot)
-        return exact_offset(0) if trips is None or trips.latest is None else trips.latest
+        if trips is None or trips.latest is None:
+            return exact_offset(0)
+        return trips.latest
 
     def estimator(self, boot: int) -> OffsetEstimator | None:
-        """Returns the limits of a member's clock, or None if it is the own clock."""
+        """Returns the limits of a member's clock, or None if it is the local clock."""
         trips = self.trips.get(boot)
         return None if trips is None else trips.estimator
 
@@ -211,18 +262,25 @@ class Pinger:
         return max((trips.shortest_ns for trips in self.trips.values()), default=0)
 
     def pause_ns(self, otherwise_ns: int) -> int:
-        """Returns the time until the next poll, ns: short while answers are under way."""
-        under_way = self._clock.monotonic_ns() < self._glance_until_ns
-        return min(GLANCE_NS, otherwise_ns) if under_way else otherwise_ns
+        """Returns the time until the next poll, in ns: `otherwise_ns` unless a reply is due."""
+        if self._clock.monotonic_ns() < self._reply_expected_until_ns:
+            return min(GLANCE_NS, otherwise_ns)
+        return otherwise_ns
 
 
-def describe_clocks(pinger: Pinger, boots: Mapping[str, int], at_ns: int) -> list[str]:
-    """Returns a sentence for every member on another clock, as of an instant of the own clock."""
+def describe_clocks(pinger: Pinger, boots: Mapping[str, int], local_ns: int) -> list[str]:
+    """Returns a sentence for every member on another clock.
+
+    Args:
+        pinger: the round trips to the members.
+        boots: boots of the members, by name.
+        local_ns: instant of the local clock for which the offsets are stated.
+    """
     texts = []
     for name, boot in boots.items():
         if boot in pinger.trips:
             estimate = pinger.estimate(boot)
-            offset_ns = estimate.extrapolate_ns(at_ns)
-            offset = format_offset(offset_ns, estimate.error_bound_ns(at_ns, offset_ns))
+            offset_ns = estimate.extrapolate_ns(local_ns)
+            offset = format_offset(offset_ns, estimate.error_bound_ns(local_ns, offset_ns))
             texts.append(f"clock of {name}: another one, {offset}")
     return texts

@@ -172,7 +172,7 @@ def make_gid(token: str) -> bytes:
     return hashlib.sha256(token.encode()).digest()[:_GID_BYTES]
 
 
-_OWN = {"timestamping": {"enabled": {"client": True}}}
+_SETTINGS = {"timestamping": {"enabled": {"client": True}}}
 """A latched topic tells by their times which of its messages are the last."""
 SENSOR = QualityOfService(reliable=False, depth=5)
 """What a subscription asks for: it matches every publisher."""
@@ -267,7 +267,7 @@ class Ros2Graph:
             listen=[],
             connect=routers,
             mode="client",
-            own=_OWN,
+            settings=_SETTINGS,
             silent="no router of ROS answers at {}",
         )
         if not self.connected and self._session.info.peers_zid():

@@ -1,8 +1,10 @@
-"""The bus over Eclipse Zenoh; only it and `ros2_graph` import `zenoh`.
+"""The bus over Eclipse Zenoh. Only this module and `ros2_graph` import `zenoh`.
 
-Invariant: nothing here waits for the network. A publisher drops a message rather than delay its
-caller (except a patient one), queries go into a ring, and a session that cannot open yet raises
-an error.
+Invariant:
+    - Nothing here waits for the network.
+    - A publisher drops a message rather than delay its caller, unless the publisher is patient.
+    - Replies go into a ring.
+    - A session that cannot be opened yet raises an error.
 """
 
 import ctypes
@@ -31,64 +33,76 @@ from .bus import (
 )
 from .zenoh_config import Endpoint, ZenohFile, ZenohMode, check_zenoh_file, make_zenoh_config
 
-ASK_TIMEOUT_S = 3.0
-ONE_POOL = "(rx:(worker_threads:4),tx:(handover:rx),acc:(handover:rx),net:(handover:rx),app:(handover:rx))"
+QUERY_TIMEOUT_S = 3.0
+SHARED_POOL = (
+    "(rx:(worker_threads:4),tx:(handover:rx),acc:(handover:rx),"
+    "net:(handover:rx),app:(handover:rx))"
+)
+"""Zenoh's runtime setting that makes all of its five pools share the threads of one."""
 MAX_DEPTH = 100
-"""Nesting of a configuration; Zenoh's recursive parser overflows its stack on deep nesting."""
+"""Largest nesting of a configuration.
+
+Zenoh's recursive parser overflows its stack on deep nesting.
+"""
 
 
 T = TypeVar("T")
 
 
 def share_threads() -> None:
-    """Puts all of Zenoh into one pool from the first session on, not five, whose threads wake
-    one another.
+    """Makes all of Zenoh use one pool of threads instead of five, from the first session on.
 
-    One thread of it does the work. Where a connection is closed with bytes that its peer never
-    took, closing holds a thread for up to 10 s (eclipse-zenoh/zenoh#1101); the others then
-    serve the other members. Not for a router: it waits for room where it reads, and needs a
-    thread that sends meanwhile.
+    The threads of several pools wake one another, which costs time. One thread of the pool does
+    the work. Closing a connection whose peer never received its last bytes holds a thread for
+    up to 10 s (eclipse-zenoh/zenoh#1101); then the other threads serve the other members.
+
+    Routers must not call this function: a router waits for room where it reads, and needs
+    another thread that sends meanwhile.
     """
-    os.environ.setdefault("ZENOH_RUNTIME", ONE_POOL)
+    os.environ.setdefault("ZENOH_RUNTIME", SHARED_POOL)
 
 
 class RouterSilent(SessionError):  # noqa: N818 - it names an outcome
-    """A router that does not answer, or not yet."""
+    """A router does not answer, or does not answer yet."""
 
 
 class _ZenohRing(Generic[T]):
-    """A ring of Zenoh's; `read` turns what it holds into an entry, or into None, which is
-    passed over.
+    """A ring of Zenoh.
+
+    Args:
+        channel: Zenoh's receiving channel.
+        read: converts a received object into an entry, or into None to skip the object.
     """
 
-    def __init__(self, source: Any, read: Callable[[Any], T | None]) -> None:
-        self._source = source
-        self._try_recv = source.try_recv
+    def __init__(self, channel: Any, read: Callable[[Any], T | None]) -> None:
+        self._channel = channel
+        self._try_recv = channel.try_recv
         self._read = read
 
     def poll(self) -> T | None:
         try:
             while (received := self._try_recv()) is not None:
-                if (entry := self._read(received)) is not None:
+                entry = self._read(received)
+                if entry is not None:
                     return entry
-        except zenoh.ZError:  # every answer to a query has arrived: the channel is closed
-            pass
+        except zenoh.ZError:
+            pass  # all replies to a query have arrived, so the channel is closed
         return None
 
 
-def _handle_samples(take: Callable[[Any], None]) -> Any:
-    """Returns a handler that calls `take` in Zenoh's threads, each of which keeps its Python
-    state.
+def _make_sample_handler(receive: Callable[[Any], None]) -> Any:
+    """Returns a Zenoh handler that calls `receive` with every sample, in threads of Zenoh.
 
-    Else CPython makes that state anew for every message, and unmaps it. A thread asks for the
-    interpreter once more than it gives it back, so its state lives as long as the process.
+    Each thread keeps its CPython thread state. Otherwise CPython would create that state anew
+    for every message, and unmap it. A thread acquires the interpreter once more than it
+    releases the interpreter, so its state lives as long as the process.
     """
-    kept = threading.local()
+    thread_states = threading.local()
 
     def handle(sample: Any) -> None:
-        take(sample)
-        if not hasattr(kept, "state"):
-            kept.state = ctypes.pythonapi.PyGILState_Ensure()
+        receive(sample)
+        if not hasattr(thread_states, "state"):
+            thread_states.state = ctypes.pythonapi.PyGILState_Ensure()
 
     return handlers.Callback(handle, indirect=False)
 
@@ -106,7 +120,8 @@ class _ZenohQuery(NamedTuple):
         return b"" if self.query.payload is None else self.query.payload.to_bytes()
 
     def reply(self, payload: bytes) -> None:
-        with self.query as query:  # a query ends for its sender only when it is dropped
+        # A query ends for its sender only when the query object is dropped.
+        with self.query as query:
             query.reply(self.key, payload)
 
 
@@ -114,45 +129,58 @@ def open_zenoh(
     listen: Sequence[Endpoint],
     connect: Sequence[Endpoint],
     mode: ZenohMode,
-    own: Mapping[str, Any] | None,
+    settings: Mapping[str, Any] | None,
     silent: str,
 ) -> Any:
     """Returns a Zenoh session with the settings of `make_zenoh_config`.
 
+    Args:
+        listen: endpoints at which the session listens.
+        connect: endpoints to which the session connects.
+        mode: "peer", "client" or "router".
+        settings: settings of a user's file, which replace the settings of the program.
+        silent: text of the error if no router answers, with {} in place of the endpoints.
+
     Raises:
-        UsageError: an endpoint is malformed, or cannot be listened at.
-        RouterSilent: a client's router does not answer: the text `silent`, with the endpoints
-            in place of {}.
+        UsageError: an endpoint is malformed, or the session cannot listen there.
+        RouterSilent: no router of a client answers.
     """
-    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # logs nothing without RUST_LOG
+    # Logs nothing unless the environment has RUST_LOG.
+    zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]
+    config = json.dumps(make_zenoh_config(listen, connect, mode, settings))
     try:
-        return zenoh.open(
-            zenoh.Config.from_json5(json.dumps(make_zenoh_config(listen, connect, mode, own)))
-        )
+        return zenoh.open(zenoh.Config.from_json5(config))
     except zenoh.ZError as error:
         if mode == "client" and "Unable to connect" in str(error):
             raise RouterSilent(silent.format(_endpoint_texts(connect))) from None
         if "in use" in str(error) or "AddrInUse" in str(error):
             raise UsageError(
                 f"cannot listen at {_endpoint_texts(listen)}: the port is in use; "
-                "end the program that has it, or choose another one with --listen tcp/127.0.0.1:PORT"
+                "end the program that uses it, or choose another port with "
+                "--listen tcp/127.0.0.1:PORT"
             ) from None
-        places = _endpoint_texts([*listen, *connect])
+        endpoints = _endpoint_texts([*listen, *connect])
         raise UsageError(
-            f"cannot open a Zenoh session with {places}: {_first_line(error)}"
+            f"cannot open a Zenoh session with {endpoints}: {_first_line(error)}"
         ) from None
 
 
 class ZenohBus:
-    """A `Bus` over a Zenoh session of its own, with the settings of a user's file.
+    """A `Bus` over a separate Zenoh session.
 
-    It connects again and again until all endpoints answer; a client connects to the first that
-    answers now, and again if it loses it. Peers reach those that they connect to, clients and
-    routers all that a router reaches.
+    A peer or router retries until all endpoints answer. A client connects to the first endpoint
+    that answers at once, and reconnects if the connection is lost. Peers reach the members that
+    they connect to; clients and routers reach all members that a router reaches.
+
+    Args:
+        listen: endpoints at which the session listens.
+        connect: endpoints to which the session connects.
+        mode: "peer", "client" or "router".
+        settings: settings of a user's file, which replace the settings of the program.
 
     Raises:
-        UsageError: an endpoint is malformed, or cannot be listened at.
-        RouterSilent: a client's router does not answer.
+        UsageError: an endpoint is malformed, or the session cannot listen there.
+        RouterSilent: no router of a client answers.
     """
 
     def __init__(
@@ -160,21 +188,24 @@ class ZenohBus:
         listen: Sequence[Endpoint] = (),
         connect: Sequence[Endpoint] = (),
         mode: ZenohMode = "peer",
-        own: Mapping[str, Any] | None = None,
+        settings: Mapping[str, Any] | None = None,
     ) -> None:
-        refused = ", or none lets this member in" if own else ""
+        or_refused = ", or none lets this member in" if settings else ""
         self._session = open_zenoh(
             listen=listen,
             connect=connect,
             mode=mode,
-            own=own,
-            silent=f"no router answers at {{}}{refused}",
+            settings=settings,
+            silent=f"no router answers at {{}}{or_refused}",
         )
-        self._kept: list[Any] = []
+        self._declarations: list[Any] = []  # Zenoh undeclares an object that is not referenced
         self._tokens: set[str] = set()
 
     def publisher(self, key: str, *, patient: bool = False) -> Callable[[bytes], None]:
-        """See `Bus`; a receiver that blocks a patient publisher for 5 s loses its connection."""
+        """See `Bus`.
+
+        A receiver that blocks a patient publisher for 5 s loses its connection.
+        """
         publisher = self._session.declare_publisher(
             key,
             congestion_control=CongestionControl.BLOCK if patient else CongestionControl.DROP,
@@ -182,7 +213,7 @@ class ZenohBus:
             express=False,
             allowed_destination=Locality.REMOTE,
         )
-        self._kept.append(publisher)
+        self._declarations.append(publisher)
         put: Callable[[bytes], None] = publisher.put
         return put
 
@@ -205,49 +236,52 @@ class ZenohBus:
     ) -> StampedInbox[T]:
         """See `Bus`."""
         ring = StampingRing(now_ns, read, capacity)
-        take = ring.receive
-        handler = _handle_samples(lambda sample: take(sample.payload.to_bytes()))
-        self._kept.append(self._subscribe(key, handler))
+        receive = ring.receive  # looked up once, not for every message
+        handler = _make_sample_handler(lambda sample: receive(sample.payload.to_bytes()))
+        self._declarations.append(self._subscribe(key, handler))
         return ring
 
     def tap(self, key: str, callback: Callable[[str, bytes], None]) -> None:
         """See `Bus`."""
-        handler = _handle_samples(lambda sample: callback(*_read_sample(sample)))
-        self._kept.append(self._subscribe(key, handler))
+        handler = _make_sample_handler(lambda sample: callback(*_read_sample(sample)))
+        self._declarations.append(self._subscribe(key, handler))
 
     def query_inbox(self, key: str) -> QueryInbox:
-        """See `Bus`; a look into a ring of our own costs a loop less than one into Zenoh's."""
+        """See `Bus`."""
+        # Polling a Python ring costs a loop less than polling a ring of Zenoh.
         ring: BoundedRing[_ZenohQuery] = BoundedRing(64)
         handler: Any = handlers.Callback(
             lambda query: ring.put(_ZenohQuery(query, key)), indirect=False
         )
-        self._kept.append(self._serve(key, handler))
+        self._declarations.append(self._serve(key, handler))
         return ring
 
     def respond(self, key: str, answer: Callable[[bytes], bytes | None]) -> None:
         """See `Bus`."""
 
         def answer_at_once(query: zenoh.Query) -> None:
-            with query:  # a query ends for its sender only when it is dropped
+            # A query ends for its sender only when the query object is dropped.
+            with query:
                 payload = answer(_ZenohQuery(query, key).payload)
                 if payload is not None:
                     query.reply(key, payload)
 
-        self._kept.append(self._serve(key, handlers.Callback(answer_at_once, indirect=False)))
+        self._declarations.append(
+            self._serve(key, handlers.Callback(answer_at_once, indirect=False))
+        )
 
     def query(self, key: str, payload: bytes = b"") -> Inbox:
         """See `Bus`."""
+        # Not a ring channel: it loses its replies when the last one has arrived.
         replies = self._session.get(
             key,
-            handlers.FifoChannel(
-                256
-            ),  # a ring forgets its answers when the last one has arrived
+            handlers.FifoChannel(256),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.QueryConsolidation(zenoh.ConsolidationMode.NONE),
-            timeout=ASK_TIMEOUT_S,
+            timeout=QUERY_TIMEOUT_S,
             allowed_destination=Locality.REMOTE,
             payload=payload,
-            # answers inherit these: no member that answers waits for a receiver that hangs
+            # Replies inherit these settings, so that no member waits for a hanging receiver.
             congestion_control=CongestionControl.DROP,
             priority=Priority.REAL_TIME,
         )
@@ -258,16 +292,17 @@ class ZenohBus:
     def announce(self, key: str) -> None:
         """See `Bus`."""
         self._tokens.add(key)
-        self._kept.append(self._session.liveliness().declare_token(key))
+        self._declarations.append(self._session.liveliness().declare_token(key))
 
     def presence(self, key: str) -> PresenceInbox:
         """See `Bus`."""
 
         def read(sample: zenoh.Sample) -> tuple[str, bool] | None:
-            token = str(sample.key_expr)  # liveliness has no locality: own tokens arrive too
-            return (
-                None if token in self._tokens else (token, sample.kind == zenoh.SampleKind.PUT)
-            )
+            token = str(sample.key_expr)
+            # Liveliness has no locality setting: tokens of this session arrive, too.
+            if token in self._tokens:
+                return None
+            return token, sample.kind == zenoh.SampleKind.PUT
 
         tokens = self._session.liveliness().declare_subscriber(
             key, handlers.RingChannel(256), history=True
@@ -278,14 +313,15 @@ class ZenohBus:
         """See `Bus`."""
         if not self._session.is_closed():
             self._session.close()
-        self._kept.clear()
+        self._declarations.clear()
 
 
 def read_zenoh_file(path: Path) -> ZenohFile:
-    """Returns a user's Zenoh configuration, a file in JSON5 or JSON.
+    """Returns a user's Zenoh configuration from a file in JSON5 or JSON.
 
     Raises:
-        UsageError: it cannot be read, is no configuration, or contradicts what a session needs.
+        UsageError: the file cannot be read, is not a configuration, or contradicts the
+            requirements of a session.
     """
     try:
         with reading(path, UsageError) as stream:
@@ -296,18 +332,22 @@ def read_zenoh_file(path: Path) -> ZenohFile:
 
 
 def _parse_json5(source: str, text: str) -> object:
-    """Parses JSON5 with Zenoh's own parser: its `metadata` may be anything."""
-    if max(accumulate((c in "[{") - (c in "]}") for c in text), default=0) > MAX_DEPTH:
+    """Returns the object in a JSON5 text, parsed by Zenoh.
+
+    The key `metadata` of a Zenoh configuration may hold any value.
+    """
+    nesting = accumulate((character in "[{") - (character in "]}") for character in text)
+    if max(nesting, default=0) > MAX_DEPTH:
         raise UsageError(f"{source}: no JSON5: nested deeper than {MAX_DEPTH}")
     try:
         config = zenoh.Config.from_json5(f"{{metadata: [\n{text}\n]}}")
     except zenoh.ZError as error:
-        place = re.search(r"--> (\d+):(\d+)", str(error))
+        match = re.search(r"--> (\d+):(\d+)", str(error))
         expected = re.search(r"= (expected .*)", str(error))
-        where = f"line {int(place[1]) - 1}, column {place[2]}: " if place else ""
-        raise UsageError(
-            f"{source}: {where}no JSON5: {expected[1] if expected else _first_line(error)}"
-        ) from None
+        # The text begins in the second line of what Zenoh parses.
+        position = f"line {int(match[1]) - 1}, column {match[2]}: " if match else ""
+        reason = expected[1] if expected else _first_line(error)
+        raise UsageError(f"{source}: {position}no JSON5: {reason}") from None
     objects: list[object] = json.loads(config.get_json("metadata"))
     if len(objects) != 1:
         raise UsageError(
@@ -317,6 +357,7 @@ def _parse_json5(source: str, text: str) -> object:
 
 
 def _find_refusal(settings: Mapping[str, Any]) -> str:
+    """Returns Zenoh's reason for refusing settings, or "" if Zenoh accepts them."""
     try:
         zenoh.Config.from_json5(json.dumps(settings))
     except zenoh.ZError as error:
@@ -325,6 +366,7 @@ def _find_refusal(settings: Mapping[str, Any]) -> str:
 
 
 def _first_line(error: zenoh.ZError) -> str:
+    """Returns the first line of an error, without its place in Zenoh's sources."""
     return re.sub(r" at /\S+:\d+\.?", "", str(error).strip().splitlines()[0])[:400]
 
 
