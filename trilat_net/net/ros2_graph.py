@@ -1,13 +1,17 @@
-"""A member of the graph of ROS 2 over Zenoh, as rmw_zenoh has it on the wire; no ROS is needed.
+"""A node in the graph of ROS 2 over Zenoh, without an installation of ROS.
 
-It has a Zenoh session of its own, as a client of ROS's router (rmw_zenohd) or of any other.
+The node follows the wire format of rmw_zenoh. It has a separate Zenoh session, which is a
+client of ROS's router (rmw_zenohd) or of another Zenoh router.
 
 Source: ros2/rmw_zenoh, docs/design.md and rmw_zenoh_cpp/src/detail (at 99a6a2bd).
 
-Invariant: every message bears an attachment of 33 bytes, since a peer aborts at one that it
-cannot parse. Its numbers begin at 1. A name of ROS has no empty part, so that no token has one
-either. Nothing that comes from ROS raises here: what bears no attachment is counted and passed
-over. A publisher drops a message rather than delay its caller.
+Invariant:
+    - Every message has an attachment of 33 bytes, because a peer aborts at an attachment that
+      it cannot parse. The numbers of messages start at 1.
+    - A ROS name has no empty part, so that no token has an empty part either.
+    - Nothing that arrives from ROS raises an error here. Messages without an attachment are
+      counted and skipped.
+    - A publisher drops a message rather than delay its caller.
 """
 
 import hashlib
@@ -30,28 +34,46 @@ from .zenoh_bus import open_zenoh
 from .zenoh_config import Endpoint
 
 TYPE_HASHES = {
-    "diagnostic_msgs/msg/DiagnosticArray": "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
-    "geometry_msgs/msg/PoseStamped": "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8",
-    "geometry_msgs/msg/TwistStamped": "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64",
-    "geometry_msgs/msg/WrenchStamped": "8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77",
-    "rcl_interfaces/msg/Log": "e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac",
-    "sensor_msgs/msg/JointState": "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
-    "std_msgs/msg/Float64MultiArray": "1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f",
-    "std_msgs/msg/String": "df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
-    "std_srvs/srv/Trigger": "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f",
-    "tf2_msgs/msg/TFMessage": "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    "diagnostic_msgs/msg/DiagnosticArray": (
+        "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
+    ),
+    "geometry_msgs/msg/PoseStamped": (
+        "10f3786d7d40fd2b54367835614bff85d4ad3b5dab62bf8bca0cc232d73b4cd8"
+    ),
+    "geometry_msgs/msg/TwistStamped": (
+        "5f0fcd4f81d5d06ad9b4c4c63e3ea51b82d6ae4d0558f1d475229b1121db6f64"
+    ),
+    "geometry_msgs/msg/WrenchStamped": (
+        "8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77"
+    ),
+    "rcl_interfaces/msg/Log": (
+        "e28ce254ca8abc06abf92773b74602cdbf116ed34fbaf294fb9f81da9f318eac"
+    ),
+    "sensor_msgs/msg/JointState": (
+        "a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
+    ),
+    "std_msgs/msg/Float64MultiArray": (
+        "1025ddc6b9552d191f89ef1a8d2f60f3d373e28b283d8891ddcc974e8c55397f"
+    ),
+    "std_msgs/msg/String": ("df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"),
+    "std_srvs/srv/Trigger": (
+        "eeff2cd6fa5ad9d27cdf4dec64818317839b62f212a91e6b5304b634b2062c5f"
+    ),
+    "tf2_msgs/msg/TFMessage": (
+        "e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+    ),
 }
-"""By type the SHA-256 of its definition (REP 2016), the same in Iron to Lyrical."""
+"""SHA-256 of each type's definition (REP 2016), the same from Iron to Lyrical."""
 DISTROS = ("humble", "jazzy", "kilted", "lyrical")
 _NO_HASH = "TypeHashNotSupported"
-"""What Humble writes in place of a hash."""
+"""Text that Humble writes in place of a hash."""
 P = ParamSpec("P")
 _ATTACHMENT = struct.Struct("<qqB16s")
 _GID_BYTES = 16
 
 
 class EndpointKind(StrEnum):
-    """What an endpoint of a node is, as its token says it."""
+    """Kind of a node's endpoint, as its token states it."""
 
     PUBLISHER = "MP"
     SUBSCRIPTION = "MS"
@@ -62,9 +84,9 @@ class QualityOfService(NamedTuple):
     """Quality of service of an endpoint.
 
     Attributes:
-        reliable: whether messages are sent again until they arrive.
-        latched: whether who comes later gets the last ones (transient local).
-        depth: how many are kept.
+        reliable: True if messages are sent again until they arrive.
+        latched: True if late subscribers receive the last messages (transient local).
+        depth: number of messages that are kept.
     """
 
     reliable: bool = True
@@ -72,17 +94,20 @@ class QualityOfService(NamedTuple):
     depth: int = 10
 
     def encode(self) -> str:
-        """Returns it as tokens have it; what is the default of ROS 2 is left out."""
+        """Returns the text in tokens, which leaves out the defaults of ROS 2."""
+        reliability = "" if self.reliable else "2"
+        durability = "1" if self.latched else ""
         depth = "" if self.depth == 42 else self.depth
-        return f"{'' if self.reliable else 2}:{1 if self.latched else ''}:,{depth}:,:,:,,"
+        return f"{reliability}:{durability}:,{depth}:,:,:,,"
 
 
 class Attachment(NamedTuple):
-    """What comes with every message, request and reply.
+    """Attachment of every message, request and reply.
 
     Attributes:
-        number: of the message, from 1 on.
-        gid: 16 bytes that name the sender; of a reply, who asked.
+        number: number of the message, from 1 on.
+        sent_unix_ns: sending time, Unix ns.
+        gid: 16 bytes that identify the sender; in a reply, the sender of the request.
     """
 
     number: int
@@ -90,13 +115,13 @@ class Attachment(NamedTuple):
     gid: bytes
 
     def encode(self) -> bytes:
-        """Returns its 33 bytes."""
+        """Returns the attachment as 33 bytes."""
         return _ATTACHMENT.pack(self.number, self.sent_unix_ns, _GID_BYTES, self.gid)
 
 
-def parse_attachment(found: Any) -> Attachment | None:
-    """Returns the attachment in some bytes, or in those of Zenoh; None if it is none."""
-    data = b"" if found is None else bytes(found)
+def parse_attachment(content: Any) -> Attachment | None:
+    """Returns the attachment in bytes, or in `ZBytes` of Zenoh; None if there is none."""
+    data = b"" if content is None else bytes(content)
     if len(data) != _ATTACHMENT.size or data[16] != _GID_BYTES:
         return None
     number, sent_unix_ns, _, gid = _ATTACHMENT.unpack(data)
@@ -104,25 +129,33 @@ def parse_attachment(found: Any) -> Attachment | None:
 
 
 def find_type_hash(kind: str, distro: str) -> str:
-    """Returns the hash of a type as a distribution of ROS 2 writes it."""
+    """Returns the hash of a message type in the form of a ROS 2 distribution."""
     return _NO_HASH if distro == "humble" else f"RIHS01_{TYPE_HASHES[kind]}"
 
 
 def name_dds_type(kind: str) -> str:
-    """Returns a type as keys and tokens have it: `std_msgs::msg::dds_::String_` of
-    `std_msgs/msg/String`.
+    """Returns the name of a message type in keys and tokens.
+
+    For std_msgs/msg/String that is std_msgs::msg::dds_::String_.
     """
     package, group, name = kind.split("/")
     return f"{package}::{group}::dds_::{name}_"
 
 
 def topic_key(domain: int, name: str, kind: str, type_hash: str) -> str:
-    """Returns the key of a topic, or of a service."""
+    """Returns the Zenoh key of a topic, or of a service."""
     return f"{domain}/{name}/{name_dds_type(kind)}/{type_hash}"
 
 
-class GraphPlace(NamedTuple):
-    """A node of ROS: its domain, the identity of its Zenoh session, its namespace and name."""
+class NodeAddress(NamedTuple):
+    """Address of a node in the graph of ROS.
+
+    Attributes:
+        domain: domain of ROS (ROS_DOMAIN_ID).
+        zid: identity of the node's Zenoh session.
+        namespace: namespace of the node; "" for the root.
+        name: name of the node.
+    """
 
     domain: int
     zid: str
@@ -130,7 +163,7 @@ class GraphPlace(NamedTuple):
     name: str
 
     def token(self) -> str:
-        """Returns the token by which others see it."""
+        """Returns the liveliness token by which other nodes see this node."""
         return f"@ros2_lv/{self.domain}/{self.zid}/0/0/NN/{self._path()}"
 
     def endpoint_token(
@@ -142,68 +175,94 @@ class GraphPlace(NamedTuple):
         type_hash: str,
         qos: QualityOfService,
     ) -> str:
-        """Returns the token of one of its endpoints; its number is its own in the session."""
-        about = f"{_mangle('/' + name)}/{name_dds_type(kind)}/{type_hash}/{qos.encode()}"
-        return f"@ros2_lv/{self.domain}/{self.zid}/0/{number}/{end}/{self._path()}/{about}"
+        """Returns the liveliness token of one endpoint of the node.
+
+        Args:
+            number: number of the endpoint, unique in the Zenoh session.
+            end: kind of the endpoint.
+            name: name of the topic or service.
+            kind: type of the messages.
+            type_hash: hash of that type.
+            qos: quality of service.
+        """
+        node = f"@ros2_lv/{self.domain}/{self.zid}/0/{number}/{end}/{self._path()}"
+        return f"{node}/{_mangle('/' + name)}/{name_dds_type(kind)}/{type_hash}/{qos.encode()}"
 
     def _path(self) -> str:
-        return f"%/{_mangle('/' + self.namespace) if self.namespace else '%'}/{self.name}"
+        namespace = _mangle("/" + self.namespace) if self.namespace else "%"
+        return f"%/{namespace}/{self.name}"
 
 
 def _mangle(name: str) -> str:
     return name.replace("/", "%")
 
 
-def find_misfit(token: str, domain: int, kind: str) -> str:
-    """Returns where a publisher, by its token, differs from a domain and a type; "" if it fits
-    both.
+def describe_mismatch(token: str, domain: int, kind: str) -> str:
+    """Returns how a publisher differs from an expected domain and message type.
+
+    Args:
+        token: liveliness token of the publisher.
+        domain: expected domain.
+        kind: expected message type.
+
+    Returns:
+        The end of a sentence; "" if the publisher matches.
     """
-    _, its_domain, *_, its_type, its_hash, _ = token.split("/")
-    if its_domain != str(domain):
-        return f"in domain {its_domain}, and this is domain {domain}"
-    if its_type != name_dds_type(kind):
-        return f"as {its_type}, and here it is {name_dds_type(kind)}"
-    known = its_hash in (find_type_hash(kind, "jazzy"), _NO_HASH)
-    return "" if known else f"with another definition of {kind}, {its_hash}"
+    _, token_domain, *_, token_type, token_hash, _ = token.split("/")
+    if token_domain != str(domain):
+        return f"in domain {token_domain}, and this is domain {domain}"
+    if token_type != name_dds_type(kind):
+        return f"as {token_type}, and here it is {name_dds_type(kind)}"
+    if token_hash not in (find_type_hash(kind, "jazzy"), _NO_HASH):
+        return f"with another definition of {kind}, {token_hash}"
+    return ""
 
 
 def make_gid(token: str) -> bytes:
-    """Returns 16 bytes that name an endpoint."""
+    """Returns 16 bytes that identify an endpoint."""
     return hashlib.sha256(token.encode()).digest()[:_GID_BYTES]
 
 
 _SETTINGS = {"timestamping": {"enabled": {"client": True}}}
-"""A latched topic tells by their times which of its messages are the last."""
+"""Latched topics need time stamps: these tell which messages are the last."""
 SENSOR = QualityOfService(reliable=False, depth=5)
-"""What a subscription asks for: it matches every publisher."""
+"""Quality of service of a subscription that matches every publisher."""
 
 
-_MOST_REASONS = 64
-"""Of refusals that are told apart, since strangers may invent further ones."""
+_MAX_REASONS = 64
+"""Number of refusal reasons that are counted separately.
+
+The number is limited because reasons contain texts of strangers.
+"""
 
 
 class Refusals:
-    """What came from ROS and was not taken: counted by its reason; the first of each reason is
-    said.
+    """Counts of the messages from ROS that were refused, by reason.
+
+    Args:
+        report: receives a text for the first refusal of each reason.
+
+    Attributes:
+        counts: number of refusals by reason.
     """
 
-    def __init__(self, say: Callable[[str], None]) -> None:
+    def __init__(self, report: Callable[[str], None]) -> None:
         self.counts: Counter[str] = Counter()
-        self._say = say
+        self._report = report
         self._lock = threading.Lock()
 
     def add(self, reason: str) -> None:
-        """Counts one, in whatever thread."""
+        """Counts a refusal; may be called in any thread."""
         with self._lock:
-            if reason not in self.counts and len(self.counts) >= _MOST_REASONS:
+            if reason not in self.counts and len(self.counts) >= _MAX_REASONS:
                 reason = "further reasons, which are counted together"
             self.counts[reason] += 1
-            first = self.counts[reason] == 1
-        if first:
-            self._say(f"refused: {reason}")
+            is_first = self.counts[reason] == 1
+        if is_first:
+            self._report(f"refused: {reason}")
 
     def guard(self, topic: str, act: Callable[P, None]) -> Callable[P, None]:
-        """Returns what does as `act`, and counts what it raises as refusals of a topic."""
+        """Returns a function that calls `act`, and counts its errors as refusals of a topic."""
 
         def guarded(*args: P.args, **named: P.kwargs) -> None:
             try:
@@ -215,7 +274,14 @@ class Refusals:
 
 
 class TopicPublisher:
-    """Publishes on a topic."""
+    """Publisher of one topic.
+
+    Args:
+        declared: Zenoh's publisher.
+        gid: 16 bytes that identify the publisher.
+        clock: clock of the sending times.
+        latched: True if late subscribers receive the last messages.
+    """
 
     def __init__(self, declared: Any, gid: bytes, clock: Clock, *, latched: bool) -> None:
         self._declared = declared
@@ -226,7 +292,10 @@ class TopicPublisher:
 
     @property
     def has_subscribers(self) -> bool:
-        """True while somebody listens, or may come later: else a message need not be made."""
+        """True while there is a subscriber, or while the topic is latched.
+
+        Otherwise the caller need not compose a message.
+        """
         return self._latched or bool(self._declared.matching_status.matching)
 
     def put(self, data: bytes) -> None:
@@ -237,19 +306,20 @@ class TopicPublisher:
 
 
 class Ros2Graph:
-    """The graph of ROS as one node of it sees it; a context, which takes that node from the
-    graph.
+    """The graph of ROS as one node sees it; a context manager, which removes the node on exit.
 
     Args:
-        refusals: takes what comes and cannot be taken.
-        routers: endpoints of ROS's router, of which the first that answers is taken.
-        namespace, name: of the node.
-        domain: ROS_DOMAIN_ID.
-        distro: of `DISTROS`, the distribution of ROS 2 whose form it writes.
+        refusals: counts the messages that are refused.
+        routers: endpoints of ROS's router; the first that answers is used.
+        namespace: namespace of the node.
+        name: name of the node.
+        clock: clock of the sending times.
+        domain: domain of ROS (ROS_DOMAIN_ID).
+        distro: the distribution of ROS 2, one of `DISTROS`, whose type hashes are written.
 
     Raises:
-        RouterSilent: no router answers, or not yet.
-        UsageError: an endpoint cannot be right, or is that of a program that forwards nothing.
+        RouterSilent: no router answers, or no router answers yet.
+        UsageError: an endpoint is invalid, or belongs to a program that forwards nothing.
     """
 
     def __init__(
@@ -272,18 +342,23 @@ class Ros2Graph:
         )
         if not self.connected and self._session.info.peers_zid():
             self._session.close()
+            endpoints = ", ".join(map(str, routers))
             raise UsageError(
-                f"{', '.join(map(str, routers))} is no router, and forwards nothing: with --ros name that of "
-                "ROS (ros2 run rmw_zenoh_cpp rmw_zenohd, at port 7447), or trilat router"
+                f"{endpoints} is no router, and forwards nothing: with --ros name that of ROS "
+                "(ros2 run rmw_zenoh_cpp rmw_zenohd, at port 7447), or trilat router"
             )
-        self._place = GraphPlace(domain, str(self._session.zid()), namespace, name)
+        self._node = NodeAddress(domain, str(self._session.zid()), namespace, name)
         self._distro = distro
         self._clock = clock
         self._endpoints = 0
         self.refusals = refusals
-        # not Zenoh's own thread for it: one that waits there when the interpreter ends aborts the process
-        self._answers = ThreadPoolExecutor(1, "services")
-        self._kept: list[Any] = [self._session.liveliness().declare_token(self._place.token())]
+        # Services do not use a thread of Zenoh: one that waits when the interpreter ends aborts
+        # the process.
+        self._service_thread = ThreadPoolExecutor(1, "services")
+        # Zenoh undeclares an object that is not referenced.
+        self._declarations: list[Any] = [
+            self._session.liveliness().declare_token(self._node.token())
+        ]
 
     def __enter__(self) -> "Ros2Graph":
         return self
@@ -291,115 +366,138 @@ class Ros2Graph:
     def __exit__(self, *_: object) -> None:
         if not self._session.is_closed():
             self._session.close()
-        self._kept.clear()
-        self._answers.shutdown(cancel_futures=True)
+        self._declarations.clear()
+        self._service_thread.shutdown(cancel_futures=True)
 
     @property
     def connected(self) -> bool:
-        """False while the router is gone; it is joined again when it comes back."""
+        """False while the router is away; the session reconnects when the router is back."""
         return bool(self._session.info.routers_zid())
 
     def publisher(self, topic: str, kind: str, qos: QualityOfService) -> TopicPublisher:
-        """Returns what publishes messages of a type, in CDR, on a topic."""
+        """Returns a publisher of messages, encoded in CDR.
+
+        Args:
+            topic: name of the topic.
+            kind: type of the messages.
+            qos: quality of service.
+        """
         key, gid = self._declare(EndpointKind.PUBLISHER, topic, kind, qos)
-        how: dict[str, Any] = {
+        options: dict[str, Any] = {
             "congestion_control": CongestionControl.DROP,
             "reliability": Reliability.RELIABLE if qos.reliable else Reliability.BEST_EFFORT,
         }
         if qos.latched:
             cache = zenoh.ext.CacheConfig(max_samples=qos.depth)
-            how |= {"cache": cache, "publisher_detection": True}
-            declared: Any = zenoh.ext.declare_advanced_publisher(self._session, key, **how)
+            options |= {"cache": cache, "publisher_detection": True}
+            declared: Any = zenoh.ext.declare_advanced_publisher(self._session, key, **options)
         else:
-            declared = self._session.declare_publisher(key, **how)
-        self._kept.append(declared)  # else who comes later would find nobody
+            declared = self._session.declare_publisher(key, **options)
+        self._declarations.append(declared)  # late subscribers need the publisher
         return TopicPublisher(declared, gid, self._clock, latched=qos.latched)
 
     def subscribe(
-        self, topic: str, kind: str, take: Callable[[bytes, Attachment], None]
+        self, topic: str, kind: str, receive: Callable[[bytes, Attachment], None]
     ) -> None:
-        """Gives the messages of a topic to `take`, in a thread of Zenoh's; what that raises is
-        refused.
+        """Subscribes to a topic, with an entry in the graph.
 
-        Publishers of another domain, type or definition are named by their tokens, and not
-        heard.
+        Messages of publishers with another domain, type or definition do not arrive; such
+        publishers are reported once, by their tokens.
+
+        Args:
+            topic: name of the topic.
+            kind: type of the messages.
+            receive: receives each payload and its attachment, in a thread of Zenoh; a message
+                for which it raises an error counts as refused.
         """
         self._declare(EndpointKind.SUBSCRIPTION, topic, kind, SENSOR)
-        guarded = self.refusals.guard(topic, take)
+        self._report_mismatches(topic, kind)
+        receive_guarded = self.refusals.guard(topic, receive)
 
-        def seen(sample: zenoh.Sample) -> None:
-            misfit = find_misfit(str(sample.key_expr), self._place.domain, kind)
-            if sample.kind == zenoh.SampleKind.PUT and misfit:
-                self.refusals.add(f"{topic} is published {misfit}")
-
-        watcher = handlers.Callback(seen, indirect=False)
-        everywhere = f"@ros2_lv/*/*/*/*/MP/*/*/*/{_mangle('/' + topic)}/**"
-        self._kept.append(
-            self._session.liveliness().declare_subscriber(everywhere, watcher, history=True)
-        )
-
-        def heard(sample: zenoh.Sample, attachment: Attachment) -> None:
-            guarded(sample.payload.to_bytes(), attachment)
+        def receive_sample(sample: zenoh.Sample, attachment: Attachment) -> None:
+            receive_guarded(sample.payload.to_bytes(), attachment)
 
         for type_hash in (find_type_hash(kind, "jazzy"), _NO_HASH):
-            self._listen(topic_key(self._place.domain, topic, kind, type_hash), topic, heard)
+            key = topic_key(self._node.domain, topic, kind, type_hash)
+            self._declare_subscriber(key, topic, receive_sample)
 
-    def tap(self, topic: str, take: Callable[[str, Attachment], None]) -> None:
-        """Gives the type and the attachment of every message of a topic to `take`, in a thread
-        of Zenoh's.
+    def _report_mismatches(self, topic: str, kind: str) -> None:
+        """Counts publishers of a topic with another domain or type as refusals."""
 
-        It listens unseen: no subscription of it is in the graph.
+        def check_publisher(sample: zenoh.Sample) -> None:
+            mismatch = describe_mismatch(str(sample.key_expr), self._node.domain, kind)
+            if sample.kind == zenoh.SampleKind.PUT and mismatch:
+                self.refusals.add(f"{topic} is published {mismatch}")
+
+        handler = handlers.Callback(check_publisher, indirect=False)
+        all_publishers = f"@ros2_lv/*/*/*/*/MP/*/*/*/{_mangle('/' + topic)}/**"
+        self._declarations.append(
+            self._session.liveliness().declare_subscriber(all_publishers, handler, history=True)
+        )
+
+    def tap(self, topic: str, receive: Callable[[str, Attachment], None]) -> None:
+        """Receives a topic without an entry in the graph.
+
+        Args:
+            topic: name of the topic.
+            receive: receives the type and the attachment of every message, in a thread of
+                Zenoh.
         """
 
-        def heard(sample: zenoh.Sample, attachment: Attachment) -> None:
-            take(str(sample.key_expr).rsplit("/", 2)[1], attachment)
+        def receive_sample(sample: zenoh.Sample, attachment: Attachment) -> None:
+            receive(str(sample.key_expr).rsplit("/", 2)[1], attachment)
 
-        self._listen(f"{self._place.domain}/{topic}/*/*", topic, heard)
+        self._declare_subscriber(f"{self._node.domain}/{topic}/*/*", topic, receive_sample)
 
-    def _listen(
-        self, key: str, topic: str, take: Callable[[zenoh.Sample, Attachment], None]
+    def _declare_subscriber(
+        self, key: str, topic: str, receive: Callable[[zenoh.Sample, Attachment], None]
     ) -> None:
+        """Declares a Zenoh subscriber, which refuses messages without an attachment."""
 
-        def heard(sample: zenoh.Sample) -> None:
+        def receive_sample(sample: zenoh.Sample) -> None:
             attachment = parse_attachment(sample.attachment)
             if attachment is None:
                 self.refusals.add(f"{topic}: a message without an attachment of ROS")
             else:
-                take(sample, attachment)
+                receive(sample, attachment)
 
-        self._kept.append(
-            self._session.declare_subscriber(key, handlers.Callback(heard, indirect=False))
-        )
+        handler = handlers.Callback(receive_sample, indirect=False)
+        self._declarations.append(self._session.declare_subscriber(key, handler))
 
     def serve(self, service: str, kind: str, answer: Callable[[bytes], bytes]) -> None:
-        """Answers the requests of a service, one after another with those of others, in a
-        thread for them.
+        """Serves a service, in a thread in which all services take turns.
+
+        Args:
+            service: name of the service.
+            kind: type of the service.
+            answer: returns the response to a request.
         """
         key, _ = self._declare(EndpointKind.SERVER, service, kind, QualityOfService())
 
         def reply(query: zenoh.Query) -> None:
-            with query:  # it ends for its sender only when it is dropped
-                asked = parse_attachment(query.attachment)
-                if asked is None or query.payload is None:
+            # A query ends for its sender only when the query object is dropped.
+            with query:
+                request = parse_attachment(query.attachment)
+                if request is None or query.payload is None:
                     self.refusals.add(f"{service}: a request without an attachment of ROS")
                     return
-                told = asked._replace(sent_unix_ns=self._clock.unix_ns())
-                query.reply(
-                    query.key_expr, answer(query.payload.to_bytes()), attachment=told.encode()
-                )
+                attachment = request._replace(sent_unix_ns=self._clock.unix_ns())
+                response = answer(query.payload.to_bytes())
+                query.reply(query.key_expr, response, attachment=attachment.encode())
 
         handler: Any = handlers.Callback(
-            lambda query: self._answers.submit(reply, query), indirect=False
+            lambda query: self._service_thread.submit(reply, query), indirect=False
         )
-        self._kept.append(self._session.declare_queryable(key, handler, complete=True))
+        self._declarations.append(self._session.declare_queryable(key, handler, complete=True))
 
     def _declare(
         self, end: EndpointKind, name: str, kind: str, qos: QualityOfService
     ) -> tuple[str, bytes]:
+        """Declares the token of an endpoint; returns the endpoint's key and gid."""
         self._endpoints += 1
         type_hash = find_type_hash(kind, self._distro)
-        token = self._place.endpoint_token(
+        token = self._node.endpoint_token(
             number=self._endpoints, end=end, name=name, kind=kind, type_hash=type_hash, qos=qos
         )
-        self._kept.append(self._session.liveliness().declare_token(token))
-        return topic_key(self._place.domain, name, kind, type_hash), make_gid(token)
+        self._declarations.append(self._session.liveliness().declare_token(token))
+        return topic_key(self._node.domain, name, kind, type_hash), make_gid(token)

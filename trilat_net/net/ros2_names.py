@@ -1,4 +1,4 @@
-"""Names of ROS 2, as topics, services and nodes may have them."""
+"""Names of topics, services and nodes of ROS 2."""
 
 import re
 
@@ -8,13 +8,18 @@ _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
 def check_ros_name(name: str, what: str) -> str:
-    """Returns a name of ROS without the slash before it.
+    """Returns a ROS name without its leading slash.
+
+    Args:
+        name: the name.
+        what: subject of the error message, as in "topic".
 
     Raises:
-        UsageError: it is none.
+        UsageError: the name is not valid.
     """
-    if not _NAME.fullmatch(bare := name.removeprefix("/")):
+    relative_name = name.removeprefix("/")
+    if not _NAME.fullmatch(relative_name):
         raise UsageError(
             f"{what} {name!r} is no name of ROS 2: letters, digits and _ in parts between /"
         )
-    return bare
+    return relative_name
