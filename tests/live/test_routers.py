@@ -106,7 +106,8 @@ def test_router_that_is_killed_and_started_again_heals_session(stage: Stage) -> 
 @pytest.mark.long
 def test_with_keys_all_stop_an_arm_only_the_operator_enables(stage: Stage) -> None:
     glide = ("--set", "on_stale.action=glide", "--set", "on_stale.align_limit_rad=3")
-    session = Session(stage, "two_sites", SITES, "--duration", "60", *glide)
+    # an operator ends it long before that
+    session = Session(stage, "two_sites", SITES, "--duration", "600", *glide)
     create_keys(stage.folder / "keys", [*SITES, RECORDER, OPERATOR], [], 1)
     session.endpoints = [place.replace("tcp", "tls") for place in session.endpoints]
     session.recorder_endpoint = session.recorder_endpoint.replace("tcp", "tls")
