@@ -327,10 +327,9 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
     """Refuses a class without `torque`, or one whose memory is not declared."""
     is_declared = hasattr(kind, "remembers")
     has_memory_methods = any(hasattr(kind, name) for name in ("memory", "recall"))
+    required = ["torque"]
     if has_memory_methods and not is_declared:
-        required = ("torque", "memory", "recall")
-    else:
-        required = ("torque",)
+        required += ["memory", "recall"]
     missing = [name for name in required if not callable(getattr(kind, name, None))]
     page = find_page("own-controller.md")
     if missing:
@@ -349,7 +348,7 @@ def _check_methods(kind: Any, code: str, path: str) -> None:
 def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
     """Refuses a number of sites outside of the range that the class states."""
     stated = getattr(kind, "sites", None)
-    bounds = stated
+    bounds: Any = stated
     if stated is None:
         bounds = (2, sys.maxsize)
     elif isinstance(stated, int):
