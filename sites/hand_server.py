@@ -157,7 +157,7 @@ class RemoteHand(HandPlayer):
             self._decide(k, message)
         return super().track(site, k)
 
-    def ask(self, k: int, arrays: SiteArrays) -> None:
+    def request_action(self, k: int, arrays: SiteArrays) -> None:
         """Sends it what it sees."""
         view = self.view(k, arrays)
         seen = _list_numbers(view) | {

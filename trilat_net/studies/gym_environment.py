@@ -176,7 +176,7 @@ class ActedHand(HandPlayer):
         super().__init__(at, None)
         self._actions = actions
 
-    def ask(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - whoever acts has seen it
+    def request_action(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - whoever acts has seen it
         """Decides by the action of the step."""
         self.hand.accept_decision(k, self._actions[k // self.hand.period_ticks].tolist())
 

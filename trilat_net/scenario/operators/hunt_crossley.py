@@ -1,4 +1,4 @@
-"""A compliant body that the end effector presses into, with damping that grows with the depth."""
+"""A compliant body into which the end effector presses; its damping grows with the depth."""
 
 import math
 from collections.abc import Mapping
@@ -12,19 +12,19 @@ from ..operators import OwnActor
 
 
 class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
-    """Tissue or rubber: F = K d^(3/2) (1 + lambda d') along its normal, d the depth, and it
-    never pulls.
+    """Tissue or rubber: F = K d^(3/2) (1 + lambda d') along its normal, never pulling.
 
-    The contact of a sphere after Hertz with the damping of Hunt and Crossley, "Coefficient of
-    restitution interpreted as damping in vibroimpact", J. Applied Mechanics 42 (1975): the
-    force begins and ends at zero, where a spring and a damper jump and pull. It is passive: its
-    damping takes energy at every depth.
+    d is the depth and d' its rate. This is the contact of a sphere after Hertz with the damping
+    of Hunt and Crossley, "Coefficient of restitution interpreted as damping in vibroimpact", J.
+    Applied Mechanics 42 (1975). The force begins and ends at zero, where a spring and a damper
+    jump and pull. The body is passive: its damping dissipates energy at every depth.
 
     Attributes:
         point_m: a point of its surface, m.
-        normal: towards the free side; its length does not matter.
+        normal: direction of the free side; its length does not matter.
         stiffness_n_m15: K, N/m^1.5.
-        damping_s_m: lambda, s/m; 3/2 of the coefficient's loss of speed per speed of impact.
+        damping_s_m: lambda, s/m: 3/2 of the rate at which the coefficient of restitution falls
+            with the speed of impact.
     """
 
     group: ClassVar[str] = "environment"
@@ -41,35 +41,38 @@ class HuntCrossley(OwnActor, frozen=True, kw_only=True, tag="hunt_crossley"):
 
     def act(self, now: Any) -> None:
         """Writes the force, N."""
-        square = depth = inward = 0.0
+        normal_squared = 0.0
+        depth = 0.0
+        depth_rate = 0.0
         for i in range(now.coordinates):
-            square += self.normal[i] * self.normal[i]
+            normal_squared += self.normal[i] * self.normal[i]
             depth += (self.point_m[i] - now.at[i]) * self.normal[i]
-            inward -= now.speed[i] * self.normal[i]
+            depth_rate -= now.speed[i] * self.normal[i]
         if depth > 0.0:
-            length = math.sqrt(square)
+            length = math.sqrt(normal_squared)
             depth = depth / length
-            inward = inward / length
-            push = (
+            depth_rate = depth_rate / length
+            force = (
                 self.stiffness_n_m15
                 * depth
                 * math.sqrt(depth)
-                * (1.0 + self.damping_s_m * inward)
+                * (1.0 + self.damping_s_m * depth_rate)
             )
-            if push > 0.0:
+            if force > 0.0:
                 for i in range(now.coordinates):
-                    now.effort[i] = push * self.normal[i] / length
+                    now.effort[i] = force * self.normal[i] / length
 
-    def effort(self, t_s: Array, at: Array, speed: Array) -> Array:  # noqa: ARG002 - it does not change
-        """Returns the force of many rows, N."""
+    # The force does not depend on the time.
+    def effort(self, t_s: Array, position: Array, speed: Array) -> Array:  # noqa: ARG002
+        """Returns the force for many rows, N."""
         normal = np.array(self.normal) / np.linalg.norm(self.normal)
-        depth = (np.array(self.point_m) - at) @ normal
-        touched = np.where(depth.real > 0.0, depth, 0.0)
-        push = (
+        depth = (np.array(self.point_m) - position) @ normal
+        contact_depth = np.where(depth.real > 0.0, depth, 0.0)
+        magnitude = (
             self.stiffness_n_m15
-            * touched
-            * np.sqrt(touched)
+            * contact_depth
+            * np.sqrt(contact_depth)
             * (1.0 - self.damping_s_m * (speed @ normal))
         )
-        force: Array = np.where(push.real > 0.0, push, 0.0)[..., None] * normal
+        force: Array = np.where(magnitude.real > 0.0, magnitude, 0.0)[..., None] * normal
         return force

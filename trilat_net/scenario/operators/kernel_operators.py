@@ -1,7 +1,9 @@
 """The operators and environments that the kernel itself computes.
 
-Invariant: each is a `TorqueKind`; the meaning of its vectors there is told by `TorqueSource`.
-An operator without a start pose holds the arm at the arm's start pose.
+Each is a `TorqueKind`; `TorqueSource` documents the meaning of its vectors there.
+
+Invariant:
+    - An operator without a start pose holds the arm at the arm's start pose.
 """
 
 import math
@@ -27,17 +29,20 @@ RecordedPoint = Annotated[
     tuple[fields.Real, ...], Meta(min_length=2, max_length=1 + MAX_JOINTS)
 ]
 FARTHEST = 100.0
-"""Largest norm of a live hand's target, m or rad; what is further is no arm's."""
+"""Largest norm of a live hand's target, m or rad; no arm reaches farther."""
 STRONGEST = 10.0
-"""Largest force of one that is taken, in parts of its limit; up to that it is limited."""
+"""Largest force that a program may ask of a live hand, in parts of the hand's force limit.
+
+A force between the limit and this is limited; a larger force is refused.
+"""
 DIRECTIONS = {
     "right": (1.0, 0.0, 0.0), "left": (-1.0, 0.0, 0.0), "ahead": (0.0, 1.0, 0.0),
     "back": (0.0, -1.0, 0.0), "up": (0.0, 0.0, 1.0), "down": (0.0, 0.0, -1.0),
 }  # fmt: skip
-"""Of whoever holds a device: x to the right, y ahead, z up."""
+"""Directions as seen by the person who holds a device: x to the right, y ahead, z up."""
 FRAMES = {2: ("right", "up"), 3: ("ahead", "left", "up")}
-"""Where the axes of an arm point, by their number, if its scenario does not say it."""
-_AXES_WORDS = {
+"""Default directions of an arm's axes, by the number of axes."""
+_AXES_TEXTS = {
     "stiffness_n_m": "one number for {all_axes}, at least 0, N/m",
     "damping_n_s_m": "one number for {all_axes}, at least 0, N s/m",
 }
@@ -61,22 +66,23 @@ class Pulse(ActorBase, frozen=True, tag="pulse"):
 
 
 class MovingSpring(ActorBase, frozen=True, kw_only=True):
-    """A spring and a damper of an operator, towards a target that moves (minimum jerk).
+    """A spring and a damper of an operator, towards a target that moves with minimum jerk.
 
-    Four fields come first: the target, that before, left out as the arm starts; stiffness and
-    damping.
+    A subclass begins with four fields: the target at the end of the motion; the target before
+    the motion, by default where the arm starts; the stiffness; the damping.
 
     Attributes:
         move_start_s: when the target begins to move.
         move_end_s: when it arrives.
         start_s: when the operator takes hold.
-        end_s: when it lets go.
-        sampled: true: evaluated once a tick and held.
+        end_s: when the operator lets go.
+        sampled: true: evaluated once per tick and held.
     """
 
     at_tip: ClassVar[bool]
 
-    # Not those of `SampledActor`: the order of keys is that of a scenario's text, whose hash logs hold.
+    # Not inherited from `SampledActor`: the order of the fields is the order of keys in a
+    # scenario's text, whose hash is in logs.
     move_start_s: fields.NotNegative = 0.0
     move_end_s: fields.NotNegative = 0.0
     start_s: fields.NotNegative = 0.0
@@ -84,42 +90,51 @@ class MovingSpring(ActorBase, frozen=True, kw_only=True):
     sampled: bool = False
 
     @classmethod
-    def complete(
+    def complete_table(
         cls,
         table: fields.TomlTable,
         entry: fields.TomlTable,  # noqa: ARG003 - all kinds have the same arguments
-        holding: HeldArm,
+        held_arm: HeldArm,
         path: str,
     ) -> None:
-        """Holds the arm as it starts where no target is given."""
-        to, before = fields.field_names(cls)[:2]
-        start = holding.end_effector_m() if cls.at_tip else holding.q0_rad
-        holding.draws.follow_start(table, before, start, path)
-        holding.draws.follow_start(table, to, table[before], path)
+        """Writes the start pose as the target where the author gave none."""
+        end_key, start_key = fields.field_names(cls)[:2]
+        start_pose = held_arm.end_effector_m() if cls.at_tip else held_arm.q0_rad
+        held_arm.draws.follow_start(table, start_key, start_pose, path)
+        held_arm.draws.follow_start(table, end_key, table[start_key], path)
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns times in a wrong order."""
-        start_s = self.move_start_s
-        end_s = self.move_end_s
-        if (problem := super().find_problem()) or end_s >= start_s:
+        """Returns a problem of the times, or None."""
+        problem = super().find_problem()
+        if problem is not None or self.move_end_s >= self.move_start_s:
             return problem
         return fields.KeyProblem(
-            "move_end_s", f"must not be before move_start_s = {start_s:g}, is {end_s:g}"
+            "move_end_s",
+            f"must not be before move_start_s = {self.move_start_s:g}, is {self.move_end_s:g}",
         )
 
     def _source(self) -> TorqueSource:
-        end, start, stiffness, damping = msgspec.structs.astuple(self)[:4]
-        held = self.start_s, self.end_s, self.move_start_s, self.move_end_s
-        kind = TorqueKind.TASK_HAND if self.at_tip else TorqueKind.HAND
-        return TorqueSource(kind, *held, start, end, stiffness, damping, self.sampled)
+        end_target, start_target, stiffness, damping = msgspec.structs.astuple(self)[:4]
+        return TorqueSource(
+            TorqueKind.TASK_HAND if self.at_tip else TorqueKind.HAND,
+            start_s=self.start_s,
+            end_s=self.end_s,
+            move_start_s=self.move_start_s,
+            move_end_s=self.move_end_s,
+            a=start_target,
+            b=end_target,
+            K=stiffness,
+            B=damping,
+            sampled=self.sampled,
+        )
 
 
 class JointSpring(MovingSpring, frozen=True, tag="spring"):
     """An operator as a spring and a damper on every joint, towards a pose that moves.
 
     Attributes:
-        to_rad: the pose that it moves to, rad.
-        from_rad: the pose before, rad; left out: the arm's start pose.
+        to_rad: the pose to which the target moves, rad.
+        from_rad: the pose before the motion, rad; left out: the arm's start pose.
         stiffness_nm_rad: per joint, N m/rad.
         damping_nm_s_rad: per joint, N m s/rad.
     """
@@ -133,18 +148,17 @@ class JointSpring(MovingSpring, frozen=True, tag="spring"):
 
 
 class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
-    """An operator at the end effector: a spring and a damper in the plane, towards a point that
-    moves.
+    """An operator at the end effector: a spring and a damper towards a point that moves.
 
     Attributes:
-        to_m: the point that it moves to, x and y, m.
-        from_m: the point before, m; left out: the end effector's start position.
-        stiffness_n_m: along x and y, N/m.
-        damping_n_s_m: along x and y, N s/m.
+        to_m: the point to which the target moves, m, one number per axis of the arm's space.
+        from_m: the point before the motion, m; left out: the end effector's start position.
+        stiffness_n_m: along each axis, N/m.
+        damping_n_s_m: along each axis, N s/m.
     """
 
     at_tip: ClassVar[bool] = True
-    value_texts: ClassVar[Mapping[str, str]] = _AXES_WORDS
+    value_texts: ClassVar[Mapping[str, str]] = _AXES_TEXTS
 
     to_m: fields.Point
     from_m: fields.Point
@@ -153,18 +167,17 @@ class EndEffectorSpring(MovingSpring, frozen=True, tag="tip_spring"):
 
 
 class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
-    """A torque that was recorded, linear between its points; nothing before the first and after
-    the last.
+    """A recorded torque: linear between its points, and zero before and after them.
 
     Attributes:
-        points: rows of time, s, and the torque on each joint, N m, in order of time.
+        points: rows of the time, s, and the torque on each joint, N m, in the order of time.
     """
 
     points: Annotated[tuple[RecordedPoint, ...], Meta(min_length=1, max_length=1_000_000)]
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns points in a wrong order."""
-        if any(b[0] <= a[0] for a, b in pairwise(self.points)):
+        """Returns a problem of the order of the points, or None."""
+        if any(later[0] <= earlier[0] for earlier, later in pairwise(self.points)):
             return fields.KeyProblem("points", "must be in the order of their times")
         return None
 
@@ -173,13 +186,12 @@ class RecordedTorque(ActorBase, frozen=True, tag="recorded"):
 
 
 class Chirp(TimedActor, frozen=True, tag="chirp"):
-    """A torque of an operator whose frequency runs from one to another, evenly, again and
-    again.
+    """A torque of an operator whose frequency rises or falls linearly, sweep after sweep.
 
     Attributes:
         peak_nm: its peak on each joint, N m.
         from_hz: frequency at the beginning of a sweep, Hz.
-        to_hz: frequency at its end, Hz.
+        to_hz: frequency at the end of a sweep, Hz.
         sweep_s: duration of a sweep, s.
     """
 
@@ -189,27 +201,27 @@ class Chirp(TimedActor, frozen=True, tag="chirp"):
     sweep_s: fields.Positive
 
     def _source(self) -> TorqueSource:
-        sweep = (self.start_s, self.start_s + self.sweep_s)
         return TorqueSource(
             TorqueKind.CHIRP,
-            self.start_s,
-            self.end_s,
-            *sweep,
-            self.peak_nm,
-            (self.from_hz, self.to_hz),
+            start_s=self.start_s,
+            end_s=self.end_s,
+            move_start_s=self.start_s,
+            move_end_s=self.start_s + self.sweep_s,
+            a=self.peak_nm,
+            b=(self.from_hz, self.to_hz),
         )
 
 
 class Multisine(TimedActor, frozen=True, tag="multisine"):
-    """A torque of an operator that is a sum of sines of one amplitude.
+    """A torque of an operator that is a sum of sines of equal amplitude.
 
     Attributes:
         amplitude_nm: amplitude of each sine on each joint, N m.
-        frequencies_hz: their frequencies, Hz.
-        phases_rad: their phases at the start, rad; left out: -pi k (k - 1) / n for the k-th of
-            n, which keeps the peak of their sum low (Schroeder, "Synthesis of low-peak-factor
-            signals and binary sequences with low autocorrelation", IEEE Trans. Information
-            Theory 16 (1970)).
+        frequencies_hz: the frequencies of the sines, Hz.
+        phases_rad: the phases of the sines at the start, rad; left out: -pi k (k - 1) / n for
+            the k-th of n sines, which keeps the peak of the sum low (Schroeder, "Synthesis of
+            low-peak-factor signals and binary sequences with low autocorrelation", IEEE Trans.
+            Information Theory 16 (1970)).
     """
 
     amplitude_nm: fields.Joints
@@ -217,7 +229,7 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
     phases_rad: Annotated[tuple[fields.Real, ...], Meta(max_length=64)] = ()
 
     def find_problem(self) -> fields.KeyProblem | None:
-        """Returns too many or too few phases."""
+        """Returns a problem of the number of phases, or of the times, or None."""
         count = len(self.frequencies_hz)
         if len(self.phases_rad) not in (0, count):
             return fields.KeyProblem(
@@ -228,7 +240,8 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
     def _source(self) -> TorqueSource:
         count = len(self.frequencies_hz)
         turns = [phase / (2.0 * math.pi) for phase in self.phases_rad]
-        turns = turns or [-k * (k - 1) / (2.0 * count) for k in range(1, count + 1)]
+        if not turns:
+            turns = [-k * (k - 1) / (2.0 * count) for k in range(1, count + 1)]
         table = np.column_stack((self.frequencies_hz, turns, np.zeros(count)))
         return TorqueSource(
             TorqueKind.MULTISINE, self.start_s, self.end_s, a=self.amplitude_nm, table=table
@@ -236,18 +249,19 @@ class Multisine(TimedActor, frozen=True, tag="multisine"):
 
 
 class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
-    """How a device in somebody's hand leads an arm, and what it renders of the arm's reaction.
+    """How a device in a person's hand leads an arm and renders the arm's reaction.
 
     Attributes:
-        frame: where each axis of the arm points, for whoever holds the device: "right", "left",
-            "ahead", "back", "up" or "down"; left out: right and up in the plane, ahead, left
-            and up in space.
+        frame: the direction of each axis of the arm as seen by the person who holds the device:
+            "right", "left", "ahead", "back", "up" or "down"; left out: right and up in the
+            plane; ahead, left and up in space.
         scale: motion of the target over motion of the device.
-        clutch: the button that leads the arm while it is pressed; pressed first, it takes hold.
+        clutch: the button that leads the arm while it is pressed; the first press takes hold.
         release: the button that lets go.
         force_scale: force on the device over the reaction of the arm.
         force_limit_n: the largest force on the device, N.
-        jump_m_s: a device that is faster has jumped, m/s; a jump moves nothing.
+        jump_m_s: speed of the device above which its motion is a jump, m/s; a jump does not
+            move the target.
     """
 
     frame: Annotated[tuple[str, ...], Meta(max_length=3)] = ()
@@ -259,42 +273,42 @@ class DeviceSettings(fields.Frozen, frozen=True, omit_defaults=True):
     jump_m_s: fields.Positive = 5.0
 
     def rows(self, axes: int) -> list[tuple[float, ...]]:
-        """Returns the axes of an arm, each as a direction of whoever holds the device."""
-        return [DIRECTIONS[word] for word in self.frame or FRAMES[axes]]
+        """Returns the directions of the arm's axes as seen by the holder of the device."""
+        return [DIRECTIONS[name] for name in self.frame or FRAMES[axes]]
 
 
 class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
-    """An operator who takes hold while a live session runs, with a mouse, a device or a
-    program.
+    """An operator who takes hold during a live session: with a mouse, a device or a program.
 
-    Nobody holds the arm before, and in virtual time nobody ever does, unless a log says so. Its
-    force is computed once a tick and held. One that pushes ("force") sets a force itself: its
-    work is of first order in the period, as nothing but the arm resists it.
+    Nobody holds the arm before. In virtual time nobody ever holds the arm, unless the run
+    executes a log in which somebody did. The force is computed once per tick and held. In the
+    mode "force" the operator sets the force itself; its work then has an error of first order
+    in the period, because nothing but the arm resists the force.
 
     Attributes:
-        mode: "tip": a spring at the end effector, "joint": a spring at every joint, both
-            towards a target that somebody moves; "force": a force at the end effector that
+        mode: "tip": a spring at the end effector; "joint": a spring at every joint; both
+            towards a target that somebody moves. "force": a force at the end effector that
             somebody sets.
-        stiffness_n_m: of "tip", along each axis, N/m.
-        damping_n_s_m: of "tip", along each axis, N s/m.
-        force_limit_n: of "tip" and "force", the largest force, N.
-        speed_limit_m_s: of "tip", the largest speed of the target, m/s.
-        stiffness_nm_rad: of "joint", per joint, N m/rad.
-        damping_nm_s_rad: of "joint", per joint, N m s/rad.
-        torque_limit_nm: of "joint", the largest norm of its torques, N m.
-        speed_limit_rad_s: of "joint", the largest speed of the target, rad/s.
-        acceleration_limit_m_s2: of "tip", the largest acceleration of the target, m/s^2.
-        acceleration_limit_rad_s2: of "joint", the largest acceleration of the target, rad/s^2.
-        device: of "tip", how a device leads it (`trilat hand --device`, a controller in virtual
-            reality).
+        stiffness_n_m: for "tip", along each axis, N/m.
+        damping_n_s_m: for "tip", along each axis, N s/m.
+        force_limit_n: for "tip" and "force", the largest force, N.
+        speed_limit_m_s: for "tip", the largest speed of the target, m/s.
+        stiffness_nm_rad: for "joint", per joint, N m/rad.
+        damping_nm_s_rad: for "joint", per joint, N m s/rad.
+        torque_limit_nm: for "joint", the largest norm of its torques, N m.
+        speed_limit_rad_s: for "joint", the largest speed of the target, rad/s.
+        acceleration_limit_m_s2: for "tip", the largest acceleration of the target, m/s^2.
+        acceleration_limit_rad_s2: for "joint", the largest acceleration of the target, rad/s^2.
+        device: for "tip", how a device leads the arm (`trilat hand --device`, a controller in
+            virtual reality).
     """
 
     value_texts: ClassVar[Mapping[str, str]] = {
-        **_AXES_WORDS,
+        **_AXES_TEXTS,
         "device": "a table of " + ", ".join(fields.field_names(DeviceSettings)),
     }
     is_open: ClassVar[bool] = True
-    """True: whoever comes may take hold."""
+    """True: anybody in the session may take hold."""
 
     mode: Literal["tip", "joint", "force"] = "tip"
     stiffness_n_m: fields.NotNegativeAxes = (300.0,)
@@ -310,57 +324,63 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
     device: DeviceSettings = DeviceSettings()
 
     @classmethod
-    def complete(
-        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: HeldArm, path: str
+    def complete_table(
+        cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Leaves out what another mode has; refuses what the author wrote of that."""
+        """Removes the keys of the other modes, and refuses those that the author wrote."""
         mode = entry.get("mode", "tip")
         fields.check_choice(mode, list(LIVE_KEYS), f"{path}.mode")
-        for key in [key for key in table if key not in ("kind", "mode", *LIVE_KEYS[mode])]:
+        mode_keys = LIVE_KEYS[mode]
+        for key in list(table):
+            if key in ("kind", "mode", *mode_keys):
+                continue
             if key in entry:
-                which = next(name for name, keys in LIVE_KEYS.items() if key in keys)
+                other_mode = next(name for name, keys in LIVE_KEYS.items() if key in keys)
                 raise ScenarioError(
-                    f"belongs to a live hand of mode {which!r}; this one is of mode {mode!r}, "
-                    f"which has {', '.join(LIVE_KEYS[mode])}",
+                    f"belongs to a live hand of mode {other_mode!r}; this one is of mode "
+                    f"{mode!r}, which has {', '.join(mode_keys)}",
                     path=f"{path}.{key}",
                 )
             del table[key]
         device = table.get("device")
-        axes = holding.counts.axes
-        if isinstance(device, dict) and isinstance(frame := device.get("frame"), list):
-            lines = {tuple(map(abs, DIRECTIONS.get(str(word), ()))) for word in frame}
-            if not len(frame) == axes == len(lines - {()}):
-                words = (
-                    f"one of {', '.join(DIRECTIONS)} for each of "
-                    f"{count_nouns(axes, 'axis')}, and no two of one line"
-                )
-                raise ScenarioError(f"must be {words}, is {frame}", path=f"{path}.device.frame")
+        if isinstance(device, dict) and isinstance(device.get("frame"), list):
+            _check_frame(device["frame"], held_arm.counts.axes, f"{path}.device.frame")
 
     def make_rules(
         self, rate_hz: int, arm: ArmModel, limits: MotionLimits | None = None
     ) -> HandRules:
-        """Returns what somebody who holds an arm may do; `limits`: of the motion of its site."""
+        """Returns the rules that the holder of an arm must keep to.
+
+        Args:
+            rate_hz: the tick rate of the site, Hz.
+            arm: the arm.
+            limits: the limits of the motion of its site; None: no limits.
+        """
         if self.mode == "force":
-            strongest = STRONGEST * self.force_limit_n
             return HandRules(
-                arm.counts.axes, rate_hz, math.inf, starts_at_arm=False, max_goal_norm=strongest
+                arm.counts.axes,
+                rate_hz,
+                speed_limit=math.inf,
+                starts_at_arm=False,
+                max_goal_norm=STRONGEST * self.force_limit_n,
             )
         if self.mode == "joint":
             size = arm.counts.joints
             speed_limit = self.speed_limit_rad_s
-            acceleration = self.acceleration_limit_rad_s2
+            acceleration_limit = self.acceleration_limit_rad_s2
             reach = arm.find_joint_reach(limits or MotionLimits())
         else:
             size = arm.counts.axes
             speed_limit = self.speed_limit_m_s
-            acceleration = self.acceleration_limit_m_s2
+            acceleration_limit = self.acceleration_limit_m_s2
             reach = arm.reach
+        is_limited = acceleration_limit < fields.MAX_QUANTITY
         return HandRules(
             size,
             rate_hz,
             speed_limit,
             max_goal_norm=FARTHEST,
-            acceleration_limit=acceleration if acceleration < fields.MAX_QUANTITY else math.inf,
+            acceleration_limit=acceleration_limit if is_limited else math.inf,
             reach=reach if self.is_open else HandReach(),
         )
 
@@ -374,6 +394,18 @@ class LiveHand(ActorBase, frozen=True, tag="live", omit_defaults=True):
             limit = self.torque_limit_nm
         kind = TorqueKind[f"LIVE_{self.mode.upper()}"]
         return TorqueSource(kind, K=stiffness, B=damping, limit=limit, sampled=True)
+
+
+def _check_frame(frame: list[Any], axes: int, path: str) -> None:
+    """Refuses directions of axes that are unknown, too few or too many, or on the same line."""
+    lines = {tuple(map(abs, DIRECTIONS.get(str(name), ()))) for name in frame}
+    lines.discard(())
+    if not len(frame) == axes == len(lines):
+        expected = (
+            f"one of {', '.join(DIRECTIONS)} for each of "
+            f"{count_nouns(axes, 'axis')}, and no two of one line"
+        )
+        raise ScenarioError(f"must be {expected}, is {frame}", path=path)
 
 
 LIVE_KEYS = {
@@ -419,12 +451,11 @@ class ViscousEnvironment(SampledActor, frozen=True, tag="viscous"):
 
 
 class Wall(SampledActor, frozen=True, tag="wall"):
-    """A unilateral wall for the end effector: it pushes out of itself, along its normal, and
-    never pulls.
+    """A unilateral wall for the end effector: it pushes along its normal and never pulls.
 
     Attributes:
-        point_m: a point of its surface, x and y, m.
-        normal: towards the free side; its length does not matter.
+        point_m: a point of its surface, m, one number per axis of the arm's space.
+        normal: direction of the free side; its length does not matter.
         stiffness_n_m: N/m.
         damping_n_s_m: N s/m.
     """
@@ -442,12 +473,15 @@ class Wall(SampledActor, frozen=True, tag="wall"):
 
     def _source(self) -> TorqueSource:
         x, y, z = (*self.normal, 0.0)[:3]
-        # `math.hypot` of three numbers rounds otherwise on other machines
+        # Unlike that of two numbers, `math.hypot` of three rounds differently between machines.
         length = math.hypot(x, y) if len(self.normal) == 2 else math.sqrt(x * x + y * y + z * z)
-        unit = tuple(x / length for x in self.normal)
-        stiffness = (self.stiffness_n_m, 0.0)
-        damping = (self.damping_n_s_m, 0.0)
-        vectors: dict[str, Any] = {"a": self.point_m, "b": unit, "K": stiffness, "B": damping}
         return TorqueSource(
-            TorqueKind.WALL, self.start_s, self.end_s, **vectors, sampled=self.sampled
+            TorqueKind.WALL,
+            self.start_s,
+            self.end_s,
+            a=self.point_m,
+            b=tuple(component / length for component in self.normal),
+            K=(self.stiffness_n_m, 0.0),
+            B=(self.damping_n_s_m, 0.0),
+            sampled=self.sampled,
         )

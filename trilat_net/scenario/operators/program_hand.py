@@ -1,8 +1,11 @@
-"""A hand of one's own in a scenario: `{ kind = "own", class = "package.module:Class", ... }`.
+"""A user's own hand in a scenario: `{ kind = "own", class = "my_policy:Reach", ... }`.
 
-Invariant: naming the class runs nothing. A hand that fails lets go at that tick and is not
-asked again, and the run goes on without it: whoever else holds the arm, and all other sites,
-never notice.
+`ProgramHand` is the table of the hand, and `HandPlayer` runs the program of the hand at a site.
+
+Invariant:
+    - Naming the class does not run any code of it.
+    - A hand that fails lets go at that tick and is not asked again. The run goes on without it,
+      and nothing else at the site, or at other sites, is affected.
 """
 
 import math
@@ -32,28 +35,30 @@ from .kernel_operators import LiveHand
 if TYPE_CHECKING:
     from ..scenario_types import Scenario
 
-OWN_KEYS = ("class", "rate_hz", "delay_ms", "process", "source_sha256", "settings")
+PROGRAM_KEYS = ("class", "rate_hz", "delay_ms", "process", "source_sha256", "settings")
+"""The keys of a hand that is a program, besides those of a live hand."""
 
 
 class ProgramHand(
     LiveHand, frozen=True, kw_only=True, tag="own", omit_defaults=True, rename={"code": "class"}
 ):
-    """An operator that is a class of one's own: it sees what its site knows, and moves, turns
-    or pushes.
+    """An operator that is a user's class: from what its site knows it moves, turns or pushes.
 
-    It takes hold at its first action. All else is as of a live hand; nobody else can hold the
-    arm.
+    The hand takes hold of the arm at its first action. Nobody else can hold that arm. Otherwise
+    it is as a live hand.
 
     Attributes:
         code: its class, as in "my_policy:Reach".
-        rate_hz: how often it is asked, Hz; the tick rate of the site is a multiple of it.
-        delay_ms: time from what it sees to what it does: it may think for so long.
-        process: true: live it runs in a process of its own (`trilat hand`), else in that of the
+        rate_hz: how often the class is asked for an action, Hz; it divides the tick rate of the
             site.
-        acceleration_limit_m_s2: as of a live hand; left out, there is none.
-        acceleration_limit_rad_s2: likewise.
-        source_sha256: hash of the file of its class.
-        settings: the arguments of its class, by name.
+        delay_ms: time from a view to the action on it, which is the time that the class may
+            take to decide.
+        process: true: in a live session the class runs in a process of its own (`trilat hand`);
+            false: in that of the site.
+        acceleration_limit_m_s2: as of a live hand; left out: no limit.
+        acceleration_limit_rad_s2: as of a live hand; left out: no limit.
+        source_sha256: hash of the file of the class.
+        settings: the arguments of the class, by name.
     """
 
     is_open: ClassVar[bool] = False
@@ -78,24 +83,28 @@ class ProgramHand(
     settings: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def complete(
-        cls, table: fields.TomlTable, entry: fields.TomlTable, holding: HeldArm, path: str
+    def complete_table(
+        cls, table: fields.TomlTable, entry: fields.TomlTable, held_arm: HeldArm, path: str
     ) -> None:
-        """Names the file of its class by a hash, and does as a live hand."""
+        """Adds the hash of the file of the class, and completes the keys of a live hand."""
         code = table.get("class")
-        place = f"{path}.class"
         if isinstance(code, str) and "source_sha256" not in entry:
-            table["source_sha256"] = read_code(code, place).sha256
-        kept = {key: table.pop(key) for key in OWN_KEYS if key in table}
-        super().complete(table, entry, holding, path)
-        table |= kept
+            table["source_sha256"] = read_code(code, f"{path}.class").sha256
+        # A live hand refuses keys that its mode does not have.
+        program_table = {key: table.pop(key) for key in PROGRAM_KEYS if key in table}
+        super().complete_table(table, entry, held_arm, path)
+        table |= program_table
 
 
 class HandSite(NamedTuple):
-    """A site as its hand of one's own needs it, which is asked `rate_hz` times a second.
+    """A site with a user's own hand.
 
     Attributes:
-        delay_s: time from what it sees to what it does, s.
+        scenario: the scenario.
+        name: the site.
+        spec: the hand in the scenario.
+        rate_hz: how often the hand is asked for an action, Hz.
+        delay_s: time from a view to the action on it, s.
     """
 
     scenario: "Scenario"
@@ -106,141 +115,166 @@ class HandSite(NamedTuple):
 
     @property
     def program(self) -> str:
-        """What the scenario calls its class."""
+        """The name of the hand's class in the scenario."""
         return self.spec.code if isinstance(self.spec, ProgramHand) else "a program"
 
     @property
     def has_separate_process(self) -> bool:
-        """True if live it runs in a process of its own."""
+        """True if the hand runs in a process of its own in a live session."""
         return isinstance(self.spec, ProgramHand) and self.spec.process
 
     @property
     def source(self) -> str:
-        """What its messages are known by: its class, and the scenario that has it."""
+        """The source that marks the hand's messages: its class and the hash of the scenario."""
         return f"{self.program[:40]} {self.scenario.sha256[:16]}"
 
     def describe(self) -> HandContext:
-        """Returns what its program knows before it begins."""
-        scenario = self.scenario
-        name = self.name
+        """Returns the facts with which the program of the hand is made."""
         spec = self.spec
-        rules = spec.make_rules(scenario.sites[name].rate_hz, scenario.arms[name])
-        limit = spec.torque_limit_nm if spec.mode == "joint" else spec.force_limit_n
-        own = (self.rate_hz, self.delay_s, rules.speed_limit, limit, scenario.draw_seed(name))
-        return HandContext(name, scenario.peers(name), spec.mode, rules.size, *own)
+        rules = spec.make_rules(
+            self.scenario.sites[self.name].rate_hz, self.scenario.arms[self.name]
+        )
+        return HandContext(
+            site=self.name,
+            peers=self.scenario.peers(self.name),
+            mode=spec.mode,
+            size=rules.size,
+            rate_hz=self.rate_hz,
+            delay_s=self.delay_s,
+            speed_limit=rules.speed_limit,
+            limit=spec.torque_limit_nm if spec.mode == "joint" else spec.force_limit_n,
+            seed=self.scenario.draw_seed(self.name),
+        )
 
     def make_hand(self) -> OwnHand:
-        """Returns the hand."""
+        """Returns the hand, which knows when the program is asked and its actions apply."""
         tick_rate_hz = self.scenario.sites[self.name].rate_hz
         arm = self.scenario.arms[self.name]
-        place: Any = list if self.spec.mode == "joint" else arm.end_effector
-        delay = math.ceil(round(self.delay_s * tick_rate_hz, 6))
-        return OwnHand(
-            self.spec.make_rules(tick_rate_hz, arm), tick_rate_hz // self.rate_hz, delay, place
-        )
+        locate: Any = list if self.spec.mode == "joint" else arm.end_effector
+        # Rounded first: in floating point 9 ms at 1000 Hz are a little more than 9 ticks.
+        delay_ticks = math.ceil(round(self.delay_s * tick_rate_hz, 6))
+        rules = self.spec.make_rules(tick_rate_hz, arm)
+        return OwnHand(rules, tick_rate_hz // self.rate_hz, delay_ticks, locate)
 
 
 class HandPlayer:
-    """A hand of one's own at its site: asks its class, lets it act, and lets go of the arm if
-    it fails.
+    """Runs a user's own hand at its site.
+
+    The player asks the program of the hand for actions and applies them. If the program fails,
+    the hand lets go of the arm for good.
 
     Attributes:
-        hand: when it is asked and acts.
-        failure: why it failed; "": it did not.
-        news: ticks, and sentences on what it has done that no event names yet.
+        hand: the hand, which decides when the program is asked and when its actions apply.
+        failure: why the program failed; "": it did not.
+        news: ticks, and sentences on changes of the hand that no event reports yet.
     """
 
-    def __init__(self, at: HandSite, program: Any, watch: Watch = call_directly) -> None:
+    def __init__(self, hand_site: HandSite, program: Any, watch: Watch = call_directly) -> None:
         self._program = program
         self._watch = watch
         self.failure = ""
         self.news = list[tuple[int, str]]()
-        self._site = at.name
-        self._code = at.program
-        self._layout = at.scenario.layout(at.name)
-        self._rate_hz = at.scenario.sites[at.name].rate_hz
-        self.hand = at.make_hand()
+        scenario = hand_site.scenario
+        self._site = hand_site.name
+        self._code = hand_site.program
+        self._layout = scenario.layout(hand_site.name)
+        self._rate_hz = scenario.sites[hand_site.name].rate_hz
+        self.hand = hand_site.make_hand()
 
     def track(self, site: Site, k: int) -> list[float]:
-        """Returns what it does in tick k, which its site is about to make; see `HandInForce`."""
-        step = self.hand.advance_to(k, self._begin(k, site.arrays))
-        self.news += [(k, self._tell(k, change)) for _, change in step.changes]
+        """Returns the action of the hand in tick `k`, the next tick of its site.
+
+        The numbers are those of `HandInForce`.
+        """
+        step = self.hand.advance_to(k, self._prepare(k, site.arrays))
+        self.news += [(k, self._describe_change(k, change)) for _, change in step.changes]
         return step.vector
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Returns what it does from tick k until it needs the arm again, before tick `end`, a
-        row a tick.
-        """
-        return self.hand.advance_span(k, end, self._begin(k, arrays))
+        """Returns the actions from tick `k` until the hand needs the arm's state again.
 
-    def _begin(self, k: int, arrays: SiteArrays) -> Callable[[], list[float]]:
-        """Asks, if it is time to; returns what reads the angles of the joints, rad."""
+        Returns:
+            A row per tick, at most until before tick `end`.
+        """
+        return self.hand.advance_span(k, end, self._prepare(k, arrays))
+
+    def _prepare(self, k: int, arrays: SiteArrays) -> Callable[[], list[float]]:
+        """Asks the program for an action if tick `k` is due for one.
+
+        Returns:
+            A function that returns the joint angles of the arm, rad.
+        """
         if self.hand.is_decision_tick(k) and not self.failure:
-            self.ask(k, arrays)
+            self.request_action(k, arrays)
         angles: Array = arrays.site[0]["q"][: self._layout.joints]
         return angles.tolist
 
     def view(self, k: int, arrays: SiteArrays) -> HandView:
-        """Returns what it sees at tick k."""
+        """Returns what the program sees at tick `k`."""
         return self.hand.build_view(k, arrays, self._layout)
 
-    def ask(self, k: int, arrays: SiteArrays) -> None:
-        """Asks its class at tick k."""
+    def request_action(self, k: int, arrays: SiteArrays) -> None:
+        """Asks the program for an action at tick `k`."""
         view = self.view(k, arrays)
         try:
-            self.hand.accept_decision(k, self._watch(k, lambda: self._program.act(view)))
-        except (Exception, SystemExit) as error:  # the user's code
+            action = self._watch(k, lambda: self._program.act(view))
+            self.hand.accept_decision(k, action)
+        # The user's code may raise anything.
+        except (Exception, SystemExit) as error:
             self.fail(k, f"{type(error).__name__}: {error}")
 
     def fail(self, k: int, problem: str) -> None:
-        """Lets go at tick k, for good."""
+        """Makes the hand let go at tick `k`, for good."""
         self.failure = f"{self._site}: its hand {self._code} failed at tick {k}: {problem}"
         self.news.append((k, f"{self.failure}; it lets go and is not asked again"))
         self.hand.release(k)
 
-    def _tell(self, k: int, change: str) -> str:
-        return f"{self._site}: {self._code} {change} at t = {tick_ns(k, self._rate_hz) / NS_PER_S:.3f} s"
+    def _describe_change(self, k: int, change: str) -> str:
+        t_s = tick_ns(k, self._rate_hz) / NS_PER_S
+        return f"{self._site}: {self._code} {change} at t = {t_s:.3f} s"
 
 
 def find_own_hand(scenario: "Scenario", site: str) -> HandSite | None:
-    """Returns a site with its hand of one's own, or None if it has none."""
-    spec = next(
-        (one for one in scenario.sites[site].hands if isinstance(one, ProgramHand)), None
-    )
-    return (
-        None
-        if spec is None
-        else HandSite(
-            scenario=scenario,
-            name=site,
-            spec=spec,
-            rate_hz=spec.rate_hz,
-            delay_s=spec.delay_ms * 1e-3,
-        )
-    )
+    """Returns a site with its own hand, or None if none of its hands is a program."""
+    for hand in scenario.sites[site].hands:
+        if isinstance(hand, ProgramHand):
+            return HandSite(
+                scenario=scenario,
+                name=site,
+                spec=hand,
+                rate_hz=hand.rate_hz,
+                delay_s=hand.delay_ms * 1e-3,
+            )
+    return None
 
 
-def make_hand_program(at: HandSite) -> HandProgram:
-    """Returns the program of a hand.
+def make_hand_program(hand_site: HandSite) -> HandProgram:
+    """Returns the program of a hand: an instance of its class.
 
     Raises:
-        CodeWithheld: its class may not run.
-        ScenarioError: it cannot be made.
+        CodeWithheld: the class may not run.
+        ScenarioError: the class cannot be imported, or its instance cannot be made.
     """
-    path = f"sites.{at.name}.hands"
-    spec = at.spec
+    path = f"sites.{hand_site.name}.hands"
+    spec = hand_site.spec
     assert isinstance(spec, ProgramHand)
     kind = import_class(CodeKey.of(spec), f"{path}.class", spec.method)
-    made: HandProgram = make_instance(kind, spec.code, at.describe(), spec.settings, path=path)
-    return made
+    program: HandProgram = make_instance(
+        kind, spec.code, hand_site.describe(), spec.settings, path=path
+    )
+    return program
 
 
 def make_hand_players(scenario: "Scenario") -> dict[str, HandPlayer]:
-    """Returns the players of all hands of one's own, by site.
+    """Returns the players of all users' own hands, by site.
 
     Raises:
         CodeWithheld: a class may not run.
-        ScenarioError: one cannot be made.
+        ScenarioError: a program cannot be made.
     """
-    placed = (find_own_hand(scenario, name) for name in scenario.names)
-    return {at.name: HandPlayer(at, make_hand_program(at)) for at in placed if at is not None}
+    players = {}
+    for name in scenario.names:
+        hand_site = find_own_hand(scenario, name)
+        if hand_site is not None:
+            players[name] = HandPlayer(hand_site, make_hand_program(hand_site))
+    return players
