@@ -1,11 +1,10 @@
-"""Masses and inertias that a scenario supplies for links of a URDF, and the balancing of
-impossible ones.
+"""Masses and inertias that a scenario gives the links of a URDF, and their balancing.
 
 Invariant:
     - A key that a scenario gives replaces the file's value; a key that it leaves out keeps it.
     - Balancing uses sums, products, quotients and square roots in a fixed order, so that a
-      balanced tensor has the same bits on every machine. A tensor that a body can have is not
-      changed by it.
+      balanced tensor has the same bits on every machine.
+    - Balancing does not change a tensor that a body can have.
 """
 
 import math
@@ -18,8 +17,8 @@ from .. import fields
 from ..core.chain import Matrix
 
 JACOBI_SWEEPS = 12
-"""Sweeps of Jacobi's method; a symmetric matrix of three rows is diagonal to rounding after six
-or seven.
+"""Sweeps of Jacobi's method. A symmetric 3 x 3 matrix is diagonal to rounding after six or
+seven sweeps.
 """
 
 ThreeReals = Annotated[tuple[fields.Real, ...], Meta(min_length=3, max_length=3)]
@@ -27,15 +26,15 @@ TensorEntries = Annotated[tuple[fields.Real, ...], Meta(min_length=6, max_length
 
 
 class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
-    """The mass and inertia of a link, in place of what its file states or leaves out.
+    """The mass and inertia of a link, in place of the values in its file.
 
     Attributes:
-        mass_kg: its mass; 0 leaves the body of the link out.
-        com_m: its centre of mass in the link's frame. Left out: as in the file, and the origin
-            of the link's frame if the file states none.
+        mass_kg: the mass; 0 removes the body of the link. Left out: as in the file.
+        com_m: the centre of mass in the link's frame. Left out: as in the file, or the origin
+            of the link's frame if the file does not state it.
         inertia_kg_m2: Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the centre of mass in the axes of the
-            link's frame. Left out: as in the file, and zero, as of a point, if the file states
-            none.
+            link's frame. Left out: as in the file, or zero, the inertia of a point, if the file
+            does not state it.
     """
 
     mass_kg: fields.NotNegative | None = None
@@ -43,14 +42,14 @@ class LinkInertia(fields.Frozen, frozen=True, omit_defaults=True):
     inertia_kg_m2: TensorEntries | None = None
 
     def list_given_keys(self) -> list[str]:
-        """Returns the keys that are given."""
+        """Returns the keys that the scenario gives."""
         return [
             key for key in fields.field_names(LinkInertia) if getattr(self, key) is not None
         ]
 
 
 def fill_tensor(entries: Sequence[float]) -> Matrix:
-    """Returns the tensor with the entries xx, xy, yy, xz, yz, zz."""
+    """Returns the symmetric tensor with the entries xx, xy, yy, xz, yz, zz."""
     xx, xy, yy, xz, yz, zz = entries
     return (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
 
@@ -60,19 +59,19 @@ def balance_tensor(tensor: Matrix) -> Matrix:
 
     With the principal moments I_1, I_2, I_3, the mass of a body has the second moments s_k =
     (I_1 + I_2 + I_3) / 2 - I_k along its principal axes. A tensor is that of a body if no s_k
-    is negative. Negative ones become zero, which is the projection onto the cone of such
-    distributions, and the moments are composed anew: I_k = s_1 + s_2 + s_3 - s_k. The principal
-    axes remain. If only the triangle inequality failed, the largest moment remains, and the two
-    smaller ones grow equally.
+    is negative. Negative s_k are set to zero, which is the projection onto the cone of such
+    distributions, and the moments are composed again: I_k = s_1 + s_2 + s_3 - s_k. The
+    principal axes do not change. If only the triangle inequality failed, the largest moment
+    does not change either, and the two smaller ones grow equally.
 
     Args:
         tensor: symmetric, kg m^2.
     """
     moments, axes = _diagonalise(tensor)
-    half = 0.5 * (moments[0] + moments[1] + moments[2])
-    seconds = [max(half - moment, 0.0) for moment in moments]
-    if all(half - moment >= 0.0 for moment in moments):
+    half_sum = 0.5 * (moments[0] + moments[1] + moments[2])
+    if all(half_sum - moment >= 0.0 for moment in moments):
         return tensor
+    seconds = [max(half_sum - moment, 0.0) for moment in moments]
     total = seconds[0] + seconds[1] + seconds[2]
     balanced = [total - second for second in seconds]
 
@@ -91,8 +90,8 @@ def balance_tensor(tensor: Matrix) -> Matrix:
 def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
     """Returns the principal moments of a symmetric tensor, and the principal axes as columns.
 
-    Jacobi's method, in plain arithmetic: LAPACK's routines differ in the last bit between
-    machines.
+    This is Jacobi's method in plain arithmetic, because LAPACK's routines differ in the last
+    bit between machines.
     """
     a = [list(row) for row in tensor]
     axes = [[float(i == j) for j in range(3)] for i in range(3)]
@@ -100,23 +99,27 @@ def _diagonalise(tensor: Matrix) -> tuple[list[float], list[list[float]]]:
         for p, q in ((0, 1), (0, 2), (1, 2)):
             if a[p][q] == 0.0:
                 continue
+            # The rotation by which a[p][q] becomes zero; the smaller of the two angles.
             theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q])
             tangent = math.copysign(1.0, theta) / (abs(theta) + math.sqrt(theta * theta + 1.0))
             cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
             sine = tangent * cosine
-            for row in a:
-                row[p], row[q] = (
-                    cosine * row[p] - sine * row[q],
-                    sine * row[p] + cosine * row[q],
-                )
+            _rotate_columns(matrix=a, p=p, q=q, cosine=cosine, sine=sine)
             for k in range(3):
-                a[p][k], a[q][k] = (
-                    cosine * a[p][k] - sine * a[q][k],
-                    sine * a[p][k] + cosine * a[q][k],
-                )
-            for row in axes:
-                row[p], row[q] = (
-                    cosine * row[p] - sine * row[q],
-                    sine * row[p] + cosine * row[q],
-                )
+                upper = a[p][k]
+                lower = a[q][k]
+                a[p][k] = cosine * upper - sine * lower
+                a[q][k] = sine * upper + cosine * lower
+            _rotate_columns(matrix=axes, p=p, q=q, cosine=cosine, sine=sine)
     return [a[0][0], a[1][1], a[2][2]], axes
+
+
+def _rotate_columns(
+    matrix: list[list[float]], p: int, q: int, cosine: float, sine: float
+) -> None:
+    """Rotates the columns `p` and `q` of a matrix into each other, in place."""
+    for row in matrix:
+        left = row[p]
+        right = row[q]
+        row[p] = cosine * left - sine * right
+        row[q] = sine * left + cosine * right

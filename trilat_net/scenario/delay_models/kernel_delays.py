@@ -1,6 +1,8 @@
 """The delay models that the kernel itself computes.
 
-Invariant: each is a `DelayKind`, and the core draws from just the distribution that it states.
+Invariant:
+    - Each model is a `DelayKind`, and the core draws from exactly the distribution that the
+      model states.
 """
 
 import math
@@ -17,25 +19,26 @@ from ..delay_traces import parse_trace
 
 PositiveMilliseconds = Annotated[float, Meta(gt=0.0, le=MAX_DELAY_MS)]
 Deviation = Annotated[float, Meta(ge=0.001, le=MAX_DELAY_MS)]
-"""A microsecond or more, to which every draw is rounded."""
+"""At least a microsecond, because every draw is rounded to microseconds."""
 Correlation = Annotated[float, Meta(ge=0.0, lt=1.0)]
 
 
-def _density(x: float) -> float:
+def _normal_density(x: float) -> float:
     return math.exp(-0.5 * x * x) / math.sqrt(2.0 * math.pi)
 
 
-def _probability(x: float) -> float:
+def _normal_probability(x: float) -> float:
+    """Returns the probability that a standard normal number is below `x`."""
     return 0.5 * math.erfc(-x / math.sqrt(2.0))
 
 
 class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
-    """Uniform about a mean.
+    """A delay with a uniform distribution.
 
     Attributes:
         delay_ms: its mean, ms.
-        half_width_ms: half of its width, ms; at most the mean. An author may leave it out: half
-            of the mean.
+        half_width_ms: half of its width, ms; at most the mean. If an author leaves it out, it
+            is half of the mean.
     """
 
     delay_ms: Milliseconds
@@ -43,7 +46,7 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
     @classmethod
     def derive_keys(cls, table: TomlTable) -> TomlTable:
-        """Returns the width that an author left out, so that naming the model suffices."""
+        """Returns the default of the half width, so that naming the model suffices."""
         delay_ms = table.get("delay_ms")
         return {"half_width_ms": 0.5 * delay_ms} if is_number(delay_ms) else {}
 
@@ -53,7 +56,7 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Half the width over the root of 3."""
+        """Returns the moments; the deviation is half_width / sqrt(3)."""
         return self.delay_ms, self.half_width_ms / math.sqrt(3.0)
 
     def _reach_ms(self) -> float:
@@ -66,11 +69,11 @@ class UniformDelay(LinkBase, frozen=True, kw_only=True, tag="uniform"):
 
 
 class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
-    """Normal, drawn again where it falls below zero.
+    """A delay with a normal distribution; a delay below zero is drawn again.
 
     Attributes:
-        delay_ms: mean of the normal distribution before it is cut at zero, ms.
-        deviation_ms: its standard deviation, ms.
+        delay_ms: mean of the normal distribution before the cut at zero, ms.
+        deviation_ms: its standard deviation before the cut, ms.
     """
 
     delay_ms: Milliseconds
@@ -82,15 +85,19 @@ class NormalDelay(LinkBase, frozen=True, kw_only=True, tag="normal"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Of the normal distribution truncated at zero."""
+        """Returns the moments of the normal distribution truncated at zero.
+
+        With a = -m / s and the hazard H = phi(a) / Phi(-a) the mean is m + s H and the
+        deviation s sqrt(1 + a H - H^2).
+        """
         a = -self.delay_ms / self.deviation_ms
-        hazard = _density(a) / _probability(-a)
+        hazard = _normal_density(a) / _normal_probability(-a)
         deviation_ms = self.deviation_ms * math.sqrt(1.0 + a * hazard - hazard * hazard)
         return self.delay_ms + self.deviation_ms * hazard, deviation_ms
 
 
 class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
-    """A distribution that is given by its moments.
+    """A delay whose distribution is given by its moments.
 
     Attributes:
         delay_ms: its mean, ms.
@@ -107,24 +114,26 @@ class MeanDeviationDelay(LinkBase, frozen=True, kw_only=True):
         delay_ms, deviation_ms = self._moments()
         if 1e-3 * delay_ms <= deviation_ms <= 10.0 * delay_ms:
             return None
-        text = f"must be from 1/1000 to 10 times delay_ms = {delay_ms:g}, is {deviation_ms:g}"
-        return KeyProblem("deviation_ms", text)
+        return KeyProblem(
+            "deviation_ms",
+            f"must be from 1/1000 to 10 times delay_ms = {delay_ms:g}, is {deviation_ms:g}",
+        )
 
 
 class GammaDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="gamma"):
-    """Gamma distribution."""
+    """A delay with a gamma distribution."""
 
     def _delay(self) -> LinkModel:
-        """Shape m^2 / s^2, scale s^2 / m."""
+        """Returns the core's model: shape m^2 / s^2, scale s^2 / m (mean m, deviation s)."""
         shape = (self.delay_ms / self.deviation_ms) ** 2
         return LinkModel(kind=DelayKind.GAMMA, extra=shape, scale=1e3 * self.delay_ms / shape)
 
 
 class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognormal"):
-    """Log-normal distribution."""
+    """A delay with a log-normal distribution."""
 
     def _delay(self) -> LinkModel:
-        """Sigma^2 = ln(1 + s^2 / m^2), mu = ln m - sigma^2 / 2."""
+        """Returns the core's model: sigma^2 = ln(1 + s^2 / m^2), mu = ln m - sigma^2 / 2."""
         variance = math.log1p((self.deviation_ms / self.delay_ms) ** 2)
         location = math.log(1e3 * self.delay_ms) - 0.5 * variance
         return LinkModel(
@@ -133,7 +142,7 @@ class LogNormalDelay(MeanDeviationDelay, frozen=True, kw_only=True, tag="lognorm
 
 
 class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexponential"):
-    """A floor and one of two exponential distributions, as in mobile networks.
+    """A floor plus a draw from one of two exponential distributions, as in mobile networks.
 
     Attributes:
         floor_ms: least delay, ms.
@@ -157,21 +166,24 @@ class HyperExponentialDelay(LinkBase, frozen=True, kw_only=True, tag="hyperexpon
         )
 
     def _moments(self) -> tuple[float, float]:
-        """A mixture's second moment is the mixture of theirs, 2 a^2 and 2 b^2."""
+        """Returns the moments of the mixture above the floor, plus the floor.
+
+        The second moment of a mixture is the mixture of the second moments, here 2 a^2 and
+        2 b^2 of exponential distributions with the means a and b.
+        """
         fast = self.fast_ms
         slow = self.slow_ms
         share = self.slow_share
-        above = (1.0 - share) * fast + share * slow
-        square = 2.0 * ((1.0 - share) * fast * fast + share * slow * slow)
-        return self.floor_ms + above, math.sqrt(square - above * above)
+        mean = (1.0 - share) * fast + share * slow
+        second_moment = 2.0 * ((1.0 - share) * fast * fast + share * slow * slow)
+        return self.floor_ms + mean, math.sqrt(second_moment - mean * mean)
 
 
 class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
-    """Normal, each sample's delay correlated with the one before, cut off at zero instead of
-    drawn again.
+    """A normal delay that is correlated from sample to sample; below zero it becomes zero.
 
     Attributes:
-        correlation: of a sample's delay with that of the sample before.
+        correlation: correlation of a sample's delay with that of the previous sample.
     """
 
     correlation: Correlation
@@ -180,13 +192,16 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
         return NormalDelay._delay(self)._replace(kind=DelayKind.AR1, weight=self.correlation)
 
     def _moments(self) -> tuple[float, float]:
-        """Of max(0, x) for a normal x, in a form in which nothing large cancels."""
+        """Returns the moments of max(0, x) for a normal x.
+
+        The variance is written in a form in which large terms do not cancel.
+        """
         m = self.delay_ms
         s = self.deviation_ms
         a = m / s
-        above = _probability(a)
-        below = _probability(-a)
-        density = _density(a)
+        above = _normal_probability(a)
+        below = _normal_probability(-a)
+        density = _normal_density(a)
         variance = (
             above + a * above * a * below + a * density * (below - above) - density * density
         )
@@ -194,7 +209,7 @@ class CorrelatedDelay(NormalDelay, frozen=True, kw_only=True, tag="ar1"):
 
 
 class NoDelay(LinkBase, frozen=True, kw_only=True, tag="none"):
-    """No delay: a sample is in use from the next tick on."""
+    """A link without delay: a sample is in use from the next tick on."""
 
     def _delay(self) -> LinkModel:
         return LinkModel()
@@ -216,7 +231,7 @@ class ConstantDelay(LinkBase, frozen=True, kw_only=True, tag="constant"):
     delay_ms: Milliseconds
 
     def _delay(self) -> LinkModel:
-        """In whole microseconds (L4)."""
+        """Returns the core's model, in whole microseconds (L4)."""
         return LinkModel(kind=DelayKind.CONSTANT, location=float(ms_to_us(self.delay_ms)))
 
     def _moments(self) -> tuple[float, float]:
@@ -251,7 +266,7 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
         )
 
     def _moments(self) -> tuple[float, float]:
-        """Over whole periods."""
+        """Returns the moments over whole periods."""
         return self.delay_ms, self.amplitude_ms / math.sqrt(2.0)
 
     def _reach_ms(self) -> float:
@@ -264,11 +279,14 @@ class SineDelay(LinkBase, frozen=True, kw_only=True, tag="sine"):
 
 
 class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
-    """Delays by time, from a file; a resolved scenario holds them itself.
+    """A delay that follows a recorded table of delays over time.
+
+    The table comes from a file; a resolved scenario holds the table itself.
 
     Attributes:
-        trace: its points, "t_us delay_us, ...", "lost" in place of a delay.
-        at_end: "hold" the last delay, or "loop".
+        trace: the points of the table, "t_us delay_us, ...", with "lost" in place of the delay
+            of a lost sample.
+        at_end: "hold": the last delay continues; "loop": the table repeats.
     """
 
     trace: str
@@ -283,20 +301,22 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
         return LinkModel(kind=DelayKind.TRACE, at_end=TraceEnd[self.at_end.upper()])
 
     def _moments(self) -> tuple[float, float]:
-        """Over one pass, by time; lost samples have no delay."""
+        """Returns the moments over one pass, weighted by time, without lost samples."""
         t_us, delay_us = self.points.T
-        lasts_us = np.diff(
-            t_us, append=2 * t_us[-1] - t_us[-2] if len(t_us) > 1 else t_us[-1] + 1
-        )
-        weights = np.where(delay_us >= 0, lasts_us, 0)
+        # The last point lasts as long as the point before it.
+        end_us = t_us[-1] + 1
+        if len(t_us) > 1:
+            end_us = 2 * t_us[-1] - t_us[-2]
+        durations_us = np.diff(t_us, append=end_us)
+        weights = np.where(delay_us >= 0, durations_us, 0)
         if not weights.any():
             return math.nan, math.nan
-        mean = float(np.average(delay_us, weights=weights))
-        variance = float(np.average((delay_us - mean) ** 2, weights=weights))
-        return mean / 1e3, math.sqrt(variance) / 1e3
+        mean_us = float(np.average(delay_us, weights=weights))
+        variance = float(np.average((delay_us - mean_us) ** 2, weights=weights))
+        return mean_us / 1e3, math.sqrt(variance) / 1e3
 
     def _reach_ms(self) -> float:
-        """That of its points, which are within bounds."""
+        """Returns the longest delay of the points, ms."""
         return float(self.points[:, 1].max()) / 1e3
 
     def _find_delay_problem(self) -> KeyProblem | None:
@@ -308,13 +328,13 @@ class TraceDelay(LinkBase, frozen=True, kw_only=True, tag="trace"):
 
 
 class NoInjectedDelay(LinkBase, frozen=True, kw_only=True, tag="measured"):
-    """Injects no delay: a sample is in use as soon as it arrives over the real network."""
+    """No injected delay: a sample is in use as soon as it arrives over the real network."""
 
     def _delay(self) -> LinkModel:
         return LinkModel(kind=DelayKind.MEASURED)
 
     def _moments(self) -> tuple[float, float]:
-        """The network's, not known beforehand."""
+        """Returns NaN: the delay of the real network is not known beforehand."""
         return math.nan, math.nan
 
     def _describe_delay(self) -> str:
