@@ -69,7 +69,9 @@ def test_a_chain_is_told_joint_by_joint_with_notes() -> None:
         f"arm of m1, m2, s: arm6.urdf, 6 joints from base to flange, 17.05 kg move\n{first}\n"
         in text
     )
-    assert "  note: joint 'wrist_1' states no limit, or 0, of effort: none is kept" in text
+    assert (
+        "  note: joint 'wrist_1' states no limit of effort, or 0: it has no such limit" in text
+    )
     assert (
         "  wrist_1 moves wrist_1_link, 1.219 kg; -6.283 to 6.283 rad; 3.142 rad/s; drive"
         in text

@@ -252,7 +252,7 @@ def test_limits_friction_and_kinds() -> None:
     assert four[7:11] == (-inf, inf, inf, 2)
     assert four.axis == (1.0, 0.0, 0.0)  # of a joint that states none
     assert read_urdf(text).notes == (
-        "joint 'three' states no limit, or 0, of position and effort and velocity: none is kept",
+        "joint 'three' states no limit of position and effort and velocity, or 0: it has no such limit",
     )
 
 
