@@ -115,7 +115,7 @@ def test_window_that_cannot_be_right_is_refused_with_its_key(
 
 def test_a_window_that_asks_nothing_is_refused() -> None:
     with pytest.raises(
-        ScenarioError, match=r"expect.windows\[0\]: asks nothing; it may ask error_peak_rad"
+        ScenarioError, match=r"expect.windows\[0\]: expects nothing; it may have error_peak_rad"
     ):
         with_expect(windows=[{"from_s": 1.0, "to_s": 2.0}])
 

@@ -1,8 +1,9 @@
-"""A scenario in lines of text, and the differences between scenarios.
+"""Describe a scenario in lines of text, and list the differences between scenarios.
 
-Invariant: a difference that several sites or links share is one entry; a law of another kind
-and a link are entries as a whole. Names, titles and expectations describe an experiment and do
-not count as differences.
+Invariant:
+    - A difference that several sites or links share is one entry. A law of another kind is one
+      entry as a whole, and so is a link.
+    - Names, titles and expectations describe an experiment and do not count as differences.
 """
 
 import math
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from ..core.chain import ChainJoint
 from ..core.delay import DelayKind
 from ..core.dominance import ROW_SUM_TOLERANCE, find_balancing_weights
 from ..core.philox import link_key
@@ -26,196 +28,230 @@ from .rest_bounds import find_rest_bounds
 from .sample_uses import count_silences, draw_used_samples
 from .scenario_reader import load_scenario
 from .scenario_types import Scenario
+from .urdf import UrdfJoint
 
 COUPLED_OPERATORS = (
-    "beta differs between sites: it weighs operators of one site each, and says nothing of hands that are "
-    "coupled to one another (one user at two handles)"
+    "beta differs between sites: it weighs operators of one site each, and says nothing of "
+    "hands "
+    "that are coupled to one another (one user at two handles)"
 )
 IRREVERSIBLE_SHARES = (
-    "the shares are not reversible (alpha_ij alpha_jk alpha_ki is not alpha_ik alpha_kj alpha_ji): some "
-    "passive operators make the loop unstable, whatever its damping (docs/errata.md, 14)"
+    "the shares are not reversible (alpha_ij alpha_jk alpha_ki is not alpha_ik alpha_kj "
+    "alpha_ji): "
+    "some passive operators make the loop unstable, whatever its damping (docs/errata.md, 14)"
 )
 
 
 def lacks_detailed_balance(scenario: Scenario) -> bool:
-    """True if all sites exchange positions and know gravity, and no D > 0 makes D (I - alpha)
-    symmetric.
+    """True if no D > 0 makes D (I - alpha) symmetric, for laws that exchange positions.
+
+    False if a law exchanges anything else than positions, or does not compensate gravity.
     """
     laws = [spec.control for spec in scenario.sites.values()]
-    return (
-        all(law.exchanges_positions() for law in laws)
-        and find_balancing_weights(scenario.alpha) is None
-    )
+    if not all(law.exchanges_positions() for law in laws):
+        return False
+    return find_balancing_weights(scenario.alpha) is None
 
 
 def _find_link_delays(links: Mapping[str, LinkBase], rates_hz: Mapping[str, int]) -> Array:
-    """Returns the delay of every link as in `LawSituation.delay_s`."""
+    """Returns the delay of every link in the form of `LawSituation.delay_s`.
+
+    A constant delay is rounded up to a tick of the receiver; other delays are NaN.
+    """
     names = list(rates_hz)
     delay_s = np.zeros((len(names), len(names)))
     for name, link in links.items():
-        peer, _, site = name.partition("->")
+        sender, _, receiver = name.partition("->")
         model = link.to_core_model()
-        rate_hz = rates_hz[site]
-        constant = model.kind == DelayKind.CONSTANT and not link.loss and not link.measured
+        rate_hz = rates_hz[receiver]
+        is_constant = model.kind == DelayKind.CONSTANT and not link.loss and not link.measured
         delay_us = max(round(model.location), model.playout_us)
         ticks = max(1, -(-delay_us * rate_hz // 1_000_000))
-        delay_s[names.index(site), names.index(peer)] = ticks / rate_hz if constant else np.nan
+        index = (names.index(receiver), names.index(sender))
+        delay_s[index] = ticks / rate_hz if is_constant else np.nan
     return delay_s
 
 
+def _find_hold_time(scenario: Scenario) -> float:
+    """Returns how long a torque is held, s; 0 unless digital, NaN if tick rates differ."""
+    if scenario.scheme != "digital":
+        return 0.0
+    periods_s = {1.0 / site.rate_hz for site in scenario.sites.values()}
+    return periods_s.pop() if len(periods_s) == 1 else math.nan
+
+
 def _list_situations(scenario: Scenario) -> Iterator[tuple[str, LawSettings, LawSituation]]:
+    """Yields each site with its law and the situation on which the law's stability rests."""
     rates_hz = {name: site.rate_hz for name, site in scenario.sites.items()}
-    every = (
-        scenario.names,
-        scenario.controls,
-        scenario.alpha,
-        _find_link_delays(scenario.links, rates_hz),
-    )
-    ticks_s = {1.0 / rate_hz for rate_hz in rates_hz.values()}
-    hold_s = (
-        0.0
-        if scenario.scheme != "digital"
-        else ticks_s.pop()
-        if len(ticks_s) == 1
-        else math.nan
-    )
+    delay_s = _find_link_delays(scenario.links, rates_hz)
+    hold_s = _find_hold_time(scenario)
     for n, (name, site) in enumerate(scenario.sites.items()):
-        limits_nm = tuple(np.atleast_1d(site.limits.tau_limit_nm).tolist())
-        gravity_nm = scenario.arms[name].largest_gravity(site.arm.g_m_s2)
         situation = LawSituation(
-            n, *every, limits_nm, site.rate_hz, gravity_nm=gravity_nm, hold_s=hold_s
+            site=n,
+            names=scenario.names,
+            laws=scenario.controls,
+            alpha=scenario.alpha,
+            delay_s=delay_s,
+            tau_limit_nm=tuple(np.atleast_1d(site.limits.tau_limit_nm).tolist()),
+            rate_hz=site.rate_hz,
+            gravity_nm=scenario.arms[name].largest_gravity(site.arm.g_m_s2),
+            hold_s=hold_s,
         )
         yield name, scenario.controls[n], situation
 
 
 def describe_law_conditions(scenario: Scenario) -> list[str]:
-    """Returns what the stability of the sites' laws rests on, a line for sites of whom the same
-    holds.
+    """Returns the conditions on which the stability of the laws rests, as lines.
+
+    Sites of one law whose condition is the same share a line.
     """
     owners: dict[tuple[str, StabilityCondition], list[str]] = {}
     for name, law, situation in _list_situations(scenario):
-        if found := law.condition(situation):
-            owners.setdefault((law.tag, found), []).append(name)
-    words = {True: "holds", False: "does not hold", None: "is not decided here"}
+        condition = law.condition(situation)
+        if condition:
+            owners.setdefault((law.tag, condition), []).append(name)
+    verdicts = {True: "holds", False: "does not hold", None: "is not decided here"}
     return [
-        f"condition of {tag} at {', '.join(where)} {words[one.holds]}: {one.text}"
-        for (tag, one), where in owners.items()
+        f"condition of {tag} at {', '.join(sites)} {verdicts[condition.holds]}: "
+        f"{condition.text}"
+        for (tag, condition), sites in owners.items()
     ]
 
 
 def _describe_idle_shares(scenario: Scenario) -> list[str]:
-    ramped = {change.dominance for change in scenario.timeline}
+    """Returns lines on sites whose dominance factors have no effect."""
+    ramped_sites = {change.dominance for change in scenario.timeline}
     owners: dict[str, list[str]] = {}
     for name, law, situation in _list_situations(scenario):
-        why = law.explain_idle_shares(situation)
-        if not why and name in ramped and law.fixed_shares:
-            why = "lines stay as they are at the start, whatever the timeline says"
-        if why:
-            owners.setdefault(why, []).append(name)
+        reason = law.explain_idle_shares(situation)
+        if not reason and name in ramped_sites and law.fixed_shares:
+            reason = "lines stay as they are at the start, whatever the timeline says"
+        if reason:
+            owners.setdefault(reason, []).append(name)
     return [
-        f"dominance without effect at {', '.join(where)}: {why}"
-        for why, where in owners.items()
+        f"dominance without effect at {', '.join(sites)}: {reason}"
+        for reason, sites in owners.items()
     ]
 
 
 def describe_scenario(scenario: str | Path | Mapping[str, Any] | Scenario) -> list[str]:
-    """Returns the facts of a valid scenario and their consequences, as lines; as `trilat
-    scenario check`.
+    """Returns the facts of a valid scenario as lines, as `trilat scenario check` prints them.
 
     >>> len(tn.describe_scenario("paper")) > 5
     True
     """
     scenario = load_scenario(scenario)
-    beta = scenario.beta
-    weights = (
-        "none: alpha is reducible, some site's weight is zero"
-        if beta is None
-        else ", ".join(
-            f"{name} {len(beta) * pi:.4g}"
-            for name, pi in zip(scenario.names, beta, strict=True)
-        )
+    names = ", ".join(scenario.names)
+    ticks = ", ".join(
+        f"{count_nouns(scenario.ticks(name), 'tick')} of {name}" for name in scenario.names
     )
-    words = {name: link.describe() for name, link in scenario.links.items()}
-    links = [f"link {name}: {text}" for name, text in words.items()]
-    return [
+    lines = [
         f"{scenario.name}: valid, sha256 {scenario.sha256[:16]}",
-        f"sites: {', '.join(scenario.names)}; {scenario.duration_s:g} s, "
-        + ", ".join(
-            f"{count_nouns(scenario.ticks(name), 'tick')} of {name}" for name in scenario.names
-        ),
-        *(
-            links
-            if len(set(words.values())) > 1
-            else [f"every link: {next(iter(words.values()))}"]
-        ),
-        *(
-            f"view of {name}: {one.view.describe()}"
-            for name, one in scenario.sites.items()
-            if one.view
-        ),
-        f"pi, the left null vector of Upsilon, sum N (beta_i = pi_i / c_i with Kd_i = c_i Kbar): {weights}",
-        *([] if beta is None or np.ptp(beta) < ROW_SUM_TOLERANCE else [COUPLED_OPERATORS]),
-        *([IRREVERSIBLE_SHARES] if lacks_detailed_balance(scenario) else []),
+        f"sites: {names}; {scenario.duration_s:g} s, {ticks}",
+        *_describe_links(scenario),
+        *_describe_shares(scenario),
         *describe_law_conditions(scenario),
         *_describe_idle_shares(scenario),
         *_describe_arms(scenario),
         *_describe_tasks(scenario),
         *_describe_silences(scenario),
         *_describe_stops(scenario),
-        *(f"assumed: {text}" for text in scenario.assumed),
-        *(
-            f"drawn with seed {scenario.seed}: {key} = {one.value} ({one.describe()})"
-            for key, one in scenario.drawn.items()
-            if one.normal or one.uniform
-        ),
     ]
+    lines += [f"assumed: {text}" for text in scenario.assumed]
+    for key, drawn in scenario.drawn.items():
+        if drawn.normal or drawn.uniform:
+            lines.append(
+                f"drawn with seed {scenario.seed}: {key} = {drawn.value} ({drawn.describe()})"
+            )
+    return lines
+
+
+def _describe_links(scenario: Scenario) -> list[str]:
+    """Returns a line for each link, or one line if all links are alike; then the views."""
+    descriptions = {name: link.describe() for name, link in scenario.links.items()}
+    if len(set(descriptions.values())) > 1:
+        lines = [f"link {name}: {text}" for name, text in descriptions.items()]
+    else:
+        lines = [f"every link: {next(iter(descriptions.values()))}"]
+    for name, site in scenario.sites.items():
+        if site.view:
+            lines.append(f"view of {name}: {site.view.describe()}")
+    return lines
+
+
+def _describe_shares(scenario: Scenario) -> list[str]:
+    """Returns lines on the weights that follow from the dominance matrix."""
+    beta = scenario.beta
+    weights = "none: alpha is reducible, some site's weight is zero"
+    if beta is not None:
+        weights = ", ".join(
+            f"{name} {len(beta) * pi:.4g}"
+            for name, pi in zip(scenario.names, beta, strict=True)
+        )
+    lines = [
+        "pi, the left null vector of Upsilon, sum N (beta_i = pi_i / c_i with Kd_i = c_i "
+        "Kbar): "
+        f"{weights}"
+    ]
+    if beta is not None and np.ptp(beta) >= ROW_SUM_TOLERANCE:
+        lines.append(COUPLED_OPERATORS)
+    if lacks_detailed_balance(scenario):
+        lines.append(IRREVERSIBLE_SHARES)
+    return lines
 
 
 def _describe_arms(scenario: Scenario) -> list[str]:
+    """Returns lines on every different arm of a URDF: its joints, limits and notes."""
     lines: list[str] = []
     for arm, owners in _group_chains(scenario):
         chain = read_arm(arm, scenario.urdf)
         model = scenario.arms[owners[0]]
-        mass = sum(joint.inertia[0] for joint in chain.joints)
+        mass_kg = sum(joint.inertia[0] for joint in chain.joints)
         lines.append(
-            f"arm of {', '.join(owners)}: {arm.urdf}, {count_nouns(len(chain.joints), 'joint')} "
-            f"from {chain.base} to {chain.tip}, {mass:.4g} kg move"
+            f"arm of {', '.join(owners)}: {arm.urdf}, "
+            f"{count_nouns(len(chain.joints), 'joint')} from {chain.base} to {chain.tip}, "
+            f"{mass_kg:.4g} kg move"
         )
         assert model.chain is not None
         for joint, drive in zip(chain.joints, model.chain.joints, strict=True):
-            unit, effort, inertia = (
-                ("m", "N", "kg") if drive.prismatic else ("rad", "N m", "kg m^2")
-            )
-            facts = [
-                f"{joint.lower:.4g} to {joint.upper:.4g} {unit}" * (joint.lower > -math.inf),
-                f"{joint.effort_limit:.4g} {effort}" * (joint.effort_limit < math.inf),
-                f"{joint.velocity_limit:.4g} {unit}/s" * (joint.velocity_limit < math.inf),
-                f"drive {drive.armature_kg_m2:.4g} {inertia}" * (drive.armature_kg_m2 > 0.0),
-            ]
-            moved = f"  {joint.name} moves {joint.link}, {joint.inertia[0]:.4g} kg"
-            lines.append("; ".join([moved, *filter(None, facts)]))
+            lines.append(_describe_joint(joint, drive))
         lines += [f"  note: {note}" for note in chain.notes]
     return lines + [f"note: {note}" for note in _list_start_notes(scenario)]
 
 
+def _describe_joint(joint: UrdfJoint, drive: ChainJoint) -> str:
+    """Returns a line on a joint: its link, its limits and the inertia of its drive."""
+    unit = "m" if drive.prismatic else "rad"
+    effort_unit = "N" if drive.prismatic else "N m"
+    inertia_unit = "kg" if drive.prismatic else "kg m^2"
+    facts = [f"  {joint.name} moves {joint.link}, {joint.inertia[0]:.4g} kg"]
+    if joint.lower > -math.inf:
+        facts.append(f"{joint.lower:.4g} to {joint.upper:.4g} {unit}")
+    if joint.effort_limit < math.inf:
+        facts.append(f"{joint.effort_limit:.4g} {effort_unit}")
+    if joint.velocity_limit < math.inf:
+        facts.append(f"{joint.velocity_limit:.4g} {unit}/s")
+    if drive.armature_kg_m2 > 0.0:
+        facts.append(f"drive {drive.armature_kg_m2:.4g} {inertia_unit}")
+    return "; ".join(facts)
+
+
 def _group_chains(scenario: Scenario) -> list[tuple[Arm, list[str]]]:
     """Returns every different arm of a URDF, with the sites that have it."""
-    grouped: list[tuple[Arm, list[str]]] = []
+    groups: list[tuple[Arm, list[str]]] = []
     for name, spec in scenario.sites.items():
         if not spec.arm.urdf:
             continue
-        owners = next((owners for arm, owners in grouped if arm == spec.arm), None)
+        owners = next((owners for arm, owners in groups if arm == spec.arm), None)
         if owners is None:
-            grouped.append((spec.arm, [name]))
+            groups.append((spec.arm, [name]))
         else:
             owners.append(name)
-    return grouped
+    return groups
 
 
 def list_arm_notes(scenario: Scenario) -> list[str]:
-    """Returns how the arms of a run differ from what their files state, a sentence each, with
-    the sites.
-    """
+    """Returns sentences on how the arms of a run differ from their files, with the sites."""
     notes = [
         f"arm of {', '.join(owners)}: {note}"
         for arm, owners in _group_chains(scenario)
@@ -225,60 +261,81 @@ def list_arm_notes(scenario: Scenario) -> list[str]:
 
 
 def _list_start_notes(scenario: Scenario) -> list[str]:
-    """Returns which joints start beyond a stop or a limit of position, and what follows, a
-    sentence each.
-    """
+    """Returns sentences on joints that start beyond a stop or a limit of position."""
     notes: list[str] = []
     for name, spec in scenario.sites.items():
-        model = scenario.arms[name]
-        units = model.joint_units("rad")
         if spec.arm.urdf and spec.arm.stops:
-            for n, joint in enumerate(read_arm(spec.arm, scenario.urdf).joints):
-                start = spec.q0_rad[n]
-                beyond = max(joint.lower - start, start - joint.upper)
-                if beyond > 0.0:
-                    notes.append(
-                        f"{name} starts {beyond:.3g} {units[n]} beyond a stop of joint {joint.name}: "
-                        "the stop lies where the arm starts"
-                    )
-        given = spec.limits.motion
-        in_force = scenario.motion_limits(name)
-        for key, before, after in (
-            ("q_min_rad", given.q_min, in_force.q_min),
-            ("q_max_rad", given.q_max, in_force.q_max),
-        ):
-            shape = (len(spec.q0_rad),)
-            moved = np.broadcast_to(before, shape) != np.broadcast_to(after, shape)
-            for n in np.flatnonzero(moved).tolist():
-                limit = float(np.broadcast_to(after, shape)[n])
-                notes.append(
-                    f"{name} starts beyond {key} of joint {model.joint_names[n]}: the limit lies at "
-                    f"{limit:.4g} {units[n]} in this run"
-                )
+            notes += _list_stop_notes(scenario, name)
+        notes += _list_limit_notes(scenario, name)
+    return notes
+
+
+def _list_stop_notes(scenario: Scenario, name: str) -> list[str]:
+    """Returns sentences on the joints of a site that start beyond a stop of their file."""
+    spec = scenario.sites[name]
+    units = scenario.arms[name].joint_units("rad")
+    joints = read_arm(spec.arm, scenario.urdf).joints
+    notes = []
+    for joint, start, unit in zip(joints, spec.q0_rad, units, strict=True):
+        excess = max(joint.lower - start, start - joint.upper)
+        if excess > 0.0:
+            notes.append(
+                f"{name} starts {excess:.3g} {unit} beyond a stop of joint {joint.name}: "
+                "the stop lies where the arm starts"
+            )
+    return notes
+
+
+def _list_limit_notes(scenario: Scenario, name: str) -> list[str]:
+    """Returns sentences on the joints of a site that start beyond a limit of position."""
+    spec = scenario.sites[name]
+    model = scenario.arms[name]
+    units = model.joint_units("rad")
+    stated = spec.limits.motion
+    in_force = scenario.motion_limits(name)
+    shape = (len(spec.q0_rad),)
+    notes = []
+    for key, stated_limit, limit_in_force in (
+        ("q_min_rad", stated.q_min, in_force.q_min),
+        ("q_max_rad", stated.q_max, in_force.q_max),
+    ):
+        before = np.broadcast_to(stated_limit, shape)
+        after = np.broadcast_to(limit_in_force, shape)
+        notes += [
+            f"{name} starts beyond {key} of joint {model.joint_names[n]}: the limit lies at "
+            f"{float(after[n]):.4g} {units[n]} in this run"
+            for n in np.flatnonzero(before != after).tolist()
+        ]
     return notes
 
 
 def _describe_tasks(scenario: Scenario) -> list[str]:
+    """Returns lines on the sites that follow with their end effectors."""
     lines = []
     for name, model in scenario.arms.items():
-        if model.shares_pose:
-            spec = scenario.sites[name]
-            followed = np.array(model.axes) > 0.0
-            least = np.linalg.svd(model.task_jacobian(spec.q0_rad)[followed], compute_uv=False)[
-                -1
-            ]
-            bound = spec.task.singular_value
-            near = ", so that its inverse is damped there" if least < bound else ""
-            axes = ", ".join(axis for axis, on in zip(TASK_AXES, followed, strict=False) if on)
-            lines.append(
-                f"{name} follows along {axes}: least singular value of its start pose {least:.3g}, damped "
-                f"below {bound:g}{near}"
-            )
+        if not model.shares_pose:
+            continue
+        spec = scenario.sites[name]
+        is_followed = np.array(model.axes) > 0.0
+        J = model.task_jacobian(spec.q0_rad)[is_followed]
+        least = np.linalg.svd(J, compute_uv=False)[-1]
+        bound = spec.task.singular_value
+        consequence = ", so that its inverse is damped there" if least < bound else ""
+        axes = ", ".join(
+            axis for axis, follows in zip(TASK_AXES, is_followed, strict=False) if follows
+        )
+        lines.append(
+            f"{name} follows along {axes}: least singular value of its start pose {least:.3g}, "
+            f"damped below {bound:g}{consequence}"
+        )
     return lines
 
 
 def _describe_silences(scenario: Scenario) -> list[str]:
-    """Returns how often sites under the rule `glide` will hold, by the draws of their links."""
+    """Returns lines on how often sites with the stale rule `glide` will hold.
+
+    The holds are counted in the samples that the links draw.
+    """
     lines = []
     for name, spec in scenario.sites.items():
         if spec.on_stale.action != "glide":
@@ -287,66 +344,75 @@ def _describe_silences(scenario: Scenario) -> list[str]:
             link = scenario.links[f"{peer}->{name}"]
             if link.measured or not scenario.dominance[name].get(peer):
                 continue
-            key = link_key(scenario.seed, f"{peer}->{name}")
-            rates_hz = spec.rate_hz, scenario.sites[peer].rate_hz
-            used = draw_used_samples(link, key, *rates_hz, scenario.duration_s)
+            used = draw_used_samples(
+                link=link,
+                key=link_key(scenario.seed, f"{peer}->{name}"),
+                receiver_hz=spec.rate_hz,
+                sender_hz=scenario.sites[peer].rate_hz,
+                duration_s=scenario.duration_s,
+            )
             count = count_silences(used, spec.rate_hz, spec.on_stale.rule.age_ns)
             if not count:
                 continue
-            a_minute = 60.0 * count / scenario.duration_s
-            advice = (
-                "; a play-out (playout_ms) or a longer silence_ms lessens that"
-                if a_minute > 1.0
-                else ""
-            )
+            per_minute = 60.0 * count / scenario.duration_s
+            advice = ""
+            if per_minute > 1.0:
+                advice = "; a play-out (playout_ms) or a longer silence_ms lessens that"
             lines.append(
-                f"{name} will hold {a_minute:.3g} times a minute: {spec.on_stale.silence_ms:g} ms without a "
-                f"new sample of {peer}, outages aside{advice}"
+                f"{name} will hold {per_minute:.3g} times a minute: "
+                f"{spec.on_stale.silence_ms:g} ms without a new sample of {peer}, outages "
+                f"aside{advice}"
             )
     return lines
 
 
 def _describe_stops(scenario: Scenario) -> list[str]:
-    """Returns when arms under the rule `glide` come to rest, and what their motors cannot hold."""
-    lines: dict[str, list[str]] = {}
+    """Returns lines on how arms with the stale rule `glide` come to rest.
+
+    Sites about which the same can be said share a line.
+    """
+    owners: dict[str, list[str]] = {}
     for name, spec in scenario.sites.items():
-        if spec.on_stale.action != "glide":
-            continue
-        if not spec.arm.known:
-            text = "have no stated time to rest: their inertia is not known (arm.known)"
-            lines.setdefault(text, []).append(name)
-            continue
-        qd = np.broadcast_to(scenario.setup(name).qd_limit_rad_s, len(spec.q0_rad))
-        bounds = find_rest_bounds(scenario, name)
-        speed = f"limits.qd_limit_rad_s = {np.max(qd):g}"
-        if not math.isfinite(bounds.rest_s):
-            text = "need more than limits.tau_limit_nm to hold themselves against gravity: they sink"
-            lines.setdefault(text, []).append(name)
-            continue
-        text = f"come to rest within {bounds.rest_s:.3g} s of a stop at {speed}"
-        lines.setdefault(text, []).append(name)
-        if bounds.bearable_share < 1.0:
-            most = bounds.bearable_share * np.max(qd)
-            text = (
-                f"can be faster than their motors bear: beyond {most:.3g} rad/s a joint may speed up to "
-                f"{np.max(bounds.peak_rad_s):.3g} rad/s while they brake from {speed}"
-            )
-            lines.setdefault(text, []).append(name)
-    return [f"arms of {', '.join(names)} {text}" for text, names in lines.items()]
+        if spec.on_stale.action == "glide":
+            for text in _describe_stop(scenario, name):
+                owners.setdefault(text, []).append(name)
+    return [f"arms of {', '.join(names)} {text}" for text, names in owners.items()]
+
+
+def _describe_stop(scenario: Scenario, name: str) -> list[str]:
+    """Returns predicates on a site's arm: when it comes to rest, and what its motors bear."""
+    spec = scenario.sites[name]
+    if not spec.arm.known:
+        return ["have no stated time to rest: their inertia is not known (arm.known)"]
+    bounds = find_rest_bounds(scenario, name)
+    if not math.isfinite(bounds.rest_s):
+        return [
+            "need more than limits.tau_limit_nm to hold themselves against gravity: they sink"
+        ]
+    qd = np.broadcast_to(scenario.setup(name).qd_limit_rad_s, len(spec.q0_rad))
+    speed = f"limits.qd_limit_rad_s = {np.max(qd):g}"
+    texts = [f"come to rest within {bounds.rest_s:.3g} s of a stop at {speed}"]
+    if bounds.bearable_share < 1.0:
+        bearable = bounds.bearable_share * np.max(qd)
+        texts.append(
+            f"can be faster than their motors bear: beyond {bearable:.3g} rad/s a joint may "
+            f"speed up to {np.max(bounds.peak_rad_s):.3g} rad/s while they brake from {speed}"
+        )
+    return texts
 
 
 _NOT_COMPARED = ("name", "title", "about", "assumed", "expect", "drawn", "sites", "links")
-_MOST = 80
-"""Most letters of a value."""
+_MAX_VALUE_LENGTH = 80
+"""Largest length of the text of a value."""
 
 
 class ScenarioDifference(NamedTuple):
     """A difference between experiments.
 
     Attributes:
-        key: its dotted path; below `sites.NAME` without that.
-        owners: its sites; none for a key of the whole experiment.
-        values: per experiment, in words; "none" if it has no such key.
+        key: the dotted path of the key; below `sites.NAME` without that prefix.
+        owners: the sites that have the difference; () for a key of the whole experiment.
+        values: the value in each experiment, as text; "none" if it has no such key.
     """
 
     key: str
@@ -359,96 +425,105 @@ class ScenarioDifference(NamedTuple):
 
 def compare_scenarios(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
     """Returns the differences between experiments, in the order of their keys."""
-    names = [", ".join(scenario.names) for scenario in scenarios]
-    found = [] if len(set(names)) == 1 else [ScenarioDifference("sites", (), tuple(names))]
+    differences: list[ScenarioDifference] = []
+    site_lists = [", ".join(scenario.names) for scenario in scenarios]
+    if len(set(site_lists)) > 1:
+        differences.append(ScenarioDifference("sites", (), tuple(site_lists)))
     tables: list[dict[str, Any]] = [msgspec.to_builtins(scenario) for scenario in scenarios]
-    found += _compare_tables(
+    differences += _compare_tables(
         [
             {key: value for key, value in table.items() if key not in _NOT_COMPARED}
             for table in tables
         ]
     )
     owners: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for site in (
-        name for name in scenarios[0].names if all(name in other.sites for other in scenarios)
-    ):
-        for row in _compare_tables([table["sites"][site] for table in tables]):
-            owners.setdefault((row.key, row.values), []).append(site)
-    found += [
-        ScenarioDifference(key, tuple(sites), values) for (key, values), sites in owners.items()
-    ]
-    return found + _compare_links(scenarios)
+    for site in scenarios[0].names:
+        if not all(site in other.sites for other in scenarios):
+            continue
+        for difference in _compare_tables([table["sites"][site] for table in tables]):
+            owners.setdefault((difference.key, difference.values), []).append(site)
+    for (key, values), sites in owners.items():
+        differences.append(ScenarioDifference(key, tuple(sites), values))
+    return differences + _compare_links(scenarios)
 
 
 def _compare_tables(tables: Sequence[Mapping[str, Any]]) -> list[ScenarioDifference]:
-    if len({table.get("control", {}).get("law") for table in tables}) > 1:
-        laws = ScenarioDifference(
-            "control", (), tuple(describe_law(table["control"]) for table in tables)
-        )
+    """Returns the differences between tables of one kind; laws of several kinds as a whole."""
+    laws = {table.get("control", {}).get("law") for table in tables}
+    if len(laws) > 1:
+        descriptions = tuple(describe_law(table["control"]) for table in tables)
         rest = [
             {key: value for key, value in table.items() if key != "control"} for table in tables
         ]
-        return [laws, *_compare_tables(rest)]
-    flat = [dict(flatten_table(table)) for table in tables]
-    return [
-        ScenarioDifference(key, (), tuple(describe_value(one.get(key)) for one in flat))
-        for key in dict.fromkeys(key for one in flat for key in one)
-        if any(one.get(key) != flat[0].get(key) for one in flat)
-    ]
+        return [ScenarioDifference("control", (), descriptions), *_compare_tables(rest)]
+    flat_tables = [dict(flatten_table(table)) for table in tables]
+    keys = dict.fromkeys(key for table in flat_tables for key in table)
+    differences = []
+    for key in keys:
+        values = [table.get(key) for table in flat_tables]
+        if any(value != values[0] for value in values):
+            differences.append(ScenarioDifference(key, (), tuple(map(describe_value, values))))
+    return differences
 
 
 def _compare_links(scenarios: Sequence[Scenario]) -> list[ScenarioDifference]:
-    alike: dict[tuple[str, ...], list[str]] = {}
-    common = [
+    """Returns the differences between links; links that differ alike are one entry."""
+    names_by_values: dict[tuple[str, ...], list[str]] = {}
+    common_names = [
         name for name in scenarios[0].links if all(name in other.links for other in scenarios)
     ]
-    for name in common:
+    for name in common_names:
         links = [scenario.links[name] for scenario in scenarios]
         if any(link != links[0] for link in links):
-            alike.setdefault(tuple(link.describe() for link in links), []).append(name)
-    return [
-        ScenarioDifference(
-            "every link" if names == common else f"link {', '.join(names)}", (), values
-        )
-        for values, names in alike.items()
-    ]
+            values = tuple(link.describe() for link in links)
+            names_by_values.setdefault(values, []).append(name)
+    differences = []
+    for values, names in names_by_values.items():
+        key = "every link" if names == common_names else f"link {', '.join(names)}"
+        differences.append(ScenarioDifference(key, (), values))
+    return differences
 
 
 def flatten_table(table: Mapping[str, Any], path: str = "") -> list[tuple[str, Any]]:
-    """Returns the values of a table and of those in it, with dotted keys."""
+    """Returns the values of a table and of the tables in it, with dotted keys."""
     pairs: list[tuple[str, Any]] = []
     for key, value in table.items():
-        where = f"{path}.{key}" if path else key
-        pairs += flatten_table(value, where) if isinstance(value, dict) else [(where, value)]
+        key_path = f"{path}.{key}" if path else key
+        if isinstance(value, dict):
+            pairs += flatten_table(value, key_path)
+        else:
+            pairs.append((key_path, value))
     return pairs
 
 
 def describe_law(control: Mapping[str, Any]) -> str:
-    """Returns a law and its gains in a few words, from its table."""
-    if "code" in control:  # a user's law: the settings are its gains, and its file has a hash
-        settings = control.get("settings", {})
-        gains = ", ".join(f"{key} {describe_value(value)}" for key, value in settings.items())
-        return f"{control['code']} ({gains})" if gains else str(control["code"])
-    gains = ", ".join(
-        f"{key} {describe_value(value)}" for key, value in control.items() if key != "law"
-    )
-    return f"{control['law']} ({gains})"
+    """Returns a short text on a law and its gains, from its table."""
+    # The gains of a user's law are its settings; the hash of its file is left out.
+    if "code" in control:
+        name = str(control["code"])
+        gains = control.get("settings", {})
+    else:
+        name = str(control["law"])
+        gains = {key: value for key, value in control.items() if key != "law"}
+    text = ", ".join(f"{key} {describe_value(value)}" for key, value in gains.items())
+    return f"{name} ({text})" if text or "code" not in control else name
 
 
 def describe_value(value: Any) -> str:
-    """Returns a value in words; a list of equal numbers as one of them."""
+    """Returns the text of a value; a list of equal numbers as one number."""
     if value is None or value == [] or value == ():
         return "none"
     if isinstance(value, dict):
-        words = [
+        return " ".join(
             describe_value(entry) if key == "kind" else f"{key} {describe_value(entry)}"
             for key, entry in value.items()
-        ]
-        return " ".join(words)
+        )
     if isinstance(value, list | tuple):
         entries = [describe_value(entry) for entry in value]
-        alike = isinstance(value[0], int | float) and len(set(entries)) == 1
-        text = entries[0] if alike else f"[{', '.join(entries)}]"
+        is_uniform = isinstance(value[0], int | float) and len(set(entries)) == 1
+        text = entries[0] if is_uniform else f"[{', '.join(entries)}]"
     else:
         text = f"{value:g}" if isinstance(value, float) else str(value)
-    return text if len(text) <= _MOST else f"{text[: _MOST - 3]}..."
+    if len(text) > _MAX_VALUE_LENGTH:
+        text = f"{text[: _MAX_VALUE_LENGTH - 3]}..."
+    return text

@@ -1,9 +1,12 @@
-"""Expectations of a run: the table [expect] and its [[expect.windows]], evaluated by `trilat
-test`.
+"""Expectations of a run: the tables [expect] and [[expect.windows]] of a scenario.
 
-Invariant: a key names a quantity, its limit and its unit, and its docstring defines the
-quantity exactly; an absent key asks nothing. `..._max_...` is the largest value that still
-holds, `..._min_...` the smallest; a window's key holds [least, most].
+`trilat test` evaluates them.
+
+Invariant:
+    - A key names a quantity, its limit and its unit, and its docstring defines the quantity
+      exactly. An absent key expects nothing.
+    - `..._max_...` is the largest value that still holds, `..._min_...` the smallest. The key
+      of a window holds [least, most].
 """
 
 import re
@@ -21,6 +24,7 @@ from ..fields import (
     NotNegative,
     Positive,
     Real,
+    TomlTable,
     check_keys,
     field_names,
     suggest_nearest,
@@ -59,26 +63,28 @@ else:
 class ExpectWindow(_JointPart, frozen=True, kw_only=True):
     """Expectations of the ticks from one time to another, as [least, most] of each quantity.
 
-    A wall's force is that of the scenario's walls at the logged state, along their normals; of
-    several it is the sum. If a run ends before the window does, nothing of it is measured, and
-    nothing holds.
+    The force of the walls is computed from the logged state, along their normals, and added up
+    if the scenario has several walls. If a run ends before the window ends, the window is not
+    measured, and its expectations fail.
 
     Attributes:
-        from_s: nominal time of its first tick, s.
-        to_s: its end, s; it does not include a tick at that time.
-        site: the site; left out: all, which only the first three quantities allow.
+        from_s: nominal time of the first tick of the window, s.
+        to_s: end of the window, s; a tick at that time does not belong to the window.
+        site: the site; left out: all sites, which only the first three quantities allow.
         error_peak_rad: largest |e| of a joint.
         speed_peak_rad_s: largest speed of a joint.
         torque_peak_nm: largest control torque of a joint.
-        q1_rad: angle of joint 1, at every tick; q2_rad of joint 2, and so on as far as the arm
-            has joints; m of a prismatic joint. Where a URDF names the joints, q_NAME_rad is
+        q1_rad: angle of joint 1 at every tick, m for a prismatic joint; q2_rad is that of joint
+            2, and so on up to the last joint. If a URDF names the joints, q_NAME_rad may be
             written as well.
-        push1_mean_nm: torque of operator and environment ON joint 1, the mean over the ticks;
-            push2_mean_nm of joint 2, and so on; push_NAME_mean_nm so.
-        wall_mean_n: force of the walls, the mean over the ticks, with or without contact.
-        wall_deviation_n: its standard deviation over the ticks (of the population).
-        wall_peak_n: the largest.
-        wall_hits: how often it begins: ticks with force after one without, within the window.
+        push1_mean_nm: mean over the ticks of the torque of operator and environment ON joint 1;
+            push2_mean_nm is that of joint 2, and so on. If a URDF names the joints,
+            push_NAME_mean_nm may be written as well.
+        wall_mean_n: mean over the ticks of the force of the walls, with or without contact.
+        wall_deviation_n: standard deviation of that force over the ticks (of the population).
+        wall_peak_n: largest force of the walls.
+        wall_hits: number of contacts that begin: ticks of the window with a force after a tick
+            of the window without one.
     """
 
     wall_mean_n: LeastMost | None = None
@@ -88,9 +94,10 @@ class ExpectWindow(_JointPart, frozen=True, kw_only=True):
 
     @property
     def limits(self) -> Iterator[tuple[str, tuple[float, ...]]]:
-        """Yields each quantity with a limit, and its least and most."""
+        """Yields each quantity that the window limits, with its [least, most]."""
         for key in _QUANTITIES:
-            if (limits := getattr(self, key)) is not None:
+            limits = getattr(self, key)
+            if limits is not None:
                 yield key, limits
 
 
@@ -100,79 +107,103 @@ _JOINT_QUANTITY = re.compile(r"(?:q|push)(\d+)_")
 
 
 def window_quantities(joints: int) -> tuple[str, ...]:
-    """Returns the quantities of a window of a site whose arm has so many joints."""
-    numbers = {key: _JOINT_QUANTITY.match(key) for key in _QUANTITIES}
-    return tuple(
-        key for key, number in numbers.items() if number is None or int(number[1]) <= joints
-    )
+    """Returns the quantities of a window for an arm with `joints` joints."""
+    quantities = []
+    for key in _QUANTITIES:
+        number = _JOINT_QUANTITY.match(key)
+        if number is None or int(number[1]) <= joints:
+            quantities.append(key)
+    return tuple(quantities)
 
 
 def number_window_joints(written: Any, joint_names: Mapping[str, tuple[str, ...]]) -> Any:
-    """Returns the windows of a file with keys that name joints, as q_elbow_rad, written by
-    their numbers.
+    """Returns the windows of a file with numbers in place of the names of joints in keys.
 
-    `joint_names` has the names of the joints of each site's arm, in their order. What is no
-    list of tables is refused later.
+    q_elbow_rad becomes q3_rad if the elbow is the third joint.
+
+    Args:
+        written: the windows; anything but a list of tables is returned as it is, and refused
+            later.
+        joint_names: the names of the joints of each site's arm, in their order.
 
     Raises:
-        ScenarioError: a window has no such key, or has one twice.
+        ScenarioError: a window has no such key, or has a key twice.
     """
     if not isinstance(written, list):
         return written
     windows = []
     for n, table in enumerate(written):
-        numbered: dict[str, Any] = {}
-        for key, value in table.items() if isinstance(table, dict) else ():
-            kind, ending, name = _split_joint_key(key)
-            names = joint_names.get(table.get("site", ""), ()) if name else ()
-            known = f"{kind}{names.index(name) + 1}{ending}" if name in names else key
-            if known in numbered or (known != key and known in table):
-                raise ScenarioError(f"is {known} once more", path=f"expect.windows[{n}].{key}")
-            numbered[known] = value
-        window = numbered if isinstance(table, dict) else table
-        windows.append(check_keys(window, _WINDOW_KEYS, f"expect.windows[{n}]"))
+        path = f"expect.windows[{n}]"
+        window = table
+        if isinstance(table, dict):
+            site = table.get("site", "")
+            names = joint_names.get(site, ()) if isinstance(site, str) else ()
+            window = _number_joints(table, names, path)
+        windows.append(check_keys(window, _WINDOW_KEYS, path))
     return windows
 
 
+def _number_joints(table: TomlTable, names: tuple[str, ...], path: str) -> TomlTable:
+    """Returns a window with numbers in place of the names of joints in its keys."""
+    window: TomlTable = {}
+    for key, value in table.items():
+        prefix, name, suffix = _split_joint_key(key)
+        numbered_key = key
+        if name in names:
+            numbered_key = f"{prefix}{names.index(name) + 1}{suffix}"
+        if numbered_key in window or (numbered_key != key and numbered_key in table):
+            raise ScenarioError(f"is {numbered_key} once more", path=f"{path}.{key}")
+        window[numbered_key] = value
+    return window
+
+
 def _split_joint_key(key: str) -> tuple[str, str, str]:
-    for kind, ending in (("q", "_rad"), ("push", "_mean_nm")):
-        if key.startswith(f"{kind}_") and key.endswith(ending):
-            return kind, ending, key.removeprefix(f"{kind}_").removesuffix(ending)
+    """Returns prefix, name and suffix of a key that names a joint, or empty texts.
+
+    "q_elbow_rad" is split into "q", "elbow" and "_rad".
+    """
+    for prefix, suffix in (("q", "_rad"), ("push", "_mean_nm")):
+        if key.startswith(f"{prefix}_") and key.endswith(suffix):
+            name = key.removeprefix(f"{prefix}_").removesuffix(suffix)
+            return prefix, name, suffix
     return "", "", ""
 
 
-def find_window_problem(window: ExpectWindow, sites: Mapping[str, int]) -> KeyProblem | None:
-    """Returns a window's problem that no run of a scenario with these sites could meet, or
-    None.
+def find_window_problem(
+    window: ExpectWindow, joint_counts: Mapping[str, int]
+) -> KeyProblem | None:
+    """Returns a problem of a window for which no run could meet it, or None.
 
-    `sites` says how many joints the arm of each has.
+    Args:
+        window: the window.
+        joint_counts: the number of joints of each site's arm.
     """
-    names = f"its sites are {', '.join(sites)}"
+    sites = f"its sites are {', '.join(joint_counts)}"
     if window.to_s <= window.from_s:
         return KeyProblem(
             "to_s", f"must be later than from_s = {window.from_s:g}, is {window.to_s:g}"
         )
-    if window.site and window.site not in sites:
-        return KeyProblem(
-            "site",
-            f"no site {window.site!r}{suggest_nearest(window.site, list(sites))}; {names}",
-        )
+    if window.site and window.site not in joint_counts:
+        hint = suggest_nearest(window.site, list(joint_counts))
+        return KeyProblem("site", f"no site {window.site!r}{hint}; {sites}")
     limits = dict(window.limits)
     if not limits:
-        valid = window_quantities(max(sites.values()))
-        return KeyProblem("", f"asks nothing; it may ask {', '.join(valid)}")
+        valid = window_quantities(max(joint_counts.values()))
+        return KeyProblem("", f"expects nothing; it may have {', '.join(valid)}")
     for key, (least, most) in limits.items():
         if not window.site and key not in ALL_SITES_QUANTITIES:
-            return KeyProblem("site", f"is missing: {key} is of one site; {names}")
-        if window.site and key not in window_quantities(sites[window.site]):
-            return KeyProblem(key, f"there is no such joint: that arm has {sites[window.site]}")
+            return KeyProblem("site", f"is missing: {key} is of one site; {sites}")
+        if window.site:
+            joints = joint_counts[window.site]
+            if key not in window_quantities(joints):
+                return KeyProblem(key, f"there is no such joint: that arm has {joints}")
         if least > most:
             return KeyProblem(key, f"must be [least, most], is [{least:g}, {most:g}]")
     return None
 
 
 END_WINDOW_S = 1.0
-"""The length of the end of a run that a key means, s."""
+"""Length of the part of a run that the keys `end_...` cover, s."""
 
 
 class Expect(
@@ -182,37 +213,37 @@ class Expect(
 
     The error of a site is e = q_i - q_id, Eq. (9); |e| is taken per joint. "Largest" and
     "smallest" are over all sites (or links), joints and ticks of the run. A run that diverged
-    ends there: its figures are of the part before, and it fails unless `stable = false` is
-    asked.
+    ends at that tick: its figures are those of the part before, and the run fails unless
+    `stable = false` is expected.
 
     Attributes:
-        stable: true: the run is stable; false: it is not. An open one fails both, see
+        stable: true: the run is stable; false: it is not. An open run fails both, see
             `analysis.run_end`.
         synchronised_by_s: from this time to the end of the run the largest |e| stays below
             `synchronised_rad`.
         synchronised_rad: the limit of |e| below which the sites are synchronised, rad.
         peak_error_max_rad: largest |e| of the run.
-        peak_error_min_rad: the same figure, from below.
+        peak_error_min_rad: lower limit of that figure.
         rms_error_max_rad: root mean square of e over the run, of the worst joint of any site.
         end_error_max_rad: largest |e| of the last second.
-        end_error_min_rad: the same figure, from below.
-        end_spread_max_rad: largest difference between two sites' angles of one joint at one
-            instant of the last second, undelayed; instants are the ticks of the first site.
-        end_pose_rad: joint angles of a site's last tick, by the site's name, rad.
-        end_pose_within_rad: how far each of those angles may be off, rad.
+        end_error_min_rad: lower limit of that figure.
+        end_spread_max_rad: largest difference between two sites' angles of one joint at the
+            same time, without delay, in the last second; at the ticks of the first site.
+        end_pose_rad: joint angles of a site at its last tick, by the site's name, rad.
+        end_pose_within_rad: largest deviation of each of those angles, rad.
         peak_torque_max_nm: largest control torque of a joint.
         peak_speed_max_rad_s: largest speed of a joint.
         age_max_ms: largest age of the sample in use (now minus its stamp), from the first
-            sample of a link on; a link that never has one fails.
-        mean_age_max_ms: that age, averaged over a link's ticks; of the link where it is
-            largest.
-        mean_age_min_ms: the same average, of the link where it is smallest, from below.
+            sample of a link on; a link that never has a sample in use fails.
+        mean_age_max_ms: upper limit of that age averaged over the ticks of a link, for the link
+            with the largest average.
+        mean_age_min_ms: lower limit of that average, for the link with the smallest average.
         late_samples_max: samples of all links that arrived after they were due.
-        no_gaps: true: there is a record of every tick, from 0 to the last that any site had to
-            make; false asks nothing.
+        no_gaps: true: there is a record of every tick, from 0 to the last tick that any site
+            had to make; false: nothing is expected.
         windows: expectations of parts of the run, see `ExpectWindow`.
-        metrics: [least, most] of any number that `trilat metrics` measures, by its key, of the
-            whole run as `trilat compare` has it.
+        metrics: [least, most] of any number that `trilat metrics` measures, by its key, over
+            the whole run as in `trilat compare`.
     """
 
     stable: bool | None = None
@@ -224,7 +255,7 @@ class Expect(
     end_error_max_rad: NotNegative | None = None
     end_error_min_rad: NotNegative | None = None
     end_spread_max_rad: NotNegative | None = None
-    end_pose_rad: dict[str, Joints] = {}  # written out, never one number for all joints
+    end_pose_rad: dict[str, Joints] = {}
     end_pose_within_rad: Positive = 0.01
     peak_torque_max_nm: NotNegative | None = None
     peak_speed_max_rad_s: NotNegative | None = None
@@ -243,35 +274,43 @@ class Expect(
         return msgspec.structs.replace(self, **tolerances) != Expect()
 
 
-def find_expect_problem(expect: Expect, sites: Mapping[str, int]) -> KeyProblem | None:
-    """Returns the problem, below `expect`, that no run of a scenario with these sites could
-    meet, or None.
+def find_expect_problem(expect: Expect, joint_counts: Mapping[str, int]) -> KeyProblem | None:
+    """Returns a problem of the expectations for which no run could meet them, or None.
 
-    `sites` says how many joints the arm of each has.
+    Args:
+        expect: the expectations.
+        joint_counts: the number of joints of each site's arm.
+
+    Returns:
+        A problem with the path of its key below `expect`.
     """
     for name, pose in expect.end_pose_rad.items():
-        if name not in sites:
+        key = f"end_pose_rad.{name}"
+        if name not in joint_counts:
+            return KeyProblem(key, f"no such site; its sites are {', '.join(joint_counts)}")
+        joints = joint_counts[name]
+        if len(pose) != joints:
             return KeyProblem(
-                f"end_pose_rad.{name}", f"no such site; its sites are {', '.join(sites)}"
+                key,
+                f"expected list of length {joints}, one angle per joint, and it has "
+                f"{len(pose)}",
             )
-        if len(pose) != sites[name]:
-            problem = f"expected list of length {sites[name]}, one angle per joint, and it has {len(pose)}"
-            return KeyProblem(f"end_pose_rad.{name}", problem)
     for n, window in enumerate(expect.windows):
-        if found := find_window_problem(window, sites):
-            return found._replace(key=f"windows[{n}].{found.key}".rstrip("."))
-    for key, (low, high) in expect.metrics.items():
+        problem = find_window_problem(window, joint_counts)
+        if problem is not None:
+            return problem._replace(key=f"windows[{n}].{problem.key}".rstrip("."))
+    for metric, (low, high) in expect.metrics.items():
         if low > high:
             return KeyProblem(
-                f"metrics.{key}", f"must be [least, most], is [{low:g}, {high:g}]"
+                f"metrics.{metric}", f"must be [least, most], is [{low:g}, {high:g}]"
             )
-    for least, most in (
+    for min_key, max_key in (
         ("peak_error_min_rad", "peak_error_max_rad"),
         ("end_error_min_rad", "end_error_max_rad"),
         ("mean_age_min_ms", "mean_age_max_ms"),
     ):
-        floor = getattr(expect, least)
-        ceiling = getattr(expect, most)
-        if floor is not None and ceiling is not None and floor > ceiling:
-            return KeyProblem(least, f"must be at most {most} = {ceiling:g}, is {floor:g}")
+        least = getattr(expect, min_key)
+        most = getattr(expect, max_key)
+        if least is not None and most is not None and least > most:
+            return KeyProblem(min_key, f"must be at most {max_key} = {most:g}, is {least:g}")
     return None
