@@ -237,7 +237,7 @@ class ChannelCheck:
         if isinstance(message, messages.Event):
             self.received += self._accounts.receive_event(self._topic, number, message)
         else:
-            self.received += self.kind == topics.STATS or self._accounts.count(
+            self.received += self.kind == topics.STATS or self._accounts.count_message(
                 self._topic, number
             )
         if self.rate_hz and isinstance(message, messages.State) and message.cmd:
