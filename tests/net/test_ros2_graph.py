@@ -20,10 +20,10 @@ from trilat_net.net.ros2_graph import (
     TYPE_HASHES,
     Attachment,
     EndpointKind,
-    NodeAddress,
     QualityOfService,
     Refusals,
     Ros2Graph,
+    Ros2Member,
     describe_mismatch,
     find_type_hash,
     make_gid,
@@ -37,7 +37,7 @@ from trilat_net.net.zenoh_config import ZenohMode, make_zenoh_config
 STRING, LOG = "std_msgs/msg/String", "rcl_interfaces/msg/Log"
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 ADD_HASH = "RIHS01_e118de6bf5eeb66a2491b5bda11202e7b68f198d6f67922cf30364858239c81a"
-LISTENER = NodeAddress(2, "aac3178e146ba6f1fc6e6a4085e77f21", "", "listener")
+LISTENER = Ros2Member(2, "aac3178e146ba6f1fc6e6a4085e77f21", "", "listener")
 
 
 def test_keys_are_those_of_the_design_of_rmw_zenoh() -> None:
@@ -59,7 +59,7 @@ def test_tokens_are_those_of_the_design_of_rmw_zenoh() -> None:
     assert LISTENER.endpoint_token(*heard) == (
         f"{root}/10/MS/%/%/listener/%chatter/std_msgs::msg::dds_::String_/{STRING_HASH}/::,10:,:,:,,"
     )
-    server = NodeAddress(2, "f9980ee0495eaafb3e38f0d19e2eae12", "", "add_two_ints_server")
+    server = Ros2Member(2, "f9980ee0495eaafb3e38f0d19e2eae12", "", "add_two_ints_server")
     kind = "example_interfaces/srv/AddTwoInts"
     served = server.endpoint_token(
         10, EndpointKind.SERVER, "add_two_ints", kind, ADD_HASH, QualityOfService()
@@ -68,7 +68,7 @@ def test_tokens_are_those_of_the_design_of_rmw_zenoh() -> None:
         "@ros2_lv/2/f9980ee0495eaafb3e38f0d19e2eae12/0/10/SS/%/%/add_two_ints_server/%add_two_ints/"
         f"example_interfaces::srv::dds_::AddTwoInts_/{ADD_HASH}/::,10:,:,:,,"
     )
-    talker = NodeAddress(0, "999bf91283606d2068c7524e5badfa6c", "robot1", "talker")
+    talker = Ros2Member(0, "999bf91283606d2068c7524e5badfa6c", "robot1", "talker")
     assert talker.endpoint_token(
         1, EndpointKind.PUBLISHER, "rosout", LOG, "RIHS01_e28c", QualityOfService()
     ).startswith(
@@ -197,7 +197,7 @@ def test_a_name_of_ros_is_taken_without_its_slash() -> None:
 def test_a_publisher_that_does_not_fit_is_named(
     domain: int, kind: str, type_hash: str, misfit: str
 ) -> None:
-    talker = NodeAddress(domain, "999bf91283606d2068c7524e5badfa6c", "robot1", "talker")
+    talker = Ros2Member(domain, "999bf91283606d2068c7524e5badfa6c", "robot1", "talker")
     sent = talker.endpoint_token(
         1, EndpointKind.PUBLISHER, "a/b", kind, type_hash, QualityOfService()
     )
@@ -291,7 +291,7 @@ def test_a_message_that_raises_is_refused_and_the_next_comes(wire: Wire) -> None
 
 def test_publishers_that_do_not_fit_are_named_as_they_appear(wire: Wire) -> None:
     wire.graph.subscribe("a", STRING, lambda *_: None)
-    place = NodeAddress(3, str(wire.stranger.zid()), "", "talker")
+    place = Ros2Member(3, str(wire.stranger.zid()), "", "talker")
     token = place.endpoint_token(
         1, EndpointKind.PUBLISHER, "a", STRING, STRING_HASH, QualityOfService()
     )

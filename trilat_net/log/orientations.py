@@ -100,7 +100,9 @@ def expand_poses(x: Array) -> Array:
     """
     if x.shape[-1] != POSE:
         return x
-    return np.concatenate([x[..., :POSITION], compute_matrix_columns(x[..., POSITION:])], axis=-1)
+    return np.concatenate(
+        [x[..., :POSITION], compute_matrix_columns(x[..., POSITION:])], axis=-1
+    )
 
 
 def choose_nearest_vectors(turns: Array, references: Array) -> Array:

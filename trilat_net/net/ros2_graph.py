@@ -147,7 +147,7 @@ def topic_key(domain: int, name: str, kind: str, type_hash: str) -> str:
     return f"{domain}/{name}/{name_dds_type(kind)}/{type_hash}"
 
 
-class NodeAddress(NamedTuple):
+class Ros2Member(NamedTuple):
     """Address of a node in the graph of ROS.
 
     Attributes:
@@ -347,7 +347,7 @@ class Ros2Graph:
                 f"{endpoints} is no router, and forwards nothing: with --ros name that of ROS "
                 "(ros2 run rmw_zenoh_cpp rmw_zenohd, at port 7447), or trilat router"
             )
-        self._node = NodeAddress(domain, str(self._session.zid()), namespace, name)
+        self._node = Ros2Member(domain, str(self._session.zid()), namespace, name)
         self._distro = distro
         self._clock = clock
         self._endpoints = 0
