@@ -1,12 +1,11 @@
-"""A plant of one's own: a class that moves an arm, and what else is in its scene, from tick to
-tick.
+"""A user's own plant: a class that moves an arm and the bodies of its scene.
 
-    plant = "my_plant:Scene"            # or a table: { class = "my_plant:Scene", mass_kg = 2.0
-    }
+    plant = "my_plant:Scene"            # or a table: { class = "my_plant:Scene", mass_kg = 2 }
 
-Invariant: what it says of the arm is measured: it becomes q, qd and tau_x of the next tick's
-record, as the motion of an arm outside of the program does. A log therefore executes the
-control again exactly, without the plant, and judges the plant by nothing.
+Invariant:
+    - The state that a plant returns is a measurement: it becomes q, qd and tau_x of the next
+      tick's record, as the motion of an arm outside of the program does. A log therefore
+      executes the control again exactly, without the plant, and does not judge the plant.
 """
 
 import math
@@ -32,10 +31,11 @@ T = TypeVar("T")
 _BODY_NAME = re.compile(r"[a-z][a-z0-9_]{0,29}")
 _MAX_BODIES = 32
 _MAX_SIZE_M = 100.0
+_POSE_NUMBERS = 7
 
 
 class PlantContext(NamedTuple):
-    """What a plant of one's own knows before it begins.
+    """The facts with which a user's own plant is made.
 
     >>> class Scene:
     ...     def __init__(self, facts: tn.PlantContext) -> None:
@@ -45,13 +45,14 @@ class PlantContext(NamedTuple):
     ...         return self.arm.q, self.arm.qd
 
     Attributes:
-        site: the site whose arm it moves.
+        site: the site whose arm the plant moves.
         scenario: the experiment: its arms, start poses and tick rates.
         q0_rad: the arm's start pose, rad, shape (n,).
         h_s: the period of a tick, s.
-        seed: for what it draws: of the scenario and the site.
-        bodies_m: the bodies that it moves besides the arm, by name: sizes along x, y and z of
-            their own, m.
+        seed: seed for random numbers of the plant, derived from the scenario's seed and the
+            site.
+        bodies_m: the bodies that the plant moves besides the arm, by name: their sizes along
+            their own axes x, y and z, m.
     """
 
     site: str
@@ -63,21 +64,29 @@ class PlantContext(NamedTuple):
 
 
 class PlantProgram(Protocol):
-    """A plant of one's own; its class is called with `PlantContext` and its settings, by name."""
+    """A user's own plant. Its class is called with `PlantContext` and its settings, by name."""
 
     def step(self, tau: Array, h_s: float) -> Sequence[Sequence[float]]:
-        """Moves on by a period under the control torque ON the joints, N m, shape (n,).
+        """Advances the plant by a period under the control torque ON the joints.
 
-        Returns q, rad, and qd, rad/s, at its end; and, if it knows it, tau_x, N m, of what
-        touches the arm: in the sign of Eq. (8), the negative of the torque ON it.
+        Args:
+            tau: the control torque, N m, shape (n,).
+            h_s: the period, s.
+
+        Returns:
+            q, rad, and qd, rad/s, at the end of the period. A plant that knows the torque of
+            contacts returns tau_x, N m, as well, in the sign of Eq. (8): the negative of the
+            torque ON the arm.
         """
 
     def poses(self) -> Sequence[Sequence[float]]:
-        """Returns where its bodies are now, in the order of `PlantContext.bodies_m`; asked only
-        with any.
+        """Returns the poses of the bodies now, in the order of `PlantContext.bodies_m`.
 
-        Seven numbers each: x, y, z of its middle in the arm's base frame, m, and the quaternion
-        w, x, y, z.
+        The method is called only if the plant has bodies.
+
+        Returns:
+            Seven numbers per body: x, y, z of its centre in the arm's base frame, m, and the
+            quaternion w, x, y, z.
         """
 
 
@@ -85,11 +94,12 @@ class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True
     """The plant of a site in a scenario.
 
     Attributes:
-        code: its class, as in "my_plant:Scene".
-        source_sha256: hash of the file of its class.
-        bodies: what else it moves, by name: sizes of a box around it, along its own x, y and z,
-            m; where they are is recorded and drawn.
-        settings: the arguments of its class, by name.
+        code: the class of the plant, as in "my_plant:Scene".
+        source_sha256: hash of the file of the class.
+        bodies: the bodies that the plant moves besides the arm, by name: the sizes of a box
+            around the body along its own axes x, y and z, m. Their poses are recorded and
+            drawn.
+        settings: the arguments of the class, by name.
     """
 
     method: ClassVar[str] = "step"
@@ -101,18 +111,21 @@ class OwnPlant(Frozen, frozen=True, rename={"code": "class"}, omit_defaults=True
 
 
 def resolve_plant(written: Any, path: str) -> Any:
-    """Returns a site's plant complete: a word as it is, a class with the hash of its file."""
-    table = {"class": written} if isinstance(written, str) and ":" in written else written
+    """Returns a site's plant complete: a class gets the hash of its file.
+
+    A text such as "external", and a value of a wrong type, is returned as it is.
+    """
+    table = written
+    if isinstance(written, str) and ":" in written:
+        table = {"class": written}
     if not isinstance(table, Mapping):
         return written
     code = table.get("class")
     if not isinstance(code, str):
         raise ScenarioError("must be a class, as in 'my_plant:Scene'", path=f"{path}.class")
-    bodies = (
-        {"bodies": _check_bodies(table["bodies"], f"{path}.bodies")}
-        if "bodies" in table
-        else {}
-    )
+    bodies = {}
+    if "bodies" in table:
+        bodies["bodies"] = _check_bodies(table["bodies"], f"{path}.bodies")
     if "source_sha256" in table:
         return {**table, **bodies}
     settings = {key: value for key, value in table.items() if key not in ("class", "bodies")}
@@ -125,6 +138,7 @@ def resolve_plant(written: Any, path: str) -> Any:
 
 
 def _check_bodies(written: Any, path: str) -> Any:
+    """Returns the table of bodies if their names and sizes are valid."""
     if not isinstance(written, Mapping) or len(written) > _MAX_BODIES:
         example = "{ box = [0.2, 0.2, 0.1] }"
         raise ScenarioError(
@@ -135,21 +149,27 @@ def _check_bodies(written: Any, path: str) -> Any:
             raise ScenarioError(
                 f"a body is named by a to z, 0 to 9 and _, not {name!r}", path=path
             )
-        given = isinstance(size, list | tuple) and all(
-            is_number(one) and 0.0 < one <= _MAX_SIZE_M for one in size
-        )
-        if not given or len(size) != 3:
-            problem = f"must be three sizes, m, above 0 and up to {_MAX_SIZE_M:g}, is {size!r}"
-            raise ScenarioError(problem, path=f"{path}.{name}")
+        if not _is_box_size(size):
+            raise ScenarioError(
+                f"must be three sizes, m, above 0 and up to {_MAX_SIZE_M:g}, is {size!r}",
+                path=f"{path}.{name}",
+            )
     return written
 
 
+def _is_box_size(size: Any) -> bool:
+    """True for a list of three lengths, m, that a body may have."""
+    if not isinstance(size, list | tuple) or len(size) != 3:
+        return False
+    return all(is_number(length) and 0.0 < length <= _MAX_SIZE_M for length in size)
+
+
 class PlantPlayer:
-    """A plant of one's own, moved from tick to tick.
+    """Runs a user's own plant at its site, tick by tick.
 
     Attributes:
-        state: the arm's motion at the next tick.
-        rate_hz: the tick rate of its site, Hz.
+        state: the state of the arm at the next tick.
+        rate_hz: the tick rate of the site, Hz.
     """
 
     def __init__(
@@ -177,65 +197,82 @@ class PlantPlayer:
         self._program: PlantProgram = make_instance(
             kind, plant.code, context, plant.settings, path=path
         )
-        self._bodies = len(plant.bodies)
-        self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), self._ask(0, self._place))
+        self._body_count = len(plant.bodies)
+        bodies = self._call(0, self._read_poses)
+        self.state = PlantState(spec.q0_rad, spec.qd0_rad_s, (), bodies)
 
     def move(self, tick: int, tau: Sequence[float]) -> None:
-        """Moves on from a tick to the next under its control torque, N m, shape (n,).
+        """Advances the plant from a tick to the next one.
+
+        Args:
+            tick: the tick.
+            tau: its control torque, N m, shape (n,).
 
         Raises:
-            PlantFailed: it raised, or says no motion of such an arm.
+            PlantFailed: the plant raised an error, or returned a state that is not a finite
+                motion of the arm.
         """
-        found = self._ask(tick, lambda: self._step(tau))
-        for name, vector in zip(("q", "qd", "tau_x"), found, strict=False):
+        vectors = self._call(tick, lambda: self._step(tau))
+        for name, vector in zip(("q", "qd", "tau_x"), vectors, strict=False):
             if len(vector) != len(tau):
-                problem = (
+                raise self._make_error(
+                    tick,
                     f"{name} has {count_nouns(len(vector), 'number')}, and the arm "
-                    f"has {count_nouns(len(tau), 'joint')}"
+                    f"has {count_nouns(len(tau), 'joint')}",
                 )
-                raise self._failed(tick, problem)
             if not all(map(math.isfinite, vector)):
-                raise self._failed(tick, f"{name} is {vector}, which is not finite")
-        bodies = self._ask(tick, self._place)
-        self.state = PlantState(found[0], found[1], found[2] if len(found) > 2 else (), bodies)
+                raise self._make_error(tick, f"{name} is {vector}, which is not finite")
+        bodies = self._call(tick, self._read_poses)
+        q, qd, *contact_torques = vectors
+        tau_x = contact_torques[0] if contact_torques else ()
+        self.state = PlantState(q, qd, tau_x, bodies)
 
     def _step(self, tau: Sequence[float]) -> list[list[float]]:
-        q, qd, *rest = self._program.step(np.array(tau), 1.0 / self.rate_hz)
-        return [[float(one) for one in vector] for vector in (q, qd, *rest[:1])]
+        """Returns q, qd and, if the plant knows it, tau_x after a period."""
+        q, qd, *others = self._program.step(np.array(tau), 1.0 / self.rate_hz)
+        return [[float(number) for number in vector] for vector in (q, qd, *others[:1])]
 
-    def _place(self) -> list[float]:
-        if not self._bodies:
+    def _read_poses(self) -> list[float]:
+        """Returns the poses of all bodies, one after the other, seven numbers each."""
+        if not self._body_count:
             return []
-        poses = [[float(one) for one in pose] for pose in self._program.poses()]
-        if [len(pose) for pose in poses] != [7] * self._bodies:
+        poses = [[float(number) for number in pose] for pose in self._program.poses()]
+        if [len(pose) for pose in poses] != [_POSE_NUMBERS] * self._body_count:
             raise ValueError(
-                f"poses() is {poses}, not seven numbers for each of {count_nouns(self._bodies, 'body')}"
+                f"poses() is {poses}, not seven numbers for each of "
+                f"{count_nouns(self._body_count, 'body')}"
             )
-        if not all(math.isfinite(one) for pose in poses for one in pose):
+        numbers = [number for pose in poses for number in pose]
+        if not all(map(math.isfinite, numbers)):
             raise ValueError(f"poses() is {poses}, which is not finite")
-        return [one for pose in poses for one in pose]
+        return numbers
 
-    def _ask(self, tick: int, call: Callable[[], T]) -> T:
+    def _call(self, tick: int, function: Callable[[], T]) -> T:
+        """Returns the result of the plant's code at a tick.
+
+        Raises:
+            PlantFailed: the code raised an error.
+        """
         try:
-            found: T = self._watch(tick, call)
-            return found
-        except (Exception, SystemExit) as error:  # the user's code
-            raise self._failed(tick, f"{type(error).__name__}: {error}") from error
+            result: T = self._watch(tick, function)
+            return result
+        # The user's code may raise anything.
+        except (Exception, SystemExit) as error:
+            raise self._make_error(tick, f"{type(error).__name__}: {error}") from error
 
-    def _failed(self, tick: int, problem: str) -> PlantFailed:
+    def _make_error(self, tick: int, problem: str) -> PlantFailed:
         return PlantFailed(problem, site=self._site, code=self._code, tick=tick)
 
 
 def make_plant_players(scenario: "Scenario") -> dict[str, PlantPlayer]:
-    """Returns the players of all plants of one's own, by site.
+    """Returns the players of all users' own plants, by site.
 
     Raises:
         CodeWithheld: a class may not run.
-        ScenarioError: one cannot be made.
+        ScenarioError: a plant cannot be made.
     """
-    plants = ((name, spec.plant) for name, spec in scenario.sites.items())
     return {
-        name: PlantPlayer(scenario, name, one)
-        for name, one in plants
-        if isinstance(one, OwnPlant)
+        name: PlantPlayer(scenario, name, spec.plant)
+        for name, spec in scenario.sites.items()
+        if isinstance(spec.plant, OwnPlant)
     }
