@@ -200,7 +200,7 @@ class Recorder:
             report.poll()
             written_ns = self._clock.monotonic_ns()
             recording.flush()
-            report.flushed(self._clock.monotonic_ns() - written_ns)
+            report.note_flush(self._clock.monotonic_ns() - written_ns)
             self._clock.sleep_until(since_ns + FLUSH_NS)
 
 

@@ -1,15 +1,16 @@
-"""One log while it is recorded: messages written, accounts of missing ones, and the recorder's
-statistics.
+"""Record one session: write its messages, count missing messages, and publish statistics.
 
-Invariant: a message of this session is written once, byte for byte; any other is counted by
-reason. The recorder sends `stored` to a site when it has every message that it can get.
-Statistics, once a second, go to the bus and the log; they are bounded, and a stepping wall
-clock shows in them and nowhere else.
+Invariant:
+    - A message of the session is written once, byte for byte. Any other message is counted as
+      dropped, by reason.
+    - The recorder publishes `stored` about a site once it has every message of the site that it
+      can get.
+    - Statistics are published and recorded once a second, and their size is bounded. A step of
+      the wall clock is visible only in the statistics.
 """
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Any
 
 from trilat_net.errors import WireError, count_nouns
 from trilat_net.log.accounting import LAST, Account
@@ -26,28 +27,37 @@ from .backfill import GapRepair
 from .site_reception import InboundQueue, SiteMessage, SiteReception
 
 SETTLE_NS = 1_000_000_000
-"""Time for messages still under way of a site that has ended and is gone."""
+"""Wait for messages in transit after a site has ended and its token has disappeared."""
 RECONNECT_NS = 10_000_000_000
-"""Time for a site that has ended and keeps records that are missing, if its connection broke.
-"""
+"""Wait for a site that has ended and still holds missing records, if its connection broke."""
 HEARD_NS = 500_000_000
-"""A site that was heard within this time is there."""
+"""A site runs if a message of the site arrived within this time."""
 UNDER_WAY_NS = 100_000_000
-"""A message that arrives within this time of the end of its site's token was under way."""
+"""A message that arrives this long after its site's token disappeared may have been in transit.
+"""
 AWAY_NS = 15_000_000_000
-"""Time for a site that is gone without an end event: a cut link may heal."""
+"""Wait for a site that disappeared without an end event, because a cut link may heal."""
 STARTS_KEPT = 4096
-"""Starts that went before they were admitted."""
+"""Largest number of starts that are remembered before they are admitted."""
 LAST_NS = 6_000_000_000
-"""Longest stay of a site after its last due tick: 5 s, and a margin."""
+"""Longest stay of a site after its last due tick: 5 s and a margin."""
 
 
 class Recording:
-    """One log and its accounts.
+    """One log while it is recorded, and the accounts of its messages.
+
+    Args:
+        writer: writes the log.
+        scenario: the scenario of the session.
+        session: name of the session.
+        epoch: the epoch of the session.
+        bus: the connection to the session.
+        publisher: publishes the recorder's own events and puts them into the same queue as
+            other messages.
 
     Attributes:
-        accounts: messages of every channel, by its key.
-        publisher: the recorder's own events; it keeps them in the same queue as other messages.
+        accounts: account of the messages of each channel, by key.
+        dropped: number of messages that were not written, by reason.
     """
 
     def __init__(
@@ -59,17 +69,17 @@ class Recording:
         bus: Bus,
         publisher: EventPublisher,
     ) -> None:
-        self.dropped: Counter[str] = Counter()
-        self._writer = writer
         self.session = session
         self.epoch = epoch
         self.publisher = publisher
+        self.dropped: Counter[str] = Counter()
+        self._writer = writer
         self._scenario = scenario
         self._bus = bus
-        self._boots = dict(epoch.boots)
-        self._candidates = dict[str, int]()
-        self._confirmed: set[int] = set()
-        self._vanished: set[tuple[str, str]] = set()
+        self._boots = dict(epoch.boots)  # by site the start that is recorded now
+        self._candidates = dict[str, int]()  # by site a start that may be recorded next
+        self._admitted: set[int] = set()  # starts that other sites admitted
+        self._vanished: set[tuple[str, str]] = set()  # site and start of tokens that ended
         self._end_ns = epoch.mono_ns + round(scenario.duration_s * 1e9) + LAST_NS
         self._sites = {
             name: SiteReception(scenario, name, epoch.boots.get(name))
@@ -90,130 +100,145 @@ class Recording:
             for name, site in self._sites.items()
             for channel in site.accounts
         }
-        self._blocks = {
+        self._block_keys = {
             key for key, (_, channel) in self._channels.items() if channel == topics.STATE
         }
-        self._own = {
+        self._recorder_accounts = {
             topics.key(session, topics.RECORDER, channel): Account()
             for channel in (topics.EVENT, topics.STATS)
         }
         self.accounts = {
             key: site.accounts[channel] for key, (site, channel) in self._channels.items()
-        } | self._own
-        self._stored: set[str] = set()
-        self._gone: set[str] = set()
-        self._gone_ns: dict[str, int] = {}
+        }
+        self.accounts.update(self._recorder_accounts)
+        self._stored: set[str] = set()  # sites about which `stored` was published
+        self._gone: set[str] = set()  # sites whose token is not present
+        self._gone_ns: dict[str, int] = {}  # by site the time since when it is gone
         self._overflowed = 0
 
     def join_late(self, now_ns: int) -> None:
-        """Reports that the recorder joins a running session, and requests everything from every
-        site.
-        """
-        at_ns = now_ns - self.epoch.mono_ns
+        """Announces that the recorder joins a running session, and requests all messages."""
+        t_ns = now_ns - self.epoch.mono_ns
         sites = ", ".join(name for name in self._sites if name not in self._gone)
         self.publisher.publish(
             "late",
-            f"the recorder joins at t = {at_ns / 1e9:.3f} s; what was before is asked of {sites}",
-            t_ns=at_ns,
+            f"the recorder joins at t = {t_ns / 1e9:.3f} s; what was before is asked of {sites}",
+            t_ns=t_ns,
         )
         for name in self._gone:
-            self.publisher.publish("lost", f"{name} is gone", about=name, t_ns=at_ns)
+            self.publisher.publish("lost", f"{name} is gone", about=name, t_ns=t_ns)
         for repair in self._repairs.values():
             repair.probe()
 
     def assume_gone(self) -> None:
-        """Takes every site as gone until its token appears."""
+        """Regards every site as gone until its token appears."""
         self._gone = set(self._sites)
 
     def write(self, queue: InboundQueue, now_ns: int) -> None:
-        """Writes the queue, requests missing messages, and sends `stored` to sites that are
-        complete.
-        """
+        """Writes the messages of the queue, repairs gaps, and publishes `stored`."""
         self._drain(queue, now_ns)
         self._admit_starts()
-        log_time_ns = self.epoch.unix_ns + now_ns - self.epoch.mono_ns
         for name, repair in list(self._repairs.items()):
-            self._sites[name].since_ns = now_ns - self.epoch.mono_ns
-            silent_ns = self._silent_since_ns(name, now_ns)
-            alive = silent_ns is None or silent_ns > self._gone_ns[name]
-            for channel, message, payload in repair.poll(now_ns, alive=alive):
-                key = topics.key(self.session, name, channel)
-                sent_ns = max(message.t_ns, 0)  # an event before the epoch has no time
-                self._writer.add(
-                    key, payload, sent_ns, log_time_ns, message.sequence, message.content
-                )
-                self._note_admission(message.content)
+            self._repair_gaps(name, repair, now_ns)
         for name, site in self._sites.items():
-            if name in self._stored or not site.is_complete:
-                continue
-            self._stored.add(name)
-            text = f"every record of {name} is stored"
-            if shortage := site.describe_missing():
-                text = f"all that can be had of {name} is stored; missing for good: {shortage}"
-            t_ns = now_ns - self.epoch.mono_ns
-            self.publisher.publish(
-                "stored", text, t_ns=t_ns, about=name, ticks=site.final_ticks
+            if site.is_complete and name not in self._stored:
+                self._stored.add(name)
+                self._publish_stored(site, now_ns)
+
+    def _repair_gaps(self, name: str, repair: GapRepair, now_ns: int) -> None:
+        """Writes the missing messages of a site that have arrived, and requests more."""
+        t_ns = now_ns - self.epoch.mono_ns
+        self._sites[name].since_ns = t_ns
+        gone_since_ns = self._find_gone_since_ns(name, now_ns)
+        is_present = gone_since_ns is None or gone_since_ns > self._gone_ns[name]
+        for channel, message, payload in repair.poll(now_ns, alive=is_present):
+            key = topics.key(self.session, name, channel)
+            sent_ns = max(message.t_ns, 0)  # a log has no times before the epoch
+            log_time_ns = self.epoch.unix_ns + t_ns
+            self._writer.add(
+                key, payload, sent_ns, log_time_ns, message.sequence, message.content
             )
+            self._note_admission(message.content)
+
+    def _publish_stored(self, site: SiteReception, now_ns: int) -> None:
+        text = f"every record of {site.name} is stored"
+        missing = site.describe_missing()
+        if missing:
+            text = f"all that can be had of {site.name} is stored; missing for good: {missing}"
+        t_ns = now_ns - self.epoch.mono_ns
+        self.publisher.publish(
+            "stored", text, t_ns=t_ns, about=site.name, ticks=site.final_ticks
+        )
 
     def _drain(self, queue: InboundQueue, until_ns: int | None) -> None:
-        for arrived in queue.drain(until_ns):
+        """Writes the messages of the queue that arrived until a time; None: all messages."""
+        for message in queue.drain(until_ns):
             try:
-                if arrived.key in self._blocks:
-                    self._take_block(*arrived)
+                if message.key in self._block_keys:
+                    self._write_block(*message)
+                elif message.key in self._recorder_accounts:
+                    self._write_recorder_message(*message)
                 else:
-                    take = self._take_own if arrived.key in self._own else self._take
-                    take(*arrived)
+                    self._write_site_message(*message)
             except WireError as error:
                 self.dropped[error.reason] += 1
 
     def _admit_starts(self) -> None:
-        """Goes over to starts of sites that others admit, or where the one before is gone or
-        has ended.
+        """Begins to record the next start of each site that has a candidate.
+
+        The start before has to be gone or ended, or another site has to have admitted the
+        candidate.
         """
         for name, boot in list(self._candidates.items()):
             before = self._sites[name]
-            left = name in self._gone or name not in self._boots
-            if not (left or before.final_ticks is not None or boot in self._confirmed):
+            has_left = name in self._gone or name not in self._boots
+            has_ended = before.final_ticks is not None
+            if not (has_left or has_ended or boot in self._admitted):
                 continue
             del self._candidates[name]
             self._boots[name] = boot
-            site = self._sites[name] = SiteReception(self._scenario, name, boot, before)
-            repair = self._repairs[name] = GapRepair(
-                self._bus, self.session, site, self.dropped
-            )
+            site = SiteReception(self._scenario, name, boot, before)
+            repair = GapRepair(self._bus, self.session, site, self.dropped)
             repair.probe()
+            self._sites[name] = site
+            self._repairs[name] = repair
             for channel in site.accounts:
                 key = topics.key(self.session, name, channel)
                 self._channels[key] = (site, channel)
                 self.accounts[key] = site.accounts[channel]
             self._stored.discard(name)
             self._gone_ns.pop(name, None)
-            (self._gone.add if (name, str(boot)) in self._vanished else self._gone.discard)(
-                name
-            )
+            if (name, str(boot)) in self._vanished:
+                self._gone.add(name)
+            else:
+                self._gone.discard(name)
 
     def _note_start(self, name: str, payload: bytes) -> None:
+        """Notes a candidate if a payload is the event by which a site joins again."""
         event = decode(payload, Event)
-        comes = event.kind in ("coming", "join") and event.boots.get(name) == event.boot
-        if comes and event.member == name and self._scenario.sites_may_return:
+        if event.kind not in ("coming", "join") or event.member != name:
+            return
+        if event.boots.get(name) == event.boot and self._scenario.sites_may_return:
             self._candidates[name] = event.boot
             self._admit_starts()
 
     def _note_admission(self, event: object) -> None:
+        """Notes a start that another site admits, and the last tick known of the start before."""
         if not isinstance(event, Event) or event.about not in self._sites:
             return
         boot = event.boots.get(event.about)
-        is_known = boot == self._boots.get(event.about)
-        if event.kind == LAST and is_known:
+        is_recorded = boot == self._boots.get(event.about)
+        if event.kind == LAST and is_recorded:
             self._sites[event.about].count_previous_start(event.ticks)
-        if event.kind != "admit" or boot is None or is_known:
+        if event.kind != "admit" or boot is None or is_recorded:
             return
-        if self._scenario.sites_may_return and len(self._confirmed) < STARTS_KEPT:
-            self._confirmed.add(boot)
+        if self._scenario.sites_may_return and len(self._admitted) < STARTS_KEPT:
+            self._admitted.add(boot)
             self._candidates[event.about] = boot
             self._admit_starts()
 
     def _read(self, key: str, payload: bytes) -> tuple[SiteReception, SiteMessage]:
+        """Decodes a message of a site, which may be the first message of its next start."""
         site, channel = self._channels[key]
         try:
             return site, site.read(channel, payload)
@@ -224,7 +249,7 @@ class Recording:
             site, channel = self._channels[key]
             return site, site.read(channel, payload)
 
-    def _take(self, key: str, payload: bytes, mono_ns: int) -> None:
+    def _write_site_message(self, key: str, payload: bytes, mono_ns: int) -> None:
         since_ns = mono_ns - self.epoch.mono_ns
         if key not in self._channels:
             raise WireError("stranger", key)
@@ -233,13 +258,16 @@ class Recording:
         channel = self._channels[key][1]
         if channel == topics.EVENT:
             self._note_admission(message.content)
-        if site.accept(channel, message, mono_ns):
-            t_ns = message.t_ns if message.t_ns >= 0 or channel != topics.EVENT else since_ns
-            log_time_ns = self.epoch.unix_ns + since_ns
-            self._writer.add(key, payload, t_ns, log_time_ns, message.sequence, message.content)
+        if not site.accept(channel, message, mono_ns):
+            return
+        sent_ns = message.t_ns
+        if sent_ns < 0 and channel == topics.EVENT:
+            sent_ns = since_ns  # an event before the epoch gets the time of its arrival
+        log_time_ns = self.epoch.unix_ns + since_ns
+        self._writer.add(key, payload, sent_ns, log_time_ns, message.sequence, message.content)
 
-    def _take_block(self, key: str, block: bytes, mono_ns: int) -> None:
-        """Writes the records of a block; one that is none drops those after it."""
+    def _write_block(self, key: str, block: bytes, mono_ns: int) -> None:
+        """Writes the records of a block up to the first payload that is not a valid record."""
         site = self._channels[key][0]
         since_ns = mono_ns - self.epoch.mono_ns
         site.since_ns = since_ns
@@ -248,167 +276,178 @@ class Recording:
         for payload, record in site.accept_records(split_states(block), mono_ns):
             add(key, payload, record.sent_ns, log_time_ns, record.tick, record)
 
-    def _take_own(self, key: str, payload: bytes, mono_ns: int) -> None:
-        account = self._own[key]
+    def _write_recorder_message(self, key: str, payload: bytes, mono_ns: int) -> None:
+        """Writes an event or statistics of this recorder."""
+        account = self._recorder_accounts[key]
         since_ns = mono_ns - self.epoch.mono_ns
+        content: Event | None = None
         if key.endswith(topics.STATS):
-            stats = decode(payload, RecorderStats)
-            boot = stats.boot
-            number = account.expected
-            content = None
+            boot = decode(payload, RecorderStats).boot
+            number = account.expected  # statistics state no number
         else:
-            event = decode(payload, Event)
-            if event.member != topics.RECORDER:
+            content = decode(payload, Event)
+            if content.member != topics.RECORDER:
                 raise WireError("stranger", key)
-            boot = event.boot
-            number = event.n
-            content = event
+            boot = content.boot
+            number = content.n
         if boot != self.publisher.info.boot:
             raise WireError("another recorder", key)
         if number >= 0 and account.receive(number, mono_ns):
-            self._writer.add(
-                key, payload, since_ns, self.epoch.unix_ns + since_ns, number, content
-            )
+            log_time_ns = self.epoch.unix_ns + since_ns
+            self._writer.add(key, payload, since_ns, log_time_ns, number, content)
 
     def note_presence(self, key: str, alive: bool) -> None:
-        """Notes a member's token that appeared or disappeared."""
+        """Notes that the token of a member appeared or disappeared."""
         parts = topics.parse_key(key)
         if parts is None or parts.member not in self._sites:
             return
-        if str(self._boots.get(parts.member)) == parts.boot:
-            (self._gone.discard if alive else self._gone.add)(parts.member)
-        elif not alive and len(self._vanished) < STARTS_KEPT:
-            self._vanished.add((parts.member, parts.boot))
+        if str(self._boots.get(parts.member)) != parts.boot:
+            if not alive and len(self._vanished) < STARTS_KEPT:
+                self._vanished.add((parts.member, parts.boot))
+        elif alive:
+            self._gone.discard(parts.member)
+        else:
+            self._gone.add(parts.member)
 
-    def _silent_since_ns(self, site: str, now_ns: int) -> int | None:
-        """Returns since when a site is gone; None while its token is present.
+    def _find_gone_since_ns(self, site: str, now_ns: int) -> int | None:
+        """Returns the time since when a site is gone, ns; None while its token is present.
 
-        A reconnection may report a token's end after its return: a message of the site that
-        arrives later than those under way proves that it is still present.
+        After a reconnection the end of a token may be reported after its return. A message of
+        the site that arrives later than `UNDER_WAY_NS` proves that the site is still present;
+        then the arrival of that message is returned.
         """
         if site not in self._gone:
             self._gone_ns.pop(site, None)
             return None
         gone_ns = self._gone_ns.setdefault(site, now_ns)
-        heard_ns = self._sites[site].last_received_ns
-        return gone_ns if heard_ns is None or heard_ns < gone_ns + UNDER_WAY_NS else heard_ns
+        last_ns = self._sites[site].last_received_ns
+        if last_ns is None or last_ns < gone_ns + UNDER_WAY_NS:
+            return gone_ns
+        return last_ns
 
     def is_over(self, now_ns: int) -> bool:
         """True once every site has all its messages stored, or is gone for good."""
-        left = [self._has_left(name, now_ns) for name in self._sites]  # each notes the time
-        return all(left)
+        # a list, because `_has_left` notes for every site since when it is gone
+        return all([self._has_left(name, now_ns) for name in self._sites])
 
     def _has_left(self, site: str, now_ns: int) -> bool:
+        """True if all messages of a site are stored, or if the site is gone for good."""
         if site in self._stored:
             return True
-        since_ns = self._silent_since_ns(site, now_ns)
+        since_ns = self._find_gone_since_ns(site, now_ns)
         if since_ns is None:
             return False
-        patience_ns = SETTLE_NS
+        wait_ns = SETTLE_NS
         if self._sites[site].final_ticks is None:
-            patience_ns = max(SETTLE_NS, min(AWAY_NS, self._end_ns - since_ns))
+            wait_ns = max(SETTLE_NS, min(AWAY_NS, self._end_ns - since_ns))
         elif not self._sites[site].is_complete:
-            patience_ns = RECONNECT_NS
-        return now_ns - since_ns > patience_ns
+            wait_ns = RECONNECT_NS
+        return now_ns - since_ns > wait_ns
 
     def is_up_to_date(self, ending_ns: int, now_ns: int) -> bool:
-        """True once nothing more can be had of any site, since the recorder was asked to end.
+        """True once the recorder has every message that any site can send by now.
 
-        A site that goes on is one that is heard `SETTLE_NS` after that, without an end, and
-        lacks nothing.
+        That holds for a site that has left, and for a site that still runs and lacks no message
+        `SETTLE_NS` after the recorder was asked to end.
 
         Args:
-            ending_ns: when the recorder was asked to end, on its monotonic clock.
-            now_ns: the time on that clock.
+            ending_ns: time at which the recorder was asked to end, on its monotonic clock, ns.
+            now_ns: the present time on that clock, ns.
         """
         for name, site in self._sites.items():
             if self._has_left(name, now_ns):
                 continue
-            heard_ns = site.last_received_ns or 0
-            is_running = (
-                site.final_ticks is None
-                and now_ns - heard_ns < HEARD_NS
-                and not site.lacks_messages
-            )
-            if not (is_running and now_ns - ending_ns > SETTLE_NS):
+            silence_ns = now_ns - (site.last_received_ns or 0)
+            is_running = site.final_ticks is None and silence_ns < HEARD_NS
+            if not is_running or site.lacks_messages or now_ns - ending_ns <= SETTLE_NS:
                 return False
         return True
 
     def flush(self) -> None:
-        """Hands everything so far to the operating system."""
+        """Hands all written messages to the operating system."""
         self._writer.flush()
 
     def finish(self, queue: InboundQueue, *, rest: bool = True) -> None:
-        """Writes the rest of the queue, if that is wanted, the accounts and the end mark."""
+        """Finishes the log with its accounts and its end mark.
+
+        Args:
+            queue: the queue of received messages.
+            rest: whether the messages that still wait in the queue are written before.
+        """
         if rest:
             self._drain(queue, None)
         self._overflowed = sum(queue.overflowed.values())
         self._writer.finish(self.render_accounts(queue))
 
     def render_accounts(self, queue: InboundQueue) -> dict[str, str]:
-        """Returns the accounts as they stand in the file: per topic, and dropped messages by
-        reason.
-        """
-        before = {
+        """Returns the accounts as texts of the file, by topic, and the dropped messages."""
+        event_accounts = {
             topics.key(self.session, name, topics.EVENT): site.event_accounts
             for name, site in self._sites.items()
         }
-        texts = {
-            f"/{key}": f"{account.describe(*before.get(key, ()))}, overflowed {queue.overflowed[key]}"
-            for key, account in self.accounts.items()
-        }
-        return {
-            **texts,
-            **{f"dropped: {reason}": str(count) for reason, count in self.dropped.items()},
-        }
+        texts = {}
+        for key, account in self.accounts.items():
+            counts = account.describe(*event_accounts.get(key, ()))
+            texts[f"/{key}"] = f"{counts}, overflowed {queue.overflowed[key]}"
+        for reason, count in self.dropped.items():
+            texts[f"dropped: {reason}"] = str(count)
+        return texts
 
     def render_summary(self) -> list[str]:
-        """Returns a line for every site, and for messages turned away or dropped."""
-        lines = []
-        for name, site in self._sites.items():
-            account = site.accounts[topics.STATE]
-            total = (
-                " records, its end is unknown"
-                if site.final_ticks is None
-                else f" of {count_nouns(account.expected, 'record')}"
-            )
-            lines.append(
-                f"recorder: {name}: {account.received}{total}, {account.missing} missing, "
-                f"{account.duplicate} duplicate, largest gap {account.largest_gap}"
-                + (f", {account.refilled} from its memory" if account.refilled else "")
-                + (
-                    f", {account.unpublished} not made while it was away"
-                    if account.unpublished
-                    else ""
-                )
-            )
+        """Returns lines on every site, on messages that did not fit, and on dropped messages."""
+        lines = [self._summarize_site(site) for site in self._sites.values()]
         if self._overflowed:
-            lines.append(
-                f"recorder: {count_nouns(self._overflowed, 'message')} turned away because the queue was full"
-            )
-        return lines + [
-            f"recorder: {count_nouns(count, 'message')} dropped: {reason}"
-            for reason, count in self.dropped.items()
-        ]
+            messages = count_nouns(self._overflowed, "message")
+            lines.append(f"recorder: {messages} turned away because the queue was full")
+        for reason, count in self.dropped.items():
+            lines.append(f"recorder: {count_nouns(count, 'message')} dropped: {reason}")
+        return lines
+
+    def _summarize_site(self, site: SiteReception) -> str:
+        account = site.accounts[topics.STATE]
+        total = f" of {count_nouns(account.expected, 'record')}"
+        if site.final_ticks is None:
+            total = " records, its end is unknown"
+        line = (
+            f"recorder: {site.name}: {account.received}{total}, {account.missing} missing, "
+            f"{account.duplicate} duplicate, largest gap {account.largest_gap}"
+        )
+        if account.refilled:
+            line += f", {account.refilled} from its memory"
+        if account.unpublished:
+            line += f", {account.unpublished} not made while it was away"
+        return line
 
     def describe_problem(self) -> str | None:
-        """Describes what is missing; None if nothing is."""
+        """Returns the first problem of the recording as text; None if it is complete."""
         for name, site in self._sites.items():
             if site.final_ticks is None:
-                return f"{name} disappeared after {count_nouns(site.accounts[topics.STATE].received, 'record')}"
-            if shortage := site.describe_missing():
-                return f"missing of {name}: {shortage}"
+                records = count_nouns(site.accounts[topics.STATE].received, "record")
+                return f"{name} disappeared after {records}"
+            missing = site.describe_missing()
+            if missing:
+                return f"missing of {name}: {missing}"
         return None
 
 
 REPORT_EVERY_NS = 1_000_000_000
+"""Period of the statistics."""
 MAX_GAPS_REPORTED = 20
-"""Gaps named of a channel; fewer with many channels."""
+"""Largest number of gaps of a channel in the statistics; smaller if there are many channels."""
 _ALL_GAPS = 600
+"""Largest number of gaps of all channels together in the statistics."""
 
 
 class RecorderReport:
-    """The statistics of one recording; `size` returns the bytes of its log."""
+    """Publishes the statistics of one recording.
+
+    Args:
+        bus: the connection to the session.
+        clock: the time.
+        recording: the recording.
+        queue: the queue of received messages, which gets the statistics as well.
+        size: returns the size of the log, bytes.
+    """
 
     def __init__(
         self,
@@ -427,9 +466,9 @@ class RecorderReport:
         self._flush_max_ns = 0
         self._due_ns = clock.monotonic_ns() + REPORT_EVERY_NS
 
-    def flushed(self, took_ns: int) -> None:
+    def note_flush(self, duration_ns: int) -> None:
         """Notes the duration of a flush, ns."""
-        self._flush_max_ns = max(self._flush_max_ns, took_ns)
+        self._flush_max_ns = max(self._flush_max_ns, duration_ns)
 
     def poll(self) -> None:
         """Publishes the statistics if they are due."""
@@ -441,47 +480,38 @@ class RecorderReport:
 
     def publish(self) -> None:
         """Publishes the statistics, and puts them into the queue."""
-        payload = encode(self._stats())
+        payload = encode(self._make_stats())
         self._flush_max_ns = 0
         self._queue.receive(self._key, payload)
         self._publish(payload)
 
-    def _stats(self) -> RecorderStats:
-        accounts = {  # by member and channel, as in "m1/state"
-            "/".join(key.split("/")[2:]): account
-            for key, account in self._recording.accounts.items()
-        }
-        most = max(1, min(MAX_GAPS_REPORTED, _ALL_GAPS // len(accounts)))
+    def _make_stats(self) -> RecorderStats:
+        recording = self._recording
         now_ns = self._clock.monotonic_ns()
-        counts: dict[str, Any] = {
-            field: {name: getattr(account, field) for name, account in accounts.items()}
-            for field in (
-                "expected",
-                "received",
-                "missing",
-                "duplicate",
-                "reordered",
-                "refilled",
-            )
-        }
-        return RecorderStats(
-            boot=self._recording.publisher.info.boot,
-            t_ns=now_ns - self._recording.epoch.mono_ns,
-            **counts,
-            gaps={
-                name: account.format_gaps(most)
-                for name, account in accounts.items()
-                if account.missing
-            },
-            overflowed={
-                name: self._queue.overflowed[key]
-                for name, key in zip(accounts, self._recording.accounts, strict=True)
-            },
-            silence_us={name: account.silence_ns // 1000 for name, account in accounts.items()},
-            dropped=dict(self._recording.dropped),
+        stats = RecorderStats(
+            boot=recording.publisher.info.boot,
+            t_ns=now_ns - recording.epoch.mono_ns,
+            expected={},
+            received={},
+            missing={},
+            dropped=dict(recording.dropped),
             queued=len(self._queue),
             written_bytes=self._size(),
             flush_max_us=self._flush_max_ns // 1000,
             mono_ns=now_ns,
             unix_ns=self._clock.unix_ns(),
         )
+        gap_limit = max(1, min(MAX_GAPS_REPORTED, _ALL_GAPS // len(recording.accounts)))
+        for key, account in recording.accounts.items():
+            name = "/".join(key.split("/")[2:])  # member and channel, as in "m1/state"
+            stats.expected[name] = account.expected
+            stats.received[name] = account.received
+            stats.missing[name] = account.missing
+            stats.duplicate[name] = account.duplicate
+            stats.reordered[name] = account.reordered
+            stats.refilled[name] = account.refilled
+            if account.missing:
+                stats.gaps[name] = account.format_gaps(gap_limit)
+            stats.overflowed[name] = self._queue.overflowed[key]
+            stats.silence_us[name] = account.silence_ns // 1000
+        return stats

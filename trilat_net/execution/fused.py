@@ -1,15 +1,17 @@
-"""The virtual-time driver without a log: all sites in one compiled loop, about 1000 times real
-time.
+"""Run all sites of a scenario in one compiled loop, without a log.
 
-It keeps the peaks of every 50 ms, and sums over the run, in place of records.
+The loop runs at about 1000 times real time. In place of records it keeps the peaks of every 50
+ms and sums over the run.
 
-Invariant: the result equals `execution.virtual` with its default network, bit for bit;
-scenarios that the compiled loop cannot run are refused. Between two states only floating-point
-numbers are mixed; counters, times and modes are those of one of them, and numbers that are
-equal in both stay as they are, bit for bit.
-
-A run with the inputs of a log is the recorded one, bit for bit. A sample that came before its
-own stamp is handed over at the first tick after it: none is in use earlier (L2).
+Invariant:
+    - The result equals that of `execution.virtual` with its default network, bit for bit.
+      Scenarios that the compiled loop cannot run are refused.
+    - A run with the inputs of a log equals the recorded run, bit for bit. A sample that arrived
+      before its own stamp is delivered at the first tick after the stamp, because no sample is
+      in use earlier (L2).
+    - `FusedRun.scale_difference` mixes only the floating-point numbers of two states. Counters,
+      times and modes become those of the other run, and numbers that are equal in both runs
+      keep their bits.
 """
 
 import math
@@ -51,17 +53,24 @@ from ..scenario.own_plant import PlantPlayer
 from ..scenario.validate import refuse_external_arms
 
 
-def _float_words(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
+def _find_float_words(dtype: np.dtype[np.generic]) -> NDArray[np.bool_]:
+    """Returns which words of eight bytes of a data type hold a floating-point number."""
     if dtype.fields is None:
         return np.full(max(1, dtype.itemsize // 8), dtype.base.kind == "f")
-    words = np.zeros(dtype.itemsize // 8, dtype=bool)
-    for field, offset, *_ in dtype.fields.values():
-        words[offset // 8 : (offset + field.itemsize) // 8] = _float_words(field)
-    return words
+    is_float = np.zeros(dtype.itemsize // 8, dtype=bool)
+    for field_dtype, offset, *_ in dtype.fields.values():
+        start = offset // 8
+        stop = (offset + field_dtype.itemsize) // 8
+        is_float[start:stop] = _find_float_words(field_dtype)
+    return is_float
 
 
 class RunState:
-    """The arrays that a run changes, all of words of eight bytes; they stay where they are."""
+    """The arrays that a run changes, as words of eight bytes in the memory of the run.
+
+    Args:
+        arrays: the arrays.
+    """
 
     def __init__(self, arrays: Sequence[NDArray[np.generic]]) -> None:
         self._words: list[NDArray[np.int64]] = []
@@ -69,46 +78,59 @@ class RunState:
         for array in arrays:
             if array.size:
                 flat = array.reshape(-1).view(np.int64)
-                assert np.shares_memory(flat, array)  # a copy would not be the run's
+                assert np.shares_memory(
+                    flat, array
+                )  # changes of a copy would not reach the run
                 self._words.append(flat)
-                self._floats.append(np.tile(_float_words(array.dtype), array.size))
+                self._floats.append(np.tile(_find_float_words(array.dtype), array.size))
 
     def scale_difference(self, other: "RunState", factor: float) -> None:
-        """Becomes another state of the same run plus so much of the difference to it; 0: its
-        very bits.
+        """Multiplies the difference to another state of the same scenario by a factor.
+
+        The state becomes other + factor (state - other). With factor 0 it gets the bits of the
+        other state. Numbers that would not be finite become those of the other state.
+
+        Args:
+            other: the other state.
+            factor: the factor.
         """
-        for own, its, floats in zip(self._words, other._words, self._floats, strict=True):
+        arrays = zip(self._words, other._words, self._floats, strict=True)
+        for words, other_words, is_float in arrays:
             if factor == 0.0:
-                own[:] = its
+                words[:] = other_words
                 continue
-            changed = np.flatnonzero((own != its) & floats)
-            x = own.view(np.float64)[changed]
-            y = its.view(np.float64)[changed]
+            changed = np.flatnonzero((words != other_words) & is_float)
+            x = words.view(np.float64)[changed]
+            y = other_words.view(np.float64)[changed]
             mixed: Array = y + factor * (x - y)
-            own[:] = its
-            own.view(np.float64)[changed] = np.where(np.isfinite(mixed), mixed, y)
+            words[:] = other_words
+            words.view(np.float64)[changed] = np.where(np.isfinite(mixed), mixed, y)
 
 
 def check_fusable(scenario: Scenario, plants: Collection[str] = ()) -> None:
-    """Refuses a scenario that the compiled loop cannot run; arms of `plants` are moved by
-    those.
+    """Checks that the compiled loop can run a scenario.
+
+    Args:
+        scenario: the scenario.
+        plants: names of the sites whose external arm is moved by a plant.
 
     Raises:
-        ScenarioError: another arm is external, or a site is so much slower than another that
-            too many samples would arrive in one of its ticks.
+        ScenarioError: another arm is external, or one site is so much slower than another site
+            that too many samples would arrive in one of its ticks.
     """
     refuse_external_arms(scenario, plants)
-    if (ratio := _largest_ratio(scenario)) > MAX_ARRIVALS:
+    ratio = _find_largest_ratio(scenario)
+    if ratio > MAX_ARRIVALS:
         raise ScenarioError(
-            f"the fastest site makes {count_nouns(ratio, 'tick')} within one of the "
-            f"slowest, at most {MAX_ARRIVALS} "
-            "are taken",
+            f"the fastest site makes {count_nouns(ratio, 'tick')} within one tick of the "
+            f"slowest; at most {MAX_ARRIVALS} samples arrive in a tick",
             path="rate_hz",
             source=scenario.name,
         )
 
 
-def _largest_ratio(scenario: Scenario) -> int:
+def _find_largest_ratio(scenario: Scenario) -> int:
+    """Returns the ratio of the largest to the smallest tick rate, rounded up."""
     rates_hz = [spec.rate_hz for spec in scenario.sites.values()]
     return math.ceil(max(rates_hz) / min(rates_hz))
 
@@ -117,21 +139,27 @@ class HandActor(Protocol):
     """A live hand in a compiled run."""
 
     def compute_actions(self, k: int, end: int, arrays: SiteArrays) -> Array:
-        """Returns what it does from tick k until it needs the arm again, before tick `end`, a
-        row a tick.
+        """Returns the actions of the hand from tick `k` until it has to see the arm again.
 
-        A row is as `HandInForce`.
+        Args:
+            k: the first tick.
+            end: the tick before which the actions end in any case.
+            arrays: the arrays of the site before tick `k`.
+
+        Returns:
+            The actions, a row per tick, as `HandInForce`.
         """
 
 
 class RunTotals(NamedTuple):
-    """Numbers of a whole run.
+    """Figures of a whole run.
 
     Attributes:
-        rms_error_rad: RMS of e of the worst joint of all sites.
-        effort_nm: RMS over sites and joints of tau - G(q), the torque beyond what gravity asks.
-        force_peak_n: the largest force of a wall; None without a wall.
-        walls_j: the work of the environments on the arms; None without one.
+        rms_error_rad: RMS of e of the worst joint of all sites, rad.
+        effort_nm: RMS over sites and joints of tau - G(q), the torque beyond the torque against
+            gravity, N m.
+        force_peak_n: largest force of a wall, N; None without a wall.
+        walls_j: work of the environments on the arms, J; None without an environment.
     """
 
     rms_error_rad: float
@@ -141,14 +169,14 @@ class RunTotals(NamedTuple):
 
 
 class RunInputs(NamedTuple):
-    """What a recorded run got from outside, for a run that is to be the same.
+    """The inputs of a recorded run, for a run that has to equal it.
 
     Attributes:
-        feed: arrivals, and what live hands did.
-        changes: the tick before which a site takes a change in, the site's place, and the
-            change, by time.
-        late_ns: by how much samples came late, at the most, ns.
-        longest_us: the longest delay that a change gave a link, us.
+        feed: arrivals of samples, and actions of live hands.
+        changes: changes during the run in order of time, as (tick before which the site applies
+            the change, index of the site, change).
+        late_ns: largest time from the stamp of a sample to its arrival, ns.
+        longest_us: longest delay that a change gave to a link, us.
     """
 
     feed: RecordedFeed
@@ -158,28 +186,41 @@ class RunInputs(NamedTuple):
 
 
 def make_prompt_inputs(sites: int) -> RunInputs:
-    """Returns the inputs of a run in virtual time: every sample comes at once, and no live hand
-    acts.
+    """Returns the inputs of a run with prompt samples and without live hands.
+
+    Args:
+        sites: number of sites.
     """
-    nothing = RecordedFeed(
-        np.zeros((sites, max(sites - 1, 1), 0), np.int64),
-        np.zeros(0, np.int64),
-        np.zeros((sites, 0, 1)),
-        np.full(sites, -1),
+    feed = RecordedFeed(
+        first=np.zeros((sites, max(sites - 1, 1), 0), np.int64),
+        samples=np.zeros(0, np.int64),
+        hands=np.zeros((sites, 0, 1)),
+        hand_rows=np.full(sites, -1),
     )
-    return RunInputs(nothing)
+    return RunInputs(feed)
 
 
 class FusedRun:
-    """A run of all sites of a scenario; from |e| = `settled_rad` on, a site is not settled.
+    """A run of all sites of a scenario in a compiled loop.
 
-    Laws that are compiled run in the loop; those in plain Python are asked between its stages,
-    tick by tick. `keep` of a site's last records are kept for `pop_records`. With `inputs` it
-    is a recorded run again; else hands of one's own act, and `hands` in their place: the loop
-    pauses where one is asked. `plants` move arms of sites, between any two ticks.
+    Compiled laws run in the loop. Laws in plain Python are called between its stages, tick by
+    tick. The loop pauses at the ticks at which a hand has to see its arm, and after every tick
+    of a site whose arm is moved by a plant.
+
+    Args:
+        scenario: the scenario.
+        settled_rad: a site is settled while its |e| is smaller than this, rad.
+        keep: number of last records of each site that are kept for `pop_records`.
+        inputs: inputs of a recorded run, which is executed again; hands then do not act.
+        hands: live hands by site, in place of those that the scenario names as programs.
+        plants: plants that move external arms, by site.
+
+    Attributes:
+        ran_s: time up to which `advance_to` has executed the run, s.
 
     Raises:
-        ScenarioError: see `check_fusable`; or a law cannot be made.
+        ScenarioError: the loop cannot run the scenario, see `check_fusable`, or a law cannot be
+            constructed.
     """
 
     def __init__(
@@ -192,89 +233,106 @@ class FusedRun:
         plants: Mapping[str, PlantPlayer] = {},
     ) -> None:
         check_fusable(scenario, plants)
+        names = scenario.names
+        count = len(names)
+        setups = [scenario.setup(name) for name in names]
+        self.ran_s = 0.0
         self._scenario = scenario
         self._settled_rad = settled_rad
-        self._inputs = inputs or make_prompt_inputs(len(scenario.names))
-        setups = [scenario.setup(name) for name in scenario.names]
+        self._inputs = inputs or make_prompt_inputs(count)
         self._hands: dict[int, HandActor] = {}
         if inputs is None:
-            self._meet_hands({**make_hand_players(scenario), **hands}, setups)
-        changes = self._inputs.changes
+            self._connect_hands({**make_hand_players(scenario), **hands}, setups)
+        self._changes = deque(self._inputs.changes)
         self._tables = stack_site_arrays(
-            setups, len(changes), self._inputs.longest_us, self._inputs.late_ns
+            setups, len(self._changes), self._inputs.longest_us, self._inputs.late_ns
         )
-        self._changes = deque(changes)
         self._layouts = [setup.layout for setup in setups]
         self._plug_laws(setups)
-        joints = max(max(layout.joints, layout.shared) for layout in self._layouts)
-        count = len(scenario.names)
         self._progress: RowArray = np.zeros(count, PROGRESS_DTYPE)
-        self._progress["rate_hz"] = [scenario.sites[name].rate_hz for name in scenario.names]
-        self._progress["apart_ns"] = self._progress["diverged_ns"] = -1
+        self._progress["rate_hz"] = [scenario.sites[name].rate_hz for name in names]
+        self._progress["apart_ns"] = -1
+        self._progress["diverged_ns"] = -1
         self._taken = np.zeros((count, count - 1), dtype=np.int64)
-        late_ticks = self._inputs.late_ns * int(self._progress["rate_hz"].max()) // NS_PER_S + 2
-        kept = 1 << max(_largest_ratio(scenario) + 1, keep, late_ticks).bit_length()
-        floats = max(layout.floats for layout in self._layouts)
-        self._sent = KeptRecords(
-            np.zeros((count, kept), dtype=np.int64), np.zeros((count, kept, floats))
-        )
+        self._sent = self._allocate_records(keep)
+        joints = max(max(layout.joints, layout.shared) for layout in self._layouts)
         self._peaks = np.full((count, 0, 3 * joints), -1.0)
         self._sums: RowArray = np.zeros(count, sums_dtype(joints))
         self._sums["first_environment"] = [
             len(spec.hands) if spec.environment else -1 for spec in scenario.sites.values()
         ]
-        self._taken_ticks = [0] * count
-        self._plants = {
-            i: plants[name] for i, name in enumerate(scenario.names) if name in plants
-        }
-        self._torques = {i: self._layouts[i].columns()["tau"] for i in self._plants}
-        self._acted = dict[int, int]()
-        self._moved = dict.fromkeys(self._plants, 0)
+        self._plants = {i: plants[name] for i, name in enumerate(names) if name in plants}
+        self._torque_columns = {i: self._layouts[i].columns()["tau"] for i in self._plants}
+        self._popped_ticks = [0] * count  # by site, see `pop_records`
+        self._action_ends = dict[int, int]()  # by site the tick after the hand's last action
+        self._plant_ticks = dict.fromkeys(self._plants, 0)  # by site the tick of its plant
         self._selected: dict[int, SiteArrays] = {}
-        self.ran_s = 0.0
 
-    def _meet_hands(self, hands: Mapping[str, HandActor], setups: Sequence[SiteSetup]) -> None:
-        """Makes room for what hands do, of every tick; each is asked at ticks of its own."""
+    def _allocate_records(self, keep: int) -> KeptRecords:
+        """Returns room for the last records of every site, of a power of two of records.
+
+        Records are kept for `pop_records`, until the slowest peer has received them, and until
+        the latest sample of a recorded run has arrived.
+        """
+        count = len(self._layouts)
+        fastest_hz = int(self._progress["rate_hz"].max())
+        late_ticks = self._inputs.late_ns * fastest_hz // NS_PER_S + 2
+        needed = max(_find_largest_ratio(self._scenario) + 1, keep, late_ticks)
+        pages = 1 << needed.bit_length()
+        floats = max(layout.floats for layout in self._layouts)
+        return KeptRecords(
+            t_ns=np.zeros((count, pages), dtype=np.int64),
+            rows=np.zeros((count, pages, floats)),
+        )
+
+    def _connect_hands(
+        self, hands: Mapping[str, HandActor], setups: Sequence[SiteSetup]
+    ) -> None:
+        """Connects live hands to their sites and prepares the feed for their actions."""
         self._hands = {
             i: hands[setup.name] for i, setup in enumerate(setups) if setup.name in hands
         }
-        if self._hands:
-            rows = [
-                _find_live_row(setup) if i in self._hands else -1
-                for i, setup in enumerate(setups)
-            ]
-            size = max((setups[i].layout.hand - 3) // 2 for i in self._hands)
-            acts = np.zeros((len(setups), 0, 1 + 2 * size))
-            feed = self._inputs.feed._replace(hands=acts, hand_rows=np.array(rows))
-            self._inputs = self._inputs._replace(feed=feed)
+        if not self._hands:
+            return
+        rows = [-1] * len(setups)
+        for i in self._hands:
+            rows[i] = _find_live_row(setups[i])
+        size = max((setups[i].layout.hand - 3) // 2 for i in self._hands)
+        actions = np.zeros((len(setups), 0, 1 + 2 * size))
+        feed = self._inputs.feed._replace(hands=actions, hand_rows=np.array(rows))
+        self._inputs = self._inputs._replace(feed=feed)
 
     def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
-        tables = self._tables
-        count = len(setups)
+        """Constructs the user laws of all sites and connects them to the arrays of the run."""
         self._laws: dict[int, PlainLaw | CompiledLaw] = {}
         self._law_arrays: LawArrays | None = None
-        if tables.channel is None:
+        if self._tables.channel is None:
             return
+        count = len(setups)
         sent = np.zeros((count, max(setup.channel.record_size for setup in setups)))
         for i, setup in enumerate(setups):
             if setup.own is not None:
-                own = select_site(tables, i, setup.layout)
+                arrays = select_site(self._tables, i, setup.layout)
                 law = setup.own(setup.law_context())
-                self._laws[i] = plug_law(law, setup, own, sent[i, : setup.channel.record_size])
+                channel = sent[i, : setup.channel.record_size]
+                self._laws[i] = plug_law(law, setup, arrays, channel)
         compiled = {i: law for i, law in self._laws.items() if isinstance(law, CompiledLaw)}
         addresses = np.zeros(count, dtype=np.int64)
-        rows = np.zeros((count, max((len(one.row) for one in compiled.values()), default=0)))
-        for i, one in compiled.items():
-            rows[i, : len(one.row)] = one.row
-            one.row = rows[i]
-            addresses[i] = one.address
+        row_size = max((len(law.row) for law in compiled.values()), default=0)
+        rows = np.zeros((count, row_size))
+        for i, compiled_law in compiled.items():
+            rows[i, : len(compiled_law.row)] = compiled_law.row
+            compiled_law.row = rows[i]
+            addresses[i] = compiled_law.address
         self._law_arrays = LawArrays(addresses, rows, sent)
 
     def step_to(self, last_ns: int) -> None:
-        """Makes the planned ticks up to a time, ns since the epoch, and takes in the changes
-        before it.
+        """Executes the planned ticks up to a time, and applies the changes before that time.
 
         A diverged run stays as it is.
+
+        Args:
+            last_ns: the time, ns since the epoch.
 
         Raises:
             LawFailed: a plugged law failed.
@@ -292,102 +350,131 @@ class FusedRun:
             self._step_until(last_ns)
 
     def _step_until(self, last_ns: int) -> None:
-        """Steps every site up to a time, in pieces within which no hand is asked and no plant
-        moves.
+        """Executes the planned ticks up to a time, in pieces between actions of programs.
+
+        Within a piece no hand has to see its arm and no plant moves.
         """
         while self.has_programs and self.diverged_s is None:
-            asked_ns = [*map(self._let_act, self._hands), *map(self._let_move, self._plants)]
-            if min(asked_ns) > last_ns:
+            pauses_ns = [self._request_actions(i) for i in self._hands]
+            pauses_ns += [self._move_plant(i) for i in self._plants]
+            next_pause_ns = min(pauses_ns)
+            if next_pause_ns > last_ns:
                 break
-            self._step_piece(min(asked_ns) - 1)
+            self._step_piece(next_pause_ns - 1)
         self._step_piece(last_ns)
         for i in self._plants:
-            self._let_move(i)
+            self._move_plant(i)
 
-    def _let_move(self, i: int) -> int:
-        """Lets the plant of a site move on to the site's next tick; returns the time of the one
-        after, ns.
+    def _move_plant(self, i: int) -> int:
+        """Moves the plant of a site on to the site's next tick.
+
+        Args:
+            i: index of the site.
+
+        Returns:
+            The time of the tick after that tick, ns, at which the plant has to move again.
         """
         k = int(self._progress[i]["tick"])
         plant = self._plants[i]
-        own = self.arrays(i).site[0]
-        if k > self._moved[i]:
-            plant.move(k - 1, self._last_row(i)[self._torques[i]].tolist())
-        self._moved[i] = k
-        n = self._layouts[i].joints
-        own["q"][:n] = plant.state.q
-        own["qd"][:n] = plant.state.qd
-        own["sensed"][:n] = [-torque for torque in plant.state.tau_x] or 0.0
-        return (
-            NEVER_NS if self._progress[i]["t_ns"] == NEVER_NS else tick_ns(k + 1, plant.rate_hz)
-        )
+        if k > self._plant_ticks[i]:
+            torque = self._last_row(i)[self._torque_columns[i]]
+            plant.move(k - 1, torque.tolist())
+        self._plant_ticks[i] = k
+        joints = self._layouts[i].joints
+        site = self.arrays(i).site[0]
+        site["q"][:joints] = plant.state.q
+        site["qd"][:joints] = plant.state.qd
+        site["sensed"][:joints] = [-torque for torque in plant.state.tau_x] or 0.0
+        if self._progress[i]["t_ns"] == NEVER_NS:
+            return NEVER_NS
+        return tick_ns(k + 1, plant.rate_hz)
 
-    def _let_act(self, i: int) -> int:
-        """Lets the hand of a site act at the ticks before it is asked again; returns the time
-        of that, ns.
+    def _request_actions(self, i: int) -> int:
+        """Requests the next actions of a hand, if its site has executed the actions before.
+
+        Args:
+            i: index of the site.
+
+        Returns:
+            The time at which the hand has to see its arm again, ns.
         """
         progress = self._progress[i]
-        hand = self._hands[i]
-        acts = self._inputs.feed.hands
-        k = int(progress["tick"])
-        rate_hz = int(progress["rate_hz"])
         if progress["t_ns"] == NEVER_NS:
             return NEVER_NS
-        if k < self._acted.get(i, 0):
-            return tick_ns(self._acted[i], rate_hz)
-        block = hand.compute_actions(k, int(progress["ticks"]), self.arrays(i))
-        _write_actions(acts[i], k, block)
-        self._acted[i] = k + len(block)
-        return tick_ns(self._acted[i], rate_hz)
+        k = int(progress["tick"])
+        if k >= self._action_ends.get(i, 0):
+            end = int(progress["ticks"])
+            actions = self._hands[i].compute_actions(k, end, self.arrays(i))
+            _write_actions(self._inputs.feed.hands[i], k, actions)
+            self._action_ends[i] = k + len(actions)
+        return tick_ns(self._action_ends[i], int(progress["rate_hz"]))
 
     def _step_piece(self, last_ns: int) -> None:
-        rows = (
-            self._progress,
-            self._taken,
-            self._sent,
-            self._inputs.feed,
-            self._peaks,
-            self._sums,
-        )
         compiled = [law for law in self._laws.values() if isinstance(law, CompiledLaw)]
         try:
             if len(compiled) < len(self._laws):
                 self._run_plain_until(last_ns)
             else:
                 run_until(
-                    last_ns,
-                    self._settled_rad,
-                    *rows,
-                    self._tables,
-                    self._tables.chain,
-                    self._law_arrays,
+                    last_ns=last_ns,
+                    apart_rad=self._settled_rad,
+                    progress=self._progress,
+                    taken=self._taken,
+                    sent=self._sent,
+                    feed=self._inputs.feed,
+                    peaks=self._peaks,
+                    sums=self._sums,
+                    arrays=self._tables,
+                    chains=self._tables.chain,
+                    laws=self._law_arrays,
                 )
         except LawFailed:
             raise
-        except Exception as error:  # whatever a compiled law raises
-            found = [law.find_failure(error) for law in compiled]
-            raise next(filter(None, found), error) from None
+        except Exception as error:  # any error that a compiled law raises
+            failures = [law.find_failure(error) for law in compiled]
+            raise next(filter(None, failures), error) from None
 
     def _run_plain_until(self, last_ns: int) -> None:
-        """Does as `run_until`, and asks laws in plain Python between the stages."""
-        kept = (self._peaks, self._sums)
-        tables = self._tables
-        laws = self._law_arrays
-        asked = (self._progress, self._taken, self._sent, self._inputs.feed)
+        """Does the work of `run_until`, and calls laws in plain Python between the stages."""
         progress = self._progress
-        while (t_ns := int(progress["t_ns"].min())) <= last_ns and t_ns != NEVER_NS:
+        tables = self._tables
+        while True:
+            t_ns = int(progress["t_ns"].min())
+            if t_ns > last_ns or t_ns == NEVER_NS:
+                return
             for i in np.flatnonzero(progress["t_ns"] == t_ns).tolist():
-                own = self.arrays(i)
-                sense_site(i, *asked, tables, own.chain)
-                if isinstance(law := self._laws.get(i), PlainLaw):
+                chain = self.arrays(i).chain
+                sense_site(
+                    i=i,
+                    progress=progress,
+                    taken=self._taken,
+                    sent=self._sent,
+                    feed=self._inputs.feed,
+                    arrays=tables,
+                    chain=chain,
+                )
+                law = self._laws.get(i)
+                if isinstance(law, PlainLaw):
                     law.compute(int(progress[i]["tick"]), t_ns)
-                finishing = (progress, self._sent, *kept, tables, own.chain, laws)
-                if finish_site(i, self._settled_rad, *finishing) == Mode.DIVERGED:
-                    progress[i]["diverged_ns"] = last_ns = t_ns
+                mode = finish_site(
+                    i=i,
+                    apart_rad=self._settled_rad,
+                    progress=progress,
+                    sent=self._sent,
+                    peaks=self._peaks,
+                    sums=self._sums,
+                    arrays=tables,
+                    chain=chain,
+                    laws=self._law_arrays,
+                )
+                if mode == Mode.DIVERGED:
+                    progress[i]["diverged_ns"] = t_ns
+                    last_ns = t_ns
 
     def advance_to(self, until_s: float) -> None:
-        """Continues the run to the end of a scenario of `until_s` seconds; a diverged run stays
-        as it is.
+        """Continues the run to the end of a scenario of `until_s` seconds.
+
+        A diverged run stays as it is.
         """
         if until_s <= self.ran_s or self.diverged_s is not None:
             return
@@ -397,141 +484,155 @@ class FusedRun:
         self.ran_s = until_s if self.diverged_s is None else self.diverged_s
 
     def plan(self, ticks: Sequence[int]) -> None:
-        """Lets each site make so many ticks in all."""
+        """Sets the total number of ticks that each site executes, and makes room for them."""
         progress: Row
         for progress, count in zip(self._progress, ticks, strict=True):
             progress.ticks = count
             if progress.tick < count:
                 progress.t_ns = tick_ns(progress.tick, progress.rate_hz)
-        most_s = max(
-            count / rate for count, rate in zip(ticks, self._progress["rate_hz"], strict=True)
-        )
-        grown = np.full(
-            (len(ticks), math.ceil(most_s * BUCKETS_PER_S) + 1, self._peaks.shape[2]), -1.0
-        )
-        grown[:, : self._peaks.shape[1]] = self._peaks
-        self._peaks = grown
+        rates_hz = self._progress["rate_hz"]
+        longest_s = max(count / rate_hz for count, rate_hz in zip(ticks, rates_hz, strict=True))
+        buckets = math.ceil(longest_s * BUCKETS_PER_S) + 1
+        peaks = np.full((len(ticks), buckets, self._peaks.shape[2]), -1.0)
+        peaks[:, : self._peaks.shape[1]] = self._peaks
+        self._peaks = peaks
         if self._hands:
             feed = self._inputs.feed
-            acts = np.zeros((len(ticks), max(ticks), feed.hands.shape[2]))
-            acts[:, : feed.hands.shape[1]] = feed.hands
-            self._inputs = self._inputs._replace(feed=feed._replace(hands=acts))
+            actions = np.zeros((len(ticks), max(ticks), feed.hands.shape[2]))
+            actions[:, : feed.hands.shape[1]] = feed.hands
+            self._inputs = self._inputs._replace(feed=feed._replace(hands=actions))
 
     @cached_property
     def _state(self) -> RunState:
-        laws = self._law_arrays
-        arrays = self._tables
-        held = [self._progress, self._taken, *self._sent, self._sums]
-        held += [array for array in arrays if isinstance(array, np.ndarray)]
-        held += [] if arrays.channel is None else [*arrays.channel]
-        return RunState([*held, *([] if laws is None else [laws.rows, laws.sent])])
+        tables = self._tables
+        arrays = [self._progress, self._taken, *self._sent, self._sums]
+        arrays += [array for array in tables if isinstance(array, np.ndarray)]
+        if tables.channel is not None:
+            arrays += tables.channel
+        if self._law_arrays is not None:
+            arrays += [self._law_arrays.rows, self._law_arrays.sent]
+        return RunState(arrays)
 
     @property
     def has_programs(self) -> bool:
-        """True if hands or plants of one's own act in it."""
+        """True if hands or plants that are programs act in the run."""
         return bool(self._hands or self._plants)
 
     def copy_state(self, other: "FusedRun") -> None:
-        """Becomes equal to another run of the same scenario, which is planned alike."""
+        """Copies the state of another run of the same scenario with the same planned ticks."""
         self.scale_difference(other, 0.0)
 
     def scale_difference(self, other: "FusedRun", factor: float) -> None:
-        """Becomes another run plus so much of its difference to that, whose records it has made
-        by now.
+        """Multiplies the difference to another run of the same scenario by a factor.
 
-        A run that has programs cannot.
+        The state becomes other + factor (state - other), see `RunState.scale_difference`. A run
+        that has programs cannot do that, because their state is unknown.
+
+        Args:
+            other: the other run, at the same time.
+            factor: the factor.
         """
         assert not self.has_programs
         self._state.scale_difference(other._state, factor)
         self._changes = deque(other._changes)
-        self._taken_ticks = list(other._taken_ticks)
+        self._popped_ticks = list(other._popped_ticks)
         for i, law in self._laws.items():
             if isinstance(law, PlainLaw):
-                own = np.array(law.memory)
-                its = np.array(other._laws[i].memory)
-                law.restore((its + factor * (own - its)).tolist())
+                memory = np.array(law.memory)
+                other_memory = np.array(other._laws[i].memory)
+                law.restore((other_memory + factor * (memory - other_memory)).tolist())
 
     def arrays(self, i: int) -> SiteArrays:
-        """Returns what a site is made of, as its next tick will find it; to be read, not
-        written.
-        """
+        """Returns the arrays of a site before its next tick, which are only to be read."""
         if i not in self._selected:
             self._selected[i] = select_site(self._tables, i, self._layouts[i])
         return self._selected[i]
 
-    def displace(self, field: str, by: Array) -> None:
-        """Adds to a field of every site's state, shape (N, n)."""
-        self._tables.site[field][:, 0, : by.shape[1]] += by
+    def displace(self, field: str, offsets: Array) -> None:
+        """Adds offsets to a field of the state of every site.
+
+        Args:
+            field: name of the field.
+            offsets: the offsets, shape (N, n).
+        """
+        self._tables.site[field][:, 0, : offsets.shape[1]] += offsets
 
     def measure_distance(self, other: "FusedRun", field: str) -> float:
-        """Returns by how much a field of the sites' state differs at the most."""
+        """Returns the largest difference of a field of the sites' states from another run."""
         return float(np.abs(self._tables.site[field] - other._tables.site[field]).max())
 
     def run_and_sample(self, until_s: float) -> tuple[Array, Array]:
-        """Continues the run; returns q, (100, N, n), rad, and theta_hat, (100, N, P), of its
-        last quarter.
+        """Continues the run to `until_s` and samples its last quarter at 100 times.
+
+        Returns:
+            q, shape (100, N, n), rad, and theta_hat, shape (100, N, P).
         """
-        found = []
+        q = []
+        theta_hat = []
         for t_s in np.linspace(0.75 * until_s, until_s, 100):
             self.advance_to(float(t_s))
-            found.append((self.q, self.theta_hat))
-        q, theta_hat = map(np.array, zip(*found, strict=True))
-        return q, theta_hat
+            q.append(self.q)
+            theta_hat.append(self.theta_hat)
+        return np.array(q), np.array(theta_hat)
 
     @property
     def diverged_s(self) -> float | None:
-        """Time at which the first site left its limits, s, or None."""
-        ends = [int(at) for at in self._progress["diverged_ns"] if at >= 0]
-        return min(ends) / NS_PER_S if ends else None
+        """Time at which the first site left its limits, s; None if no site did."""
+        ends_ns = [int(end_ns) for end_ns in self._progress["diverged_ns"] if end_ns >= 0]
+        return min(ends_ns) / NS_PER_S if ends_ns else None
 
     @property
     def settled_s(self) -> float | None:
-        """Time from which on every |e| is below `settled_rad`, s; None if one is not at the end."""
-        last = max(range(len(self._progress)), key=lambda n: int(self._progress[n]["apart_ns"]))
+        """Time from which every |e| is below `settled_rad`, s; None if never until the end."""
+        last = int(np.argmax(self._progress["apart_ns"]))  # the site that settles last
         progress: Row = self._progress[last]
         if progress.apart_ns < 0:
             return 0.0
-        ended = progress.apart_ns == tick_ns(progress.tick - 1, progress.rate_hz)
-        return None if ended else float(progress.apart_ns) / NS_PER_S
+        if progress.apart_ns == tick_ns(progress.tick - 1, progress.rate_hz):
+            return None
+        return float(progress.apart_ns) / NS_PER_S
 
     @property
     def buckets(self) -> tuple[Array, ...]:
         """The peaks of every 50 ms of each site, see `run_until`, shape (buckets, 3 n) each.
 
-        -1 marks a bucket without a record of that site; the last one may be incomplete.
+        -1 marks a bucket without a record of the site. The last bucket may be incomplete.
         """
-        return tuple(
-            self._peaks[
-                n, : (int(progress["tick"]) - 1) * BUCKETS_PER_S // int(progress["rate_hz"]) + 1
-            ]
-            for n, progress in enumerate(self._progress)
-        )
+        buckets = []
+        for peaks, progress in zip(self._peaks, self._progress, strict=True):
+            last_tick = int(progress["tick"]) - 1
+            count = last_tick * BUCKETS_PER_S // int(progress["rate_hz"]) + 1
+            buckets.append(peaks[:count])
+        return tuple(buckets)
 
     @property
     def maxima(self) -> tuple[Array, ...]:
-        """Largest |e|, rad, and |qd|, rad/s, of any joint, of the same buckets, shape (buckets,
-        2) each.
-        """
+        """Largest |e|, rad, and |qd|, rad/s, of each bucket, shape (buckets, 2) each."""
         return tuple(map(largest_of_joints, self.buckets))
 
     @property
     def totals(self) -> RunTotals:
         """Errors, effort and contact over the whole run."""
+        sums = self._sums
         ticks = self._progress["tick"].astype(np.float64)
-        specs = self._scenario.sites.values()
-        touched = any(isinstance(one, Wall) for spec in specs for one in spec.environment)
+        mean_effort = np.mean(sums["effort"] / (self._tables.site["joints"][:, 0] * ticks))
+        force_peak_n = None
+        if self._has_wall:
+            force_peak_n = float(sums["force_peak_n"].max())
+        walls_j = None
+        if (sums["first_environment"] >= 0).any():
+            walls_j = float(sums["environment_j"].sum())
         return RunTotals(
-            rms_error_rad=float(np.sqrt(self._sums["errors"] / ticks[:, None]).max()),
-            effort_nm=float(
-                np.sqrt(
-                    np.mean(self._sums["effort"] / (self._tables.site["joints"][:, 0] * ticks))
-                )
-            ),
-            force_peak_n=float(self._sums["force_peak_n"].max()) if touched else None,
-            walls_j=float(self._sums["environment_j"].sum())
-            if (self._sums["first_environment"] >= 0).any()
-            else None,
+            rms_error_rad=float(np.sqrt(sums["errors"] / ticks[:, None]).max()),
+            effort_nm=float(np.sqrt(mean_effort)),
+            force_peak_n=force_peak_n,
+            walls_j=walls_j,
         )
+
+    @property
+    def _has_wall(self) -> bool:
+        specs = self._scenario.sites.values()
+        return any(isinstance(part, Wall) for spec in specs for part in spec.environment)
 
     @property
     def q(self) -> Array:
@@ -545,11 +646,12 @@ class FusedRun:
 
     @property
     def memories(self) -> list[Array]:
-        """What the laws of sites remember after the last tick; of one that is not plugged in
-        nothing.
-        """
-        laws = [self._laws.get(i) for i in range(len(self._progress))]
-        return [np.array([] if law is None else law.memory, dtype=np.float64) for law in laws]
+        """Memory of each site's user law after the last tick; empty for other laws."""
+        memories = []
+        for i in range(len(self._progress)):
+            law = self._laws.get(i)
+            memories.append(np.array([] if law is None else law.memory, dtype=np.float64))
+        return memories
 
     @property
     def tau_x(self) -> list[Array]:
@@ -560,28 +662,33 @@ class FusedRun:
         ]
 
     def pop_records(self) -> list[tuple[IntArray, Array]]:
-        """Returns of each site the records since the last call, as far as they are kept: t, ns,
-        and a row.
+        """Returns the records of each site since the last call, as far as they are kept.
+
+        Returns:
+            Per site the nominal times, shape (K,), ns, and the records, shape (K, floats), with
+            the columns of `Layout.columns`.
         """
-        found = []
-        for n, progress in enumerate(self._progress):
-            pages = self._sent.t_ns.shape[1]
-            first = max(self._taken_ticks[n], int(progress["tick"]) - pages)
-            at = np.arange(first, int(progress["tick"])) % pages
-            floats = self._layouts[n].floats
-            found.append((self._sent.t_ns[n, at], self._sent.rows[n, at, :floats]))
-            self._taken_ticks[n] = int(progress["tick"])
-        return found
+        records = []
+        pages = self._sent.t_ns.shape[1]
+        for i, progress in enumerate(self._progress):
+            stop = int(progress["tick"])
+            first = max(self._popped_ticks[i], stop - pages)
+            positions = np.arange(first, stop) % pages
+            t_ns = self._sent.t_ns[i, positions]
+            rows = self._sent.rows[i, positions, : self._layouts[i].floats]
+            records.append((t_ns, rows))
+            self._popped_ticks[i] = stop
+        return records
 
     @property
     def records(self) -> Array:
-        """Last record of each site, floats as in `Layout.columns`, a row per site."""
-        return np.array([self._last_row(n) for n in range(len(self._progress))])
+        """Last record of each site, with the columns of `Layout.columns`, a row per site."""
+        return np.array([self._last_row(i) for i in range(len(self._progress))])
 
-    def _last_row(self, n: int) -> Array:
-        row: Array = self._sent.rows[
-            n, (int(self._progress[n]["tick"]) - 1) % self._sent.t_ns.shape[1]
-        ]
+    def _last_row(self, i: int) -> Array:
+        pages = self._sent.t_ns.shape[1]
+        last_tick = int(self._progress[i]["tick"]) - 1
+        row: Array = self._sent.rows[i, last_tick % pages]
         return row
 
 
@@ -590,7 +697,7 @@ def explain_not_repeatable(log: Log, *, own_laws: bool = False) -> str:
 
     Args:
         log: the log.
-        own_laws: whether code of laws from outside may run.
+        own_laws: whether laws that are code from outside may run.
     """
     scenario = log.scenario
     if scenario.external:
@@ -611,74 +718,104 @@ def read_run_inputs(log: Log) -> RunInputs:
     """Returns the inputs of a run that can be executed again, see `explain_not_repeatable`.
 
     Raises:
-        LogError: the log names a change that is none.
+        LogError: the log holds a text that is not a change of the scenario.
     """
     ticks = max(len(log[name]) for name in log.sites)
-    listed = [
-        (tick * NS_PER_S // log[name].rate_hz, (tick, i, change))
-        for i, name in enumerate(log.scenario.names)
-        for tick, taken in log.commands(name).items()
-        for change in taken
-    ]
-    changes = [one for _, one in sorted(listed, key=lambda timed: timed[0])]
+    changes = _read_changes(log)
     models = [change.model for _, _, change in changes if change.model is not None]
     longest_us = max_delay_us(models, [None] * len(models)) if models else 0
     feed = make_prompt_inputs(len(log.scenario.names)).feed
     late_ns = 0
     if log.driver != "virtual":
-        first, samples, late_ns = _list_arrivals(log, ticks)
+        first, samples, late_ns = _read_arrivals(log, ticks)
         feed = feed._replace(first=first, samples=samples)
     return RunInputs(_add_hands(feed, log, ticks), changes, late_ns, longest_us)
 
 
-def _list_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
-    """Returns arrivals as a feed has them, and by how much the latest came after its stamp, ns."""
+def _read_changes(log: Log) -> list[tuple[int, int, CoreChange]]:
+    """Returns the changes of all sites in order of time, see `RunInputs`."""
+    timed_changes = []
+    for i, name in enumerate(log.scenario.names):
+        for tick, changes in log.commands(name).items():
+            t_ns = tick * NS_PER_S // log[name].rate_hz
+            timed_changes += [(t_ns, (tick, i, change)) for change in changes]
+    timed_changes.sort(key=lambda timed: timed[0])
+    return [change for _, change in timed_changes]
+
+
+def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
+    """Returns the arrivals of a log as a feed has them.
+
+    Args:
+        log: the log.
+        ticks: largest number of ticks of a site.
+
+    Returns:
+        `first` and `samples` as in `RecordedFeed`, and the largest time from the stamp of a
+        sample to its arrival, ns.
+    """
     names = log.scenario.names
     first = np.zeros((len(names), max(len(names) - 1, 1), ticks + 1), dtype=np.int64)
-    listed: list[IntArray] = []
-    total = late_ns = 0
-    for i, part in enumerate(map(log.__getitem__, names)):
+    samples: list[IntArray] = []
+    total = 0
+    late_ns = 0
+    for i, name in enumerate(names):
+        part = log[name]
         counts, rows = part.arrivals
-        came = np.repeat(part.tick, counts)
-        for p, peer in enumerate(part.peers):
-            known = (rows[:, 0] == p) & (rows[:, 1] >= 0) & (rows[:, 1] <= log[peer].last_tick)
-            sent = rows[known, 1]
-            stamps_ns = rows[known, 1] * NS_PER_S // log[peer].rate_hz
-            at = np.maximum(came[known], -(-(stamps_ns + 1) * part.rate_hz // NS_PER_S))
-            order = np.argsort(at, kind="stable")
-            first[i, p] = total + np.searchsorted(at[order], np.arange(ticks + 1))
-            listed.append(sent[order])
-            total += len(sent)
-            late_ns = max(
-                late_ns, int((at * NS_PER_S // part.rate_hz - stamps_ns).max(initial=0))
-            )
-    return first, np.concatenate([*listed, np.zeros(0, np.int64)]), late_ns
+        arrival_ticks = np.repeat(part.tick, counts)
+        for j, peer in enumerate(part.peers):
+            is_known = (rows[:, 1] >= 0) & (rows[:, 1] <= log[peer].last_tick)
+            selected = (rows[:, 0] == j) & is_known
+            sample_ticks = rows[selected, 1]
+            stamps_ns = sample_ticks * NS_PER_S // log[peer].rate_hz
+            # no sample is in use before the first tick after its stamp (L2)
+            earliest = -(-(stamps_ns + 1) * part.rate_hz // NS_PER_S)
+            delivery_ticks = np.maximum(arrival_ticks[selected], earliest)
+            order = np.argsort(delivery_ticks, kind="stable")
+            starts = np.searchsorted(delivery_ticks[order], np.arange(ticks + 1))
+            first[i, j] = total + starts
+            samples.append(sample_ticks[order])
+            total += len(sample_ticks)
+            ages_ns = delivery_ticks * NS_PER_S // part.rate_hz - stamps_ns
+            late_ns = max(late_ns, int(ages_ns.max(initial=0)))
+    return first, np.concatenate([*samples, np.zeros(0, np.int64)]), late_ns
 
 
 def _add_hands(feed: RecordedFeed, log: Log, ticks: int) -> RecordedFeed:
+    """Returns a feed with the recorded actions of live hands."""
     setups = [log.scenario.setup(name)._replace(own=None) for name in log.scenario.names]
-    rows = list(map(_find_live_row, setups))
+    rows = [_find_live_row(setup) for setup in setups]
     if max(rows) < 0:
         return feed
     size = max((setup.layout.hand - 3) // 2 for setup in setups)
-    hands = np.zeros((len(setups), ticks, 1 + 2 * size))
+    actions = np.zeros((len(setups), ticks, 1 + 2 * size))
     for i, name in enumerate(log.scenario.names):
         if rows[i] >= 0:
-            _write_actions(hands[i], 0, log[name].hand)
-    return feed._replace(hands=hands, hand_rows=np.array(rows))
+            _write_actions(actions[i], 0, log[name].hand)
+    return feed._replace(hands=actions, hand_rows=np.array(rows))
 
 
-def _write_actions(acts: Array, k: int, block: Array) -> None:
-    """Writes what a hand does from tick k on, a row as `HandInForce`, as a feed has it."""
-    own = (block.shape[1] - 3) // 2
-    size = (acts.shape[1] - 1) // 2
-    target = block[:, 3 : 3 + own]
-    part = acts[k : k + len(block)]
-    part[:, 0] = block[:, 0]
-    part[:, 1 : 1 + own] = target
-    part[:, 1 + size : 1 + size + own] = target + block[:, 3 + own :]
+def _write_actions(feed_actions: Array, k: int, actions: Array) -> None:
+    """Writes actions of a hand into a feed.
+
+    Args:
+        feed_actions: the actions of one site in a `RecordedFeed`, shape (K, 1 + 2 size).
+        k: tick of the first action.
+        actions: the actions, a row per tick, as `HandInForce`.
+    """
+    count = (actions.shape[1] - 3) // 2
+    size = (feed_actions.shape[1] - 1) // 2
+    target = actions[:, 3 : 3 + count]
+    rate = actions[:, 3 + count :]
+    rows = feed_actions[k : k + len(actions)]
+    rows[:, 0] = actions[:, 0]
+    rows[:, 1 : 1 + count] = target
+    rows[:, 1 + size : 1 + size + count] = target + rate
 
 
 def _find_live_row(setup: SiteSetup) -> int:
-    """Returns which of a site's torque sources is its live hand; -1: it has none."""
-    return next((n for n, one in enumerate(setup.actors) if one.kind in LIVE_KINDS), -1)
+    """Returns the index of the live hand among a site's torque sources; -1 without one."""
+    for index, source in enumerate(setup.actors):
+        if source.kind in LIVE_KINDS:
+            return index
+    return -1

@@ -1,13 +1,17 @@
-"""Twins of a run: the same run again, pushed by a little at an instant.
+"""Execute a run again together with twins: copies of the run that are displaced a little.
 
-Invariant: the run is executed again from its own inputs and compared with its records, bit for
-bit. A twin gets the same arrivals, changes, hands and random delays; so what differs is the
-push and what became of it, and nothing else. Nothing of the difference is a model.
+The difference between a twin and its run shows whether small displacements grow or decay.
 
-A difference that has grown is made small again along itself (Benettin, Galgani, Giorgilli and
-Strelcyn, Meccanica 15, 1980): all numbers of the twin's state, past samples included, go back
-to the run's plus a fraction of the difference, and what is counted goes on from where it was.
-One that has died down to the rounding of the numbers is pushed anew.
+A difference that has grown is scaled down again (Benettin, Galgani, Giorgilli and Strelcyn,
+Meccanica 15, 1980): every number x of the twin's state, past samples included, becomes
+x_run + factor (x - x_run), and the logarithm of the factor is added to the growth. A twin whose
+difference has decayed to the rounding of the numbers is displaced again.
+
+Invariant:
+    - The run is executed again from its own inputs and compared with its records, bit for bit.
+    - A twin gets the same arrivals, changes, hands and random delays as the run. The difference
+      is therefore the effect of the push alone.
+    - The difference is computed by two complete runs, not by a linear model.
 """
 
 import math
@@ -27,28 +31,28 @@ from ..scenario import Scenario
 from .fused import FusedRun, RunInputs, explain_not_repeatable, read_run_inputs
 
 PUSH_RAD = 1e-6
-"""The usual push, rad."""
+"""The usual size of a push, rad."""
 LARGEST = 1e-4
-"""A difference larger than this, rad or rad/s, and than ten times its push, is made small again
-at the end of its window.
+"""A difference larger than this, rad or rad/s, and larger than ten times its push, is scaled
+down at the end of a window.
 """
 SMALLEST = 1e-12
-"""One smaller than this is lost in the rounding of the numbers."""
+"""A difference smaller than this is lost in the rounding of the numbers."""
 WINDOWS = 16
-"""Windows of a run, at whose ends differences are looked at."""
+"""Number of windows of a run. Differences are scaled down or displaced again at their ends."""
 
 
 class Push(NamedTuple):
-    """A push of a twin.
+    """A displacement of the state of a twin.
 
     Attributes:
-        name: what it is, in words, as "1e-06 rad at m1 joint 1".
-        field: "q", rad; "qd", rad/s; or "theta_hat".
-        by: of each site and number the push, shape (N, n).
-        at_s: the instant, s since the epoch.
-        again: a twin that died down is pushed again, at the end of a window; else it ends
-            there.
-        largest: a difference larger than this is made small again; math.inf: none is.
+        name: description of the push, as "1e-06 rad at m1 joint 1".
+        field: the displaced field: "q", rad; "qd", rad/s; or "theta_hat".
+        by: the displacement of each site and number, shape (N, n).
+        at_s: time of the push, s since the epoch.
+        again: whether a twin whose difference has decayed is pushed again at the end of a
+            window; else the twin ends there.
+        largest: a difference larger than this is scaled down; math.inf: never.
     """
 
     name: str
@@ -60,19 +64,21 @@ class Push(NamedTuple):
 
 
 class TwinPath(NamedTuple):
-    """What became of a push.
+    """The difference of a twin from its run, in intervals of 50 ms.
 
     Attributes:
-        push: the push.
-        t_s: ends of intervals of 50 ms, shape (K,), s.
-        largest: logarithm of the largest difference of velocities in an interval, rad/s, of
-            every joint of all sites, as if nothing had been made small again, shape (K, J);
-            -inf where there is none.
-        last: the difference at the last tick of an interval, shape (K, J), rad/s, with
-        scale: the logarithm of the factor by which it was made small, shape (K,).
-        pushed: the places in `t_s` at which it was pushed.
-        died: the place from which on there is nothing but rounding; None: it is pushed anew, or
-            lives.
+        push: the push of the twin.
+        t_s: ends of the intervals, shape (K,), s.
+        largest: logarithm of the largest difference of velocity in an interval, rad/s, of each
+            of the J joints of all sites, as if the difference had never been scaled down, shape
+            (K, J); -inf where the twin and the run are equal.
+        last: difference at the last tick of an interval as it was computed, shape (K, J),
+            rad/s.
+        scale: logarithm of the factor that converts `last` to the unscaled difference, shape
+            (K,).
+        pushed: indices in `t_s` of the intervals in which the twin was pushed.
+        died: index in `t_s` from which the difference is only rounding; None if the twin was
+            pushed again or its difference is larger.
     """
 
     push: Push
@@ -88,10 +94,9 @@ class Twins(NamedTuple):
     """The twins of a run.
 
     Attributes:
-        paths: of each push.
-        joints: names of the joints, as in "m1 joint 1".
-        speed: the largest speed of every joint of the run itself in an interval, shape (K, J),
-            rad/s.
+        paths: the difference of each twin from the run.
+        joints: names of the joints of all sites, as in "m1 joint 1".
+        speed: largest speed of each joint of the run in an interval, shape (K, J), rad/s.
         same: True if the run that was executed again has the bits of the records.
     """
 
@@ -111,105 +116,150 @@ def list_joints(scenario: Scenario) -> tuple[str, ...]:
 
 
 def choose_pushes(scenario: Scenario, count: int) -> list[Push]:
-    """Returns so many pushes: each joint, as far as they go, the estimates, and random ones of
-    all joints.
+    """Returns `count` pushes of different joints and estimates.
 
-    The random ones are by less and more than `PUSH_RAD`: growth that is not of small motions
-    alone differs.
+    The pushes are: one of all estimates, if a site learns; up to three of all joints in a
+    random direction, with sizes around `PUSH_RAD`; and one of each joint. Random pushes of
+    different sizes reveal growth that depends on the size of the motion.
     """
-    each = [(joint.replace(" joint ", ".q"), PUSH_RAD) for joint in list_joints(scenario)]
+    joint_targets = [joint.replace(" joint ", ".q") for joint in list_joints(scenario)]
+    targets = []
     learns = any(scenario.gains(name).law is Law.ADAPTIVE for name in scenario.names)
-    chosen = [("theta", PUSH_RAD)] * (learns and count > 2)
-    random = max(1, min(3, count - len(each) - len(chosen)))
-    chosen += [("q", factor * PUSH_RAD) for factor in (1.0, 1e-3, 1e3)[:random]]
-    pushes = [parse_push(scenario, *one) for one in (chosen + each)[:count]]
-    return [one._replace(again=True, largest=LARGEST) for one in pushes]
+    if learns and count > 2:
+        targets.append(("theta", PUSH_RAD))
+    random_count = max(1, min(3, count - len(joint_targets) - len(targets)))
+    targets += [("q", factor * PUSH_RAD) for factor in (1.0, 1e-3, 1e3)[:random_count]]
+    targets += [(target, PUSH_RAD) for target in joint_targets]
+    pushes = []
+    for target, size in targets[:count]:
+        push = parse_push(scenario, target, size)
+        pushes.append(push._replace(again=True, largest=LARGEST))
+    return pushes
 
 
 LEAST_PUSH = 1e-11
 MOST_PUSH = 1.0
-"""A smaller push is lost in the rounding of the numbers; a larger one is another run."""
+"""A smaller push is lost in the rounding of the numbers; a larger push makes another run."""
 _TARGET = re.compile(r"(?:([a-z][a-z0-9_]*)\.)?(qd?|theta)([1-9]\d*)?")
+"""Target of a push: optional site, kind, and optional number from 1."""
 
 
 def parse_push(
     scenario: Scenario, target: str, size: float = PUSH_RAD, at_s: float = 0.0
 ) -> Push:
-    """Returns the push of a number, "m1.q1", "s.qd2", "m2.theta3", or of many in a drawn
-    direction, "m1.q".
+    """Returns the push of a target such as "m1.q1", "s.qd2", "m2.theta3" or "m1.q".
 
-    Its twin is pushed once. One that is not small is never made small again.
+    A target without a number means all numbers of that kind, in a random direction. A target
+    without a site means all sites. The twin is pushed once. A difference that begins larger
+    than `LARGEST` is never scaled down.
+
+    Args:
+        scenario: the scenario.
+        target: the target.
+        size: size of the push: rad, rad/s, or the unit of an estimate.
+        at_s: time of the push, s since the epoch.
 
     Raises:
-        UsageError: there is no such number, or no such size.
+        UsageError: the scenario has no such target, or the size is out of range.
     """
-    site, kind, number = (
-        found.groups() if (found := _TARGET.fullmatch(target)) else (None, "", "1")
-    )
+    match = _TARGET.fullmatch(target)
+    site, kind, number = match.groups() if match else (None, "", "1")
     layouts = {name: scenario.layout(name) for name in scenario.names}
-    adaptive = Law.ADAPTIVE
-    joints = [one.joints for one in layouts.values()]
-    estimates = [
-        one.parameters * (scenario.gains(name).law is adaptive) for name, one in layouts.items()
-    ]
-    part, counts = ("estimate", estimates) if kind == "theta" else ("joint", joints)
+    if kind == "theta":
+        noun = "estimate"
+        counts = _count_estimates(scenario)
+    else:
+        noun = "joint"
+        counts = [layout.joints for layout in layouts.values()]
+    # the sites that have the target
     owners = [
-        n
-        for n, name in enumerate(layouts)
-        if site in (None, name) and counts[n] >= int(number or 1)
+        i
+        for i, name in enumerate(layouts)
+        if site in (None, name) and counts[i] >= int(number or 1)
     ]
     if not owners or (number and not site):
-        each = zip(layouts, joints, estimates, strict=True)
-        there = ", ".join(
-            f"{name} ({count_nouns(n, 'joint')}, {count_nouns(m, 'estimate')})"
-            for name, n, m in each
-        )
-        names = ", ".join(f"{scenario.names[0]}.{one}" for one in ("q1", "qd1", "theta1", "q"))
-        raise UsageError(f"--push {target}: no such number; as in {names}, or q, of {there}")
+        raise UsageError(_describe_targets(scenario, target))
     if not LEAST_PUSH <= abs(size) <= MOST_PUSH:
         raise UsageError(
-            f"--push {target}={size:g}: a push is of a size from {LEAST_PUSH:g} to {MOST_PUSH:g}"
+            f"--push {target}={size:g}: a push is of a size from {LEAST_PUSH:g} "
+            f"to {MOST_PUSH:g}"
         )
-    chance = np.random.Generator(np.random.Philox(0))
-    by = np.zeros((len(counts), max(counts)))
-    for n in owners:
-        one = np.arange(counts[n]) == int(number or 0) - 1
-        by[n, : counts[n]] = size * (one if number else chance.uniform(-1.0, 1.0, counts[n]))
+    generator = np.random.Generator(np.random.Philox(0))
+    displacements = np.zeros((len(counts), max(counts)))
+    for i in owners:
+        if number:
+            direction = np.arange(counts[i]) == int(number) - 1
+        else:
+            direction = generator.uniform(-1.0, 1.0, counts[i])
+        displacements[i, : counts[i]] = size * direction
+    owner = f"all {noun}s"
+    if number:
+        owner = f"{site} {noun} {number}"
+    elif site:
+        owner = f"all {noun}s of {site}"
     unit = {"q": "rad at", "qd": "rad/s at", "theta": "of"}[kind]
-    of = f"{site} {part} {number}" if number else f"all {part}s{f' of {site}' if site else ''}"
-    field = "theta_hat" if kind == "theta" else kind
-    largest = LARGEST if abs(size) < LARGEST else math.inf
     return Push(
-        name=f"{size:g} {unit} {of}",
-        field=field,
-        by=by,
+        name=f"{size:g} {unit} {owner}",
+        field="theta_hat" if kind == "theta" else kind,
+        by=displacements,
         at_s=at_s,
         again=False,
-        largest=largest,
+        largest=LARGEST if abs(size) < LARGEST else math.inf,
     )
+
+
+def _count_estimates(scenario: Scenario) -> list[int]:
+    """Returns the number of estimated parameters of each site; 0 for laws that do not learn."""
+    return [
+        scenario.layout(name).parameters if scenario.gains(name).law is Law.ADAPTIVE else 0
+        for name in scenario.names
+    ]
+
+
+def _describe_targets(scenario: Scenario, target: str) -> str:
+    """Returns an error text that names the targets of a push in a scenario."""
+    sites = []
+    for name, estimates in zip(scenario.names, _count_estimates(scenario), strict=True):
+        joints = scenario.layout(name).joints
+        numbers = f"{count_nouns(joints, 'joint')}, {count_nouns(estimates, 'estimate')}"
+        sites.append(f"{name} ({numbers})")
+    first = scenario.names[0]
+    examples = ", ".join(f"{first}.{number}" for number in ("q1", "qd1", "theta1", "q"))
+    sites_text = ", ".join(sites)
+    return f"--push {target}: no such number; as in {examples}, or q, of {sites_text}"
 
 
 def run_twins(log: Log, pushes: Sequence[Push], *, own_laws: bool = False) -> Twins:
-    """Executes a run again, and a twin of it for every push.
+    """Executes the run of a log again, and a twin of the run for every push.
+
+    Args:
+        log: the log.
+        pushes: the pushes.
+        own_laws: whether laws that are code from outside may run.
 
     Raises:
-        NotRepeatable: it cannot be executed again, or is another run here.
+        NotRepeatable: the run cannot be executed again, or differs from its records here.
         LogError: a record cannot be read.
     """
-    if why := explain_not_repeatable(log, own_laws=own_laws):
-        raise NotRepeatable(f"no twins: {why}")
-    ticks = [len(log[name]) for name in log.scenario.names]
-    return _TwinRuns(
-        scenario=log.scenario, pushes=pushes, ticks=ticks, inputs=read_run_inputs(log), log=log
-    ).run()
+    reason = explain_not_repeatable(log, own_laws=own_laws)
+    if reason:
+        raise NotRepeatable(f"no twins: {reason}")
+    runs = _TwinRuns(
+        scenario=log.scenario,
+        pushes=pushes,
+        ticks=[len(log[name]) for name in log.scenario.names],
+        inputs=read_run_inputs(log),
+        log=log,
+    )
+    return runs.run()
 
 
 def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: float) -> Twins:
-    """Makes a run of a scenario in virtual time, and a twin of it for every push.
+    """Runs a scenario in virtual time, and a twin of the run for every push.
 
     Raises:
-        ScenarioError: virtual time cannot run it.
-        NotRepeatable: a push is beyond its end.
+        ScenarioError: virtual time cannot run the scenario.
+        NotRepeatable: a push is not within the run.
     """
     ticks = [
         max(1, round(duration_s * scenario.sites[name].rate_hz)) for name in scenario.names
@@ -218,8 +268,14 @@ def run_virtual_twins(scenario: Scenario, pushes: Sequence[Push], duration_s: fl
 
 
 class _TwinRuns:
-    """A run of so many ticks of each site and its twins, side by side; of a log, if there is
-    one.
+    """A run and its twins, executed side by side.
+
+    Args:
+        scenario: the scenario.
+        pushes: the push of each twin.
+        ticks: number of ticks of each site.
+        inputs: inputs of a recorded run.
+        log: the log of the recorded run, whose records the run has to equal.
     """
 
     def __init__(
@@ -232,73 +288,69 @@ class _TwinRuns:
     ) -> None:
         self._log = log
         self._pushes = pushes
+        self._joints = list_joints(scenario)
         self._layouts = [scenario.layout(name) for name in scenario.names]
         rates_hz = [scenario.sites[name].rate_hz for name in scenario.names]
-        end_s = max(n / hz for n, hz in zip(ticks, rates_hz, strict=True))
-        if any(not 0.0 <= push.at_s < end_s for push in pushes):
-            raise NotRepeatable(
-                f"no twins: a push lies within the run, from 0 s until before {end_s:g} s"
-            )
-        equal = (
-            np.ceil(np.linspace(0.0, end_s, WINDOWS + 1)[1:] * BUCKETS_PER_S) / BUCKETS_PER_S
-        )
-        self._ends = np.array(
-            sorted({*equal.tolist(), *({push.at_s for push in pushes} - {0.0})})
-        )
-        keep = math.ceil(float(np.diff(self._ends, prepend=0.0).max()) * max(rates_hz)) + 2
+        durations_s = [count / rate_hz for count, rate_hz in zip(ticks, rates_hz, strict=True)]
+        self._ends_s = _plan_windows(max(durations_s), pushes)
+        longest_window_s = float(np.diff(self._ends_s, prepend=0.0).max())
+        keep = math.ceil(longest_window_s * max(rates_hz)) + 2
         runs = [FusedRun(scenario, keep=keep, inputs=inputs) for _ in range(1 + len(pushes))]
         for run in runs:
             run.plan(ticks)
         self._run = runs[0]
         self._twins = runs[1:]
-        self._joints = list_joints(scenario)
-        shape = math.ceil(self._ends[-1] * BUCKETS_PER_S) + 1, len(self._joints)
-        self._largest = np.full((len(pushes), *shape), -np.inf)
-        self._last = np.zeros((len(pushes), *shape))
-        self._scales = np.zeros((len(pushes), shape[0]))
-        self._scale = np.zeros(len(pushes))
-        self._speed = np.zeros(shape)
+        twins = len(pushes)
+        buckets = math.ceil(self._ends_s[-1] * BUCKETS_PER_S) + 1
+        joints = len(self._joints)
+        self._largest = np.full((twins, buckets, joints), -np.inf)  # see `TwinPath`
+        self._last = np.zeros((twins, buckets, joints))
+        self._scales = np.zeros((twins, buckets))
+        self._scale = np.zeros(twins)  # the present entry of `_scales` of each twin
+        self._speed = np.zeros((buckets, joints))
         self._pushed: list[list[int]] = [[] for _ in pushes]
         self._died: list[int | None] = [None for _ in pushes]
         self._same = True
 
     def run(self) -> Twins:
+        """Executes all runs and returns the differences of the twins."""
         for n, push in enumerate(self._pushes):
             if push.at_s == 0.0:
                 self._push(n, 0.0)
         with np.errstate(divide="ignore", invalid="ignore"):
-            for end_s in self._ends.tolist():
-                self._make_window(end_s)
+            for end_s in self._ends_s.tolist():
+                self._execute_window(end_s)
         t_s = (np.arange(len(self._speed)) + 1.0) / BUCKETS_PER_S
-        kept = zip(
-            self._largest,
-            self._last,
-            self._scales,
-            map(tuple, self._pushed),
-            self._died,
-            strict=True,
-        )
-        paths = [
-            TwinPath(push, t_s, *found) for push, found in zip(self._pushes, kept, strict=True)
-        ]
+        paths = []
+        for n, push in enumerate(self._pushes):
+            path = TwinPath(
+                push=push,
+                t_s=t_s,
+                largest=self._largest[n],
+                last=self._last[n],
+                scale=self._scales[n],
+                pushed=tuple(self._pushed[n]),
+                died=self._died[n],
+            )
+            paths.append(path)
         return Twins(paths, self._joints, self._speed, self._same)
 
-    def _make_window(self, end_s: float) -> None:
+    def _execute_window(self, end_s: float) -> None:
+        """Executes the run and its twins to the end of a window."""
         last_ns = math.ceil(end_s * NS_PER_S) - 1
         self._run.step_to(last_ns)
-        kept = self._run.pop_records()
+        records = self._run.pop_records()
         if self._log is not None:
-            self._compare(self._log, kept)
-        for at, starts, qd, _ in self._cut(kept, kept):
-            self._speed[at] = np.maximum(
-                self._speed[at], np.maximum.reduceat(np.abs(qd), starts, axis=0)
-            )
+            self._compare_with_log(self._log, records)
+        for cells, starts, qd, _ in self._split_buckets(records, records):
+            speed = np.maximum.reduceat(np.abs(qd), starts, axis=0)
+            self._speed[cells] = np.maximum(self._speed[cells], speed)
         for n, twin in enumerate(self._twins):
             if self._pushed[n] and self._died[n] is None:
                 twin.step_to(last_ns)
-                self._measure(n, kept, twin.pop_records())
-                if not twin.has_programs:  # whose state no twin can take over
-                    self._renew(n, end_s)
+                self._measure_difference(n, records, twin.pop_records())
+                if not twin.has_programs:  # the state of a program cannot be copied
+                    self._renew_difference(n, end_s)
             elif not self._pushed[n] and self._pushes[n].at_s <= end_s:
                 twin.copy_state(self._run)
                 self._push(n, end_s)
@@ -309,80 +361,114 @@ class _TwinRuns:
         self._pushed[n].append(round(at_s * BUCKETS_PER_S))
         self._scale[n] = 0.0
 
-    def _compare(self, log: Log, kept: Sequence[tuple[Ints, Array]]) -> None:
-        for name, layout, (t_ns, rows) in zip(log.sites, self._layouts, kept, strict=True):
+    def _compare_with_log(self, log: Log, records: Sequence[tuple[Ints, Array]]) -> None:
+        """Refuses a run that differs from the records of its log by more than rounding."""
+        for name, layout, (t_ns, rows) in zip(log.sites, self._layouts, records, strict=True):
             part = log[name]
             columns = layout.columns()
             first = int(np.searchsorted(part.t_ns, t_ns[0])) if len(t_ns) else 0
-            here = slice(first, first + len(t_ns))
-            for signal, recorded in (
-                ("q", part.q[here]),
-                ("qd", part.qd[here]),
-                ("tau", part.tau[here]),
-            ):
-                apart = np.abs(rows[:, columns[signal]] - recorded).max(initial=0.0)
-                self._same &= bool(apart == 0.0)
-                if not apart <= SAME_RUN:
+            window = slice(first, first + len(t_ns))
+            logged = {"q": part.q[window], "qd": part.qd[window], "tau": part.tau[window]}
+            for signal, values in logged.items():
+                difference = np.abs(rows[:, columns[signal]] - values).max(initial=0.0)
+                self._same &= bool(difference == 0.0)
+                if not difference <= SAME_RUN:
                     raise NotRepeatable(
-                        f"no twins: executed again, {signal} of {name} is off by {apart:.2g}: it is not the "
-                        "run of these records (trilat verify)"
+                        f"no twins: executed again, {signal} of {name} is off by "
+                        f"{difference:.2g}: it is not the run of these records (trilat verify)"
                     )
 
-    def _cut(
-        self, kept: Sequence[tuple[Ints, Array]], own: Sequence[tuple[Ints, Array]]
+    def _split_buckets(
+        self,
+        records: Sequence[tuple[Ints, Array]],
+        twin_records: Sequence[tuple[Ints, Array]],
     ) -> Iterator[tuple[tuple[Ints, ...], Ints, Array, Array]]:
-        place = 0
-        for layout, (t_ns, rows), (own_ns, own_rows) in zip(
-            self._layouts, kept, own, strict=True
+        """Yields the velocities of each site in a window, with the intervals of 50 ms.
+
+        Args:
+            records: times and records of each site of the run.
+            twin_records: times and records of each site of a twin.
+
+        Yields:
+            The cells of an array (K, J) that the site fills, the first row of each interval,
+            and the velocities of the run and of the twin, rad/s, a row per tick.
+        """
+        column = 0
+        for layout, (t_ns, rows), (twin_ns, twin_rows) in zip(
+            self._layouts, records, twin_records, strict=True
         ):
             qd = layout.columns()["qd"]
-            made = min(len(t_ns), len(own_ns))
-            if made:
-                buckets = t_ns[:made] * BUCKETS_PER_S // NS_PER_S
+            count = min(len(t_ns), len(twin_ns))
+            if count:
+                buckets = t_ns[:count] * BUCKETS_PER_S // NS_PER_S
                 starts = np.flatnonzero(np.diff(buckets, prepend=-1))
-                at = np.ix_(buckets[starts], np.arange(place, place + layout.joints))
-                yield at, starts, rows[:made, qd], own_rows[:made, qd]
-            place += layout.joints
+                columns = np.arange(column, column + layout.joints)
+                cells = np.ix_(buckets[starts], columns)
+                yield cells, starts, rows[:count, qd], twin_rows[:count, qd]
+            column += layout.joints
 
-    def _measure(
-        self, n: int, kept: Sequence[tuple[Ints, Array]], own: Sequence[tuple[Ints, Array]]
+    def _measure_difference(
+        self,
+        n: int,
+        records: Sequence[tuple[Ints, Array]],
+        twin_records: Sequence[tuple[Ints, Array]],
     ) -> None:
-        for at, starts, qd, own_qd in self._cut(kept, own):
-            apart = own_qd - qd
-            largest = (
-                np.log(np.maximum.reduceat(np.abs(apart), starts, axis=0)) + self._scale[n]
-            )
-            self._largest[n][at] = np.maximum(self._largest[n][at], largest)
-            self._last[n][at] = apart[np.append(starts[1:], len(apart)) - 1]
-            self._scales[n, at[0].reshape(-1)] = self._scale[n]
+        """Adds the differences of a twin in a window to its path."""
+        for cells, starts, qd, twin_qd in self._split_buckets(records, twin_records):
+            difference = twin_qd - qd
+            peaks = np.maximum.reduceat(np.abs(difference), starts, axis=0)
+            unscaled = np.log(peaks) + self._scale[n]
+            self._largest[n][cells] = np.maximum(self._largest[n][cells], unscaled)
+            ends = np.append(starts[1:], len(difference))
+            self._last[n][cells] = difference[ends - 1]
+            self._scales[n, cells[0].reshape(-1)] = self._scale[n]
 
-    def _renew(self, n: int, end_s: float) -> None:
+    def _renew_difference(self, n: int, end_s: float) -> None:
+        """Scales down a large difference; pushes or ends a twin without a difference."""
         twin = self._twins[n]
-        last = round(end_s * BUCKETS_PER_S)
         push = self._pushes[n]
-        q, qd = (twin.measure_distance(self._run, field) for field in ("q", "qd"))
-        pushed = float(np.abs(push.by).max())  # nothing is made larger than it is
-        recent = (
-            self._largest[n, max(0, last - BUCKETS_PER_S) : last].max(initial=-np.inf)
-            - self._scale[n]
-        )
-        dead = recent < math.log(SMALLEST)  # whatever is left of it as a shift to another rest
-        if dead and push.again:
+        bucket = round(end_s * BUCKETS_PER_S)
+        q = twin.measure_distance(self._run, "q")
+        qd = twin.measure_distance(self._run, "qd")
+        size = float(np.abs(push.by).max())
+        last_second = self._largest[n, max(0, bucket - BUCKETS_PER_S) : bucket]
+        recent = last_second.max(initial=-np.inf) - self._scale[n]
+        # velocities alone decide: a twin may rest at another position
+        decayed = recent < math.log(SMALLEST)
+        if decayed and push.again:
             twin.copy_state(self._run)
             self._push(n, end_s)
-        elif dead and twin.diverged_s is None:
-            alive = self._largest[n].max(axis=1) - self._scales[n] >= math.log(SMALLEST)
-            self._died[n] = (
-                int(np.flatnonzero(alive)[-1]) + 1 if alive.any() else self._pushed[n][0]
-            )
-            self._largest[n, self._died[n] :] = -np.inf
-        elif push.largest < math.inf and not max(q, qd) <= max(push.largest, 10.0 * pushed):
-            factor = pushed / max(q, qd)
+        elif decayed and twin.diverged_s is None:
+            unscaled = self._largest[n].max(axis=1) - self._scales[n]
+            larger = np.flatnonzero(unscaled >= math.log(SMALLEST))
+            died = int(larger[-1]) + 1 if len(larger) else self._pushed[n][0]
+            self._died[n] = died
+            self._largest[n, died:] = -np.inf
+        elif push.largest < math.inf and not max(q, qd) <= max(push.largest, 10.0 * size):
+            factor = size / max(q, qd)
             twin.scale_difference(self._run, factor)
             self._scale[n] -= math.log(factor)
 
 
+def _plan_windows(end_s: float, pushes: Sequence[Push]) -> Array:
+    """Returns the ends of the windows of a run, s, ascending.
+
+    The windows end at multiples of 50 ms and at the times of the pushes.
+
+    Raises:
+        NotRepeatable: a push is not within the run.
+    """
+    if any(not 0.0 <= push.at_s < end_s for push in pushes):
+        raise NotRepeatable(
+            f"no twins: a push lies within the run, from 0 s until before {end_s:g} s"
+        )
+    equal_windows_s = np.linspace(0.0, end_s, WINDOWS + 1)[1:]
+    window_ends_s = np.ceil(equal_windows_s * BUCKETS_PER_S) / BUCKETS_PER_S
+    push_times_s = {push.at_s for push in pushes} - {0.0}
+    return np.array(sorted({*window_ends_s.tolist(), *push_times_s}))
+
+
 SAME_RUN = 1e-7
-"""Executed on another platform, where the last bits differ, a run may be so far from its
-records, rad.
+"""Largest difference, rad, rad/s or N m, of a run from its records. The last bits differ if the
+run is executed on another platform.
 """
