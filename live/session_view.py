@@ -109,7 +109,11 @@ class SiteView:
         record = self.record
         if record is None or not self.glides or self.ended:
             return None
-        lost = self.layout.find_lost(record.mem, self.peers) if self.layout is not None else ()
+        lost = (
+            self.layout.list_lost_peers(record.mem, self.peers)
+            if self.layout is not None
+            else ()
+        )
         alarm = find_alarm(
             session=session,
             site=name,

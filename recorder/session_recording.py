@@ -327,8 +327,9 @@ class Recording:
 
     def is_over(self, now_ns: int) -> bool:
         """True once every site has all its messages stored, or is gone for good."""
-        # a list, because `_has_left` notes for every site since when it is gone
-        return all([self._has_left(name, now_ns) for name in self._sites])
+        # not `all` of a generator: `_has_left` notes for every site since when it is gone
+        have_left = [self._has_left(name, now_ns) for name in self._sites]
+        return all(have_left)
 
     def _has_left(self, site: str, now_ns: int) -> bool:
         """True if all messages of a site are stored, or if the site is gone for good."""

@@ -275,7 +275,7 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
     chains = any(arm.chain is not None for arm in scenario.arms.values())
     # what is cached may be of arms with other numbers of joints
     if chains or not is_core_cached():
-        compiling_notice.say = say
+        compiling_notice.report = say
         with interrupt.raising():
             for name in layouts.values():
                 warm_up(scenario, name)

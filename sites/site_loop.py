@@ -136,7 +136,7 @@ class PeerInbox:
             self._dropped["missing"] += sample.tick - self._last[index] - 1
         self._last[index] = max(self._last[index], sample.tick)
         delay_ns = self._monitors[index].receive(sample, arrived_ns)
-        ch = link.channel.select_for_peer(sample.ch, link.place) if sample.ch else ()
+        ch = link.channel.select_for_peer(sample.ch, link.index_at_peer) if sample.ch else ()
         return Arrival(
             peer=index,
             tick=sample.tick,

@@ -285,7 +285,7 @@ def watch_law(
 
 
 def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:
-    site.begin_at(first_tick_at(0, site.rate_hz))
+    site.start_at(first_tick_at(0, site.rate_hz))
     site.release_tick(0, 0)  # as a site does that joins late
     estimator = OffsetEstimator()
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None

@@ -176,7 +176,7 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
             return RunningSite(parts, publisher, pinger, epoch)
         if joining.coming_at != begins:
             begins = joining.coming_at
-            parts.site.begin_at(begins)  # it takes 0.1 s for every hour that the session runs
+            parts.site.start_at(begins)  # it takes 0.1 s for every hour that the session runs
         now_ns = parts.clock.monotonic_ns()
         if now_ns > give_up_ns:
             missing = membership.list_missing()
@@ -232,7 +232,7 @@ class RunningSite:
             )
             for peer, boot in zip(site.peers, boots, strict=True)
         ]
-        site.begin_at(epoch.first)
+        site.start_at(epoch.first)
         parts.buffer.begin_at(epoch.first)
         own = {peer.name for peer in peers if peer.is_own and peer.name in epoch.boots}
         self._here = [name for name in scenario.names if name == parts.name or name in own]
@@ -513,7 +513,9 @@ class RunningSite:
         if rule.action is not StaleAction.GLIDE:
             return
         says_lost = rule.degrades and mode is Mode.RETURN
-        lost = parts.site.layout.find_lost(output.mem, parts.site.peers) if says_lost else ()
+        lost = (
+            parts.site.layout.list_lost_peers(output.mem, parts.site.peers) if says_lost else ()
+        )
         shown = (
             parts.options.session,
             parts.name,

@@ -348,7 +348,7 @@ def decided(peer: str, site: str) -> Site:
     for tick, commands in log.commands(site).items():
         core.release_tick(index, tick * log.scenario.sites[peer].rate_hz // core.rate_hz)
         for command in commands:
-            core.order(command, 0)
+            core.apply_change(command, 0)
     return core
 
 

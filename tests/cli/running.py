@@ -88,7 +88,7 @@ def trilat(*arguments: str | Path, cwd: Path) -> Done:
         mock.patch.object(sys, "argv", ["trilat", *map(str, arguments)]),
         mock.patch.dict(os.environ, PLAIN),
         mock.patch.object(
-            compiling_notice, "said", True
+            compiling_notice, "is_reported", True
         ),  # by which worker it is compiled is chance
     ):
         try:

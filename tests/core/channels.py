@@ -42,7 +42,7 @@ def channel(
     table = np.empty((0, 2), dtype=np.int64) if points is None else points
     row: Any = np.zeros(1, link_dtype(2))[0]
     row.rate_hz, row.key, row.models = rate_hz, link_key(seed, name), len(models)
-    row.used = row.foreseen = -1
+    row.used = row.scheduled = -1
     row.outage_first, row.outage_count = len(table) - outages, outages
     return Channel(
         row,
@@ -55,7 +55,7 @@ def channel(
 def due(made: Channel, count: int) -> Ints:
     """When the next samples up to `count` are due, ns, or LOST; shape (count,) from a fresh channel."""
     row, models, dues, points = made
-    first = int(row.foreseen) + 1
+    first = int(row.scheduled) + 1
     parts = []
     for start in range(first, count, len(dues)):
         end = min(start + len(dues), count)

@@ -170,7 +170,7 @@ def run_stop(
 ) -> list[TickRecord]:
     """The records of a stop until the arm has been at rest for 0.3 s."""
     moving = Site(scenario.setup(site))
-    moving.resume(before, last)
+    moving.restore_state(before, last)
     rate_hz = scenario.sites[site].rate_hz
     first = last.tick + 1
     order = [CoreChange("stop", order=LifeOrder.STOP)]

@@ -138,8 +138,8 @@ def test_a_site_primed_in_the_middle_has_the_same_future(name: str, k: int) -> N
     worn = behind(name)
     stepped(worn, ticks[: k + 100])
     for site in (behind(name), worn):
-        site.prime(k, in_use, waiting)
-        site.resume(before, last)
+        site.restore_links(k, in_use, waiting)
+        site.restore_state(before, last)
         assert stepped(site, ticks[k:]) == whole[k:]
 
 
@@ -175,7 +175,7 @@ def test_whatever_number_a_sample_claims_the_work_is_bounded(
     site = behind(name)
     for k, now in enumerate(came):
         output = site.step(TickInput(k, [Arrival(0, m, (0.1, 0.2), (0.0, 0.0)) for m in now]))
-        assert site._links["foreseen"][0] <= k + 10_000
+        assert site._links["scheduled"][0] <= k + 10_000
         assert output.used[0] < k
     k = len(came)
     counts = site.counts()[0]
@@ -239,7 +239,7 @@ def test_a_measured_sample_is_in_use_from_its_arrival(
             max(usable, default=-1)
         ]
     assert site.counts()[0].late == 0
-    assert site.measures(0)
+    assert site.is_measured(0)
 
 
 def test_measured_link_may_have_play_out_buffer_of_its_own() -> None:

@@ -152,9 +152,9 @@ def test_a_command_before_what_is_planned_comes_first() -> None:
 def test_more_commands_than_a_run_takes_are_refused() -> None:
     made = site()
     for n in range(MAX_RAMPS):
-        made.order(CoreChange(str(n), ramp=DominanceRamp(n, n, (0.5, 0.5))), 0)
+        made.apply_change(CoreChange(str(n), ramp=DominanceRamp(n, n, (0.5, 0.5))), 0)
     with pytest.raises(ValueError, match="256"):
-        made.order(CoreChange("one more", ramp=DominanceRamp(S, S, (0.5, 0.5))), 0)
+        made.apply_change(CoreChange("one more", ramp=DominanceRamp(S, S, (0.5, 0.5))), 0)
 
 
 def test_each_ramp_begins_where_the_one_before_was() -> None:

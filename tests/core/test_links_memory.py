@@ -14,7 +14,7 @@ from trilat_net.core.delay import LinkModel
 from trilat_net.core.link import AHEAD_LIMIT_S, calendar_pages
 from trilat_net.core.site_arrays import (
     MAX_LINKS_BYTES,
-    LinkRoom,
+    CalendarSizer,
     SiteArrays,
     links_bytes,
     needed_pages,
@@ -191,7 +191,7 @@ def test_change_that_would_need_more_than_limit_is_refused() -> None:
 def test_links_stay_within_the_limit_and_count_the_rest() -> None:
     """Of a site that is given less: stamps from further ahead are refused, all others come into use."""
     setup = load_scenario("paper").setup("m1")
-    assert LinkRoom(setup).most_pages == calendar_pages(1000) > needed_pages(setup)
+    assert CalendarSizer(setup).most_pages == calendar_pages(1000) > needed_pages(setup)
     free, tight = one_link(1000, 1000, 1_000_000), one_link(1000, 1000, 1_000_000)
     tight._room.most_pages = 1024
     ahead = TickInput(0, [sample(m) for m in (0, 500, 900, 1100, 5000)])
@@ -209,6 +209,6 @@ def test_links_stay_within_the_limit_and_count_the_rest() -> None:
 def test_the_most_pages_are_within_the_limit() -> None:
     """Where twenty seconds do not fit."""
     setup = parse_scenario(many(12, 4000, 100.0)).setup("a0")
-    pages = LinkRoom(setup).most_pages
+    pages = CalendarSizer(setup).most_pages
     assert needed_pages(setup) < pages < calendar_pages(4000)
     assert links_bytes(setup, pages) <= MAX_LINKS_BYTES < links_bytes(setup, 2 * pages)

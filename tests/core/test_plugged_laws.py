@@ -35,7 +35,7 @@ def run_by_hand(scenario: Scenario, ticks: int = TICKS) -> dict[str, list[TickRe
             arrivals = []
             for j, link in enumerate(setups[name].links if k else ()):
                 r = records[link.peer][k - 1]
-                part = link.channel.select_for_peer(r.ch, link.place)
+                part = link.channel.select_for_peer(r.ch, link.index_at_peer)
                 arrivals.append(Arrival(j, k - 1, r.q, r.qd, 0, r.tau_x, part))
             records[name].append(site.step(TickInput(k, arrivals)))
     return records
@@ -72,7 +72,7 @@ def test_a_law_sees_peers_external_torque_and_its_past() -> None:
     scenario = linked("tests.laws:Adaptive", "free", **{"sites.m1.hands": [pulse]})
     made: list[Watching] = []
     setup = scenario.setup("m1")._replace(
-        own=lambda facts: made.append(Watching(facts)) or made[-1]
+        law_factory=lambda facts: made.append(Watching(facts)) or made[-1]
     )
     site, records = Site(setup), []
     for k in range(20):

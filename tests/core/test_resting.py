@@ -209,7 +209,9 @@ def stop_at_instants(log: Log, count: int, ticks: int = 1700) -> Iterator[Stop]:
     for n, at in enumerate(np.linspace(5, len(log[names[0]]) - 5, count).astype(int).tolist()):
         part = log[names[n % len(names)]]
         site = Site(log.scenario.setup(part.name))
-        site.resume(*(read_output(part.states[row], part.peers) for row in (at - 2, at - 1)))
+        site.restore_state(
+            *(read_output(part.states[row], part.peers) for row in (at - 2, at - 1))
+        )
         order = [CoreChange("stop", order=LifeOrder.STOP)]
         made = [
             site.step(TickInput(k, commands=order if k == at else ()))

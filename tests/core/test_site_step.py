@@ -87,8 +87,8 @@ def test_site_resumed_from_two_records_goes_on_with_same_bits(scheme: str, k: in
     before, last = whole[max(0, k - 2)], whole[k - 1]
     in_use = [sample(m, peer) if m >= 0 else None for peer, m in enumerate(last.used)]
     waiting = [sample(m, peer) for peer, m in enumerate(last.used) for m in range(m + 1, k - 1)]
-    site.prime(k, in_use, waiting)
-    site.resume(before, last)
+    site.restore_links(k, in_use, waiting)
+    site.restore_state(before, last)
     assert [bits(o) for o in stepped(site, ticks[k:])] == [bits(o) for o in whole[k:]]
 
 

@@ -89,12 +89,12 @@ def test_an_alarm_says_what_to_do(mode, reason, advice):
 
 def test_who_goes_on_without_a_peer_says_so():
     layout = Layout()
-    mem = [0.0] * layout.life_memory(2) + [0.0, -1.0]
-    assert layout.find_lost(mem, ("m1", "m2")) == ["m2"]
-    alarm = find_alarm("x", "s", "run", mem, 2, layout.find_lost(mem, ("m1", "m2")))
+    mem = [0.0] * layout.count_life_memory(2) + [0.0, -1.0]
+    assert layout.list_lost_peers(mem, ("m1", "m2")) == ["m2"]
+    alarm = find_alarm("x", "s", "run", mem, 2, layout.list_lost_peers(mem, ("m1", "m2")))
     assert alarm.word == "WITHOUT m2"
     assert find_alarm("x", "s", "fault", mem, 2, ["m2"]).word == "FAULT"
-    assert layout.find_lost(mem[:4], ("m1", "m2")) == []
+    assert layout.list_lost_peers(mem[:4], ("m1", "m2")) == []
 
 
 @pytest.mark.parametrize("mem", [[], [0.0] * 5, [0.0] * 5 + [1e9], [0.0] * 5 + [-1.0]])

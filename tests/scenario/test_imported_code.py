@@ -104,8 +104,8 @@ def test_a_law_is_not_told_what_nobody_knows() -> None:
             super().__init__(facts)
             told.append(facts.theta)
 
-    Site(load_scenario("two_sites", unknown).setup("s")._replace(own=Listening))
-    Site(load_scenario("two_sites").setup("s")._replace(own=Listening))
+    Site(load_scenario("two_sites", unknown).setup("s")._replace(law_factory=Listening))
+    Site(load_scenario("two_sites").setup("s")._replace(law_factory=Listening))
     assert told == [(), (3.0, 1.0, 1.0, 2.0, 1.0)]
     scenario = load_scenario(
         "two_sites", {**unknown, "sites.s.control.law": "tests.laws:Knowing"}
@@ -202,7 +202,7 @@ def test_what_a_law_sends_stands_in_the_scenario(folder: Path) -> None:
         for link in setup.links:  # what is sent to this site is found in the peer's record
             record = list(range(channel.record_size))
             first = 3 + 2 * scenario.peers(link.peer).index(site)
-            assert link.channel.select_for_peer(record, link.place) == [
+            assert link.channel.select_for_peer(record, link.index_at_peer) == [
                 0,
                 1,
                 2,

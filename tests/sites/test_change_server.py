@@ -96,7 +96,7 @@ def test_triangle_dragged_for_minute_is_obeyed_to_its_end() -> None:
         (taken,), _ = asked.ask(
             10 * n, dominance="s", to={"m1": 0.5 + n / 4000, "m2": 0.5 - n / 4000}
         )
-        site.order(taken, 10 * n * 1_000_000)
+        site.apply_change(taken, 10 * n * 1_000_000)
     replies = [
         asked.ask(19_000, dominance="s", to={"m1": 1.0, "m2": 0.0})[1]
         for _ in range(MAX_RAMPS + 1)

@@ -119,7 +119,7 @@ class Hanging:
 
 
 def test_a_law_that_does_not_come_back_is_stopped() -> None:
-    site = Site(setup("s", "two_sites")._replace(own=Hanging))
+    site = Site(setup("s", "two_sites")._replace(law_factory=Hanging))
     before = signal.getsignal(signal.SIGALRM)
     watched = WatchedCode(
         "the law laws:Hanging", 1000, fail_of("s", "laws:Hanging"), SystemClock()

@@ -127,7 +127,7 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     lost = np.zeros((len(t_s), peers), dtype=bool)
     if not log.scenario.sites[site].on_stale.rule.degrades or not len(part):
         return lost
-    gone = part.memory(part.layout.life_memory(peers), peers) != 0.0
+    gone = part.memory(part.layout.count_life_memory(peers), peers) != 0.0
     rows = np.searchsorted(part.t_s, t_s + RAMP_TIME_TOLERANCE_S, side="right") - 1
     lost[rows >= 0] = gone[rows[rows >= 0]]
     return lost

@@ -12,9 +12,9 @@ from .delay import (
     LOSS,
     DelayKind,
     clamp_delay_us,
+    custom_delay_us,
     draw_delay_us,
-    draw_user_delay_us,
-    next_correlated,
+    next_ar1_value,
     sine_delay_us,
     trace_delay_us,
 )
@@ -30,7 +30,7 @@ _AR1 = int(DelayKind.AR1)
 _SINE = int(DelayKind.SINE)
 _TRACE = int(DelayKind.TRACE)
 _MEASURED = int(DelayKind.MEASURED)
-_OWN = int(DelayKind.OWN)
+_OWN = int(DelayKind.CUSTOM)
 
 
 @leaf
@@ -78,13 +78,13 @@ def _delay_us(
     if model.kind == _SINE:
         return clamp_delay_us(sine_delay_us(stamp_ns, model))
     if model.kind == _AR1:
-        link.memory = next_correlated(
+        link.memory = next_ar1_value(
             key=key, sample=sample, correlation=model.weight, before=link.memory, fresh=fresh
         )
         return clamp_delay_us(model.location + model.scale * link.memory)
     if model.kind == _OWN:
         return clamp_delay_us(
-            draw_user_delay_us(
+            custom_delay_us(
                 key=key, sample=sample, stamp_ns=stamp_ns, model=model, points=points
             )
         )
@@ -128,8 +128,8 @@ def schedule_deliveries(
     `link` is a row of LINK_DTYPE; the others are those of `LinkArrays`.
     """
     kept = dues.shape[0]
-    while link.foreseen < sample:
-        m = link.foreseen + 1
+    while link.scheduled < sample:
+        m = link.scheduled + 1
         fresh = m == 0
         stamp_ns = tick_ns(m, link.rate_hz)
         while link.model + 1 < link.models and models[link.model + 1].from_ns <= stamp_ns:
@@ -143,4 +143,4 @@ def schedule_deliveries(
             model=models[link.model],
             points=points,
         )
-        link.foreseen = m
+        link.scheduled = m

@@ -15,7 +15,7 @@ import numpy as np
 from .jit import leaf
 from .philox import DrawKey, standard_gamma, standard_normal, uniforms
 from .plugged import call_address
-from .vectors import Points, Row, count_begun
+from .vectors import Points, Row, count_started
 
 MAX_DELAY_US = 10_000_000
 """No delay is longer; the tail of a distribution is cut off here."""
@@ -32,7 +32,7 @@ class DelayKind(IntEnum):
     AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample, cut off
     at zero.
     SINE: location + scale sin(2 pi t / extra + weight). TRACE: a table by time. MEASURED: none
-    is injected; a sample is used as soon as it has come. OWN: a function of its own, never
+    is injected; a sample is used as soon as it has come. CUSTOM: a function of its own, never
     above `location`.
     """
 
@@ -46,7 +46,7 @@ class DelayKind(IntEnum):
     SINE = 7
     TRACE = 8
     MEASURED = 9
-    OWN = 10
+    CUSTOM = 10
 
 
 class TraceEnd(IntEnum):
@@ -141,7 +141,7 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
         DelayKind.SINE: location + abs(scale),
         DelayKind.TRACE: 0.0 if trace is None else float(np.max(trace[:, 1], initial=0)),
         DelayKind.MEASURED: 0.0,
-        DelayKind.OWN: location,
+        DelayKind.CUSTOM: location,
     }[DelayKind(model.kind)]
 
 
@@ -198,7 +198,7 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
 
 
 @leaf
-def next_correlated(
+def next_ar1_value(
     key: DrawKey, sample: int, correlation: float, before: float, fresh: bool
 ) -> float:
     """Returns the next number of an AR(1) sequence, standard normal; a fresh one has no number
@@ -233,7 +233,7 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
     if model.at_end == _LOOP and count > 1:
         end_us = points[first + count - 1, 0]
         t_us %= 2 * end_us - points[first + count - 2, 0]
-    before = count_begun(points, first, count, t_us) - 1
+    before = count_started(points, first, count, t_us) - 1
     delay_us: int = points[first + max(before, 0), 1]
     return delay_us
 
@@ -247,7 +247,7 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 
 
 @leaf
-def draw_user_delay_us(
+def custom_delay_us(
     key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
 ) -> float:
     """Returns the delay of an own kind, us, not rounded; its numbers stand in the table, two a

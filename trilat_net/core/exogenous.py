@@ -21,7 +21,7 @@ from .elementary import sincos
 from .jit import leaf
 from .plugged import call_address, compile_to_address, list_numbers
 from .two_link_arm import end_effector_jacobian, forward_kinematics
-from .vectors import Array, Pair, Row, RowArray, Vector, count_begun
+from .vectors import Array, Pair, Row, RowArray, Vector, count_started
 
 
 class TorqueKind(IntEnum):
@@ -248,7 +248,7 @@ def _table_place(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, 
     count = actor.table_count
     if count < 1 or t_s < table[first, 0] or t_s > table[first + count - 1, 0]:
         return -1, -1, 0.0
-    before = count_begun(table, first, count, t_s) - 1
+    before = count_started(table, first, count, t_s) - 1
     low = first + max(min(before, count - 2), 0)
     high = min(low + 1, first + count - 1)
     span = table[high, 0] - table[low, 0]

@@ -14,7 +14,7 @@ from .compiled_law import law_stage
 from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
 from .kernel import act_stages, channel_of, reference_stages, torque_stage
-from .link import LinkArrays, accept_sample, recall_sample
+from .link import LinkArrays, accept_sample, release_sample
 from .site_arrays import SiteArrays
 from .task_space import POSITION
 from .ticks import BUCKETS_PER_S, Mode, tick_ns
@@ -23,7 +23,16 @@ from .vectors import Array, IntArray, Row, RowArray
 NEVER_NS = 2**63 - 1
 """The time of the next tick of a site that has made all its ticks."""
 
-_PROGRESS = ("tick", "t_ns", "ticks", "rate_hz", "bucket", "part", "apart_ns", "diverged_ns")
+_PROGRESS = (
+    "tick",
+    "t_ns",
+    "ticks",
+    "rate_hz",
+    "bucket",
+    "part",
+    "unsettled_ns",
+    "diverged_ns",
+)
 PROGRESS_DTYPE = np.dtype((np.record, [(name, "i8") for name in _PROGRESS]))
 """A site's progress: its next tick and the time of that, how many it makes in all; the bucket,
 and how many BUCKETS_PER_S-th ticks of it are gone; when its |e| last was above the limit of
@@ -31,7 +40,7 @@ rest, and when it diverged (-1: never).
 """
 
 
-class KeptRecords(NamedTuple):
+class RecentRecords(NamedTuple):
     """The last records of a site, kept as long as a peer may still want them; of all sites one
     axis more.
 
@@ -61,7 +70,7 @@ def sums_dtype(joints: int) -> np.dtype[np.void]:
 _DIVERGED = int(Mode.DIVERGED)
 
 
-def largest_of_joints(buckets: Array) -> Array:
+def max_over_joints(buckets: Array) -> Array:
     """Returns the largest |e| and |qd| of any joint, of buckets as `run_until` makes them,
     shape (K, 2).
     """
@@ -77,7 +86,7 @@ def _first_sent(s: Row) -> int:
     return first
 
 
-class RecordedFeed(NamedTuple):
+class ReplayedInputs(NamedTuple):
     """What came to the sites of a recorded run from outside, in place of prompt samples and
     free hands.
 
@@ -93,12 +102,12 @@ class RecordedFeed(NamedTuple):
     first: IntArray
     samples: IntArray
     hands: Array
-    hand_rows: IntArray
+    hand_indices: IntArray
 
 
 @leaf
 def _accept_made(
-    k: int, rate_hz: int, peer: Row, sample: int, sent: KeptRecords, link: LinkArrays
+    k: int, rate_hz: int, peer: Row, sample: int, sent: RecentRecords, link: LinkArrays
 ) -> None:
     """Accepts a sample that its sender has made."""
     n = peer.joints
@@ -132,7 +141,7 @@ def _receive(
     peer: Row,
     made: int,
     next_sample: int,
-    sent: KeptRecords,
+    sent: RecentRecords,
     link: LinkArrays,
 ) -> int:
     """Accepts a peer's samples before time t, of the `made` there are; returns which is the
@@ -145,11 +154,11 @@ def _receive(
 
 
 @leaf
-def _take_hand(i: int, k: int, actors: TorqueSourceRows, feed: RecordedFeed) -> None:
+def _take_hand(i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs) -> None:
     """Lets the live hand of a site do what it did at tick k."""
-    if feed.hand_rows[i] < 0 or k >= feed.hands.shape[1]:
+    if feed.hand_indices[i] < 0 or k >= feed.hands.shape[1]:
         return
-    hand: Row = actors[feed.hand_rows[i]]
+    hand: Row = actors[feed.hand_indices[i]]
     size = (feed.hands.shape[2] - 1) // 2
     hand.grip = feed.hands[i, k, 0]
     for n in range(min(size, hand.a.shape[0])):
@@ -183,7 +192,7 @@ def _update_peaks(
         peaks[bucket, joints + i] = max(peaks[bucket, joints + i], speed)
         peaks[bucket, 2 * joints + i] = angle
     if error >= apart_rad:
-        progress.apart_ns = t_ns
+        progress.unsettled_ns = t_ns
     progress.part += BUCKETS_PER_S
     while progress.part >= progress.rate_hz:
         progress.part -= progress.rate_hz
@@ -342,8 +351,8 @@ def sense_site(
     i: int,
     progress: RowArray,
     taken: IntArray,
-    sent: KeptRecords,
-    feed: RecordedFeed,
+    sent: RecentRecords,
+    feed: ReplayedInputs,
     arrays: SiteArrays,
     chain: RowArray | None,
 ) -> None:
@@ -366,7 +375,7 @@ def sense_site(
             channel=channel_of(channel_of(arrays.channel, i), p),
         )
         sender: Row = arrays.site[j, 0]
-        kept = KeptRecords(sent.t_ns[j], sent.rows[j])
+        kept = RecentRecords(sent.t_ns[j], sent.rows[j])
         if k + 1 < feed.first.shape[2]:
             for n in range(feed.first[i, p, k], feed.first[i, p, k + 1]):
                 _accept_made(
@@ -388,7 +397,7 @@ def sense_site(
                 sent=kept,
                 link=link,
             )
-        recall_sample(k, rate_hz, link)
+        release_sample(k, rate_hz, link)
     _take_hand(i, k, arrays.actors[i], feed)
     reference_stages(
         k=k,
@@ -407,7 +416,7 @@ def finish_site(
     i: int,
     apart_rad: float,
     progress: RowArray,
-    sent: KeptRecords,
+    sent: RecentRecords,
     peaks: Array,
     sums: RowArray,
     arrays: SiteArrays,
@@ -466,8 +475,8 @@ def run_until(
     apart_rad: float,
     progress: RowArray,
     taken: IntArray,
-    sent: KeptRecords,
-    feed: RecordedFeed,
+    sent: RecentRecords,
+    feed: ReplayedInputs,
     peaks: Array,
     sums: RowArray,
     arrays: SiteArrays,

@@ -101,18 +101,18 @@ class _CompilingNotice(event.Listener):
     """
 
     def __init__(self) -> None:
-        self.said = False
-        self.say: Callable[[str], None] = partial(print, file=sys.stderr, flush=True)
+        self.is_reported = False
+        self.report: Callable[[str], None] = partial(print, file=sys.stderr, flush=True)
         self._restore: list[Callable[[], None]] = []  # of compilations inside one another
 
     def on_start(self, begun: Any) -> None:
         """Says so as anything of the core is compiled."""
         self._restore.append(end_process_at_signals())
-        if not self.said and begun.data["dispatcher"].py_func.__module__.startswith(
+        if not self.is_reported and begun.data["dispatcher"].py_func.__module__.startswith(
             __package__
         ):
-            self.said = True
-            self.say(COMPILING)
+            self.is_reported = True
+            self.report(COMPILING)
 
     def on_end(self, _: Any) -> None:
         """Says nothing."""

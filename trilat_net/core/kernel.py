@@ -12,10 +12,10 @@ from . import chain_stages, control, two_link_stages
 from .dominance import update_reference, update_stale_mode
 from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
-from .link import ChannelArrays, LinkArrays, accept_sample, recall_sample, release_tick
+from .link import ChannelArrays, LinkArrays, accept_sample, release_sample, release_tick
 from .resting import add_rest_torque, advance_rest, limit_torque_rate, rests, rests_by_law
 from .safeguards import is_torque_finite, limit_reference, return_to_law
-from .session_life import is_law_returning, latch, update_session_life
+from .session_life import is_law_returning, latch_mode, update_session_life
 from .site_arrays import SiteArrays, TickBuffers
 from .site_setup import Law, Scheme, StaleAction
 from .task_space import POSE, update_orientation_reference
@@ -28,7 +28,7 @@ _NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
 _DIGITAL = int(Scheme.DIGITAL)
 _ADAPTIVE = int(Law.ADAPTIVE)
-_OWN = int(Law.OWN)
+_OWN = int(Law.USER)
 
 
 @leaf
@@ -109,7 +109,7 @@ def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
     resting = False
     if s.on_stale == _GLIDE:
         if s.reason != _NOT_FINITE and s.mode != _DIVERGED and not is_torque_finite(s):
-            latch(t_ns, s, _FAULT, _NOT_FINITE)
+            latch_mode(t_ns, s, _FAULT, _NOT_FINITE)
         resting = rests(s)
         if resting:
             if not rests_by_law(s):
@@ -310,10 +310,10 @@ def sense_stages(
     rate_hz = arrays.site[0].rate_hz
     for missed in range(k - arrays.site[0].skipped, k):  # ticks that the site did not make
         for j in range(arrays.links.shape[0]):
-            recall_sample(missed, rate_hz, link_arrays(arrays, j))
+            release_sample(missed, rate_hz, link_arrays(arrays, j))
     accept_stage(k, count, arrays, buffers)
     for j in range(arrays.links.shape[0]):  # 2 recall
-        recall_sample(k, rate_hz, link_arrays(arrays, j))
+        release_sample(k, rate_hz, link_arrays(arrays, j))
     a = arrays
     reference_stages(
         k=k,

@@ -6,7 +6,7 @@ never at its own stamp. Its real arrival has no influence if it precedes the due
 measured link a sample is due at once, so there the arrival alone counts.)
 
 A link is a calendar. `accept_sample` files a sample in the page of the tick that releases it,
-if none newer is there; `recall_sample` reads the page of the present tick. Both cost the same
+if none newer is there; `release_sample` reads the page of the present tick. Both cost the same
 at any delay. Newest wins: an older sample never replaces a newer one. So a calendar need only
 span what may wait, while the times at which samples are due, eight bytes each, are kept for as
 long as a late one or a copy may come.
@@ -23,7 +23,7 @@ from .jit import leaf
 from .ticks import NS_PER_S, LinkCounts, first_tick_at, tick_ns
 from .vectors import Array, IntArray, Points, Row, RowArray, put
 
-_CHANNEL = ("models", "model", "outage_first", "outage_count", "foreseen", "bad", "due_before")
+_CHANNEL = ("models", "model", "outage_first", "outage_count", "scheduled", "bad", "due_before")
 
 
 def _sample_vectors(shared: int) -> list[tuple[str, str, tuple[int]]]:
@@ -148,7 +148,7 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
         sample=tick, link=row, models=link.models, dues=dues, points=link.points
     )
     due_ns = dues[tick % dues.shape[0]]
-    if due_ns == LOST or tick <= row.foreseen - dues.shape[0]:
+    if due_ns == LOST or tick <= row.scheduled - dues.shape[0]:
         return LOST
     if due_ns <= _FILED:
         due_ns = _FILED - due_ns
@@ -200,11 +200,11 @@ def accept_sample(
     dues = link.dues
     calendar = link.calendar
     row.accepted += 1
-    if tick < 0 or (tick > row.foreseen and _far_ahead(k, rate_hz, tick, row.rate_hz)):
+    if tick < 0 or (tick > row.scheduled and _far_ahead(k, rate_hz, tick, row.rate_hz)):
         row.refused += 1
         return
     place = tick % dues.shape[0]
-    if row.foreseen - dues.shape[0] < tick <= row.foreseen and dues[place] <= _FILED:
+    if row.scheduled - dues.shape[0] < tick <= row.scheduled and dues[place] <= _FILED:
         row.duplicate += 1
         return
     release = release_tick(tick, rate_hz, link)
@@ -236,7 +236,7 @@ def accept_sample(
 
 
 @leaf
-def recall_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
+def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
     """Brings into use the newest sample that tick k releases, if there is one; else the last
     one stays.
 

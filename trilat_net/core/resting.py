@@ -66,7 +66,7 @@ _STOPPED = int(Mode.STOPPED)
 _NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
 _ADAPTIVE = int(Law.ADAPTIVE)
-_OWN = int(Law.OWN)
+_OWN = int(Law.USER)
 _KNOWN = int(Law.KNOWN)
 
 
@@ -105,7 +105,7 @@ def rests_by_law(site: Row) -> bool:
 
 
 @leaf
-def begin_rest(t_ns: int, mode: int, reason: int, site: Row) -> None:
+def enter_rest(t_ns: int, mode: int, reason: int, site: Row) -> None:
     """Enters a mode in which the arm comes to rest; what rests already goes on, unless its law
     failed.
     """

@@ -20,7 +20,7 @@ from math import isfinite
 
 from .chain import add, put_three, scale, subtract, three
 from .jit import leaf
-from .resting import advance_rest_reference, begin_rest, put_rest_reference, rests
+from .resting import advance_rest_reference, enter_rest, put_rest_reference, rests
 from .rotation import (
     angular_velocity,
     compose_rotations,
@@ -161,12 +161,12 @@ def is_law_returning(t_ns: int, site: Row) -> bool:
 
 
 @leaf
-def latch(t_ns: int, site: Row, mode: int, reason: int) -> None:
+def latch_mode(t_ns: int, site: Row, mode: int, reason: int) -> None:
     """Enters FAULT or STOPPED."""
     for p in range(site.theta_hat.shape[0]):
         if not isfinite(site.theta_hat[p]):
             site.theta_hat[p] = 0.0
-    begin_rest(t_ns, mode, reason, site)
+    enter_rest(t_ns, mode, reason, site)
 
 
 @leaf
@@ -193,27 +193,27 @@ def _obey(t_ns: int, site: Row) -> None:
     site.order = site.skipped = 0
     moves = mode in (_RUN, _ALIGN)
     if order == _TO_RESET and mode == _FAULT:
-        begin_rest(t_ns, _WAITING, _RESET, site)
+        enter_rest(t_ns, _WAITING, _RESET, site)
     elif order == _TO_ENABLE and mode == _STOPPED:
-        begin_rest(t_ns, _WAITING, _ENABLE, site)
+        enter_rest(t_ns, _WAITING, _ENABLE, site)
     elif order == _TAKE_HOLD and mode == _STOPPED and site.reason == _RELEASED:
-        begin_rest(t_ns, _WAITING, _HELD, site)
+        enter_rest(t_ns, _WAITING, _HELD, site)
     elif order == _TO_STOP and mode == _STOPPED:
         site.reason = _STOP
     elif order in (_TO_STOP, _LET_GO) and mode != _FAULT and mode != _STOPPED:
-        latch(t_ns, site, _STOPPED, _STOP if order == _TO_STOP else _RELEASED)
+        latch_mode(t_ns, site, _STOPPED, _STOP if order == _TO_STOP else _RELEASED)
     elif mode in (_FAULT, _STOPPED):
         return
     elif order == _LOSE_ARM or skipped > FAULT_OVERRUN_TICKS:
-        latch(t_ns, site, _FAULT, _ARM_SILENT if order == _LOSE_ARM else _OVERRUN)
+        latch_mode(t_ns, site, _FAULT, _ARM_SILENT if order == _LOSE_ARM else _OVERRUN)
     elif order == _HEAR_SILENCE and moves:
-        begin_rest(t_ns, _HOLD, _ARM_SILENT, site)
+        enter_rest(t_ns, _HOLD, _ARM_SILENT, site)
     elif order == _HEAR_SILENCE:
         site.reason = _ARM_SILENT
     elif order == _HEAR_ARM and site.reason == _ARM_SILENT:
         site.reason = _ARM_BACK
     elif skipped > HELD_OVERRUN_TICKS and moves:
-        begin_rest(t_ns, _HOLD, _OVERRUN, site)
+        enter_rest(t_ns, _HOLD, _OVERRUN, site)
 
 
 @leaf
@@ -221,7 +221,7 @@ def _update_mode(t_ns: int, site: Row, links: RowArray) -> None:
     """Changes the mode where limits or the peers ask for it."""
     fault = _find_fault(site)
     if fault >= 0 and site.mode != _FAULT:
-        latch(t_ns, site, _FAULT, fault)
+        latch_mode(t_ns, site, _FAULT, fault)
     if site.mode == _FAULT or site.mode == _STOPPED or site.reason == _ARM_SILENT:
         return
     heard = _all_heard(t_ns, site.stale_ns, links)
@@ -230,7 +230,7 @@ def _update_mode(t_ns: int, site: Row, links: RowArray) -> None:
     elif heard and site.mode == _HOLD and site.return_from_ns != t_ns:
         _leave_rest(t_ns, site, _PEERS_BACK)
     elif not heard and (site.mode == _RUN or site.mode == _ALIGN):
-        begin_rest(t_ns, _HOLD, _PEER_SILENT, site)
+        enter_rest(t_ns, _HOLD, _PEER_SILENT, site)
     elif site.regrouped and (site.mode == _RUN or site.mode == _ALIGN):
         _carry_on(site)
         _begin_aligning(
@@ -251,7 +251,7 @@ def update_session_life(t_ns: int, site: Row, links: RowArray) -> None:
     if site.mode == _DIVERGED:
         return
     if t_ns == tick_ns(site.first, site.rate_hz):
-        begin_rest(t_ns, _WAITING, _START, site)
+        enter_rest(t_ns, _WAITING, _START, site)
     ticks = 1 + site.skipped
     if site.order != 0 or site.skipped != 0:
         _obey(t_ns, site)

@@ -200,7 +200,11 @@ def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
     """Returns the buffers of a site."""
     layout = setup.layout
     shape = (MAX_ARRIVALS, layout.shared)
-    most = 0 if setup.own is None else max(link.channel.received_size for link in setup.links)
+    most = (
+        0
+        if setup.law_factory is None
+        else max(link.channel.received_size for link in setup.links)
+    )
     return TickBuffers(
         np.zeros(MAX_ARRIVALS, arrival_dtype(layout.shared)),
         np.zeros(shape),
@@ -242,7 +246,7 @@ def build_site_arrays(
     dues = np.full((peers, kept), LOST, dtype=np.int64)
     chain = None if setup.chain is None else build_chain(setup.chain.joints, layout.joints)
     site = _build_site(setup, layout)
-    channel = _build_channel(setup, pages) if plugged or setup.own is not None else None
+    channel = _build_channel(setup, pages) if plugged or setup.law_factory is not None else None
     arrays = SiteArrays(
         site=site,
         links=rows,
@@ -272,7 +276,9 @@ def needed_pages(setup: SiteSetup) -> int:
 def links_bytes(setup: SiteSetup, pages: int) -> int:
     """Returns the memory of a site's links with so many pages each, bytes."""
     numbers = (
-        sum(vector.length for vector in setup.received_vectors) if setup.own is not None else 0
+        sum(vector.length for vector in setup.received_vectors)
+        if setup.law_factory is not None
+        else 0
     )
     page = sample_dtype(setup.layout.shared).itemsize + 8 * numbers
     return len(setup.links) * (pages * page + 8 * _kept_dues(setup))
@@ -304,7 +310,7 @@ def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
     return arrays._replace(calendars=calendars, channel=channel)
 
 
-class LinkRoom:
+class CalendarSizer:
     """The room of a site's links: for its delays, and more for senders further ahead and delays
     that grow.
 
@@ -388,7 +394,7 @@ in a run.
 """
 
 
-def take_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
+def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
     """Takes a change in; one that is planned for later, by the scenario or an earlier order,
     still comes.
 
@@ -452,7 +458,7 @@ def stack_site_arrays(
     pages = calendar_pages(fastest_hz, max(longest, longest_us), margin_ns)
     layouts = [setup.layout for setup in setups]
     largest = Layout(*map(max, zip(*layouts, strict=True)))
-    plugged = any(setup.own is not None for setup in setups)
+    plugged = any(setup.law_factory is not None for setup in setups)
     sites = [
         build_site_arrays(one, (spare,) * 2, pages, largest, plugged=plugged) for one in setups
     ]
@@ -506,7 +512,7 @@ def _stack_channels(
             common, own = (
                 link.channel.count_numbers(per_peer=per_peer) for per_peer in (False, True)
             )
-            places[places >= common] += link.place * own
+            places[places >= common] += link.index_at_peer * own
     waiting, received, places = map(_stack_padded, zip(*channels, strict=True))
     for channel, whole in zip(channels, places, strict=True):
         whole[:, channel.places.shape[1] :] = -1
@@ -574,7 +580,7 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
     }
     vectors |= {**setup.limits._asdict(), **setup.rest.vectors()}
     vectors |= {"q": setup.q0, "qd": setup.qd0, "q_before": setup.q0}
-    if gains.law is Law.OWN and setup.theta_known:
+    if gains.law is Law.USER and setup.theta_known:
         vectors["known"] = setup.theta
     vectors["theta_hat"] = gains.known if gains.law is Law.KNOWN else gains.theta_hat0
     lengths = {
@@ -622,7 +628,7 @@ def _build_links(
         row.followed = link.followed
         row.dispensable = link.dispensable
         row.used = -1
-        row.foreseen = -1
+        row.scheduled = -1
         row.q[: len(link.q0)] = link.q0
         row.outage_first = outage_first
         row.outage_count = len(link.outages)

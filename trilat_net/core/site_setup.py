@@ -39,12 +39,12 @@ class Law(IntEnum):
     ADAPTIVE is the paper's, Eq. (13) and (15), with its estimate in a box if one is given.
     KNOWN knows
     gravity: tau = G(q) - K e - d qd - Kd ed + k_f felt, which is P+d, PD+d, or direct force
-    reflection. OWN is a user's law, in Python.
+    reflection. USER is a user's law, in Python.
     """
 
     ADAPTIVE = 0
     KNOWN = 1
-    OWN = 2
+    USER = 2
 
 
 LEAST_STOP_S = 0.1
@@ -148,7 +148,7 @@ class LinkSetup(NamedTuple):
         traces: per model the points of its trace, shape (n, 2), see `Points`, or None.
         outages: when the link is cut: pairs of first stamp and end, ns.
         channel: what the peer's law sends besides its motion.
-        place: the site's place among the peers of its peer, in scenario order.
+        index_at_peer: the site's place among the peers of its peer, in scenario order.
         speed_limit: largest speed of the peer's joints, rad/s, for who drops samples beyond; ()
             for no one.
         bit: of the peer in sets of sites.
@@ -165,7 +165,7 @@ class LinkSetup(NamedTuple):
     traces: tuple[Points | None, ...] = (None,)
     outages: tuple[tuple[int, int], ...] = ()
     channel: LawChannel = LawChannel()
-    place: int = 0
+    index_at_peer: int = 0
     speed_limit: tuple[float, ...] = ()
     bit: int = 0
     followed: int = 0
@@ -243,7 +243,7 @@ class Layout(NamedTuple):
             for (name, length), end in zip(lengths.items(), ends, strict=True)
         }
 
-    def life_memory(self, peers: int, *, degrades: bool = False) -> int:
+    def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
         """Returns how many numbers a site that glides, with so many peers, has in a record's
         `mem`.
 
@@ -260,9 +260,9 @@ class Layout(NamedTuple):
         first = 2 * (self.shared + 1) + peers + self.joints
         return slice(first, first + 2 * self.joints * self.task)
 
-    def find_lost(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
+    def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
         """Returns the peers without which a site that degrades goes on, by a record's `mem`."""
-        end = self.life_memory(len(peers), degrades=True)
+        end = self.count_life_memory(len(peers), degrades=True)
         return [
             peer for peer, gone in zip(peers, mem[end - len(peers) : end], strict=False) if gone
         ]
@@ -380,7 +380,7 @@ class SiteSetup(NamedTuple):
         on_stale: the rule for a stale peer.
         external: true: the arm is outside of the program; it is measured, and nothing is
             integrated.
-        own: makes the user's law, if it is one.
+        law_factory: makes the user's law, if it is one.
         theta_known: false: `theta` is not that of the arm, which is outside of the program and
             unidentified.
         chain: the arm, if it is a chain; None: it is the planar two-link arm.
@@ -406,7 +406,7 @@ class SiteSetup(NamedTuple):
     ramps: tuple[DominanceRamp, ...] = ()
     on_stale: StaleRule = StaleRule()
     external: bool = False
-    own: UserLawFactory | None = None
+    law_factory: UserLawFactory | None = None
     theta_known: bool = True
     chain: ChainSetup | None = None
     channel: LawChannel = LawChannel()

@@ -32,11 +32,11 @@ from .live_hand import HandInForce, empty_hand_vector
 from .site_arrays import (
     MAX_CHANGES,
     MAX_RAMPS,
-    LinkRoom,
+    CalendarSizer,
     SiteArrays,
+    apply_change,
     build_site_arrays,
     build_tick_buffers,
-    take_change,
 )
 from .site_setup import SiteSetup, StaleAction
 from .ticks import (
@@ -77,7 +77,7 @@ class Site:
         self.rate_hz = setup.rate_hz
         self.peers = tuple(link.peer for link in setup.links)
         self._starts = [link.q0 for link in setup.links]
-        self._room = LinkRoom(setup)
+        self._room = CalendarSizer(setup)
         self._external = setup.external
         self._arrays = build_site_arrays(setup, (MAX_CHANGES, MAX_RAMPS))
         self.layout = setup.layout
@@ -137,7 +137,9 @@ class Site:
 
     def _plug_law(self, setup: SiteSetup) -> None:
         """Makes the law of a setup that has its own."""
-        self._user_law = None if setup.own is None else setup.own(setup.law_context())
+        self._user_law = (
+            None if setup.law_factory is None else setup.law_factory(setup.law_context())
+        )
         self._law = None
         self.law_failure: LawFailed | None = None
         if self._user_law is not None:
@@ -150,7 +152,7 @@ class Site:
                 act_stages, 0, 0, a.site, a.actors, a.table, a.chain, b.record
             )
 
-    def order(self, command: CoreChange, t_ns: int) -> None:
+    def apply_change(self, command: CoreChange, t_ns: int) -> None:
         """Takes in a change; one that is planned for later, by the scenario or an earlier
         order, still comes.
 
@@ -161,11 +163,11 @@ class Site:
         Raises:
             ValueError: the arrays have no more room for it.
         """
-        take_change(self._arrays, command, t_ns)
+        apply_change(self._arrays, command, t_ns)
         if command.model is not None:
             self._room.lengthen(command.peer, command.model)
 
-    def begin_at(self, k: int) -> None:
+    def start_at(self, k: int) -> None:
         """Lets tick k be the first one, of a site that joins a running session; for a site
         without ticks.
 
@@ -173,7 +175,7 @@ class Site:
         its channels are where they would be.
         """
         if k <= self._site["first"]:
-            self.prime(k, [None] * len(self.peers), ())
+            self.restore_links(k, [None] * len(self.peers), ())
         self._site["first"] = k
         for n, link in enumerate(self._links):
             sample = (k - 1) * int(link["rate_hz"]) // self.rate_hz
@@ -188,14 +190,14 @@ class Site:
             tick: its number, one more than the last one's, and the input since then.
 
         Raises:
-            ValueError: more than MAX_ARRIVALS arrivals, or more changes than `order` takes.
+            ValueError: more than MAX_ARRIVALS arrivals, or more changes than `apply_change` takes.
             LawFailed: a user's law did, and the site does not go on without it, as under
                 `glide`.
         """
         t_ns = tick.k * NS_PER_S // self.rate_hz
         count = len(tick.arrivals)
         for command in tick.commands:
-            self.order(command, t_ns)
+            self.apply_change(command, t_ns)
         packed = self._pack(tick.k, tick.arrivals)
         bodies: Sequence[float] = ()
         if tick.measured is not None and self._external:
@@ -340,7 +342,7 @@ class Site:
         release = int(find_release(peer, tick, self._arrays))
         return None if release == LOST else release
 
-    def measures(self, peer: int) -> bool:
+    def is_measured(self, peer: int) -> bool:
         """True if the link to this peer injects no delay: then no sample of it is late."""
         link: Row = self._links[peer]
         return bool(self._arrays.models[peer, link.model]["kind"] == DelayKind.MEASURED)
@@ -349,11 +351,11 @@ class Site:
         """Returns the tick rate of a peer, Hz."""
         return int(self._links[peer]["rate_hz"])
 
-    def resume(self, before: TickRecord, last: TickRecord) -> None:
+    def restore_state(self, before: TickRecord, last: TickRecord) -> None:
         """Restores the arm and its controller after `step(last.tick)`, from two records in a
         row.
 
-        `prime` restores the links.
+        `restore_links` restores the links.
 
         Args:
             before: the record of the tick before the last one; any if that is tick 0.
@@ -397,7 +399,7 @@ class Site:
             self._law_memory = list(rest)
         resume_stages(last.tick, self._arrays)
 
-    def prime(
+    def restore_links(
         self, k: int, in_use: Sequence[Arrival | None], waiting: Sequence[Arrival]
     ) -> None:
         """Restores the links before tick k.
@@ -417,7 +419,7 @@ class Site:
             zip(self._links, self._starts, in_use, strict=True)
         ):
             # the channel's memory is a function of what went before
-            link.foreseen = -1
+            link.scheduled = -1
             link.model = 0
             link.due_before = 0
             if sample is None:

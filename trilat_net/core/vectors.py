@@ -41,7 +41,7 @@ def put(a: Any, values: Any) -> None:
 
 
 @leaf
-def count_begun(table: Any, first: int, count: int, now: float) -> int:
+def count_started(table: Any, first: int, count: int, now: float) -> int:
     """Returns how many of so many rows, in the order of their times, begin at a time or before
     it.
     """

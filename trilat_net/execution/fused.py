@@ -29,17 +29,17 @@ from ..core.exogenous import LIVE_KINDS
 from ..core.fused_run import (
     NEVER_NS,
     PROGRESS_DTYPE,
-    KeptRecords,
     LawArrays,
-    RecordedFeed,
+    RecentRecords,
+    ReplayedInputs,
     finish_site,
-    largest_of_joints,
+    max_over_joints,
     run_until,
     sense_site,
     sums_dtype,
 )
 from ..core.law_view import PlainLaw
-from ..core.site_arrays import SiteArrays, select_site, stack_site_arrays, take_change
+from ..core.site_arrays import SiteArrays, apply_change, select_site, stack_site_arrays
 from ..core.site_setup import SiteSetup
 from ..core.ticks import BUCKETS_PER_S, MAX_ARRIVALS, NS_PER_S, CoreChange, Mode, tick_ns
 from ..core.vectors import Array, IntArray, Row, RowArray
@@ -179,7 +179,7 @@ class RunInputs(NamedTuple):
         longest_us: longest delay that a change gave to a link, us.
     """
 
-    feed: RecordedFeed
+    feed: ReplayedInputs
     changes: Sequence[tuple[int, int, CoreChange]] = ()
     late_ns: int = 0
     longest_us: int = 0
@@ -191,11 +191,11 @@ def make_prompt_inputs(sites: int) -> RunInputs:
     Args:
         sites: number of sites.
     """
-    feed = RecordedFeed(
+    feed = ReplayedInputs(
         first=np.zeros((sites, max(sites - 1, 1), 0), np.int64),
         samples=np.zeros(0, np.int64),
         hands=np.zeros((sites, 0, 1)),
-        hand_rows=np.full(sites, -1),
+        hand_indices=np.full(sites, -1),
     )
     return RunInputs(feed)
 
@@ -251,7 +251,7 @@ class FusedRun:
         self._plug_laws(setups)
         self._progress: RowArray = np.zeros(count, PROGRESS_DTYPE)
         self._progress["rate_hz"] = [scenario.sites[name].rate_hz for name in names]
-        self._progress["apart_ns"] = -1
+        self._progress["unsettled_ns"] = -1
         self._progress["diverged_ns"] = -1
         self._taken = np.zeros((count, count - 1), dtype=np.int64)
         self._sent = self._allocate_records(keep)
@@ -268,7 +268,7 @@ class FusedRun:
         self._plant_ticks = dict.fromkeys(self._plants, 0)  # by site the tick of its plant
         self._selected: dict[int, SiteArrays] = {}
 
-    def _allocate_records(self, keep: int) -> KeptRecords:
+    def _allocate_records(self, keep: int) -> RecentRecords:
         """Returns room for the last records of every site, of a power of two of records.
 
         Records are kept for `pop_records`, until the slowest peer has received them, and until
@@ -280,7 +280,7 @@ class FusedRun:
         needed = max(_find_largest_ratio(self._scenario) + 1, keep, late_ticks)
         pages = 1 << needed.bit_length()
         floats = max(layout.floats for layout in self._layouts)
-        return KeptRecords(
+        return RecentRecords(
             t_ns=np.zeros((count, pages), dtype=np.int64),
             rows=np.zeros((count, pages, floats)),
         )
@@ -299,7 +299,7 @@ class FusedRun:
             rows[i] = _find_live_row(setups[i])
         size = max((setups[i].layout.hand - 3) // 2 for i in self._hands)
         actions = np.zeros((len(setups), 0, 1 + 2 * size))
-        feed = self._inputs.feed._replace(hands=actions, hand_rows=np.array(rows))
+        feed = self._inputs.feed._replace(hands=actions, hand_indices=np.array(rows))
         self._inputs = self._inputs._replace(feed=feed)
 
     def _plug_laws(self, setups: Sequence[SiteSetup]) -> None:
@@ -311,9 +311,9 @@ class FusedRun:
         count = len(setups)
         sent = np.zeros((count, max(setup.channel.record_size for setup in setups)))
         for i, setup in enumerate(setups):
-            if setup.own is not None:
+            if setup.law_factory is not None:
                 arrays = select_site(self._tables, i, setup.layout)
-                law = setup.own(setup.law_context())
+                law = setup.law_factory(setup.law_context())
                 channel = sent[i, : setup.channel.record_size]
                 self._laws[i] = plug_law(law, setup, arrays, channel)
         compiled = {i: law for i, law in self._laws.items() if isinstance(law, CompiledLaw)}
@@ -344,7 +344,7 @@ class FusedRun:
             if t_ns > last_ns:
                 break
             self._step_until(t_ns - 1)
-            take_change(self.arrays(i), change, t_ns)
+            apply_change(self.arrays(i), change, t_ns)
             self._changes.popleft()
         if self.diverged_s is None:
             self._step_until(last_ns)
@@ -584,13 +584,13 @@ class FusedRun:
     @property
     def settled_s(self) -> float | None:
         """Time from which every |e| is below `settled_rad`, s; None if never until the end."""
-        last = int(np.argmax(self._progress["apart_ns"]))  # the site that settles last
+        last = int(np.argmax(self._progress["unsettled_ns"]))  # the site that settles last
         progress: Row = self._progress[last]
-        if progress.apart_ns < 0:
+        if progress.unsettled_ns < 0:
             return 0.0
-        if progress.apart_ns == tick_ns(progress.tick - 1, progress.rate_hz):
+        if progress.unsettled_ns == tick_ns(progress.tick - 1, progress.rate_hz):
             return None
-        return float(progress.apart_ns) / NS_PER_S
+        return float(progress.unsettled_ns) / NS_PER_S
 
     @property
     def buckets(self) -> tuple[Array, ...]:
@@ -608,7 +608,7 @@ class FusedRun:
     @property
     def maxima(self) -> tuple[Array, ...]:
         """Largest |e|, rad, and |qd|, rad/s, of each bucket, shape (buckets, 2) each."""
-        return tuple(map(largest_of_joints, self.buckets))
+        return tuple(map(max_over_joints, self.buckets))
 
     @property
     def totals(self) -> RunTotals:
@@ -751,7 +751,7 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
         ticks: largest number of ticks of a site.
 
     Returns:
-        `first` and `samples` as in `RecordedFeed`, and the largest time from the stamp of a
+        `first` and `samples` as in `ReplayedInputs`, and the largest time from the stamp of a
         sample to its arrival, ns.
     """
     names = log.scenario.names
@@ -781,7 +781,7 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
     return first, np.concatenate([*samples, np.zeros(0, np.int64)]), late_ns
 
 
-def _add_hands(feed: RecordedFeed, log: Log, ticks: int) -> RecordedFeed:
+def _add_hands(feed: ReplayedInputs, log: Log, ticks: int) -> ReplayedInputs:
     """Returns a feed with the recorded actions of live hands."""
     setups = [log.scenario.setup(name)._replace(own=None) for name in log.scenario.names]
     rows = [_find_live_row(setup) for setup in setups]
@@ -792,14 +792,14 @@ def _add_hands(feed: RecordedFeed, log: Log, ticks: int) -> RecordedFeed:
     for i, name in enumerate(log.scenario.names):
         if rows[i] >= 0:
             _write_actions(actions[i], 0, log[name].hand)
-    return feed._replace(hands=actions, hand_rows=np.array(rows))
+    return feed._replace(hands=actions, hand_indices=np.array(rows))
 
 
 def _write_actions(feed_actions: Array, k: int, actions: Array) -> None:
     """Writes actions of a hand into a feed.
 
     Args:
-        feed_actions: the actions of one site in a `RecordedFeed`, shape (K, 1 + 2 size).
+        feed_actions: the actions of one site in a `ReplayedInputs`, shape (K, 1 + 2 size).
         k: tick of the first action.
         actions: the actions, a row per tick, as `HandInForce`.
     """

@@ -116,7 +116,9 @@ def select_peer_channels(
     for arrival in arrivals:
         if arrival.ch:
             link = links[arrival.peer]
-            arrival = arrival._replace(ch=link.channel.select_for_peer(arrival.ch, link.place))
+            arrival = arrival._replace(
+                ch=link.channel.select_for_peer(arrival.ch, link.index_at_peer)
+            )
         selected.append(arrival)
     return selected
 

@@ -305,7 +305,7 @@ class SiteVerifier:
         self._site = Site(setup)
         self._external = site in log.scenario.external
         # a site that glides holds by a reference of its own, unless its law reflects forces
-        reflects = setup.own is not None or any(setup.gains.k_f)
+        reflects = setup.law_factory is not None or any(setup.gains.k_f)
         self._detached = setup.on_stale.action is StaleAction.GLIDE and not reflects
         self._starts = {boot: first for first, boot in log.starts.get(site, ())}
         self._absences = {last + 1: first for first, last in log.absences.get(site, ())}
@@ -417,7 +417,7 @@ class SiteVerifier:
         self._inputs.pop_changes(first - 1)  # these concern the start before
         self._applied.clear()
         self._site = Site(self._setup)
-        self._site.begin_at(first)
+        self._site.start_at(first)
         self._start_tick = first
         self._certain = True
         return first
@@ -432,7 +432,7 @@ class SiteVerifier:
         self._site = Site(self._setup)
         self._certain = False
         if self._start_tick:
-            self._site.begin_at(self._start_tick)
+            self._site.start_at(self._start_tick)
         for change in self._applied:
             self._site.order(change, state.t_ns)
 

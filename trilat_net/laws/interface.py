@@ -109,7 +109,7 @@ class LawSettings(Frozen, frozen=True):
 
     def gains(self, theta: Array) -> Gains:  # noqa: ARG002 - as the laws of the kernel
         """Returns the gains for the kernel, for an arm with parameters theta."""
-        return Gains(Law.OWN)
+        return Gains(Law.USER)
 
     def linear_gains(self, theta: Array) -> Gains | None:
         """Returns gains of a kernel law with the same small motions, or None.

@@ -57,7 +57,7 @@ class LinkSchedule:
         row.key = setup.key
         row.models = len(self.models)
         row.used = -1
-        row.foreseen = -1
+        row.scheduled = -1
         row.outage_first = len(points)
         row.outage_count = len(setup.outages)
         self.row = row
@@ -68,7 +68,7 @@ class LinkSchedule:
 
         The first of them is the sample after the last one of the previous call.
         """
-        first = int(self.row.foreseen) + 1
+        first = int(self.row.scheduled) + 1
         due_ns = np.empty(max(0, end - first), dtype=np.int64)
         for start in range(first, end, _BLOCK):
             stop = min(start + _BLOCK, end)
@@ -92,7 +92,7 @@ class LinkSchedule:
         Returns:
             Numbers of samples, and the receiver's first tick at or after each due time.
         """
-        samples = np.arange(int(self.row.foreseen) + 1, end)
+        samples = np.arange(int(self.row.scheduled) + 1, end)
         due_ns = self.draw(end)
         stamp_ns = samples * NS_PER_S // int(self.row.rate_hz)
         # A sample is never released at its own stamp.

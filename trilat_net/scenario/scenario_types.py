@@ -594,7 +594,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             traces=tuple(link.points for _, link in models),
             outages=tuple((round(a * 1e9), round(b * 1e9)) for a, b in first.outages_s),
             channel=self.channel(peer),
-            place=self.peers(peer).index(site),
+            index_at_peer=self.peers(peer).index(site),
             speed_limit=self._speed_limit(peer)
             if self.sites[site].on_stale.action == "glide"
             else (),

@@ -310,8 +310,8 @@ def _complete_estimates(
     rows = []
     for n, site in enumerate(conditions.sites):
         given = None if theta_hat is None else theta_hat[n]
-        if isinstance(site.own, NumericLaw):
-            rows.append(site.own.complete_memory(given))
+        if isinstance(site.law_factory, NumericLaw):
+            rows.append(site.law_factory.complete_memory(given))
         elif has_estimate(site):
             rows.append(site.theta if given is None else given[: len(site.theta)])
         else:
@@ -326,8 +326,10 @@ def _settle_memories(
     for n, (site, x) in enumerate(
         zip(conditions.sites, linear_loop.gather_site_arguments(conditions, rest), strict=True)
     ):
-        if isinstance(site.own, NumericLaw):
-            theta_hat[n, : len(site.own.memory)] = site.own.iterate_memory(x, ticks)
+        if isinstance(site.law_factory, NumericLaw):
+            theta_hat[n, : len(site.law_factory.memory)] = site.law_factory.iterate_memory(
+                x, ticks
+            )
     return rest._replace(theta_hat=theta_hat)
 
 

@@ -134,7 +134,7 @@ class LinearAnalysis(Result):
         conditions = self.conditions
         rest = self.rest
         layouts = [site.layout for site in conditions.sites]
-        learns = [not isinstance(site.own, NumericLaw) for site in conditions.sites]
+        learns = [not isinstance(site.law_factory, NumericLaw) for site in conditions.sites]
         q = [own[: layout.joints].tolist() for own, layout in zip(rest.q, layouts, strict=True)]
         theta_hat = [
             own[: layout.parameters * one].tolist()

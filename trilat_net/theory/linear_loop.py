@@ -259,8 +259,8 @@ def _select_states(
 ) -> SiteJacobian:
     """Returns a site's derivatives by the states that the loop keeps of its estimate."""
     motion = _name_motion(layout.joints)
-    if isinstance(site.own, NumericLaw):
-        return SiteJacobian(layout, rates, (*motion, *site.own.names))
+    if isinstance(site.law_factory, NumericLaw):
+        return SiteJacobian(layout, rates, (*motion, *site.law_factory.names))
     if not site_dynamics.has_estimate(site):
         return _replace_estimate(layout, rates, np.zeros((0, layout.parameters)), ())
     if site.chain is None or all_estimates:

@@ -70,8 +70,8 @@ class NumericLaw:
                 "in joint space only",
                 path=path,
             )
-        assert setup.own is not None
-        self._law = setup.own(setup.law_context())
+        assert setup.law_factory is not None
+        self._law = setup.law_factory(setup.law_context())
         self._layout = setup.layout
         self._arrays = build_site_arrays(setup)
         self._rate_hz = setup.rate_hz

@@ -113,7 +113,9 @@ class OperatingConditions(NamedTuple):
         Site i uses them if its dominance factor is not zero, or if its law is imported: such a
         law reads the samples of every peer.
         """
-        is_imported = np.array([isinstance(site.own, NumericLaw) for site in self.sites])
+        is_imported = np.array(
+            [isinstance(site.law_factory, NumericLaw) for site in self.sites]
+        )
         is_other = ~np.eye(len(self.alpha), dtype=bool)
         coupled = (self.alpha != 0.0) | (is_imported[:, np.newaxis] & is_other)
         return [(int(i), int(j)) for i, j in zip(*np.nonzero(coupled), strict=True)]
@@ -245,7 +247,7 @@ def _build_imported_law(scenario: Scenario, site: SiteSetup, alpha: Array) -> Si
     i = scenario.names.index(site.name)
     shares = np.delete(alpha[i], i).tolist()
     try:
-        return site._replace(own=NumericLaw(site, law.code, shares))
+        return site._replace(law_factory=NumericLaw(site, law.code, shares))
     except ScenarioError as error:
         raise type(error)(error.problem, path=error.path, source=scenario.name) from None
 

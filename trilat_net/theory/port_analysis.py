@@ -251,7 +251,7 @@ def analyse_ports(
         proof=_check_proof(conditions, loop, w_rad_s),
         beta=compute_proof_weights(conditions),
         estimates_true=all(
-            site.gains.law is Law.OWN or np.allclose(own[: len(site.theta)], site.theta)
+            site.gains.law is Law.USER or np.allclose(own[: len(site.theta)], site.theta)
             for own, site in zip(rest.theta_hat, conditions.sites, strict=True)
         ),
         absolute=frequency_search.find_minima(

@@ -82,8 +82,10 @@ def lay_out_arguments(site: SiteSetup) -> ArgumentLayout:
 
     The memory of an imported law takes the position of the estimate.
     """
-    if isinstance(site.own, NumericLaw):
-        return ArgumentLayout(site.layout.joints, len(site.own.memory), 0, len(site.links))
+    if isinstance(site.law_factory, NumericLaw):
+        return ArgumentLayout(
+            site.layout.joints, len(site.law_factory.memory), 0, len(site.links)
+        )
     return ArgumentLayout(site.layout.joints, site.layout.parameters, site.layout.shared)
 
 
@@ -170,9 +172,9 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     following = follow_peers(site, arm, x)
     external = x[layout.external_torque] + _sum_actors(site, arm, x, sampled=False)
     held = _sum_actors(site, arm, x, sampled=True)
-    if isinstance(site.own, NumericLaw):
+    if isinstance(site.law_factory, NumericLaw):
         law_arguments = np.concatenate([x[: layout.inputs.stop], external + held])
-        tau, estimate_rate = site.own.evaluate(law_arguments)
+        tau, estimate_rate = site.law_factory.evaluate(law_arguments)
     elif has_estimate(site):
         tau, estimate_rate = _evaluate_adaptive_law(site, arm, following, x)
     else:
@@ -201,8 +203,8 @@ def differentiate_site_rates(site: SiteSetup, x: Array) -> SiteRates:
 
 def has_estimate(site: SiteSetup) -> bool:
     """True if the site's state includes an estimate, or the memory of an imported law."""
-    if isinstance(site.own, NumericLaw):
-        return len(site.own.memory) > 0
+    if isinstance(site.law_factory, NumericLaw):
+        return len(site.law_factory.memory) > 0
     return site.gains.law is Law.ADAPTIVE
 
 

@@ -151,8 +151,10 @@ def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | No
     laws: dict[str, Any] = {}
     for name, spec in log.scenario.sites.items():
         setup = log.scenario.setup(name)
-        if setup.own is not None and (own_laws or not isinstance(spec.control, ImportedLaw)):
-            law = setup.own(setup.law_context())
+        if setup.law_factory is not None and (
+            own_laws or not isinstance(spec.control, ImportedLaw)
+        ):
+            law = setup.law_factory(setup.law_context())
             laws |= {name: law} if callable(getattr(law, "energies", None)) else {}
     if not laws:
         return None
@@ -205,7 +207,7 @@ def _add_parts(energy: Array) -> Array:
 def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
     part = log[name]
     rule = log.scenario.sites[name].on_stale.rule
-    life = part.layout.life_memory(len(part.peers), degrades=rule.degrades)
+    life = part.layout.count_life_memory(len(part.peers), degrades=rule.degrades)
     own = life if rule.action is StaleAction.GLIDE else part.layout.shared + 1
     attributes = getattr(law, "remembers", ())
     lengths = [np.size(getattr(law, attribute)) for attribute in attributes]

@@ -158,7 +158,7 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
     absent = [name for name in (peer, site) if name not in runs]
     if absent:
         return unavailable(ENERGY, f"no records of {', '.join(absent)}", of="link")
-    if gains.law is Law.OWN:
+    if gains.law is Law.USER:
         unknown = f"the law {identify_law(law)} does not say which part of its torque is due to a peer"
         return unavailable(ENERGY, unknown, of="link")
     records = runs[site].records

@@ -371,7 +371,7 @@ def _holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
     arm = build_arm_rows(scenario, site)
     gains = spec.control.gains(arm.theta)
     none = np.zeros(len(spec.q0_rad))
-    if gains.law is Law.OWN:
+    if gains.law is Law.USER:
         return (
             none,
             f"the law {identify_law(spec.control)} states no stiffness that holds e at rest",

@@ -260,7 +260,7 @@ class OwnDelay(LinkBase, frozen=True, kw_only=True):
         return np.resize(numbers, (rows, 2)).view(np.int64)
 
     def _delay(self) -> LinkModel:
-        return LinkModel(kind=DelayKind.OWN, location=1e3 * self._reach_ms())
+        return LinkModel(kind=DelayKind.CUSTOM, location=1e3 * self._reach_ms())
 
     def to_core_model(self, from_ns: int = 0) -> LinkModel:
         """Returns the core's model of the link, with the address of the compiled `draw`."""
