@@ -244,7 +244,7 @@ class RecordedInputs(Generic[Change]):
         states = self._part.states
         peers = self._part.peers
         for change in changes:
-            site.order(change, states[row].t_ns)
+            site.apply_change(change, states[row].t_ns)
         before = read_output(states[row - 2], peers)
         last = read_output(states[row - 1], peers)
         in_use: list[Arrival | None] = []
@@ -259,8 +259,8 @@ class RecordedInputs(Generic[Change]):
             arrivals, missing = self.find_arrivals([(peer, tick, 0) for tick in waiting_ticks])
             self.add_lacking(missing)
             waiting += arrivals
-        site.prime(states[row].tick, in_use, waiting[-MAX_ARRIVALS:])
-        site.resume(before, last)
+        site.restore_links(states[row].tick, in_use, waiting[-MAX_ARRIVALS:])
+        site.restore_state(before, last)
 
     def _find_in_use(self, peer: int, used: int, size: int) -> Arrival | None:
         """Returns the sample of a peer that is in use, or None before the first sample.

@@ -434,7 +434,7 @@ class SiteVerifier:
         if self._start_tick:
             self._site.start_at(self._start_tick)
         for change in self._applied:
-            self._site.order(change, state.t_ns)
+            self._site.apply_change(change, state.t_ns)
 
     def _make_difference(
         self, state: State, field: str, logged: Any, computed: Any
@@ -463,7 +463,7 @@ class SiteVerifier:
         if follows_two and not result.whole_run:
             before = read_output(states[row - 2], peers)
             last = read_output(states[row - 1], peers)
-            self._site.resume(before, last)
+            self._site.restore_state(before, last)
         arrivals, missing = self._inputs.find_arrivals(state.rx)
         invalid_arrival = None
         if missing:

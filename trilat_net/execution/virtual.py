@@ -509,7 +509,7 @@ def write_virtual_log(
     except CodeFailed as failure:
         if failure.site not in members:
             # the event needs a site, and the law that failed cannot be constructed again
-            without_law = Site(scenario.setup(failure.site)._replace(own=None))
+            without_law = Site(scenario.setup(failure.site)._replace(law_factory=None))
             members[failure.site] = _VirtualChannels(scenario, without_law, writer)
         member = members[failure.site]
         member.write(member.make_new_event_entry("failed", str(failure), t_ns), writer)

@@ -129,17 +129,17 @@ def _find_absent_at_site(log: Log, name: str) -> list[LateSample]:
         set(arrivals[arrivals[:, 0] == peer, 1].tolist()) for peer in range(len(part.peers))
     ]
     # only the links of the site are used, so its law is left out
-    site = Site(log.scenario.setup(name)._replace(own=None))
+    site = Site(log.scenario.setup(name)._replace(law_factory=None))
     checked = [0] * len(part.peers)  # per peer the number of samples looked at so far
     absent = []
     for state in part.states:
         for command in commands.get(state.tick, ()):
-            site.order(command, state.t_ns)
+            site.apply_change(command, state.t_ns)
         for peer, tick, _ in state.rx:
             # a damaged record may list any peer and tick
             exists = 0 <= peer < len(peer_ticks) and 0 <= tick < peer_ticks[peer]
             due_tick = site.release_tick(peer, tick) if exists else None
-            if due_tick is None or due_tick >= state.tick or site.measures(peer):
+            if due_tick is None or due_tick >= state.tick or site.is_measured(peer):
                 continue
             absent.append(
                 LateSample(
@@ -154,7 +154,7 @@ def _find_absent_at_site(log: Log, name: str) -> list[LateSample]:
             newest = state.t_ns * site.peer_rate_hz(peer) // NS_PER_S
             sent = min(newest, log.last_ticks[sender]) + 1
             for tick in range(checked[peer], sent):
-                if tick in arrived[peer] or site.measures(peer):
+                if tick in arrived[peer] or site.is_measured(peer):
                     continue
                 due_tick = site.release_tick(peer, tick)
                 if due_tick is None or not _uses_older(part, sender, tick, due_tick):
