@@ -229,7 +229,7 @@ def test_site_resumed_from_two_records_goes_on_with_same_bits(
         if not (j and 50 <= m < 90)
     ]
     made.restore_links(k, in_use, [moving(j, m) for j, m in heard])
-    made.resume(whole[k - 2], last)
+    made.restore_state(whole[k - 2], last)
     assert stepped(made, cut_ticks()[k:]) == whole[k:]
 
 

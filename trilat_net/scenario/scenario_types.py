@@ -512,7 +512,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             ramps=tuple(self.scripted_ramps(site)),
             on_stale=spec.on_stale.rule,
             external=spec.plant != "simulated",
-            own=control.build_factory(len(self.sites), self.scheme),
+            law_factory=control.build_factory(len(self.sites), self.scheme),
             theta_known=spec.arm.known,
             chain=arm.chain,
             channel=self.channel(site),
