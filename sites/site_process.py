@@ -174,8 +174,8 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
             since_ns = parts.clock.monotonic_ns() - epoch.mono_ns
             options.connection.require_keys_until(scenario.duration_s - since_ns / NS_PER_S)
             return RunningSite(parts, publisher, pinger, epoch)
-        if joining.coming_at != begins:
-            begins = joining.coming_at
+        if joining.announced_first_tick != begins:
+            begins = joining.announced_first_tick
             parts.site.start_at(begins)  # it takes 0.1 s for every hour that the session runs
         now_ns = parts.clock.monotonic_ns()
         if now_ns > give_up_ns:
