@@ -193,7 +193,7 @@ def test_links_stay_within_the_limit_and_count_the_rest() -> None:
     setup = load_scenario("paper").setup("m1")
     assert CalendarSizer(setup).most_pages == calendar_pages(1000) > needed_pages(setup)
     free, tight = one_link(1000, 1000, 1_000_000), one_link(1000, 1000, 1_000_000)
-    tight._room.most_pages = 1024
+    tight._sizer.most_pages = 1024
     ahead = TickInput(0, [sample(m) for m in (0, 500, 900, 1100, 5000)])
     for site in (free, tight):
         used = [

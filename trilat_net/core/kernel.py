@@ -229,7 +229,7 @@ def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None
     """
     if channel is None:
         return None
-    return ChannelArrays(channel.waiting[peer], channel.received[peer], channel.places[peer])
+    return ChannelArrays(channel.waiting[peer], channel.received[peer], channel.columns[peer])
 
 
 @leaf

@@ -1,15 +1,19 @@
 """The receiving end of one directed link j -> i, which applies the delay.
 
-Invariant (L2): a sample of tick m is due when its channel says so, counted from its nominal
-stamp in integer nanoseconds; it is in use from the receiver's first tick at or after that,
-never at its own stamp. Its real arrival has no influence if it precedes the due time. (On a
-measured link a sample is due at once, so there the arrival alone counts.)
+A link is a calendar: a ring of pages, one for each of the receiver's next ticks.
+`accept_sample` files a sample in the page of the tick that releases it, unless that page holds a
+newer sample. `release_sample` reads the page of the present tick. Both cost the same at any
+delay. A calendar only spans the ticks for which samples may wait. The due times of samples, of
+eight bytes each, are kept for as long as a late sample or a duplicate may arrive.
 
-A link is a calendar. `accept_sample` files a sample in the page of the tick that releases it,
-if none newer is there; `release_sample` reads the page of the present tick. Both cost the same
-at any delay. Newest wins: an older sample never replaces a newer one. So a calendar need only
-span what may wait, while the times at which samples are due, eight bytes each, are kept for as
-long as a late one or a copy may come.
+Invariant:
+
+- (L2) The due time of sample m follows from the nominal stamp of m and the link's channel, in
+  integer nanoseconds. The sample is in use from the receiver's first tick at or after its due
+  time, and never at its own stamp.
+- An arrival before the due time has no influence on that tick. On a measured link a sample is
+  due at once, so that only its arrival counts.
+- The newest sample wins: an older sample never replaces a newer one.
 """
 
 from functools import cache
@@ -20,82 +24,57 @@ import numpy as np
 from .channel import LOST, schedule_deliveries
 from .delay import MAX_DELAY_US, DelayKind
 from .jit import leaf
-from .ticks import NS_PER_S, LinkCounts, first_tick_at, tick_ns
+from .row_fields import LinkRow, SampleRow, row_dtype
+from .ticks import NS_PER_S, first_tick_at, tick_ns
 from .vectors import Array, IntArray, Points, Row, RowArray, put
-
-_CHANNEL = ("models", "model", "outage_first", "outage_count", "scheduled", "bad", "due_before")
-
-
-def _sample_vectors(shared: int) -> list[tuple[str, str, tuple[int]]]:
-    return [(name, "f8", (shared,)) for name in ("q", "qd", "tau_x")]
 
 
 @cache
 def link_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the layout of a link on which samples of so many coordinates come: one row per
-    peer.
+    """Returns the layout of a link's row for samples of `shared` coordinates, see `LinkRow`.
 
-    They stand in scenario order. `used` is -1 until the first sample is released; until then q
-    and qd are the peer's start pose, at rest (L7). It is `new` in the tick that released it, at
-    `used_ns`; `tick` and `age_s` are filled in for laws that look at their peers. `gone` is 0
-    of a peer that is there, -1 of one that is lost, and of one that is heard again the time
-    since when, ns: see `lost_peers`.
+    A site has one row per peer, in scenario order.
     """
-    fields = [
-        ("alpha", "f8"),
-        ("alpha_rate", "f8"),
-        ("rate_hz", "i8"),
-        *((name, "i8") for name in ("used", "used_ns", "tick", "new")),
-        ("age_s", "f8"),
-        *_sample_vectors(shared),
-        ("key", "u8"),
-        *((name, "i8") for name in ("bit", "followed", "dispensable")),
-        ("gone", "f8"),
-        *((name, "i8") for name in _CHANNEL),
-        ("memory", "f8"),
-        *((name, "i8") for name in LinkCounts._fields),
-    ]
-    return np.dtype((np.record, fields))
+    return row_dtype("link", {"shared": shared})
 
 
 @cache
 def sample_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the layout of a calendar's pages: one per tick of the receiver, a power of two of
-    them.
+    """Returns the layout of a calendar's pages for samples of `shared` coordinates.
 
-    A page holds the newest sample that its tick releases, with the sample's own tick (-1:
-    none).
+    A calendar has a power of two of pages. See `SampleRow`.
     """
-    return np.dtype((np.record, [("tick", "i8"), *_sample_vectors(shared)]))
+    return row_dtype("sample", {"shared": shared})
 
 
 class ChannelArrays(NamedTuple):
-    """What peers' laws send besides, in the order in which the receiver's law has it; one axis
-    more per peer.
+    """The numbers that a peer's law sends, in the order in which the receiver's law reads them.
+
+    The arrays of all peers, and of all sites of a stack, have further axes in front.
 
     Attributes:
-        waiting: of the samples that wait, by the calendar's page, shape (pages, C).
-        received: of the sample in use, shape (C,); zeros before the first.
-        places: where each number stands among those that come with a sample; -1: it does not,
-            and is 0.
+        waiting: the numbers of the waiting samples, by page of the calendar, shape (pages, C).
+        received: the numbers of the sample in use, shape (C,); zeros before the first sample.
+        columns: for each number its column among the numbers that arrive with a sample, shape
+            (C,); -1: the peer does not send the number, which is 0.
     """
 
     waiting: Array
     received: Array
-    places: IntArray
+    columns: IntArray
 
 
 class LinkArrays(NamedTuple):
     """The arrays of one link.
 
     Attributes:
-        state: shape (1,), see `link_dtype`.
-        models: what its channel does, shape (M,), LINK_MODEL_DTYPE.
-        dues: when the last samples are due, ns, or LOST; of one that has come `_FILED` less
-            that.
+        state: the row of the link, shape (1,), see `link_dtype`.
+        models: the models of its channel, shape (M,), LINK_MODEL_DTYPE.
+        dues: the due times of its newest samples, ns, or LOST; sample m is at m modulo the
+            length. The entry of a sample that has arrived is `_FILED` minus the due time.
         calendar: the samples that wait, shape (pages,), see `sample_dtype`.
         points: the site's traces and outages, shape (n, 2).
-        channel: what the peer's law sends besides; None: the site's law does not look at it.
+        channel: the numbers that the peer's law sends; None: the site's law ignores them.
     """
 
     state: RowArray
@@ -108,20 +87,21 @@ class LinkArrays(NamedTuple):
 
 AHEAD_LIMIT_S = 10
 AHEAD_LIMIT_NS = AHEAD_LIMIT_S * NS_PER_S
-"""A stamp further ahead of the receiver than this is refused."""
+"""Largest lead of a stamp over the receiver; a sample further ahead is refused."""
 
 _MEASURED = int(DelayKind.MEASURED)
 
 
 _FILED = LOST - 1
-"""No time that a sample is due is negative, so that what is not above this tells of one that
-has come.
+"""Marks samples that have arrived: due times are never negative, so `_FILED - due` is at most
+this, and LOST is above it.
 """
 
 
 def span_ticks(span_ns: int, rate_hz: int) -> int:
-    """Returns the ticks of a time; `first_tick_at` for those who need not load the compiled
-    core.
+    """Returns the number of ticks that span a time, rounded up.
+
+    The same as `first_tick_at`, but in plain Python: callers need no compiled core.
     """
     return -(-span_ns * rate_hz // NS_PER_S)
 
@@ -129,20 +109,25 @@ def span_ticks(span_ns: int, rate_hz: int) -> int:
 def calendar_pages(
     rate_hz: int, delay_us: int = MAX_DELAY_US, ahead_ns: int = AHEAD_LIMIT_NS
 ) -> int:
-    """Returns the pages of a calendar spanning a delay of samples from so far ahead; by default
-    the most.
+    """Returns the pages of a calendar, a power of two; by default the largest number needed.
+
+    Args:
+        rate_hz: the tick rate of the receiver, Hz.
+        delay_us: the longest delay, us.
+        ahead_ns: the longest time by which a sender may be ahead of the receiver, ns.
     """
-    return 1 << (span_ticks(delay_us * 1000 + ahead_ns, rate_hz) + 2).bit_length()
+    span = span_ticks(delay_us * 1000 + ahead_ns, rate_hz)
+    return 1 << (span + 2).bit_length()
 
 
 @leaf
 def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
-    """Returns the receiver's tick at which sample `tick` comes into use if it has arrived by
-    then.
+    """Returns the receiver's tick at which sample `tick` comes into use if it arrives in time.
 
-    LOST if it never does, or if it is so old that its due time is kept no more.
+    LOST if the link loses the sample, or if the sample is so old that the link has forgotten its
+    due time.
     """
-    row: Row = link.state[0]
+    row: LinkRow = link.state[0]
     dues = link.dues
     schedule_deliveries(
         sample=tick, link=row, models=link.models, dues=dues, points=link.points
@@ -156,9 +141,9 @@ def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
 
 
 @leaf
-def _far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
+def _is_far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
     """True if a sample's stamp is more than AHEAD_LIMIT_S ahead of tick k."""
-    # a hostile tick must not overflow the rest
+    # Compare whole seconds first: the nanoseconds of a hostile stamp would overflow int64.
     if tick // peer_rate_hz > k // rate_hz + AHEAD_LIMIT_S + 1:
         return True
     return tick_ns(tick, peer_rate_hz) - tick_ns(k, rate_hz) > AHEAD_LIMIT_NS
@@ -166,15 +151,17 @@ def _far_ahead(k: int, rate_hz: int, tick: int, peer_rate_hz: int) -> bool:
 
 @leaf
 def _file_sent(channel: ChannelArrays | None, page: int, sent: Array) -> None:
+    """Files the numbers that a peer's law sent with a sample in a page of the calendar."""
     if channel is None:
         return
-    for c in range(channel.places.shape[0]):
-        place = channel.places[c]
-        channel.waiting[page, c] = sent[place] if place >= 0 else 0.0
+    for c in range(channel.columns.shape[0]):
+        column = channel.columns[c]
+        channel.waiting[page, c] = sent[column] if column >= 0 else 0.0
 
 
 @leaf
 def _use_sent(channel: ChannelArrays | None, page: int) -> None:
+    """Brings the numbers that a peer's law sent with a released sample into use."""
     if channel is not None:
         put(channel.received, channel.waiting[page])
 
@@ -190,21 +177,31 @@ def accept_sample(
     sent: Array,
     link: LinkArrays,
 ) -> None:
-    """Files one arrival of a peer's tick in a link at the receiver's tick k; counts what it
-    cannot use.
+    """Files one arrival of a peer in its link, or counts the reason for which it is not used.
 
-    `sent` is what the peer's law sends besides its motion; a site whose law does not look at it
-    takes any.
+    A late sample, which arrives after its due time, is used at the present tick if no newer
+    sample is in use: see `release < k` below.
+
+    Args:
+        k: the present tick of the receiver.
+        rate_hz: the tick rate of the receiver, Hz.
+        tick: the sample's stamp, a tick of the peer.
+        q: joint angles or pose of the peer.
+        qd: its derivative.
+        tau_x: the exogenous torque of the peer.
+        sent: the numbers that the peer's law sent; ignored if the receiver's law ignores them.
+        link: the arrays of the link.
     """
-    row: Row = link.state[0]
+    row: LinkRow = link.state[0]
     dues = link.dues
     calendar = link.calendar
     row.accepted += 1
-    if tick < 0 or (tick > row.scheduled and _far_ahead(k, rate_hz, tick, row.rate_hz)):
+    if tick < 0 or (tick > row.scheduled and _is_far_ahead(k, rate_hz, tick, row.rate_hz)):
         row.refused += 1
         return
-    place = tick % dues.shape[0]
-    if row.scheduled - dues.shape[0] < tick <= row.scheduled and dues[place] <= _FILED:
+    index = tick % dues.shape[0]
+    has_due = row.scheduled - dues.shape[0] < tick <= row.scheduled
+    if has_due and dues[index] <= _FILED:
         row.duplicate += 1
         return
     release = release_tick(tick, rate_hz, link)
@@ -213,18 +210,19 @@ def accept_sample(
         return
     if release < k:
         model: Row = link.models[row.model]
-        if model.kind != _MEASURED:
+        if model.kind != _MEASURED:  # on a measured link every sample is due before it arrives
             row.late += 1
         release = k
-    if release - k >= calendar.shape[0]:  # whoever steps a site makes room first
+    # The driver has made room for stamps in range, see `CalendarSizer`.
+    if release - k >= calendar.shape[0]:
         row.refused += 1
         return
-    dues[place] = _FILED - dues[place]
+    dues[index] = _FILED - dues[index]
     if tick <= row.used:
         row.superseded += 1
         return
     page = release & (calendar.shape[0] - 1)
-    slot: Row = calendar[page]
+    slot: SampleRow = calendar[page]
     if slot.tick >= 0:
         row.superseded += 1
     if slot.tick < tick:
@@ -237,13 +235,18 @@ def accept_sample(
 
 @leaf
 def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
-    """Brings into use the newest sample that tick k releases, if there is one; else the last
-    one stays.
+    """Brings the newest sample that tick k releases into use; without one the last one stays.
 
-    Every tick must be recalled once, in order. The channel is advanced to t_k here, so that a
-    long silence of the peer costs nothing at its end.
+    Every tick must be released once, in order. The deliveries of all samples with a stamp up to
+    t_k are scheduled here, so that the first sample after a long silence costs no more than any
+    other.
+
+    Args:
+        k: the tick of the receiver.
+        rate_hz: the tick rate of the receiver, Hz.
+        link: the arrays of the link.
     """
-    row: Row = link.state[0]
+    row: LinkRow = link.state[0]
     row.new = 0
     calendar = link.calendar
     sample = k if row.rate_hz == rate_hz else k * row.rate_hz // rate_hz
@@ -251,7 +254,7 @@ def release_sample(k: int, rate_hz: int, link: LinkArrays) -> None:
         sample=sample, link=row, models=link.models, dues=link.dues, points=link.points
     )
     page = k & (calendar.shape[0] - 1)
-    slot: Row = calendar[page]
+    slot: SampleRow = calendar[page]
     newest = slot.tick
     if newest < 0:
         return

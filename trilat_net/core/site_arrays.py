@@ -1,8 +1,14 @@
-"""The arrays of a running site: their layout, and how a setup fills them.
+"""The arrays of a running site: how a setup fills them, and how they grow during a run.
 
-Invariant: the kernel reads and writes nothing else; two sites of one setup have the same
-arrays. A site's state is one row of a structured array: one argument that costs a quarter of a
-microsecond to pass, and fields with the paper's names.
+A site's state is one row of a structured array (`SiteRow`, in `row_fields`): as an argument of
+compiled code it costs a quarter of a microsecond, and its fields have the paper's names. Each
+peer has a row of its link (`LinkRow`), a table of link models and a calendar.
+
+Invariant:
+
+- The kernel reads and writes nothing but these arrays and the buffers of the tick.
+- Two sites of one setup have equal arrays.
+- The links of a site take at most `MAX_LINKS_BYTES` of memory beyond what their delays need.
 """
 
 from collections.abc import Sequence
@@ -25,146 +31,44 @@ from .link import (
     sample_dtype,
     span_ticks,
 )
+from .row_fields import FIELDS, field_shape, row_dtype
 from .site_setup import Gains, Law, Layout, LinkSetup, SiteSetup
 from .ticks import MAX_ARRIVALS, NS_PER_S, CoreChange, DominanceRamp, LifeOrder, Mode
-from .two_link_arm import JOINTS, PARAMETERS
 from .vectors import Array, IntArray, Points, Row, RowArray
 
-_SETTINGS = (
-    *(
-        "rate_hz",
-        "first",
-        "scheme",
-        "law",
-        "external",
-        "ramps",
-        "on_stale",
-        "stale_ns",
-        "return_ns",
-    ),
-    *("theta_known", "needs_model", "remembered", "asked", "order", "skipped"),
-    *("degrades", "regrouped", "bit", "holds"),
-)
-_COUNTS = ("joints", "shared", "parameters", "task", "sent")
 _GAINS = tuple(name for name in Gains._fields if name not in ("law", "theta_hat0", "absolute"))
-"""Constant gains; the first estimate becomes `theta_hat`."""
-_PER_JOINT = (
-    *(
-        "tau_limit",
-        "qd_limit",
-        "Kp",
-        "d",
-        "q",
-        "qd",
-        "tau",
-        "tau_before",
-        "on_arm",
-        "held",
-        "sensed",
-    ),
-    *("r", "u", "tau_x", "q_before", "G", "bias", "rho", "width", "friction"),
-    *("q_min", "q_max", "tau_rate", "tau_held", "q_rest", "qd_rest"),
-    *("damping", "integral", "deceleration"),
-)
-_PER_COORDINATE = (
-    *(
-        "Lambda",
-        "Kd",
-        "K",
-        "k_f",
-        "q_held",
-        "qd_held",
-        "q_des",
-        "qd_des",
-        "q_followed",
-        "qd_followed",
-        "felt",
-        "e",
-        "ed",
-        "qd_des_limit",
-    ),
-)
-_PER_PARAMETER = ("theta", "known", "Gamma", "low", "high", "theta_hat", "Yr", "Yr_before")
-_OF_TASK = ("x", "xd", "wrench", "axes", "b", "y")
-_OF_CHAIN = (
-    "posture",
-    "v",
-    "a",
-    "zeros",
-    "stage_q",
-    "stage_qd",
-    "stage_qdd",
-    "stage_torque",
-    "sum_qd",
-    "sum_qdd",
-)
+"""Constant gains, named as the site's fields are; theta_hat0 becomes `theta_hat`."""
 
 
 @cache
 def site_dtype(layout: Layout) -> np.dtype[np.void]:
-    """Returns the layout of a site's row: its settings and gains, its state, the results within
-    a tick.
-    """
-    fields: list[Any] = [
-        (name, "i8") for name in (*_SETTINGS, *_COUNTS, "mode", "return_from_ns", "reason")
-    ]
-    fields += [
-        *((name, "f8") for name in ("g", "wall_n", "align_speed", "align_limit")),
-        ("lengths", "f8", (2,)),
-    ]
-    fields += [
-        ("k", "i8"),
-        ("t_s", "f8"),
-        ("h_s", "f8"),
-        ("M", "f8", (layout.joints, layout.joints)),
-    ]
-    for names, count in (
-        (_PER_JOINT, layout.joints),
-        (_PER_COORDINATE, layout.shared),
-        (_PER_PARAMETER, layout.parameters),
-        (_OF_TASK, layout.shared),
-    ):
-        fields += [(name, "f8", (count,)) for name in names]
-    if layout.chain:
-        fields += [(name, "f8", (layout.joints,)) for name in _OF_CHAIN]
-        fields += [("gravity", "f8", (3,)), ("tip", "f8", (3,))]
-        fields += [(name, "f8") for name in ("scale", "posture_rate", "singular_value")]
-        fields += [(name, "f8", (layout.shared, layout.joints)) for name in ("J", "Jd")]
-        fields += [("A", "f8", (layout.shared, layout.shared)), ("tip_back", "f8", (3, 3))]
-    # the leaves of the planar arm are compiled for any
-    fields.append(("Y", "f8", (JOINTS, PARAMETERS)))
-    return np.dtype((np.record, fields))
+    """Returns the layout of a site's row, see `SiteRow`."""
+    return row_dtype("site", layout.axes(), chain=layout.chain)
 
 
 @cache
 def arrival_dtype(shared: int) -> np.dtype[np.void]:
-    """Returns the layout of an arrival whose vectors have so many numbers."""
-    return np.dtype(
-        (
-            np.record,
-            [("peer", "i8"), ("tick", "i8"), ("q", "f8", (shared,)), ("qd", "f8", (shared,))],
-        )
-    )
+    """Returns the layout of an arrival with vectors of `shared` numbers, see `ArrivalRow`."""
+    return row_dtype("arrival", {"shared": shared})
 
 
 class SiteArrays(NamedTuple):
-    """The arrays of one site, or of several that are stacked: then each has one axis more, in
-    front.
+    """The arrays of one site, or of several sites stacked along an additional first axis.
 
     Attributes:
         site: state and constants, shape (1,), see `site_dtype`.
         links: one row per peer, shape (P,), see `link_dtype`.
-        models: what the links' channels do, shape (P, M), LINK_MODEL_DTYPE.
-        dues: when the links' last samples are due, shape (P, D), ns; see `LinkArrays`.
+        models: the models of the links' channels, shape (P, M), LINK_MODEL_DTYPE.
+        dues: due times of the links' newest samples, shape (P, D), ns; see `LinkArrays`.
         calendars: the links' calendars, shape (P, pages), see `sample_dtype`.
-        points: traces and outages, shape (n, 2); of stacked sites one for all.
-        ramps: how dominance factors change, shape (R, RAMP_COLUMNS + P).
+        points: traces and outages, shape (n, 2); stacked sites share one table.
+        ramps: changes of the dominance factors, shape (R, RAMP_COLUMNS + P).
         actors: operators and environments, shape (A,), see `torque_source_dtype`.
-        table: their recorded torques, shape (rows, 1 + n); of stacked sites one for all.
+        table: their recorded torques, shape (rows, 1 + n); stacked sites share one table.
         chain: the joints of a chain, shape (n,), see `chain_dtype`; None: the planar two-link
             arm.
-        channel: what the peers' laws send, per peer, for a plugged law; None: the law is one of
-            the kernel's.
+        channel: the numbers that the peers' laws send, per peer, for a user's law; None: the
+            kernel computes the law.
     """
 
     site: RowArray
@@ -181,13 +85,13 @@ class SiteArrays(NamedTuple):
 
 
 class TickBuffers(NamedTuple):
-    """Input and output of one tick.
+    """The input and the output of one tick.
 
     Attributes:
-        arrivals: what came in, shape (MAX_ARRIVALS,), see `arrival_dtype`.
-        forces: the peers' exogenous torques that came with it, shape (MAX_ARRIVALS, m), N m.
-        sent: what the peers' laws sent with it, shape (MAX_ARRIVALS, C).
-        record: the record's floats, see `Layout.columns`; written.
+        arrivals: the samples that arrived, shape (MAX_ARRIVALS,), see `arrival_dtype`.
+        forces: their exogenous torques, shape (MAX_ARRIVALS, m), N m.
+        sent: the numbers that the peers' laws sent with them, shape (MAX_ARRIVALS, C).
+        record: output: the floats of the record, see `Layout.columns`.
     """
 
     arrivals: RowArray
@@ -199,17 +103,14 @@ class TickBuffers(NamedTuple):
 def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
     """Returns the buffers of a site."""
     layout = setup.layout
-    shape = (MAX_ARRIVALS, layout.shared)
-    most = (
-        0
-        if setup.law_factory is None
-        else max(link.channel.received_size for link in setup.links)
-    )
+    most_received = 0
+    if setup.law_factory is not None:
+        most_received = max(link.channel.received for link in setup.links)
     return TickBuffers(
-        np.zeros(MAX_ARRIVALS, arrival_dtype(layout.shared)),
-        np.zeros(shape),
-        np.zeros((MAX_ARRIVALS, most)),
-        np.zeros(layout.floats),
+        arrivals=np.zeros(MAX_ARRIVALS, arrival_dtype(layout.shared)),
+        forces=np.zeros((MAX_ARRIVALS, layout.shared)),
+        sent=np.zeros((MAX_ARRIVALS, most_received)),
+        record=np.zeros(layout.floats),
     )
 
 
@@ -221,21 +122,20 @@ def build_site_arrays(
     *,
     plugged: bool = False,
 ) -> SiteArrays:
-    """Returns the arrays of a site at its first tick.
+    """Returns the arrays of a site before its first tick.
 
     Args:
-        setup: all that the site is built from.
-        spare: room for so many more changes of a link, and for so many of the dominance
-            factors.
-        pages: pages of a link, and samples whose due times it keeps; 0: pages for its delays,
-            and due times for as long as a sample may be late.
-        layout: of the arrays, if they are to be larger than the site needs.
-        plugged: with the arrays of a plugged law, also if the site's is none.
+        setup: the setup of the site.
+        spare: free rows for later changes: of each link's model, and of the dominance factors.
+        pages: pages of each calendar and due times that each link keeps; 0: pages for the
+            delays of the setup, and due times for as long as a sample may be late.
+        layout: layout of the arrays if they are larger than the site needs.
+        plugged: true: with the arrays of a user's law even if the site has no such law.
     """
     links = setup.links
     layout = layout or setup.layout
     peers = len(links)
-    kept = pages or _kept_dues(setup)
+    kept_dues = pages or _kept_dues(setup)
     pages = pages or needed_pages(setup)
     calendars = np.zeros((peers, pages), sample_dtype(layout.shared))
     calendars["tick"] = -1
@@ -243,22 +143,19 @@ def build_site_arrays(
     actors, table = torque_source_rows(setup.actors, layout.joints, 3 if layout.chain else 2)
     ramps = np.zeros((1 + len(setup.ramps) + spare[1], RAMP_COLUMNS + peers))
     ramps[0, RAMP_COLUMNS:] = [link.alpha for link in links]
-    dues = np.full((peers, kept), LOST, dtype=np.int64)
-    chain = None if setup.chain is None else build_chain(setup.chain.joints, layout.joints)
-    site = _build_site(setup, layout)
-    channel = _build_channel(setup, pages) if plugged or setup.law_factory is not None else None
+    has_channel = plugged or setup.law_factory is not None
     arrays = SiteArrays(
-        site=site,
+        site=_build_site(setup, layout),
         links=rows,
         models=models,
-        dues=dues,
+        dues=np.full((peers, kept_dues), LOST, dtype=np.int64),
         calendars=calendars,
         points=points,
         ramps=ramps,
         actors=actors,
         table=table,
-        chain=chain,
-        channel=channel,
+        chain=None if setup.chain is None else build_chain(setup.chain.joints, layout.joints),
+        channel=_build_channel(setup, pages) if has_channel else None,
     )
     for ramp in setup.ramps:
         add_ramp(arrays, ramp)
@@ -266,60 +163,65 @@ def build_site_arrays(
 
 
 def needed_pages(setup: SiteSetup) -> int:
-    """Returns the pages of a site's links: for its delays, by senders that are ahead of it a
-    little.
+    """Returns the pages of a calendar for the delays of a setup.
+
+    Senders may be up to `_NEAR_NS` ahead of the site.
     """
-    longest = max(max_delay_us(link.models, link.traces) for link in setup.links)
-    return calendar_pages(setup.rate_hz, longest, _NEAR_NS)
+    longest_us = max(max_delay_us(link.models, link.traces) for link in setup.links)
+    return calendar_pages(setup.rate_hz, longest_us, _NEAR_NS)
 
 
 def links_bytes(setup: SiteSetup, pages: int) -> int:
-    """Returns the memory of a site's links with so many pages each, bytes."""
-    numbers = (
-        sum(vector.length for vector in setup.received_vectors)
-        if setup.law_factory is not None
-        else 0
-    )
-    page = sample_dtype(setup.layout.shared).itemsize + 8 * numbers
-    return len(setup.links) * (pages * page + 8 * _kept_dues(setup))
+    """Returns the memory of a site's links whose calendars have `pages` pages, bytes."""
+    numbers = 0
+    if setup.law_factory is not None:
+        numbers = sum(vector.length for vector in setup.received_vectors)
+    page_bytes = sample_dtype(setup.layout.shared).itemsize + 8 * numbers
+    link_bytes = pages * page_bytes + 8 * _kept_dues(setup)
+    return len(setup.links) * link_bytes
 
 
 def _kept_dues(setup: SiteSetup) -> int:
-    """Returns how many due times a link keeps: from the latest sample there may be to the one
-    most ahead.
+    """Returns the number of due times that a link keeps.
+
+    They span the stamps from the latest possible sample to the one farthest ahead.
     """
     fastest_hz = max(setup.rate_hz, *(link.rate_hz for link in setup.links))
     return span_ticks(MAX_DELAY_US * 1000 + AHEAD_LIMIT_NS, fastest_hz) + _SLACK
 
 
 def widen_calendars(arrays: SiteArrays, k: int, pages: int) -> SiteArrays:
-    """Returns the arrays of a site before tick k with calendars of more pages, and in them all
-    that waits.
+    """Returns arrays with larger calendars and the same waiting samples.
+
+    Args:
+        arrays: the arrays before tick k.
+        k: the next tick that the calendars release.
+        pages: the new number of pages, a power of two.
     """
     ticks = np.arange(k, k + arrays.calendars.shape[1])
-    old = ticks & (len(ticks) - 1)
-    new = ticks & (pages - 1)
+    old_pages = ticks & (len(ticks) - 1)
+    new_pages = ticks & (pages - 1)
     calendars = np.zeros((len(arrays.links), pages), arrays.calendars.dtype)
     calendars["tick"] = -1
-    calendars[:, new] = arrays.calendars[:, old]
+    calendars[:, new_pages] = arrays.calendars[:, old_pages]
     channel = arrays.channel
     if channel is not None:
         waiting = np.zeros((*calendars.shape, channel.waiting.shape[2]))
-        waiting[:, new] = channel.waiting[:, old]
+        waiting[:, new_pages] = channel.waiting[:, old_pages]
         channel = channel._replace(waiting=waiting)
     return arrays._replace(calendars=calendars, channel=channel)
 
 
 class CalendarSizer:
-    """The room of a site's links: for its delays, and more for senders further ahead and delays
-    that grow.
+    """Enlarges the calendars of a site when a sample arrives that needs more pages.
 
-    Never more than `MAX_LINKS_BYTES`: what does not fit is refused as it is filed, like a stamp
-    out of range.
+    A sample needs more pages if its sender is far ahead or if the delays of its link grew. The
+    links never take more than `MAX_LINKS_BYTES`, or what the delays of the setup need: a sample
+    that does not fit is refused in stage 1, like a sample whose stamp is out of range.
 
     Attributes:
-        newest: per peer a sample that fits at any tick from the last one on, and all older ones
-            with it.
+        newest: per peer the newest stamp that fits at the last tick and at all later ones.
+        most_pages: the largest number of pages.
     """
 
     def __init__(self, setup: SiteSetup) -> None:
@@ -328,25 +230,30 @@ class CalendarSizer:
         self._delay_us = [max_delay_us(link.models, link.traces) for link in setup.links]
         self.newest = [-1] * len(setup.links)
         self.most_pages = needed_pages(setup)
-        most = calendar_pages(setup.rate_hz)
-        while (
-            self.most_pages < most
-            and links_bytes(setup, 2 * self.most_pages) <= MAX_LINKS_BYTES
-        ):
+        limit = calendar_pages(setup.rate_hz)
+        while self.most_pages < limit:
+            if links_bytes(setup, 2 * self.most_pages) > MAX_LINKS_BYTES:
+                break
             self.most_pages *= 2
 
     def clear(self) -> None:
-        """Forgets the last tick."""
+        """Forgets which stamps fit."""
         self.newest = [-1] * len(self.newest)
 
-    def lengthen(self, peer: int, model: LinkModel) -> None:
-        """Takes in a change of a link."""
-        self._delay_us[peer] = max(self._delay_us[peer], max_delay_us([model], [None]))
+    def add_model(self, peer: int, model: LinkModel) -> None:
+        """Makes room for the delays of another model of a link."""
+        longest_us = max_delay_us([model], [None])
+        self._delay_us[peer] = max(self._delay_us[peer], longest_us)
         self.newest[peer] = -1
 
-    def make(self, arrays: SiteArrays, k: int, peer: int, tick: int) -> SiteArrays:
-        """Returns the arrays at tick k with room for a peer's sample, if one from as far ahead
-        is taken.
+    def make_room(self, arrays: SiteArrays, k: int, peer: int, tick: int) -> SiteArrays:
+        """Returns the arrays with pages for a peer's sample, if its stamp is in range.
+
+        Args:
+            arrays: the arrays at tick k.
+            k: the present tick of the site.
+            peer: the peer's index.
+            tick: the sample's stamp.
         """
         wait = span_ticks(self._delay_us[peer] * 1000, self._rate_hz) + _SLACK
         ahead = tick * self._rate_hz // self._peer_hz[peer] - k
@@ -355,56 +262,57 @@ class CalendarSizer:
         pages = arrays.calendars.shape[1]
         if ahead + wait > pages < self.most_pages:
             pages = min(1 << (ahead + wait).bit_length(), self.most_pages)
-            arrays = widen_calendars(arrays, k - int(arrays.site["skipped"][0]), pages)
+            # Samples of missed ticks still wait in the pages of those ticks.
+            first = k - int(arrays.site["skipped"][0])
+            arrays = widen_calendars(arrays, first, pages)
         self.newest[peer] = (k + pages - wait) * self._peer_hz[peer] // self._rate_hz
         return arrays
 
 
 def add_ramp(arrays: SiteArrays, ramp: DominanceRamp) -> None:
-    """Adds a change of the dominance factors to those that are planned, in the order of their
-    starts.
-    """
+    """Inserts a change of the dominance factors into the planned ones, ordered by start."""
     site: Row = arrays.site[0]
     count = int(site.ramps)
     ramps = arrays.ramps
-    place = 1 + int(np.searchsorted(ramps[1:count, 0], ramp.start_ns, side="right"))
-    ramps[place + 1 : count + 1] = ramps[place:count].copy()
-    ramps[place] = (ramp.start_ns, ramp.end_ns, *ramp.alpha)
+    index = 1 + int(np.searchsorted(ramps[1:count, 0], ramp.start_ns, side="right"))
+    ramps[index + 1 : count + 1] = ramps[index:count].copy()
+    ramps[index] = (ramp.start_ns, ramp.end_ns, *ramp.alpha)
     site.ramps = count + 1
 
 
 def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
-    """Adds a change of a link to those that are planned, in the order of their first stamps."""
+    """Inserts a change of a link into the planned ones, ordered by first stamp."""
     link: Row = arrays.links[peer]
     models = arrays.models[peer]
     count = int(link.models)
-    place = 1 + int(np.searchsorted(models["from_ns"][1:count], model.from_ns, side="right"))
-    models[place + 1 : count + 1] = models[place:count].copy()
-    models[place] = model
+    index = 1 + int(np.searchsorted(models["from_ns"][1:count], model.from_ns, side="right"))
+    models[index + 1 : count + 1] = models[index:count].copy()
+    models[index] = model
     link.models = count + 1
-    if link.model >= place:  # samples from ahead that are scheduled already stay as they are
+    # The model in force moves down one row. Samples that are scheduled already keep their times.
+    if link.model >= index:
         link.model += 1
 
 
 MAX_CHANGES = 4096
-"""Most changes of one link that a site takes besides its scenario's."""
+"""Largest number of changes of one link besides those of the scenario."""
 MAX_RAMPS = 256
-"""Most changes of the dominance factors that wait to begin, besides the scenario's; any number
-in a run.
+"""Largest number of waiting changes of the dominance factors besides those of the scenario.
+
+A run may have any number of changes: those that have begun are folded, see `fold_ramps`.
 """
 
 
 def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
-    """Takes a change in; one that is planned for later, by the scenario or an earlier order,
-    still comes.
+    """Applies a change, or adds it to the planned ones; other planned changes stay planned.
 
     Args:
-        arrays: of the site.
+        arrays: the arrays of the site.
         change: the change.
         t_ns: a time before which the site makes no more ticks, ns since the epoch.
 
     Raises:
-        ValueError: the arrays have no more room for it.
+        ValueError: the arrays have no free row for the change.
     """
     s: Row = arrays.site[0]
     if change.order is LifeOrder.OVERRUN:
@@ -425,129 +333,138 @@ def apply_change(arrays: SiteArrays, change: CoreChange, t_ns: int) -> None:
 
 
 _NEAR_NS = NS_PER_S // 4
-"""By how much senders are ahead of a receiver that is a little late: a calendar has pages for
-that.
-"""
+"""Lead of senders over a receiver that is a little late: calendars have pages for it, ns."""
 MAX_LINKS_BYTES = 64 << 20
-"""Most memory of a site's links, bytes."""
+"""Largest memory of a site's links beyond what their delays need, bytes."""
 _SLACK = 4
-"""Ticks by which a sample may be scheduled before it is filed, and some."""
+"""Additional ticks: a sample is scheduled up to two ticks before it is filed; and some reserve."""
 _NEVER_SAMPLED = 2
-"""Neither evaluated in every stage (0) nor once a tick (1)."""
+"""Marks an actor that fills up a stack: evaluated neither in every stage (0) nor per tick (1)."""
 
 
 def stack_site_arrays(
     setups: Sequence[SiteSetup], spare: int = 0, longest_us: int = 0, late_ns: int = 0
 ) -> SiteArrays:
-    """Returns the arrays of all sites of a run stacked, with links no longer than their delays
-    need.
+    """Returns the arrays of all sites of a run, stacked, with calendars as long as needed.
 
     An array that is shorter than another site's is filled up with rows that are never read.
 
     Args:
-        setups: of the sites.
-        spare: room for so many more changes of each link and of each site's dominance factors.
+        setups: the setups of the sites.
+        spare: free rows for later changes, of each link and of each site's dominance factors.
         longest_us: the longest delay of such a change, us.
-        late_ns: by how much samples may come late, ns.
+        late_ns: largest lateness of a sample, ns.
     """
-    longest = max(
+    delays_us = [
         max_delay_us(link.models, link.traces) for setup in setups for link in setup.links
-    )
+    ]
     fastest_hz = max(setup.rate_hz for setup in setups)
     margin_ns = late_ns + _SLACK * NS_PER_S // fastest_hz
-    pages = calendar_pages(fastest_hz, max(longest, longest_us), margin_ns)
+    pages = calendar_pages(fastest_hz, max(*delays_us, longest_us), margin_ns)
     layouts = [setup.layout for setup in setups]
     largest = Layout(*map(max, zip(*layouts, strict=True)))
     plugged = any(setup.law_factory is not None for setup in setups)
     sites = [
-        build_site_arrays(one, (spare,) * 2, pages, largest, plugged=plugged) for one in setups
+        build_site_arrays(setup, (spare, spare), pages, largest, plugged=plugged)
+        for setup in setups
     ]
-    first_point = first_torque = 0
-    for site in sites:  # one table of points, and one of torques, for all
-        site.models["trace_first"] += first_point
-        site.links["outage_first"] += first_point
-        site.actors["table_first"] += first_torque
-        first_point += len(site.points)
-        first_torque += len(site.table)
+    _share_tables(sites)
     columns: dict[str, list[Any]] = {
         name: [getattr(site, name) for site in sites] for name in SiteArrays._fields
     }
     if not largest.chain:
         del columns["chain"]
     channels = [site.channel for site in sites if site.channel is not None]
-    if not channels:
-        del columns["channel"]
+    del columns["channel"]
     joined: dict[str, Any] = {
         name: np.concatenate(columns.pop(name)) for name in ("points", "table")
     }
     if channels:
-        joined["channel"] = _stack_channels(setups, columns.pop("channel"))
+        joined["channel"] = _stack_channels(setups, channels)
     stacked: dict[str, Any] = {name: _stack_padded(column) for name, column in columns.items()}
     for row, site in zip(stacked["actors"], sites, strict=True):
         row["sampled"][len(site.actors) :] = _NEVER_SAMPLED
     return SiteArrays(**{"chain": None, "channel": None, **stacked, **joined})
 
 
+def _share_tables(sites: Sequence[SiteArrays]) -> None:
+    """Shifts the rows of each site's points and torques to their rows in the joined tables."""
+    first_point = 0
+    first_torque = 0
+    for site in sites:
+        site.models["trace_first"] += first_point
+        site.links["outage_first"] += first_point
+        site.actors["table_first"] += first_torque
+        first_point += len(site.points)
+        first_torque += len(site.table)
+
+
 def select_site(stacked: SiteArrays, i: int, layout: Layout) -> SiteArrays:
-    """Returns the arrays of one site of a stack; its rows may be longer than its layout."""
+    """Returns the arrays of site `i` of a stack; its rows may be longer than its layout."""
     channel = stacked.channel
-    parts = {name: getattr(stacked, name)[i] for name in SiteArrays._fields[:5]}
+    if channel is not None:
+        channel = ChannelArrays(*(array[i] for array in channel))
     return stacked._replace(
-        **parts,
+        site=stacked.site[i],
+        links=stacked.links[i],
+        models=stacked.models[i],
+        dues=stacked.dues[i],
+        calendars=stacked.calendars[i],
         ramps=stacked.ramps[i],
         actors=stacked.actors[i],
         chain=None if stacked.chain is None else stacked.chain[i, : layout.joints],
-        channel=None if channel is None else ChannelArrays(*(array[i] for array in channel)),
+        channel=channel,
     )
 
 
 def _stack_channels(
     setups: Sequence[SiteSetup], channels: Sequence[ChannelArrays]
 ) -> ChannelArrays:
-    """Returns the channels of several sites stacked; places are those in the numbers of the
-    peer's record.
+    """Returns the channels of several sites stacked.
+
+    Their columns become those of the peer's record, which holds what the peer sends to all sites
+    and then what it sends to each of them.
     """
     for setup, channel in zip(setups, channels, strict=True):
-        for link, places in zip(setup.links, channel.places, strict=True):
-            common, own = (
-                link.channel.count_numbers(per_peer=per_peer) for per_peer in (False, True)
-            )
-            places[places >= common] += link.index_at_peer * own
-    waiting, received, places = map(_stack_padded, zip(*channels, strict=True))
-    for channel, whole in zip(channels, places, strict=True):
-        whole[:, channel.places.shape[1] :] = -1
-    return ChannelArrays(waiting, received, places)
+        for link, columns in zip(setup.links, channel.columns, strict=True):
+            to_all = link.channel.numbers(per_peer=False)
+            to_each = link.channel.numbers(per_peer=True)
+            columns[columns >= to_all] += link.index_at_peer * to_each
+    waiting, received, columns = map(_stack_padded, zip(*channels, strict=True))
+    for channel, padded in zip(channels, columns, strict=True):
+        padded[:, channel.columns.shape[1] :] = -1
+    return ChannelArrays(waiting, received, columns)
 
 
 def _stack_padded(arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Returns arrays stacked, each filled up with zeros to the longest along every axis."""
     shape = np.max([array.shape for array in arrays], axis=0)
-    return np.stack(
-        [
-            np.pad(
-                array,
-                [(0, most - length) for most, length in zip(shape, array.shape, strict=True)],
-            )
-            for array in arrays
-        ]
-    )
+    padded = []
+    for array in arrays:
+        widths = [(0, most - length) for most, length in zip(shape, array.shape, strict=True)]
+        padded.append(np.pad(array, widths))
+    return np.stack(padded)
 
 
 def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
+    """Returns the row of a site before its first tick, shape (1,).
+
+    The layout may be larger than the site's: the numbers beyond stay zero.
+    """
     site = np.zeros(1, site_dtype(layout))
     s: Row = site[0]
     gains = setup.gains
     rule = setup.on_stale
-    own = setup.layout
+    site_layout = setup.layout
     s.rate_hz = setup.rate_hz
     s.scheme = setup.scheme
     s.law = gains.law
     s.mode = Mode.RUN
-    s.joints = own.joints
-    s.shared = own.shared
-    s.parameters = own.parameters
-    s.task = own.task
-    s.sent = own.sent
+    s.joints = site_layout.joints
+    s.shared = site_layout.shared
+    s.parameters = site_layout.parameters
+    s.task = site_layout.task
+    s.sent = site_layout.sent
     s.external = int(setup.external)
     s.ramps = 1
     s.theta_known = setup.theta_known
@@ -570,53 +487,60 @@ def _build_site(setup: SiteSetup, layout: Layout) -> RowArray:
         s.scale = task.scale
         s.posture_rate = task.posture_rate
         s.singular_value = task.singular_value
-        s.axes[: own.shared] = task.axes
-        s.posture[: own.joints] = task.posture or setup.q0
-    vectors = {name: getattr(gains, name) for name in _GAINS}
-    vectors |= {
-        "tau_limit": setup.tau_limit_nm,
-        "qd_limit": setup.qd_limit_rad_s,
-        "theta": setup.theta,
-    }
-    vectors |= {**setup.limits._asdict(), **setup.rest.vectors()}
-    vectors |= {"q": setup.q0, "qd": setup.qd0, "q_before": setup.q0}
-    if gains.law is Law.USER and setup.theta_known:
-        vectors["known"] = setup.theta
-    vectors["theta_hat"] = gains.known if gains.law is Law.KNOWN else gains.theta_hat0
-    lengths = {
-        **dict.fromkeys(_PER_JOINT, own.joints),
-        **dict.fromkeys(_PER_COORDINATE, own.shared),
-        **dict.fromkeys(_PER_PARAMETER, own.parameters),
-    }
-    for name, value in vectors.items():
-        s[name][: lengths[name]] = value
+        s.axes[: site_layout.shared] = task.axes
+        s.posture[: site_layout.joints] = task.posture or setup.q0
+    for name, numbers in _list_vectors(setup).items():
+        (length,) = field_shape(FIELDS["site"][name], site_layout.axes())
+        s[name][:length] = numbers
     return site
 
 
+def _list_vectors(setup: SiteSetup) -> dict[str, Any]:
+    """Returns the vectors of a site's row before its first tick, by field."""
+    gains = setup.gains
+    vectors: dict[str, Any] = {name: getattr(gains, name) for name in _GAINS}
+    vectors |= setup.limits._asdict()
+    vectors |= setup.rest.vectors()
+    vectors["tau_limit"] = setup.tau_limit_nm
+    vectors["qd_limit"] = setup.qd_limit_rad_s
+    vectors["theta"] = setup.theta
+    vectors["q"] = setup.q0
+    vectors["qd"] = setup.qd0
+    vectors["q_before"] = setup.q0
+    if gains.law is Law.USER and setup.theta_known:
+        vectors["known"] = setup.theta
+    vectors["theta_hat"] = gains.known if gains.law is Law.KNOWN else gains.theta_hat0
+    return vectors
+
+
 def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
+    """Returns the channels of a site's peers, with zeros for all received numbers."""
     vectors = setup.received_vectors
     links = setup.links
     numbers = sum(vector.length for vector in vectors)
-    places = np.array([link.channel.find_columns(vectors) for link in links], dtype=np.int64)
+    columns = np.array([link.channel.find_places(vectors) for link in links], dtype=np.int64)
     shape = (len(links), numbers)
     return ChannelArrays(
-        np.zeros((len(links), pages, numbers)), np.zeros(shape), places.reshape(shape)
+        waiting=np.zeros((len(links), pages, numbers)),
+        received=np.zeros(shape),
+        columns=columns.reshape(shape),
     )
 
 
 def _build_links(
     links: Sequence[LinkSetup], spare: int, shared: int
 ) -> tuple[RowArray, RowArray, Points]:
-    """Returns the links' rows, their models, and the points of their traces and outages."""
+    """Returns the links' rows, their models, and the points of their traces and outages.
+
+    In the table of points all traces come first, then all outages.
+    """
+    most_models = max(len(link.models) for link in links)
     rows = np.zeros(len(links), link_dtype(shared))
-    all_models = np.zeros(
-        (len(links), max(len(link.models) for link in links) + spare), LINK_MODEL_DTYPE
-    )
+    all_models = np.zeros((len(links), most_models + spare), LINK_MODEL_DTYPE)
     traces = [trace for link in links for trace in link.traces if trace is not None]
     outages = [outage for link in links for outage in link.outages]
-    points = np.array(
-        [pair for trace in traces for pair in trace] + outages, dtype=np.int64
-    ).reshape(-1, 2)
+    pairs = [point for trace in traces for point in trace]
+    points = np.array(pairs + outages, dtype=np.int64).reshape(-1, 2)
     trace_first = 0
     outage_first = sum(map(len, traces))
     row: Row

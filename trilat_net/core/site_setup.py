@@ -220,6 +220,10 @@ class Layout(NamedTuple):
             hand=hand,
         )
 
+    def axes(self) -> dict[str, int]:
+        """Returns the lengths of the axes that the fields of rows name, see `row_fields`."""
+        return {"joints": self.joints, "shared": self.shared, "parameters": self.parameters}
+
     def lengths(self) -> dict[str, int]:
         """Returns how many numbers the vectors of a record have, in their order."""
         n = self.joints

@@ -1,8 +1,10 @@
-"""Ticks: their nominal times, and the input and the record of one.
+"""Ticks: their nominal times, the input and the record of a tick, and texts about them.
 
-Invariant (L1): tick k of a loop of `rate_hz` lies at `k * 10^9 // rate_hz` nanoseconds after
-the epoch; integers, one rounding rule, no drift. Invariant (L3): the record of a tick names its
-inputs; the sample in use is an output.
+Invariant:
+
+- (L1) Tick k of a loop of `rate_hz` lies at `k * 10^9 // rate_hz` nanoseconds after the epoch:
+  integers with one rounding rule, so that no drift builds up.
+- (L3) The record of a tick names the inputs of the tick. The sample in use is an output.
 """
 
 from collections.abc import Sequence
@@ -14,7 +16,7 @@ from .jit import leaf
 
 NS_PER_S = 1_000_000_000
 BUCKETS_PER_S = 20
-"""A run that is reduced to peaks keeps them for so many equal parts of each second."""
+"""Equal parts of a second for which a run that is reduced to peaks keeps the peaks."""
 
 
 @leaf
@@ -27,24 +29,26 @@ def tick_ns(tick: int, rate_hz: int) -> int:
 def first_tick_at(due_ns: int, rate_hz: int) -> int:
     """Returns the first tick whose nominal time is at or after `due_ns`, ns since the epoch.
 
-    Exact: floor(k 10^9 / rate) >= due holds just where k 10^9 >= due * rate.
+    The result is exact: floor(k 10^9 / rate) >= due if and only if k 10^9 >= due rate.
     """
     return -(-due_ns * rate_hz // 1_000_000_000)
 
 
 MAX_ARRIVALS = 4096
-"""Most arrivals that one tick takes in; a driver leaves the rest for the next one."""
+"""Largest number of arrivals of one tick; a driver keeps further ones for the next tick."""
 
 
 class Mode(IntEnum):
     """The mode of a site in a tick.
 
-    RUN follows the peers. A stale peer leads to HOLD (stays at the last reference) or BRAKE
-    (stays where the arm is); a fresh sample from there to RETURN (goes back to the peers over a
-    time) and so to RUN. Under the rule `glide` a site is WAITING for its peers before it goes
-    to them, see `session_life`. DIVERGED, past a limit, is final. Under `glide` a limit leads
-    to FAULT and an order to STOPPED in its place: the arm comes to rest, as in HOLD, and only
-    another order leads back to WAITING.
+    In RUN the site follows its peers. A stale peer leads to HOLD (the site keeps its last
+    reference) or to BRAKE (the site keeps the pose of its arm). A fresh sample then leads to
+    RETURN (the site returns to its peers within a fixed time) and from there to RUN. DIVERGED,
+    beyond a limit, is final.
+
+    Under the rule `glide` a site is WAITING for its peers before it aligns with them, see
+    `session_life`. There a limit leads to FAULT instead of DIVERGED, and a stop order to
+    STOPPED: the arm comes to rest, as in HOLD, and only another order leads back to WAITING.
     """
 
     RUN = 1
@@ -58,7 +62,10 @@ class Mode(IntEnum):
 
 
 class LifeReason(IntEnum):
-    """Why a site under the rule `glide` last changed its mode, see `session_life`."""
+    """The reason for which a site under the rule `glide` last changed its mode.
+
+    `session_life` explains the changes of mode.
+    """
 
     START = 0
     PEERS_HERE = 1
@@ -83,13 +90,18 @@ class LifeReason(IntEnum):
 
 
 class LifeOrder(IntEnum):
-    """What a site under the rule `glide` is ordered to do, see `session_life`.
+    """An order to a site under the rule `glide`, see `session_life`.
 
-    STOP leads to STOPPED, from where ENABLE leads back; RESET leads back from FAULT. The others
-    come from the site itself, at an arm outside of the program: ARM_SILENT and ARM_LOST say
-    that no measurement came for a time, ARM_BACK that one came again, RELEASED that nobody
-    holds its dead-man switch, HELD that somebody does again, OVERRUN that it did not make some
-    ticks. Of several in one tick, the one of the highest number counts, and OVERRUN besides.
+    STOP leads to STOPPED, and ENABLE back to WAITING. RESET leads from FAULT to WAITING. The
+    site itself gives the other orders if its arm is outside of the program:
+
+    - ARM_SILENT and ARM_LOST: the arm sent no measurement for a shorter or a longer time.
+    - ARM_BACK: the arm sends measurements again.
+    - RELEASED: nobody holds the dead-man switch.
+    - HELD: somebody holds the dead-man switch again.
+    - OVERRUN: the site missed ticks.
+
+    Of several orders in one tick the one with the highest number counts. OVERRUN counts besides.
     """
 
     ENABLE = 1
@@ -108,12 +120,12 @@ class Arrival(NamedTuple):
 
     Attributes:
         peer: index of the peer among the site's links.
-        tick: the sample's tick, at the peer's rate.
+        tick: the stamp of the sample, a tick at the peer's rate.
         q: the peer's joint angles, rad.
-        qd: its joint velocities, rad/s.
-        latency_us: its time under way, microseconds; telemetry, enters no formula.
-        tau_x: the exogenous torque of the peer's record, N m; laws that reflect force use it.
-        ch: what the peer's law sent to this site besides, see `LawChannel.select_for_peer`.
+        qd: the peer's joint velocities, rad/s.
+        latency_us: the measured latency, us; telemetry that enters no formula.
+        tau_x: the exogenous torque of the peer's record, N m, for laws that reflect force.
+        ch: the numbers that the peer's law sent to this site, see `LawChannel.part`.
     """
 
     peer: int
@@ -129,8 +141,8 @@ class DominanceRamp(NamedTuple):
     """A linear change of a site's dominance factors over a time.
 
     Attributes:
-        start_ns: when it begins, ns since the epoch.
-        end_ns: when it is complete, not before `start_ns`.
+        start_ns: its start, ns since the epoch.
+        end_ns: its end, ns since the epoch, not before `start_ns`.
         alpha: the factors at its end, per peer in scenario order.
     """
 
@@ -140,16 +152,15 @@ class DominanceRamp(NamedTuple):
 
 
 class CoreChange(NamedTuple):
-    """A change ordered from outside.
+    """A change of a running site by a command from outside: of a link, of shares, or an order.
 
     Attributes:
-        text: its text in the record, from which every reader derives the same change.
-        peer: the link that it changes, by its peer's index; -1 for a change of the dominance
-            factors.
-        model: the link's model from then on.
+        text: the text in the record, from which all readers derive the same change.
+        peer: the index of the peer whose link changes; -1 for other changes.
+        model: the new model of the link.
         ramp: the change of the dominance factors.
-        order: what the site is to do.
-        skipped: with OVERRUN, the ticks before this one that the site did not make.
+        order: the order to the site.
+        skipped: with OVERRUN, the number of ticks before this one that the site missed.
     """
 
     text: str
@@ -161,14 +172,14 @@ class CoreChange(NamedTuple):
 
 
 class PlantState(NamedTuple):
-    """What was measured of an arm outside of the program.
+    """A measurement of an arm outside of the program.
 
     Attributes:
         q: joint angles, rad.
         qd: joint velocities, rad/s.
-        tau_x: torque of operator and environment, N m, in the sign of the record; empty: none
-            is measured.
-        bodies: poses of what else is in its scene, as a record has them.
+        tau_x: torque of operator and environment, N m, in the sign of the record; empty if the
+            arm does not measure it.
+        bodies: poses of the other bodies of the scene, as in `TickRecord.bodies`.
     """
 
     q: Sequence[float]
@@ -178,15 +189,15 @@ class PlantState(NamedTuple):
 
 
 class TickInput(NamedTuple):
-    """One call of `Site.step`.
+    """The input of one call of `Site.step`.
 
     Attributes:
-        k: its number.
-        arrivals: the samples since the tick before, in order.
-        commands: the changes ordered since then.
-        measured: the present state of an external plant; None: unchanged.
-        hand: what a live hand does in this tick, see `live_hand.empty_hand_vector`; empty: nobody holds
-            the arm.
+        k: the tick.
+        arrivals: the samples that arrived since the previous tick, in order.
+        commands: the changes that were commanded since the previous tick.
+        measured: the present state of an external arm; None: unchanged.
+        hand: the action of a live hand in this tick, see `live_hand.free_hand`; empty: nobody
+            holds the arm.
     """
 
     k: int
@@ -197,8 +208,7 @@ class TickInput(NamedTuple):
 
 
 class TickRecord(NamedTuple):
-    """The record of one tick: the state AT t_k and what followed from it, never the advanced
-    state.
+    """The record of one tick: the state AT t_k and its consequences, never the advanced state.
 
     Attributes:
         tick: k.
@@ -213,22 +223,23 @@ class TickRecord(NamedTuple):
             negative.
         theta_hat: estimate of the parameters.
         used: tick of the sample in use, per peer in scenario order; -1 before the first.
-        rx_crc: CRC-32 of this tick's arrivals as the step took them in, little-endian (peer
-            i64, tick i64, q f64s, qd f64s) each, followed by their tau_x if the law reflects
-            force; shows a changed input at its own tick.
-        cmd: texts of the changes that it took in.
-        mem: the rest of the site's memory: empty in RUN and DIVERGED, else the pose that it
-            holds, rad, and the time at which it began to return, ns since the epoch (0 before).
-            A site with a user's law always has these, and the law's memory after them. Under
-            the rule `glide` a site always has what `session_life` remembers in their place.
-        x: in task space what the site shares of its end effector: its place, m, and
-            orientation; else empty.
-        xd: its derivative, m/s and rad/s.
-        wrench: what tau_x amounts to there, N and N m.
-        ch: what the site's law sends besides, see `LawChannel`.
-        hand: what a live hand does in this tick, see `live_hand`; empty if the site has none.
-        bodies: poses of the bodies of its plant, seven numbers each: x, y, z in the arm's base
-            frame, m, and the unit quaternion w, x, y, z; empty if it has none.
+        rx_crc: CRC-32 of the arrivals of this tick as the step received them, so that a changed
+            input shows at its own tick. Each arrival is little-endian (peer i64, tick i64, q
+            f64s, qd f64s), followed by its tau_x if the law reflects force.
+        cmd: texts of the changes that this tick applied.
+        mem: the memory of the site that no other field holds. In RUN and DIVERGED it is empty;
+            otherwise it is the held pose, rad, and the time at which the return began, ns since
+            the epoch (0 before). A site with a user's law always has these numbers, followed
+            by the memory of the law. Under the rule `glide` a site always has the memory of
+            `session_life` instead, see `Layout.count_life_memory`.
+        x: in task space the shared pose of the end effector: position, m, and orientation;
+            otherwise empty.
+        xd: derivative of x, m/s and rad/s.
+        wrench: tau_x expressed at the end effector, N and N m.
+        ch: the numbers that the site's law sends, see `LawChannel`.
+        hand: the action of a live hand in this tick, see `live_hand`; empty without a hand.
+        bodies: poses of the bodies of the plant, seven numbers each: x, y, z in the arm's base
+            frame, m, and the unit quaternion w, x, y, z; empty without bodies.
     """
 
     tick: int
@@ -253,23 +264,27 @@ class TickRecord(NamedTuple):
     bodies: Sequence[float] = ()
 
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
-        """Returns the motion and the exogenous torque that peers get, in the coordinates that
-        sites share.
+        """Returns the motion and the exogenous torque that peers receive.
+
+        They are in shared coordinates: those of the end effector in task space, else the joints.
         """
-        return (self.x, self.xd, self.wrench) if self.x else (self.q, self.qd, self.tau_x)
+        if self.x:
+            return self.x, self.xd, self.wrench
+        return self.q, self.qd, self.tau_x
 
 
 class LinkCounts(NamedTuple):
-    """Counts of one link since the start.
+    """Counts of samples on one link since the start.
 
     Attributes:
         accepted: samples that arrived.
-        late: of those, the ones that arrived after they were due.
-        duplicate: the ones that had arrived before.
-        refused: the ones whose stamp was out of range.
-        lost: the ones that the link's model lost.
-        superseded: the ones never used, because a newer one was released before or with them.
-        copies: duplicates that the link's model made.
+        late: of those, samples that arrived after they were due.
+        duplicate: of those, samples that had arrived before.
+        refused: of those, samples whose stamp was out of range.
+        lost: of those, samples that the link's model lost.
+        superseded: samples that were never used, because a newer sample was released before
+            them or in the same tick.
+        copies: duplicates that the link's model produced.
     """
 
     accepted: int
@@ -300,23 +315,22 @@ _REASONS = {
 
 
 def find_life_reason(output: TickRecord) -> LifeReason:
-    """Returns why a site under the rule `glide` last changed its mode, as its record remembers
-    it.
-    """
-    return LifeReason(int(output.mem[2 * len(output.q_des) + 1]))
+    """Returns the reason, stored in a record, for which a gliding site last changed its mode."""
+    shared = len(output.q_des)
+    return LifeReason(int(output.mem[2 * shared + 1]))
 
 
 class LifeAlarm(NamedTuple):
-    """A mode of a site that nobody may overlook.
+    """An alarm about the mode of a site, which nobody may overlook.
 
     Attributes:
         word: the mode, in capitals.
-        reason: why.
-        advice: what to do, at a terminal.
-        order: the order that ends it, "enable" or "reset", where a page has a button for it; ""
-            if none does.
-        before: what has to be done before that order, a clause that ends in ", then"; "" if
-            nothing.
+        reason: the reason for the mode.
+        advice: the remedy at a terminal.
+        order: the order that ends the alarm, "enable" or "reset", where a page has a button for
+            it; "" if no order ends it.
+        before: the remedy that has to precede the order, a clause that ends in ", then"; "" if
+            none is needed.
     """
 
     word: str
@@ -333,7 +347,18 @@ _REMEDIES = {
     LifeReason.LIMIT_Q: "bring the joint back within its limits, then",
     LifeReason.ARM_SILENT: "let the program of the arm send again, then",
 }
-_ONCE_HEARD = "it goes on by itself once all its peers are heard"
+_ORDERS = {"fault": "reset", "stopped": "enable"}
+"""The order that ends a mode."""
+_ALARM_MODES = ("fault", "stopped", "hold")
+_ADVICE = {
+    ("stopped", LifeReason.RELEASED): "hold the switch",
+    ("fault", LifeReason.RELEASED): "hold the switch",
+    ("hold", LifeReason.RELEASED): "hold the switch",
+    ("hold", LifeReason.ARM_SILENT): "it goes on by itself once its arm is heard",
+    ("hold", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
+    ("waiting", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
+}
+_DEFAULT_ADVICE = "it goes on by itself once all its peers are heard"
 
 
 def find_alarm(
@@ -344,67 +369,86 @@ def find_alarm(
     shared: int,
     lost: Sequence[str] = (),
 ) -> LifeAlarm | None:
-    """Returns the alarm of a site under the rule `glide`, by a record with `shared`
-    coordinates; or None.
+    """Returns the alarm of a site under the rule `glide`, or None.
 
-    `lost` are the peers that it goes on without.
+    Args:
+        session: the name of the session, for the advice.
+        site: the name of the site, for the advice.
+        mode: the mode in the site's record.
+        mem: the memory in the site's record.
+        shared: the number of coordinates that sites share.
+        lost: the names of the peers without which the site goes on.
     """
     try:
         reason = LifeReason(int(mem[2 * shared + 1]))
-    except (IndexError, ValueError, OverflowError):  # of another rule, or a stranger's
+    except (IndexError, ValueError, OverflowError):  # another rule, or a record of a stranger
         return None
-    if mode not in ("fault", "stopped", "hold") and (mode, reason) != (
-        "waiting",
-        LifeReason.ALIGN_LIMIT,
-    ):
-        names = ", ".join(lost)
-        advice = f"the share comes back by itself once {names} is there again"
-        return (
-            LifeAlarm(f"WITHOUT {names}", "the others have its share", advice) if lost else None
-        )
-    order = {"fault": "reset", "stopped": "enable"}.get(mode, "")
-    if reason is LifeReason.RELEASED:  # the dead-man switch ends it, and no order
-        order = ""
+    is_too_far = (mode, reason) == ("waiting", LifeReason.ALIGN_LIMIT)
+    if mode not in _ALARM_MODES and not is_too_far:
+        return _find_lost_alarm(lost)
+    # The dead-man switch ends a release, and no order does.
+    order = "" if reason is LifeReason.RELEASED else _ORDERS.get(mode, "")
     before = _REMEDIES.get(reason, "") if mode == "fault" else ""
-    advice = (
-        f"{before} trilat {order} --session {session} {site}".lstrip() if order else _ONCE_HEARD
+    advice = _DEFAULT_ADVICE
+    if order:
+        advice = f"{before} trilat {order} --session {session} {site}".lstrip()
+    advice = _ADVICE.get((mode, reason), advice)
+    text = _REASONS.get(reason, reason.name.lower().replace("_", " "))
+    return LifeAlarm(word=mode.upper(), reason=text, advice=advice, order=order, before=before)
+
+
+def _find_lost_alarm(lost: Sequence[str]) -> LifeAlarm | None:
+    """Returns the alarm of a site that goes on without lost peers, or None if it has all."""
+    if not lost:
+        return None
+    names = ", ".join(lost)
+    return LifeAlarm(
+        word=f"WITHOUT {names}",
+        reason="the others have its share",
+        advice=f"the share comes back by itself once {names} is there again",
     )
-    advice = {
-        (mode, LifeReason.RELEASED): "hold the switch",
-        ("hold", LifeReason.ARM_SILENT): "it goes on by itself once its arm is heard",
-        ("hold", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
-        ("waiting", LifeReason.ALIGN_LIMIT): "bring the arms closer together",
-    }.get((mode, reason), advice)
-    why = _REASONS.get(reason, reason.name.lower().replace("_", " "))
-    return LifeAlarm(word=mode.upper(), reason=why, advice=advice, order=order, before=before)
+
+
+_ACTIVITIES = {
+    Mode.RUN: "follows its peers",
+    Mode.HOLD: "holds its reference",
+    Mode.BRAKE: "holds its pose",
+    Mode.RETURN: "returns to its peers",
+    Mode.WAITING: "waits for its peers",
+    Mode.FAULT: "is in FAULT",
+    Mode.STOPPED: "is STOPPED",
+}
 
 
 def describe_mode(
     site: str, output: TickRecord, *, glides: bool = False, law_failure: Exception | None = None
 ) -> str:
-    """Returns the text of the event that a site changes its mode; one that `glides` says why."""
-    doing = {
-        Mode.RUN: "follows its peers",
-        Mode.HOLD: "holds its reference",
-        Mode.BRAKE: "holds its pose",
-        Mode.RETURN: "returns to its peers",
-        Mode.WAITING: "waits for its peers",
-        Mode.FAULT: "is in FAULT",
-        Mode.STOPPED: "is STOPPED",
-    }
-    why = _REASONS.get(find_life_reason(output), "") if glides else "a peer is stale"
+    """Returns the text of the event that a site changes its mode.
+
+    Args:
+        site: the name of the site.
+        output: the record of the first tick in the mode.
+        glides: true: the site is under the rule `glide`, and the text gives the reason.
+        law_failure: the error with which the user's law failed, or None.
+    """
+    if glides:
+        reason = find_life_reason(output)
+        text = _REASONS.get(reason, "")
+    else:
+        reason = None
+        text = "a peer is stale"
     if law_failure is not None and find_life_reason(output) is LifeReason.NOT_FINITE:
-        why = str(law_failure)
-    regrouped = glides and find_life_reason(output) in (LifeReason.DROPPED, LifeReason.RESTORED)
-    aligns = output.mode is Mode.RETURN and not regrouped
-    if aligns or output.mode is Mode.RUN:
-        why = ""
-    return f"{site} {doing[output.mode]} from t = {output.t_ns * 1e-9:.3f} s{': ' * bool(why)}{why}"
+        text = str(law_failure)
+    is_regrouped = reason in (LifeReason.DROPPED, LifeReason.RESTORED)
+    is_aligning = output.mode is Mode.RETURN and not is_regrouped
+    if is_aligning or output.mode is Mode.RUN:
+        text = ""
+    event = f"{site} {_ACTIVITIES[output.mode]} from t = {output.t_ns * 1e-9:.3f} s"
+    return f"{event}: {text}" if text else event
 
 
 def describe_divergence(site: str, output: TickRecord) -> str:
     """Returns the text of the event that a site diverged."""
     speed = max(abs(v) for v in output.qd)
-    return (
-        f"{site} diverged at t = {output.t_ns * 1e-9:.3f} s: a joint moves at {speed:.4g} rad/s"
-    )
+    t_s = output.t_ns * 1e-9
+    return f"{site} diverged at t = {t_s:.3f} s: a joint moves at {speed:.4g} rad/s"

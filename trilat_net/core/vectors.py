@@ -1,8 +1,10 @@
-"""Types of the core's numbers: arrays, rows of structured arrays, and vectors of fixed length
-as tuples.
+"""Types of the core's numbers: arrays, rows of structured arrays, and vectors as tuples.
 
-Invariant: a leaf takes vectors (tuples or rows of arrays, read by index) and returns tuples,
-which stay in registers while a tick is computed; only `put` writes.
+Invariant:
+
+- A leaf reads vectors by index, so that they may be tuples or rows of arrays.
+- A leaf returns vectors as tuples, which stay in registers while a tick is computed. Results in
+  arrays are written by `put`.
 """
 
 from collections.abc import Sequence
@@ -23,47 +25,51 @@ Vector = Sequence[float] | Any
 
 @leaf
 def pair(a: Vector) -> Pair:
-    """Returns the two numbers of a row."""
+    """Returns the two numbers of a row as a tuple."""
     return a[0], a[1]
 
 
 @leaf
 def five(a: Vector) -> Five:
-    """Returns the five numbers of a row."""
+    """Returns the five numbers of a row as a tuple."""
     return a[0], a[1], a[2], a[3], a[4]
 
 
 @leaf
 def put(a: Any, values: Any) -> None:
-    """Writes one row into another of the same length."""
+    """Copies `values` into the array `a` of the same length."""
     for i in range(a.shape[0]):
         a[i] = values[i]
 
 
 @leaf
 def count_started(table: Any, first: int, count: int, now: float) -> int:
-    """Returns how many of so many rows, in the order of their times, begin at a time or before
-    it.
+    """Returns how many rows of a table start at the time `now` or before.
+
+    The rows `first` to `first + count - 1` are ordered by time, which is their first column. The
+    method is bisection.
     """
     low = first
     high = first + count
     while low < high:
-        half = (low + high) // 2
-        if table[half, 0] <= now:
-            low = half + 1
+        middle = (low + high) // 2
+        if table[middle, 0] <= now:
+            low = middle + 1
         else:
-            high = half
+            high = middle
     return low - first
 
 
 Array = NDArray[np.float64]
 
 Row = Any
-"""A row of a structured array; NumPy's types cannot name its fields."""
+"""A row of a structured array whose fields no type names; `row_fields` has types of most rows."""
 
 Points = NDArray[np.int64]
-"""A table of pairs, shape (n, 2): traces (time since their first point and delay, us; a delay
-of -1 is a sample lost) and outages (first and last stamp, ns), one after the other.
+"""A table of pairs, shape (n, 2), of traces and then of outages.
+
+The points of a trace are the time since its first point, us, and the delay, us; -1: the sample
+is lost. An outage is its first stamp and its end, ns.
 """
 
 RowArray = NDArray[np.void]
