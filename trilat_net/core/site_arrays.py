@@ -105,7 +105,7 @@ def build_tick_buffers(setup: SiteSetup) -> TickBuffers:
     layout = setup.layout
     most_received = 0
     if setup.law_factory is not None:
-        most_received = max(link.channel.received for link in setup.links)
+        most_received = max(link.channel.received_size for link in setup.links)
     return TickBuffers(
         arrivals=np.zeros(MAX_ARRIVALS, arrival_dtype(layout.shared)),
         forces=np.zeros((MAX_ARRIVALS, layout.shared)),
@@ -427,8 +427,8 @@ def _stack_channels(
     """
     for setup, channel in zip(setups, channels, strict=True):
         for link, columns in zip(setup.links, channel.columns, strict=True):
-            to_all = link.channel.numbers(per_peer=False)
-            to_each = link.channel.numbers(per_peer=True)
+            to_all = link.channel.count_numbers(per_peer=False)
+            to_each = link.channel.count_numbers(per_peer=True)
             columns[columns >= to_all] += link.index_at_peer * to_each
     waiting, received, columns = map(_stack_padded, zip(*channels, strict=True))
     for channel, padded in zip(channels, columns, strict=True):
@@ -518,7 +518,7 @@ def _build_channel(setup: SiteSetup, pages: int) -> ChannelArrays:
     vectors = setup.received_vectors
     links = setup.links
     numbers = sum(vector.length for vector in vectors)
-    columns = np.array([link.channel.find_places(vectors) for link in links], dtype=np.int64)
+    columns = np.array([link.channel.find_columns(vectors) for link in links], dtype=np.int64)
     shape = (len(links), numbers)
     return ChannelArrays(
         waiting=np.zeros((len(links), pages, numbers)),

@@ -108,7 +108,7 @@ class Site:
         self._plug_law(setup)
         live = [n for n, actor in enumerate(setup.actors) if actor.kind in LIVE_KINDS]
         self._hand = self._find_hand(live[0]) if live else None
-        counts = [link.channel.received for link in setup.links]
+        counts = [link.channel.received_size for link in setup.links]
         receives = self._user_law is not None and any(counts)
         self._received_counts = counts if receives else None
         self._glides = setup.on_stale.action is StaleAction.GLIDE
@@ -329,7 +329,7 @@ class Site:
         if self._hand is None:
             return ()
         grip, target, target_ahead = self._hand
-        action = list(vector) or free_hand(len(target))
+        action = list(vector) or empty_hand_vector(len(target))
         hand = HandInForce.read(action)
         grip[0] = hand.grip
         target[:] = hand.target
@@ -419,7 +419,7 @@ class Site:
         self._sent[:] = last.ch or 0.0
         self._apply_hand(last.hand)
         if self._law is not None:
-            self._law.recall(law_memory)
+            self._law.restore(law_memory)
             self._law_memory = list(law_memory)
         resume_stages(last.tick, self._arrays)
 

@@ -783,7 +783,9 @@ def _read_arrivals(log: Log, ticks: int) -> tuple[IntArray, IntArray, int]:
 
 def _add_hands(feed: ReplayedInputs, log: Log, ticks: int) -> ReplayedInputs:
     """Returns a feed with the recorded actions of live hands."""
-    setups = [log.scenario.setup(name)._replace(law_factory=None) for name in log.scenario.names]
+    setups = [
+        log.scenario.setup(name)._replace(law_factory=None) for name in log.scenario.names
+    ]
     rows = [_find_live_row(setup) for setup in setups]
     if max(rows) < 0:
         return feed
