@@ -91,7 +91,7 @@ def test_it_is_executed_again_and_its_energies_close() -> None:
     assert np.abs(balance.residual).max() <= 1e-4 * np.abs(balance.V).max()
     assert list_losses(log) == ["m2 without m1 3.12 to 4.35 s", "s without m1 3.12 to 4.35 s"]
     (premise,) = (one for one in trilat_net.certify(log).premises if one.name == "shares")
-    assert "s without m1 3.12 to 4.35 s; those that are left follow each other" in premise.text
+    assert "s without m1 3.12 to 4.35 s; the remaining sites follow each other" in premise.text
 
 
 def test_last_that_is_followed_and_slave_are_waited_for() -> None:

@@ -1,8 +1,11 @@
-"""One view of a recorded run: its sites' records aligned, the torques by source, dominance,
-links and walls.
+"""Provides one view of a recorded run, from which all metrics are computed.
 
-Invariant: whatever is derived from a log is derived once, by `RunView.once`, whoever asks
-first.
+The view holds the aligned records of the sites, the torques by source, the dominance factors,
+the links and the walls.
+
+Invariant:
+    - Each quantity is derived from the log only once, by `RunView.compute_once` or by a cached
+      property.
 """
 
 from collections.abc import Callable, Iterable
@@ -27,8 +30,12 @@ T = TypeVar("T")
 
 
 class SiteRun(NamedTuple):
-    """A site with records: these aligned, the torque ON its arm by source, and its dominance
-    factors.
+    """A site of a recorded run.
+
+    Attributes:
+        records: its aligned records.
+        torque: torque ON its arm, by source.
+        dominance: its dominance factors for its peers.
     """
 
     records: AlignedRecords
@@ -37,40 +44,45 @@ class SiteRun(NamedTuple):
 
 
 class RunView:
-    """A run as metrics see it.
+    """A recorded run as metrics see it.
+
+    Args:
+        log: the log of the run.
 
     Attributes:
-        log: its log.
-        scenario: its scenario.
+        log: the log of the run.
+        scenario: the scenario of the run.
     """
 
     def __init__(self, log: Log) -> None:
         self.log = log
         self.scenario = log.scenario
-        self._made: dict[Callable[[RunView], Any], Any] = {}
+        self._results: dict[Callable[[RunView], Any], Any] = {}
 
-    def compute_once(self, make: Callable[["RunView"], T]) -> T:
-        """Returns what a function makes of this view, made when it is first asked for."""
-        if make not in self._made:
-            self._made[make] = make(self)
-        return cast(T, self._made[make])
+    def compute_once(self, compute: Callable[["RunView"], T]) -> T:
+        """Returns the result of a function of this view, which is called at most once."""
+        if compute not in self._results:
+            self._results[compute] = compute(self)
+        return cast(T, self._results[compute])
 
     @cached_property
     def sites(self) -> dict[str, SiteRun]:
         """The sites with records."""
         return {
             site: SiteRun(
-                own,
-                attribute_torque(own, self.scenario),
-                trace_dominance(self.log, site, own.t_s),
+                records,
+                attribute_torque(records, self.scenario),
+                trace_dominance(self.log, site, records.t_s),
             )
-            for site, own in align_records(self.log).items()
+            for site, records in align_records(self.log).items()
         }
 
     @cached_property
     def shared(self) -> dict[str, SiteRun]:
-        """The same as what sites share: in task space places for angles, and forces for
-        torques.
+        """The sites with records, in the coordinates that sites share.
+
+        In task space, poses of end effectors take the place of joint angles, and forces take
+        the place of torques.
         """
         return {site: _view_shared(self.scenario, run) for site, run in self.sites.items()}
 
@@ -81,48 +93,62 @@ class RunView:
 
     @cached_property
     def links(self) -> dict[str, LinkSummary]:
-        """The links "j->i"."""
-        return {use.name: use for use in summarise_links(self.log)}
+        """The links by name, "j->i"."""
+        return {link.name: link for link in summarise_links(self.log)}
 
     @cached_property
     def walls(self) -> dict[str, tuple[str, TorqueSource]]:
-        """The walls "s/1" (the first of s), each with its site."""
-        return {
-            f"{site}/{n}": (site, wall)
-            for site in self.log.sites
-            for n, wall in enumerate(list_walls(self.scenario.sites[site]), 1)
-        }
+        """The walls by name, each with its site; "s/1" is the first wall of site s."""
+        walls = {}
+        for site in self.log.sites:
+            for number, wall in enumerate(list_walls(self.scenario.sites[site]), 1):
+                walls[f"{site}/{number}"] = (site, wall)
+        return walls
 
-    def places(self, of: str) -> Iterable[str]:
-        """Returns the names of the places of a kind: "run" (one, by ""), "site", "link" or
-        "wall".
+    def list_subjects(self, kind: str) -> Iterable[str]:
+        """Returns the names of the subjects of a kind.
+
+        Args:
+            kind: "run" (a single subject named ""), "site", "link" or "wall".
         """
-        return {"run": [""], "site": self.log.sites, "link": self.links, "wall": self.walls}[of]
+        if kind == "run":
+            return [""]
+        subjects: dict[str, Iterable[str]] = {
+            "site": self.log.sites,
+            "link": self.links,
+            "wall": self.walls,
+        }
+        return subjects[kind]
 
 
 def _view_shared(scenario: Scenario, run: SiteRun) -> SiteRun:
-    """Returns a site's run as what sites share.
+    """Returns a site's run in the coordinates that sites share.
 
-    What an operator was to do is turned into forces in the first pose, so that what stands
-    still does.
+    An operator's script is turned into forces with the Jacobian of the first pose, so that a
+    constant script stays constant.
     """
-    records, torque, dominance = run
+    records = run.records
+    torque = run.torque
     arm = build_arm_rows(scenario, records.site)
-    follows = build_following(arm, records.q, records.qd, np.array(records.axes))
-    if isinstance(follows, JointFollowing):
-        return run
     axes = np.array(records.axes)
+    following = build_following(arm, records.q, records.qd, axes)
+    if isinstance(following, JointFollowing):
+        return run
     script = torque.script
-    forces = torque._replace(
-        operator_now=follows.project_torque(torque.operator_now),
-        operator_held=follows.project_torque(torque.operator_held),
-        environment_now=follows.project_torque(torque.environment_now),
-        environment_held=follows.project_torque(torque.environment_held),
-    )
     if script is not None:
-        script = script @ (follows.inverse[0] @ follows.J[0]).T
+        script = script @ (following.inverse[0] @ following.J[0]).T
+    forces = torque._replace(
+        operator_now=following.project_torque(torque.operator_now),
+        operator_held=following.project_torque(torque.operator_held),
+        environment_now=following.project_torque(torque.environment_now),
+        environment_held=following.project_torque(torque.environment_held),
+        script=script,
+    )
     x = records.x
-    if x.shape[1] == POSE:  # metrics compare poses of different times
+    if x.shape[1] == POSE:
+        # metrics compare poses of different times, so rotation vectors must not change branch
         x = np.hstack([x[:, :POSITION], compute_continuous_vectors(x[:, POSITION:])])
-    places = records._replace(q=axes * x, qd=axes * records.xd, tau_x=axes * records.wrench)
-    return SiteRun(places, forces._replace(script=script), dominance)
+    shared_records = records._replace(
+        q=axes * x, qd=axes * records.xd, tau_x=axes * records.wrench
+    )
+    return SiteRun(shared_records, forces, run.dominance)

@@ -38,17 +38,17 @@ def test_all_hold_in_free_motion() -> None:
         (
             "law",
             {"sites__m2__control__law": "p_d"},
-            "m2: law p_d, for which there is no such V",
+            "m2: law p_d has no functional V",
         ),
         (
             "parameters",
             {"control__Gamma": [1.0, 1.0, 1.0, 0.0, 0.0]},
-            "not learnt, and not known",
+            "neither learnt nor known",
         ),
         (
             "parameters",
             {"control__law": "adaptive_box", "control__theta_high": 1.9},
-            "theta is outside of the box",
+            "theta is outside the box",
         ),
         (
             "Kd",
@@ -56,7 +56,7 @@ def test_all_hold_in_free_motion() -> None:
             "no beta exists: m1 (3, 3), m2 (3, 3), s (1, 3)",
         ),
         ("Kd", {"control__Kd": 0.0}, "some Kd is zero"),
-        ("shares", runs.EXPERT, "nobody of m1, s follows m2, whose beta is 0"),
+        ("shares", runs.EXPERT, "none of m1, s follows m2, whose beta is 0"),
         (
             "delays",
             {"link__model": "uniform", "link__half_width_ms": 30.0},
@@ -85,7 +85,7 @@ def test_one_that_fails_says_why(name: str, overrides: dict[str, object], says: 
 def test_unequal_scalars_of_kd_hold() -> None:
     found = premises(sites__m2__control__Kd=6.0)["Kd"]
     assert found.holds
-    assert found.text == "one Kd but for a scalar: m1 1, m2 2, s 1"
+    assert found.text == "one Kd up to a scalar: m1 1, m2 2, s 1"
 
 
 def test_a_hand_that_holds_on_fails_a_premise() -> None:
@@ -101,11 +101,11 @@ def test_a_hand_that_holds_on_fails_a_premise() -> None:
 def test_a_damper_of_qd_may_give_energy_to_r() -> None:
     hands = next(p for p in runs.run("wall").certificate.premises if p.name == "hands")
     assert hands.holds is False
-    assert hands.text.startswith("the hands and walls gave up to")
+    assert hands.text.startswith("the hands and walls supplied up to")
 
 
 @pytest.mark.parametrize(
-    ("apart_rad", "says"), [(0.5, "the walls gave up to"), (1e-8, "the walls only took")]
+    ("apart_rad", "says"), [(0.5, "the walls supplied up to"), (1e-8, "the walls only absorbed energy")]
 )
 def test_what_rounding_gives_is_not_given(apart_rad: float, says: str) -> None:
     """A damper of a motion of 1e-8 rad gives some 1e-17 J to r, of a V of known arms that is hardly more."""

@@ -50,7 +50,7 @@ def test_a_law_without_a_functional_is_judged_by_growth_alone(
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
     assert (
         found.verdict.text
-        == "V cannot be judged: m1, m2, s: law p_d, for which there is no such V"
+        == "V cannot be judged: m1, m2, s: law p_d has no functional V"
     )
     assert found.end.behaviour is motion
     assert found.passed is passed
@@ -79,7 +79,7 @@ def test_an_arm_whose_theta_nobody_knows_has_no_v() -> None:
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
     assert (
         found.verdict.text
-        == "V cannot be judged: s: nobody knows the arm's theta, and V is made of it"
+        == "V cannot be judged: s: theta of the arm is unknown, and V depends on it"
     )
 
 
@@ -91,7 +91,7 @@ def test_an_external_arm_is_judged_where_theta_explains_its_motion() -> None:
     found = certify(outside(logs.rewritten(still_free(), change=change), known=True))
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
     assert (
-        "the arm of s, outside of the program, does not move as its theta says"
+        "the external arm of s does not move as its theta says"
         in found.verdict.text
     )
 

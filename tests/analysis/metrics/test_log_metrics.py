@@ -296,7 +296,7 @@ def test_arms_that_move_share_nothing() -> None:
     assert found.static_windows.value is None
     assert (
         found.run["sharing_off"].why
-        == "no second in which all sites rest under torques that stand"
+        == "no second in which all sites rest under constant torques"
     )
 
 

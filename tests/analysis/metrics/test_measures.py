@@ -65,7 +65,7 @@ def test_a_key_with_two_definitions_is_refused_with_both_homes() -> None:
 def test_a_measure_gives_the_quantities_that_it_declares(name: str) -> None:
     view = RunView(trilat_net.simulate(name, {"duration_s": 0.2}))
     for one in list_measures():
-        for place in view.places(one.of):
+        for place in view.list_subjects(one.of):
             assert set(one.measure(view, place)) == {
                 quantity.key for quantity in one.quantities
             }

@@ -1,18 +1,26 @@
-"""The corrected functional V_i of a site, and every term that changes it, in J.
+"""Computes the corrected functional V_i of a site, and every term that changes it, in J.
 
-Invariant: V_i = 1/2 ( r'M r + (theta_hat - theta)' Gamma^-1 (theta_hat - theta) + e' Lambda Kd
-e + sum_j alpha_ij int qd_j' Kd qd_j ds ), the integral from the stamp of the sample in use to
-now: the paper's Eq. (16) with the integral that its Eq. (22) needs (docs/errata.md). With |x|^2
-= x'Kd x, V_i' = -r'Kp r - 1/2 sum_j alpha_ij |qd_i - qd_j(t - T)|^2 - 1/2 |qd_i|^2 + 1/2 sum_j
-alpha_ij |qd_j|^2: the first two terms dissipate, the last two are transferred between sites and
-cancel under beta. In task space e and qd_j are those of end effectors and r is that of the task
-(`following`); docs/certificate.md says what else changes.
+    V_i = 1/2 ( r'M r + (theta_hat - theta)' Gamma^-1 (theta_hat - theta) + e' Lambda Kd e
+                + sum_j alpha_ij int qd_j' Kd qd_j ds )
 
-Within a sample period a term is a trapezoid, with an error of second order in the period,
-followed by an exact jump at its end; a jump of e is divided among links, changes of dominance
-and the rule for stale peers. Operator and environment do work on r = qd + Lambda e, not on qd:
-the theorem requires passivity with respect to r. A site has a functional if its control law is
-the paper's and theta of its arm is known.
+The integral runs from the stamp of the sample in use to now. This is the paper's Eq. (16) with
+the integral that its Eq. (22) needs (docs/errata.md). With |x|^2 = x'Kd x, its derivative is
+
+    V_i' = -r'Kp r - 1/2 sum_j alpha_ij |qd_i - qd_j(t - T)|^2
+           - 1/2 |qd_i|^2 + 1/2 sum_j alpha_ij |qd_j|^2
+
+The terms of the first line dissipate. Those of the second are transferred between sites, and
+cancel under the weights beta. In task space e and qd_j are those of end effectors, and r is
+that of the task (`following`); docs/certificate.md states what else changes.
+
+Within a sample period each term is integrated by the trapezoid rule, with an error of second
+order in the period, followed by an exact jump at the end of the period. A jump of e is divided
+among the links, changes of dominance, and the rule for stale peers.
+
+Invariant:
+    - Operators and environments do work on r = qd + Lambda e, not on qd: the theorem requires
+      passivity with respect to r.
+    - A site has a functional if its control law is the paper's, and theta of its arm is known.
 """
 
 from collections.abc import Mapping
@@ -33,24 +41,27 @@ from ..following import Following, build_following
 from ..torque_sources import TorqueSplit
 
 RATE_TOLERANCE = 1e-12
-"""A torque this near to what its rate allows is at that limit, as a share of its largest."""
+"""A torque is at its rate limit if it is nearer than this, as a share of its largest value."""
 JUMP_TOLERANCE = 1e-12
-"""A smaller change of e, rad, and of its derivative, rad/s, is no jump."""
+"""Smaller changes of e, rad, and of its derivative, rad/s, are no jump."""
 
 
 class SiteConstants(NamedTuple):
     """Constants of a site; vectors per joint have shape (n,), per parameter (P,).
 
     Attributes:
-        arm: the arm, of true parameters. Lambda, Kp, Kd: gains, 1/s and N m s/rad; in task
-        space Lambda and Kd (N s/m) have shape (m,).
-        Gamma: adaptation gain.
-        low, high: limits of the estimates.
+        arm: the arm with its true parameters.
+        Lambda: gain of the error, 1/s; in task space of shape (m,).
+        Kp: gain of r, N m s/rad.
+        Kd: gain of ed, N m s/rad; in task space of shape (m,), N s/m.
+        Gamma: adaptation gains.
+        low: lower limits of the estimates.
+        high: upper limits of the estimates.
         tau_limit: largest torque of a joint, N m, shape () or (n,).
         axes: per coordinate of the task 1 if the site follows along it, else 0, and Lambda and
             Kd are 0; () in joint space.
-        rho, width: largest robust torque of each joint, N m, and the r at which it is 0.71 of
-        that, rad/s.
+        rho: largest robust torque of each joint, N m.
+        width: value of r at which the robust torque is 0.71 of the largest, rad/s.
         friction: share of the joints' friction that the law compensates.
         tau_rate: largest rate of the torque of a joint, N m/s, shape () or (n,).
     """
@@ -76,23 +87,20 @@ class SiteConstants(NamedTuple):
 
     @property
     def weighing_Kd(self) -> Array:  # noqa: N802 - the paper's symbol
-        """Kd as the weights of V see it: NaN along an axis that the site does not follow, shape
-        (m,).
-        """
-        return np.where(np.array(self.axes) == 0.0, np.nan, self.Kd) if self.axes else self.Kd
+        """Kd as the weights of V use it, shape (m,): NaN along axes that are not followed."""
+        if not self.axes:
+            return self.Kd
+        return np.where(np.array(self.axes) == 0.0, np.nan, self.Kd)
 
     def robust_torque(self, r: Array) -> Array:
-        """Returns the torque that opposes r besides Kp r, shape (K, n), N m."""
+        """Returns the robust torque that opposes r in addition to Kp r, shape (K, n), N m."""
         return self.rho * r / np.sqrt(r**2 + self.width**2)
 
     @property
     def unknown_friction(self) -> Array:
-        """The share of friction that the law does not compensate, of joints that have any,
-        shape (n,).
-        """
-        share: Array = (1.0 - self.friction) * (
-            self.arm.friction(np.ones((1, len(self.Kp))))[0] != 0.0
-        )
+        """Share of each joint's friction that the law does not compensate, shape (n,)."""
+        has_friction = self.arm.friction(np.ones((1, len(self.Kp))))[0] != 0.0
+        share: Array = (1.0 - self.friction) * has_friction
         return share
 
     @property
@@ -102,37 +110,44 @@ class SiteConstants(NamedTuple):
 
 
 def derive_site_constants(scenario: Scenario, site: str) -> SiteConstants:
-    """Returns the constants of a site whose law is the paper's, with a box or without."""
+    """Returns the constants of a site whose law is the paper's, with or without a box."""
     spec = scenario.sites[site]
     arm = build_arm_rows(scenario, site)
     gains = scenario.gains(site)
     names = ("Lambda", "Kp", "Kd", "Gamma", "low", "high", "rho", "width", "friction")
-    of_law = {name: np.array(getattr(gains, name)) for name in names}
-    task = arm.task
-    if task is not None:
-        of_law |= {name: np.array(task.axes) * of_law[name] for name in ("Lambda", "Kd")}
+    gain_arrays = {name: np.array(getattr(gains, name)) for name in names}
+    axes: tuple[float, ...] = ()
+    if arm.task is not None:
+        axes = arm.task.axes
+        for name in ("Lambda", "Kd"):
+            gain_arrays[name] = np.array(axes) * gain_arrays[name]
     return SiteConstants(
-        **of_law,
+        **gain_arrays,
         arm=arm,
-        axes=() if task is None else task.axes,
+        axes=axes,
         tau_limit=np.asarray(spec.limits.tau_limit_nm, dtype=np.float64),
         tau_rate=np.asarray(spec.limits.motion.tau_rate, dtype=np.float64),
     )
 
 
 class PeriodEnds(NamedTuple):
-    """The ends of every period, shape (K - 1, n); `right` is before the jump, `middle` half-way
-    through it.
+    """The ends of all K - 1 periods, shape (K - 1, n) each.
+
+    At the end of a period e jumps. `left` means the start of the period, `right` its end before
+    the jump, and `middle` half-way through the jump. In task space, e and its jumps have m
+    coordinates, in m.
 
     Attributes:
         following: True if the site followed its peers at both ends, shape (K - 1,).
-        link: per peer the jump of e by the age of its sample, shape (peers, K - 1, n), rad; in
-            task space, as all of e, (peers, K - 1, m), m.
-        dominance: the jump of e by a step of dominance factors, rad.
-        rule: the jump of e by the rule for stale peers, rad.
-        r_left, r_right, r_middle: r = qd + Lambda e, rad/s.
-        e_middle: rad.
-        qd_des_left, qd_des_right: rad/s.
+        link: per peer the jump of e by the age of its sample, shape (peers, K - 1, n), rad.
+        dominance: jump of e by a step of dominance factors, rad.
+        rule: jump of e by the rule for stale peers, rad.
+        r_left: r = qd + Lambda e at the start, rad/s.
+        r_right: r before the jump, rad/s.
+        r_middle: r half-way through the jump, rad/s.
+        e_middle: e half-way through the jump, rad.
+        qd_des_left: reference velocity at the start, rad/s.
+        qd_des_right: reference velocity before the jump, rad/s.
     """
 
     following: Bools
@@ -149,16 +164,17 @@ class PeriodEnds(NamedTuple):
 
 @dataclass(frozen=True)
 class SiteMotion:
-    """Motion of a site and all that acts on it, over K rows: what its energies are computed
-    from.
+    """Motion of a site and everything that acts on it, over K rows.
 
     Attributes:
-        dominance, peers: its factors for its peers, and these as the site sees them, in the
-        same order.
-        torque: ON its arm.
-        scheme: whether it holds tau_k, or extrapolates the torque.
-        common: per coordinate 1 if all sites follow along it, else 0; () if they follow along
-            all.
+        records: records of the site.
+        constants: constants of the site.
+        dominance: dominance factors for its peers.
+        peers: the peers as the site sees them, in the order of the dominance factors.
+        torque: torque ON the arm by source.
+        scheme: whether the controller holds tau_k, or extrapolates the torque.
+        common: per coordinate 1 if all sites follow along it, else 0; () if all sites follow
+            along all coordinates.
     """
 
     records: AlignedRecords
@@ -171,147 +187,156 @@ class SiteMotion:
 
     @cached_property
     def following(self) -> Following:
-        """How an error of the reference becomes motion and torque of the joints."""
-        at = self.records
-        c = self.constants
-        return build_following(c.arm, at.q, at.qd, c.Lambda)
+        """The maps from an error of the reference to motion and torque of the joints."""
+        records = self.records
+        return build_following(self.constants.arm, records.q, records.qd, self.constants.Lambda)
 
     @cached_property
     def r(self) -> Array:
-        """The sliding variable qd + Lambda e, Eq. (10), shape (K, n), rad/s; in task space qd -
-        v.
+        """The sliding variable, shape (K, n), rad/s.
+
+        It is qd + Lambda e, Eq. (10), and in task space qd - v.
         """
-        return (
-            self.records.qd
-            - self.following.compute_reference(slice(None), self.records.e, self.records.ed)[0]
-        )
+        records = self.records
+        v, _ = self.following.compute_reference(slice(None), records.e, records.ed)
+        return records.qd - v
 
     @cached_property
     def Yr(self) -> Array:  # noqa: N802 - the paper's symbol
         """Y'r of Eq. (15), shape (K, P)."""
-        at = self.records
-        v, a = self.following.compute_reference(slice(None), at.e, at.ed)
-        return self.constants.arm.gradient(q=at.q, qd=at.qd, v=v, a=a, r=self.r)
+        records = self.records
+        v, a = self.following.compute_reference(slice(None), records.e, records.ed)
+        return self.constants.arm.gradient(q=records.q, qd=records.qd, v=v, a=a, r=self.r)
 
     @cached_property
     def mean_Yr(self) -> Array:  # noqa: N802 - the paper's symbol
         """Y'r with which the scheme advances the estimate over a period, shape (K - 1, P)."""
-        return (
-            self.Yr[:-1]
-            if self.scheme is Scheme.DIGITAL
-            else 0.5 * (self.Yr[:-1] + self.Yr[1:])
-        )
+        if self.scheme is Scheme.DIGITAL:
+            return self.Yr[:-1]
+        return 0.5 * (self.Yr[:-1] + self.Yr[1:])
 
     def law_torque(self, rows: Ints) -> Array:
-        """Returns tau of Eq. (13), without its limit, in some rows, shape (K, n), N m."""
-        return self.control_torque(
-            rows, self.records.e[rows], self.records.ed[rows], self.r[rows]
-        )
+        """Returns tau of Eq. (13) without its limit, in some rows, shape (K, n), N m."""
+        records = self.records
+        return self.control_torque(rows, records.e[rows], records.ed[rows], self.r[rows])
 
     def control_torque(self, rows: Ints, e: Array, ed: Array, r: Array) -> Array:
-        """Returns tau of Eq. (13) with these errors in place of the recorded ones, without its
-        limit.
+        """Returns tau of Eq. (13) without its limit, with the given errors, shape (K, n), N m.
+
+        Args:
+            rows: rows whose pose and estimate are used.
+            e: errors in place of the recorded ones, shape (K, n).
+            ed: their derivatives, shape (K, n).
+            r: sliding variable in place of the recorded one, shape (K, n).
         """
-        at = self.records
+        records = self.records
         c = self.constants
         v, a = self.following.compute_reference(rows, e, ed)
-        model = c.arm.law_torque(at.theta_hat[rows], at.q[rows], at.qd[rows], v, a)
-        found: Array = (
-            model
-            - c.Kp * r
-            - self.following.compute_joint_torque(rows, c.Kd * ed)
-            - c.robust_torque(r)
+        model = c.arm.law_torque(
+            records.theta_hat[rows], records.q[rows], records.qd[rows], v, a
         )
-        return found - (1.0 - c.friction) * c.arm.friction(v)
+        damping = self.following.compute_joint_torque(rows, c.Kd * ed)
+        tau: Array = model - c.Kp * r - damping - c.robust_torque(r)
+        return tau - (1.0 - c.friction) * c.arm.friction(v)
 
     @property
     def rests(self) -> Bools:
         """True if the torque may not be that of the law alone, shape (K,)."""
-        at = self.records
-        return at.rests if at.rests.size else np.zeros(len(at.known), dtype=np.bool_)
+        records = self.records
+        if records.rests.size:
+            return records.rests
+        return np.zeros(len(records.known), dtype=np.bool_)
 
     @cached_property
     def nearest_torques(self) -> tuple[Array, Array]:
-        """The least and the largest torque that a row may have, by its limit and its rate, (K,
-        n), N m.
+        """The smallest and the largest torque that a row may have, shape (K, n) each, N m.
+
+        They follow from the torque's limit, and from its rate limit after the tick before.
         """
-        at = self.records
+        records = self.records
         c = self.constants
-        low = np.broadcast_to(-c.tau_limit, at.tau.shape).copy()
+        low = np.broadcast_to(-c.tau_limit, records.tau.shape).copy()
         high = -low
         if np.any(np.isfinite(c.tau_rate)):
-            # the first tick has none before it
-            before = np.vstack([np.zeros(at.tau.shape[1]), at.tau[:-1]])
-            most = np.broadcast_to(at.h_s * c.tau_rate, at.tau.shape).copy()
-            most[0] = most[0] if at.first == 0 else np.inf
-            low = np.maximum(low, before - most)
-            high = np.minimum(high, before + most)
+            # the torque before tick 0 is zero; before any other first tick it is unknown
+            before = np.vstack([np.zeros(records.tau.shape[1]), records.tau[:-1]])
+            largest_step = np.broadcast_to(records.h_s * c.tau_rate, records.tau.shape).copy()
+            if records.first != 0:
+                largest_step[0] = np.inf
+            low = np.maximum(low, before - largest_step)
+            high = np.minimum(high, before + largest_step)
         return low, high
 
     @cached_property
     def limited(self) -> Bools:
-        """True for each torque at its limit, or as far from the one before as it may be, shape
-        (K, n).
-        """
+        """True for each torque at its limit or at its rate limit, shape (K, n)."""
         low, high = self.nearest_torques
         c = self.constants
         tau = self.records.tau
-        near = RATE_TOLERANCE * c.tau_limit if np.any(np.isfinite(c.tau_rate)) else 0.0
-        found: Bools = (tau <= low + near) | (tau >= high - near)
-        return found & ~self.rests[:, np.newaxis]
+        tolerance = 0.0
+        if np.any(np.isfinite(c.tau_rate)):
+            tolerance = RATE_TOLERANCE * c.tau_limit
+        limited: Bools = (tau <= low + tolerance) | (tau >= high - tolerance)
+        return limited & ~self.rests[:, np.newaxis]
 
     @cached_property
     def ends(self) -> PeriodEnds:
-        """The ends of its periods.
+        """The ends of all periods.
 
         While the site follows its peers, the smooth course of its reference is Eq. (6) with
-        every stamp moving at rate one. Otherwise the rule decides: the trapezoid rule on the
-        recorded derivative.
+        every stamp moving at rate one. Otherwise the rule for stale peers decides, and the
+        trapezoid rule is applied to the recorded derivative.
         """
-        at = self.records
+        records = self.records
         views = list(self.peers.values())
-        alpha = self.dominance
-        following = at.follows[:-1] & at.follows[1:]
-        here = following[:, np.newaxis]
-        left = at.follows[:-1, np.newaxis]
-        before, after, rate = (
-            x[:, :, np.newaxis] for x in (alpha.before, alpha.alpha[1:], alpha.rate[:-1])
-        )
-        kept_q = np.sum([before[:, j] * v.delayed_end.q for j, v in enumerate(views)], axis=0)
-        rates = [
-            before[:, j] * v.delayed_end.qd + rate[:, j] * v.delayed_end.q
-            for j, v in enumerate(views)
-        ]
-        qd_des_left = at.qd_des[:-1]
-        qd_des_right = np.where(left, np.sum(rates, axis=0), at.qd_des[1:])
-        ruled_q = at.q_des[:-1] + 0.5 * at.h_s * (qd_des_left + qd_des_right)
-        jumps = [
-            before[:, j] * (v.delayed_end.q - v.delayed.q[1:]) for j, v in enumerate(views)
-        ]
-        link = np.where(here, jumps, 0.0)
-        steps = [(before[:, j] - after[:, j]) * v.delayed.q[1:] for j, v in enumerate(views)]
-        dominance = np.where(here, np.sum(steps, axis=0), 0.0)
-        rule = np.where(here, 0.0, np.where(left, kept_q, ruled_q) - at.q_des[1:])
-        jump = link.sum(axis=0) + dominance + rule
-        moved = self.following.compute_jump_of_r(slice(1, None), jump)
+        dominance = self.dominance
+        following = records.follows[:-1] & records.follows[1:]
+        follows_at_both = following[:, np.newaxis]
+        follows_at_left = records.follows[:-1, np.newaxis]
+        alpha_right = dominance.before[:, :, np.newaxis]
+        alpha_next = dominance.alpha[1:, :, np.newaxis]
+        alpha_rate = dominance.rate[:-1, :, np.newaxis]
+
+        # the reference of Eq. (6) and its derivative at the end of the period, before any jump
+        q_terms = []
+        qd_terms = []
+        link_jumps = []
+        dominance_jumps = []
+        for j, view in enumerate(views):
+            q_end = view.delayed_end.q
+            qd_end = view.delayed_end.qd
+            q_next = view.delayed.q[1:]
+            q_terms.append(alpha_right[:, j] * q_end)
+            qd_terms.append(alpha_right[:, j] * qd_end + alpha_rate[:, j] * q_end)
+            link_jumps.append(alpha_right[:, j] * (q_end - q_next))
+            dominance_jumps.append((alpha_right[:, j] - alpha_next[:, j]) * q_next)
+        q_des_followed = np.sum(q_terms, axis=0)
+        qd_des_left = records.qd_des[:-1]
+        qd_des_right = np.where(follows_at_left, np.sum(qd_terms, axis=0), records.qd_des[1:])
+        q_des_ruled = records.q_des[:-1] + 0.5 * records.h_s * (qd_des_left + qd_des_right)
+
+        link = np.where(follows_at_both, link_jumps, 0.0)
+        dominance_jump = np.where(follows_at_both, np.sum(dominance_jumps, axis=0), 0.0)
+        q_des_right = np.where(follows_at_left, q_des_followed, q_des_ruled)
+        rule = np.where(follows_at_both, 0.0, q_des_right - records.q_des[1:])
+        jump_of_e = link.sum(axis=0) + dominance_jump + rule
+        jump_of_r = self.following.compute_jump_of_r(slice(1, None), jump_of_e)
         return PeriodEnds(
-            following,
-            link,
-            dominance,
-            rule,
+            following=following,
+            link=link,
+            dominance=dominance_jump,
+            rule=rule,
             r_left=self.r[:-1],
-            r_right=self.r[1:] - moved,
-            r_middle=self.r[1:] - 0.5 * moved,
-            e_middle=at.e[1:] - 0.5 * jump,
+            r_right=self.r[1:] - jump_of_r,
+            r_middle=self.r[1:] - 0.5 * jump_of_r,
+            e_middle=records.e[1:] - 0.5 * jump_of_e,
             qd_des_left=qd_des_left,
             qd_des_right=qd_des_right,
         )
 
 
 class FunctionalParts(NamedTuple):
-    """V_i of a site by its four parts in the order of the module's docstring, each of shape
-    (K,), J.
-    """
+    """The four parts of V_i in the order of the module's docstring, shape (K,) each, J."""
 
     kinetic: Array
     parameter: Array
@@ -326,31 +351,34 @@ class FunctionalParts(NamedTuple):
 
 def evaluate_functional(site: SiteMotion) -> FunctionalParts:
     """Returns the functional of a site along its records."""
-    at = site.records
+    records = site.records
     c = site.constants
     r = site.r
-    off = (at.theta_hat - c.theta)[:, c.adapts]
-    in_transit = [_energy_in_transit(c, view) for view in site.peers.values()]
+    parameter_error = (records.theta_hat - c.theta)[:, c.adapts]
+    delay_terms = [
+        alpha * _energy_in_transit(c, view)
+        for alpha, view in zip(site.dominance.alpha.T, site.peers.values(), strict=True)
+    ]
     return FunctionalParts(
-        kinetic=0.5 * (r * c.arm.multiply_inertia(at.q, r)).sum(axis=1),
-        parameter=0.5 * (off**2 / c.Gamma[c.adapts]).sum(axis=1),
-        position=0.5 * (c.Lambda * c.Kd * at.e**2).sum(axis=1),
-        delay=np.sum(
-            [a * x for a, x in zip(site.dominance.alpha.T, in_transit, strict=True)], axis=0
-        ),
+        kinetic=0.5 * (r * c.arm.multiply_inertia(records.q, r)).sum(axis=1),
+        parameter=0.5 * (parameter_error**2 / c.Gamma[c.adapts]).sum(axis=1),
+        position=0.5 * (c.Lambda * c.Kd * records.e**2).sum(axis=1),
+        delay=np.sum(delay_terms, axis=0),
     )
 
 
 def _energy_in_transit(c: SiteConstants, view: DelayedPeer) -> Array:
-    """Returns 1/2 int qd_j' Kd qd_j ds from the stamp of the sample in use to now, shape (K,),
-    J.
-    """
+    """Returns 1/2 int qd_j' Kd qd_j ds from the stamp in use to now, shape (K,), J."""
     return 0.5 * ((view.now.squares - view.delayed.squares) @ c.Kd)
 
 
 class Increment(NamedTuple):
-    """An amount of energy per period, shape (K - 1,), J: the two ends of a trapezoid, and a
-    jump after it.
+    """An amount of energy per period, shape (K - 1,) each, J.
+
+    Attributes:
+        left: contribution of the start of the period to the trapezoid rule.
+        right: contribution of the end of the period, before a jump.
+        jump: amount at the jump after it.
     """
 
     left: Array
@@ -366,325 +394,387 @@ class Increment(NamedTuple):
 def _trapezoid(
     site: SiteMotion, left: Array, right: Array, jump: Array | None = None
 ) -> Increment:
+    """Returns the trapezoid rule over powers at both ends of every period, and a jump."""
     half_s = 0.5 * site.records.h_s
-    return Increment(
-        half_s * left, half_s * right, np.zeros(len(left)) if jump is None else jump
-    )
+    if jump is None:
+        jump = np.zeros(len(left))
+    return Increment(half_s * left, half_s * right, jump)
 
 
-def _jump(amount: Array) -> Increment:
+def _jump_alone(amount: Array) -> Increment:
     return Increment(np.zeros(len(amount)), np.zeros(len(amount)), amount)
 
 
-def _nothing(site: SiteMotion) -> Increment:
-    return _jump(np.zeros(len(site.records.known) - 1))
+def _zero_increment(site: SiteMotion) -> Increment:
+    return _jump_alone(np.zeros(len(site.records.known) - 1))
 
 
 def compute_dissipation(site: SiteMotion) -> dict[str, Increment]:
-    """Returns what a site dissipates: r'Kp r, and 1/2 sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2.
+    """Returns the energy that a site dissipates, by kind.
 
-    And r'(friction(qd) - friction(qd - r)) of joints with friction; r times a robust torque;
-    and along axes that not all sites follow what they do not give back to each other.
+    - damping: r'Kp r, and r times the robust torque;
+    - disagreement: 1/2 sum_j alpha_ij |qd_i - qd_j(t - T_ij)|^2;
+    - friction, of joints that have any: r'(friction(qd) - friction(qd - r));
+    - open axes, if not all sites follow along all axes: the energy that sites do not return to
+      each other along these axes.
     """
-    at = site.records
+    records = site.records
     c = site.constants
     ends = site.ends
-    alpha = site.dominance
-    rate = at.shared_rate
-    left = right = np.zeros(len(at.known) - 1)
+    dominance = site.dominance
+    rate = records.shared_rate
+    left = np.zeros(len(records.known) - 1)
+    right = left
     for j, view in enumerate(site.peers.values()):
-        left = left + 0.5 * alpha.alpha[:-1, j] * _norm(c, rate[:-1] - view.delayed.qd[:-1])
-        right = right + 0.5 * alpha.before[:, j] * _norm(c, rate[1:] - view.delayed_end.qd)
-    damping = (
-        (r * (c.Kp * r + c.robust_torque(r))).sum(axis=1) for r in (ends.r_left, ends.r_right)
-    )
-    found = {
-        "damping": _trapezoid(site, *damping),
+        squared_left = _weighted_square(c, rate[:-1] - view.delayed.qd[:-1])
+        squared_right = _weighted_square(c, rate[1:] - view.delayed_end.qd)
+        left = left + 0.5 * dominance.alpha[:-1, j] * squared_left
+        right = right + 0.5 * dominance.before[:, j] * squared_right
+
+    def damping_power(r: Array) -> Array:
+        power: Array = (r * (c.Kp * r + c.robust_torque(r))).sum(axis=1)
+        return power
+
+    def friction_power(r: Array, qd: Array) -> Array:
+        power: Array = (r * (c.arm.friction(qd) - c.arm.friction(qd - r))).sum(axis=1)
+        return power
+
+    dissipation = {
+        "damping": _trapezoid(site, damping_power(ends.r_left), damping_power(ends.r_right)),
         "disagreement": _trapezoid(site, left, right),
     }
     if not all(site.common):
-        found["open axes"] = compute_transfer(site, 1.0 - np.array(site.common))
-    friction = [
-        (r * (c.arm.friction(qd) - c.arm.friction(qd - r))).sum(axis=1)
-        for r, qd in ((ends.r_left, at.qd[:-1]), (ends.r_right, at.qd[1:]))
-    ]
-    return {**found, "friction": _trapezoid(site, *friction)} if np.any(friction) else found
+        dissipation["open axes"] = compute_transfer(site, 1.0 - np.array(site.common))
+    friction_left = friction_power(ends.r_left, records.qd[:-1])
+    friction_right = friction_power(ends.r_right, records.qd[1:])
+    if friction_left.any() or friction_right.any():
+        dissipation["friction"] = _trapezoid(site, friction_left, friction_right)
+    return dissipation
 
 
 def compute_transfer(site: SiteMotion, axes: Array) -> Increment:
-    """Returns int 1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2: what a site gives to those that
-    follow it.
+    """Returns the energy that a site gives to its followers, less the energy it gets.
 
-    That is along the axes of weight 1, and not along those of weight 0.
+    That is int 1/2 |qd_i|^2 - 1/2 sum_j alpha_ij |qd_j|^2.
+
+    Args:
+        site: motion of the site.
+        axes: weight of each axis, 1 or 0, shape (m,) or ().
     """
     c = site.constants._replace(Kd=axes * site.constants.Kd)
-    own = 0.5 * _norm(c, site.records.shared_rate)
-    left = own[:-1]
-    right = own[1:]
+    local = 0.5 * _weighted_square(c, site.records.shared_rate)
+    left = local[:-1]
+    right = local[1:]
     for j, view in enumerate(site.peers.values()):
-        peer = 0.5 * _norm(c, view.now.qd)
+        peer = 0.5 * _weighted_square(c, view.now.qd)
         left = left - site.dominance.alpha[:-1, j] * peer[:-1]
         right = right - site.dominance.before[:, j] * peer[1:]
     return _trapezoid(site, left, right)
 
 
-def _norm(c: SiteConstants, x: Array) -> Array:
-    norm: Array = (c.Kd * x**2).sum(axis=1)
-    return norm
+def _weighted_square(c: SiteConstants, x: Array) -> Array:
+    """Returns |x|^2 = x'Kd x of every row, shape (K,)."""
+    square: Array = (c.Kd * x**2).sum(axis=1)
+    return square
 
 
 def compute_work(site: SiteMotion) -> dict[str, Increment]:
-    """Returns the work done on a site, by its source: all that may raise V_i besides transfer."""
+    """Returns the work on a site by source: everything besides transfer that may raise V_i."""
     torque = site.torque
-    at = site.records
-    stops = site.constants.arm.stop_torque(at.q, at.qd)
-    return {
+    records = site.records
+    c = site.constants
+    stops = c.arm.stop_torque(records.q, records.qd)
+    work = {
         "hands": torque_work(site, torque.operator_now, torque.operator_held),
         "walls": torque_work(site, torque.environment_now, torque.environment_held),
-        **({"stops": torque_work(site, stops, np.zeros_like(stops))} if stops.any() else {}),
-        **{
-            f"{peer}->{site.records.site}": link_work(site, j)
-            for j, peer in enumerate(site.peers)
-        },
-        "shares": dominance_change_work(site),
-        "rule": stale_rule_work(site),
-        "torque limit": torque_limit_work(site),
-        "estimates": estimate_work(site),
-        **(
-            {"friction": unknown_friction_work(site)}
-            if site.constants.unknown_friction.any()
-            else {}
-        ),
-        **({"singular poses": singular_pose_work(site)} if site.constants.axes else {}),
     }
+    if stops.any():
+        work["stops"] = torque_work(site, stops, np.zeros_like(stops))
+    for j, peer in enumerate(site.peers):
+        work[f"{peer}->{records.site}"] = link_work(site, j)
+    work["shares"] = dominance_change_work(site)
+    work["rule"] = stale_rule_work(site)
+    work["torque limit"] = torque_limit_work(site)
+    work["estimates"] = estimate_work(site)
+    if c.unknown_friction.any():
+        work["friction"] = unknown_friction_work(site)
+    if c.axes:
+        work["singular poses"] = singular_pose_work(site)
+    return work
 
 
 def torque_work(site: SiteMotion, now: Array, held: Array) -> Increment:
-    """Returns the work int r' tau_h of a torque ON the arm, one of the present and one held,
-    (K, n), N m.
+    """Returns the work int r' tau_h of a torque ON the arm.
+
+    Args:
+        site: motion of the site.
+        now: part of the torque that follows the state, shape (K, n), N m.
+        held: part of the torque that is held over every period, shape (K, n), N m.
     """
     left = (site.ends.r_left * (now[:-1] + held[:-1])).sum(axis=1)
-    return _trapezoid(site, left, (site.ends.r_right * (now[1:] + held[:-1])).sum(axis=1))
+    right = (site.ends.r_right * (now[1:] + held[:-1])).sum(axis=1)
+    return _trapezoid(site, left, right)
 
 
 def link_work(site: SiteMotion, j: int) -> Increment:
-    """Returns the work of the link from peer j: the exact change of V where the age of its
-    sample changes.
+    """Returns the work of the link from peer j: the change of V_i as its sample's age jumps.
 
-    With s' in place of s + h at the end of a period: (Lambda M r + Lambda Kd e)' de, with r and
-    e half-way through the jump and de what this link adds to it, less 1/2 alpha_ij int qd_j' Kd
-    qd_j ds from s + h to s'. For an age that varies smoothly this is the integral of the
-    theorem's missing term with dT/dt.
+    At the end of a period the stamp s + h is replaced by the stamp s' of the next sample in
+    use. With r and e half-way through the jump, and de the jump of e by this link, the work is
+    exactly
+
+        (Lambda M r + Lambda Kd e)' de - 1/2 alpha_ij int qd_j' Kd qd_j ds from s + h to s'.
+
+    For an age that varies smoothly this is the integral of the theorem's missing term with
+    dT/dt.
     """
     view = list(site.peers.values())[j]
     stored = 0.5 * (view.delayed_end.squares - view.delayed.squares[1:]) @ site.constants.Kd
-    return _jump(
-        _energy_of_jump(site, site.ends.link[j]) + site.dominance.before[:, j] * stored
-    )
+    jump = _energy_of_jump(site, site.ends.link[j])
+    return _jump_alone(jump + site.dominance.before[:, j] * stored)
 
 
 def dominance_change_work(site: SiteMotion) -> Increment:
-    """Returns the work of a change of dominance, without that of beta: what a ramp or a step
-    adds to V_i.
+    """Returns the work on V_i of a change of dominance factors, along a ramp or at a step.
 
-    1/2 sum_j alpha_ij' int qd_j' Kd qd_j ds + qd_i' Kd sum_j alpha_ij' q_j(t - T_ij): the
-    second because ed, and with it the damping, contains the ramp.
+    Along a ramp its power is
+
+        1/2 sum_j alpha_ij' int qd_j' Kd qd_j ds + qd_i' Kd sum_j alpha_ij' q_j(t - T_ij),
+
+    the second term because ed, and with it the damping, contains the ramp. The work of a change
+    of the weights beta is not included.
     """
-    at = site.records
+    records = site.records
     c = site.constants
-    alpha = site.dominance
+    dominance = site.dominance
     ends = site.ends
-    if alpha.constant:
-        return _nothing(site)
-    left = right = np.zeros(len(at.known) - 1)
+    if dominance.constant:
+        return _zero_increment(site)
+    left = np.zeros(len(records.known) - 1)
+    right = left
     jump = _energy_of_jump(site, ends.dominance)
+    qd_left = records.shared_rate[:-1]
+    qd_right = records.shared_rate[1:]
     for j, view in enumerate(site.peers.values()):
         stored = _energy_in_transit(c, view)
-        rate = alpha.rate[:-1, j]
-        kept = 0.5 * (view.now.squares[1:] - view.delayed_end.squares) @ c.Kd
-        followed_rate = np.where(ends.following, rate, 0.0)
-        left = left + rate * stored[:-1]
-        left = left + followed_rate * (at.shared_rate[:-1] * c.Kd * view.delayed.q[:-1]).sum(
-            axis=1
-        )
-        right = right + rate * kept
-        right = right + followed_rate * (at.shared_rate[1:] * c.Kd * view.delayed_end.q).sum(
-            axis=1
-        )
-        jump = jump + (alpha.alpha[1:, j] - alpha.before[:, j]) * stored[1:]
+        stored_end = 0.5 * (view.now.squares[1:] - view.delayed_end.squares) @ c.Kd
+        alpha_rate = dominance.rate[:-1, j]
+        followed_rate = np.where(ends.following, alpha_rate, 0.0)
+        left = left + alpha_rate * stored[:-1]
+        left = left + followed_rate * (qd_left * c.Kd * view.delayed.q[:-1]).sum(axis=1)
+        right = right + alpha_rate * stored_end
+        right = right + followed_rate * (qd_right * c.Kd * view.delayed_end.q).sum(axis=1)
+        jump = jump + (dominance.alpha[1:, j] - dominance.before[:, j]) * stored[1:]
     return _trapezoid(site, left, right, jump)
 
 
 def stale_rule_work(site: SiteMotion) -> Increment:
-    """Returns the work of the rule for stale peers: all that moves the reference while it is
-    not Eq. (6).
-    """
-    at = site.records
-    alpha = site.dominance
+    """Returns the work of the rule for stale peers, while it replaces Eq. (6)."""
+    dominance = site.dominance
     ends = site.ends
     ruled = ~ends.following
     if not ruled.any():
-        return _nothing(site)
-    views = list(enumerate(site.peers.values()))
-    seen = np.sum(
-        [alpha.alpha[:-1, j, None] * view.delayed.qd[:-1] for j, view in views], axis=0
-    )
-    kept = np.sum([alpha.before[:, j, None] * view.delayed_end.qd for j, view in views], axis=0)
-    rate = at.shared_rate
-    left = (rate[:-1] * site.constants.Kd * (ends.qd_des_left - seen)).sum(axis=1)
-    right = (rate[1:] * site.constants.Kd * (ends.qd_des_right - kept)).sum(axis=1)
+        return _zero_increment(site)
+    left_terms = []
+    right_terms = []
+    for j, view in enumerate(site.peers.values()):
+        left_terms.append(dominance.alpha[:-1, j, None] * view.delayed.qd[:-1])
+        right_terms.append(dominance.before[:, j, None] * view.delayed_end.qd)
+    followed_left = np.sum(left_terms, axis=0)
+    followed_right = np.sum(right_terms, axis=0)
+    rate = site.records.shared_rate
+    Kd = site.constants.Kd
+    left = (rate[:-1] * Kd * (ends.qd_des_left - followed_left)).sum(axis=1)
+    right = (rate[1:] * Kd * (ends.qd_des_right - followed_right)).sum(axis=1)
+    jump = _energy_of_jump(site, ends.rule)
     return _trapezoid(
         site,
-        *(np.where(ruled, x, 0.0) for x in (left, right, _energy_of_jump(site, ends.rule))),
+        np.where(ruled, left, 0.0),
+        np.where(ruled, right, 0.0),
+        np.where(ruled, jump, 0.0),
     )
 
 
 def torque_limit_work(site: SiteMotion) -> Increment:
-    """Returns the work of what limits, or a rest, kept from the arm: int r' (tau - tau of Eq.
-    (13)).
-    """
-    at = site.records
-    cut = np.flatnonzero(site.limited.any(axis=1) | site.rests)
-    power = np.zeros(len(at.known))
-    if len(cut):
-        power[cut] = (site.r[cut] * (at.tau[cut] - site.law_torque(cut))).sum(axis=1)
+    """Returns the work int r' (tau - tau of Eq. (13)) of limits and rests on the torque."""
+    records = site.records
+    power = np.zeros(len(records.known))
+    rows = np.flatnonzero(site.limited.any(axis=1) | site.rests)
+    if len(rows):
+        difference = records.tau[rows] - site.law_torque(rows)
+        power[rows] = (site.r[rows] * difference).sum(axis=1)
     return _trapezoid(site, power[:-1], power[1:])
 
 
 def unknown_friction_work(site: SiteMotion) -> Increment:
-    """Returns the work -int r' friction(v) of the share of friction that the law does not
-    compensate.
-    """
-    at = site.records
+    """Returns the work -int r' friction(v) of friction that the law does not compensate."""
+    records = site.records
     c = site.constants
     ends = site.ends
-    left, right = (
-        -(r * (1.0 - c.friction) * c.arm.friction(qd - r)).sum(axis=1)
-        for r, qd in ((ends.r_left, at.qd[:-1]), (ends.r_right, at.qd[1:]))
+
+    def power(r: Array, qd: Array) -> Array:
+        power: Array = -(r * (1.0 - c.friction) * c.arm.friction(qd - r)).sum(axis=1)
+        return power
+
+    return _trapezoid(
+        site, power(ends.r_left, records.qd[:-1]), power(ends.r_right, records.qd[1:])
+    )
+
+
+def singular_pose_work(site: SiteMotion) -> Increment:
+    """Returns the work of the damping near singular poses.
+
+    It is int r'M(a - v') - (J r - x' - Lambda e)'Kd ed. Both terms are zero where J J+ = I.
+    """
+    ends = site.ends
+    e_right = 2.0 * ends.e_middle - site.records.e[1:]
+    left = _singular_pose_power(
+        site=site,
+        rows=slice(0, -1),
+        e=site.records.e[:-1],
+        qd_des=ends.qd_des_left,
+        r=ends.r_left,
+    )
+    right = _singular_pose_power(
+        site=site,
+        rows=slice(1, None),
+        e=e_right,
+        qd_des=ends.qd_des_right,
+        r=ends.r_right,
     )
     return _trapezoid(site, left, right)
 
 
-def singular_pose_work(site: SiteMotion) -> Increment:
-    """Returns the work of the damping near singular poses: int r'M(a - v') - (J r - x' - Lambda
-    e)'Kd ed.
-
-    Both are zero where J J+ = I.
-    """
-    at = site.records
+def _singular_pose_power(
+    site: SiteMotion, rows: slice, e: Array, qd_des: Array, r: Array
+) -> Array:
+    """Returns the power of the damping near singular poses at one end of every period, W."""
+    records = site.records
     c = site.constants
-    ends = site.ends
-    powers = []
-    for e, rows, qd_des, r in (
-        (at.e[:-1], slice(0, -1), ends.qd_des_left, ends.r_left),
-        (2.0 * ends.e_middle - at.e[1:], slice(1, None), ends.qd_des_right, ends.r_right),
-    ):
-        missed, a_missed = site.following.compute_damping_deviation(rows, e)
-        ed = at.shared_rate[rows] - qd_des
-        power = -(missed * c.Kd * ed).sum(axis=1)
-        if a_missed.any():
-            power = power + (c.arm.multiply_inertia(at.q[rows], r) * a_missed).sum(axis=1)
-        powers.append(power)
-    return _trapezoid(site, *powers)
+    velocity_error, acceleration_error = site.following.compute_damping_deviation(rows, e)
+    ed = records.shared_rate[rows] - qd_des
+    power: Array = -(velocity_error * c.Kd * ed).sum(axis=1)
+    if acceleration_error.any():
+        momentum = c.arm.multiply_inertia(records.q[rows], r)
+        power = power + (momentum * acceleration_error).sum(axis=1)
+    return power
 
 
 def measure_torque_error(site: SiteMotion) -> Array:
-    """Returns by how much recorded torques differ from Eq. (13) within its limits, shape (K,),
-    N m.
+    """Returns the difference between recorded torques and Eq. (13), shape (K,), N m.
 
-    The largest of all joints; 0 where there is no record, or where the site rests.
+    Eq. (13) is taken within its limits. The difference is the largest of all joints, and 0 in
+    rows without a record and while the site rests.
     """
-    at = site.records
-    law = site.law_torque(np.arange(len(at.known)))
-    error: Array = np.abs(at.tau - np.clip(law, *site.nearest_torques)).max(axis=1)
-    return np.where(at.known & ~site.rests, error, 0.0)
+    records = site.records
+    low, high = site.nearest_torques
+    law_torque = site.law_torque(np.arange(len(records.known)))
+    error: Array = np.abs(records.tau - np.clip(law_torque, low, high)).max(axis=1)
+    return np.where(records.known & ~site.rests, error, 0.0)
 
 
 def estimate_work(site: SiteMotion) -> Increment:
-    """Returns the work of estimates that do not follow Eq. (15): held in their box, fixed, or
-    at rest.
+    """Returns the work of estimates that do not follow Eq. (15): held in their box, or fixed.
 
-    The box lessens 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta) where it holds the
-    truth; a parameter that is not adapted leaves r' Y (theta_hat - theta) without its
-    counterpart.
+    The box reduces 1/2 (theta_hat - theta)' Gamma^-1 (theta_hat - theta), since it contains
+    theta. A parameter that is not adapted, or not while the site rests, leaves r' Y (theta_hat
+    - theta) without its counterpart.
     """
-    at = site.records
+    records = site.records
     c = site.constants
-    off = at.theta_hat - c.theta
-    still = np.concatenate([[False], (np.diff(off, axis=0) == 0.0).all(axis=1)]) & site.rests
-    at_edge = (
-        ((at.theta_hat <= c.low) | (at.theta_hat >= c.high))[1:]
-        & c.adapts
-        & ~still[1:, np.newaxis]
-    )
-    wrong = (off != 0.0) & (~c.adapts | still[:, np.newaxis])
-    if not (at_edge.any() or wrong.any()):
-        return _nothing(site)
-    # what the box kept the estimate from
-    held = np.diff(off, axis=0) + at.h_s * c.Gamma * site.mean_Yr
+    theta_hat = records.theta_hat
+    parameter_error = theta_hat - c.theta
+    is_unchanged = (np.diff(parameter_error, axis=0) == 0.0).all(axis=1)
+    is_frozen = np.concatenate([[False], is_unchanged]) & site.rests
+    is_at_edge = ((theta_hat <= c.low) | (theta_hat >= c.high))[1:]
+    is_held = is_at_edge & c.adapts & ~is_frozen[1:, np.newaxis]
+    is_fixed = (parameter_error != 0.0) & (~c.adapts | is_frozen[:, np.newaxis])
+    if not (is_held.any() or is_fixed.any()):
+        return _zero_increment(site)
+    # change by which the box kept the estimate from the step of Eq. (15)
+    correction = np.diff(parameter_error, axis=0) + records.h_s * c.Gamma * site.mean_Yr
+    mean_error = 0.5 * (parameter_error[:-1] + parameter_error[1:])
     with np.errstate(divide="ignore", invalid="ignore"):
-        amount = np.where(at_edge, 0.5 * (off[:-1] + off[1:]) * held / c.Gamma, 0.0).sum(axis=1)
-    power = np.where(wrong, site.Yr * off, 0.0).sum(axis=1)
-    return _trapezoid(site, power[:-1], power[1:], amount)
+        jump = np.where(is_held, mean_error * correction / c.Gamma, 0.0).sum(axis=1)
+    power = np.where(is_fixed, site.Yr * parameter_error, 0.0).sum(axis=1)
+    return _trapezoid(site, power[:-1], power[1:], jump)
 
 
 def compute_sampling_work(site: SiteMotion) -> Increment:
-    """Returns the work of the scheme: of the torque that is held in place of Eq. (13), of its
-    step of (15).
+    """Returns the work of the scheme that samples the continuous law.
 
-    int r' (u - tau), with u = tau_k of `digital` or the extrapolated one of `second_order`, and
-    tau straight to its value before the jump; and the scheme's step of the estimate in place of
-    the trapezoid rule up to there. It is no part of the balance: what that leaves without this
-    is unexplained.
+    It has two parts:
+
+    - int r' (u - tau), where u is the torque that is held: tau_k of `digital`, or the
+      extrapolated torque of `second_order`. tau is taken as straight up to its value before the
+      jump.
+    - the scheme's step of the estimate, in place of the trapezoid rule on Eq. (15).
+
+    This work is no part of the balance: the balance's residual without it is unexplained.
     """
-    at = site.records
+    records = site.records
     c = site.constants
     ends = site.ends
-    u = hold_torque(at.tau, c.tau_limit, digital=site.scheme is Scheme.DIGITAL)[:-1]
+    digital = site.scheme is Scheme.DIGITAL
+    u = hold_torque(records.tau, c.tau_limit, digital=digital)[:-1]
     tau_right, Yr_right = _evaluate_before_jump(site)
-    off_law = u - 0.5 * (at.tau[:-1] + tau_right)
-    amount = at.h_s * (0.5 * (ends.r_left + ends.r_right) * off_law).sum(axis=1)
-    off = (at.theta_hat - c.theta) * c.adapts
-    missed = 0.5 * (site.Yr[:-1] + Yr_right) - site.mean_Yr
-    return _jump(amount + 0.5 * at.h_s * ((off[1:] + off[:-1]) * missed).sum(axis=1))
+    torque_error = u - 0.5 * (records.tau[:-1] + tau_right)
+    mean_r = 0.5 * (ends.r_left + ends.r_right)
+    torque_part = records.h_s * (mean_r * torque_error).sum(axis=1)
+    parameter_error = (records.theta_hat - c.theta) * c.adapts
+    Yr_error = 0.5 * (site.Yr[:-1] + Yr_right) - site.mean_Yr
+    error_sum = parameter_error[1:] + parameter_error[:-1]
+    return _jump_alone(torque_part + 0.5 * records.h_s * (error_sum * Yr_error).sum(axis=1))
 
 
 def _evaluate_before_jump(site: SiteMotion) -> tuple[Array, Array]:
-    at = site.records
+    """Returns the torque and Y'r at the end of every period, before the jump of e.
+
+    Returns:
+        tau of Eq. (13) within its limit, shape (K - 1, n), N m.
+        Y'r of Eq. (15), shape (K - 1, P).
+    """
+    records = site.records
     c = site.constants
     ends = site.ends
-    tau = at.tau[1:].copy()
+    tau = records.tau[1:].copy()
     Yr = site.Yr[1:].copy()
-    e = 2.0 * ends.e_middle - at.e[1:]
-    moved = np.abs(e - at.e[1:]) + np.abs(ends.qd_des_right - at.qd_des[1:]) > JUMP_TOLERANCE
-    rows = np.flatnonzero(moved.any(axis=1))
-    e = e[rows]
-    ed = (at.shared_rate[1:] - ends.qd_des_right)[rows]
-    r = ends.r_right[rows]
-    later = rows + 1
-    v, a = site.following.compute_reference(later, e, ed)
-    Yr[rows] = c.arm.gradient(q=at.q[later], qd=at.qd[later], v=v, a=a, r=r)
-    found = np.clip(site.control_torque(later, e, ed, r), -c.tau_limit, c.tau_limit)
-    bound = site.rests | (site.limited.any(axis=1) & np.any(np.isfinite(c.tau_rate)))
-    # then no jump of e moves it
-    tau[rows] = np.where(bound[later, np.newaxis], tau[rows], found)
+    e_right = 2.0 * ends.e_middle - records.e[1:]
+    jump_size = np.abs(e_right - records.e[1:]) + np.abs(ends.qd_des_right - records.qd_des[1:])
+    periods = np.flatnonzero((jump_size > JUMP_TOLERANCE).any(axis=1))
+    e = e_right[periods]
+    ed = (records.shared_rate[1:] - ends.qd_des_right)[periods]
+    r = ends.r_right[periods]
+    rows = periods + 1
+    v, a = site.following.compute_reference(rows, e, ed)
+    Yr[periods] = c.arm.gradient(q=records.q[rows], qd=records.qd[rows], v=v, a=a, r=r)
+    law_torque = np.clip(site.control_torque(rows, e, ed, r), -c.tau_limit, c.tau_limit)
+    # a torque at its rate limit, or of a resting site, does not move with a jump of e
+    has_rate_limit = np.any(np.isfinite(c.tau_rate))
+    is_bound = site.rests | (site.limited.any(axis=1) & has_rate_limit)
+    tau[periods] = np.where(is_bound[rows, np.newaxis], tau[periods], law_torque)
     return tau, Yr
 
 
 def _energy_of_jump(site: SiteMotion, de: Array) -> Array:
-    """Returns the exact part that `de` has in the change of 1/2 (r'M r + e' Lambda Kd e), shape
-    (K - 1,), J.
+    """Returns the share of `de` in the change of 1/2 (r'M r + e' Lambda Kd e) at every jump.
 
-    Both are quadratic in e, so that the gradient half-way through the whole jump gives it,
-    linear in `de`.
+    Both terms are quadratic in e. Their change is therefore exactly the gradient half-way
+    through the whole jump, times the jump, and it is linear in `de`.
+
+    Args:
+        site: motion of the site.
+        de: part of the jump of e, shape (K - 1, n).
+
+    Returns:
+        The change, shape (K - 1,), J.
     """
     c = site.constants
     ends = site.ends
     if not de.any():
         return np.zeros(len(de))
     momentum = c.arm.multiply_inertia(site.records.q[1:], ends.r_middle)
-    change: Array = (momentum * site.following.compute_jump_of_r(slice(1, None), de)).sum(
-        axis=1
-    )
+    dr = site.following.compute_jump_of_r(slice(1, None), de)
+    change: Array = (momentum * dr).sum(axis=1)
     change += (c.Kd * ends.e_middle * c.Lambda * de).sum(axis=1)
     return change

@@ -1,10 +1,16 @@
-"""ObservedEnergy of laws that declare what proves it: energy of lines, observers and tanks,
-from the records.
+"""Judges the energies that control laws declare, from the records of a run.
 
-Invariant: a law that declares energies is believed in nothing else. A line is what a site gave
-less what its peer took; the arm's port is the torque that was held times the step of the
-joints. Lines and stores are never below zero, and what a law has taken for good never falls, or
-the certificate says where.
+A law may declare the energies that prove its passivity: those of its lines to peers, of its
+observers and of its tanks. This module recomputes what the arms exchanged with the laws, and
+checks the declared energies against that.
+
+    line from peer j to site i: what j's law put in, less what i's law took out;
+    arm's port: sum over ticks of u_k' (q_{k+1} - q_k), u_k the torque that was held.
+
+Invariant:
+    - The declared energies are believed only as far as they agree with the records.
+    - Lines and stores are never below zero, and the energy that a law dissipated never falls;
+      otherwise the verdict names the place.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,15 +31,15 @@ from ..arm_rows import build_arm_rows
 from .premises import Premise
 
 LEAST_ENERGY_J = -1e-9
-"""What rounding may leave of an energy that is not below zero, J."""
+"""Rounding error of an energy that is zero, J."""
 ROUNDING_SHARE = 1e-12
-"""And as a share of the largest energy."""
+"""Further rounding error, as a share of the largest energy."""
 SAMPLING_SHARE = 1e-2
-"""The arms may get so much more than the laws book, as a share of the largest energy."""
+"""Energy that arms may get beyond what their laws book, as a share of the largest energy."""
 
 
 class ObservedFinding(StrEnum):
-    """Class of a verdict; the text is the word for people."""
+    """Class of a verdict; the value is the text for people."""
 
     PASSIVE = "observed energy never below zero"
     NEGATIVE = "observed energy below zero"
@@ -45,13 +51,14 @@ class EnergyCurve(NamedTuple):
     """An energy over time.
 
     Attributes:
-        kind: "line" from a peer to a site, "known" there of a peer, "store" of, "taken" by or
-            "given" by it.
-        site: whose it is.
-        peer: the other end; "" of what has none.
-        t_s: of the site's ticks, s.
-        energy_j: the sum of its parts, shape (K,).
-        least_j: that of them which is least, shape (K,).
+        kind: "line" for the energy on the way from a peer to the site, "known" for the part of
+            it that the site knows, "store" for energy that the law stores, "taken" for energy
+            that the law dissipated, "given" for energy that the arm gave to the law.
+        site: name of the site.
+        peer: the other end of a line; "" otherwise.
+        t_s: times of the site's ticks, shape (K,), s.
+        energy_j: the sum of the energy's parts, shape (K,).
+        least_j: the smallest part, shape (K,).
     """
 
     kind: str
@@ -63,18 +70,23 @@ class EnergyCurve(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Its name: "line m->s", "known at s of m", "store of s", "taken by s" or "given by s"."""
-        site = self.site
-        peer = self.peer
+        """Name of the energy, such as "line m->s", "known at s of m" or "store of s"."""
         if self.kind == "line":
-            return f"line {peer}->{site}"
+            return f"line {self.peer}->{self.site}"
         if self.kind == "known":
-            return f"known at {site} of {peer}"
-        return f"{self.kind} {'of' if self.kind == 'store' else 'by'} {site}"
+            return f"known at {self.site} of {self.peer}"
+        preposition = "of" if self.kind == "store" else "by"
+        return f"{self.kind} {preposition} {self.site}"
 
 
 class LeastEnergy(NamedTuple):
-    """An energy that must not be below zero, where it is least; named like its curve."""
+    """The minimum over time of an energy that must not be below zero.
+
+    Attributes:
+        name: name of the energy's curve.
+        amount_j: the minimum.
+        at_s: time of the minimum.
+    """
 
     name: str
     amount_j: float
@@ -85,14 +97,14 @@ class ObservedEnergy(NamedTuple):
     """Verdict on the energies that laws declare.
 
     Attributes:
-        finding: its class.
-        text: the sentence.
-        premises: what it rests on, one by one.
-        least: every energy where it is least.
-        largest_j: the largest of them.
-        residual_j: by how much the books of a law do not add up at most.
-        sampling_j: the most that the arms got beyond what the laws book.
-        curves: of every energy, and of what the arms gave to their laws.
+        finding: class of the verdict.
+        text: the verdict as a sentence.
+        premises: the premises of the verdict.
+        least: the minimum of every energy.
+        largest_j: the largest of all energies.
+        residual_j: the largest error in the books of a law.
+        sampling_j: the most energy that an arm got beyond what its law books.
+        curves: every energy over time, and what the arms gave to their laws.
     """
 
     finding: ObservedFinding
@@ -105,33 +117,29 @@ class ObservedEnergy(NamedTuple):
     curves: Sequence[EnergyCurve] = ()
 
     def to_json(self) -> JsonObject:
-        """Returns it ready for JSON."""
-        premises, least = (
-            [one._asdict() for one in rows] for rows in (self.premises, self.least)
-        )
-        plain = {key: value for key, value in self._asdict().items() if key != "curves"}
-        return {
-            **plain,
-            "finding": self.finding.name.lower(),
-            "premises": premises,
-            "least": least,
-        }
+        """Returns the verdict without its curves, ready for JSON."""
+        content = self._asdict()
+        del content["curves"]
+        content["finding"] = self.finding.name.lower()
+        content["premises"] = [premise._asdict() for premise in self.premises]
+        content["least"] = [least._asdict() for least in self.least]
+        return content
 
 
 class _SiteBooks(NamedTuple):
-    """The energies of a site's law at its ticks, from the first one, J.
+    """The energies of a site's law at its ticks, from the first tick on, shape (K,) each, J.
 
     Attributes:
-        t_s: the ticks' times, s.
-        booked: what its law declares.
-        port: what the arm gave to the law by its books.
-        taken: what the law has taken for good.
-        residual: by how much the books do not add up.
-        leak: what the arm got beyond the books.
+        t_s: times of the ticks, in s.
+        declared: the energies that the law declares.
+        port: energy that the arm gave to the law, according to the law.
+        taken: energy that the law dissipated.
+        residual: error of the law's books.
+        leak: energy that the arm got beyond what the law books.
     """
 
     t_s: Array
-    booked: LawEnergies
+    declared: LawEnergies
     port: Array
     taken: Array
     residual: Array
@@ -139,187 +147,263 @@ class _SiteBooks(NamedTuple):
 
 
 def observe_energies(log: Log, *, own_laws: bool = False) -> ObservedEnergy | None:
-    """Returns the verdict on the energies that the laws of a log declare; None if none declares
-    any.
+    """Returns the verdict on the energies that the laws of a log declare.
 
-    A law from outside is asked with `own_laws` alone, since that runs its code.
+    Args:
+        log: the log of a run.
+        own_laws: also evaluate laws from outside the program, which runs their code.
+
+    Returns:
+        The verdict, or None if no law declares energies.
 
     Raises:
         LogError: a record cannot be read.
         ScenarioError: the file of a law from outside is missing.
     """
     laws: dict[str, Any] = {}
-    for name, spec in log.scenario.sites.items():
-        setup = log.scenario.setup(name)
-        if setup.law_factory is not None and (
-            own_laws or not isinstance(spec.control, ImportedLaw)
-        ):
+    for site, spec in log.scenario.sites.items():
+        setup = log.scenario.setup(site)
+        is_allowed = own_laws or not isinstance(spec.control, ImportedLaw)
+        if setup.law_factory is not None and is_allowed:
             law = setup.law_factory(setup.law_context())
-            laws |= {name: law} if callable(getattr(law, "energies", None)) else {}
+            if callable(getattr(law, "energies", None)):
+                laws[site] = law
     if not laws:
         return None
-    silent = [name for name in log.sites if name not in laws]
-    gaps = [
-        name
-        for name in log.sites
-        if not len(log[name]) or log[name].missing or log[name].tick[0]
+    unjudged = ObservedFinding.NOT_JUDGED
+    silent = [site for site in log.sites if site not in laws]
+    if silent:
+        text = f"{unjudged}: the law of {', '.join(silent)} declares none"
+        return ObservedEnergy(unjudged, text)
+    parts = {site: log[site] for site in log.sites}
+    incomplete = [
+        site
+        for site, part in parts.items()
+        if not len(part) or part.missing or part.tick[0]  # records are missing before tick[0]
     ]
-    if silent or gaps:
-        why = f"the law of {', '.join(silent)} declares none"
-        why = why if silent else f"records of {', '.join(gaps)} are missing"
-        return ObservedEnergy(
-            ObservedFinding.NOT_JUDGED, f"{ObservedFinding.NOT_JUDGED}: {why}"
-        )
-    return _judge(log, {name: _read_books(log, name, law) for name, law in laws.items()})
+    if incomplete:
+        text = f"{unjudged}: records of {', '.join(incomplete)} are missing"
+        return ObservedEnergy(unjudged, text)
+    books = {site: _read_books(log, site, law) for site, law in laws.items()}
+    return _judge_books(log, books)
 
 
-def _read_books(log: Log, name: str, law: Any) -> _SiteBooks:
-    part = log[name]
-    setup = log.scenario.setup(name)
+def _read_books(log: Log, site: str, law: Any) -> _SiteBooks:
+    """Returns the energies of a site's law, declared and recomputed from the records."""
+    part = log[site]
+    setup = log.scenario.setup(site)
+    # the record that says `diverged` has no law of its own
     count = len(part) - int(part.mode[-1] == "diverged")
-    records = _read_law_records(log, name, law, count)
-    booked: LawEnergies = law.energies(records)
+    records = _read_law_records(log, site, law, count)
+    declared: LawEnergies = law.energies(records)
     limit_nm = np.array(setup.tau_limit_nm)
     digital = setup.scheme is Scheme.DIGITAL
-    given = -sum_work(hold_torque(records.tau, limit_nm, digital=digital), records.q)
-    if setup.theta_known:  # holding the arm is no work of the law
-        potential = build_arm_rows(log.scenario, name).potential_energy(records.q)
-        given += booked.gravity * (potential - potential[0])
-    given *= booked.weight
-    port = given if booked.port is None else booked.port
-    store = np.zeros(count) if booked.store is None else _add_parts(booked.store)
-    flows = sum(map(_add_parts, booked.took)) - sum(map(_add_parts, booked.gave))
-    left = port + flows - store
-    left -= left[0]
-    taken = left if booked.taken is None else booked.taken - booked.taken[0]
-    t_s = part.t_s[:count]
+    arm_gave = -sum_work(hold_torque(records.tau, limit_nm, digital=digital), records.q)
+    if setup.theta_known:
+        # holding the arm against gravity is no work of the law
+        potential = build_arm_rows(log.scenario, site).potential_energy(records.q)
+        arm_gave += declared.gravity * (potential - potential[0])
+    arm_gave *= declared.weight
+    port = arm_gave if declared.port is None else declared.port
+    stored = np.zeros(count) if declared.store is None else _add_parts(declared.store)
+    received = sum(map(_add_parts, declared.took))
+    sent = sum(map(_add_parts, declared.gave))
+    dissipated = port + (received - sent) - stored
+    dissipated -= dissipated[0]
+    taken = dissipated
+    if declared.taken is not None:
+        taken = declared.taken - declared.taken[0]
     return _SiteBooks(
-        t_s=t_s, booked=booked, port=port, taken=taken, residual=left - taken, leak=port - given
+        t_s=part.t_s[:count],
+        declared=declared,
+        port=port,
+        taken=taken,
+        residual=dissipated - taken,
+        leak=port - arm_gave,
     )
 
 
 def _add_parts(energy: Array) -> Array:
     """Returns the sum of an energy's parts, shape (K,)."""
-    whole: Array = energy.reshape(len(energy), -1).sum(axis=1)
-    return whole
+    total: Array = energy.reshape(len(energy), -1).sum(axis=1)
+    return total
 
 
-def _read_law_records(log: Log, name: str, law: Any, count: int) -> LawRecords:
-    part = log[name]
-    rule = log.scenario.sites[name].on_stale.rule
-    life = part.layout.count_life_memory(len(part.peers), degrades=rule.degrades)
-    own = life if rule.action is StaleAction.GLIDE else part.layout.shared + 1
+def _read_law_records(log: Log, site: str, law: Any, count: int) -> LawRecords:
+    """Returns the first `count` records of a site in the form that a law expects."""
+    part = log[site]
+    sent = {key: values[:count] for key, values in part.sent.items()}
+    return LawRecords(
+        h_s=1.0 / part.rate_hz,
+        q=part.q[:count],
+        qd=part.qd[:count],
+        tau=part.tau[:count],
+        tau_x=part.tau_x[:count],
+        to_all={key: values for key, values in sent.items() if "[" not in key},
+        memory=_read_law_memory(log, site, law, count),
+        peers=[_read_peer_records(log, site, peer, sent, count) for peer in part.peers],
+    )
+
+
+def _read_law_memory(log: Log, site: str, law: Any, count: int) -> dict[str, Array]:
+    """Returns the attributes that a law remembers, over the first `count` records."""
+    part = log[site]
+    rule = log.scenario.sites[site].on_stale.rule
+    life_length = part.layout.count_life_memory(len(part.peers), degrades=rule.degrades)
+    # the law's memory follows that of the session's life, or that of the reference
+    first = life_length if rule.action is StaleAction.GLIDE else part.layout.shared + 1
     attributes = getattr(law, "remembers", ())
     lengths = [np.size(getattr(law, attribute)) for attribute in attributes]
-    mem = part.memory(own, sum(lengths))[:count]
-    parts = np.split(mem, np.cumsum(lengths, dtype=np.int64)[:-1], axis=1)
-    memory = dict(zip(attributes, parts, strict=False))  # without any, the one part is empty
-    sent = {key: values[:count] for key, values in part.sent.items()}
-    peers = []
-    for peer in part.peers:
-        tick = part.used[peer][:count]
-        there = log[peer].sent
-        heard = {key.removesuffix(f"[{name}]"): values for key, values in there.items()}
-        received = {
-            key: np.where(tick[:, None] >= 0, values[np.maximum(tick, 0)], 0.0)
-            for key, values in heard.items()
-            if "[" not in key
-        }
-        alone = {
-            key.partition("[")[0]: values
-            for key, values in sent.items()
-            if key.endswith(f"[{peer}]")
-        }
-        peers.append(PeerRecords(tick, received, alone))
-    to_all = {key: values for key, values in sent.items() if "[" not in key}
-    motion = (part.q[:count], part.qd[:count], part.tau[:count], part.tau_x[:count])
-    return LawRecords(1.0 / part.rate_hz, *motion, to_all, memory, peers)
+    memory = part.memory(first, sum(lengths))[:count]
+    parts = np.split(memory, np.cumsum(lengths, dtype=np.int64)[:-1], axis=1)
+    return dict(zip(attributes, parts, strict=False))  # without attributes, one empty part
+
+
+def _read_peer_records(
+    log: Log, site: str, peer: str, sent: Mapping[str, Array], count: int
+) -> PeerRecords:
+    """Returns what a site's law received from a peer, and what it sent to that peer alone.
+
+    A key such as `wave[s]` is a value for site s alone.
+    """
+    tick = log[site].used[peer][:count]
+    peer_sent = {
+        key.removesuffix(f"[{site}]"): values for key, values in log[peer].sent.items()
+    }
+    received = {
+        key: np.where(tick[:, None] >= 0, values[np.maximum(tick, 0)], 0.0)
+        for key, values in peer_sent.items()
+        if "[" not in key
+    }
+    sent_to_peer = {
+        key.partition("[")[0]: values
+        for key, values in sent.items()
+        if key.endswith(f"[{peer}]")
+    }
+    return PeerRecords(tick, received, sent_to_peer)
 
 
 def _find_curves(log: Log, books: Mapping[str, _SiteBooks]) -> Iterator[EnergyCurve]:
     """Yields the energies that must not be below zero."""
-    for site, own in books.items():
-        booked = own.booked
+    for site, site_books in books.items():
+        declared = site_books.declared
         energies = []
-        if booked.store is not None:
-            energies.append(("store", "", booked.store))
-        # what the peer had given by each tick of this site
+        if declared.store is not None:
+            energies.append(("store", "", declared.store))
         for j, peer in enumerate(log[site].peers):
-            other = books[peer]
-            gave = other.booked.gave[log[peer].peers.index(site)]
-            row = np.searchsorted(other.t_s, own.t_s + 1e-9, side="right") - 1
-            energies.append(("line", peer, gave[row] - booked.took[j]))
-            if booked.observed:
-                energies.append(("known", peer, booked.observed[j]))
+            peer_books = books[peer]
+            peer_gave = peer_books.declared.gave[log[peer].peers.index(site)]
+            # what the peer had given by each tick of this site
+            row = np.searchsorted(peer_books.t_s, site_books.t_s + 1e-9, side="right") - 1
+            energies.append(("line", peer, peer_gave[row] - declared.took[j]))
+            if declared.observed:
+                energies.append(("known", peer, declared.observed[j]))
         for kind, peer, energy in energies:
-            least = energy.reshape(len(energy), -1).min(axis=1)
             yield EnergyCurve(
                 kind=kind,
                 site=site,
                 peer=peer,
-                t_s=own.t_s,
+                t_s=site_books.t_s,
                 energy_j=_add_parts(energy),
-                least_j=least,
+                least_j=energy.reshape(len(energy), -1).min(axis=1),
             )
-        falls = own.taken - np.maximum.accumulate(own.taken)
         yield EnergyCurve(
-            kind="taken", site=site, peer="", t_s=own.t_s, energy_j=own.taken, least_j=falls
+            kind="taken",
+            site=site,
+            peer="",
+            t_s=site_books.t_s,
+            energy_j=site_books.taken,
+            least_j=site_books.taken - np.maximum.accumulate(site_books.taken),
         )
 
 
-def _judge(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
+def _judge_books(log: Log, books: Mapping[str, _SiteBooks]) -> ObservedEnergy:
+    """Returns the verdict on the energies of all sites."""
     curves = list(_find_curves(log, books))
     least = []
-    for one in curves:
-        low = int(one.least_j.argmin())
-        least.append(LeastEnergy(one.name, float(one.least_j[low]), float(one.t_s[low])))
-    largest = max(float(one.energy_j.max()) for one in curves)
-    curves += [
-        EnergyCurve(
-            kind="given", site=site, peer="", t_s=one.t_s, energy_j=one.port, least_j=one.port
+    for curve in curves:
+        row = int(curve.least_j.argmin())
+        least.append(LeastEnergy(curve.name, float(curve.least_j[row]), float(curve.t_s[row])))
+    largest_j = max(float(curve.energy_j.max()) for curve in curves)
+    for site, site_books in books.items():
+        port = site_books.port
+        curves.append(
+            EnergyCurve(
+                kind="given",
+                site=site,
+                peer="",
+                t_s=site_books.t_s,
+                energy_j=port,
+                least_j=port,
+            )
         )
-        for site, one in books.items()
-    ]
-    scale = max(largest, *(float(np.abs(own.port).max()) for own in books.values()))
-    residual = max(float(np.abs(own.residual).max()) for own in books.values())
-    sampling = max(float(own.leak.max()) for own in books.values())
-    premises = _check_premises(log, books, scale)
-    lowest = min(least, key=lambda one: one.amount_j)
+    ports_j = [float(np.abs(site_books.port).max()) for site_books in books.values()]
+    scale_j = max(largest_j, *ports_j)
+    premises = _check_books(log, books, scale_j)
+    lowest = min(least, key=lambda energy: energy.amount_j)
     failed = [premise.name for premise in premises if not premise.holds]
     if not premises[0].holds:
         finding = ObservedFinding.BROKEN
         text = premises[0].text
-    elif lowest.amount_j < LEAST_ENERGY_J - ROUNDING_SHARE * scale:
+    elif lowest.amount_j < LEAST_ENERGY_J - ROUNDING_SHARE * scale_j:
         finding = ObservedFinding.NEGATIVE
         text = f"{lowest.name} is {lowest.amount_j:.3g} J at {lowest.at_s:.4g} s"
     else:
         finding = ObservedFinding.PASSIVE
-        text = f"{count_nouns(len(least), 'energy')}, the largest {largest:.4g} J"
-        text += f"; but a premise fails: {', '.join(failed)}" * bool(failed)
-    numbers = (least, largest, residual, sampling, curves)
-    return ObservedEnergy(finding, f"{finding}: {text}", premises, *numbers)
+        text = f"{count_nouns(len(least), 'energy')}, the largest {largest_j:.4g} J"
+        if failed:
+            text += f"; but a premise fails: {', '.join(failed)}"
+    return ObservedEnergy(
+        finding=finding,
+        text=f"{finding}: {text}",
+        premises=premises,
+        least=least,
+        largest_j=largest_j,
+        residual_j=max(_largest_residual_j(site_books) for site_books in books.values()),
+        sampling_j=max(float(site_books.leak.max()) for site_books in books.values()),
+        curves=curves,
+    )
 
 
-def _check_premises(log: Log, books: Mapping[str, _SiteBooks], scale: float) -> list[Premise]:
-    residual = {site: float(np.abs(own.residual).max()) for site, own in books.items()}
-    site = max(residual, key=residual.__getitem__)
-    text = f"the law of {site} adds up to {residual[site]:.1e} J of {scale:.4g} J, the others closer"
-    premises = [Premise("books", residual[site] <= -LEAST_ENERGY_J + 1e-9 * scale, text)]
-    limits = {name: np.array(log.scenario.setup(name).tau_limit_nm) for name in books}
-    cut = [name for name in books if (np.abs(log[name].tau) >= limits[name]).any()]
-    leak = {name: float(own.leak.max()) for name, own in books.items()}
-    most = SAMPLING_SHARE * scale + 1e-9
-    missed = [name for name in cut if leak[name] > most]
-    text = f"cut off at {', '.join(missed or cut)}" if cut else "never cut off"
-    text += (
-        ": the arm got another one than the law books"
-        if missed
-        else ", and booked so" * bool(cut)
+def _largest_residual_j(site_books: _SiteBooks) -> float:
+    return float(np.abs(site_books.residual).max())
+
+
+def _check_books(log: Log, books: Mapping[str, _SiteBooks], scale_j: float) -> list[Premise]:
+    """Returns the premises on the books of all laws: `books`, `torque` and `sampling`.
+
+    Args:
+        log: the log of the run.
+        books: the energies of every site's law.
+        scale_j: the largest energy that occurs.
+    """
+    residual_j = {site: _largest_residual_j(site_books) for site, site_books in books.items()}
+    worst = max(residual_j, key=residual_j.__getitem__)
+    holds = residual_j[worst] <= -LEAST_ENERGY_J + 1e-9 * scale_j
+    text = f"the books of {worst}'s law close to {residual_j[worst]:.1e} J of {scale_j:.4g} J"
+    premises = [Premise("books", holds, f"{text}, and the others closer")]
+
+    limited = []
+    for site in books:
+        limit_nm = np.array(log.scenario.setup(site).tau_limit_nm)
+        if (np.abs(log[site].tau) >= limit_nm).any():
+            limited.append(site)
+    leak_j = {site: float(site_books.leak.max()) for site, site_books in books.items()}
+    largest_leak_j = SAMPLING_SHARE * scale_j + 1e-9
+    unbooked = [site for site in limited if leak_j[site] > largest_leak_j]
+    if unbooked:
+        text = (
+            f"cut off at {', '.join(unbooked)}: the law books another torque than the arm got"
+        )
+    elif limited:
+        text = f"cut off at {', '.join(limited)}, and booked so"
+    else:
+        text = "never cut off"
+    premises.append(Premise("torque", not unbooked, text))
+
+    worst = max(leak_j, key=leak_j.__getitem__)
+    text = f"the arm of {worst} got up to {leak_j[worst]:.3g} J more than its law books"
+    premises.append(
+        Premise("sampling", leak_j[worst] <= largest_leak_j, f"{text}, between ticks")
     )
-    premises.append(Premise("torque", not missed, text))
-    site = max(leak, key=leak.__getitem__)
-    text = (
-        f"the arm of {site} got up to {leak[site]:.3g} J more than its law books, between ticks"
-    )
-    premises.append(Premise("sampling", leak[site] <= most, text))
     return premises

@@ -1,12 +1,19 @@
-"""What a certificate rests on: the theorem's premises, checked one by one against a log, and
-its records.
+"""Checks the premises of the stability theorem against a log, and collects the evidence.
 
-Invariant: what is missing never counts as stable. Too little of the run or of the periods of V,
-and sites that a rerun took over as recorded, leave a run open; a log that was changed passes
-nothing. A premise holds, fails, or cannot be decided; each states its evidence. The theorem is
-the paper's with the weights and the repaired proof of docs/errata.md: constant delays, constant
-dominance factors under which every site reaches every other, one Kd up to a scalar per site,
-the adaptive law, and no operator or operators that are passive with respect to r.
+The theorem is the paper's, with the weights and the repaired proof of docs/errata.md. The
+theorem requires:
+
+- constant delays;
+- constant dominance factors under which every site reaches every other;
+- the same Kd at every site, up to a scalar per site;
+- the adaptive law at every site;
+- no operator, or operators that are passive with respect to r.
+
+Invariant:
+    - Missing information never counts as stable: if too little of the run or too few periods
+      of V can be judged, or if a rerun took sites over as recorded, the run is left open.
+    - A log that was changed passes nothing.
+    - A premise holds, fails, or cannot be decided, and always states its evidence.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,37 +50,35 @@ from .energy_balance import (
 from .energy_terms import SiteConstants, derive_site_constants
 
 CONSTANT_DELAY_TOLERANCE_S = 1e-7
-"""Ages that differ by no more are one: stamps are whole nanoseconds."""
+"""Ages that differ by less than this count as equal, s: stamps are whole nanoseconds."""
 SAMPLING_RISE_SHARE = 1e-4
-"""Rises up to this share of the scale are attributed to sampling if the residual is as large.
-"""
+"""Rises of V up to this share of the scale count as sampling, if the residual is as large."""
 MIN_FREE_S = 1.0
-"""The least free motion at the end of a run of which the theorem speaks, s; and so many times
-the largest age of a sample in use:
-"""
+"""Shortest free motion at the end of a run about which the theorem says anything, s."""
 MIN_FREE_AGES = 5.0
+"""The free motion must also last this many times the largest age of a sample in use."""
 LEAST_ABSENCE_S = 0.1
-"""Sites end within that time of each other; a stretch that is shorter is none."""
+"""Sites end within this time of each other; shorter stretches of a run are ignored, s."""
 LEAST_SPEED_M_S = 1e-9
-"""What rounding may leave of the speed along an axis along which an end effector cannot move.
-"""
+"""Rounding error of the speed along an axis along which an end effector cannot move, m/s."""
 MAX_LISTED_NAMES = 4
-"""Links or sites that a sentence names."""
+"""Most links or sites that a sentence names."""
 
 
-NO_COMMON_TIME = "there is no time of which every site has records"
-NO_PERIOD = "there is no period of which all records are there"
-_OF_ORIENTATIONS = (
+NO_COMMON_TIME = "there is no time at which every site has records"
+NO_PERIOD = "there is no period whose records are complete"
+_ORIENTATIONS_TEXT = (
     "it follows orientations, whose ed is no derivative of e, so that V has terms of no sign"
 )
 
 
 class Premise(NamedTuple):
-    """One premise of the theorem, by its key.
+    """A premise of the theorem, and whether it holds in a run.
 
     Attributes:
+        name: key of the premise.
         holds: True if it holds, False if it fails, None if the log does not decide it.
-        text: the evidence.
+        text: the evidence, as a sentence.
     """
 
     name: str
@@ -82,24 +87,25 @@ class Premise(NamedTuple):
 
 
 def explain_no_functional(scenario: Scenario) -> str:
-    """Returns the reasons why sites have no functional; "" if each has one."""
-    lacking: dict[str, list[str]] = {}
+    """Returns the reasons why some sites have no functional V, or "" if every site has one."""
+    sites_by_reason: dict[str, list[str]] = {}
     for site, spec in scenario.sites.items():
         if not spec.arm.known:
-            lacking.setdefault("nobody knows the arm's theta, and V is made of it", []).append(
-                site
-            )
+            reason = "theta of the arm is unknown, and V depends on it"
         elif not spec.control.has_functional:
-            lacking.setdefault(
-                f"law {spec.control.tag}, for which there is no such V", []
-            ).append(site)
+            reason = f"law {spec.control.tag} has no functional V"
         elif spec.task.space == "pose":
-            lacking.setdefault(_OF_ORIENTATIONS, []).append(site)
-    return "; ".join(f"{', '.join(names)}: {reason}" for reason, names in lacking.items())
+            reason = _ORIENTATIONS_TEXT
+        else:
+            continue
+        sites_by_reason.setdefault(reason, []).append(site)
+    return "; ".join(
+        f"{', '.join(sites)}: {reason}" for reason, sites in sites_by_reason.items()
+    )
 
 
 class AbsentSpan(NamedTuple):
-    """A time in which a site was away from the session, s."""
+    """A span of time during which a site was absent from the session, in s."""
 
     site: str
     from_s: float
@@ -107,16 +113,17 @@ class AbsentSpan(NamedTuple):
 
 
 class FunctionalFacts(NamedTuple):
-    """What is known of V in a run.
+    """Everything a log shows about the functional V of a run.
 
     Attributes:
-        log: of the run.
-        energies, balance: of every site, and of all together.
-        groups: the closed groups for which there is at some time no unique beta; () if there is
-            one.
-        absent: when sites were away.
-        unjudged: the times between which records are missing though all sites were there, s.
-        tolerance: the size that a rise of V must exceed, J.
+        log: the log of the run.
+        energies: energies of every site.
+        balance: energy balance of all sites together.
+        groups: closed groups of sites at the first time at which beta is not unique; () if beta
+            is always unique.
+        absent: spans during which a site was absent.
+        unjudged: spans in which records are missing although all sites were present, in s.
+        tolerance: size that a rise of V must exceed to count, in J.
     """
 
     log: Log
@@ -129,13 +136,13 @@ class FunctionalFacts(NamedTuple):
 
 
 class RunFacts(NamedTuple):
-    """What a log shows of a run, each fact once.
+    """Everything a log shows about a run, computed once.
 
     Attributes:
-        log: its log.
-        constants: of every site; {} if some law or arm has no V.
-        functional: what is known of V; None if nothing is.
-        unknown: why that is so; "" of what is known.
+        log: the log of the run.
+        constants: constants of every site; {} if some law or arm has no V.
+        functional: facts about V, or None if V cannot be computed.
+        unknown: the reason why `functional` is None; "" otherwise.
     """
 
     log: Log
@@ -145,147 +152,159 @@ class RunFacts(NamedTuple):
 
 
 def gather_facts(log: Log) -> RunFacts:
-    """Returns what a log shows of V.
+    """Returns everything that a log shows about the run and its functional V.
 
     Raises:
-        LogError: a record names a change that is none.
+        LogError: a record names a change that is not valid.
     """
-    if lacking := explain_no_functional(log.scenario):
+    lacking = explain_no_functional(log.scenario)
+    if lacking:
         return RunFacts(log, {}, unknown=lacking)
     constants = {site: derive_site_constants(log.scenario, site) for site in log.sites}
-    if not (energies := compute_site_energies(log)):
+    energies = compute_site_energies(log)
+    if not energies:
         return RunFacts(log, constants, unknown=NO_COMMON_TIME)
     balance = compute_energy_balance(energies)
     absent = find_absent_spans(log)
     if not balance.judged.any():
         return RunFacts(log, constants, unknown=NO_PERIOD)
-    closed = map(find_closed_groups, find_dominance_matrices(energies))
-    groups = next((groups for groups in closed if len(groups) > 1), ())
-    named = tuple(tuple(log.sites[n] for n in group) for group in groups)
-    there = [
+    closed_groups = map(find_closed_groups, find_dominance_matrices(energies))
+    ambiguous = next((groups for groups in closed_groups if len(groups) > 1), ())
+    group_names = tuple(tuple(log.sites[n] for n in group) for group in ambiguous)
+    unjudged_while_present = [
         (from_s, to_s)
         for from_s, to_s in find_unjudged_spans(balance)
-        if not any(away.from_s < to_s and from_s < away.to_s for away in absent)
+        if not any(span.from_s < to_s and from_s < span.to_s for span in absent)
     ]
-    sampled = min(float(np.ptp(balance.residual)), SAMPLING_RISE_SHARE * balance.scale)
-    tolerance = float(np.ptp(balance.unexplained)) + sampled + ZERO_ENERGY_J
-    known = FunctionalFacts(
+    sampling_j = min(float(np.ptp(balance.residual)), SAMPLING_RISE_SHARE * balance.scale)
+    facts = FunctionalFacts(
         log=log,
         energies=energies,
         balance=balance,
-        groups=named,
+        groups=group_names,
         absent=absent,
-        unjudged=there,
-        tolerance=tolerance,
+        unjudged=unjudged_while_present,
+        tolerance=float(np.ptp(balance.unexplained)) + sampling_j + ZERO_ENERGY_J,
     )
-    return RunFacts(log, constants, known)
+    return RunFacts(log, constants, facts)
 
 
 def check_premises(run: RunFacts) -> list[Premise]:
-    """Returns the premises of the theorem, and that on sampled walls: what each check finds, in
-    order.
-    """
-    law = (
-        "adaptive at every site, of arms whose theta is known" if run.constants else run.unknown
-    )
-    found: list[Premise | None] = [Premise("law", bool(run.constants), law)]
+    """Returns the premises of the theorem and the premise on sampled walls, each checked."""
+    law = "adaptive at every site, of arms whose theta is known"
+    premises: list[Premise | None] = [
+        Premise("law", bool(run.constants), law if run.constants else run.unknown)
+    ]
     if run.constants:
-        found += [_check_parameters(run), _check_gains(run)]
-    found.append(_check_walls(run.log))
+        premises += [_check_parameters(run), _check_gains(run)]
+    premises.append(_check_walls(run.log))
     if run.functional is not None:
-        found += [check(run.functional) for check in OF_RUN]
-    return [premise for premise in found if premise is not None]
+        premises += [check(run.functional) for check in FUNCTIONAL_CHECKS]
+    return [premise for premise in premises if premise is not None]
 
 
 def _check_parameters(run: RunFacts) -> Premise:
-    """The truth is in the box, and the estimate is right where nothing is adapted."""
+    """Checks that theta is in its box, and that parameters that are not adapted are known."""
     faults = []
-    for site, c in run.constants.items():
-        if ((c.theta < c.low) | (c.theta > c.high)).any():
-            faults.append(f"{site}: theta is outside of the box that its estimates are held in")
-        first = np.clip(
-            run.log.scenario.sites[site].control.gains(c.theta).theta_hat0, c.low, c.high
-        )
-        if (~c.adapts & (first != c.theta)).any():
-            faults.append(f"{site}: a parameter is not learnt, and not known either")
-        if c.unknown_friction.any():
+    for site, constants in run.constants.items():
+        theta = constants.theta
+        low = constants.low
+        high = constants.high
+        if ((theta < low) | (theta > high)).any():
+            faults.append(f"{site}: theta is outside the box that its estimates are held in")
+        gains = run.log.scenario.sites[site].control.gains(theta)
+        first_estimate = np.clip(gains.theta_hat0, low, high)
+        if (~constants.adapts & (first_estimate != theta)).any():
+            faults.append(f"{site}: a parameter is neither learnt nor known")
+        if constants.unknown_friction.any():
             faults.append(f"{site}: its law does not compensate all friction of the joints")
-    text = "every parameter is learnt or known, and no box shuts it out"
-    return Premise("parameters", not faults, _list(faults) or text)
+    text = "every parameter is learnt or known, and no box excludes it"
+    return Premise("parameters", not faults, _join_limited(faults) or text)
 
 
 def _check_gains(run: RunFacts) -> Premise:
+    """Checks that the Kd of all sites are positive and equal up to a scalar per site."""
     constants = run.constants
-    Kd = np.array([c.weighing_Kd for c in constants.values()])
+    Kd = np.array([site_constants.weighing_Kd for site_constants in constants.values()])
     scales = find_kd_scales(Kd)
     if scales is None:
-        rows = [
-            f"{site} ({', '.join(f'{value:g}' for value in c.Kd)})"
-            for site, c in constants.items()
-        ]
+        rows = []
+        for site, site_constants in constants.items():
+            numbers = ", ".join(f"{value:g}" for value in site_constants.Kd)
+            rows.append(f"{site} ({numbers})")
         text = f"Kd differs in shape between sites, so that no beta exists: {', '.join(rows)}"
         return Premise("Kd", False, text)
-    if not Kd.all():  # NaN counts as positive
-        return Premise("Kd", False, "some Kd is zero: the theorem asks for positive ones")
-    alike = np.ptp(scales) == 0.0
-    scalars = f"one Kd but for a scalar: {_per_site(dict(zip(constants, scales, strict=True)))}"
-    return Premise("Kd", True, "one Kd for all sites" if alike else scalars)
+    if not Kd.all():  # NaN (an axis that is not followed) counts as positive
+        return Premise("Kd", False, "some Kd is zero, but the theorem requires positive Kd")
+    if np.ptp(scales) == 0.0:
+        return Premise("Kd", True, "one Kd for all sites")
+    scales_by_site = dict(zip(constants, scales, strict=True))
+    return Premise("Kd", True, f"one Kd up to a scalar: {_format_by_site(scales_by_site)}")
 
 
 def _check_walls(log: Log) -> Premise | None:
-    """No sampled wall gives energy; None if no wall is sampled."""
+    """Checks that no sampled wall generates energy; None if no wall is sampled."""
     if not any(map(list_sampled_walls, log.scenario.sites.values())):
         return None
     walls = find_wall_energies(log)
     if not walls:
         return Premise("walls", True, "no sampled wall was touched")
-    giving = [wall for wall in walls if wall.arm_damping_n_s_m <= wall.required_damping_n_s_m]
+    active = [wall for wall in walls if wall.arm_damping_n_s_m <= wall.required_damping_n_s_m]
     texts = [
-        f"{wall.site}: K h / 2 + B is {wall.required_damping_n_s_m:.3g} N s/m, the arm's own damping "
-        f"{wall.arm_damping_n_s_m:.3g}; gave {wall.generated_j:.3g} J with respect to qd"
-        for wall in giving or walls
+        f"{wall.site}: K h / 2 + B is {wall.required_damping_n_s_m:.3g} N s/m, the arm's own "
+        f"damping {wall.arm_damping_n_s_m:.3g}; generated {wall.generated_j:.3g} J "
+        "with respect to qd"
+        for wall in active or walls
     ]
-    kind = (
-        "a sampled wall gives energy in contact" if giving else "every sampled wall is passive"
-    )
-    return Premise("walls", not giving, f"{kind}: {'; '.join(texts)}")
+    summary = "every sampled wall is passive"
+    if active:
+        summary = "a sampled wall generates energy in contact"
+    return Premise("walls", not active, f"{summary}: {'; '.join(texts)}")
 
 
 def _check_dominance(run: FunctionalFacts) -> Premise:
+    """Checks that the dominance factors are constant and that alpha is irreducible."""
     names = run.log.scenario.names
     energies = run.energies
     changing = [
         site for site, energy in energies.items() if not energy.motion.dominance.constant
     ]
     if changing:
-        lost = list_losses(run.log)
-        why = f": {_list(lost)}; those that are left follow each other" if lost else ""
-        return Premise("shares", False, f"the shares of {_list(changing)} change{why}")
+        losses = list_losses(run.log)
+        text = f"the shares of {_join_limited(changing)} change"
+        if losses:
+            text += f": {_join_limited(losses)}; the remaining sites follow each other"
+        return Premise("shares", False, text)
     Kd = np.array([energy.motion.constants.weighing_Kd for energy in energies.values()])
     weights = compute_lyapunov_weights(run.log.scenario.alpha, Kd)
     groups = [tuple(names[n] for n in group) for group in weights.groups]
     if len(groups) > 1:
         return Premise("shares", False, describe_closed_groups(groups))
-    outside = [site for site in names if site not in groups[0]]
-    if outside:
-        why = f"nobody of {', '.join(groups[0])} follows {', '.join(outside)}, whose beta is 0"
-        text = f"alpha is reducible, {why}: V tells nothing of it; it follows as in a cascade"
+    weightless = [site for site in names if site not in groups[0]]
+    if weightless:
+        followers = ", ".join(weightless)
+        text = (
+            f"alpha is reducible: none of {', '.join(groups[0])} follows {followers}, whose "
+            f"beta is 0, so V says nothing about {followers}, which follow as in a cascade"
+        )
         return Premise("shares", False, text)
-    beta = (
-        ""
-        if weights.scales is None
-        else f"; beta: {_per_site(dict(zip(names, weights.beta, strict=True)))}"
-    )
-    return Premise("shares", True, f"constant, alpha irreducible{beta}")
+    text = "constant, alpha irreducible"
+    if weights.scales is not None:
+        beta_by_site = dict(zip(names, weights.beta, strict=True))
+        text += f"; beta: {_format_by_site(beta_by_site)}"
+    return Premise("shares", True, text)
 
 
 def describe_closed_groups(groups: Sequence[Sequence[str]]) -> str:
     """Returns a sentence on closed groups of sites, for which beta is not unique."""
-    named = " and ".join("{" + ", ".join(group) + "}" for group in groups)
-    return f"{named} follow nobody outside: beta is not unique, certify each group by itself"
+    group_texts = " and ".join("{" + ", ".join(group) + "}" for group in groups)
+    return (
+        f"{group_texts} follow nobody outside: beta is not unique, certify each group by itself"
+    )
 
 
 def _check_delays(run: FunctionalFacts) -> Premise:
+    """Checks that the age of the sample in use is constant on every link."""
     varying = []
     constant = set()
     for site, energy in run.energies.items():
@@ -295,72 +314,86 @@ def _check_delays(run: FunctionalFacts) -> Premise:
             if not used.any():
                 continue
             age_s = (records.t_s - view.stamp_s)[used]
-            first_s = view.stamp_s[used][0]
-            late = records.first == 0 and first_s > records.h_s + CONSTANT_DELAY_TOLERANCE_S
-            if np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S or late:
-                varying.append(
-                    f"{peer}->{site} ({1e3 * age_s.min():.4g} to {1e3 * age_s.max():.4g} ms)"
-                )
+            first_stamp_s = view.stamp_s[used][0]
+            latest_first_s = records.h_s + CONSTANT_DELAY_TOLERANCE_S
+            starts_late = records.first == 0 and first_stamp_s > latest_first_s
+            if np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S or starts_late:
+                shortest_ms = 1e3 * age_s.min()
+                longest_ms = 1e3 * age_s.max()
+                varying.append(f"{peer}->{site} ({shortest_ms:.4g} to {longest_ms:.4g} ms)")
             else:
                 constant.add(f"{1e3 * age_s[0]:.4g} ms")
     if varying:
-        return Premise(
-            "delays", False, f"the age of the sample in use varies: {_list(varying)}"
-        )
+        text = f"the age of the sample in use varies: {_join_limited(varying)}"
+        return Premise("delays", False, text)
+    if not constant:
+        return Premise("delays", None, "no sample came into use")
     text = f"constant on every link: {', '.join(sorted(constant))}"
-    return (
-        Premise("delays", True, text)
-        if constant
-        else Premise("delays", None, "no sample came into use")
-    )
+    return Premise("delays", True, text)
 
 
 def _check_following(run: FunctionalFacts) -> Premise:
+    """Checks that every site follows its peers all the time: it never holds, brakes or stops.
+
+    A site whose reference moves at its largest allowed speed does not follow its peers either.
+    """
     log = run.log
-    found = {site: find_mode_intervals(log[site]) for site in log.sites}
-    away = [f"{site} {s[0].from_s:.4g} to {s[-1].to_s:.4g} s" for site, s in found.items() if s]
-    stops = any(one.mode in HALTED_MODES for intervals in found.values() for one in intervals)
+    intervals_by_site = {site: find_mode_intervals(log[site]) for site in log.sites}
+    interruptions = []
+    is_halted = False
+    for site, intervals in intervals_by_site.items():
+        if intervals:
+            from_s = intervals[0].from_s
+            to_s = intervals[-1].to_s
+            interruptions.append(f"{site} {from_s:.4g} to {to_s:.4g} s")
+        is_halted = is_halted or any(interval.mode in HALTED_MODES for interval in intervals)
     for site in log.sites:
-        held = ~find_unlimited_rows(log.scenario.sites[site].limits, log[site].qd_des)
-        if held.any():
-            away.append(
-                f"{site} with a reference as fast as it may be at "
-                f"{count_nouns(np.count_nonzero(held), 'tick')}"
-            )
-    words = "hold, brake, return or stop" if stops else "hold, brake or return"
-    text = f"{words}: {_list(away)}" if away else "every site follows its peers all the time"
-    return Premise("following", not away, text)
+        limits = log.scenario.sites[site].limits
+        limited_rows = ~find_unlimited_rows(limits, log[site].qd_des)
+        if limited_rows.any():
+            ticks = count_nouns(np.count_nonzero(limited_rows), "tick")
+            interruptions.append(f"{site} with a reference as fast as it may be at {ticks}")
+    if not interruptions:
+        return Premise("following", True, "every site follows its peers all the time")
+    modes = "hold, brake, return or stop" if is_halted else "hold, brake or return"
+    return Premise("following", False, f"{modes}: {_join_limited(interruptions)}")
 
 
 def _check_torque_limits(run: FunctionalFacts) -> Premise:
-    """No torque is cut off; of a chain the joints are named at which one is."""
-    cut = {site: energy.motion.limited for site, energy in run.energies.items()}
-    ticks = [
-        f"{site}{_name_joints(run, site, rows)} at {count_nouns(np.count_nonzero(rows.any(axis=1)), 'tick')}"
-        for site, rows in cut.items()
-        if rows.any()
-    ]
-    return Premise(
-        "torque", not ticks, f"cut off: {_list(ticks)}" if ticks else "never cut off"
-    )
+    """Checks that no torque is at its limit; names the joints of a chain that are."""
+    limited_sites = []
+    for site, energy in run.energies.items():
+        limited = energy.motion.limited
+        if limited.any():
+            ticks = count_nouns(np.count_nonzero(limited.any(axis=1)), "tick")
+            limited_sites.append(f"{site}{_name_joints(run, site, limited)} at {ticks}")
+    if limited_sites:
+        return Premise("torque", False, f"cut off: {_join_limited(limited_sites)}")
+    return Premise("torque", True, "never cut off")
 
 
-def _name_joints(run: FunctionalFacts, site: str, rows: Bools) -> str:
-    """Returns the joints of a chain for which some row is True, in brackets; "" of the planar
-    arm.
+def _name_joints(run: FunctionalFacts, site: str, affected: Bools) -> str:
+    """Returns the names of affected joints in parentheses; "" for the planar arm.
+
+    Args:
+        run: facts of the run.
+        site: site of the arm.
+        affected: True for each row and joint that is affected, shape (K, n).
     """
     model = run.log.scenario.arms[site]
-    names = [model.joint_names[n] for n in np.flatnonzero(rows.any(axis=0))]
-    return "" if model.chain is None else f" ({_list(names)})"
+    if model.chain is None:
+        return ""
+    names = [model.joint_names[n] for n in np.flatnonzero(affected.any(axis=0))]
+    return f" ({_join_limited(names)})"
 
 
 def _check_stops(run: FunctionalFacts) -> Premise | None:
-    """No stop is touched: they are passive with respect to qd, and not to r; None if no joint
-    has any.
+    """Checks that no joint touches its stops; None if no joint has stops.
+
+    Stops are passive with respect to qd, but not with respect to r.
     """
-    chains = [
-        model.chain for model in run.log.scenario.arms.values() if model.chain is not None
-    ]
+    arms = run.log.scenario.arms.values()
+    chains = [model.chain for model in arms if model.chain is not None]
     if not any(joint.stop_stiffness for chain in chains for joint in chain.joints):
         return None
     touched = []
@@ -370,150 +403,167 @@ def _check_stops(run: FunctionalFacts) -> Premise | None:
         if pushed.any():
             first_s = records.t_s[int(np.argmax(pushed.any(axis=1)))]
             touched.append(f"{site}{_name_joints(run, site, pushed)} from {first_s:.4g} s on")
-    text = (
-        f"the arm runs into stops of its joints: {_list(touched)}"
-        if touched
-        else "no stop is touched"
-    )
-    return Premise("stops", not touched, text)
+    if touched:
+        text = f"the arm runs into the stops of its joints: {_join_limited(touched)}"
+        return Premise("stops", False, text)
+    return Premise("stops", True, "no stop is touched")
 
 
 def _check_axes(run: FunctionalFacts) -> Premise | None:
-    """Nobody follows a site along an axis along which it moves and follows nobody; None in
-    joint space.
+    """Checks that a site that is followed along an axis follows along that axis itself.
+
+    An axis along which the followed site cannot move is exempt. None in joint space.
     """
     motions = {
         site: energy.motion
         for site, energy in run.energies.items()
         if energy.motion.constants.axes
     }
+    if not motions:
+        return None
     faults = []
     for site, motion in motions.items():
-        free = np.array(motion.constants.axes) == 0.0
-        free &= np.abs(motion.records.xd).max(axis=0) > LEAST_SPEED_M_S
-        for follower, other in motions.items():
-            followed = site in run.energies[follower].followed
-            if followed and (free & (np.array(other.constants.axes) > 0.0)).any():
+        free_axes = np.array(motion.constants.axes) == 0.0
+        free_axes &= np.abs(motion.records.xd).max(axis=0) > LEAST_SPEED_M_S
+        for follower, follower_motion in motions.items():
+            is_followed = site in run.energies[follower].followed
+            followed_axes = np.array(follower_motion.constants.axes) > 0.0
+            if is_followed and (free_axes & followed_axes).any():
                 faults.append(
                     f"{follower} follows {site} along an axis that {site} does not follow"
                 )
     text = "every site follows along each axis along which it moves and is followed"
-    return Premise("axes", not faults, _list(faults) or text) if motions else None
+    return Premise("axes", not faults, _join_limited(faults) or text)
 
 
 def _check_singular_poses(run: FunctionalFacts) -> Premise | None:
-    """No pose is damped: then J J+ = I; None in joint space."""
-    following = {site: energy.motion.following for site, energy in run.energies.items()}
-    found = {site: one for site, one in following.items() if isinstance(one, TaskFollowing)}
-    near = [
-        f"{site} from {run.energies[site].motion.records.t_s[int(np.argmax(one.damping > 0.0))]:.4g} s on"
-        for site, one in found.items()
-        if one.damping.any()
-    ]
-    bounds = _per_site({site: one.least.min() for site, one in found.items()})
-    text = f"none is near; least singular value at least: {bounds}"
+    """Checks that no pose is damped, so that J J+ = I; None in joint space."""
+    near = []
+    least_by_site = {}
+    for site, energy in run.energies.items():
+        following = energy.motion.following
+        if not isinstance(following, TaskFollowing):
+            continue
+        least_by_site[site] = following.least.min()
+        if following.damping.any():
+            first_row = int(np.argmax(following.damping > 0.0))
+            first_s = energy.motion.records.t_s[first_row]
+            near.append(f"{site} from {first_s:.4g} s on")
+    if not least_by_site:
+        return None
     if near:
-        text = f"a pose is so nearly singular that it is damped: {_list(near)}"
-    return Premise("singular poses", not near, text) if found else None
+        text = f"a pose is so nearly singular that it is damped: {_join_limited(near)}"
+        return Premise("singular poses", False, text)
+    bounds = _format_by_site(least_by_site)
+    text = f"no pose is near one; least singular value at least: {bounds}"
+    return Premise("singular poses", True, text)
 
 
 def _check_operators(run: FunctionalFacts) -> Premise:
-    """Passive with respect to r: they give no more than they took before, up to a constant."""
+    """Checks that operators and environments are passive with respect to r.
+
+    They are passive if they supply no more energy than they absorbed before. If they do supply
+    energy, the premise still holds for a run that ends with enough free motion.
+    """
     energies = run.energies
     balance = run.balance
-    pushed_s = {
-        site: energy.motion.records.t_s[energy.motion.records.tau_x.any(axis=1)]
-        for site, energy in energies.items()
-    }
-    sites = [site for site, t_s in pushed_s.items() if len(t_s)]
-    outside = run.log.scenario.external
-    if outside and not sites:
-        return Premise("hands", None, f"no record says who pushes the arm of {_list(outside)}")
-    if not sites:
+    push_times_s = {}
+    for site, energy in energies.items():
+        records = energy.motion.records
+        t_s = records.t_s[records.tau_x.any(axis=1)]
+        if len(t_s):
+            push_times_s[site] = t_s
+    external = run.log.scenario.external
+    if external and not push_times_s:
+        text = f"no record says who pushes the arm of {_join_limited(external)}"
+        return Premise("hands", None, text)
+    if not push_times_s:
         return Premise("hands", True, "nobody pushes")
     weightless = [
-        s for n, s in enumerate(energies) if s in sites and not balance.beta[:, n].any()
+        site
+        for n, site in enumerate(energies)
+        if site in push_times_s and not balance.beta[:, n].any()
     ]
     if weightless:
-        return Premise(
-            "hands",
-            False,
-            f"{_list(weightless)}, of beta 0, is pushed: V tells nothing of that",
-        )
-    gave = float(rise_above_minimum(balance.external_work).max())
-    who = " and ".join(balance.external)
-    if gave <= 1e-9 * balance.scale + ZERO_ENERGY_J:
-        return Premise("hands", True, f"the {who} only took: passive with respect to r")
-    let_go_s = max(pushed_s[site][-1] for site in sites)
-    r = (
-        "qd - v"
-        if any(energy.motion.constants.axes for energy in energies.values())
-        else "qd + Lambda e"
-    )
-    text = f"the {who} gave up to {gave:.3g} J with respect to r = {r}"
+        sites = _join_limited(weightless)
+        return Premise("hands", False, f"{sites}, of beta 0, is pushed: V does not show that")
+    supplied_j = float(rise_above_minimum(balance.external_work).max())
+    sources = " and ".join(balance.external)
+    if supplied_j <= 1e-9 * balance.scale + ZERO_ENERGY_J:
+        text = f"the {sources} only absorbed energy: passive with respect to r"
+        return Premise("hands", True, text)
+    released_s = max(t_s[-1] for t_s in push_times_s.values())
+    in_task_space = any(energy.motion.constants.axes for energy in energies.values())
+    r = "qd - v" if in_task_space else "qd + Lambda e"
+    text = f"the {sources} supplied up to {supplied_j:.3g} J with respect to r = {r}"
     ages_s = [energy.largest_age_s for energy in energies.values()]
-    free_s = float(balance.t_s[-1] - let_go_s)
+    free_s = float(balance.t_s[-1] - released_s)
     least_s = max(MIN_FREE_S, MIN_FREE_AGES * max(ages_s))
     if free_s >= least_s:
-        return Premise("hands", True, f"{text}; nobody pushes after {let_go_s:.3f} s")
+        return Premise("hands", True, f"{text}; nobody pushes after {released_s:.3f} s")
     if free_s > 1e-9:
         short = f"{free_s:.3g} s of free motion at the end are less than {least_s:.3g} s"
-        return Premise("hands", False, f"{text}, and push until {let_go_s:.3f} s: {short}")
-    return Premise(
-        "hands", False, f"{text}, and push to the end: not passive with respect to r"
-    )
+        text += f", and push until {released_s:.3f} s: {short}"
+        return Premise("hands", False, text)
+    text += ", and push to the end: not passive with respect to r"
+    return Premise("hands", False, text)
 
 
 def _check_records(run: FunctionalFacts) -> Premise:
+    """Checks that the records are complete while all sites were present."""
     if not run.unjudged:
-        where = "" if run.balance.judged.all() else " while all sites were there"
-        return Premise("records", True, f"every period of every site rests on records{where}")
-    lost = [f"{a:.4g} to {b:.4g} s" for a, b in run.unjudged]
-    return Premise("records", None, f"not judged: {_list(lost)}: records are missing there")
+        text = "every period of every site rests on records"
+        if not run.balance.judged.all():
+            text += " while all sites were present"
+        return Premise("records", True, text)
+    spans = [f"{from_s:.4g} to {to_s:.4g} s" for from_s, to_s in run.unjudged]
+    text = f"not judged: {_join_limited(spans)}: records are missing there"
+    return Premise("records", None, text)
 
 
 def find_absent_spans(log: Log) -> list[AbsentSpan]:
-    """Returns when sites were away from the session, in order."""
+    """Returns the spans during which sites were absent from the session, in order."""
     end_s = recorded_end_s(log)
-    found = []
+    absent = []
     for site in log.sites:
         part = log[site]
-        spans = [
-            (a / part.rate_hz, (b + 1) / part.rate_hz) for a, b in log.absences.get(site, ())
-        ]
-        left_s = (part.last_tick + 1) / part.rate_hz
+        for first, last in log.absences.get(site, ()):
+            absent.append(AbsentSpan(site, first / part.rate_hz, (last + 1) / part.rate_hz))
+        last_s = (part.last_tick + 1) / part.rate_hz
         kinds = {event.kind for event in log.events if event.about == site}
-        if left_s < end_s - LEAST_ABSENCE_S and kinds & {"left", "lost"}:
-            spans.append((left_s, end_s))
-        found += [AbsentSpan(site, *span) for span in spans]
-    return sorted(found, key=lambda one: one[1:])
+        if last_s < end_s - LEAST_ABSENCE_S and kinds & {"left", "lost"}:
+            absent.append(AbsentSpan(site, last_s, end_s))
+    return sorted(absent, key=lambda span: span[1:])
 
 
 def _check_presence(run: FunctionalFacts) -> Premise | None:
-    """All sites are there all the time; None if they are. Else what the stretches are by
-    themselves.
+    """Checks that all sites are present all the time; None if they are.
+
+    Otherwise the text describes each stretch during which all sites were present.
     """
     if not run.absent:
         return None
-    after_s = max(energy.begin_s for energy in run.energies.values())
-    edges = [
-        (after_s, after_s),
-        *((a, b) for _, a, b in run.absent),
-        (recorded_end_s(run.log),) * 2,
-    ]
+    stretch_start_s = max(energy.begin_s for energy in run.energies.values())
+    end_s = recorded_end_s(run.log)
+    absences = [(stretch_start_s, stretch_start_s)]
+    absences += [(span.from_s, span.to_s) for span in run.absent]
+    absences.append((end_s, end_s))
     stretches = []
-    for from_s, to_s in edges:
-        if from_s - after_s > LEAST_ABSENCE_S:
-            stretches.append(_describe_stretch(run.energies, after_s, from_s))
-        after_s = max(after_s, to_s)
-    who = _list([f"{site} {from_s:.4g} to {to_s:.4g} s" for site, from_s, to_s in run.absent])
+    for from_s, to_s in absences:
+        if from_s - stretch_start_s > LEAST_ABSENCE_S:
+            stretches.append(_describe_stretch(run.energies, stretch_start_s, from_s))
+        stretch_start_s = max(stretch_start_s, to_s)
+    absent = _join_limited(
+        [f"{site} {from_s:.4g} to {to_s:.4g} s" for site, from_s, to_s in run.absent]
+    )
     text = (
-        f"away: {who}, of which the theorem says nothing; by themselves: {'; '.join(stretches)}"
+        f"away: {absent}, about which the theorem says nothing; by themselves: "
+        f"{'; '.join(stretches)}"
     )
     return Premise("presence", False, text)
 
 
-OF_RUN = (
+FUNCTIONAL_CHECKS = (
     _check_dominance,
     _check_delays,
     _check_following,
@@ -525,66 +575,69 @@ OF_RUN = (
     _check_records,
     _check_presence,
 )
-"""The premises that a run decides of which V is known."""
+"""Checks of the premises that only a run with a known V decides."""
 
 
 def _describe_stretch(energies: Mapping[str, SiteEnergy], from_s: float, to_s: float) -> str:
-    """Returns from when on all sites follow in a stretch of time, and if the delays are
-    constant then.
+    """Returns a phrase on a stretch of time: when all sites follow, and whether delays vary.
+
+    Args:
+        energies: energies of every site.
+        from_s: start of the stretch, in s.
+        to_s: end of the stretch, in s.
     """
-    follow_s = from_s
-    varying = []
+    all_follow_s = from_s
     for energy in energies.values():
         records = energy.motion.records
-        apart = (
-            records.known & ~records.follows & (records.t_s >= from_s) & (records.t_s < to_s)
-        )
-        if apart.any():
-            follow_s = max(
-                follow_s, float(records.t_s[np.flatnonzero(apart)[-1]]) + records.h_s
-            )
+        inside = (records.t_s >= from_s) & (records.t_s < to_s)
+        not_following = records.known & ~records.follows & inside
+        if not_following.any():
+            last_row = np.flatnonzero(not_following)[-1]
+            all_follow_s = max(all_follow_s, float(records.t_s[last_row]) + records.h_s)
     stretch = f"{from_s:.4g} to {to_s:.4g} s"
-    if to_s - follow_s < LEAST_ABSENCE_S:
+    if to_s - all_follow_s < LEAST_ABSENCE_S:
         return f"{stretch} not all follow"
+    varying = []
     for site, energy in energies.items():
         records = energy.motion.records
-        inside = records.known & (records.t_s >= follow_s) & (records.t_s < to_s)
+        inside = records.known & (records.t_s >= all_follow_s) & (records.t_s < to_s)
         for peer, view in energy.followed.items():
             age_s = (records.t_s - view.stamp_s)[inside & np.isfinite(view.stamp_s)]
             if len(age_s) and np.ptp(age_s) > CONSTANT_DELAY_TOLERANCE_S:
                 varying.append(f"{peer}->{site}")
-    delays = f"ages vary ({_list(varying)})" if varying else "delays are constant"
-    return f"{stretch} all follow from {follow_s:.4g} s on, {delays}"
+    delays = f"ages vary ({_join_limited(varying)})" if varying else "delays are constant"
+    return f"{stretch} all follow from {all_follow_s:.4g} s on, {delays}"
 
 
 def find_unjudged_spans(balance: EnergyBalance) -> list[tuple[float, float]]:
-    """Returns the times between which records are missing, s."""
-    edges = np.flatnonzero(
-        np.diff(np.concatenate([[True], balance.judged, [True]]).astype(np.int8))
-    )
+    """Returns the (start, end) of every span in which records are missing, in s."""
+    padded = np.concatenate([[True], balance.judged, [True]])
+    edges = np.flatnonzero(np.diff(padded.astype(np.int8)))
     times = balance.t_s[edges]
     return list(zip(times[::2].tolist(), times[1::2].tolist(), strict=True))
 
 
-def _list(words: Sequence[str]) -> str:
-    more = f" and {len(words) - MAX_LISTED_NAMES} more" if len(words) > MAX_LISTED_NAMES else ""
-    return ", ".join(words[:MAX_LISTED_NAMES]) + more
+def _join_limited(items: Sequence[str]) -> str:
+    """Returns items separated by commas; beyond `MAX_LISTED_NAMES`, how many more there are."""
+    text = ", ".join(items[:MAX_LISTED_NAMES])
+    hidden = len(items) - MAX_LISTED_NAMES
+    return f"{text} and {hidden} more" if hidden > 0 else text
 
 
-def _per_site(values: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+def _format_by_site(values: Mapping[str, float]) -> str:
+    return ", ".join(f"{site} {value:.4g}" for site, value in values.items())
 
 
 class Evidence(NamedTuple):
     """The records that a certificate rests on.
 
     Attributes:
-        coverage: ticks of every site that have a record, and those of the run.
+        coverage: recorded ticks and expected ticks of every site.
         functional_share: share of the periods of V that rest on records, while no site was
-            away; None without V.
-        min_coverage: the least share of either that passes.
-        integrity: whether the log is as it was made.
-        unmet: sites of an open-loop rerun that met samples which are not in the file.
+            absent; None without V.
+        min_coverage: least share, of ticks and of periods, that passes.
+        integrity: whether the log is unchanged since it was written.
+        unmet: sites that an open-loop rerun took over as recorded.
     """
 
     coverage: Coverage
@@ -595,21 +648,19 @@ class Evidence(NamedTuple):
 
     @property
     def reasons(self) -> list[str]:
-        """What leaves the run open, in words."""
-        found = (
-            []
-            if self.integrity.passed
-            else [f"the log is not as it was made: {self.integrity.text}"]
-        )
+        """Sentences on everything in the evidence that leaves the run open."""
+        reasons = []
+        if not self.integrity.passed:
+            reasons.append(f"the log is not as it was made: {self.integrity.text}")
         if self.coverage.share < self.min_coverage:
-            found.append(f"records are missing: {self.coverage.describe(self.min_coverage)}")
+            reasons.append(f"records are missing: {self.coverage.describe(self.min_coverage)}")
         if self.functional_share is not None and self.functional_share < self.min_coverage:
-            found.append(
-                f"V is judged over {100.0 * self.functional_share:.4g} % of its periods"
-            )
+            percent = 100.0 * self.functional_share
+            reasons.append(f"V is judged over {percent:.4g} % of its periods")
         if self.unmet:
-            found.append(f"{' and '.join(self.unmet)}, as recorded, did not react to this run")
-        return found
+            sites = " and ".join(self.unmet)
+            reasons.append(f"{sites}, as recorded, did not react to this run")
+        return reasons
 
     @property
     def text(self) -> str:
@@ -629,24 +680,29 @@ class Evidence(NamedTuple):
 
 
 def collect_evidence(run: RunFacts, min_coverage: float) -> Evidence:
-    """Returns what a certificate of a log rests on: of V the periods in which no site was away."""
+    """Returns the evidence for a certificate: coverage, integrity, and the judged share of V.
+
+    Args:
+        run: facts of the run.
+        min_coverage: least share, of ticks and of periods of V, that passes.
+    """
     log = run.log
-    known = run.functional
-    share = None
-    if known is not None and not known.groups:
-        t_s = known.balance.t_s
-        judged = known.balance.judged
-        asked = np.ones(len(judged), dtype=np.bool_)
-        for from_s, to_s in set(find_unjudged_spans(known.balance)) - set(known.unjudged):
-            asked &= (t_s[:-1] < from_s) | (t_s[:-1] >= to_s)
-        share = float(judged[asked].mean()) if asked.any() else 0.0
-    unmet = tuple(site for site in log.sites if site not in log.executed_sites)
-    there = {site: len(np.unique(log[site].tick)) for site in log.sites}
-    coverage = Coverage(there, {site: log.expected_ticks(site) for site in log.sites})
+    facts = run.functional
+    functional_share = None
+    if facts is not None and not facts.groups:
+        t_s = facts.balance.t_s
+        judged = facts.balance.judged
+        all_present = np.ones(len(judged), dtype=np.bool_)
+        # spans that are unjudged because a site was absent do not count against the share
+        for from_s, to_s in set(find_unjudged_spans(facts.balance)) - set(facts.unjudged):
+            all_present &= (t_s[:-1] < from_s) | (t_s[:-1] >= to_s)
+        functional_share = float(judged[all_present].mean()) if all_present.any() else 0.0
+    recorded_ticks = {site: len(np.unique(log[site].tick)) for site in log.sites}
+    expected_ticks = {site: log.expected_ticks(site) for site in log.sites}
     return Evidence(
-        coverage=coverage,
-        functional_share=share,
+        coverage=Coverage(recorded_ticks, expected_ticks),
+        functional_share=functional_share,
         min_coverage=min_coverage,
         integrity=judge_integrity(log),
-        unmet=unmet,
+        unmet=tuple(site for site in log.sites if site not in log.executed_sites),
     )

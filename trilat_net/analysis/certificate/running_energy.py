@@ -1,11 +1,16 @@
-"""V of a session while it runs, and the work of operator and environment, from the newest
-records.
+"""Computes V, and the work of operators and environments, while a session runs.
 
-Invariant: V is that of `certify` at the same instants, to rounding: the same functions over the
-records of a window that reaches back to the oldest sample in use. Nothing is estimated: a time
-whose records are not all there yet waits for them, and is passed over if they cannot be had. A
-window is bounded; a record may come late, out of order or twice, and what is not there is not
-known, as in `AlignedRecords`.
+The newest records of every site are kept in a window. V is computed by the functions of
+`certify`, over the records of these windows.
+
+Invariant:
+    - V equals that of `certify` at the same instants, up to rounding: the windows reach back to
+      the oldest sample in use.
+    - Nothing is extrapolated: an instant waits until its records are complete, and is skipped
+      if they cannot be had.
+    - The size of a window is bounded.
+    - A record may arrive late, out of order or twice. Ticks without a record are marked
+      unknown, as in `AlignedRecords`.
 """
 
 from collections.abc import Iterable, Mapping
@@ -33,6 +38,7 @@ from ..dominance_history import (
     list_scripted_ramps,
 )
 from .energy_balance import (
+    SiteEnergy,
     compute_energy_balance,
     derive_site_energies,
     find_common_times,
@@ -41,91 +47,107 @@ from .energy_balance import (
 from .premises import describe_closed_groups, explain_no_functional
 
 STEP_S = 0.25
-"""The least time that is computed at once, s."""
+"""Shortest span over which V is computed in one call, s."""
 LONGEST_STEP_S = 2.0
-"""The longest, s: what is behind by more catches up in several steps."""
-KEPT_S = 12.0
-"""Records that are kept at least: the largest age of a sample, and the time in which a gap is
-filled.
+"""Longest span over which V is computed in one call, s; a longer backlog takes several
+calls.
 """
+KEPT_S = 12.0
+"""Least time that a window reaches back, s: it covers the largest age of a sample, and the time
+within which a gap is filled.
+"""
+_NEVER_TICK = -(2**40)
+_RAMP_MARGIN_S = 1.0
+"""Ramps are kept until this long after they were superseded, s."""
 
 
 class RecordWindow:
-    """The records of one site, from `first` on; `newest` is the last one's tick, -1 before the
-    first.
+    """The newest records of one site.
 
     Args:
         scenario: the session's scenario.
-        site: whose records these are.
-        kept_s: how far back they reach at least, s.
+        site: name of the site.
+        kept_s: least time that the window reaches back, in s.
+
+    Attributes:
+        first: the oldest tick of the window.
+        newest: the newest recorded tick; -1 before the first record.
     """
 
     def __init__(self, scenario: Scenario, site: str, kept_s: float = KEPT_S) -> None:
+        spec = scenario.sites[site]
         self.site = site
-        self.rate_hz = scenario.sites[site].rate_hz
+        self.rate_hz = spec.rate_hz
         self.peers = scenario.peers(site)
-        self._axes = scenario.arms[site].axes
-        layout = scenario.layout(site)
-        names = (
-            *RECORD_COLUMNS,
-            *(TASK_VECTORS if layout.task else ()),
-            *(("hand",) if layout.hand else ()),
-        )
-        lengths = layout.lengths()
-        ends = list(accumulate(lengths[name] for name in names))
-        self._columns = {
-            name: slice(*span) for name, span in zip(names, pairwise([0, *ends]), strict=True)
-        }
-        self._kept = max(8, round(kept_s * self.rate_hz))
-        self._floats = np.zeros((2 * self._kept, ends[-1]))
-        self._used = np.full((2 * self._kept, len(self.peers)), -1, dtype=np.int64)
-        self._known = np.zeros(2 * self._kept, dtype=np.bool_)
-        self._follows, self._rests = np.zeros((2, 2 * self._kept), dtype=np.bool_)
-        self._limits = scenario.sites[site].limits
         self.first = 0
         self.newest = -1
-        self._glides = scenario.sites[site].on_stale.action == "glide"
-        self._rested_at = -(2**40)
+        self._axes = scenario.arms[site].axes
+        self._limits = spec.limits
+        self._kept = max(8, round(kept_s * self.rate_hz))
+        capacity = 2 * self._kept
+        layout = scenario.layout(site)
+        names = [*RECORD_COLUMNS]
+        if layout.task:
+            names += TASK_VECTORS
+        if layout.hand:
+            names.append("hand")
+        lengths = layout.lengths()
+        ends = list(accumulate(lengths[name] for name in names))
+        spans = pairwise([0, *ends])
+        self._columns = {name: slice(*span) for name, span in zip(names, spans, strict=True)}
+        self._floats = np.zeros((capacity, ends[-1]))
+        self._used = np.full((capacity, len(self.peers)), -1, dtype=np.int64)
+        self._known = np.zeros(capacity, dtype=np.bool_)
+        self._follows = np.zeros(capacity, dtype=np.bool_)
+        self._rests = np.zeros(capacity, dtype=np.bool_)
+        self._glides = spec.on_stale.action == "glide"
+        self._last_resting_tick = _NEVER_TICK
 
     def receive(self, record: State) -> bool:
-        """Adds a record; false if it is older than the window, or says that the site diverged."""
+        """Stores a record.
+
+        Returns:
+            False if the record is older than the window, or says that the site diverged.
+        """
         if record.tick < self.first or record.mode == "diverged":
             return False
         if self.newest < 0:
             self.first = max(0, record.tick - self._kept)
-        if record.tick - self.first >= 2 * self._kept:
-            self._move(record.tick - self._kept + 1)
+        if record.tick - self.first >= len(self._floats):
+            self._shift_to(record.tick - self._kept + 1)
         row = record.tick - self.first
         for name, columns in self._columns.items():
             self._floats[row, columns] = getattr(record, name)
         self._used[row] = [record.used.get(peer, -1) for peer in self.peers]
         if self._glides and record.mode in RESTING_MODES:
-            self._rested_at = max(self._rested_at, record.tick)
-        since = record.tick - self._rested_at
+            self._last_resting_tick = max(self._last_resting_tick, record.tick)
+        ticks_since_rest = record.tick - self._last_resting_tick
         self._known[row] = True
-        self._rests[row] = 0 <= since <= RESUMING_S * self.rate_hz
-        free = self._limits.qd_des_limit_rad_s is None or find_unlimited_rows(
-            self._limits, np.array(record.qd_des)
-        )
-        self._follows[row] = record.mode == "run" and free
+        self._rests[row] = 0 <= ticks_since_rest <= RESUMING_S * self.rate_hz
+        self._follows[row] = record.mode == "run" and self._is_unlimited(record)
         self.newest = max(self.newest, record.tick)
         return True
 
-    def _move(self, first: int) -> None:
-        left = max(0, self.newest + 1 - first)
-        for column in (self._floats, self._used, self._known, self._follows, self._rests):
-            column[:left] = column[first - self.first :][:left].copy()
-        self._known[left:] = False
+    def _is_unlimited(self, record: State) -> bool:
+        """True if the reference of a record moves slower than it may."""
+        if self._limits.qd_des_limit_rad_s is None:
+            return True
+        return bool(find_unlimited_rows(self._limits, np.array(record.qd_des)))
+
+    def _shift_to(self, first: int) -> None:
+        """Drops the records before tick `first`, and moves the others to the front."""
+        remaining = max(0, self.newest + 1 - first)
+        for rows in (self._floats, self._used, self._known, self._follows, self._rests):
+            rows[:remaining] = rows[first - self.first :][:remaining].copy()
+        self._known[remaining:] = False
         self.first = first
 
     def has_record(self, tick: int) -> bool:
-        """True if there is a record of a tick."""
+        """True if the window has a record of tick `tick`."""
         return self.first <= tick <= self.newest and bool(self._known[tick - self.first])
 
     def rows(self, first: int, last: int) -> AlignedRecords:
-        """Returns the records of ticks in the window, both ends included; a missing one is
-        interpolated.
-        """
+        """Returns the records of ticks `first` to `last`; missing records are interpolated."""
         part = slice(first - self.first, last + 1 - self.first)
         known = self._known[part].copy()
         floats = self._floats[part]
@@ -134,34 +156,40 @@ class RecordWindow:
         rests = self._rests[part].copy()
         if not known.all() and known.any():
             floats = floats.copy()
-            there = np.flatnonzero(known)
+            ticks = np.arange(len(known))
+            known_rows = np.flatnonzero(known)
             for column in floats.T:
-                column[:] = np.interp(np.arange(len(known)), there, column[there])
-            before = there[
-                np.maximum(np.searchsorted(there, np.arange(len(known)), side="right") - 1, 0)
-            ]
-            used = used[before]
-            follows = follows[before]
-            rests = rests[before]
+                column[:] = np.interp(ticks, known_rows, column[known_rows])
+            # what is no number is that of the last record before the gap
+            preceding = np.searchsorted(known_rows, ticks, side="right") - 1
+            last_known = known_rows[np.maximum(preceding, 0)]
+            used = used[last_known]
+            follows = follows[last_known]
+            rests = rests[last_known]
         columns: dict[str, Any] = {
-            name: floats[:, where] for name, where in self._columns.items()
+            name: floats[:, span] for name, span in self._columns.items()
         }
         return AlignedRecords(
-            *(self.site, self.rate_hz, first, known, follows),
-            **columns,
+            site=self.site,
+            rate_hz=self.rate_hz,
+            first=first,
+            known=known,
+            follows=follows,
             used={peer: used[:, n] for n, peer in enumerate(self.peers)},
             axes=self._axes,
             rests=rests,
+            **columns,
         )
 
 
 class EnergyCourse(NamedTuple):
-    """V over some instants.
+    """The functional V over some instants.
 
     Attributes:
-        t_s: instants, ticks of the fastest site, s.
-        V: the functional, J.
-        supplied: work of operator and environment since the first instant of all, J.
+        t_s: instants, at ticks of the fastest site, shape (T,), s.
+        V: the functional, shape (T,), J.
+        supplied: work of operators and environments since the first computed instant, shape
+            (T,), J.
     """
 
     t_s: Array
@@ -170,90 +198,103 @@ class EnergyCourse(NamedTuple):
 
 
 class RunningEnergy:
-    """V of a running session; `reason` says why there is none, "" if there is.
+    """Computes V of a running session, span by span.
 
     Args:
         scenario: the session's scenario.
-        windows: the records of every site, as they come in.
+        windows: the newest records of every site, which are updated while the session runs.
+
+    Attributes:
+        reason: the reason why V cannot be computed; "" if it can.
     """
 
     def __init__(self, scenario: Scenario, windows: Mapping[str, RecordWindow]) -> None:
         self.reason = explain_no_functional(scenario)
-        if any(spec.on_stale.rule.degrades for spec in scenario.sites.values()):
-            self.reason = (
-                self.reason or "shares change when a peer is lost: trilat certify tells V"
-            )
+        degrades = any(spec.on_stale.rule.degrades for spec in scenario.sites.values())
+        if degrades and not self.reason:
+            self.reason = "shares change when a peer is lost: `trilat certify` computes V"
         self._scenario = scenario
         self._windows = windows
         self._dominance = {site: list_scripted_ramps(scenario, site) for site in windows}
-        self._done_s: float | None = None
+        self._computed_until_s: float | None = None
         self._supplied = 0.0
 
     def add_changes(self, site: str, changes: Iterable[CoreChange]) -> None:
-        """Notes changes that a site took in; those of its dominance factors count."""
-        self._dominance[site][1].extend(
-            change.ramp for change in changes if change.ramp is not None
-        )
+        """Adds changes that a site applied; only those of its dominance factors matter."""
+        _, ramps = self._dominance[site]
+        ramps.extend(change.ramp for change in changes if change.ramp is not None)
 
     def compute_next(self, complete: Mapping[str, int]) -> EnergyCourse | None:
-        """Returns V since the last call; None if it is not known yet.
+        """Returns V since the last call; None if no further span is complete yet.
 
-        `complete` has of every site the last tick up to which all records are there or cannot
-        be had.
+        Args:
+            complete: for every site, the last tick up to which each record has arrived or
+                cannot be had.
         """
         if self.reason or min(complete.values()) < 1:
             return None
         windows = self._windows
-        end_s = min(complete[site] / windows[site].rate_hz for site in windows)
+        complete_s = min(complete[site] / window.rate_hz for site, window in windows.items())
         oldest_s = max(window.first / window.rate_hz for window in windows.values())
-        if self._done_s is None:
-            self._done_s = oldest_s
-        if end_s - self._done_s < STEP_S:
+        if self._computed_until_s is None:
+            self._computed_until_s = oldest_s
+        if complete_s - self._computed_until_s < STEP_S:
             return None
-        begin_s = max(self._done_s, oldest_s)
-        end_s = min(end_s, begin_s + LONGEST_STEP_S)
-        self._done_s = end_s
-        return self._compute(begin_s, end_s)
+        begin_s = max(self._computed_until_s, oldest_s)
+        end_s = min(complete_s, begin_s + LONGEST_STEP_S)
+        self._computed_until_s = end_s
+        return self._compute_span(begin_s, end_s)
 
-    def _compute(self, begin_s: float, end_s: float) -> EnergyCourse | None:
-        """Returns V between two times; the first of them was there at the call before."""
-        spans = {
+    def _compute_span(self, begin_s: float, end_s: float) -> EnergyCourse | None:
+        """Returns V between two times; the first one ended the span before."""
+        tick_spans = {
             site: (
-                int(np.ceil(begin_s * w.rate_hz - 1e-6)),
-                int(np.floor(end_s * w.rate_hz + 1e-6)),
+                int(np.ceil(begin_s * window.rate_hz - 1e-6)),
+                int(np.floor(end_s * window.rate_hz + 1e-6)),
             )
-            for site, w in self._windows.items()
+            for site, window in self._windows.items()
         }
-        if any(last - first < 1 for first, last in spans.values()):
+        if any(last - first < 1 for first, last in tick_spans.values()):
             return None
-        records = {site: self._windows[site].rows(*span) for site, span in spans.items()}
-        reach = {site: first for site, (first, _) in spans.items()}
-        for own in records.values():
-            for peer, used in own.used.items():
-                reach[peer] = min(reach[peer], max(int(used.min()) - 2, 0))
-        pasts = {}
-        for site, window in self._windows.items():
-            from_tick = max(reach[site], window.first)
-            pasts[site] = PeerTrajectory(window.rows(from_tick, spans[site][1]))
-        energies = derive_site_energies(self._scenario, records, pasts, self._trace)
+        energies = self._derive_energies(tick_spans)
         for alpha in find_dominance_matrices(energies):
-            if len(groups := find_closed_groups(alpha)) > 1:
-                names = list(records)
-                self.reason = describe_closed_groups(
-                    [[names[n] for n in group] for group in groups[:2]]
-                )
+            groups = find_closed_groups(alpha)
+            if len(groups) > 1:
+                sites = list(energies)
+                names = [[sites[n] for n in group] for group in groups[:2]]
+                self.reason = describe_closed_groups(names)
                 return None
-        balance = (
-            compute_energy_balance(energies) if len(find_common_times(energies)) > 1 else None
-        )
-        for site, known in self._dominance.items():
-            self._dominance[site] = drop_finished_ramps(*known, begin_s - 1.0)
-        # a session that was joined late: what was under way then is not known
+        is_known = len(find_common_times(energies)) > 1
+        balance = compute_energy_balance(energies) if is_known else None
+        for site, (start, ramps) in self._dominance.items():
+            self._dominance[site] = drop_finished_ramps(start, ramps, begin_s - _RAMP_MARGIN_S)
+        # no balance yet: the session was joined late, and what was under way then is unknown
         if balance is None:
             return None
         supplied = self._supplied + balance.external_work
         self._supplied = float(supplied[-1])
         return EnergyCourse(balance.t_s, balance.V, supplied)
 
-    def _trace(self, site: str, t_s: Array) -> DominanceHistory:
-        return evaluate_ramps(*self._dominance[site], t_s, 1.0 / self._windows[site].rate_hz)
+    def _derive_energies(
+        self, tick_spans: Mapping[str, tuple[int, int]]
+    ) -> dict[str, SiteEnergy]:
+        """Returns the energies of all sites over their spans of ticks, (first, last) each."""
+        windows = self._windows
+        records = {
+            site: windows[site].rows(first, last) for site, (first, last) in tick_spans.items()
+        }
+        # the first tick of each site of which a peer may still use the sample
+        oldest_used = {site: first for site, (first, _) in tick_spans.items()}
+        for site_records in records.values():
+            for peer, used in site_records.used.items():
+                oldest_used[peer] = min(oldest_used[peer], max(int(used.min()) - 2, 0))
+        pasts = {}
+        for site, window in windows.items():
+            first = max(oldest_used[site], window.first)
+            _, last = tick_spans[site]
+            pasts[site] = PeerTrajectory(window.rows(first, last))
+        return derive_site_energies(self._scenario, records, pasts, self._trace_dominance)
+
+    def _trace_dominance(self, site: str, t_s: Array) -> DominanceHistory:
+        start, ramps = self._dominance[site]
+        return evaluate_ramps(start, ramps, t_s, 1.0 / self._windows[site].rate_hz)

@@ -1,10 +1,12 @@
-"""Stability certificate of a log: premises, energy balance, end of the run and the verdict,
-also as JSON.
+"""Issues the stability certificate of a log: premises, energy balance, end of the run, verdict.
 
-Invariant: V falls except for supplied energy. A rise beyond operator and environment is
-reported with its time, amount and sources; energy without a source means that the log's
-equations did not produce it. What a log cannot decide is stated: without a functional the end
-of the run alone decides. JSON keys end in their unit, and unknown values are null.
+Invariant:
+    - By the theorem V does not rise except by supplied energy. A rise beyond the work of
+      operators and environments is reported with its time, amount and sources.
+    - Energy without a source means that the log's equations did not produce the records.
+    - Anything that a log cannot decide is stated. Without a functional V the end of the run
+      alone decides.
+    - JSON keys end in their unit, and unknown values are null.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -43,27 +45,30 @@ from .premises import (
 )
 
 BROKEN_BALANCE_SHARE = 2e-4
-"""Largest unexplained energy as a share of the scale, beyond the uncertainty of the trapezoid
+"""Largest unexplained energy as a share of the scale, beyond the error of the trapezoid
 rule.
 """
 CLEAR_BREAK_SHARE = 1e-3
-"""With more than this, and no uncertainty of that size, the period is not the cause."""
+"""A larger share than this, with a smaller uncertainty, cannot be due to a long period."""
 TORQUE_TOLERANCE = 1e-6
-"""A recorded torque that differs from Eq. (13) by more, relative to 1 + |tau|, was not made by
-it.
-"""
+"""Largest difference of a recorded torque from Eq. (13), relative to 1 + |tau|."""
 COARSE_TOLERANCE_SHARE = 1e-2
 """A tolerance above this share of the scale decides nothing about a rise."""
+NOTABLE_CAUSE_SHARE = 0.05
+"""A source is named as a cause of a rise if it supplied more than this share of the rise."""
 
 FALSE_RECORDS_TEXT = "these records were not made by the equations that the log claims"
-_PERIOD_OR_FALSE = f"the period is too long for these gains, or {FALSE_RECORDS_TEXT}; `trilat verify` tells which"
+_PERIOD_OR_FALSE = (
+    f"the period is too long for these gains, or {FALSE_RECORDS_TEXT}; "
+    "`trilat verify` tells which"
+)
 
 
-_REFUTES = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
+_REFUTING_FINDINGS = (ObservedFinding.NEGATIVE, ObservedFinding.BROKEN)
 
 
 class StabilityFinding(StrEnum):
-    """Class of a verdict; the text is the word for people."""
+    """Class of a verdict on V; the value is the text for people."""
 
     COVERED = "covered by the theorem"
     DID_NOT_RISE = "outside the theorem, yet V did not rise"
@@ -73,12 +78,14 @@ class StabilityFinding(StrEnum):
 
 
 class FunctionalRise(NamedTuple):
-    """The largest rise of V that operator and environment did not supply.
+    """The largest rise of V that operators and environments did not supply.
 
     Attributes:
-        from_s, at_s: when V was lowest before it, and when it was highest, s.
-        amount: its size, J.
-        causes: the sources of more than 5 % of it and their work in between, J, largest first.
+        from_s: time of the minimum of V before the rise, in s.
+        at_s: time of the highest V, in s.
+        amount: size of the rise, in J.
+        causes: work of each source during the rise, in J, largest first; only sources of more
+            than 5 % of the rise.
     """
 
     from_s: float
@@ -88,11 +95,13 @@ class FunctionalRise(NamedTuple):
 
 
 class StabilityVerdict(NamedTuple):
-    """Verdict on V: its class and the sentence.
+    """Verdict on V.
 
     Attributes:
+        finding: class of the verdict.
+        text: the verdict as a sentence.
         rise: the largest rise beyond the tolerance; None if V did not rise.
-        tolerance: the size that a rise must exceed, J.
+        tolerance: size that a rise must exceed to count, in J.
     """
 
     finding: StabilityFinding
@@ -102,16 +111,16 @@ class StabilityVerdict(NamedTuple):
 
 
 class EndPoseRoots(NamedTuple):
-    """The loop linearised where a run ended.
+    """Characteristic roots of the loop, linearised at the pose at which a run ended.
 
     Attributes:
-        verdict: stable, unstable or at the edge, of small motions there; "" if there is no such
-            loop.
-        rate_per_s: the largest real part of a root that is not zero by structure, 1/s; None
-            without one.
-        exact: True of the sampled loop where delays repeat; else the roots are no proof, but
-            may be a doubt.
-        text: the rest and its roots, or why there are none.
+        verdict: "stable", "unstable" or "at the edge", for small motions; "" if no such loop
+            exists.
+        rate_per_s: the largest real part of all roots that are not zero by structure, 1/s; None
+            if there is no such root.
+        exact: True if the roots are those of the sampled loop with repeating delays; otherwise
+            they may raise a doubt, but prove nothing.
+        text: the pose and its roots, or the reason why there are none.
     """
 
     verdict: str
@@ -125,15 +134,19 @@ class Certificate(Result):
     """Stability certificate of a log.
 
     Attributes:
-        premises, verdict, end: of the theorem, on V, and of the run from e and qd alone.
-        evidence: how much of the run the log has, and that nothing was changed.
-        balance: of all sites; None without a functional, or if beta is not unique.
-        paper_balance: the same with the paper's weights; None if those are right, or without a balance.
-        groups: closed groups of sites, if there are several: then beta is not unique.
-        energies: of every site; {} without a functional.
-        roots: of the loop where the run ended; None if nobody looked.
-        observed: of the energies that laws declare; None if none does.
-        twins: what became of small pushes; None if nobody looked.
+        premises: the premises of the theorem, each checked.
+        verdict: verdict on V.
+        end: end of the run, judged from e and qd alone.
+        evidence: coverage of the run by records, and integrity of the log.
+        balance: energy balance of all sites; None without a functional, or if beta is not
+            unique.
+        paper_balance: balance with the paper's weights, ones; None if these are the right
+            weights, or if there is no balance.
+        groups: closed groups of sites, if there are several: beta is not unique then.
+        energies: energies of every site; {} without a functional.
+        roots: roots of the loop at the pose where the run ended; None if not computed.
+        observed: verdict on the energies that laws declare; None if no law declares any.
+        twins: growth of small pushes; None if not computed.
     """
 
     premises: list[Premise]
@@ -150,84 +163,88 @@ class Certificate(Result):
 
     @property
     def paper_weights_rise(self) -> FunctionalRise | None:
-        """The largest rise of V with the paper's weights; None if it did not rise, or if they
-        are right.
-        """
-        return (
-            None
-            if self.paper_balance is None
-            else _find_largest_rise(self.paper_balance, self.verdict.tolerance)
-        )
+        """The largest rise of V with the paper's weights; None if V does not rise with them."""
+        if self.paper_balance is None:
+            return None
+        return _find_largest_rise(self.paper_balance, self.verdict.tolerance)
 
     @property
     def bounded_by_v(self) -> bool:
-        """True if V bounds every site: it did not rise, and no site's weight in it is zero.
+        """True if V bounds every site: V did not rise, and no site's weight is zero.
 
-        A site of no weight is bounded as well if the dominance factors are all that fails: it
-        converges after those that it follows (docs/errata.md, 11).
+        A site of zero weight is bounded as well if the premise on dominance factors is the only
+        one that fails: the site converges after the sites that it follows (docs/errata.md, 11).
         """
-        sound = (StabilityFinding.COVERED, StabilityFinding.DID_NOT_RISE)
-        if self.balance is None or self.verdict.finding not in sound:
+        did_not_rise = (StabilityFinding.COVERED, StabilityFinding.DID_NOT_RISE)
+        if self.balance is None or self.verdict.finding not in did_not_rise:
             return False
+        if (self.balance.beta > 0.0).all():
+            return True
         failed = [premise.name for premise in self.premises if premise.holds is not True]
         constant = all(energy.motion.dominance.constant for energy in self.energies.values())
-        return bool((self.balance.beta > 0.0).all()) or (failed == ["shares"] and constant)
+        return failed == ["shares"] and constant
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """What leaves the run open or false, in words: of the log, its end, V, the roots at its
-        end pose.
+        """Sentences on everything that leaves the run open or refutes it.
+
+        They concern the end of the run, its twins, V, the roots at the end pose, the energies
+        that laws declare, and the log.
         """
-        broken = self.verdict.finding is StabilityFinding.BROKEN
-        found = [self.verdict.text] if broken else []
-        if self.balance is not None and not broken:
-            found += describe_unsupplied_growth(self.balance, self.verdict.tolerance)
-        roots = self.roots
-        twins = self.twins
-        if roots is not None and roots.verdict == "unstable":
-            doubt = None if roots.exact else roots.rate_per_s
-            if doubt is None or twins is None or doubt <= twins.excluded_rate_per_s:
-                # roots that are no proof give way to pushes in the run's own ticks
-                found.append(roots.text)
-        if self.observed is not None and self.observed.finding in _REFUTES:
-            found.append(self.observed.text)
-        told = self._by_twins.reason
-        return (*self.end.reasons, *([told] if told else []), *found, *self.evidence.reasons)
+        reasons = [*self.end.reasons]
+        twin_reason = self._twin_verdict.reason
+        if twin_reason:
+            reasons.append(twin_reason)
+        if self.verdict.finding is StabilityFinding.BROKEN:
+            reasons.append(self.verdict.text)
+        elif self.balance is not None:
+            reasons += describe_unsupplied_growth(self.balance, self.verdict.tolerance)
+        if self.roots is not None and self.roots.verdict == "unstable":
+            doubtful_rate = None if self.roots.exact else self.roots.rate_per_s
+            twins = self.twins
+            # roots that are not exact give way to twins, which rerun the recorded ticks
+            if (
+                doubtful_rate is None
+                or twins is None
+                or doubtful_rate <= twins.excluded_rate_per_s
+            ):
+                reasons.append(self.roots.text)
+        if self.observed is not None and self.observed.finding in _REFUTING_FINDINGS:
+            reasons.append(self.observed.text)
+        reasons += self.evidence.reasons
+        return tuple(reasons)
 
     @property
-    def _by_twins(self) -> TwinVerdict:
+    def _twin_verdict(self) -> TwinVerdict:
         if self.twins is None:
             return TwinVerdict(self.end.stability)
-        known = {"stable": True, "unstable": False}
-        settles = (
-            known.get(self.roots.verdict)
-            if self.roots is not None and self.roots.exact
-            else None
-        )
+        settles = None
         if self.verdict.finding is StabilityFinding.COVERED:
             settles = True
+        elif self.roots is not None and self.roots.exact:
+            settles = {"stable": True, "unstable": False}.get(self.roots.verdict)
         rose = self.verdict.finding is StabilityFinding.ROSE
         return judge_end_by_twins(self.end, self.twins, settles=settles, rises=rose)
 
     @property
     def stability(self) -> Stability:
-        """The judgement: of its end and its twins; what else is known may leave a stable run
-        open.
-        """
-        own = self._by_twins.stability
-        return Stability.OPEN if own is Stability.STABLE and self.reasons else own
+        """Judgement by the end of the run and its twins; reasons leave a stable run open."""
+        stability = self._twin_verdict.stability
+        if stability is Stability.STABLE and self.reasons:
+            return Stability.OPEN
+        return stability
 
     @property
     def passed(self) -> bool:
-        """Decides the exit code: the run is stable."""
+        """True if the run is stable; decides the exit code."""
         return self.accepts(())
 
     def headline(self) -> str:
         """Returns the judgement, and how the run ended."""
-        by_twins = (
-            self.stability is Stability.STABLE and self.end.stability is not Stability.STABLE
-        )
-        return f"{self.stability}: {self.end.behaviour}{', yet every push dies away' if by_twins else ''}"
+        text = f"{self.stability}: {self.end.behaviour}"
+        if self.stability is Stability.STABLE and self.end.stability is not Stability.STABLE:
+            text += ", yet every push dies away"
+        return text
 
     def to_dict(self) -> JsonObject:
         """Returns plain values, with the keys of `trilat certify --json`."""
@@ -265,153 +282,171 @@ class Certificate(Result):
         return [premise._asdict() for premise in self.premises]
 
     def accepts(self, accepted: Collection[str]) -> bool:
-        """True if the run is stable, or bounded or open where that is accepted.
+        """True if the run is stable, or "bounded" or "open" and that is accepted.
 
-        Never with a broken balance or a changed log.
+        A run with a broken energy balance or a changed log is never accepted.
         """
-        if (
-            self.verdict.finding is StabilityFinding.BROKEN
-            or not self.evidence.integrity.passed
-        ):
+        if self.verdict.finding is StabilityFinding.BROKEN:
             return False
-        bounded = "bounded" in accepted and self.end.behaviour is EndBehaviour.BOUNDED
-        opened = "open" in accepted and self.stability is Stability.OPEN
-        return bounded or opened or self.stability is Stability.STABLE
+        if not self.evidence.integrity.passed:
+            return False
+        if "bounded" in accepted and self.end.behaviour is EndBehaviour.BOUNDED:
+            return True
+        if "open" in accepted and self.stability is Stability.OPEN:
+            return True
+        return self.stability is Stability.STABLE
 
 
 def certify(
     log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False
 ) -> Certificate:
-    """Returns the certificate of a log; torn, short and empty ones too.
+    """Returns the certificate of a log, which may be torn, short or empty.
 
-    Of a run of which less than `min_coverage` of every site's ticks can be judged, a stable end
-    is open. With `own_laws` the code of laws from outside runs, as far as they declare
-    energies.
+    Args:
+        log: the log of a run.
+        min_coverage: share of every site's ticks that must be judged; with less, a run with a
+            stable end is open.
+        own_laws: run the code of laws from outside the program, if they declare energies.
 
     Raises:
-        LogError: a record cannot be read, or names a change that is none.
+        LogError: a record cannot be read, or names a change that is not valid.
     """
     run = gather_facts(log)
-    known = run.functional
+    facts = run.functional
     premises = check_premises(run)
     verdict = StabilityVerdict(StabilityFinding.NOT_JUDGED, run.unknown)
-    if known is not None:
-        verdicts = (judge(known, premises) for judge in JUDGEMENTS)
+    if facts is not None:
+        verdicts = (judge(facts, premises) for judge in JUDGEMENTS)
         verdict = next(verdict for verdict in verdicts if verdict is not None)
-        verdict = verdict if known.groups else verdict._replace(tolerance=known.tolerance)
+        if not facts.groups:
+            verdict = verdict._replace(tolerance=facts.tolerance)
     if verdict.finding in (StabilityFinding.BROKEN, StabilityFinding.NOT_JUDGED):
         verdict = verdict._replace(text=f"{verdict.finding}: {verdict.text}")
-    end = classify_log_end(log)
-    observed = observe_energies(log, own_laws=own_laws)
-    found = Certificate(
-        premises, verdict, end, collect_evidence(run, min_coverage), observed=observed
+    certificate = Certificate(
+        premises=premises,
+        verdict=verdict,
+        end=classify_log_end(log),
+        evidence=collect_evidence(run, min_coverage),
+        observed=observe_energies(log, own_laws=own_laws),
     )
-    if known is None:
-        return found
-    if known.groups:
-        return replace(found, groups=known.groups, energies=known.energies)
-    alike = np.allclose(known.balance.beta, 1.0)
-    ones = None if alike else compute_energy_balance(known.energies, paper_weights=True)
-    return replace(found, balance=known.balance, paper_balance=ones, energies=known.energies)
+    if facts is None:
+        return certificate
+    if facts.groups:
+        return replace(certificate, groups=facts.groups, energies=facts.energies)
+    paper_balance = None
+    if not np.allclose(facts.balance.beta, 1.0):
+        paper_balance = compute_energy_balance(facts.energies, paper_weights=True)
+    return replace(
+        certificate,
+        balance=facts.balance,
+        paper_balance=paper_balance,
+        energies=facts.energies,
+    )
 
 
 def _judge_site_balances(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
-    """A site's balance does not close; each site counts by itself.
+    """Returns a verdict if the energy balance of some site does not close.
 
-    An arm outside of the program need not follow its theta, nor are its angles and velocities
-    measured at once; the records of any other are not what they claim, unless the period may be
-    the cause.
+    Each site is judged by itself. The arm of an external site need not follow its theta, and
+    its angles and velocities are not measured at the same instant: V cannot be judged then. The
+    records of any other site are false, unless a long period may be the cause.
     """
     energies = run.energies
     scale = run.balance.scale
 
-    def allow(site: str, share: float = BROKEN_BALANCE_SHARE) -> float:
+    def compute_bound_j(site: str, share: float = BROKEN_BALANCE_SHARE) -> float:
         return share * scale + 2.0 * energies[site].uncertainty + ZERO_ENERGY_J
 
-    worst = {site: _largest(energy.unexplained) for site, energy in energies.items()}
-    wrong = [site for site in energies if worst[site] > allow(site)]
+    error_j = {site: _largest(energy.unexplained) for site, energy in energies.items()}
+    wrong = [site for site in energies if error_j[site] > compute_bound_j(site)]
     if not wrong:
         return None
-    outside = run.log.scenario.external
-    ours = [site for site in wrong if not {*outside} & {site, *energies[site].followed}]
-    site = max(ours or wrong, key=worst.__getitem__)
+    external = run.log.scenario.external
+    simulated = [site for site in wrong if not {*external} & {site, *energies[site].followed}]
+    site = max(simulated or wrong, key=error_j.__getitem__)
     energy = energies[site]
-    at_s = energy.motion.records.t_s[int(np.argmax(np.abs(energy.unexplained) > allow(site)))]
-    amount = f"{worst[site]:.3g} J of {scale:.4g} J"
-    text = f"the energy of {site} does not add up from {at_s:.4g} s on, by {amount}"
-    if not ours:
-        why = f"the arm of {', '.join(outside)}, outside of the program, does not move as its theta says"
-        return StabilityVerdict(
-            StabilityFinding.NOT_JUDGED, f"{text}: {why}, or somebody pushes it"
-        )
-    clear = worst[site] > allow(site, CLEAR_BREAK_SHARE)
-    certain = clear and energy.uncertainty < CLEAR_BREAK_SHARE * scale
-    why = FALSE_RECORDS_TEXT if certain else _PERIOD_OR_FALSE
-    return StabilityVerdict(StabilityFinding.BROKEN, f"{text}: {why}")
+    exceeds = np.abs(energy.unexplained) > compute_bound_j(site)
+    from_s = energy.motion.records.t_s[int(np.argmax(exceeds))]
+    amount = f"{error_j[site]:.3g} J of {scale:.4g} J"
+    text = f"the energy of {site} does not add up from {from_s:.4g} s on, by {amount}"
+    if not simulated:
+        arms = f"the external arm of {', '.join(external)}"
+        text += f": {arms} does not move as its theta says, or somebody pushes it"
+        return StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
+    is_clear = error_j[site] > compute_bound_j(site, CLEAR_BREAK_SHARE)
+    is_certain = is_clear and energy.uncertainty < CLEAR_BREAK_SHARE * scale
+    reason = FALSE_RECORDS_TEXT if is_certain else _PERIOD_OR_FALSE
+    return StabilityVerdict(StabilityFinding.BROKEN, f"{text}: {reason}")
 
 
 def _judge_torques(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
-    """Recorded torques are not those of Eq. (13)."""
+    """Returns a verdict if recorded torques differ from those of Eq. (13)."""
     for site, energy in run.energies.items():
-        error = energy_terms.measure_torque_error(energy.motion)
         records = energy.motion.records
-        wrong = error > TORQUE_TOLERANCE * (1.0 + np.abs(records.tau).max(axis=1))
+        error_nm = energy_terms.measure_torque_error(energy.motion)
+        wrong = error_nm > TORQUE_TOLERANCE * (1.0 + np.abs(records.tau).max(axis=1))
         if wrong.any():
-            off = f"{error.max():.3g} N m, from {records.t_s[int(np.argmax(wrong))]:.4g} s on"
-            text = f"the torque of {site} is not that of Eq. (13), by up to {off}: {FALSE_RECORDS_TEXT}"
+            from_s = records.t_s[int(np.argmax(wrong))]
+            text = (
+                f"the torque of {site} is not that of Eq. (13), by up to "
+                f"{error_nm.max():.3g} N m, from {from_s:.4g} s on: {FALSE_RECORDS_TEXT}"
+            )
             return StabilityVerdict(StabilityFinding.BROKEN, text)
     return None
 
 
 def _judge_weights(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
-    """There is no unique beta."""
+    """Returns a verdict if beta is not unique."""
     if not run.groups:
         return None
     return StabilityVerdict(StabilityFinding.NOT_JUDGED, describe_closed_groups(run.groups))
 
 
 def _judge_precision(run: FunctionalFacts, _: Sequence[Premise]) -> StabilityVerdict | None:
-    """The energies are known too badly."""
+    """Returns a verdict if the energies are not known precisely enough."""
     scale = run.balance.scale
-    tolerance = run.tolerance
-    if tolerance <= COARSE_TOLERANCE_SHARE * scale + 2.0 * ZERO_ENERGY_J:
+    if run.tolerance <= COARSE_TOLERANCE_SHARE * scale + 2.0 * ZERO_ENERGY_J:
         return None
-    known = f"its energies are known only to {tolerance:.3g} J of {scale:.4g} J"
-    why = f"the period is too long for these gains, so that {known}"
-    return StabilityVerdict(StabilityFinding.NOT_JUDGED, why)
+    text = (
+        "the period is too long for these gains, so that its energies are known only to "
+        f"{run.tolerance:.3g} J of {scale:.4g} J"
+    )
+    return StabilityVerdict(StabilityFinding.NOT_JUDGED, text)
 
 
 def _judge_course(run: FunctionalFacts, premises: Sequence[Premise]) -> StabilityVerdict:
+    """Returns the verdict by the premises, and by whether V rose."""
     balance = run.balance
-    sources = list(run.balance.external)
     failed = [premise.name for premise in premises if premise.holds is False]
     outside = f"outside the theorem ({', '.join(failed)})"
     rise = _find_largest_rise(balance, run.tolerance)
     if rise is not None:
-        held = "though the premises of the theorem hold, which is one of continuous time"
-        causes = ", ".join(
-            f"{name} {amount:.3g} J" for name, amount in list(rise.causes.items())[:4]
+        context = outside
+        if not failed:
+            context = "though the premises of the theorem hold, which is one of continuous time"
+        largest_causes = list(rise.causes.items())[:4]
+        causes = ", ".join(f"{name} {amount:.3g} J" for name, amount in largest_causes)
+        percent = 100.0 * rise.amount / balance.V.max()
+        text = (
+            f"{context}: V rose by {rise.amount:.3g} J ({percent:.3g} % of its largest value) "
+            f"from {rise.from_s:.4g} to {rise.at_s:.4g} s"
         )
-        who = f"; given by {causes}" if causes else "; nobody gave it"
-        share = f"{100.0 * rise.amount / balance.V.max():.3g} % of its largest value"
-        text = f"V rose by {rise.amount:.3g} J ({share}) from {rise.from_s:.4g} to {rise.at_s:.4g} s{who}"
-        return StabilityVerdict(
-            StabilityFinding.ROSE, f"{outside if failed else held}: {text}", rise
-        )
+        text += f"; given by {causes}" if causes else "; nobody gave it"
+        return StabilityVerdict(StabilityFinding.ROSE, text, rise)
     first, last = (x if x > ZERO_ENERGY_J else 0.0 for x in (balance.V[0], balance.V[-1]))
-    fell = (
-        f"V rose by no more than the {' and '.join(sources)} gave"
-        if sources
-        else "V did not rise"
-    )
-    fell += (
-        f": {first:.4g} J at {balance.t_s[0]:.4g} s, {last:.4g} J at {balance.t_s[-1]:.4g} s"
-    )
+    text = "V did not rise"
+    if balance.external:
+        text = f"V rose by no more than the {' and '.join(balance.external)} gave"
+    from_s = balance.t_s[0]
+    to_s = balance.t_s[-1]
+    text += f": {first:.4g} J at {from_s:.4g} s, {last:.4g} J at {to_s:.4g} s"
     undecided = [premise.text for premise in premises if premise.holds is None]
-    text = "; ".join([fell, *undecided])
+    text = "; ".join([text, *undecided])
     if failed:
         return StabilityVerdict(StabilityFinding.DID_NOT_RISE, f"{outside}, yet {text}")
-    covered = f"{StabilityFinding.COVERED}{', as far as the log tells' if undecided else ''}"
+    covered = StabilityFinding.COVERED.value
+    if undecided:
+        covered += ", as far as the log tells"
     return StabilityVerdict(StabilityFinding.COVERED, f"{covered}: {text}")
 
 
@@ -422,14 +457,18 @@ JUDGEMENTS = (
     _judge_precision,
     _judge_course,
 )
-"""What refutes the log, what keeps V from being judged, and what V did: the first that applies
-decides.
+"""Judgements in order: whether the records are false, whether V can be judged, how V moved.
+
+The first judgement that returns a verdict decides.
 """
 
 
 def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRise | None:
-    """Returns the largest rise of V that operator and environment did not supply, if above a
-    tolerance, J.
+    """Returns the largest rise of V that was not supplied, or None if below the tolerance.
+
+    Args:
+        balance: energy balance of all sites.
+        tolerance: size that the rise must exceed, in J.
     """
     V = balance.unsupplied
     rise = rise_above_minimum(V)
@@ -437,62 +476,77 @@ def _find_largest_rise(balance: EnergyBalance, tolerance: float) -> FunctionalRi
     if rise[last] <= tolerance:
         return None
     first = int(V[: last + 1].argmin())
-    inner = {name: x for name, x in balance.work.items() if name not in EXTERNAL_SOURCES}
-    sources = {
-        **{("" if "->" in name else "the ") + name: x for name, x in inner.items()},
-        "sampling": balance.sampling,
-        "what beta does not cancel": -balance.transfer,
+    work_by_source = {}
+    for name, work in balance.work.items():
+        if name not in EXTERNAL_SOURCES:
+            is_link = "->" in name
+            work_by_source[name if is_link else f"the {name}"] = work
+    work_by_source["sampling"] = balance.sampling
+    work_by_source["what beta does not cancel"] = -balance.transfer
+    causes = {name: float(work[last] - work[first]) for name, work in work_by_source.items()}
+    largest_first = sorted(causes.items(), key=lambda cause: -cause[1])
+    notable = {
+        name: amount
+        for name, amount in largest_first
+        if amount > NOTABLE_CAUSE_SHARE * rise[last]
     }
-    causes = {name: float(x[last] - x[first]) for name, x in sources.items()}
-    ordered = sorted(causes.items(), key=lambda cause: -cause[1])
-    notable = {name: amount for name, amount in ordered if amount > 0.05 * rise[last]}
     return FunctionalRise(
-        float(balance.t_s[first]), float(balance.t_s[last]), float(rise[last]), notable
+        from_s=float(balance.t_s[first]),
+        at_s=float(balance.t_s[last]),
+        amount=float(rise[last]),
+        causes=notable,
     )
 
 
 def describe_unsupplied_growth(balance: EnergyBalance, tolerance: float) -> list[str]:
-    """Returns what V, less the work of operator and environment, says against a run that looks
-    stable.
+    """Returns sentences on growth of V against a run that looks stable.
 
-    It must not end above its beginning, nor rise at the end of the judged half: to above its
-    least value there, by more than half of what it fell within that half.
+    V, less the work of operators and environments, must not end above its beginning. Nor may it
+    rise at the end of the judged half: above its minimum there, by more than half of the amount
+    by which it fell within that half.
+
+    Args:
+        balance: energy balance of all sites.
+        tolerance: size that a rise must exceed to count, in J.
     """
     V = balance.unsupplied
-    half = len(balance.unsupplied) // 2
-    found = []
+    half = len(V) // 2
+    sentences = []
     gained = float(V[-1] - V[0])
     if gained > tolerance:
-        found.append(f"V ends {gained:.3g} J above its beginning, and nobody gave that")
+        sentences.append(f"V ends {gained:.3g} J above its beginning, and nobody gave that")
     judged = V[half:]
     lowest = int(judged.argmin())
     risen = float(judged[-1] - judged[lowest])
     fell = float(judged[0] - judged[lowest])
     if risen > tolerance and risen > 0.5 * fell:
         from_s = float(balance.t_s[half + lowest])
-        found.append(
+        sentences.append(
             f"V rises at the end: by {risen:.3g} J from {from_s:.4g} s on, and nobody gave that"
         )
-    return found
+    return sentences
 
 
 def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> JsonObject:
     V = balance.V
     sites = certificate.energies
-    ones = certificate.paper_balance
-    with_ones: JsonObject | None = None
-    if ones is not None:
-        with_ones = {"v_first_j": float(ones.V[0]), "v_max_j": float(ones.V.max())}
-        with_ones["rise"] = _rise_to_json(certificate.paper_weights_rise)
+    paper_balance = certificate.paper_balance
+    paper_json: JsonObject | None = None
+    if paper_balance is not None:
+        paper_json = {
+            "v_first_j": float(paper_balance.V[0]),
+            "v_max_j": float(paper_balance.V.max()),
+            "rise": _rise_to_json(certificate.paper_weights_rise),
+        }
     return {
         "beta_first": dict(zip(sites, balance.beta[0].tolist(), strict=True)),
         "beta_last": dict(zip(sites, balance.beta[-1].tolist(), strict=True)),
         "v_first_j": float(V[0]),
         "v_last_j": float(V[-1]),
         "v_max_j": float(V.max()),
-        "parts_last_j": _last(balance.parts),
-        "taken_j": _last(balance.dissipation),
-        "given_j": _last(balance.work),
+        "parts_last_j": _last_values(balance.parts),
+        "taken_j": _last_values(balance.dissipation),
+        "given_j": _last_values(balance.work),
         "sampling_j": float(balance.sampling[-1]),
         "passed_on_j": float(balance.transfer[-1]),
         "scale_j": balance.scale,
@@ -502,7 +556,7 @@ def _functional_to_json(certificate: Certificate, balance: EnergyBalance) -> Jso
             site: _largest(energy.unexplained) for site, energy in sites.items()
         },
         "not_judged_s": find_unjudged_spans(balance),
-        "ones": with_ones,
+        "ones": paper_json,
     }
 
 
@@ -517,7 +571,7 @@ def _rise_to_json(rise: FunctionalRise | None) -> JsonObject | None:
     }
 
 
-def _last(columns: dict[str, Array]) -> dict[str, float]:
+def _last_values(columns: dict[str, Array]) -> dict[str, float]:
     return {name: float(values[-1]) for name, values in columns.items()}
 
 

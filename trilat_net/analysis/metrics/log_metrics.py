@@ -1,9 +1,10 @@
-"""All metrics of a log, their JSON, and the comparison of several logs.
+"""Computes all metrics of a log, converts them to JSON, and compares several logs.
 
-Invariant: every quantity is present for every place it applies to, as a number or with the
-reason for its absence; in JSON the number is null and `unknown` has the reason. Whatever a file
-of this folder measures belongs to it. A comparison has one column per log and one row per
-metric of the whole run.
+Invariant:
+    - Every quantity is present for every subject (run, site, link or wall) to which it applies:
+      as a number, or with the reason why there is none.
+    - In JSON a missing number is null, and `unknown` has the reason.
+    - A comparison has a column per log and a row per metric of the whole run.
 """
 
 import math
@@ -30,14 +31,15 @@ from .measures import Measure, Metric, MetricValues, Quantity, list_measures, qu
 from .motion_metrics import ParameterEstimates, read_all_estimates
 from .static_windows import JointLoad, SharingRatio, StiffnessEstimate
 
-for _found in pkgutil.iter_modules(import_module(__package__).__path__):
-    import_module(f"{__package__}.{_found.name}")
+# every file of this folder declares its metrics when it is imported
+for _module in pkgutil.iter_modules(import_module(__package__).__path__):
+    import_module(f"{__package__}.{_module.name}")
 
 _ALONG_AXES = {"N m": "N", "rad": "m", "N m/rad": "N/m", "N m s/rad": "N s/m"}
-"""Units along an axis in place of those of a joint."""
+"""Units of quantities along an axis, by the units of the same quantities of a joint."""
 
 METRICS_JSON_VERSION = 1
-"""Of this layout: keys may be added under it, none is taken away or changes its meaning."""
+"""Version of the JSON: keys may be added, but no key is removed or changes its meaning."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -45,17 +47,23 @@ class LogMetrics(Result):
     """All metrics of a log.
 
     Attributes:
-        log, scenario, driver, complete: the name of its file, and what it says of itself. run,
-        sites, links, walls: of the whole, per site, per link "j->i", per wall "s/1" (the first
-        of s).
-        estimates: per site with records, its parameter estimates.
-        static_windows, stiffness: their number, and the stiffness from one of them to the next.
-        joint_loads: the loaded joints in them, with the torques of all loaded sites.
-        sharing_ratios: the force sharing of those at which two sites are loaded.
+        log: name of the log's file.
+        scenario: name of the scenario.
+        driver: driver of the run, "live" or "virtual".
+        complete: True if the log was closed properly.
+        run: metrics of the whole run.
+        sites: metrics by site.
+        links: metrics by link, "j->i".
+        walls: metrics by wall; "s/1" is the first wall of site s.
+        estimates: parameter estimates by site, of sites with records.
+        static_windows: number of static windows.
+        joint_loads: loaded joints in static windows, with the torques of all loaded sites.
+        sharing_ratios: force sharing at joints at which two sites are loaded.
+        stiffness: stiffness between successive static windows.
         responses: impedances and reflections over frequency.
-        axes: names of what sites share in task space, where a joint's number is that of an
-            axis; else ().
-        joint_names: names that the files of the arms give their joints, if they agree; else ().
+        axes: names of the shared coordinates in task space, where the number of a joint stands
+            for a coordinate; () otherwise.
+        joint_names: names of the joints in the arms' files, if these agree; () otherwise.
     """
 
     log: str
@@ -76,227 +84,258 @@ class LogMetrics(Result):
     joint_names: tuple[str, ...] = ()
 
     def label(self, number: int) -> str:
-        """Returns what the number of a joint stands for, from 1: "1", "3 elbow", or the name of
-        an axis.
+        """Returns the label of a joint, "1" or "3 elbow", or the name of an axis.
+
+        Args:
+            number: number of the joint or axis, from 1.
         """
         if self.axes:
             return self.axes[number - 1]
         return f"{number} {self.joint_names[number - 1]}" if self.joint_names else str(number)
 
-    def unit(self, of_joint: str, number: int) -> str:
-        """Returns the unit of a joint's quantity, or of that along an axis of a place."""
-        return (
-            _ALONG_AXES.get(of_joint, of_joint)
-            if self.axes and number <= POSITION
-            else of_joint
-        )
+    def unit(self, joint_unit: str, number: int) -> str:
+        """Returns the unit of a quantity of a joint or of an axis.
+
+        Args:
+            joint_unit: the unit of the quantity of a joint.
+            number: number of the joint or axis, from 1.
+        """
+        if self.axes and number <= POSITION:
+            return _ALONG_AXES.get(joint_unit, joint_unit)
+        return joint_unit
 
     def headline(self) -> str:
-        """Returns what was measured, in one line."""
-        known = sum(one.value is not None for _, one in self._each())
-        return f"{self.log}: {count_nouns(known, 'number')} of {self.scenario}, {', '.join(self.sites)}"
+        """Returns one line on what was measured."""
+        known = sum(value.value is not None for _, value in self._list_values())
+        numbers = count_nouns(known, "number")
+        return f"{self.log}: {numbers} of {self.scenario}, {', '.join(self.sites)}"
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat metrics --json`."""
-        places = {"sites": self.sites, "links": self.links, "walls": self.walls}
-        windows = self.static_windows.value
-        named = {
-            f"{kind}.{name}.": one
-            for kind, found in places.items()
-            for name, one in found.items()
-        }
-        metrics_by_path = {
-            "run.": self.run,
-            **named,
-            "": {"windows_at_rest": self.static_windows},
-        }
+        subjects = {"sites": self.sites, "links": self.links, "walls": self.walls}
+        window_count = self.static_windows.value
+        metrics_by_path = {"run.": self.run}
+        for kind, metrics_by_name in subjects.items():
+            for name, metrics in metrics_by_name.items():
+                metrics_by_path[f"{kind}.{name}."] = metrics
+        metrics_by_path[""] = {"windows_at_rest": self.static_windows}
         content: dict[str, Any] = {
             "version": METRICS_JSON_VERSION,
             "log": self.log,
             "scenario": self.scenario,
             "driver": self.driver,
             "complete": self.complete,
-            "run": _values(self.run),
-            **{
-                kind: {name: _values(one) for name, one in found.items()}
-                for kind, found in places.items()
-            },
-            "parameters": {
-                site: estimates.to_json() for site, estimates in self.estimates.items()
-            },
-            "windows_at_rest": None if windows is None else int(windows),
-            **_details_to_json(self),
-            "unknown": {
-                path + key: one.why
-                for path, found in metrics_by_path.items()
-                for key, one in found.items()
-                if one.value is None
-            },
+            "run": _values_to_json(self.run),
         }
-        return {key: _finite(value) for key, value in content.items()}
+        for kind, metrics_by_name in subjects.items():
+            content[kind] = {
+                name: _values_to_json(metrics) for name, metrics in metrics_by_name.items()
+            }
+        content["parameters"] = {
+            site: estimates.to_json() for site, estimates in self.estimates.items()
+        }
+        content["windows_at_rest"] = None if window_count is None else int(window_count)
+        content |= _details_to_json(self)
+        content["unknown"] = {
+            path + key: value.why
+            for path, metrics in metrics_by_path.items()
+            for key, value in metrics.items()
+            if value.value is None
+        }
+        return {key: _replace_not_finite(value) for key, value in content.items()}
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row per quantity and place."""
+        """Returns a row per quantity and subject to which it applies."""
         return [
-            {**row, "value": one.value, "why": one.why}
-            for row, one in self._each()
-            if one.applies
+            {**row, "value": value.value, "why": value.why}
+            for row, value in self._list_values()
+            if value.applies
         ]
 
-    def _each(self) -> Iterator[tuple[dict[str, str], Metric]]:
+    def _list_values(self) -> Iterator[tuple[dict[str, str], Metric]]:
+        """Yields every metric, each after a description of its quantity and subject."""
         for quantity in quantities():
-            words = {"group": quantity.group, "key": quantity.key, "name": quantity.name}
-            for place, one in self.values_of(quantity).items():
-                yield {**words, "of": place or "run", "unit": quantity.unit}, one
+            for subject, value in self.values_of(quantity).items():
+                row = {
+                    "group": quantity.group,
+                    "key": quantity.key,
+                    "name": quantity.name,
+                    "of": subject or "run",
+                    "unit": quantity.unit,
+                }
+                yield row, value
 
     def values_of(self, quantity: Quantity) -> dict[str, Metric]:
-        """Returns a quantity of every place that has it; of the run by the name ""."""
+        """Returns a quantity by subject; the run is named ""."""
         if quantity.of == "run":
             return {"": self.run[quantity.key]}
-        found: dict[str, MetricValues] = getattr(self, f"{quantity.of}s")
-        return {name: metrics[quantity.key] for name, metrics in found.items()}
+        metrics_by_name: dict[str, MetricValues] = getattr(self, f"{quantity.of}s")
+        return {name: metrics[quantity.key] for name, metrics in metrics_by_name.items()}
 
     def run_value(self, quantity: Quantity) -> Metric:
         """Returns a quantity of the run, see `reduce_to_run`."""
         return reduce_to_run(quantity, self.values_of(quantity))
 
 
-def reduce_to_run(quantity: Quantity, places: Mapping[str, Metric]) -> Metric:
-    """Returns a quantity of the run, of that of its places: the largest of them, or their sum.
+def reduce_to_run(quantity: Quantity, values_by_subject: Mapping[str, Metric]) -> Metric:
+    """Returns a quantity of the run: the largest value of its subjects, or their sum.
 
-    A place that can have none does not count; if one lacks a number that it could have, so does
-    the run.
+    Subjects to which the quantity does not apply are left out. If a subject lacks a number that
+    it could have, the run lacks it too.
     """
-    counted = {name: one for name, one in places.items() if one.applies}
-    whys = [
-        f"{name}: {one.why}" if name else one.why for name, one in counted.items() if one.why
+    applicable = {name: value for name, value in values_by_subject.items() if value.applies}
+    reasons = [
+        f"{name}: {value.why}" if name else value.why
+        for name, value in applicable.items()
+        if value.why
     ]
-    if whys:
-        return Metric(None, "; ".join(whys))
-    values = [one.value for one in counted.values() if one.value is not None]
-    if not values:
-        nowhere = dict.fromkeys(one.why for one in places.values())
-        return Metric(None, "; ".join(nowhere) or f"there is no {quantity.of}", applies=False)
-    return Metric(sum(values) if quantity.reduction == "sum" else max(values))
+    if reasons:
+        return Metric(None, "; ".join(reasons))
+    numbers = [value.value for value in applicable.values() if value.value is not None]
+    if not numbers:
+        # each reason once, in order
+        reasons = list(dict.fromkeys(value.why for value in values_by_subject.values()))
+        return Metric(None, "; ".join(reasons) or f"there is no {quantity.of}", applies=False)
+    return Metric(sum(numbers) if quantity.reduction == "sum" else max(numbers))
 
 
-# what is not finite is no number
+# overflow and NaN do not warn: a metric that is not finite becomes a reason
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def compute_log_metrics(log: Log) -> LogMetrics:
-    """Returns all quantities of a log; of torn, short and empty ones too.
+    """Returns all metrics of a log, which may be torn, short or empty.
 
     Raises:
-        LogError: a record cannot be read, or names a change that is none.
+        LogError: a record cannot be read, or names a change that is not valid.
     """
     view = RunView(log)
     scenario = log.scenario
-    found = _measure_places(view, list_measures())
-    names = {
+    values = _measure_subjects(view, list_measures())
+    axes: tuple[str, ...] = ()
+    if follows_in_task_space(log):
+        axes = TASK_AXES[: scenario.arms[log.sites[0]].counts.shared]
+    joint_names = {
         arm.joint_names if scenario.sites[site].arm.urdf else ()
         for site, arm in scenario.arms.items()
     }
     return LogMetrics(
-        *(Path(log.source).name, scenario.name, log.driver, log.complete),
-        found["run"][""],
-        *(found["site"], found["link"], found["wall"]),
-        view.compute_once(read_all_estimates),
-        static_windows.count_static_windows(view),
-        view.compute_once(static_windows.find_joint_loads),
-        view.compute_once(static_windows.find_sharing_ratios),
-        static_windows.estimate_stiffness(view),
-        estimate_impedances(view),
-        TASK_AXES[: scenario.arms[log.sites[0]].counts.shared]
-        if follows_in_task_space(log)
-        else (),
-        names.pop() if len(names) == 1 else (),
+        log=Path(log.source).name,
+        scenario=scenario.name,
+        driver=log.driver,
+        complete=log.complete,
+        run=values["run"][""],
+        sites=values["site"],
+        links=values["link"],
+        walls=values["wall"],
+        estimates=view.compute_once(read_all_estimates),
+        static_windows=static_windows.count_static_windows(view),
+        joint_loads=view.compute_once(static_windows.find_joint_loads),
+        sharing_ratios=view.compute_once(static_windows.find_sharing_ratios),
+        stiffness=static_windows.estimate_stiffness(view),
+        responses=estimate_impedances(view),
+        axes=axes,
+        joint_names=joint_names.pop() if len(joint_names) == 1 else (),
     )
 
 
-def _measure_places(
+def _measure_subjects(
     view: RunView, wanted: Iterable[Measure]
 ) -> dict[str, dict[str, MetricValues]]:
-    found: dict[str, dict[str, MetricValues]] = {
-        of: {place: {} for place in view.places(of)} for of in ("run", "site", "link", "wall")
+    """Returns metrics by kind of subject, subject and key."""
+    values: dict[str, dict[str, MetricValues]] = {
+        kind: {name: {} for name in view.list_subjects(kind)}
+        for kind in ("run", "site", "link", "wall")
     }
-    for one in wanted:
-        for place, values in found[one.of].items():
-            values.update(one.measure(view, place))
-    return found
+    for measure in wanted:
+        for name, metrics in values[measure.of].items():
+            metrics.update(measure.measure(view, name))
+    return values
 
 
 def find_quantity(key: str) -> Quantity:
     """Returns the quantity of a key.
 
     Raises:
-        KeyError: there is none; the message names the nearest.
+        KeyError: no quantity has this key; the message names the nearest key.
     """
-    known = {one.key: one for one in quantities()}
+    known = {quantity.key: quantity for quantity in quantities()}
     if key not in known:
-        near = suggest_nearest(key, list(known))
-        raise KeyError(f"no metric {key!r}{near}; docs/metrics.md has them all")
+        nearest = suggest_nearest(key, list(known))
+        raise KeyError(f"no metric {key!r}{nearest}; docs/metrics.md has them all")
     return known[key]
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as there
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")  # as in compute_log_metrics
 def measure_run(log: Log, keys: Iterable[str]) -> dict[str, Metric]:
-    """Returns quantities of the whole run by their keys; nothing else is computed."""
-    asked = {key: find_quantity(key) for key in keys}
+    """Returns quantities of the whole run by their keys; computes nothing else.
+
+    Raises:
+        KeyError: no quantity has one of the keys.
+        LogError: a record cannot be read, or names a change that is not valid.
+    """
+    requested = {key: find_quantity(key) for key in keys}
     wanted = [
-        one
-        for one in list_measures()
-        if any(quantity.key in asked for quantity in one.quantities)
+        measure
+        for measure in list_measures()
+        if any(quantity.key in requested for quantity in measure.quantities)
     ]
-    found = _measure_places(RunView(log), wanted)
-    return {
-        key: reduce_to_run(one, {place: values[key] for place, values in found[one.of].items()})
-        for key, one in asked.items()
-    }
+    values = _measure_subjects(RunView(log), wanted)
+    run_values = {}
+    for key, quantity in requested.items():
+        values_by_subject = {
+            name: metrics[key] for name, metrics in values[quantity.of].items()
+        }
+        run_values[key] = reduce_to_run(quantity, values_by_subject)
+    return run_values
 
 
 def _details_to_json(metrics: LogMetrics) -> dict[str, Any]:
-
-    def units(one: ImpedanceEstimate) -> str:
-        return metrics.unit(one.unit, one.joint)
-
-    found = {
-        "levers": [
-            load._asdict()
-            | {"weight": _values(load.weight)}
-            | _value_and_why("imbalance", load.imbalance)
-            for load in metrics.joint_loads
-        ],
-        "force_sharing": [
-            pair._asdict() | {"off": pair.off} | _value_and_why("expected_nm", pair.expected_nm)
-            for pair in metrics.sharing_ratios
-        ],
-        "stiffness": [one._asdict() for one in metrics.stiffness],
-        "felt": [
-            {
-                **one._asdict(),
-                "ratio": _response_to_json(one.ratio, units(one)),
-                "spectrum": [_response_to_json(line, units(one)) for line in one.spectrum],
-            }
-            for one in metrics.responses
-        ],
+    """Returns the results of static windows and the responses, ready for JSON."""
+    details: dict[str, list[dict[str, Any]]] = {
+        "levers": [_load_to_json(load) for load in metrics.joint_loads],
+        "force_sharing": [_sharing_to_json(ratio) for ratio in metrics.sharing_ratios],
+        "stiffness": [estimate._asdict() for estimate in metrics.stiffness],
+        "felt": [_impedance_to_json(metrics, estimate) for estimate in metrics.responses],
     }
-    if not metrics.axes:
-        for entry in (
-            one for entries in found.values() for one in entries if metrics.joint_names
-        ):
-            entry["joint_name"] = metrics.joint_names[entry["joint"] - 1]
-        return found
-    return {
-        name: [_name_axis(metrics, one) for one in entries] for name, entries in found.items()
-    }
+    if metrics.axes:
+        return {
+            name: [_name_axis(metrics, entry) for entry in entries]
+            for name, entries in details.items()
+        }
+    if metrics.joint_names:
+        for entries in details.values():
+            for entry in entries:
+                entry["joint_name"] = metrics.joint_names[entry["joint"] - 1]
+    return details
+
+
+def _load_to_json(load: JointLoad) -> dict[str, Any]:
+    content = load._asdict() | {"weight": _values_to_json(load.weight)}
+    return content | _value_and_reason("imbalance", load.imbalance)
+
+
+def _sharing_to_json(ratio: SharingRatio) -> dict[str, Any]:
+    content = ratio._asdict() | {"off": ratio.off}
+    return content | _value_and_reason("expected_nm", ratio.expected_nm)
+
+
+def _impedance_to_json(metrics: LogMetrics, estimate: ImpedanceEstimate) -> dict[str, Any]:
+    unit = metrics.unit(estimate.unit, estimate.joint)
+    content = estimate._asdict()
+    content["ratio"] = _response_to_json(estimate.ratio, unit)
+    content["spectrum"] = [_response_to_json(response, unit) for response in estimate.spectrum]
+    return content
 
 
 def _name_axis(metrics: LogMetrics, entry: dict[str, Any]) -> dict[str, Any]:
+    """Returns an entry with the name of its axis for its joint, and the units of an axis."""
     number = entry.pop("joint")
-    endings = (("_nm_rad", "_n_m"), ("_nm", "_n"), ("_rad", "_m")) if number <= POSITION else ()
+    endings: dict[str, str] = {}
+    if number <= POSITION:
+        endings = {"_nm_rad": "_n_m", "_nm": "_n", "_rad": "_m"}  # the longest first
     renamed = {}
     for key, value in entry.items():
-        ending = next((pair for pair in endings if key.endswith(pair[0])), ("", ""))
-        renamed[key.removesuffix(ending[0]) + ending[1]] = value
+        ending = next((ending for ending in endings if key.endswith(ending)), "")
+        renamed[key.removesuffix(ending) + endings.get(ending, "")] = value
     return {"axis": metrics.label(number), **renamed}
 
 
@@ -304,78 +343,92 @@ def _response_to_json(response: FrequencyResponse, unit: str) -> dict[str, Any]:
     return {**response._asdict(), "why": response.why or None, "unit": unit}
 
 
-def _value_and_why(key: str, one: Metric) -> dict[str, Any]:
-    return {key: one.value, "why": one.why or None}
+def _value_and_reason(key: str, value: Metric) -> dict[str, Any]:
+    return {key: value.value, "why": value.why or None}
 
 
-def _finite(value: Any) -> Any:
+def _replace_not_finite(value: Any) -> Any:
+    """Returns a value with None for every number in it that is not finite."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
-    return [_finite(one) for one in value] if isinstance(value, list | tuple) else value
+        return {key: _replace_not_finite(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_replace_not_finite(inner) for inner in value]
+    return value
 
 
-def _values(metrics: MetricValues) -> dict[str, float | None]:
-    return {key: one.value for key, one in metrics.items()}
+def _values_to_json(metrics: MetricValues) -> dict[str, float | None]:
+    return {key: value.value for key, value in metrics.items()}
 
 
 class ComparisonRow(NamedTuple):
-    """A quantity of every run, by its entry in the catalogue and the metric of each column."""
+    """A quantity of several runs.
+
+    Attributes:
+        quantity: the quantity.
+        entries: its metric in every run, by column.
+    """
 
     quantity: Quantity
     entries: tuple[Metric, ...]
 
     @property
     def values(self) -> tuple[float | None, ...]:
-        """The numbers; None for missing ones."""
+        """The numbers by column; None for missing numbers."""
         return tuple(entry.value for entry in self.entries)
 
 
 class MetricComparison(NamedTuple):
-    """Runs side by side, by name: the quantities that one could have, in the order of the
-    catalogue.
+    """Metrics of several runs, side by side.
+
+    Attributes:
+        columns: names of the runs.
+        rows: all quantities that apply to one of the runs, in the order in which they are
+            shown.
     """
 
     columns: tuple[str, ...]
     rows: tuple[ComparisonRow, ...]
 
     def row(self, key: str) -> ComparisonRow:
-        """Returns a quantity's row by its key; KeyError without one."""
+        """Returns the row of a quantity by its key; raises KeyError if there is none."""
         return {row.quantity.key: row for row in self.rows}[key]
 
 
 def compare_metrics(logs: Sequence[Log], names: Sequence[str] = ()) -> MetricComparison:
-    """Returns logs side by side, torn, short and empty ones too; columns bear their files'
-    names by default.
+    """Returns the metrics of several logs, which may be torn, short or empty, side by side.
+
+    Args:
+        logs: the logs.
+        names: names of the columns; by default the names of the logs' files.
 
     Raises:
-        LogError: a record cannot be read, or names a change that is none.
+        LogError: a record cannot be read, or names a change that is not valid.
     """
     measured = [compute_log_metrics(log) for log in logs]
     rows = [
-        ComparisonRow(one, tuple(metrics.run_value(one) for metrics in measured))
-        for one in quantities()
+        ComparisonRow(quantity, tuple(metrics.run_value(quantity) for metrics in measured))
+        for quantity in quantities()
     ]
-    kept = tuple(row for row in rows if any(entry.applies for entry in row.entries))
-    return MetricComparison(tuple(names) or tuple(Path(log.source).stem for log in logs), kept)
+    applicable = tuple(row for row in rows if any(entry.applies for entry in row.entries))
+    columns = tuple(names) or tuple(Path(log.source).stem for log in logs)
+    return MetricComparison(columns, applicable)
 
 
 def comparison_to_json(comparison: MetricComparison) -> dict[str, Any]:
-    """Returns a comparison, ready for JSON: finite numbers, and null with its reason in
-    `unknown`.
-    """
-    return {
-        "columns": list(comparison.columns),
-        "rows": [
+    """Returns a comparison, ready for JSON: missing numbers are null, with a reason."""
+    rows = []
+    for row in comparison.rows:
+        quantity = row.quantity
+        rows.append(
             {
-                "key": row.quantity.key,
-                "name": row.quantity.name,
-                "unit": row.quantity.unit,
-                "group": row.quantity.group,
+                "key": quantity.key,
+                "name": quantity.name,
+                "unit": quantity.unit,
+                "group": quantity.group,
                 "values": list(row.values),
                 "unknown": [entry.why or None for entry in row.entries],
             }
-            for row in comparison.rows
-        ],
-    }
+        )
+    return {"columns": list(comparison.columns), "rows": rows}

@@ -1,14 +1,16 @@
-"""Rendered impedance and reflected wall force over frequency, by a run's frequency response.
+"""Estimates rendered impedances and reflected wall forces over frequency, from a recorded run.
 
-Invariant: a response without sufficient excitation is undecided, with a reason. It is given at
-the spectral line with the strongest drive, and at all that are driven nearly as much, if at
-least `MIN_SEGMENTS` independent segments excite the line and both signals have a coherence of
-at least `MIN_COHERENCE` with the
-drive: then its random error is at most 17.2 %.
+In a closed loop the ratio of two signals depends on the drive. The drive is therefore a third
+signal, which depends on nothing else, and the ratio is H = S_dy / S_dx. docs/metrics.md names
+drives and sources (Welch; Bendat and Piersol; Soderstrom and Stoica).
 
-In a closed loop the ratio of two signals depends on the drive, so the drive is a signal of its
-own that depends on nothing else: H = S_dy / S_dx. docs/metrics.md names drives and sources
-(Welch; Bendat and Piersol; Soderstrom and Stoica).
+Invariant:
+    - A response is given at the spectral line with the strongest drive, and at all lines that
+      are driven nearly as much.
+    - A response is decided only if at least `MIN_SEGMENTS` independent segments excite the
+      line, and if both signals have a coherence of at least `MIN_COHERENCE` with the drive:
+      its random error is at most 17.2 % then.
+    - A response without sufficient excitation is undecided, with a reason.
 """
 
 import math
@@ -27,34 +29,37 @@ Complex = NDArray[np.complex128]
 SEGMENT_S = 4.0
 """Length of a segment, s: lines are a quarter of a hertz apart."""
 _LOWEST_LINE = 2
-"""The first line that a Hann window keeps free of the mean."""
+"""The first line into which a Hann window does not leak the mean."""
 HIGHEST_HZ = 20.0
 """Highest line, Hz: operators and arms are slower."""
 MIN_COHERENCE = 0.9
+"""Least coherence of both signals with the drive."""
 MIN_SEGMENTS = 4.0
+"""Least number of independent segments that excite a line."""
 _OVERLAP_FACTOR = 1.06
-"""So many segments under a Hann window count as one if they overlap by half."""
+"""Segments per independent segment, under a Hann window with half-overlapping segments."""
 MIN_DRIVE_TORQUE_NM = 0.05
 """Least amplitude of a torque that drives, N m."""
-_NEARLY = 0.55
-"""Share of the strongest drive from which on a line counts as driven: a Hann window leaks 0.5
-to the next.
+_DRIVEN_SHARE = 0.55
+"""Share of the strongest drive above which a line is driven: a Hann window leaks 0.5 into the
+next line.
 """
 STILL_SCRIPT_NM_S = 1e-6
-"""A script that changes by less stands still, N m/s."""
-NO_SCRIPT_TEXT = "what the hand was to do is not in the scenario: nobody knows who drives"
+"""A script that changes by less than this per second stands still, N m/s."""
+NO_SCRIPT_TEXT = "the scenario does not contain the hand's intention: the drive is unknown"
 
 
 class FrequencyResponse(NamedTuple):
-    """Output over input at one frequency; undecided values are None.
+    """Ratio of an output to an input at one frequency; undecided values are None.
 
     Attributes:
-        frequency_hz: the line with the strongest drive.
-        gain, phase_rad: of the ratio, in the unit of output over input.
+        frequency_hz: frequency of the line.
+        gain: gain of the ratio, in the unit of output over input.
+        phase_rad: phase of the ratio.
         coherence: the smaller of both signals' coherences with the drive.
-        segments: number of segments of equal power that would drive the line as much as all of
-            them do.
-        error: random error of the gain, one standard deviation as a share of it.
+        segments: number of segments of equal power that would drive the line as much as all
+            recorded segments do.
+        error: random error of the gain, one standard deviation as a share of the gain.
         why: the reason why the ratio is undecided; "" if it is decided.
     """
 
@@ -70,59 +75,87 @@ class FrequencyResponse(NamedTuple):
 def estimate_responses(
     drive: Array, put_in: Array, came_out: Array, usable: Bools, rate_hz: int, least: float
 ) -> list[FrequencyResponse]:
-    """Returns the ratio of two signals at the driven lines, that with the strongest drive
-    first.
+    """Returns the ratio of an output to an input at every driven line, the strongest first.
 
-    Driven is a line with a drive of `least` or more; without one, the only entry says so. The
-    drive depends on no other signal. Usable are rows that are recorded while no other drive is
-    active. Own code in place of `scipy.signal.csd`, which cannot leave out segments with
-    unusable rows.
+    `scipy.signal.csd` is not used, because it cannot leave out segments with unusable rows.
+
+    Args:
+        drive: the signal that drives both, and that depends on no other signal, shape (K,).
+        put_in: the input signal, shape (K,).
+        came_out: the output signal, shape (K,).
+        usable: True for rows that are recorded while no other drive is active, shape (K,).
+        rate_hz: rows per second.
+        least: least amplitude of the drive at a driven line.
+
+    Returns:
+        The responses; without a driven line, a single response with the reason.
     """
     length = round(SEGMENT_S * rate_hz)
-    starts: list[
-        int
-    ] = []  # of segments with usable rows alone, each half a length after the one before
-    if length >= 4 * _LOWEST_LINE:
-        unusable = np.concatenate([[0], np.cumsum(~usable)])
-        first = np.arange(0, len(usable) - length + 1, length // 2)
-        starts = first[unusable[first + length] == unusable[first]].tolist()
+    starts = _find_segments(usable, length)
     if not starts:
-        return [
-            FrequencyResponse(
-                why=f"no {SEGMENT_S:g} s are recorded in which nobody else drives"
-            )
-        ]
-    D = _spectra(drive, starts, length)
+        reason = f"no {SEGMENT_S:g} s are recorded in which nobody else drives"
+        return [FrequencyResponse(why=reason)]
+    D = _compute_spectra(drive, starts, length)
     power = (np.abs(D) ** 2).mean(axis=0)
     if not np.isfinite(power).all():
         return [FrequencyResponse(why="its numbers are too large")]
     strongest = int(power.argmax())
     if math.sqrt(2.0 * power[strongest]) < least:
         return [FrequencyResponse(why="nothing drives it")]
-    driven = np.flatnonzero(power >= max(0.5 * least**2, _NEARLY**2 * power[strongest]))
-    X, Y = (_spectra(one, starts, length) for one in (put_in, came_out))
-    return [
-        _estimate_at_line((line + _LOWEST_LINE) / SEGMENT_S, D[:, line], X[:, line], Y[:, line])
-        for line in (strongest, *driven[driven != strongest].tolist())
-    ]
+    least_power = max(0.5 * least**2, _DRIVEN_SHARE**2 * power[strongest])
+    driven = np.flatnonzero(power >= least_power)
+    X = _compute_spectra(put_in, starts, length)
+    Y = _compute_spectra(came_out, starts, length)
+    responses = []
+    for line in (strongest, *driven[driven != strongest].tolist()):
+        frequency_hz = (line + _LOWEST_LINE) / SEGMENT_S
+        responses.append(_estimate_at_line(frequency_hz, D[:, line], X[:, line], Y[:, line]))
+    return responses
+
+
+def _find_segments(usable: Bools, length: int) -> list[int]:
+    """Returns the first rows of all segments of usable rows, which overlap by half."""
+    if length < 4 * _LOWEST_LINE:
+        return []
+    unusable_before = np.concatenate([[0], np.cumsum(~usable)])
+    first = np.arange(0, len(usable) - length + 1, length // 2)
+    is_usable = unusable_before[first + length] == unusable_before[first]
+    starts: list[int] = first[is_usable].tolist()
+    return starts
 
 
 def _estimate_at_line(
     frequency_hz: float, D: Complex, X: Complex, Y: Complex
 ) -> FrequencyResponse:
+    """Returns the ratio of Y to X at one line, from the segments' spectra there.
+
+    Args:
+        frequency_hz: frequency of the line.
+        D: the drive in every segment, shape (S,).
+        X: the input in every segment, shape (S,).
+        Y: the output in every segment, shape (S,).
+    """
     power = np.abs(D) ** 2
     segments = float(power.sum() ** 2 / (power**2).sum()) / _OVERLAP_FACTOR
     if segments < MIN_SEGMENTS:
-        why = f"undecided: {segments:.1f} stretches of {SEGMENT_S:g} s drive {frequency_hz:g} Hz, "
-        return FrequencyResponse(
-            frequency_hz, segments=segments, why=f"{why}{MIN_SEGMENTS:g} are needed"
+        reason = (
+            f"undecided: {segments:.1f} stretches of {SEGMENT_S:g} s drive "
+            f"{frequency_hz:g} Hz, {MIN_SEGMENTS:g} are needed"
         )
-    coherence = min(_coherence(D, X), _coherence(D, Y))
+        return FrequencyResponse(frequency_hz, segments=segments, why=reason)
+    input_coherence = _compute_coherence(D, X)
+    output_coherence = _compute_coherence(D, Y)
+    coherence = min(input_coherence, output_coherence)
     if coherence < MIN_COHERENCE:
-        why = f"undecided: the coherence at {frequency_hz:g} Hz is {coherence:.2f}, {MIN_COHERENCE:g} is needed"
-        return FrequencyResponse(frequency_hz, coherence=coherence, segments=segments, why=why)
+        reason = (
+            f"undecided: the coherence at {frequency_hz:g} Hz is {coherence:.2f}, "
+            f"{MIN_COHERENCE:g} is needed"
+        )
+        return FrequencyResponse(
+            frequency_hz, coherence=coherence, segments=segments, why=reason
+        )
     H = np.vdot(D, Y) / np.vdot(D, X)
-    noise = sum(1.0 / _coherence(D, one) - 1.0 for one in (X, Y))
+    noise = (1.0 / input_coherence - 1.0) + (1.0 / output_coherence - 1.0)
     error = math.sqrt(max(0.0, noise) / (2.0 * segments))
     return FrequencyResponse(
         frequency_hz=frequency_hz,
@@ -134,37 +167,46 @@ def _estimate_at_line(
     )
 
 
-def _coherence(D: Complex, X: Complex) -> float:
+def _compute_coherence(D: Complex, X: Complex) -> float:
+    """Returns the coherence |S_dx|^2 / (S_dd S_xx) of two signals; 0 if one vanishes."""
     power = float(np.vdot(D, D).real * np.vdot(X, X).real)
-    return min(1.0, float(abs(np.vdot(D, X)) ** 2) / power) if power > 0.0 else 0.0
+    if not power > 0.0:
+        return 0.0
+    return min(1.0, float(abs(np.vdot(D, X)) ** 2) / power)
 
 
-def _spectra(signal: Array, starts: list[int], length: int) -> Complex:
-    """Returns the lines of every segment above the mean, shape (S, L), under a Hann window.
+def _compute_spectra(signal: Array, starts: list[int], length: int) -> Complex:
+    """Returns the spectral lines of every segment under a Hann window, shape (S, L).
 
-    Scaled so that the square of a line is the mean square of its sinusoid. No slope is taken
-    out: that would bend slow sinusoids too.
+    They are scaled so that the square of a line is the mean square of its sinusoid. No trend is
+    removed, because that would distort slow sinusoids too.
+
+    Args:
+        signal: the signal, shape (K,).
+        starts: the first row of every segment.
+        length: rows of a segment.
     """
-    segments = np.stack([signal[n : n + length] for n in starts])
+    segments = np.stack([signal[start : start + length] for start in starts])
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(length) + 0.5) / length)
     highest = min(int(HIGHEST_HZ * SEGMENT_S), length // 2 - 1)
     scale = math.sqrt(2.0) / window.sum()
-    lines: Complex = (
-        np.fft.rfft(segments * window, axis=1)[:, _LOWEST_LINE : highest + 1] * scale
-    )
+    spectra = np.fft.rfft(segments * window, axis=1)
+    lines: Complex = spectra[:, _LOWEST_LINE : highest + 1] * scale
     return lines
 
 
 class ImpedanceEstimate(NamedTuple):
-    """An impedance or a reflection over frequency, of a joint, from 1.
+    """An impedance or a reflection of a joint over frequency.
 
     Attributes:
-        kind: "impedance": torque of an operator ON its arm over the velocity of the joint: of
-            its site and of all behind it, N m s/rad. "reflection": torque that an operator
-            feels over the one of the environment ON another arm.
-        at, of: the site of the operator, and of a reflection that of the environment, else "".
-        ratio: at the line with the strongest drive.
-        spectrum: at every driven line, by rising frequency.
+        kind: "impedance" for an operator's torque ON its arm over the joint's velocity, which
+            is the impedance of its site and of all sites behind it, N m s/rad; "reflection"
+            for the torque that an operator feels over the environment's torque ON another arm.
+        at: site of the operator.
+        of: site of the environment of a reflection; "" otherwise.
+        joint: number of the joint, from 1.
+        ratio: the response at the line with the strongest drive.
+        spectrum: the responses at all driven lines, by rising frequency.
     """
 
     kind: str
@@ -181,64 +223,94 @@ class ImpedanceEstimate(NamedTuple):
 
 
 def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
-    """Returns the impedance at every operator, and its reflection of every environment
-    elsewhere.
-    """
+    """Returns each operator's impedance, and its reflection of each environment elsewhere."""
     runs = view.shared
     operators = [site for site, run in runs.items() if run.torque.operator.any()]
-    walls = [site for site, run in runs.items() if run.torque.environment.any()]
-    pairs = [(site, "") for site in operators]
-    pairs += [(site, wall) for wall in walls for site in operators if site != wall]
-    return [one for site, wall in pairs for one in _estimate_joints(runs, site, wall)]
+    environments = [site for site, run in runs.items() if run.torque.environment.any()]
+    estimates = []
+    for site in operators:
+        estimates += _estimate_joints(runs, site, "")
+    for environment in environments:
+        for site in operators:
+            if site != environment:
+                estimates += _estimate_joints(runs, site, environment)
+    return estimates
 
 
 def _estimate_joints(
-    runs: Mapping[str, SiteRun], site: str, wall: str
+    runs: Mapping[str, SiteRun], site: str, environment: str
 ) -> Iterator[ImpedanceEstimate]:
-    records, by_source, _ = runs[site]
-    script = by_source.script
-    usable = _find_still_rows(runs, site, alone=not wall)
-    rows, recorded = find_latest_rows(runs[wall or site].records, records.t_s)
+    """Yields the impedance of every joint of a site, or its reflection of an environment.
+
+    Args:
+        runs: all sites with records.
+        site: the site of the operator.
+        environment: the site of the environment; "" for an impedance.
+    """
+    records = runs[site].records
+    torque = runs[site].torque
+    usable = _find_still_rows(runs, site, alone=not environment)
+    rows, recorded = find_latest_rows(runs[environment or site].records, records.t_s)
     for joint in range(records.qd.shape[1]):
-        found = [FrequencyResponse(why=NO_SCRIPT_TEXT)]
-        if script is not None and usable is not None:
+        responses = [FrequencyResponse(why=NO_SCRIPT_TEXT)]
+        if torque.script is not None and usable is not None:
             usable = usable & records.known
-            operator = by_source.operator[:, joint]
-            if wall:
-                torque = runs[wall].torque.environment[rows, joint]
-                signals = torque, torque, -operator, usable & recorded
+            operator = torque.operator[:, joint]
+            if environment:
+                wall_torque = runs[environment].torque.environment[rows, joint]
+                responses = estimate_responses(
+                    drive=wall_torque,
+                    put_in=wall_torque,
+                    came_out=-operator,
+                    usable=usable & recorded,
+                    rate_hz=records.rate_hz,
+                    least=MIN_DRIVE_TORQUE_NM,
+                )
             else:
-                signals = script[:, joint], records.qd[:, joint], operator, usable
-            found = estimate_responses(*signals, records.rate_hz, MIN_DRIVE_TORQUE_NM)
-        spectrum = sorted(
-            (one for one in found if one.frequency_hz), key=lambda one: one.frequency_hz or 0.0
-        )
-        kind = "reflection" if wall else "impedance"
+                responses = estimate_responses(
+                    drive=torque.script[:, joint],
+                    put_in=records.qd[:, joint],
+                    came_out=operator,
+                    usable=usable,
+                    rate_hz=records.rate_hz,
+                    least=MIN_DRIVE_TORQUE_NM,
+                )
+        spectrum = [response for response in responses if response.frequency_hz]
+        spectrum.sort(key=lambda response: response.frequency_hz or 0.0)
         yield ImpedanceEstimate(
-            kind=kind,
+            kind="reflection" if environment else "impedance",
             at=site,
-            of=wall,
+            of=environment,
             joint=joint + 1,
-            ratio=found[0],
+            ratio=responses[0],
             spectrum=tuple(spectrum),
         )
 
 
-def _find_still_rows(runs: Mapping[str, SiteRun], at: str, *, alone: bool) -> Bools | None:
-    """Returns at which ticks of a site no operator moves, that of the site included unless
-    `alone` drives.
+def _find_still_rows(
+    runs: Mapping[str, SiteRun], reference_site: str, *, alone: bool
+) -> Bools | None:
+    """Returns the ticks of a site at which no operator moves, shape (K,).
 
-    None if one of them has no script.
+    Args:
+        runs: all sites with records.
+        reference_site: the site whose ticks are judged.
+        alone: the operator of that site may move, since it alone drives.
+
+    Returns:
+        True for each such tick; None if some operator has no script.
     """
-    t_s = runs[at].records.t_s
+    t_s = runs[reference_site].records.t_s
     still = np.ones(len(t_s), dtype=np.bool_)
-    for site, (records, torque, _) in runs.items():
-        if alone and site == at:
+    for site, run in runs.items():
+        if alone and site == reference_site:
             continue
-        if torque.script is None:
+        script = run.torque.script
+        if script is None:
             return None
-        if len(torque.script) > 1:
-            rows, _ = find_latest_rows(records, t_s)
-            rate = np.abs(np.gradient(torque.script, axis=0)).max(axis=1) * records.rate_hz
-            still &= rate[rows] < STILL_SCRIPT_NM_S
+        if len(script) > 1:
+            rows, _ = find_latest_rows(run.records, t_s)
+            slopes = np.abs(np.gradient(script, axis=0)).max(axis=1)
+            rate_nm_s = slopes * run.records.rate_hz
+            still &= rate_nm_s[rows] < STILL_SCRIPT_NM_S
     return still

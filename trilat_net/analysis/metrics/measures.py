@@ -1,8 +1,11 @@
-"""What a metric is: the quantities of a kind of place, and the function that measures them.
+"""Declares metrics: the quantities of a kind of subject, and the function that measures them.
 
-Invariant: a value is a finite number, or None with a reason. A key has one definition, beside
-its function in one file of this folder, and in docs/metrics.md; whoever shows, compares or asks
-finds it by its file.
+A subject is the run, a site, a link or a wall.
+
+Invariant:
+    - A value is a finite number, or None with a reason.
+    - A key has one definition, beside its function in one file of this folder, and in
+      docs/metrics.md. Everything that shows, compares or requests a metric finds it there.
 """
 
 import math
@@ -21,8 +24,10 @@ class Metric(NamedTuple):
     """A number, or the reason why there is none.
 
     Attributes:
-        value, why: the number, finite, or None; the reason, or "".
-        applies: False if no log of this experiment could have one: then nothing is unknown.
+        value: the number, finite; None if there is none.
+        why: the reason why there is no number; "" otherwise.
+        applies: False if no log of this experiment could have a number: nothing is unknown
+            then.
     """
 
     value: float | None
@@ -37,20 +42,25 @@ _NOT_FINITE = "it is no finite number"
 
 
 def metric(value: float | None, why: str = _NOT_FINITE) -> Metric:
-    """Returns a metric of a number; with the reason if it is None or not finite."""
-    return (
-        Metric(None, why) if value is None or not math.isfinite(value) else Metric(float(value))
-    )
+    """Returns the metric of a number, or of the reason `why` if it is None or not finite."""
+    if value is None or not math.isfinite(value):
+        return Metric(None, why)
+    return Metric(float(value))
 
 
 def unavailable(group: str, why: str, *, of: str = "", applies: bool = True) -> MetricValues:
-    """Returns the quantities of a group, or those of it that are `of` a kind of place, without
-    a number.
+    """Returns the quantities of a group, all without a number.
+
+    Args:
+        group: the group of the quantities.
+        why: the reason why there are no numbers.
+        of: kind of subject to which the quantities are limited; "" for every kind.
+        applies: see `Metric`.
     """
     return {
-        q.key: Metric(None, why, applies)
-        for q in quantities()
-        if q.group == group and of in ("", q.of)
+        quantity.key: Metric(None, why, applies)
+        for quantity in quantities()
+        if quantity.group == group and of in ("", quantity.of)
     }
 
 
@@ -58,40 +68,44 @@ def measure_shared(
     group: str,
     space: str,
     keys: Iterable[str],
-    off: Array,
+    differences: Array,
     at_end: NDArray[np.bool_],
-    none: str = _NOT_FINITE,
+    why_not_at_end: str = _NOT_FINITE,
 ) -> MetricValues:
-    """Returns what sites share, angles, rad, or places, m, or both of a pose: RMS, peak, peak
-    at the end.
+    """Returns the RMS, the peak and the peak at the end of differences in a shared coordinate.
+
+    Sites share angles in rad, positions in m, or both in a pose.
 
     Args:
-        group: that of the quantities.
-        space: in which sites share.
-        keys: of the three quantities, without the unit.
-        off: by how much it is off, shape (K, n).
-        at_end: which rows are of the last second, shape (K,).
-        none: why there may be none of them.
+        group: the group of the quantities.
+        space: the space in which sites share: "joints", "position" or "pose".
+        keys: the keys of the three quantities, without the unit.
+        differences: the differences in every row, shape (K, n).
+        at_end: True for rows of the last second, shape (K,).
+        why_not_at_end: the reason if no row is at the end.
     """
-    found = unavailable(group, "sites share angles, not places", applies=False)
-    if space == "joints":
-        parts = [("rad", slice(None))]
-    else:
-        found = unavailable(group, "sites share places, not angles", applies=False)
-        parts = [("m", slice(0, POSITION)), ("rad", slice(POSITION, None))][
-            : 1 + (space == "pose")
-        ]
-    for unit, columns in parts:
-        part = off[:, columns]
-        values = metric(rms(part)), metric(peak(part)), metric(peak(part[at_end]), none)
-        found |= {f"{key}_{unit}": value for key, value in zip(keys, values, strict=True)}
-    return found
+    columns_by_unit = {"rad": slice(None)}
+    excluded = "sites share angles, not places"
+    if space != "joints":
+        columns_by_unit = {"m": slice(0, POSITION)}
+        excluded = "sites share places, not angles"
+        if space == "pose":
+            columns_by_unit["rad"] = slice(POSITION, None)
+    values = unavailable(group, excluded, applies=False)
+    for unit, columns in columns_by_unit.items():
+        part = differences[:, columns]
+        part_metrics = (
+            metric(rms(part)),
+            metric(peak(part)),
+            metric(peak(part[at_end]), why_not_at_end),
+        )
+        for key, value in zip(keys, part_metrics, strict=True):
+            values[f"{key}_{unit}"] = value
+    return values
 
 
 def rms(values: ArrayLike) -> float:
-    """Returns the root mean square over rows of the column with the largest; NaN of no rows,
-    shape (K, n).
-    """
+    """Returns the largest of the columns' root mean squares, shape (K, n); NaN without rows."""
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
         return math.nan
@@ -99,7 +113,7 @@ def rms(values: ArrayLike) -> float:
 
 
 def peak(values: ArrayLike) -> float:
-    """Returns the largest absolute value; NaN of none."""
+    """Returns the largest absolute value; NaN without values."""
     array = np.asarray(values, dtype=np.float64)
     return float(np.abs(array).max()) if array.size else math.nan
 
@@ -108,12 +122,12 @@ class Quantity(NamedTuple):
     """A number that a run, or each of its sites, links or walls has.
 
     Attributes:
-        key: its name in programs; ends in its unit, if any.
-        name: its name for people.
-        unit: its unit; "" for a number without.
-        reduction: reduction to the run: "max" or "sum" over all places.
-        of: the kind of place that has one: "run", "site", "link" or "wall".
-        group: its heading.
+        key: key in programs; ends in its unit, if any.
+        name: name for people.
+        unit: unit; "" for a pure number.
+        reduction: reduction to the run: "max" or "sum" over all subjects.
+        of: kind of subject: "run", "site", "link" or "wall".
+        group: heading under which the quantity is shown.
     """
 
     key: str
@@ -125,10 +139,11 @@ class Quantity(NamedTuple):
 
 
 def list_shared_quantities(names: Mapping[str, str]) -> list[Quantity]:
-    """Returns what sites share by key and name: of their angles q, rad, and then of their
-    places x, m.
+    """Returns quantities of shared angles q, in rad, and then of shared positions x, in m.
 
-    A key lacks its unit; "{0}" in a name stands for q or x.
+    Args:
+        names: names for people by key; a key lacks its unit, and "{0}" in a name stands for q
+            or x.
     """
     symbols = {"rad": "q", "m": "x"}
     return [
@@ -139,13 +154,11 @@ def list_shared_quantities(names: Mapping[str, str]) -> list[Quantity]:
 
 
 Measuring = Callable[[RunView, str], MetricValues]
-"""Returns the quantities of a place, by their keys; each a number or the reason why there is
-none.
-"""
+"""Measures a subject of a run: returns its quantities by key, each a number or a reason."""
 
 
 class Measure(NamedTuple):
-    """Quantities of a kind of place, and what measures them."""
+    """Quantities of a kind of subject, and the function that measures them."""
 
     of: str
     group: str
@@ -165,7 +178,7 @@ SHARING = "force sharing"
 USERS = "users"
 NETWORK = "network"
 LOOP = "loop"
-_SHOWN = (
+_GROUP_ORDER = (
     TRACKING,
     SPREAD,
     FOLLOWING,
@@ -178,36 +191,43 @@ _SHOWN = (
     NETWORK,
     LOOP,
 )
-"""Headings in the order in which they are shown; others follow."""
+"""Groups in the order in which they are shown; other groups follow."""
 
 
 def measures(of: str, group: str, *quantities: Quantity) -> Callable[[Measuring], Measuring]:
-    """Declares that a function measures these quantities of every "run", "site", "link" or
-    "wall".
+    """Declares that a function measures some quantities of every subject of a kind.
+
+    Args:
+        of: kind of subject: "run", "site", "link" or "wall".
+        group: heading under which the quantities are shown.
+        quantities: the quantities, without kind and group.
 
     Raises:
-        ValueError: another function measures one of them.
+        ValueError: another function measures one of the quantities.
     """
 
     def declare(measure: Measuring) -> Measuring:
-        known = {one.key: other for other in _MEASURES for one in other.quantities}
-        for one in quantities:
-            if other := known.get(one.key):
-                homes = f"{other.measure.__module__} and {measure.__module__}"
-                raise ValueError(f"metric {one.key} has two definitions, in {homes}")
-        told = tuple(one._replace(of=of, group=group) for one in quantities)
-        _MEASURES.append(Measure(of, group, told, measure))
+        definitions = {
+            quantity.key: declared for declared in _MEASURES for quantity in declared.quantities
+        }
+        for quantity in quantities:
+            other = definitions.get(quantity.key)
+            if other is not None:
+                modules = f"{other.measure.__module__} and {measure.__module__}"
+                raise ValueError(f"metric {quantity.key} has two definitions, in {modules}")
+        complete = tuple(quantity._replace(of=of, group=group) for quantity in quantities)
+        _MEASURES.append(Measure(of, group, complete, measure))
         return measure
 
     return declare
 
 
 def list_measures() -> list[Measure]:
-    """Returns what is measured, in the order in which it is shown."""
-    place = {group: n for n, group in enumerate(_SHOWN)}
-    return sorted(_MEASURES, key=lambda one: place.get(one.group, len(place)))
+    """Returns all measures, in the order in which they are shown."""
+    rank = {group: n for n, group in enumerate(_GROUP_ORDER)}
+    return sorted(_MEASURES, key=lambda measure: rank.get(measure.group, len(rank)))
 
 
 def quantities() -> list[Quantity]:
-    """Returns all quantities, in that order."""
-    return [quantity for one in list_measures() for quantity in one.quantities]
+    """Returns all quantities, in the order in which they are shown."""
+    return [quantity for measure in list_measures() for quantity in measure.quantities]

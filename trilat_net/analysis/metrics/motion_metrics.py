@@ -1,14 +1,17 @@
-"""Metrics of motion, links and loops: tracking, spread, following, effort, contact, estimates,
-timing.
+"""Metrics of motion, contact, learning, links and loops.
 
-Invariant: e is Eq. (9) and includes the delay; the spread compares one instant; a slave is
-compared with its master as that was when the sample in use was taken. Effort counts the torque
-in the record: Eq. (13) within its limit, gravity compensation included. A wall is the
-scenario's, at the logged states; ticks without a record contribute nothing. A parameter counts
-if the control law adapts it (Gamma > 0); if theta is unknown there is no error, but the
-estimates are still reported.
+Metrics of links and of the sites' loops use the definitions of docs/definitions.md.
 
-Those of links and of the loops of sites add no definition to docs/definitions.md.
+Invariant:
+    - e is that of Eq. (9), and includes the delay.
+    - The spread compares all sites at the same instant.
+    - A slave is compared with its master at the time at which the sample in use was taken.
+    - Effort counts the recorded torque: Eq. (13) within its limit, gravity compensation
+      included.
+    - A wall is that of the scenario, at the logged states. Ticks without a record contribute
+      nothing.
+    - A parameter counts if the control law adapts it (Gamma > 0). If theta is unknown there is
+      no error, but the estimates are still reported.
 """
 
 from typing import NamedTuple
@@ -57,7 +60,7 @@ from .measures import (
 )
 
 LONG_END_S = 5.0
-"""Length of the end of a run for slopes of estimates and for contact, s."""
+"""Length of the end of a run over which contact and the slopes of estimates are measured, s."""
 _ERRORS = {"rms_error": "RMS e", "max_error": "peak |e|", "max_error_end": "peak |e|, last 1 s"}
 _SPREADS = {
     "spread_rms": "RMS spread, undelayed",
@@ -69,101 +72,106 @@ _LAGS = {
     "following_max": "peak |{0}_m(t-T) - {0}_s|",
     "following_end": "the same, last 1 s",
 }
+_ERROR_UNITS = {"joints": "rad", "position": "m", "pose": "m or rad"}
 
 
 @measures(
     "site", TRACKING, Quantity("settle_s", "settled", "s"), *list_shared_quantities(_ERRORS)
 )
 def measure_tracking(view: RunView, site: str) -> MetricValues:
-    """Returns settling, RMS and peak of a site's e."""
+    """Returns the settling time, the RMS and the peak of a site's error e."""
     log = view.log
     part = log[site]
     if not len(part):
         return unavailable(TRACKING, f"no records of {site}")
-    e = site_signals.joint_errors(part)
     space = log.scenario.sites[site].task.space
-    unit = "rad" if space == "joints" else "m" if space == "position" else "m or rad"
-    unsettled = f"|e| exceeds {site_signals.SETTLED_ERROR_RAD:g} {unit} in the last record"
-    at_end = part.t_s > part.t_s[-1] - END_WINDOW_S
-    return {
-        **measure_shared(group=TRACKING, space=space, keys=_ERRORS, off=e, at_end=at_end),
-        "settle_s": metric(site_signals.settling_time_s(part), unsettled),
-    }
+    limit = f"{site_signals.SETTLED_ERROR_RAD:g} {_ERROR_UNITS[space]}"
+    metrics = measure_shared(
+        group=TRACKING,
+        space=space,
+        keys=_ERRORS,
+        differences=site_signals.joint_errors(part),
+        at_end=part.t_s > part.t_s[-1] - END_WINDOW_S,
+    )
+    metrics["settle_s"] = metric(
+        site_signals.settling_time_s(part), f"|e| exceeds {limit} in the last record"
+    )
+    return metrics
 
 
 @measures("run", SPREAD, *list_shared_quantities(_SPREADS))
 def measure_spread(view: RunView, _run: str) -> MetricValues:
-    """Returns the undelayed spread: the largest difference between sites' angles of a joint at
-    an instant.
+    """Returns the undelayed spread: the largest difference of a joint angle between two sites.
 
-    In task space between their places, along axes that all follow. Instants are the ticks of
-    the first site at which every other site has its own latest tick recorded.
+    In task space the positions of end effectors are compared instead, along the axes that all
+    sites follow. The instants are the ticks of the first site at which every other site has a
+    record of its latest tick.
     """
     log = view.log
-    runs = view.sites
     if view.absent:
         return unavailable(SPREAD, f"no records of {', '.join(view.absent)}")
-    sites = [run.records for run in runs.values()]
+    sites = [run.records for run in view.sites.values()]
     rows, known = find_common_rows(sites)
-    poses = [records.shared[row] for records, row in zip(sites, rows, strict=True)]
+    poses_by_site = [records.shared[row] for records, row in zip(sites, rows, strict=True)]
     if not known.any():
         return unavailable(SPREAD, "no instant of which every site has a record")
-    there = np.stack(poses)[:, known]
-    # of vectors on both sides of half a turn the difference is a whole turn
+    poses = np.stack(poses_by_site)[:, known]
+    # two rotation vectors of nearly the same orientation, on both sides of half a turn, differ
+    # by a whole turn
     if sites[0].x.shape[1] == POSE:
-        for turns in there[1:, :, POSITION:]:
-            turns[:] = choose_nearest_vectors(turns, there[0, :, POSITION:])
-    apart = np.ptp(there, axis=0)
+        for orientations in poses[1:, :, POSITION:]:
+            orientations[:] = choose_nearest_vectors(orientations, poses[0, :, POSITION:])
+    spread = np.ptp(poses, axis=0)
     axes = [records.axes for records in sites]
     if all(axes):
-        apart = apart * np.prod(axes, axis=0)
+        spread = spread * np.prod(axes, axis=0)
     end_s = min(float(records.t_s[-1]) for records in sites)
-    last = sites[0].t_s[known] > end_s - END_WINDOW_S
-    none = "no instant of the last second of which every site has a record"
     return measure_shared(
         group=SPREAD,
         space=log.scenario.sites[log.sites[0]].task.space,
         keys=_SPREADS,
-        off=apart,
-        at_end=last,
-        none=none,
+        differences=spread,
+        at_end=sites[0].t_s[known] > end_s - END_WINDOW_S,
+        why_not_at_end="no instant of the last second of which every site has a record",
     )
 
 
 @measures("link", FOLLOWING, *list_shared_quantities(_LAGS))
 def measure_following(view: RunView, link: str) -> MetricValues:
-    """Returns q_m(t - T) - q_s of a master's link to a slave, T being the effective delay of
-    the tick.
+    """Returns q_m(t - T) - q_s of a link from a master to a slave, T being the age at the tick.
 
-    At every tick t_k of the slave from its first sample of that master on: the master's angles
-    in the record whose sample the slave has in use, less the slave's own.
+    At every tick of the slave from its first sample of that master on, the master's angles in
+    the record whose sample the slave uses are compared with the slave's own angles.
     """
-    log = view.log
-    runs = view.sites
-    use = view.links[link]
-    peer = use.peer
-    site = use.site
-    if [log.scenario.sites[name].role for name in (peer, site)] != ["master", "slave"]:
+    peer = view.links[link].peer
+    site = view.links[link].site
+    specs = view.log.scenario.sites
+    if specs[peer].role != "master" or specs[site].role != "slave":
         return unavailable(FOLLOWING, "no link of a master to a slave", applies=False)
-    absent = [name for name in (peer, site) if name not in runs]
-    if absent:
-        return unavailable(FOLLOWING, f"no records of {', '.join(absent)}")
-    master = runs[peer].records
-    slave = runs[site].records
-    row = slave.used[peer] - master.first
-    inside = (slave.used[peer] >= 0) & (row >= 0) & (row < len(master.known))
+    missing = [name for name in (peer, site) if name not in view.sites]
+    if missing:
+        return unavailable(FOLLOWING, f"no records of {', '.join(missing)}")
+    master = view.sites[peer].records
+    slave = view.sites[site].records
+    used = slave.used[peer]
+    row = used - master.first
+    inside = (used >= 0) & (row >= 0) & (row < len(master.known))
     row = np.clip(row, 0, len(master.known) - 1)
     known = slave.known & inside & master.known[row]
     if not known.any():
         return unavailable(FOLLOWING, f"no record of {site} uses a recorded sample of {peer}")
-    there = master.shared[row]
-    apart = compute_task_errors(there, slave.x, slave.axes) if slave.x.size else there - slave.q
-    off = apart[known]
-    last = slave.known_at_end(END_WINDOW_S)[known]
-    space = log.scenario.sites[site].task.space
-    none = "no sample in the last second"
+    master_pose = master.shared[row]
+    if slave.x.size:
+        lag = compute_task_errors(master_pose, slave.x, slave.axes)
+    else:
+        lag = master_pose - slave.q
     return measure_shared(
-        group=FOLLOWING, space=space, keys=_LAGS, off=off, at_end=last, none=none
+        group=FOLLOWING,
+        space=specs[site].task.space,
+        keys=_LAGS,
+        differences=lag[known],
+        at_end=slave.known_at_end(END_WINDOW_S)[known],
+        why_not_at_end="no sample in the last second",
     )
 
 
@@ -177,22 +185,21 @@ def measure_following(view: RunView, link: str) -> MetricValues:
     Quantity("chatter_nm", "chatter, mean change of tau a tick", "N m"),
 )
 def measure_effort(view: RunView, site: str) -> MetricValues:
-    """Returns effort and saturation of a site."""
-    log = view.log
-    part = log[site]
+    """Returns the effort of a site, and how often its torque is at the limit."""
+    part = view.log[site]
     if not len(part):
         return unavailable(EFFORT, f"no records of {site}")
     tau = part.tau
-    steps = np.diff(tau, axis=0)[np.diff(part.tick) == 1]
-    at_limit = np.any(np.abs(tau) >= log.scenario.sites[site].limits.tau_limit_nm, axis=1)
+    limit_nm = view.log.scenario.sites[site].limits.tau_limit_nm
+    at_limit = np.any(np.abs(tau) >= limit_nm, axis=1)
+    changes = np.diff(tau, axis=0)[np.diff(part.tick) == 1]
+    chatter = float(np.abs(changes).mean(axis=0).max()) if len(changes) else None
     return {
         "effort_nm2_s": metric(float(np.einsum("kj,kj->", tau, tau)) / part.rate_hz),
         "rms_tau_nm": metric(rms(tau)),
         "peak_tau_nm": metric(peak(tau)),
         "saturated_share": metric(float(at_limit.mean())),
-        "chatter_nm": metric(
-            float(np.abs(steps).mean(axis=0).max()) if len(steps) else None, "no two ticks"
-        ),
+        "chatter_nm": metric(chatter, "no two ticks"),
     }
 
 
@@ -211,10 +218,10 @@ def measure_effort(view: RunView, site: str) -> MetricValues:
     Quantity("end_hits", "hits, last 5 s", "", "sum"),
 )
 def measure_wall_contact(view: RunView, name: str) -> MetricValues:
-    """Returns force, hits and depth of a wall, over the run and over its last 5 s; None without
-    records.
+    """Returns force, hits and depth of a wall, over the run and over its last 5 s.
 
-    The first record, of all and after a gap, begins no contact: its beginning is unknown.
+    A contact in the first record, or in the first record after a gap, is not counted as a hit,
+    because its beginning is unknown.
     """
     site, wall = view.walls[name]
     run = view.sites.get(site)
@@ -225,29 +232,35 @@ def measure_wall_contact(view: RunView, name: str) -> MetricValues:
     end_effector = run.torque.end_effector
     force = wall_force(wall, t_s, end_effector)
     touches = force > 0.0
-    began = touches & np.concatenate([[False], ~touches[:-1] & known[:-1]])
+    was_free = np.concatenate([[False], ~touches[:-1] & known[:-1]])
+    is_hit = touches & was_free
+    depth = wall_depth(wall, end_effector)[known]
     metrics = {
         "contact_share": metric(float(touches[known].mean())),
-        "depth_max_m": metric(max(0.0, float(wall_depth(wall, end_effector)[known].max()))),
+        "depth_max_m": metric(max(0.0, float(depth.max()))),
     }
     at_end = known & (t_s > t_s[known][-1] - LONG_END_S)
     for prefix, rows in (("", known), ("end_", at_end)):
         metrics[f"{prefix}force_mean_n"] = metric(float(force[rows].mean()))
         metrics[f"{prefix}force_deviation_n"] = metric(float(force[rows].std()))
         metrics[f"{prefix}force_peak_n"] = metric(float(force[rows].max()))
-        metrics[f"{prefix}hits"] = metric(float(np.count_nonzero(began[rows])))
-    return {key: metrics[key] for key in unavailable(CONTACT, "")}
+        metrics[f"{prefix}hits"] = metric(float(np.count_nonzero(is_hit[rows])))
+    return {key: metrics[key] for key in unavailable(CONTACT, "")}  # in the declared order
 
 
 class BaseEstimates(NamedTuple):
-    """Estimates of a chain in the combinations of learnt parameters that torques determine,
-    shape (B,) each.
+    """Estimates of a chain in base parameters, shape (B,) each.
+
+    Base parameters are the combinations of learnt parameters that torques determine.
 
     Attributes:
-        parameter: the parameter that each is named after, by its place in theta, from 0.
-        theta: of the true parameters; None if unknown.
-        first, last: of the estimates of the first and the last record.
-        consistent_first, consistent_last: for each link, if some body has these estimates.
+        parameter: index in theta of the parameter after which each combination is named.
+        theta: true values; None if unknown.
+        first: estimates in the first record.
+        last: estimates in the last record.
+        consistent_first: for each link, whether some body has the parameters of the first
+            record.
+        consistent_last: the same for the last record.
     """
 
     parameter: list[int]
@@ -259,16 +272,16 @@ class BaseEstimates(NamedTuple):
 
 
 class ParameterEstimates(NamedTuple):
-    """Estimates of a site, shape (P,) each.
+    """Parameter estimates of a site, shape (P,) each.
 
     Attributes:
-        learnt: True for each that the law adapts.
-        theta: the true parameters; None if unknown.
-        first, last: the estimates of the first and the last record.
-        slope_per_s: of straight lines through the last 5 s, 1/s; None with less than two
-            records.
-        base: the same of a chain, of whose parameters torques determine combinations alone;
-            else None.
+        learnt: True for each parameter that the law adapts.
+        theta: true parameters; None if unknown.
+        first: estimates in the first record.
+        last: estimates in the last record.
+        slope_per_s: slopes of straight lines through the last 5 s, 1/s; None with fewer than
+            two records.
+        base: the estimates of a chain in base parameters; None for the planar arm.
     """
 
     learnt: list[bool]
@@ -281,8 +294,10 @@ class ParameterEstimates(NamedTuple):
     def to_json(self) -> JsonObject:
         """Returns the estimates, ready for JSON."""
         content = self._asdict()
-        base = content.pop("base")
-        return content if base is None else {**content, "base": base._asdict()}
+        del content["base"]
+        if self.base is not None:
+            content["base"] = self.base._asdict()
+        return content
 
 
 def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> ParameterEstimates:
@@ -291,35 +306,59 @@ def read_parameter_estimates(scenario: Scenario, records: AlignedRecords) -> Par
     arm = build_arm_rows(scenario, records.site)
     gains = spec.control.gains(arm.theta)
     theta_hat = records.theta_hat
-    moved = (theta_hat != theta_hat[0]).any(axis=0)
-    adapted = np.array(gains.Gamma) > 0.0 if gains.law is Law.ADAPTIVE else moved
-    rows = records.known_at_end(LONG_END_S)
+    if gains.law is Law.ADAPTIVE:
+        learnt = np.array(gains.Gamma) > 0.0
+    else:  # a parameter that changes is learnt
+        learnt = (theta_hat != theta_hat[0]).any(axis=0)
+    at_end = records.known_at_end(LONG_END_S)
     slope = None
-    if np.count_nonzero(rows) >= 2:
-        x = records.t_s[rows] - records.t_s[rows].mean()
-        slope = (x @ theta_hat[rows] / (x @ x)).tolist()
+    if np.count_nonzero(at_end) >= 2:
+        centred_s = records.t_s[at_end] - records.t_s[at_end].mean()
+        slope = (centred_s @ theta_hat[at_end] / (centred_s @ centred_s)).tolist()
     theta = arm.theta.tolist() if spec.arm.known else None
-    base = None if isinstance(arm, PlanarArmRows) else _in_base(arm, adapted, theta, theta_hat)
-    ends = theta_hat[0].tolist(), theta_hat[-1].tolist()
-    return ParameterEstimates(adapted.tolist(), theta, *ends, slope, base)
+    base = None
+    if not isinstance(arm, PlanarArmRows):
+        base = _estimate_base_parameters(arm, learnt, theta, theta_hat)
+    return ParameterEstimates(
+        learnt=learnt.tolist(),
+        theta=theta,
+        first=theta_hat[0].tolist(),
+        last=theta_hat[-1].tolist(),
+        slope_per_s=slope,
+        base=base,
+    )
 
 
 def read_all_estimates(view: RunView) -> dict[str, ParameterEstimates]:
-    """Returns the estimates of every site with records."""
+    """Returns the parameter estimates of every site with records."""
     return {
         site: read_parameter_estimates(view.scenario, run.records)
         for site, run in view.sites.items()
     }
 
 
-def _in_base(
+def _estimate_base_parameters(
     arm: ArmRows, learnt: Bools, theta: list[float] | None, theta_hat: Array
 ) -> BaseEstimates:
+    """Returns the estimates of a chain in base parameters.
+
+    Args:
+        arm: the chain.
+        learnt: True for each parameter that the law adapts, shape (P,).
+        theta: true parameters; None if unknown.
+        theta_hat: estimates in every record, shape (K, P).
+    """
     base = find_base_parameters(arm, learnt)
     first, last = (base.combination @ theta_hat[[0, -1]].T).T.tolist()
-    truth = None if theta is None else (base.combination @ np.array(theta)).tolist()
-    consistent = map(find_consistent_links, theta_hat[[0, -1]])
-    return BaseEstimates(base.kept.tolist(), truth, first, last, *consistent)
+    true_base = None if theta is None else (base.combination @ np.array(theta)).tolist()
+    return BaseEstimates(
+        parameter=base.kept.tolist(),
+        theta=true_base,
+        first=first,
+        last=last,
+        consistent_first=find_consistent_links(theta_hat[0]),
+        consistent_last=find_consistent_links(theta_hat[-1]),
+    )
 
 
 @measures(
@@ -333,11 +372,10 @@ def _in_base(
     Quantity("unphysical_links", "unphysical links, at last", "", "sum"),
 )
 def measure_parameter_error(view: RunView, site: str) -> MetricValues:
-    """Returns the distance of the estimates from theta at both ends, and their rate of change
-    at the end.
+    """Returns the estimates' distance from theta, and their rate of change at the end.
 
-    Distance and energy of a chain are those of the combinations that torques determine: what
-    else its estimates are off by stays as it is, and acts on nothing.
+    Distance and energy of a chain are those of its base parameters. The remaining errors of the
+    estimates stay as they are and have no effect on the torque.
     """
     scenario = view.scenario
     estimates = view.compute_once(read_all_estimates).get(site)
@@ -345,13 +383,14 @@ def measure_parameter_error(view: RunView, site: str) -> MetricValues:
         return unavailable(LEARNING, "no records of the site")
     arm = build_arm_rows(scenario, site)
     gains = scenario.sites[site].control.gains(arm.theta)
-    rows = np.array(estimates.learnt)
-    if not rows.any():
+    learnt = np.array(estimates.learnt)
+    if not learnt.any():
         return unavailable(LEARNING, "nothing is learnt", applies=False)
-    slopes = estimates.slope_per_s
     base = estimates.base
-    slope = None if slopes is None else float(np.linalg.norm(np.array(slopes)[rows]))
     metrics = unavailable(LEARNING, "theta of the arm is not known")
+    slope = None
+    if estimates.slope_per_s is not None:
+        slope = float(np.linalg.norm(np.array(estimates.slope_per_s)[learnt]))
     metrics["theta_slope_per_s"] = metric(slope, "less than two records in the last 5 s")
     metrics["unphysical_links"] = Metric(
         None, "it is no chain, of ten parameters a link", applies=False
@@ -360,36 +399,43 @@ def measure_parameter_error(view: RunView, site: str) -> MetricValues:
         metrics["unphysical_links"] = metric(base.consistent_last.count(False))
     if estimates.theta is None:
         return metrics
-    off = np.array([estimates.first, estimates.last])[:, rows] - np.array(estimates.theta)[rows]
-    if base is not None:
-        off = np.array([base.first, base.last]) - np.array(base.theta)
-    energy: list[float | None] = [None, None]
+    if base is None:
+        first_and_last = np.array([estimates.first, estimates.last])[:, learnt]
+        errors = first_and_last - np.array(estimates.theta)[learnt]
+    else:
+        errors = np.array([base.first, base.last]) - np.array(base.theta)
+    energies: list[float | None] = [None, None]
+    why = "the gains of learning are not known"
     if gains.law is Law.ADAPTIVE:
-        energy = _find_parameter_energy(arm, rows, np.array(gains.Gamma), off)
-    why = (
-        "it is no finite number"
-        if gains.law is Law.ADAPTIVE
-        else "the gains of learning are not known"
-    )
-    for end, distance, stored in zip(
-        ("first", "last"), np.linalg.norm(off, axis=1), energy, strict=True
-    ):
+        energies = _compute_parameter_energy(arm, learnt, np.array(gains.Gamma), errors)
+        why = "it is no finite number"
+    distances = np.linalg.norm(errors, axis=1)
+    for end, distance, energy in zip(("first", "last"), distances, energies, strict=True):
         metrics[f"theta_error_{end}"] = metric(float(distance))
-        metrics[f"theta_energy_{end}_j"] = metric(stored, why)
+        metrics[f"theta_energy_{end}_j"] = metric(energy, why)
     return metrics
 
 
-def _find_parameter_energy(
-    arm: ArmRows, learnt: Bools, Gamma: Array, off: Array
+def _compute_parameter_energy(
+    arm: ArmRows, learnt: Bools, Gamma: Array, errors: Array
 ) -> list[float | None]:
-    """Returns the part of V of errors of base parameters, which learn with B Gamma B', shape
-    (K, B), J.
+    """Returns the part of V of parameter errors, in J, for each row.
+
+    Base parameters learn with the gain B Gamma B', where B is the matrix of their combinations.
+
+    Args:
+        arm: the arm.
+        learnt: True for each parameter that the law adapts, shape (P,).
+        Gamma: adaptation gains, shape (P,).
+        errors: errors of the learnt parameters, of a chain those of its base parameters, shape
+            (K, B).
     """
     if isinstance(arm, PlanarArmRows):
-        energy = 0.5 * (off**2 / Gamma[learnt]).sum(axis=1)
+        energy = 0.5 * (errors**2 / Gamma[learnt]).sum(axis=1)
     else:
         B = find_base_parameters(arm, learnt).combination
-        energy = 0.5 * (off * np.linalg.solve(B * Gamma @ B.T, off.T).T).sum(axis=1)
+        weighted = np.linalg.solve(B * Gamma @ B.T, errors.T).T
+        energy = 0.5 * (errors * weighted).sum(axis=1)
     return list(energy.tolist())
 
 
@@ -404,23 +450,24 @@ def _find_parameter_energy(
     Quantity("burst", "lost in a row, mean"),
     Quantity("late_samples", "late samples", "", "sum"),
 )
-def measure_network(view: RunView, link: str) -> MetricValues:
+def measure_network(view: RunView, name: str) -> MetricValues:
     """Returns effective delay, loss and bursts of a link."""
-    use = view.links[link]
-    age = use.age_ms
-    never = "no sample ever came into use"
+    link = view.links[name]
+    age = link.age_ms
+    unused = "no sample ever came into use"
     unknown = "of no sample it is known whether it came"
-    lossless = Metric(None, "nothing was lost", applies=False)
+    burst = metric(link.burst, unknown)
+    if link.loss == 0.0:
+        burst = Metric(None, "nothing was lost", applies=False)
+    late = link.counts.late if link.counts else None
     return {
-        "age_mean_ms": metric(age.mean if age else None, never),
-        "age_p99_ms": metric(age.p99 if age else None, never),
-        "age_max_ms": metric(age.max if age else None, never),
-        "silence_ms": metric(use.silence_ms, never),
-        "loss": metric(use.loss, unknown),
-        "burst": lossless if use.loss == 0.0 else metric(use.burst, unknown),
-        "late_samples": metric(
-            use.counts.late if use.counts else None, f"no records of {use.site}"
-        ),
+        "age_mean_ms": metric(age.mean if age else None, unused),
+        "age_p99_ms": metric(age.p99 if age else None, unused),
+        "age_max_ms": metric(age.max if age else None, unused),
+        "silence_ms": metric(link.silence_ms, unused),
+        "loss": metric(link.loss, unknown),
+        "burst": burst,
+        "late_samples": metric(late, f"no records of {link.site}"),
     }
 
 
@@ -434,7 +481,7 @@ def measure_network(view: RunView, link: str) -> MetricValues:
     Quantity("missing", "missing records", "", "sum"),
 )
 def measure_loop(view: RunView, site: str) -> MetricValues:
-    """Returns lateness, computing time and overruns of a site's loop, and its missing records."""
+    """Returns lateness, computing time and overruns of a site's loop, and missing records."""
     log = view.log
     missing = {"missing": metric(log.missing(site))}
     if log.driver != "live":
@@ -442,11 +489,12 @@ def measure_loop(view: RunView, site: str) -> MetricValues:
     if not len(log[site]):
         return unavailable(LOOP, f"no records of {site}") | missing
     health = describe_site_health(log, site)
-    busy = health["busy_us"]
+    late_us = health["late_us"]
+    busy_us = health["busy_us"]
     return {
-        "late_p99_us": metric(health["late_us"]["p99"]),
-        "late_max_us": metric(health["late_us"]["max"]),
-        "busy_p99_us": metric(busy["p99"] if busy else None, "no second record"),
+        "late_p99_us": metric(late_us["p99"]),
+        "late_max_us": metric(late_us["max"]),
+        "busy_p99_us": metric(busy_us["p99"] if busy_us else None, "no second record"),
         "overruns": metric(health["overruns"]),
         **missing,
     }

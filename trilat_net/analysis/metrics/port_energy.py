@@ -1,13 +1,17 @@
-"""Energies of a site's ports, of its arm, and the energy that the delay of each link injects.
+"""Metrics of energy: of a site's ports, of its arm, and of the delay of each link.
 
-Invariant: the work of a torque is int tau' dq: tau_k' (q_k+1 - q_k), exactly, for one held over
-a period; the trapezoid rule over dq for one that follows the state, which is exact for springs.
-The running energy of a port is that of a passivity observer (Hannaford and Ryu 2002).
+The work of a torque is int tau' dq. For a torque that is held over a period it is exactly
+tau_k' (q_{k+1} - q_k). For a torque that follows the state, the trapezoid rule over dq is used,
+which is exact for springs. The running energy of a port is that of a passivity observer
+(Hannaford and Ryu 2002).
 
-The control torque is affine in a peer's motion: that of the same law without delay, at this
-state and estimate, plus one term per link, E_ij = int qd_i' dtau_ij dt, dtau_ij = S_i ( p_j(t -
-T_ij) - p_j(t) ), p_j being what the link carries and S_i the law's gain; docs/metrics.md has it
-for each law, and the sources.
+The control torque is affine in a peer's motion: it equals the torque of the same law without
+delay, at the same state and estimate, plus one term per link,
+
+    E_ij = int qd_i' dtau_ij dt,   dtau_ij = S_i ( p_j(t - T_ij) - p_j(t) ),
+
+where p_j is the signal that the link carries, and S_i the law's gain. docs/metrics.md gives
+both for each law, and the sources.
 """
 
 import numpy as np
@@ -32,16 +36,28 @@ _NO_FRICTION = Metric(None, "its joints have no friction", applies=False)
 
 
 def held_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque held over every period, shape (K - 1, n) or more, N m, per
-    period, J.
+    """Returns the work per period of a torque that is held over every period.
+
+    Args:
+        torque: the torque in every period, shape (K - 1, n) or longer, N m.
+        q: joint angles at the ticks, shape (K, n), rad.
+
+    Returns:
+        Work per period, shape (K - 1,), J.
     """
     work: Array = np.einsum("kj,kj->k", torque[: len(q) - 1], np.diff(q, axis=0))
     return work
 
 
 def trapezoid_work(torque: Array, q: Array) -> Array:
-    """Returns the work of a torque that follows the present, shape (K, n), N m, per period, (K
-    - 1,), J.
+    """Returns the work per period of a torque that follows the state, by the trapezoid rule.
+
+    Args:
+        torque: the torque at the ticks, shape (K, n), N m.
+        q: joint angles at the ticks, shape (K, n), rad.
+
+    Returns:
+        Work per period, shape (K - 1,), J.
     """
     return held_work(0.5 * (torque[:-1] + torque[1:]), q)
 
@@ -49,8 +65,8 @@ def trapezoid_work(torque: Array, q: Array) -> Array:
 def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
     """Returns the torque that the controller held over every period, shape (K - 1, n), N m.
 
-    The drives of an arm outside of the program got tau; their torque in between is unknown: the
-    trapezoid.
+    The drives of an external arm received tau, but their torque between two ticks is unknown:
+    the mean of both ticks is used.
     """
     spec = scenario.sites[records.site]
     if spec.plant != "simulated":
@@ -62,12 +78,11 @@ def held_control_torque(records: AlignedRecords, scenario: Scenario) -> Array:
 def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
     """Returns the arm's kinetic and potential energy, shape (K,), J.
 
-    1/2 qd'M qd + g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)) of the planar arm: of height zero
-    when level.
+    For the planar arm it is 1/2 qd'M qd + g (theta_4 sin q_1 + theta_5 sin(q_1 + q_2)): the
+    height is zero when the arm is level.
     """
-    kinetic = 0.5 * np.einsum(
-        "kj,kj->k", records.qd, arm.multiply_inertia(records.q, records.qd)
-    )
+    momentum = arm.multiply_inertia(records.q, records.qd)
+    kinetic = 0.5 * np.einsum("kj,kj->k", records.qd, momentum)
     energy: Array = kinetic + arm.potential_energy(records.q)
     return energy
 
@@ -87,12 +102,14 @@ def mechanical_energy(arm: ArmRows, records: AlignedRecords) -> Array:
 def measure_port_energy(view: RunView, site: str) -> MetricValues:
     """Returns the energies of a site's ports, over the periods with both ends recorded.
 
-    Stops of joints count as environment; friction takes what the arm gains less.
+    The stops of joints count as environment. Friction absorbs energy that the arm does not
+    gain.
     """
     if site not in view.sites:
         return unavailable(ENERGY, f"no records of {site}", of="site")
     scenario = view.scenario
-    (records, torque, _) = view.sites[site]
+    records = view.sites[site].records
+    torque = view.sites[site].torque
     arm = build_arm_rows(scenario, records.site)
     spec = scenario.sites[records.site]
     known = records.known_periods
@@ -100,38 +117,41 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
     if not known.any():
         return unavailable(ENERGY, "no two records in a row", of="site")
 
-    def total(amounts: Array) -> Array:
-        return np.cumsum(np.where(known, amounts, 0.0))
+    def accumulate(work: Array) -> Array:
+        return np.cumsum(np.where(known, work, 0.0))
 
-    controller = total(held_work(held_control_torque(records, scenario), q))
-    operator = total(
+    controller = accumulate(held_work(held_control_torque(records, scenario), q))
+    operator = accumulate(
         trapezoid_work(torque.operator_now, q) + held_work(torque.operator_held, q)
     )
-    stops = arm.stop_torque(q, records.qd)
-    rubbed = arm.friction(records.qd)
-    walls = total(
-        trapezoid_work(torque.environment_now + stops, q)
+    stop_torque = arm.stop_torque(q, records.qd)
+    walls = accumulate(
+        trapezoid_work(torque.environment_now + stop_torque, q)
         + held_work(torque.environment_held, q)
     )
-    friction = total(trapezoid_work(rubbed, q))
-    no_walls = Metric(None, "the scenario has no environment here", applies=False)
-    bounded = bool(spec.environment) or stops.any()
-    found = {
+    friction_torque = arm.friction(records.qd)
+    friction = accumulate(trapezoid_work(friction_torque, q))
+    metrics = {
         "controller_j": metric(controller[-1]),
         "hands_j": metric(operator[-1]),
         "hands_most_j": metric(max(0.0, float(operator.max()))),
-        "walls_j": metric(walls[-1]) if bounded else no_walls,
-        "walls_most_j": metric(max(0.0, float(walls.max()))) if bounded else no_walls,
-        "friction_j": metric(friction[-1]) if rubbed.any() else _NO_FRICTION,
     }
+    if bool(spec.environment) or stop_torque.any():
+        metrics["walls_j"] = metric(walls[-1])
+        metrics["walls_most_j"] = metric(max(0.0, float(walls.max())))
+    else:
+        no_walls = Metric(None, "the scenario has no environment here", applies=False)
+        metrics["walls_j"] = no_walls
+        metrics["walls_most_j"] = no_walls
+    metrics["friction_j"] = metric(friction[-1]) if friction_torque.any() else _NO_FRICTION
     if not spec.arm.known:
         unknown = Metric(None, "theta of the arm is not known")
-        return {**found, "mechanical_j": unknown, "unaccounted_j": unknown}
-    change = total(np.diff(mechanical_energy(arm, records)))
-    unaccounted = np.abs(change - controller - operator - walls + friction)
+        return {**metrics, "mechanical_j": unknown, "unaccounted_j": unknown}
+    gained = accumulate(np.diff(mechanical_energy(arm, records)))
+    unaccounted = np.abs(gained - controller - operator - walls + friction)
     return {
-        **found,
-        "mechanical_j": metric(change[-1]),
+        **metrics,
+        "mechanical_j": metric(gained[-1]),
         "unaccounted_j": metric(float(unaccounted.max())),
     }
 
@@ -143,11 +163,10 @@ def measure_port_energy(view: RunView, site: str) -> MetricValues:
     Quantity("delay_most_j", "given by the delay at most", "J"),
 )
 def measure_delay_energy(view: RunView, link: str) -> MetricValues:
-    """Returns the energy that the delay of a link injects: in all, and the most until any time,
-    J.
+    """Returns the energy that a link's delay injects: in all, and the most up to any time, J.
 
-    Over the periods that follow from records alone and in which the site follows its peers; of
-    the torque that the law asks for, before its limit.
+    Only periods count that follow from records alone, and in which the site follows its peers.
+    The torque is that of the law before its limit.
     """
     runs = view.sites
     peer = view.links[link].peer
@@ -155,31 +174,32 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
     arm = build_arm_rows(view.scenario, site)
     law = view.scenario.sites[site].control
     gains = law.gains(arm.theta)
-    absent = [name for name in (peer, site) if name not in runs]
-    if absent:
-        return unavailable(ENERGY, f"no records of {', '.join(absent)}", of="link")
+    missing = [name for name in (peer, site) if name not in runs]
+    if missing:
+        return unavailable(ENERGY, f"no records of {', '.join(missing)}", of="link")
     if gains.law is Law.USER:
-        unknown = f"the law {identify_law(law)} does not say which part of its torque is due to a peer"
+        name = identify_law(law)
+        unknown = f"the law {name} does not say which part of its torque is due to a peer"
         return unavailable(ENERGY, unknown, of="link")
     records = runs[site].records
-    other = runs[peer].records
-    factors = runs[site].dominance
-    if min(len(records.known), len(other.known)) < 2:
+    peer_records = runs[peer].records
+    dominance = runs[site].dominance
+    if min(len(records.known), len(peer_records.known)) < 2:
         return unavailable(ENERGY, "no two records in a row", of="link")
-    delayed = view_delayed_peer(records, PeerTrajectory(other))
-    known = delayed.delayed.known & delayed.now.known & records.follows
+    peer_view = view_delayed_peer(records, PeerTrajectory(peer_records))
+    known = peer_view.delayed.known & peer_view.now.known & records.follows
     judged = records.known_periods & known[:-1] & known[1:]
     if not judged.any():
         return unavailable(ENERGY, "no period rests on records of both sites", of="link")
     j = list(records.used).index(peer)
-    torque = _delay_torque(
+    torque = _compute_delay_torque(
         gains=gains,
         arm=arm,
         records=records,
-        other=other,
-        view=delayed,
-        alpha=factors.alpha[:, [j]],
-        rate=factors.rate[:, [j]],
+        peer_records=peer_records,
+        view=peer_view,
+        alpha=dominance.alpha[:, [j]],
+        alpha_rate=dominance.rate[:, [j]],
     )
     injected = np.cumsum(np.where(judged, trapezoid_work(torque, records.q), 0.0))
     return {
@@ -188,41 +208,50 @@ def measure_delay_energy(view: RunView, link: str) -> MetricValues:
     }
 
 
-def _delay_torque(
+def _compute_delay_torque(
     gains: Gains,
     arm: ArmRows,
     records: AlignedRecords,
-    other: AlignedRecords,
+    peer_records: AlignedRecords,
     view: DelayedPeer,
     alpha: Array,
-    rate: Array,
+    alpha_rate: Array,
 ) -> Array:
-    """Returns the torque that the delay adds to that of the law, shape (K, n), N m.
+    """Returns the torque that the delay of a link adds to that of the law, shape (K, n), N m.
 
-    Without what it does to the Coulomb friction that a law compensates.
+    Its effect on the Coulomb friction that a law compensates is left out.
+
+    Args:
+        gains: gains of the law.
+        arm: the site's arm.
+        records: the site's records.
+        peer_records: the peer's records.
+        view: the peer as the site sees it.
+        alpha: dominance factor of the peer, shape (K, 1).
+        alpha_rate: its derivative, shape (K, 1), 1/s.
     """
-    late = view.delayed.q - view.now.q
-    off = alpha * late
-    off_rate = alpha * (view.delayed.qd - view.now.qd) + rate * late
-    every = slice(None)
+    all_rows = slice(None)
+    lag = view.delayed.q - view.now.q
+    reference_change = alpha * lag
+    reference_rate_change = alpha * (view.delayed.qd - view.now.qd) + alpha_rate * lag
     axes = np.array(records.axes or 1.0)
-    follows = build_following(
-        arm, records.q, records.qd, axes * np.array(gains.Lambda)
-    ).without_posture()
+    Lambda = axes * np.array(gains.Lambda)
     Kd = axes * np.array(gains.Kd)
+    following = build_following(arm, records.q, records.qd, Lambda).without_posture()
     if gains.law is Law.ADAPTIVE:
-        v, a = follows.compute_reference(every, -off, -off_rate)
+        v, a = following.compute_reference(all_rows, -reference_change, -reference_rate_change)
         torque = arm.weightless().law_torque(records.theta_hat, records.q, records.qd, v, a)
-        return (
-            torque + np.array(gains.Kp) * v + follows.compute_joint_torque(every, Kd * off_rate)
-        )
-    pull = axes * np.array(gains.K) * off + Kd * off_rate
-    # it reflects the torque on the peer: as it came, less the one at the same time
+        damping = following.compute_joint_torque(all_rows, Kd * reference_rate_change)
+        return torque + np.array(gains.Kp) * v + damping
+    force = axes * np.array(gains.K) * reference_change + Kd * reference_rate_change
+    # a law that reflects force uses the peer's external torque as it arrived, instead of the
+    # peer's present one
     if np.any(gains.k_f):
-        used = records.used[other.site]
-        row = np.clip(used - other.first, 0, len(other.known) - 1)
-        pushed = other.wrench if other.wrench.size else other.tau_x
-        came = np.where((used >= 0)[:, None], -pushed[row], 0.0)
-        now = [np.interp(records.t_s, other.t_s, -column) for column in pushed.T]
-        pull = pull + axes * np.array(gains.k_f) * alpha * (came - np.stack(now, axis=1))
-    return follows.compute_joint_torque(every, pull)
+        used = records.used[peer_records.site]
+        row = np.clip(used - peer_records.first, 0, len(peer_records.known) - 1)
+        peer_torque = peer_records.wrench if peer_records.wrench.size else peer_records.tau_x
+        arrived = np.where((used >= 0)[:, None], -peer_torque[row], 0.0)
+        columns = [np.interp(records.t_s, peer_records.t_s, -x) for x in peer_torque.T]
+        present = np.stack(columns, axis=1)
+        force = force + axes * np.array(gains.k_f) * alpha * (arrived - present)
+    return following.compute_joint_torque(all_rows, force)

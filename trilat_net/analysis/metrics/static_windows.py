@@ -1,11 +1,17 @@
-"""Metrics at rest: windows in which all arms rest under constant torques, rendered stiffness,
-force sharing.
+"""Metrics at rest: static windows, rendered stiffness and force sharing.
 
-Invariant: docs/metrics.md defines and derives each. A stiffness is the operator's own, and is
-not given, if anything but that operator changed; it is a secant along the path taken: the other
-joint moves as well. The torques tau_i ON the arms obey sum_i (pi_i / K_i) tau_i = 0 per joint,
-pi being the left Perron vector of the dominance matrix and K_i what holds e_i; if gravity is
-adapted the estimates take up the load.
+In a static window all arms rest under constant torques. The torques tau_i ON the arms obey
+
+    sum_i (pi_i / K_i) tau_i = 0   for every joint,
+
+where pi is the left Perron vector of the dominance matrix, and K_i the stiffness that holds
+e_i. docs/metrics.md defines and derives each metric.
+
+Invariant:
+    - A stiffness is that which one operator met, and is given only if nothing but that operator
+      changed.
+    - A stiffness is a secant along the path taken: the other joints move as well.
+    - If gravity is adapted, the estimates take up the load, and no torque is expected.
 """
 
 from collections.abc import Mapping
@@ -20,7 +26,7 @@ from ...core.vectors import Array
 from ...log.record_columns import Ints
 from ...scenario import Scenario
 from ...scenario.laws import identify_law
-from ..aligned import find_latest_rows
+from ..aligned import Bools, find_latest_rows
 from ..arm_rows import build_arm_rows
 from ..dominance_history import find_closed_groups, left_perron_vector
 from ..run_end import STATIC_SPEED_RAD_S
@@ -28,31 +34,35 @@ from ..run_view import RunView, SiteRun
 from .measures import SHARING, Metric, MetricValues, Quantity, measures, metric
 
 WINDOW_S = 1.0
-"""Length of a window, s; an interval must be as long."""
+"""Length of a window, s."""
 MAX_TORQUE_VARIATION = 0.01
-"""Largest variation of a torque in a window, as a share of the largest one there."""
+"""Largest variation of a torque within a window, as a share of the largest torque there."""
 MIN_LOAD_NM = 0.05
-"""Smaller torques are no load, N m."""
+"""Smaller torques do not count as a load, N m."""
 MOVING_SCRIPT_NM = 1e-9
-"""A script that changes by more from tick to tick moves, N m."""
+"""A script that changes by more than this from tick to tick moves, N m."""
 MIN_TORQUE_CHANGE_NM = 0.1
-"""Least change of a torque that shows a stiffness, N m."""
+"""Least change of a torque from which a stiffness is computed, N m."""
 MIN_ANGLE_CHANGE_RAD = 1e-4
-"""Least change of an angle, rad."""
+"""Least change of an angle from which a stiffness is computed, rad."""
 STILL_SCRIPT_NM = 1e-6
-"""An operator whose script changed by no more between windows stood still, N m."""
+"""An operator whose script changes by no more than this between two windows stood still, N
+m.
+"""
 MIN_LOAD_SHARE = 0.02
 """A site with less than this share of the largest torque is not loaded."""
 
 
 class StaticWindow(NamedTuple):
-    """A static window, from its first tick to its last; per site means over it, shape (n,).
+    """A window in which all arms rest, with means over the window by site.
 
     Attributes:
-        torque, environment: of operator and environment ON the arm, and of the environment
-        alone, N m.
-        script: the operator's script, N m; None if unknown.
-        q: the joint angles, rad.
+        from_s: time of the first tick, in s.
+        to_s: time of the last tick, in s.
+        torque: torque of operator and environment ON the arm, shape (n,), N m.
+        environment: torque of the environment alone, shape (n,), N m.
+        script: the operator's script, shape (n,), N m; None if unknown.
+        q: joint angles, shape (n,), rad.
         alpha: the dominance matrix, shape (N, N).
     """
 
@@ -66,41 +76,58 @@ class StaticWindow(NamedTuple):
 
 
 def find_static_windows(view: RunView) -> list[StaticWindow]:
-    """Returns the static windows of all sites, in order; none if one has no records."""
+    """Returns the static windows of a run, in order; [] if some site has no records.
+
+    A window is the last `WINDOW_S` of an interval in which all sites rest.
+    """
     if view.absent:
         return []
     runs = view.shared
-    first = next(iter(runs.values())).records
-    rows = {}
-    still = first.known.copy()
-    for site, (records, torque, dominance) in runs.items():
-        rows[site], recorded = find_latest_rows(records, first.t_s)
-        slow = np.abs(records.qd).max(axis=1) < STATIC_SPEED_RAD_S
-        static = records.follows & slow & ~dominance.rate.any(axis=1)
-        if torque.script is not None:  # without a script the torque decides
-            moves = np.abs(np.diff(torque.script, axis=0)).max(axis=1) > MOVING_SCRIPT_NM
-            static &= ~(np.append(moves, False) | np.append(False, moves))
-        still &= recorded & static[rows[site]]
-    need = int(np.ceil(WINDOW_S * first.rate_hz))
-    edges = (
-        np.flatnonzero(np.diff(np.concatenate([[False], still, [False]])))
-        .reshape(-1, 2)
-        .tolist()
-    )
+    first_records = next(iter(runs.values())).records
+    rows_by_site = {}
+    still = first_records.known.copy()
+    for site, run in runs.items():
+        row, recorded = find_latest_rows(run.records, first_records.t_s)
+        rows_by_site[site] = row
+        still &= recorded & _find_resting_rows(run)[row]
+    window_ticks = int(np.ceil(WINDOW_S * first_records.rate_hz))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]])))
     windows = []
-    for last in (slice(end - need - 1, end) for begin, end in edges if end - begin > need):
-        here = {site: row[last] for site, row in rows.items()}
-        pushed = [runs[site].records.tau_x[row] for site, row in here.items()]
-        largest = max(float(np.abs(values).max()) for values in pushed)
-        variation = max(float(np.ptp(values, axis=0).max()) for values in pushed)
-        if not variation > MAX_TORQUE_VARIATION * max(largest, MIN_LOAD_NM):
-            windows.append(_average_window(runs, here, first.t_s[last]))
+    for begin, end in edges.reshape(-1, 2).tolist():
+        if end - begin <= window_ticks:
+            continue
+        ticks = slice(end - window_ticks - 1, end)
+        window_rows = {site: row[ticks] for site, row in rows_by_site.items()}
+        torques = [runs[site].records.tau_x[row] for site, row in window_rows.items()]
+        largest_nm = max(float(np.abs(torque).max()) for torque in torques)
+        variation_nm = max(float(np.ptp(torque, axis=0).max()) for torque in torques)
+        if not variation_nm > MAX_TORQUE_VARIATION * max(largest_nm, MIN_LOAD_NM):
+            windows.append(_average_window(runs, window_rows, first_records.t_s[ticks]))
     return windows
+
+
+def _find_resting_rows(run: SiteRun) -> Bools:
+    """Returns the rows in which a site rests under constant shares and a constant script."""
+    records = run.records
+    slow = np.abs(records.qd).max(axis=1) < STATIC_SPEED_RAD_S
+    resting = records.follows & slow & ~run.dominance.rate.any(axis=1)
+    script = run.torque.script
+    if script is not None:  # without a script the variation of the torque decides
+        moves = np.abs(np.diff(script, axis=0)).max(axis=1) > MOVING_SCRIPT_NM
+        resting &= ~(np.append(moves, False) | np.append(False, moves))
+    return resting
 
 
 def _average_window(
     runs: Mapping[str, SiteRun], rows: Mapping[str, Ints], t_s: Array
 ) -> StaticWindow:
+    """Returns a static window with the means over its rows.
+
+    Args:
+        runs: all sites.
+        rows: rows of the window by site.
+        t_s: times of the window, in s.
+    """
     names = list(runs)
     window = StaticWindow(
         from_s=float(t_s[0]),
@@ -111,25 +138,30 @@ def _average_window(
         q={},
         alpha=np.zeros((len(names), len(names))),
     )
-    for i, (site, (records, torque, dominance)) in enumerate(runs.items()):
+    for i, (site, run) in enumerate(runs.items()):
         row = rows[site]
-        window.torque[site] = -records.tau_x[row].mean(axis=0)
-        window.environment[site] = torque.environment[row].mean(axis=0)
-        window.script[site] = None if torque.script is None else torque.script[row].mean(axis=0)
-        window.q[site] = records.q[row].mean(axis=0)
-        for j, peer in enumerate(records.used):
-            window.alpha[i, names.index(peer)] = dominance.alpha[row[-1], j]
+        script = run.torque.script
+        window.torque[site] = -run.records.tau_x[row].mean(axis=0)
+        window.environment[site] = run.torque.environment[row].mean(axis=0)
+        window.script[site] = None if script is None else script[row].mean(axis=0)
+        window.q[site] = run.records.q[row].mean(axis=0)
+        for j, peer in enumerate(run.records.used):
+            window.alpha[i, names.index(peer)] = run.dominance.alpha[row[-1], j]
     return window
 
 
 class StiffnessEstimate(NamedTuple):
-    """Stiffness that an operator met at a joint, from 1, between the ends of two static windows
-    in a row.
+    """Stiffness that an operator met at a joint, between two successive static windows.
 
     Attributes:
-        torque_nm, angle_rad: change of the operator's torque ON its arm, and of the joint's
-        angle.
-        stiffness_nm_rad: their ratio; None if the joint did not move: too stiff to measure.
+        from_s: end of the first window, in s.
+        to_s: end of the second window, in s.
+        site: site of the operator.
+        joint: number of the joint, from 1.
+        torque_nm: change of the operator's torque ON its arm.
+        angle_rad: change of the joint's angle.
+        stiffness_nm_rad: their ratio; None if the joint did not move, and is too stiff to be
+            measured.
     """
 
     from_s: float
@@ -142,54 +174,64 @@ class StiffnessEstimate(NamedTuple):
 
 
 def estimate_stiffness(view: RunView) -> list[StiffnessEstimate]:
-    """Returns the stiffness between each two static windows between which one operator alone
-    moved.
-    """
+    """Returns the stiffness between successive static windows, if a single operator moved."""
     estimates = []
     for before, after in pairwise(view.compute_once(find_static_windows)):
-        moved = []
-        known = True
-        for site, now in after.script.items():
-            then = before.script[site]
-            if now is None or then is None:
-                known = False
-            elif np.abs(now - then).max() > STILL_SCRIPT_NM:
-                moved.append(site)
-        if not known or len(moved) != 1 or (before.alpha != after.alpha).any():
+        site = _find_single_mover(before, after)
+        if not site or (before.alpha != after.alpha).any():
             continue
-        site = moved[0]
-        operator = [
-            window.torque[site] - window.environment[site] for window in (before, after)
-        ]
-        torques = operator[1] - operator[0]
-        angles = after.q[site] - before.q[site]
-        for joint in range(len(torques)):
-            torque = float(torques[joint])
-            angle = float(angles[joint])
-            if abs(torque) >= MIN_TORQUE_CHANGE_NM:
-                K = torque / angle if abs(angle) >= MIN_ANGLE_CHANGE_RAD else None
-                found = StiffnessEstimate(
-                    from_s=before.to_s,
-                    to_s=after.to_s,
-                    site=site,
-                    joint=joint + 1,
-                    torque_nm=torque,
-                    angle_rad=angle,
-                    stiffness_nm_rad=K,
-                )
-                estimates.append(found)
+        torque_before = before.torque[site] - before.environment[site]
+        torque_after = after.torque[site] - after.environment[site]
+        torque_changes = (torque_after - torque_before).tolist()
+        angle_changes = (after.q[site] - before.q[site]).tolist()
+        for joint, torque_nm in enumerate(torque_changes):
+            if not abs(torque_nm) >= MIN_TORQUE_CHANGE_NM:  # also if it is NaN
+                continue
+            angle_rad = angle_changes[joint]
+            stiffness = None
+            if abs(angle_rad) >= MIN_ANGLE_CHANGE_RAD:
+                stiffness = torque_nm / angle_rad
+            estimate = StiffnessEstimate(
+                from_s=before.to_s,
+                to_s=after.to_s,
+                site=site,
+                joint=joint + 1,
+                torque_nm=torque_nm,
+                angle_rad=angle_rad,
+                stiffness_nm_rad=stiffness,
+            )
+            estimates.append(estimate)
     return estimates
 
 
+def _find_single_mover(before: StaticWindow, after: StaticWindow) -> str:
+    """Returns the site of the only operator whose script changed between two windows.
+
+    Returns "" if no operator or several operators moved, or if some script is unknown.
+    """
+    moved = []
+    for site, script_after in after.script.items():
+        script_before = before.script[site]
+        if script_after is None or script_before is None:
+            return ""
+        if np.abs(script_after - script_before).max() > STILL_SCRIPT_NM:
+            moved.append(site)
+    return moved[0] if len(moved) == 1 else ""
+
+
 class SharingRatio(NamedTuple):
-    """Two loaded sites in a static window, from its first tick to its last; joints count from
-    1.
+    """Force sharing between two loaded sites at a joint, in a static window.
 
     Attributes:
-        pushed, pushed_nm: the site of the torque, and that torque, ON its arm.
-        by_wall: True if the environment makes most of it. holds, felt_nm: the site of the
-        operator that feels it, and what: the negative of its own ON its arm.
-        expected_nm: the torque by the dominance factors.
+        from_s: time of the window's first tick, in s.
+        to_s: time of the window's last tick, in s.
+        joint: number of the joint, from 1.
+        pushed: site at which the torque acts.
+        pushed_nm: that torque ON its arm.
+        by_wall: True if the environment contributes most of that torque.
+        holds: site of the operator that feels the torque.
+        felt_nm: torque that this operator feels: the negative of its own torque ON its arm.
+        expected_nm: torque that the dominance factors let expect.
     """
 
     from_s: float
@@ -204,19 +246,22 @@ class SharingRatio(NamedTuple):
 
     @property
     def off(self) -> float | None:
-        """Relative deviation of the felt torque from the expected one; None without one."""
+        """Relative deviation of the felt torque from the expected one; None if unknown."""
         expected = self.expected_nm.value
-        return (
-            None if expected is None or expected == 0.0 else abs(self.felt_nm / expected - 1.0)
-        )
+        if expected is None or expected == 0.0:
+            return None
+        return abs(self.felt_nm / expected - 1.0)
 
 
 class JointLoad(NamedTuple):
-    """The torques of a joint, from 1, in a static window, of all loaded sites.
+    """The torques of all loaded sites at a joint, in a static window.
 
     Attributes:
-        torque_nm: per loaded site, ON its arm.
-        weight: per loaded site pi_i / K_i, the largest of all sites 1.
+        from_s: time of the window's first tick, in s.
+        to_s: time of the window's last tick, in s.
+        joint: number of the joint, from 1.
+        torque_nm: torque ON the arm of each loaded site.
+        weight: pi_i / K_i of each loaded site, scaled so that the largest of all sites is 1.
         imbalance: |sum of weight times torque| / largest |weight times torque|.
     """
 
@@ -232,11 +277,11 @@ def find_joint_loads(view: RunView) -> list[JointLoad]:
     """Returns the loaded joints of every static window."""
     loads = []
     for window in view.compute_once(find_static_windows):
-        weights = _torque_weights(view.scenario, window.alpha)
+        weights = _compute_torque_weights(view.scenario, window.alpha)
         for joint in range(min(map(len, window.torque.values()))):
             torque = {site: float(values[joint]) for site, values in window.torque.items()}
-            least = max(MIN_LOAD_NM, MIN_LOAD_SHARE * max(map(abs, torque.values())))
-            loaded = {site: value for site, value in torque.items() if abs(value) >= least}
+            least_nm = max(MIN_LOAD_NM, MIN_LOAD_SHARE * max(map(abs, torque.values())))
+            loaded = {site: value for site, value in torque.items() if abs(value) >= least_nm}
             if loaded:
                 loads.append(_weigh_load(window, joint, loaded, weights))
     return loads
@@ -248,7 +293,7 @@ def count_static_windows(view: RunView) -> Metric:
         return Metric(None, f"no records of {', '.join(view.absent)}")
     return metric(
         len(view.compute_once(find_static_windows)) or None,
-        "no second in which all sites rest under torques that stand",
+        "no second in which all sites rest under constant torques",
     )
 
 
@@ -259,13 +304,15 @@ def count_static_windows(view: RunView) -> Metric:
 )
 def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
     """Returns the largest deviation of force sharing from the dominance factors."""
-    pairs = view.compute_once(find_sharing_ratios)
-    offs = [pair.off for pair in pairs if pair.off is not None]
-    if offs:
-        return {"sharing_off": metric(max(offs))}
-    whys = "; ".join(dict.fromkeys(pair.expected_nm.why for pair in pairs))
+    ratios = view.compute_once(find_sharing_ratios)
+    deviations = [ratio.off for ratio in ratios if ratio.off is not None]
+    if deviations:
+        return {"sharing_off": metric(max(deviations))}
+    reasons = "; ".join(dict.fromkeys(ratio.expected_nm.why for ratio in ratios))
     why = (
-        count_static_windows(view).why or whys or "no two sites are loaded in a window at rest"
+        count_static_windows(view).why
+        or reasons
+        or "no two sites are loaded in a window at rest"
     )
     return {"sharing_off": Metric(None, why, applies=bool(view.absent))}
 
@@ -273,125 +320,133 @@ def measure_force_sharing(view: RunView, _run: str) -> MetricValues:
 def _weigh_load(
     window: StaticWindow, joint: int, torque: dict[str, float], weights: Array | str
 ) -> JointLoad:
+    """Returns a loaded joint with the weights of its torques.
+
+    Args:
+        window: the static window.
+        joint: index of the joint, from 0.
+        torque: torques of the loaded sites, N m.
+        weights: weights of all sites and joints, shape (N, n), or the reason why they are
+            unknown.
+    """
     if isinstance(weights, str):
-        why = Metric(None, weights)
-        return JointLoad(
-            from_s=window.from_s,
-            to_s=window.to_s,
-            joint=joint + 1,
-            torque_nm=torque,
-            weight=dict.fromkeys(torque, why),
-            imbalance=why,
-        )
-    column = weights[:, joint] / np.nanmax(weights[:, joint])
-    weight = dict(zip(window.torque, column.tolist(), strict=True))
-    moments = [weight[site] * value for site, value in torque.items()]
-    largest = max(map(abs, moments))
-    share = abs(sum(moments)) / largest if largest > 0.0 else None
-    imbalance = metric(share, "nobody who is followed is loaded")
-    shown = {site: metric(weight[site]) for site in torque}
+        unknown = Metric(None, weights)
+        weight_metrics = dict.fromkeys(torque, unknown)
+        imbalance = unknown
+    else:
+        column = weights[:, joint] / np.nanmax(weights[:, joint])
+        weight = dict(zip(window.torque, column.tolist(), strict=True))
+        moments = [weight[site] * value for site, value in torque.items()]
+        largest = max(map(abs, moments))
+        share = abs(sum(moments)) / largest if largest > 0.0 else None
+        imbalance = metric(share, "no site that others follow is loaded")
+        weight_metrics = {site: metric(weight[site]) for site in torque}
     return JointLoad(
         from_s=window.from_s,
         to_s=window.to_s,
         joint=joint + 1,
         torque_nm=torque,
-        weight=shown,
+        weight=weight_metrics,
         imbalance=imbalance,
     )
 
 
 def find_sharing_ratios(view: RunView) -> list[SharingRatio]:
-    """Returns the force sharing of every joint in a static window at which two sites are
-    loaded.
+    """Returns the force sharing at every joint at which two sites are loaded.
 
-    The operator that feels is a spring; if both are or none, the slave is the site of the
-    torque.
+    The operator that feels the torque is a spring. If both operators are springs, or none is,
+    the torque is that of the slave.
     """
-    scenario = view.scenario
-    at = {window.from_s: window for window in view.compute_once(find_static_windows)}
-    pairs = []
+    windows = {window.from_s: window for window in view.compute_once(find_static_windows)}
+    ratios = []
     for load in view.compute_once(find_joint_loads):
-        if len(load.torque_nm) == 2:
-            pushed, holds = sorted(
-                load.torque_nm, key=lambda site: _holding_rank(scenario, site, load.to_s)
-            )
-            torque = load.torque_nm[pushed]
-            by_wall = abs(
-                float(at[load.from_s].environment[pushed][load.joint - 1])
-            ) > 0.5 * abs(torque)
-            one = load.weight[pushed]
-            other = load.weight[holds]
-            if one.value is None or other.value is None:
-                expected = Metric(None, one.why)
-            elif other.value == 0.0:
-                expected = Metric(None, f"nobody ends up following {holds}")
-            else:
-                expected = metric(torque * one.value / other.value)
-            felt = -load.torque_nm[holds]
-            pairs.append(
-                SharingRatio(*load[:3], pushed, torque, by_wall, holds, felt, expected)
-            )
-    return pairs
+        if len(load.torque_nm) != 2:
+            continue
+        ranks = {
+            site: _rank_as_holder(view.scenario, site, load.to_s) for site in load.torque_nm
+        }
+        pushed, holds = sorted(load.torque_nm, key=ranks.__getitem__)
+        torque = load.torque_nm[pushed]
+        wall_torque = float(windows[load.from_s].environment[pushed][load.joint - 1])
+        pushed_weight = load.weight[pushed]
+        holds_weight = load.weight[holds]
+        if pushed_weight.value is None or holds_weight.value is None:
+            expected = Metric(None, pushed_weight.why)
+        elif holds_weight.value == 0.0:
+            expected = Metric(None, f"no site follows {holds} in the end")
+        else:
+            expected = metric(torque * pushed_weight.value / holds_weight.value)
+        ratio = SharingRatio(
+            from_s=load.from_s,
+            to_s=load.to_s,
+            joint=load.joint,
+            pushed=pushed,
+            pushed_nm=torque,
+            by_wall=abs(wall_torque) > 0.5 * abs(torque),
+            holds=holds,
+            felt_nm=-load.torque_nm[holds],
+            expected_nm=expected,
+        )
+        ratios.append(ratio)
+    return ratios
 
 
-def _holding_rank(scenario: Scenario, site: str, at_s: float) -> tuple[bool, bool]:
-    """Returns a sort key of the site that feels: a spring is active there and no wall; it is a
-    master.
+def _rank_as_holder(scenario: Scenario, site: str, t_s: float) -> tuple[bool, bool]:
+    """Returns a sort key: the site whose operator feels the torque comes last.
+
+    That is a site at which a spring is active and no environment exists, or else a master.
     """
     spec = scenario.sites[site]
-    springs = (
-        one.actor
-        for one in spec.hands
-        if one.actor.kind in (TorqueKind.HAND, TorqueKind.TASK_HAND)
-    )
-    held = any(spring.start_s <= at_s < spring.end_s for spring in springs)
-    return held and not spec.environment, spec.role == "master"
+    spring_kinds = (TorqueKind.HAND, TorqueKind.TASK_HAND)
+    springs = [hand.actor for hand in spec.hands if hand.actor.acts in spring_kinds]
+    is_held = any(spring.start_s <= t_s < spring.end_s for spring in springs)
+    return is_held and not spec.environment, spec.role == "master"
 
 
-def _torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
-    """Returns pi_i / K_i per joint, shape (N, n); or the reason why that does not weigh
-    torques.
-    """
+def _compute_torque_weights(scenario: Scenario, alpha: Array) -> Array | str:
+    """Returns pi_i / K_i per joint, shape (N, n), or the reason why it is unknown."""
     if len(find_closed_groups(alpha)) > 1:
         return "two groups of sites follow nobody else: who feels whom is not unique"
     stiffness = []
     for site in scenario.names:
-        K, why = _holding_stiffness(scenario, site)
+        K, why = _find_holding_stiffness(scenario, site)
         if why:
             return f"{site}: {why}"
         stiffness.append(K)
     return left_perron_vector(alpha)[:, np.newaxis] / np.array(stiffness)
 
 
-def _holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
-    """Returns the stiffness that holds e at rest, shape (n,), N m/rad, and the reason why more
-    acts.
+def _find_holding_stiffness(scenario: Scenario, site: str) -> tuple[Array, str]:
+    """Returns the stiffness that holds e at rest, shape (n,), N m/rad.
+
+    Returns:
+        The stiffness, NaN along axes that the site does not follow.
+        The reason why the stiffness is unknown, or ""; with a reason the stiffness is zero.
     """
     spec = scenario.sites[site]
     arm = build_arm_rows(scenario, site)
     gains = spec.control.gains(arm.theta)
-    none = np.zeros(len(spec.q0_rad))
+    unknown = np.zeros(len(spec.q0_rad))
     if gains.law is Law.USER:
-        return (
-            none,
-            f"the law {identify_law(spec.control)} states no stiffness that holds e at rest",
-        )
+        name = identify_law(spec.control)
+        return unknown, f"the law {name} states no stiffness that holds e at rest"
     if not spec.arm.known:
-        return none, "theta of the arm is not known"
+        return unknown, "theta of the arm is not known"
     if np.any(gains.k_f):
-        return none, "it reflects force: e is not all that its law goes by"
-    adaptive = gains.law is Law.ADAPTIVE
+        return unknown, "the law reflects force: its torque does not depend on e alone"
+    is_adaptive = gains.law is Law.ADAPTIVE
     gravity = arm.gravity_parameters
-    if adaptive and arm.task is not None:
-        return (
-            none,
-            "in task space what holds the e of this law changes with the pose: J+'Kp J+ Lambda",
-        )
-    estimate = np.array(gains.theta_hat0 if adaptive else gains.known)
-    if adaptive and np.any((np.array(gains.Gamma) > 0.0) & gravity):
-        return none, "gravity is learnt: the estimates take up the load"
+    if is_adaptive and arm.task is not None:
+        why = "in task space the stiffness of this law changes with the pose: J+'Kp J+ Lambda"
+        return unknown, why
+    estimate = np.array(gains.theta_hat0 if is_adaptive else gains.known)
+    if is_adaptive and np.any((np.array(gains.Gamma) > 0.0) & gravity):
+        return unknown, "gravity is learnt: the estimates take up the load"
     if np.any((estimate != arm.theta) & gravity) and spec.arm.g_m_s2 > 0.0:
-        return none, "gravity is not known exactly"
-    K = np.array(gains.Kp) * np.array(gains.Lambda) if adaptive else np.array(gains.K)
-    free = np.array(scenario.arms[site].axes or 1.0) == 0.0
-    return np.where(free, np.nan, K), "" if ((K > 0.0) | free).all() else "nothing holds its e"
+        return unknown, "gravity is not known exactly"
+    K = np.array(gains.K)
+    if is_adaptive:
+        K = np.array(gains.Kp) * np.array(gains.Lambda)
+    free_axes = np.array(scenario.arms[site].axes or 1.0) == 0.0
+    why = "" if ((K > 0.0) | free_axes).all() else "nothing holds its e"
+    return np.where(free_axes, np.nan, K), why

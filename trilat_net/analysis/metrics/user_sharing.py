@@ -1,9 +1,11 @@
-"""Metrics of users who share a slave: authority, disagreement, interventions, takeovers.
+"""Metrics of users who share a slave: authority, disagreement, interventions and takeovers.
 
-Invariant: the users are the masters of the scenario, the slave its first one; a user leads
-whose share in the slave's reference is the largest. Torques are those of hands ON arms, without
-the environment's; in task space they are forces at end effectors. Rows without a record do not
-count.
+Invariant:
+    - The users are the masters of the scenario, and the shared slave is its first slave.
+    - The user with the largest share in the slave's reference leads.
+    - Torques are those of hands ON arms, without the environment's. In task space they are
+      forces at end effectors.
+    - Rows without a record do not count.
 """
 
 import math
@@ -32,26 +34,30 @@ from .measures import (
     unavailable,
 )
 
-PARTS = 8
-WIDEST = 0.25
-"""Of a share in motion: parts that the jackknife leaves out in turn, and the widest half
-interval, 95 %.
-"""
+JACKKNIFE_BLOCKS = 8
+"""Number of blocks of rows that the jackknife leaves out, one at a time."""
+LARGEST_HALF_WIDTH = 0.25
+"""Largest half-width of the 95 % interval with which a share in the motion is given."""
 STUDENT_T = 2.3646
-"""The 0.975 quantile of Student's t with one degree of freedom less than parts, 7."""
+"""The 0.975 quantile of Student's t with `JACKKNIFE_BLOCKS` - 1 = 7 degrees of freedom."""
+LEAST_INDEPENDENCE = 1e-9
+"""Smallest singular value of the users' relative velocities, as a share of the slave's
+motion.
+"""
 
 
-def _unasked(why: str) -> Metric:
-    return Metric(None, why, applies=False)
+def _not_applicable(reason: str) -> Metric:
+    return Metric(None, reason, applies=False)
 
 
 def read_user_shares(view: RunView) -> UserShares | Metric:
-    """Returns the shares of the users at the slave's ticks, or why there are none."""
+    """Returns the users' shares at the slave's ticks, or a metric with the reason for none."""
     slave, users = find_users(view.scenario)
     if not slave or len(users) < 2:
-        return _unasked("no two users share a slave")
-    if absent := [site for site in (*users, slave) if site not in view.sites]:
-        return Metric(None, f"no records of {', '.join(absent)}")
+        return _not_applicable("no two users share a slave")
+    missing = [site for site in (*users, slave) if site not in view.sites]
+    if missing:
+        return Metric(None, f"no records of {', '.join(missing)}")
     return find_user_shares(view.scenario, view.sites[slave].dominance.alpha)
 
 
@@ -62,53 +68,82 @@ def read_user_shares(view: RunView) -> UserShares | Metric:
     Quantity("motion_share", "share in the slave's motion"),
 )
 def measure_authority(view: RunView, site: str) -> MetricValues:
-    """Returns a user's share in the slave's motion, and h sum_k a_k |tau_h,k|^2 by its
-    dominance a_k.
+    """Returns a user's authority: its weighted effort, and its share in the slave's motion.
+
+    The effort is h sum_k a_k |tau_h,k|^2, with a_k the user's dominance factor at tick k, and
+    tau_h,k the torque of its hand.
     """
     shared = view.compute_once(read_user_shares)
-    (slave, users) = find_users(view.scenario)
+    slave, users = find_users(view.scenario)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="site", applies=shared.applies)
     if site not in users:
         return unavailable(USERS, "its hand is no user's", of="site", applies=False)
-    records, torque, _ = view.sites[site]
-    row, recorded = find_latest_rows(view.sites[slave].records, records.t_s)
-    squares = shared.shares[row, users.index(site)] * np.square(torque.operator).sum(axis=1)
-    effort = squares[records.known & recorded].sum() * records.h_s
-    found = view.compute_once(_identify_shares)
-    share = found if isinstance(found, Metric) else metric(found[users.index(site)])
-    return {"authority_effort_nm2_s": metric(float(effort)), "motion_share": share}
+    records = view.sites[site].records
+    torque = view.sites[site].torque
+    user = users.index(site)
+    slave_row, slave_recorded = find_latest_rows(view.sites[slave].records, records.t_s)
+    weighted = shared.shares[slave_row, user] * np.square(torque.operator).sum(axis=1)
+    effort = weighted[records.known & slave_recorded].sum() * records.h_s
+    motion_shares = view.compute_once(_identify_shares)
+    if isinstance(motion_shares, Metric):
+        motion_share = motion_shares
+    else:
+        motion_share = metric(motion_shares[user])
+    return {"authority_effort_nm2_s": metric(float(effort)), "motion_share": motion_share}
 
 
 def _identify_shares(view: RunView) -> list[float] | Metric:
-    """Returns by user the a that minimise sum_k |qd_k - sum_i a_i qd_i(used_k)|^2, their sum
-    being 1.
+    """Returns the least-squares shares of the users in the slave's motion.
 
-    qd is the slave's velocity, that of task space where it is, and used_k the sample of user i
-    in use.
+    The shares a_i minimise sum_k |qd_k - sum_i a_i qd_i(s_k)|^2 subject to sum_i a_i = 1. Here
+    qd_k is the slave's velocity at tick k (in task space that of its end effector), and
+    qd_i(s_k) is user i's velocity at the stamp of the sample that the slave uses. With the
+    constraint, the last user's velocity is subtracted from all others, and its share is one
+    minus their sum.
+
+    The jackknife over blocks of rows estimates the shares' standard error, since velocities at
+    successive ticks are not independent.
+
+    Returns:
+        The shares in the order of the users, or a metric that states why they are unknown.
     """
     slave, users = find_users(view.scenario)
-    own = view.sites[slave].records
-    judged = own.known & own.follows
-    rates = []
-    for other in (view.sites[user].records for user in users):
-        row = own.used[other.site] - other.first
-        there = row.clip(0, len(other.known) - 1)
-        judged &= (row == there) & other.known[there]
-        rates.append(other.shared_rate[there])
-    *firsts, last = (rate[judged].ravel() for rate in rates)
-    apart = np.column_stack([one - last for one in firsts])
-    moves = own.shared_rate[judged].ravel()
-    if not len(moves) or np.linalg.svd(apart, compute_uv=False)[-1] <= 1e-9 * np.linalg.norm(
-        moves
-    ):
-        return Metric(None, "the users move alike, or nobody moves")
-    every = np.arange(len(moves))
-    rows = [every, *(np.delete(every, part) for part in np.array_split(every, PARTS))]
-    shares, *others = (np.linalg.lstsq(apart[row], (moves - last)[row])[0] for row in rows)
-    half = STUDENT_T * math.sqrt((PARTS - 1) * np.var(others, axis=0).max())
-    if not half <= WIDEST:
-        return Metric(None, f"the motion does not tell: shares within +- {half:.2g}")
+    slave_records = view.sites[slave].records
+    valid = slave_records.known & slave_records.follows
+    user_rates = []
+    for user in users:
+        records = view.sites[user].records
+        used_row = slave_records.used[user] - records.first
+        row = used_row.clip(0, len(records.known) - 1)
+        valid &= (used_row == row) & records.known[row]
+        user_rates.append(records.shared_rate[row])
+    slave_rate = slave_records.shared_rate[valid].ravel()
+    *other_rates, last_rate = (rate[valid].ravel() for rate in user_rates)
+    relative_rates = np.column_stack([rate - last_rate for rate in other_rates])
+    relative_slave_rate = slave_rate - last_rate
+    unknown = Metric(None, "the users' motions are not independent, or no arm moves")
+    if not len(slave_rate):
+        return unknown
+    least_singular_value = np.linalg.svd(relative_rates, compute_uv=False)[-1]
+    if least_singular_value <= LEAST_INDEPENDENCE * np.linalg.norm(slave_rate):
+        return unknown
+
+    shares = np.linalg.lstsq(relative_rates, relative_slave_rate)[0]
+    all_rows = np.arange(len(slave_rate))
+    jackknife_shares = []
+    for block in np.array_split(all_rows, JACKKNIFE_BLOCKS):
+        rows = np.delete(all_rows, block)
+        jackknife_shares.append(
+            np.linalg.lstsq(relative_rates[rows], relative_slave_rate[rows])[0]
+        )
+    # jackknife (Quenouille 1956): (n - 1) / n times the sum of squared deviations, n blocks
+    variance = (JACKKNIFE_BLOCKS - 1) * np.var(jackknife_shares, axis=0).max()
+    half_width = STUDENT_T * math.sqrt(variance)
+    if not half_width <= LARGEST_HALF_WIDTH:  # also if it is NaN
+        return Metric(
+            None, f"the motion does not determine the shares: only within +- {half_width:.2g}"
+        )
     return [*shares.tolist(), 1.0 - float(shares.sum())]
 
 
@@ -126,73 +161,95 @@ def _identify_shares(view: RunView) -> list[float] | Metric:
 def measure_sharing(view: RunView, _run: str) -> MetricValues:
     """Returns disagreement, interventions and takeovers of the users of a slave."""
     shared = view.compute_once(read_user_shares)
-    (slave, users) = find_users(view.scenario)
+    slave, users = find_users(view.scenario)
     if isinstance(shared, Metric):
         return unavailable(USERS, shared.why, of="run", applies=shared.applies)
     records = view.sites[slave].records
     intervenes = shared.leader[records.known] != shared.program
-    spans = sorted(
-        (ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in list_ramps(view.log, slave)[1]
-    )
-    changed = records.t_s[1:][np.diff(shared.leader) != 0]
-    taken = [_time_taken(at_s, records.h_s, spans) for at_s in changed.tolist()]
+    ramps = list_ramps(view.log, slave)[1]
+    ramp_spans_s = sorted((ramp.start_ns * 1e-9, ramp.end_ns * 1e-9) for ramp in ramps)
+    takeover_times_s = records.t_s[1:][np.diff(shared.leader) != 0]
+    durations_s = [
+        _measure_takeover_s(t_s, records.h_s, ramp_spans_s) for t_s in takeover_times_s.tolist()
+    ]
+    longest_s = _not_applicable("the leader never changes")
+    if durations_s:
+        longest_s = metric(max(durations_s))
     return {
         **_measure_disagreement([view.shared[user] for user in users]),
         "intervention_share": metric(float(intervenes.mean())),
-        "takeovers": metric(float(len(changed))),
-        "takeover_s": metric(max(taken)) if taken else _unasked("the lead never changes"),
-        "lead_jump": _compare_steps(records, spans),
+        "takeovers": metric(float(len(takeover_times_s))),
+        "takeover_s": longest_s,
+        "lead_jump": _compare_steps(records, ramp_spans_s),
     }
 
 
 def _measure_disagreement(runs: list[SiteRun]) -> MetricValues:
+    """Returns the part of the users' torques that cancels, as an RMS and as a share.
+
+    Of torques tau_i in a joint or along an axis, (sum_i |tau_i| - |sum_i tau_i|) / 2 cancels.
+    """
     rows, known = find_common_rows([run.records for run in runs])
-    torques = np.stack([run.torque.operator[row] for run, row in zip(runs, rows, strict=True)])[
-        :, known
-    ]
-    sizes = np.abs(torques).sum(axis=0)
-    cancels = 0.5 * (sizes - np.abs(torques.sum(axis=0)))
-    whole = sizes.sum()
-    places = POSITION if runs[0].records.x.size else 0
-    found = {
-        "internal_share": metric(2.0 * cancels.sum() / whole)
-        if whole
-        else _unasked("nobody pushes")
-    }
-    for unit, part in (("n", cancels[:, :places]), ("nm", cancels[:, places:])):
-        found[f"internal_rms_{unit}"] = (
-            metric(rms(part)) if part.shape[1] else _unasked("none is shared")
-        )
-    return found
+    torques = np.stack([run.torque.operator[row] for run, row in zip(runs, rows, strict=True)])
+    torques = torques[:, known]
+    total_sizes = np.abs(torques).sum(axis=0)
+    cancelled = 0.5 * (total_sizes - np.abs(torques.sum(axis=0)))
+    total = total_sizes.sum()
+    internal_share = _not_applicable("nobody pushes")
+    if total:
+        internal_share = metric(2.0 * cancelled.sum() / total)
+    values = {"internal_share": internal_share}
+    # in task space, forces along the axes of the position come first
+    force_columns = POSITION if runs[0].records.x.size else 0
+    parts = {"n": cancelled[:, :force_columns], "nm": cancelled[:, force_columns:]}
+    for unit, part in parts.items():
+        if part.shape[1]:
+            values[f"internal_rms_{unit}"] = metric(rms(part))
+        else:
+            values[f"internal_rms_{unit}"] = _not_applicable("the users share none")
+    return values
 
 
-def _time_taken(at_s: float, h_s: float, spans: list[tuple[float, float]]) -> float:
-    """Returns how long before a change of the lead the ramp began that made it; 0 if no ramp
-    did.
+def _measure_takeover_s(
+    change_s: float, h_s: float, ramp_spans_s: list[tuple[float, float]]
+) -> float:
+    """Returns the time from the start of a ramp to the change of the leader that it caused.
+
+    Args:
+        change_s: time at which the leader changed, in s.
+        h_s: the slave's period, in s.
+        ramp_spans_s: (start, end) of every ramp, in s, sorted.
+
+    Returns:
+        The time in s; 0 if no ramp caused the change.
     """
-    within = [
-        start
-        for start, end in spans
-        if start <= at_s + RAMP_TIME_TOLERANCE_S and at_s <= end + h_s
+    starts_s = [
+        start_s
+        for start_s, end_s in ramp_spans_s
+        if start_s <= change_s + RAMP_TIME_TOLERANCE_S and change_s <= end_s + h_s
     ]
-    return at_s - within[-1] if within else 0.0
+    return change_s - starts_s[-1] if starts_s else 0.0
 
 
-def _compare_steps(records: AlignedRecords, spans: list[tuple[float, float]]) -> Metric:
-    """Returns the largest step of q_id from tick to tick while shares change, over that of the
-    rest.
+def _compare_steps(records: AlignedRecords, ramp_spans_s: list[tuple[float, float]]) -> Metric:
+    """Returns the largest step of q_id while shares change, divided by the largest other step.
+
+    Args:
+        records: records of the slave.
+        ramp_spans_s: (start, end) of every ramp of the slave's shares, in s.
     """
-    places = records.q_des[:, :POSITION] if records.x.size else records.q_des
+    q_des = records.q_des[:, :POSITION] if records.x.size else records.q_des
     follows = records.known & records.follows
-    steps = np.abs(np.diff(places, axis=0)).max(axis=1)
-    begins = records.t_s[:-1] - RAMP_TIME_TOLERANCE_S
-    ends = records.t_s[1:] + RAMP_TIME_TOLERANCE_S
-    changing = np.any(
-        [(ends >= start) & (begins <= end) for start, end in [*spans, (np.inf, 0.0)]], axis=0
-    )
+    steps = np.abs(np.diff(q_des, axis=0)).max(axis=1)
+    period_start_s = records.t_s[:-1] - RAMP_TIME_TOLERANCE_S
+    period_end_s = records.t_s[1:] + RAMP_TIME_TOLERANCE_S
+    changing = np.zeros(len(steps), dtype=np.bool_)
+    for start_s, end_s in ramp_spans_s:
+        changing |= (period_end_s >= start_s) & (period_start_s <= end_s)
     judged = follows[:-1] & follows[1:]
     if not (judged & changing).any():
-        return _unasked("no share changes")
-    largest = peak(steps[judged & changing])
-    rest = peak(steps[judged & ~changing])
-    return metric(largest / rest if rest else None, "the reference rests outside of it")
+        return _not_applicable("no share changes")
+    largest_while_changing = peak(steps[judged & changing])
+    largest_otherwise = peak(steps[judged & ~changing])
+    ratio = largest_while_changing / largest_otherwise if largest_otherwise else None
+    return metric(ratio, "the reference rests while no share changes")
