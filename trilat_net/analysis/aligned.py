@@ -1,12 +1,13 @@
-"""Aligned records.
+"""Aligns a site's records on its tick grid, and views its peers as the site sees them.
 
-A site's log as columns on its full tick grid, and its peers as it sees them after their links.
-
-Invariant: a gap is filled in, so that sums have all their terms and times stay times, and is
-marked in `known`; no metric uses a row that is not known. A peer's motion is a cubic through
-angles and velocities between its records, and rest before them (L7). Between two ticks a stamp
-moves at rate one, as under the constant delay of the theorem; the difference from the sample in
-use at the next tick is a jump of that link.
+Invariant:
+    - A gap in the records is filled by interpolation, so that sums have all their terms and
+      rows keep their times. Filled rows are not `known`, and no metric uses them.
+    - A peer's motion is a cubic through angles and velocities between its records, and rest
+      before its first record (L7).
+    - Between two ticks a stamp moves at rate one, as under the constant delay of the theorem.
+      The difference from the stamp of the sample in use at the next tick is a jump of that
+      link.
 """
 
 from collections.abc import Sequence
@@ -29,36 +30,43 @@ from ..scenario.scenario_types import Limits
 
 Bools = NDArray[np.bool_]
 RECORD_COLUMNS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x", "theta_hat")
-_NONE: Array = np.zeros((0, 0))
+_NO_COLUMNS: Array = np.zeros((0, 0))
 _NO_ROWS: Bools = np.zeros(0, dtype=np.bool_)
 RESUMING_S = 2.0 * BLEND_S
-"""For so long after one of the `RESTING_MODES` the torque may not be that of the law alone
-either.
+"""Time after one of the `RESTING_MODES` for which the torque may not be that of the law alone,
+s.
 """
+_TICK_TOLERANCE = 1e-5
+"""Times that differ from a tick by less than this share of a period are at the tick."""
 
 
 class AlignedRecords(NamedTuple):
-    """A site's records on every tick from its first to its last; K rows, one per tick.
+    """A site's records on every tick from its first to its last: K rows, one per tick.
+
+    In task space the shared coordinates are those of the end effector, of length m.
 
     Attributes:
-        site: its name.
-        rate_hz: its tick rate, Hz.
-        first: the tick of row 0.
-        known: True if there is a record of that tick.
-        follows: True if the site followed its peers then: no hold, no brake, no return, and no
-            reference as fast as it may move.
-        q, qd: joint angles, shape (K, n), rad, and velocities, rad/s.
-        q_des, qd_des: the same of the reference.
+        site: name of the site.
+        rate_hz: tick rate, in Hz.
+        first: tick of row 0.
+        known: True if the tick has a record, shape (K,).
+        follows: True if the site followed its peers, shape (K,): it did not hold, brake or
+            return, and its reference was slower than its limit.
+        q: joint angles, shape (K, n), rad.
+        qd: joint velocities, shape (K, n), rad/s.
+        q_des: reference of the shared coordinates, shape (K, n) or (K, m).
+        qd_des: its derivative.
         tau: control torque, shape (K, n), N m.
         tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
-        theta_hat: estimate, shape (K, P).
-        used: per peer the tick of the sample in use; -1 before the first. x, xd: in task space
-        the end effector's place or pose and its derivative, shape (K, m); else empty.
-        wrench: what tau_x amounts to there, likewise.
+        theta_hat: parameter estimates, shape (K, P).
+        used: per peer the tick of the sample in use, shape (K,); -1 before the first sample.
+        x: position or pose of the end effector in task space, shape (K, m); else empty.
+        xd: its derivative.
+        wrench: the force at the end effector that tau_x amounts to, shape (K, m); else empty.
         axes: see `SiteLog`.
-        hand: what somebody who holds the arm does, shape (K, h), see `HandInForce`; else empty.
-        rests: True in one of the `RESTING_MODES`, and for `RESUMING_S` afterwards; empty:
-            never.
+        hand: action of a live hand, shape (K, h), see `HandInForce`; else empty.
+        rests: True in one of the `RESTING_MODES`, and for `RESUMING_S` afterwards, shape (K,);
+            empty if the site never rests.
     """
 
     site: str
@@ -74,26 +82,26 @@ class AlignedRecords(NamedTuple):
     tau_x: Array
     theta_hat: Array
     used: dict[str, Ints]
-    x: Array = _NONE
-    xd: Array = _NONE
-    wrench: Array = _NONE
+    x: Array = _NO_COLUMNS
+    xd: Array = _NO_COLUMNS
+    wrench: Array = _NO_COLUMNS
     axes: tuple[float, ...] = ()
-    hand: Array = _NONE
+    hand: Array = _NO_COLUMNS
     rests: Bools = _NO_ROWS
 
     @property
     def shared(self) -> Array:
-        """What peers get: q, or x in task space, shape (K, m)."""
+        """The coordinates that peers receive: q, or x in task space, shape (K, m)."""
         return self.x if self.x.size else self.q
 
     @property
     def shared_rate(self) -> Array:
-        """Its derivative: qd, or xd in task space, shape (K, m)."""
+        """Their derivative: qd, or xd in task space, shape (K, m)."""
         return self.xd if self.x.size else self.qd
 
     @property
     def h_s(self) -> float:
-        """The period, s."""
+        """The period, in s."""
         return 1.0 / self.rate_hz
 
     @property
@@ -103,8 +111,9 @@ class AlignedRecords(NamedTuple):
 
     @property
     def nominal_s(self) -> Array:
-        """The same of whole nanoseconds, as the core compares them with begin and end of a
-        torque, s.
+        """Nominal time of every row in whole nanoseconds, shape (K,), s.
+
+        The core compares these times with the start and end of an exogenous torque.
         """
         tick = np.arange(self.first, self.first + len(self.known), dtype=np.int64)
         return (tick * NS_PER_S // self.rate_hz).astype(np.float64) * 1e-9
@@ -112,15 +121,13 @@ class AlignedRecords(NamedTuple):
     @property
     def e(self) -> Array:
         """Position error, Eq. (9), shape (K, n), rad; in task space (K, m), see `SiteLog.e`."""
-        return (
-            compute_task_errors(self.x, self.q_des, self.axes)
-            if self.x.size
-            else self.q - self.q_des
-        )
+        if self.x.size:
+            return find_task_errors(self.x, self.q_des, self.axes)
+        return self.q - self.q_des
 
     @property
     def ed(self) -> Array:
-        """Its derivative, shape (K, n), rad/s; in task space (K, m)."""
+        """Velocity error, shape (K, n), rad/s; in task space (K, m)."""
         return self.shared_rate - self.qd_des
 
     @property
@@ -129,17 +136,19 @@ class AlignedRecords(NamedTuple):
         return self.known[:-1] & self.known[1:]
 
     def known_at_end(self, length_s: float) -> Bools:
-        """Returns the recorded rows of the last seconds, shape (K,)."""
+        """Returns the recorded rows of the last `length_s` seconds, shape (K,)."""
         rows: Bools = self.known & (self.t_s > self.t_s[-1] - length_s)
         return rows
 
 
 def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
-    """Returns the torque that a controller holds from every tick to the next, shape (K, n), N
-    m.
+    """Returns the torque that a controller holds over every period, shape (K, n), N m.
 
-    tau_k of `digital`; of `second_order` the extrapolated 1.5 tau_k - 0.5 tau_(k-1) within the
-    limit.
+    Args:
+        tau: the recorded torque, shape (K, n), N m.
+        limit_nm: limit of the torque.
+        digital: True for the scheme `digital`, which holds tau_k; False for `second_order`,
+            which extrapolates it to 1.5 tau_k - 0.5 tau_{k-1} within the limit.
     """
     held = tau.copy()
     if not digital:
@@ -148,99 +157,134 @@ def hold_torque(tau: Array, limit_nm: Array | float, *, digital: bool) -> Array:
 
 
 def align_records(log: Log, *, common: bool = False) -> dict[str, AlignedRecords]:
-    """Returns the records of the sites that have any, in scenario order.
+    """Returns the aligned records of all sites that have records, in scenario order.
 
     The record that says `diverged` is left out: it may hold zeros in place of numbers that are
-    not finite. With `common` all end where the first site ends, as sums over all sites need it:
-    then {} unless every site has two ticks until there.
+    not finite.
+
+    Args:
+        log: the log of a run.
+        common: end all sites where the first site ends, as sums over all sites require.
+
+    Returns:
+        The records by site; with `common` {} unless every site has two ticks.
     """
-    rows: dict[str, Ints] = {}
+    rows_by_site: dict[str, Ints] = {}
     for site in log.sites:
-        first = np.unique(log[site].tick, return_index=True)[1]
-        rows[site] = first[log[site].mode[first] != "diverged"]
+        first_of_tick = np.unique(log[site].tick, return_index=True)[1]
+        modes = log[site].mode[first_of_tick]
+        rows_by_site[site] = first_of_tick[modes != "diverged"]
     if not common:
         return {
-            site: _fill_tick_grid(log.scenario, log[site], kept)
-            for site, kept in rows.items()
-            if len(kept)
+            site: _fill_tick_grid(log.scenario, log[site], rows)
+            for site, rows in rows_by_site.items()
+            if len(rows)
         }
-    if min(map(len, rows.values())) < 2:
+    if min(map(len, rows_by_site.values())) < 2:
         return {}
-    begin_s = max(log[site].tick[kept[0]] / log[site].rate_hz for site, kept in rows.items())
-    end_s = min(log[site].tick[kept[-1]] / log[site].rate_hz for site, kept in rows.items())
-    if end_s <= begin_s:
+    first_times_s = []
+    last_times_s = []
+    for site, rows in rows_by_site.items():
+        part = log[site]
+        first_times_s.append(part.tick[rows[0]] / part.rate_hz)
+        last_times_s.append(part.tick[rows[-1]] / part.rate_hz)
+    end_s = min(last_times_s)
+    if end_s <= max(first_times_s):
         return {}
-    last = {site: int(np.floor(end_s * log[site].rate_hz + 1e-6)) for site in rows}
-    found = {
-        site: _fill_tick_grid(log.scenario, log[site], kept, last[site])
-        for site, kept in rows.items()
-    }
-    return found if min(len(records.known) for records in found.values()) > 1 else {}
+    aligned = {}
+    for site, rows in rows_by_site.items():
+        last_tick = int(np.floor(end_s * log[site].rate_hz + 1e-6))
+        aligned[site] = _fill_tick_grid(log.scenario, log[site], rows, last_tick)
+    return aligned if min(len(records.known) for records in aligned.values()) > 1 else {}
 
 
 def find_unlimited_rows(limits: Limits, qd_des: Array) -> Bools:
-    """Returns the rows in which no coordinate of a reference is as fast as it may be; of one
-    row, if so.
+    """Returns the rows in which every coordinate of a reference is slower than its limit.
+
+    Args:
+        limits: limits of the site.
+        qd_des: reference velocities, shape (K, n) or (n,).
+
+    Returns:
+        True for such rows, shape (K,) or ().
     """
     return np.asarray((np.abs(qd_des) < limits.motion.qd_des_limit).all(axis=-1))
 
 
-def _find_rests(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
+def _find_resting_rows(modes: NDArray[Any], tick: Ints, rate_hz: int) -> Bools:
     """Returns the records in one of the `RESTING_MODES`, or within `RESUMING_S` after one."""
     rests = np.isin(modes, RESTING_MODES)
     if not rests.any():
         return rests
-    last = np.maximum.accumulate(np.where(rests, tick, np.iinfo(np.int64).min // 2))
-    return tick - last <= RESUMING_S * rate_hz
+    never = np.iinfo(np.int64).min // 2
+    last_resting_tick = np.maximum.accumulate(np.where(rests, tick, never))
+    return tick - last_resting_tick <= RESUMING_S * rate_hz
 
 
 def _fill_tick_grid(
     scenario: Scenario, part: SiteLog, rows: Ints, last: int | None = None
 ) -> AlignedRecords:
-    """Returns some records, one for a tick, on every tick up to `last`; missing ones are
-    interpolated.
+    """Returns a site's records on every tick; missing records are interpolated.
+
+    Args:
+        scenario: scenario of the run.
+        part: the site's part of the log.
+        rows: rows of the records to use, one per tick, by rising tick.
+        last: last tick; by default that of the last record.
     """
-    names = (*RECORD_COLUMNS, *(TASK_VECTORS if part.layout.task else ()))
-    names += ("hand",) if part.layout.hand else ()
+    names = [*RECORD_COLUMNS]
+    if part.layout.task:
+        names += TASK_VECTORS
+    if part.layout.hand:
+        names.append("hand")
     part.prepare(*names)
     tick = part.tick[rows]
     first = int(tick[0])
-    end = int(tick[-1]) if last is None else max(first, min(last, int(tick[-1])))
+    end = int(tick[-1])
+    if last is not None:
+        end = max(first, min(last, end))
     grid = np.arange(first, end + 1)
-    before = np.searchsorted(tick, grid, side="right") - 1
-    known: Bools = tick[before] == grid
-    follows: Bools = (part.mode[rows] == "run")[before]
-    glides = scenario.sites[part.name].on_stale.action == "glide"
-    rests = _find_rests(part.mode[rows], tick, part.rate_hz)[before] if glides else _NO_ROWS
-    follows &= find_unlimited_rows(scenario.sites[part.name].limits, part.qd_des[rows])[before]
-    columns = {name: getattr(part, name)[rows] for name in names}
-    for name, values in columns.items():
-        columns[name] = (
-            values[: len(grid)]
-            if known.all()
-            else np.stack([np.interp(grid, tick, column) for column in values.T], axis=1)
-        )
-    used = {peer: part.used[peer][rows][before] for peer in part.peers}
+    # index of the last record at or before each tick
+    previous = np.searchsorted(tick, grid, side="right") - 1
+    known: Bools = tick[previous] == grid
+    spec = scenario.sites[part.name]
+    modes = part.mode[rows]
+    follows: Bools = (modes == "run")[previous]
+    follows &= find_unlimited_rows(spec.limits, part.qd_des[rows])[previous]
+    rests = _NO_ROWS
+    if spec.on_stale.action == "glide":
+        resting = _find_resting_rows(modes, tick, part.rate_hz)[previous]
+        if resting.any():
+            rests = resting
+    columns = {}
+    for name in names:
+        values = getattr(part, name)[rows]
+        if known.all():
+            columns[name] = values[: len(grid)]
+        else:
+            interpolated = [np.interp(grid, tick, column) for column in values.T]
+            columns[name] = np.stack(interpolated, axis=1)
     return AlignedRecords(
-        part.name,
-        part.rate_hz,
-        first,
-        known,
-        follows,
-        used=used,
+        site=part.name,
+        rate_hz=part.rate_hz,
+        first=first,
+        known=known,
+        follows=follows,
+        used={peer: part.used[peer][rows][previous] for peer in part.peers},
         axes=part.axes,
-        rests=rests if rests.any() else _NO_ROWS,
+        rests=rests,
         **columns,
     )
 
 
 class PeerMotion(NamedTuple):
-    """Motion of a peer at K times: of its joints, or of its end effector in task space.
+    """Motion of a peer at K times: of its joints, or in task space of its end effector.
 
     Attributes:
-        q, qd: what it shares, shape (K, n), rad and rad/s; in task space (K, m), m and m/s.
-        squares: integral of qd squared since row 0, per joint, shape (K, n), rad^2/s.
-        known: True if it follows from records.
+        q: shared coordinates, shape (K, n), rad; in task space (K, m), m.
+        qd: their derivatives, shape (K, n), rad/s; in task space (K, m), m/s.
+        squares: integral of qd squared since row 0, per coordinate, shape (K, n), rad^2/s.
+        known: True if the motion follows from records, shape (K,).
     """
 
     q: Array
@@ -250,66 +294,74 @@ class PeerMotion(NamedTuple):
 
 
 class PeerTrajectory:
-    """A site's motion as a function of time: its records, polynomials between them, rest before
-    them (L7).
+    """A site's motion as a function of time.
+
+    The motion is a polynomial between two records, and rest before the first record (L7).
+
+    Args:
+        records: the site's records.
     """
 
     def __init__(self, records: AlignedRecords) -> None:
         self.records = records
-        squares = records.shared_rate**2
-        steps = 0.5 * records.h_s * (squares[1:] + squares[:-1])
-        self._squares: Array = np.vstack(
-            [np.zeros((1, squares.shape[1])), np.cumsum(steps, axis=0)]
-        )
+        squared_rate = records.shared_rate**2
+        steps = 0.5 * records.h_s * (squared_rate[1:] + squared_rate[:-1])
+        start = np.zeros((1, squared_rate.shape[1]))
+        self._squares: Array = np.vstack([start, np.cumsum(steps, axis=0)])
 
     def evaluate(self, t_s: Array) -> PeerMotion:
-        """Returns the site at times, s since the epoch; on its ticks these are its records.
+        """Returns the site's motion at some times; on its ticks this equals its records.
 
-        q is the cubic through angles and velocities, qd runs straight from record to record,
-        and the integral is the exact one of the trapezoid rule.
+        q is the cubic Hermite polynomial through angles and velocities, and qd is linear
+        between two records. The integral of qd squared is the exact one of the trapezoid rule.
+
+        Args:
+            t_s: times since the epoch, shape (K,), s.
         """
         records = self.records
-        h = self.records.h_s
-        place = t_s * records.rate_hz - records.first
-        nearest = np.round(place)
-        place = np.where(np.abs(place - nearest) < 1e-5, nearest, place)
-        low = np.clip(np.floor(place), 0, len(records.known) - 2).astype(np.int64)
-        x = np.clip(place - low, 0.0, 1.0)[:, np.newaxis]
-        at = records.shared
-        rate = records.shared_rate
-        qa = at[low]
-        qb = at[low + 1].copy()
-        va = rate[low]
-        vb = rate[low + 1]
-        # between two rotation vectors of different branches lies nothing
-        if self.records.x.shape[1] == POSE:
-            qb[:, POSITION:] = choose_nearest_vectors(qb[:, POSITION:], qa[:, POSITION:])
-        q = qa + x * (
-            h * va
-            + x * (3 * (qb - qa) - h * (2 * va + vb) + x * (2 * (qa - qb) + h * (va + vb)))
-        )
+        h = records.h_s
+        position = t_s * records.rate_hz - records.first
+        nearest = np.round(position)
+        is_at_tick = np.abs(position - nearest) < _TICK_TOLERANCE
+        position = np.where(is_at_tick, nearest, position)
+        last_period = len(records.known) - 2
+        row = np.clip(np.floor(position), 0, last_period).astype(np.int64)
+        x = np.clip(position - row, 0.0, 1.0)[:, np.newaxis]
+        qa = records.shared[row]
+        qb = records.shared[row + 1].copy()
+        va = records.shared_rate[row]
+        vb = records.shared_rate[row + 1]
+        # rotation vectors of different branches must not be interpolated
+        if records.x.shape[1] == POSE:
+            qb[:, PLACE:] = bring_nearer(qb[:, PLACE:], qa[:, PLACE:])
+        quadratic = 3 * (qb - qa) - h * (2 * va + vb)
+        cubic = 2 * (qa - qb) + h * (va + vb)
+        q = qa + x * (h * va + x * (quadratic + x * cubic))
         qd = va + x * (vb - va)
-        sa = va**2
-        sb = vb**2
-        squares = self._squares[low] + h * x * (sa + 0.5 * x * (sb - sa))
-        x0 = x[:, 0]
-        known = (records.known[low] | (x0 == 1.0)) & (records.known[low + 1] | (x0 == 0.0))
-        known &= (place >= 0.0) | (records.first == 0)
-        q = np.where(x == 1.0, qb, q)
-        at_rest = place < 0.0
-        qd[at_rest] = 0.0
-        squares[at_rest] = 0.0
+        squared_a = va**2
+        squared_b = vb**2
+        mean_square = squared_a + 0.5 * x * (squared_b - squared_a)
+        squares = self._squares[row] + h * x * mean_square
+        fraction = x[:, 0]
+        known_a = records.known[row] | (fraction == 1.0)
+        known_b = records.known[row + 1] | (fraction == 0.0)
+        known = known_a & known_b & ((position >= 0.0) | (records.first == 0))
+        q = np.where(x == 1.0, qb, q)  # exactly the record, which the polynomial rounds
+        is_before = position < 0.0
+        qd[is_before] = 0.0
+        squares[is_before] = 0.0
         return PeerMotion(q, qd, squares, known)
 
 
 class DelayedPeer(NamedTuple):
-    """A peer as a site sees it after its link.
+    """A peer as a site sees it through its link.
 
     Attributes:
-        now, delayed: the peer at the site's ticks, and at the stamps of the samples in use, K rows
-        each.
-        delayed_end: the peer at the end of a period if that stamp moves at rate one, K - 1 rows.
-        stamp_s: the stamp of the sample in use, shape (K,), s; NaN before the first.
+        now: the peer at the site's ticks, K rows.
+        delayed: the peer at the stamps of the samples in use, K rows.
+        delayed_end: the peer at the end of every period, if the stamp moves at rate one, K - 1
+            rows.
+        stamp_s: stamp of the sample in use, shape (K,), s; NaN before the first sample.
     """
 
     now: PeerMotion
@@ -319,36 +371,43 @@ class DelayedPeer(NamedTuple):
 
     @property
     def known(self) -> Bools:
-        """True if all of a period follows from records, shape (K - 1,)."""
-        ends = (
-            self.now.known[:-1],
-            self.now.known[1:],
-            self.delayed.known[:-1],
-            self.delayed.known[1:],
-        )
-        known: Bools = np.logical_and.reduce([*ends, self.delayed_end.known])
+        """True if the whole period follows from records, shape (K - 1,)."""
+        now = self.now.known
+        delayed = self.delayed.known
+        conditions = [now[:-1], now[1:], delayed[:-1], delayed[1:], self.delayed_end.known]
+        known: Bools = np.logical_and.reduce(conditions)
         return known
 
 
 _BEFORE_EPOCH_S = -1.0
-"""Any time before the epoch: the start pose, at rest (L7)."""
+"""Any time before the epoch, at which a peer is at rest in its start pose (L7)."""
 
 
 def view_delayed_peer(records: AlignedRecords, past: PeerTrajectory) -> DelayedPeer:
-    """Returns what a site sees of a peer whose motion is given, by the site's records."""
+    """Returns a peer as a site sees it.
+
+    Args:
+        records: the site's records.
+        past: the peer's motion.
+    """
     used = records.used[past.records.site]
-    began = used >= 0
-    stamp_s = np.where(began, used / past.records.rate_hz, _BEFORE_EPOCH_S)
-    kept_s = np.where(began, stamp_s + records.h_s, _BEFORE_EPOCH_S)[:-1]
-    stamps = np.where(began, stamp_s, np.nan)
+    has_sample = used >= 0
+    stamp_s = np.where(has_sample, used / past.records.rate_hz, _BEFORE_EPOCH_S)
+    end_stamp_s = np.where(has_sample, stamp_s + records.h_s, _BEFORE_EPOCH_S)[:-1]
     return DelayedPeer(
-        past.evaluate(records.t_s), past.evaluate(stamp_s), past.evaluate(kept_s), stamps
+        now=past.evaluate(records.t_s),
+        delayed=past.evaluate(stamp_s),
+        delayed_end=past.evaluate(end_stamp_s),
+        stamp_s=np.where(has_sample, stamp_s, np.nan),
     )
 
 
 def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
-    """Returns the rows of a site's latest ticks at given times, and True where recorded, shape
-    (K,).
+    """Returns the rows of a site's latest ticks at given times, shape (K,).
+
+    Returns:
+        The rows.
+        True where the tick is recorded.
     """
     row = np.floor(t_s * records.rate_hz + 1e-6).astype(np.int64) - records.first
     inside = (row >= 0) & (row < len(records.known))
@@ -358,8 +417,16 @@ def find_latest_rows(records: AlignedRecords, t_s: Array) -> tuple[Ints, Bools]:
 
 
 def find_common_rows(sites: Sequence[AlignedRecords]) -> tuple[list[Ints], Bools]:
-    """Returns per site the rows of its latest ticks at those of the first one, and where all
-    are recorded.
+    """Returns the rows of every site's latest ticks at the ticks of the first site.
+
+    Returns:
+        The rows by site, shape (K,) each.
+        True where the ticks of all sites are recorded, shape (K,).
     """
-    found = [find_latest_rows(records, sites[0].t_s) for records in sites]
-    return [row for row, _ in found], np.logical_and.reduce([recorded for _, recorded in found])
+    rows = []
+    recorded_by_site = []
+    for records in sites:
+        row, recorded = find_latest_rows(records, sites[0].t_s)
+        rows.append(row)
+        recorded_by_site.append(recorded)
+    return rows, np.logical_and.reduce(recorded_by_site)

@@ -1,20 +1,22 @@
-"""Inertia, torque, energy and end effector of an arm, over all rows of a log at once.
+"""Computes inertia, torque, energy and end effector of an arm, over all rows of a log at once.
 
-Invariant: of the planar arm written from Section IV and Eq. (12) of the paper, independently of
-the core that ran the log; of a chain by the core's leaves, which the tests compare with
-Pinocchio: a kinetic term or a gradient is one recursion. Both have the same functions, and
-hardly anything else asks which arm it is.
+Torques determine some linear combinations of a chain's ten parameters per link, its base
+parameters, and nothing else, however the chain moves. Adaptation moves estimates along these
+combinations alone, so errors of estimates are stated in them. The combinations follow from the
+geometry, by a QR decomposition of the stacked regressors of many states, column by column: a
+column that depends on the columns before it adds nothing, and its parameter joins theirs.
 
-Torques determine some linear combinations of a chain's ten parameters a link and nothing of the
-rest, however it moves; adaptation moves estimates along the former alone. An error of estimates
-is stated in those combinations. Which they are follows from the geometry: QR of regressors of
-many states, stacked, column by column: a column that depends on those before it adds nothing,
-and its parameter joins theirs.
+Sources: M. Gautier, "Numerical calculation of the base inertial parameters of robots", J.
+Robotic Systems 8 (1991), for the QR decomposition; P. M. Wensing, S. Kim, J.-J. Slotine,
+"Linear matrix inequalities for physically consistent inertial parameter identification", IEEE
+Robotics and Automation Letters 3 (2018), for the pseudo-inertia.
 
-Source: M. Gautier, "Numerical calculation of the base inertial parameters of robots", J.
-Robotic Systems 8 (1991), for the QR; P. M. Wensing, S. Kim, J.-J. Slotine, "Linear matrix
-inequalities for physically consistent inertial parameter identification", IEEE Robotics and
-Automation Letters 3 (2018), for the pseudo-inertia.
+Invariant:
+    - The planar arm is written from Section IV and Eq. (12) of the paper, independently of the
+      core that ran the log.
+    - A chain is computed by the core's leaves, which the tests compare with Pinocchio: a
+      kinetic term or a gradient is one recursion.
+    - Both arms have the same methods, so that few callers need to know which arm they use.
 """
 
 import math
@@ -47,16 +49,17 @@ from ..scenario import Scenario
 from ..scenario.arms import ArmModel
 
 HANGING_RAD = 0.3
-"""A link within this of straight down hangs."""
+"""A link whose angle to straight down is smaller than this hangs, rad."""
 _NO_WEIGHT_J = 1e-6
-"""An arm whose energy in the field of gravity varies by less cannot hang."""
+"""An arm whose potential energy varies by less than this cannot hang, J."""
 _ENERGY_SWEEPS = 20
+"""Sweeps over all joints in the search for the least and the largest potential energy."""
 
 Numbers = NDArray[Any]
-"""Real numbers, or complex ones for a derivative by complex step.
+"""Real numbers, or complex numbers for a derivative by complex step.
 
-Vectors have their components on the first axis and any number of columns behind it: shape (n,)
-or (n, B).
+Vectors have their components on the first axis, and any number of columns: shape (n,) or (n,
+B).
 """
 
 
@@ -68,24 +71,24 @@ def multiply_columns(matrix: Numbers, vector: Numbers) -> Numbers:
 
 def solve_columns(A: Numbers, b: Numbers) -> Numbers:
     """Returns the solutions of A y = b, shapes (m, m, ...) and (m, ...)."""
-    solved = np.linalg.solve(
-        np.moveaxis(A, (0, 1), (-2, -1)), np.moveaxis(b, 0, -1)[..., np.newaxis]
-    )
-    return np.moveaxis(solved[..., 0], -1, 0)
+    matrices = np.moveaxis(A, (0, 1), (-2, -1))
+    right_sides = np.moveaxis(b, 0, -1)[..., np.newaxis]
+    solutions = np.linalg.solve(matrices, right_sides)
+    return np.moveaxis(solutions[..., 0], -1, 0)
 
 
 @dataclass(frozen=True)
 class PlacedArm:
-    """The planar arm in the poses q, analytic in every argument: a complex step gives exact
-    derivatives.
+    """The planar arm in given poses.
 
-    "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic Uncertainty", Eq.
-    (1)-(5), (24). `theory.textbook_arm.PlacedChain` has the same methods.
+    All methods are analytic in every argument, so that a complex step gives exact derivatives.
+    They follow "Adaptive Control of Dual User Teleoperation with Time Delay and Dynamic
+    Uncertainty", Eq. (1)-(5) and (24). `theory.textbook_arm.PlacedChain` has the same methods.
 
     Attributes:
-        g_m_s2: gravitational acceleration, m/s^2.
-        lengths_m: of the two links.
-        q: shape (2, ...), rad.
+        g_m_s2: gravitational acceleration, in m/s^2.
+        lengths_m: lengths of the two links.
+        q: joint angles, shape (2, ...), rad.
     """
 
     g_m_s2: float
@@ -112,16 +115,14 @@ class PlacedArm:
 
     def required_torque(self, theta: Numbers, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
         """Returns M(q) a + C(q, qd) v + G(q), shape (2, ...), N m: Y theta of Eq. (12)."""
-        moving = multiply_columns(self.coriolis_matrix(theta, qd), v)
-        return (
-            multiply_columns(self.inertia_matrix(theta), a)
-            + moving
-            + self.gravity_torque(theta)
-        )
+        inertial = multiply_columns(self.inertia_matrix(theta), a)
+        coriolis = multiply_columns(self.coriolis_matrix(theta, qd), v)
+        return inertial + coriolis + self.gravity_torque(theta)
 
     def regressor_matrix(self, qd: Numbers, v: Numbers, a: Numbers) -> Numbers:
-        """Returns Y(q, qd, v, a), shape (2, 5, ...), Eq. (12): column p is the torque of theta
-        = e_p.
+        """Returns the regressor Y(q, qd, v, a) of Eq. (12), shape (2, 5, ...).
+
+        Column p is the torque for theta = e_p, the unit vector of parameter p.
         """
         units = np.multiply.outer(np.eye(5), np.ones(self.q.shape[1:]))
         return np.stack([self.required_torque(unit, qd, v, a) for unit in units], axis=1)
@@ -131,15 +132,16 @@ class PlacedArm:
         return 0.0 * v
 
     def joint_acceleration(self, theta: Numbers, qd: Numbers, torque: Numbers) -> Numbers:
-        """Returns qdd, shape (2, ...), rad/s^2: the solution of M qdd + C qd + G = torque, Eq.
-        (8).
+        """Returns the acceleration qdd, shape (2, ...), rad/s^2.
+
+        It solves M qdd + C qd + G = torque, Eq. (8).
         """
-        at_no_acceleration = self.required_torque(theta, qd, qd, np.zeros_like(qd))
-        return solve_columns(self.inertia_matrix(theta), torque - at_no_acceleration)
+        bias_torque = self.required_torque(theta, qd, qd, np.zeros_like(qd))
+        return solve_columns(self.inertia_matrix(theta), torque - bias_torque)
 
     def end_effector_position(self) -> Numbers:
         """Returns the position of the end effector from the base, shape (2, ...), m."""
-        (l1_m, l2_m) = self.lengths_m
+        l1_m, l2_m = self.lengths_m
         inner = self.q[0]
         outer = self.q[0] + self.q[1]
         x = l1_m * np.cos(inner) + l2_m * np.cos(outer)
@@ -149,17 +151,19 @@ class PlacedArm:
     def position_jacobian(self) -> Numbers:
         """Returns the Jacobian of that position, shape (2, 2, ...), m/rad: rows x and y."""
         x, y = self.end_effector_position()
+        l2_m = self.lengths_m[1]
         outer = self.q[0] + self.q[1]
-        return np.array(
-            [[-y, -self.lengths_m[1] * np.sin(outer)], [x, self.lengths_m[1] * np.cos(outer)]]
-        )
+        return np.array([[-y, -l2_m * np.sin(outer)], [x, l2_m * np.cos(outer)]])
 
 
 class EndEffectorRows(NamedTuple):
-    """Position and velocity of the end effector, shape (K, 2), m and m/s; in space (K, 3).
+    """Motion of the end effector over K rows; a chain has three coordinates instead of two.
 
     Attributes:
-        J: its Jacobian, shape (K, 2, n), m/rad: rows x and y (and z), columns the joints.
+        position: position, shape (K, 2) or (K, 3), m.
+        speed: velocity, shape (K, 2) or (K, 3), m/s.
+        J: Jacobian, shape (K, 2, n) or (K, 3, n), m/rad: a row per coordinate, a column per
+            joint.
     """
 
     position: Array
@@ -167,24 +171,25 @@ class EndEffectorRows(NamedTuple):
     J: Array
 
     def find_force(self, torque: Array, least: float = 1e-15) -> Array:
-        """Returns the least force that explains torques of shape (K, n), N m: shape (K, 2) or
-        (K, 3), N.
+        """Returns the smallest force that explains a joint torque, shape (K, 2) or (K, 3), N.
 
-        Directions in which the end effector moves less than `least` times the most are not told
-        from none.
+        Args:
+            torque: joint torque, shape (K, n), N m.
+            least: directions in which the end effector moves by less than this share of the
+                largest motion are treated as directions in which it cannot move.
         """
         inverse = np.linalg.pinv(self.J.transpose(0, 2, 1), rcond=least)
-        found: Array = np.einsum("kij,kj->ki", inverse, torque)
-        return found
+        force: Array = np.einsum("kij,kj->ki", inverse, torque)
+        return force
 
 
 class PlanarArmRows(NamedTuple):
-    """The planar two-link arm over rows; `ChainArmRows` has the same functions.
+    """The planar two-link arm over rows; `ChainArmRows` has the same methods.
 
     Attributes:
-        theta: its true parameters, Eq. (24), shape (5,).
-        g: gravitational acceleration, m/s^2.
-        lengths_m: of its two links.
+        theta: true parameters, Eq. (24), shape (5,).
+        g: gravitational acceleration, in m/s^2.
+        lengths_m: lengths of the two links.
     """
 
     theta: Array
@@ -193,16 +198,16 @@ class PlanarArmRows(NamedTuple):
 
     @property
     def task(self) -> None:
-        """None: it follows joint by joint."""
+        """None: the planar arm follows joint by joint."""
         return
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
-        """True for each parameter that the torque of gravity consists of: theta_4 and theta_5."""
+        """True for the parameters of the torque of gravity, theta_4 and theta_5, shape (5,)."""
         return np.arange(5) >= 3
 
     def place(self, q: Array) -> PlacedArm:
-        """Returns the arm in the poses of all rows, which are the columns there."""
+        """Returns the arm in the poses of all rows; the rows become columns."""
         return PlacedArm(self.g, self.lengths_m, q.T)
 
     def weightless(self) -> "PlanarArmRows":
@@ -214,17 +219,14 @@ class PlanarArmRows(NamedTuple):
         return multiply_columns(self.place(q).inertia_matrix(self.theta), x.T).T
 
     def law_torque(self, theta_hat: Array, q: Array, qd: Array, v: Array, a: Array) -> Array:
-        """Returns Y(q, qd, v, a) theta_hat of estimates of every row, shape (K, 5), as (K, 2),
-        N m.
-        """
+        """Returns Y(q, qd, v, a) theta_hat, shape (K, 2), N m; theta_hat has shape (K, 5)."""
         return self.place(q).required_torque(theta_hat.T, qd.T, v.T, a.T).T
 
     def gradient(self, q: Array, qd: Array, v: Array, a: Array, r: Array) -> Array:
         """Returns Y'r of r = qd - v, shape (K, 5)."""
-        found: Array = np.einsum(
-            "ijk,ki->kj", self.place(q).regressor_matrix(qd.T, v.T, a.T), r
-        )
-        return found
+        regressor = self.place(q).regressor_matrix(qd.T, v.T, a.T)
+        gradient: Array = np.einsum("ijk,ki->kj", regressor, r)
+        return gradient
 
     def gravity_torque(self, q: Array) -> Array:
         """Returns G(q), shape (K, 2), N m."""
@@ -237,11 +239,11 @@ class PlanarArmRows(NamedTuple):
         return energy
 
     def friction(self, speed: Array) -> Array:
-        """Returns the torque that friction takes at joint speeds, shape (K, 2), N m: none."""
+        """Returns zeros: this arm has no friction in its joints, shape (K, 2), N m."""
         return np.zeros_like(speed)
 
     def stop_torque(self, q: Array, qd: Array) -> Array:  # noqa: ARG002 - as of a chain
-        """Returns the torque of its stops ON the joints, shape (K, 2), N m: it has none."""
+        """Returns zeros: the joints of this arm have no stops, shape (K, 2), N m."""
         return np.zeros_like(q)
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
@@ -252,11 +254,10 @@ class PlanarArmRows(NamedTuple):
         return EndEffectorRows(arm.end_effector_position().T, speed.T, J.transpose(2, 0, 1))
 
     def hanging_angle(self, q: Array) -> float:
-        """Returns how far from straight down the link is that hangs least, in one pose, shape
-        (2,), rad.
-        """
+        """Returns the largest angle of a link to straight down, in rad; q has shape (2,)."""
+        link_angles = np.cumsum(q)
         return max(
-            abs(math.remainder(angle + math.pi / 2.0, math.tau)) for angle in np.cumsum(q)
+            abs(math.remainder(angle + math.pi / 2.0, math.tau)) for angle in link_angles
         )
 
 
@@ -273,7 +274,7 @@ def _put_torques(
 ) -> None:
     """Writes M a + C(q, qd) v + G + armature a + friction(v) of every row, shape (K, n).
 
-    Parameters theta of shape (K, 10 n), or (1, 10 n) for all rows.
+    theta has shape (K, 10 n), or (1, 10 n) for all rows.
     """
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
@@ -305,20 +306,19 @@ def _put_end_effectors(
     gravity: Array,
     tip: Array,
     q: Array,
-    at: Array,
+    position: Array,
     J: Array,
     energy: Array,
 ) -> None:
-    """Writes place, (K, 3), and Jacobian, (K, 6, n), of every row, and the links' potential
-    energy, (K,), J.
+    """Writes the end effector's position and Jacobian, and the potential energy, of every row.
 
-    That energy is -g'(m p + R mc) of every link, p and R its place and orientation in the
-    base's frame.
+    The potential energy of a link is -g'(m p + R mc), with p and R its position and
+    orientation in the base's frame. The arrays have shapes (K, 3), (K, 6, n) and (K,).
     """
     n = chain.shape[0]
     for k in range(q.shape[0]):
         place_joints(chain, q[k])
-        at[k, 0], at[k, 1], at[k, 2] = place_end_effector(chain, tip)
+        position[k, 0], position[k, 1], position[k, 2] = place_end_effector(chain, tip)
         p_x = 0.0
         p_y = 0.0
         p_z = 0.0
@@ -340,15 +340,14 @@ def _put_end_effectors(
 
 
 class ChainArmRows(NamedTuple):
-    """A chain of n joints over rows, by the core's recursions: what M, C and G are made of is
-    theta.
+    """A chain of n joints over rows, computed by the core's recursions.
 
-    The inertia of its drives counts in M. The law knows friction and drives, so that its torque
-    has them.
+    theta determines M, C and G. The inertia of the drives counts in M. The law knows friction
+    and drives, so its torque includes them.
 
     Attributes:
-        theta: its true parameters, shape (10 n,).
-        chain: its joints, gravity and end effector.
+        theta: true parameters, shape (10 n,).
+        chain: joints, gravity and end effector.
     """
 
     theta: Array
@@ -356,14 +355,12 @@ class ChainArmRows(NamedTuple):
 
     @property
     def task(self) -> TaskSetup | None:
-        """How it follows with its end effector; None: joint by joint."""
+        """The task that the end effector follows; None if the arm follows joint by joint."""
         return self.chain.task
 
     @property
     def gravity_parameters(self) -> NDArray[np.bool_]:
-        """True for each parameter that the torque of gravity may consist of: m and m c of every
-        link.
-        """
+        """True for the parameters of the torque of gravity: m and m c of every link."""
         return np.arange(len(self.theta)) % LINK_PARAMETERS < 4
 
     @property
@@ -373,30 +370,32 @@ class ChainArmRows(NamedTuple):
     def _column(self, name: str) -> Array:
         return np.array([getattr(joint, name) for joint in self.chain.joints])
 
-    def _of_joints(self, **values: Any) -> "ChainArmRows":
+    def _replace_in_joints(self, **values: Any) -> "ChainArmRows":
+        """Returns the same chain with some values of every joint replaced."""
         joints = tuple(joint._replace(**values) for joint in self.chain.joints)
         return self._replace(chain=self.chain._replace(joints=joints))
 
     def weightless(self) -> "ChainArmRows":
-        """Returns the same chain without gravity and Coulomb friction: its torque is linear in
-        v and a.
+        """Returns the same chain without gravity and Coulomb friction.
+
+        The torque of this chain is linear in v and a.
         """
-        bare = self._of_joints(coulomb=0.0)
+        bare = self._replace_in_joints(coulomb=0.0)
         return bare._replace(chain=bare.chain._replace(gravity_m_s2=(0.0, 0.0, 0.0)))
 
     def without_drives(self) -> "ChainArmRows":
-        """Returns the same chain without armature and friction: its torque is linear in theta."""
-        return self._of_joints(coulomb=0.0, viscous=0.0, armature_kg_m2=0.0)
+        """Returns this chain without armature and friction: its torque is linear in theta."""
+        return self._replace_in_joints(coulomb=0.0, viscous=0.0, armature_kg_m2=0.0)
 
     def multiply_inertia(self, q: Array, x: Array) -> Array:
-        """Returns (M(q) + armature) x, shape (K, n): one recursion without speed and gravity."""
+        """Returns (M(q) + armature) x, shape (K, n), by one recursion without gravity."""
         still = np.zeros_like(q)
         return self.weightless().law_torque(self.theta[np.newaxis], q, still, still, x)
 
     def law_torque(self, theta_hat: Array, q: Array, qd: Array, v: Array, a: Array) -> Array:
         """Returns Y(q, qd, v, a) theta_hat + armature a + friction(v), shape (K, n), N m.
 
-        Estimates of every row, shape (K, 10 n), or one for all, (1, 10 n).
+        theta_hat has shape (K, 10 n), or (1, 10 n) for all rows.
         """
         torque = np.zeros_like(q)
         theta_hat, q, qd, v, a = map(np.ascontiguousarray, (theta_hat, q, qd, v, a))
@@ -414,7 +413,7 @@ class ChainArmRows(NamedTuple):
 
     def gradient(self, q: Array, qd: Array, v: Array, a: Array, r: Array) -> Array:  # noqa: ARG002
         """Returns Y'r of r = qd - v, shape (K, 10 n)."""
-        found = np.zeros((len(q), len(self.theta)))
+        gradient = np.zeros((len(q), len(self.theta)))
         q, qd, v, a = map(np.ascontiguousarray, (q, qd, v, a))
         _put_gradients(
             chain=self._rows,
@@ -423,9 +422,9 @@ class ChainArmRows(NamedTuple):
             qd=qd,
             v=v,
             a=a,
-            gradient=found,
+            gradient=gradient,
         )
-        return found
+        return gradient
 
     def gravity_torque(self, q: Array) -> Array:
         """Returns G(q), shape (K, n), N m."""
@@ -435,78 +434,94 @@ class ChainArmRows(NamedTuple):
         )
 
     def _place(self, q: Array) -> tuple[Array, Array, Array]:
-        found = np.zeros((len(q), 3)), np.zeros((len(q), 6, q.shape[1])), np.zeros(len(q))
-        gravity = np.array(self.chain.gravity_m_s2)
-        tip = np.array(self.chain.tip_m)
+        """Returns position and Jacobian of the end effector, and the potential energy.
+
+        Returns:
+            Position of the end effector, shape (K, 3), m.
+            Its Jacobian, velocity above angular velocity, shape (K, 6, n).
+            Potential energy, shape (K,), J.
+        """
+        position = np.zeros((len(q), 3))
+        J = np.zeros((len(q), 6, q.shape[1]))
+        energy = np.zeros(len(q))
         _put_end_effectors(
-            self._rows, self.theta, gravity, tip, np.ascontiguousarray(q), *found
+            chain=self._rows,
+            theta=self.theta,
+            gravity=np.array(self.chain.gravity_m_s2),
+            tip=np.array(self.chain.tip_m),
+            q=np.ascontiguousarray(q),
+            position=position,
+            J=J,
+            energy=energy,
         )
-        return found
+        return position, J, energy
 
     def potential_energy(self, q: Array) -> Array:
-        """Returns the links' energy in the field of gravity, shape (K,), J; zero in the base's
-        origin.
-        """
+        """Returns the links' potential energy, shape (K,), J; zero in the base's origin."""
         return self._place(q)[2]
 
     def friction(self, speed: Array) -> Array:
-        """Returns the torque that friction takes at joint speeds, shape (K, n), N m."""
+        """Returns the friction torque against a motion of the joints, shape (K, n), N m."""
         x = speed / COULOMB_SPEED
-        return self._column("viscous") * speed + self._column("coulomb") * x / np.sqrt(
-            1.0 + x * x
-        )
+        viscous = self._column("viscous") * speed
+        return viscous + self._column("coulomb") * x / np.sqrt(1.0 + x * x)
 
     def stop_torque(self, q: Array, qd: Array) -> Array:
-        """Returns the torque of the joints' stops ON them, shape (K, n), N m: springs that
-        never pull.
+        """Returns the torque of the stops ON the joints, shape (K, n), N m.
+
+        Stops are springs with dampers that never pull.
         """
         stiffness = self._column("stop_stiffness")
         damping = self._column("stop_damping")
-        under = np.maximum(self._column("lower") - q, 0.0)
-        over = np.maximum(q - self._column("upper"), 0.0)
-        up = np.where(under > 0.0, np.maximum(stiffness * under - damping * qd, 0.0), 0.0)
-        down = np.where(over > 0.0, np.maximum(stiffness * over + damping * qd, 0.0), 0.0)
-        return up - down
+        below = np.maximum(self._column("lower") - q, 0.0)
+        above = np.maximum(q - self._column("upper"), 0.0)
+        push_up = np.maximum(stiffness * below - damping * qd, 0.0)
+        push_down = np.maximum(stiffness * above + damping * qd, 0.0)
+        return np.where(below > 0.0, push_up, 0.0) - np.where(above > 0.0, push_down, 0.0)
 
     def place_end_effector(self, q: Array, qd: Array) -> EndEffectorRows:
         """Returns the end effector in space, in the base's frame."""
-        at, J, _ = self._place(q)
-        J = np.ascontiguousarray(J[:, :3])
-        return EndEffectorRows(at, np.einsum("kij,kj->ki", J, qd), J)
+        position, full_J, _ = self._place(q)
+        J = np.ascontiguousarray(full_J[:, :3])
+        return EndEffectorRows(position, np.einsum("kij,kj->ki", J, qd), J)
 
     def jacobian_rate(self, q: Array, qd: Array) -> Array:
         """Returns the derivative of the end effector's Jacobian along qd, shape (K, 3, n).
 
-        Column i turns with all joints up to i; of those after it the end effector moves about
-        its axis.
+        Column i turns with all joints up to i. Motion of the joints after i moves the end
+        effector about the axis of joint i.
         """
         J = self._place(q)[1].transpose(0, 2, 1)
         linear = J[:, :, :3]
         axis = J[:, :, 3:]
-        speed, turn = (qd[:, :, np.newaxis] * x for x in (linear, axis))
-        later = speed.sum(axis=1, keepdims=True) - np.cumsum(speed, axis=1)
-        found: Array = np.cross(np.cumsum(turn, axis=1), linear) + np.cross(axis, later)
-        return found.transpose(0, 2, 1)
+        velocity = qd[:, :, np.newaxis] * linear
+        turn = qd[:, :, np.newaxis] * axis
+        velocity_after = velocity.sum(axis=1, keepdims=True) - np.cumsum(velocity, axis=1)
+        rate: Array = np.cross(np.cumsum(turn, axis=1), linear) + np.cross(axis, velocity_after)
+        return rate.transpose(0, 2, 1)
 
     def hanging_angle(self, q: Array) -> float:
-        """Returns at which angle a pendulum stores as much of its energy as the chain in a
-        pose, (n,), rad.
+        """Returns the angle of a pendulum with the same share of its potential energy, in rad.
 
-        The least and the largest energy are looked for from this pose on, joint by joint; stops
-        do not count. What has no weight never hangs: infinity.
+        The least and the largest potential energy are searched joint by joint from this pose
+        on, without regard to stops. A chain without weight never hangs: the angle is infinite.
+
+        Args:
+            q: pose, shape (n,), rad.
         """
-        low = self._find_extreme_energy(q, 1.0)
-        high = self._find_extreme_energy(q, -1.0)
-        if high - low <= _NO_WEIGHT_J:
+        lowest_j = self._find_extreme_energy(q, 1.0)
+        highest_j = self._find_extreme_energy(q, -1.0)
+        if highest_j - lowest_j <= _NO_WEIGHT_J:
             return math.inf
-        share = (float(self.potential_energy(q[np.newaxis])[0]) - low) / (high - low)
+        energy_j = float(self.potential_energy(q[np.newaxis])[0])
+        share = (energy_j - lowest_j) / (highest_j - lowest_j)
         return math.acos(min(max(1.0 - 2.0 * share, -1.0), 1.0))
 
     def _find_extreme_energy(self, q: Array, sign: float) -> float:
-        """Returns the least energy (sign 1) or the largest (-1), by turns of one revolute joint
-        at a time.
+        """Returns the least (sign 1) or the largest (sign -1) potential energy, in J.
 
-        As a function of one joint's angle it is a + b cos q + c sin q, which three angles give.
+        Coordinate descent over the revolute joints: as a function of one joint's angle the
+        energy is a + b cos q + c sin q, which its values at three angles determine.
         """
         q = q.copy()
         revolute = np.flatnonzero(~self._column("prismatic").astype(bool))
@@ -514,8 +529,8 @@ class ChainArmRows(NamedTuple):
             poses = np.tile(q, (3, 1))
             poses[:, joint] = (0.0, 0.5 * np.pi, np.pi)
             at_0, at_90, at_180 = self.potential_energy(poses).tolist()
-            middle = 0.5 * (at_0 + at_180)
-            q[joint] = math.atan2(-sign * (at_90 - middle), -sign * (at_0 - middle))
+            mean = 0.5 * (at_0 + at_180)
+            q[joint] = math.atan2(-sign * (at_90 - mean), -sign * (at_0 - mean))
         return float(self.potential_energy(q[np.newaxis])[0])
 
 
@@ -528,15 +543,21 @@ def build_arm_rows(scenario: Scenario, site: str) -> ArmRows:
     if model.chain is None:
         return PlanarArmRows(model.theta, scenario.sites[site].arm.g_m_s2, model.lengths_m)
     chain = model.chain
-    task = model.chain.task
+    task = chain.task
     if task is not None and not task.posture:
         chain = chain._replace(task=task._replace(posture=scenario.sites[site].q0_rad))
     return ChainArmRows(model.theta, chain)
 
 
 def joint_positions_m(arm: ArmModel, q: Array) -> Array:
-    """Returns base, joints and end effector of angles (K, n), rad: (K, L, 2), m, of chains (K,
-    L, 3).
+    """Returns the positions of base, joints and end effector in K poses, in m.
+
+    Args:
+        arm: the arm.
+        q: joint angles, shape (K, n), rad.
+
+    Returns:
+        Positions, shape (K, L, 2), of chains (K, L, 3).
     """
     if arm.chain is None:
         points = np.zeros((len(q), 1 + JOINTS, 2))
@@ -549,40 +570,37 @@ def joint_positions_m(arm: ArmModel, q: Array) -> Array:
     for pose, angles in zip(points, q, strict=True):
         place_joints(rows, np.ascontiguousarray(angles))
         pose[-1] = place_end_effector(rows, tip_m)
-        at = np.zeros(3)
-        turned = np.eye(3)
+        position = np.zeros(3)
+        orientation = np.eye(3)
         for n, row in enumerate(rows, 1):
-            at = at + turned @ row.p
-            pose[n] = at
-            turned = row.R_base.copy()
+            position = position + orientation @ row.p
+            pose[n] = position
+            orientation = row.R_base.copy()
     return points
 
 
 def upright_axes(chain: ChainSetup) -> Array:
-    """Returns two directions of the floor and the one up, as rows in the base's frame, shape
-    (3, 3).
-    """
-    down = np.array(chain.gravity_m_s2)
-    size = float(np.linalg.norm(down))
-    up = -down / size if size else np.array([0.0, 0.0, 1.0])
-    ahead = np.eye(3)[int(np.argmin(np.abs(up) > 0.9))]  # x, unless gravity acts along it
+    """Returns two horizontal directions and the upward one, in the base's frame, (3, 3)."""
+    gravity = np.array(chain.gravity_m_s2)
+    size = float(np.linalg.norm(gravity))
+    up = -gravity / size if size else np.array([0.0, 0.0, 1.0])
+    ahead = np.eye(3)[int(np.argmin(np.abs(up) > 0.9))]  # x, unless gravity acts along x
     ahead = ahead - (ahead @ up) * up
     ahead /= np.linalg.norm(ahead)
     return np.array([ahead, np.cross(up, ahead), up])
 
 
 DEPENDENT_SHARE = 1e-9
-"""A column of which a smaller share is independent of those before it depends on them."""
+"""A column depends on the columns before it if a smaller share of it is independent of them."""
 
 
 class BaseParameters(NamedTuple):
-    """Combinations of parameters that torques determine.
+    """Combinations of parameters that torques determine: base = combination theta.
 
     Attributes:
-        kept: per combination the parameter that it is named after, in ascending order, shape
-            (B,).
-        combination: its factors of all parameters, 1 of its own, shape (B, P): base =
-            combination theta.
+        kept: per combination the index of the parameter after which it is named, ascending,
+            shape (B,).
+        combination: factors of all parameters, 1 for the naming parameter, shape (B, P).
     """
 
     kept: NDArray[np.int64]
@@ -590,69 +608,80 @@ class BaseParameters(NamedTuple):
 
 
 def stack_regressors(arm: ChainArmRows, states: int) -> Array:
-    """Returns regressors of so many random states, one below the other, shape (states n, 10 n)."""
+    """Returns the regressors of random states, stacked, shape (states n, 10 n)."""
     random = np.random.default_rng(1)
-    (n, count) = (len(arm.chain.joints), len(arm.theta))
+    n = len(arm.chain.joints)
+    count = len(arm.theta)
     q = random.uniform(-np.pi, np.pi, (states, n))
     qd, a = random.normal(size=(2, states, n))
-    each = np.repeat(np.arange(states), count)
-    columns = np.tile(np.eye(count), (states, 1))
-    torque = arm.without_drives().law_torque(columns, q[each], qd[each], qd[each], a[each])
+    # a regressor's columns are the torques of unit parameters
+    row = np.repeat(np.arange(states), count)
+    unit_parameters = np.tile(np.eye(count), (states, 1))
+    torque = arm.without_drives().law_torque(unit_parameters, q[row], qd[row], qd[row], a[row])
     return torque.reshape(states, count, n).transpose(0, 2, 1).reshape(-1, count)
 
 
 @lru_cache(maxsize=64)
-def _find_base_parameters(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParameters:
+def _find_chain_base(chain: ChainSetup, learnt: tuple[bool, ...]) -> BaseParameters:
+    """Returns the base parameters of a chain by a QR decomposition (Gautier 1991)."""
     arm = ChainArmRows(np.zeros(len(learnt)), chain)
     W = stack_regressors(arm, 4 * LINK_PARAMETERS)[:, list(learnt)]
-    places = np.flatnonzero(learnt)
+    indices = np.flatnonzero(learnt)
+    least_size = DEPENDENT_SHARE * float(np.linalg.norm(W)) / np.sqrt(W.shape[1])
     Q = np.zeros((len(W), 0))
     kept = []
     for p, column in enumerate(W.T):
+        # Gram-Schmidt, twice: the first pass leaves rounding errors of the size of the column
         rest = column - Q @ (Q.T @ column)
-        # once more: the first leaves rounding of the size of the column
         rest -= Q @ (Q.T @ rest)
         size = float(np.linalg.norm(rest))
-        if size > DEPENDENT_SHARE * float(np.linalg.norm(W)) / np.sqrt(W.shape[1]):
+        if size > least_size:
             Q = np.column_stack([Q, rest / size])
             kept.append(p)
     factors = np.linalg.lstsq(W[:, kept], W, rcond=None)[0]
     combination = np.zeros((len(kept), len(learnt)))
-    combination[:, places] = np.where(np.abs(factors) > DEPENDENT_SHARE, factors, 0.0)
-    combination[:, places[kept]] = np.eye(len(kept))
-    return BaseParameters(places[kept], combination)
+    combination[:, indices] = np.where(np.abs(factors) > DEPENDENT_SHARE, factors, 0.0)
+    combination[:, indices[kept]] = np.eye(len(kept))
+    return BaseParameters(indices[kept], combination)
 
 
 def find_base_parameters(arm: ArmRows, learnt: NDArray[np.bool_]) -> BaseParameters:
-    """Returns the combinations of the parameters that are learnt, shape (P,).
+    """Returns the combinations of learnt parameters that torques determine.
 
-    The five parameters of the planar arm are base parameters already, each by itself.
+    The five parameters of the planar arm are base parameters already.
+
+    Args:
+        arm: the arm.
+        learnt: True for each parameter that is learnt, shape (P,).
     """
     if isinstance(arm, ChainArmRows):
-        return _find_base_parameters(arm.chain, tuple(learnt.tolist()))
+        return _find_chain_base(arm.chain, tuple(learnt.tolist()))
     kept = np.flatnonzero(learnt)
     return BaseParameters(kept, np.eye(len(learnt))[kept])
 
 
 def find_pseudo_inertias(theta: Array) -> Array:
-    """Returns the pseudo-inertia of every link, shape (n, 4, 4): [[S, m c], [m c', m]], S =
-    tr(I) 1/2 - I.
+    """Returns the pseudo-inertia of every link, shape (n, 4, 4).
+
+    It is [[S, m c], [m c', m]] with S = tr(I) / 2 - I.
     """
     links = theta.reshape(-1, LINK_PARAMETERS)
-    found = np.zeros((len(links), 4, 4))
-    found[:, 3, 3] = links[:, 0]
-    found[:, :3, 3] = found[:, 3, :3] = links[:, 1:4]
+    pseudo_inertias = np.zeros((len(links), 4, 4))
+    pseudo_inertias[:, 3, 3] = links[:, 0]
+    pseudo_inertias[:, :3, 3] = links[:, 1:4]
+    pseudo_inertias[:, 3, :3] = links[:, 1:4]
     xx, xy, yy, xz, yz, zz = links[:, 4:].T
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]).transpose(2, 0, 1)
-    half = 0.5 * (xx + yy + zz)
-    found[:, :3, :3] = half[:, np.newaxis, np.newaxis] * np.eye(3) - inertia
-    return found
+    half_trace = 0.5 * (xx + yy + zz)
+    S = half_trace[:, np.newaxis, np.newaxis] * np.eye(3) - inertia
+    pseudo_inertias[:, :3, :3] = S
+    return pseudo_inertias
 
 
 def find_consistent_links(theta: Array) -> list[bool]:
-    """Returns for each link if some body has these parameters: its pseudo-inertia is positive
-    definite.
+    """Returns for each link whether some body has its parameters (Wensing et al. 2018).
+
+    That is so if the link's pseudo-inertia is positive definite.
     """
-    return [
-        bool(values.min() > 0.0) for values in np.linalg.eigvalsh(find_pseudo_inertias(theta))
-    ]
+    eigenvalues = np.linalg.eigvalsh(find_pseudo_inertias(theta))
+    return [bool(values.min() > 0.0) for values in eigenvalues]

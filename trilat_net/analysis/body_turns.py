@@ -1,4 +1,4 @@
-"""Orientations of a plant's bodies in a stream of frames."""
+"""Aligns the orientations of a plant's bodies in a stream of frames."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -11,8 +11,10 @@ from ..log.orientations import QUATERNION_AXES, QuaternionSigns
 
 
 class BodyTurns:
-    """Poses of a plant's bodies in one stream: of both signs of a quaternion the nearer to the
-    one before.
+    """Chooses the signs of the quaternions of a plant's bodies in one stream of frames.
+
+    Of the two quaternions of an orientation, the one nearer to that of the frame before is
+    chosen.
     """
 
     def __init__(self) -> None:
@@ -21,8 +23,10 @@ class BodyTurns:
         )
 
     def align(self, bodies: Sequence[float]) -> Array:
-        """Returns poses, shape (7 b,), as given: x, y, z, m, and the unit quaternion w, x, y, z
-        of each.
+        """Returns the poses of a frame with chosen signs, shape (7 b,).
+
+        Args:
+            bodies: pose of each body: position x, y, z in m, and unit quaternion w, x, y, z.
         """
         poses = np.array(bodies, dtype=np.float64).reshape(-1, POSITION + len(QUATERNION_AXES))
         for body, pose in enumerate(poses):

@@ -1,13 +1,13 @@
-"""Dominance of sites: alpha of Eq. (6) over time, ramps and steps included, and the weights
-that it gives.
+"""Traces the dominance of sites over time, alpha of Eq. (6), and its Lyapunov weights.
 
-Invariant: alpha is a function of time and of the applied changes alone; a ramp starts from the
-value that the ramp before it has at that time.
+The weights of the sites' functionals are beta_i = pi_i / c_i, where pi is the left Perron
+vector of alpha, and c_i the scalar in Kd_i = c_i Kbar. Both conditions are necessary: beta'
+Upsilon <= 0 together with Upsilon 1 = 0 forces equality, so that there is no slack. pi as the
+weight of a delayed consensus is a known result (docs/errata.md); the paper uses ones.
 
-The weights of the sites' functionals are beta_i = pi_i / c_i: pi is the left Perron vector of
-alpha, c_i the scalar in Kd_i = c_i Kbar. Both conditions are necessary: beta' Upsilon <= 0
-together with Upsilon 1 = 0 forces equality, so there is no slack. pi as the weight of a delayed
-consensus is a known result (docs/errata.md); the paper uses ones.
+Invariant:
+    - alpha is a function of time and of the applied changes alone.
+    - A ramp starts from the value that the ramp before it has at that time.
 """
 
 from collections.abc import Sequence
@@ -25,16 +25,16 @@ from ..log.record_columns import Ints
 from ..scenario import Scenario
 
 RAMP_TIME_TOLERANCE_S = 5e-10
-"""Half of the nanosecond in which ramps begin and end."""
+"""Half of the nanosecond to which ramps start and end, s."""
 
 
 class DominanceHistory(NamedTuple):
-    """Dominance factors of a site for its peers, in scenario order.
+    """Dominance factors of a site for its P peers, in scenario order.
 
     Attributes:
-        alpha: at every row, shape (K, P).
-        rate: their derivative as the controller takes it into account, shape (K, P), 1/s.
-        before: at the end of every period, before a step there, shape (K - 1, P).
+        alpha: factors at every row, shape (K, P).
+        rate: their derivatives as the controller takes them into account, shape (K, P), 1/s.
+        before: factors at the end of every period, before a step there, shape (K - 1, P).
     """
 
     alpha: Array
@@ -43,59 +43,71 @@ class DominanceHistory(NamedTuple):
 
     @property
     def constant(self) -> bool:
-        """True if nothing changes."""
+        """True if no factor ever changes."""
         return bool(np.all(self.alpha == self.alpha[0]) and not self.rate.any())
 
 
 def trace_dominance(log: Log, site: str, t_s: Array) -> DominanceHistory:
-    """Returns the dominance factors of a site at ticks in a row, s.
+    """Returns the dominance factors of a site at successive ticks.
+
+    A site that goes on without a peer rescales the factors of the others to the sum 1.
+
+    Args:
+        log: the log of a run.
+        site: name of the site.
+        t_s: times of the ticks, shape (K,), s.
 
     Raises:
-        LogError: a record names a change that is none.
+        LogError: a record names a change that is not valid.
     """
-    planned = evaluate_ramps(
-        *list_ramps(log, site), t_s, 1.0 / log.scenario.sites[site].rate_hz
-    )
-    there = ~find_lost_peers(log, site, t_s)
-    if there.all():
+    start, ramps = list_ramps(log, site)
+    planned = evaluate_ramps(start, ramps, t_s, 1.0 / log.scenario.sites[site].rate_hz)
+    present = ~find_lost_peers(log, site, t_s)
+    if present.all():
         return planned
-    alpha = planned.alpha * there
-    rate = planned.rate * there
-    before = planned.before * there[:-1]
-    whole = alpha.sum(axis=1, keepdims=True)
-    whole_rate = rate.sum(axis=1, keepdims=True)
-    rate = (rate * whole - alpha * whole_rate) / whole**2
-    return DominanceHistory(alpha / whole, rate, before / before.sum(axis=1, keepdims=True))
+    alpha = planned.alpha * present
+    rate = planned.rate * present
+    before = planned.before * present[:-1]
+    total = alpha.sum(axis=1, keepdims=True)
+    total_rate = rate.sum(axis=1, keepdims=True)
+    return DominanceHistory(
+        alpha=alpha / total,
+        rate=(rate * total - alpha * total_rate) / total**2,
+        before=before / before.sum(axis=1, keepdims=True),
+    )
 
 
 def list_ramps(log: Log, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Returns the factors of a site at the epoch, shape (P,), and its ramps, scripted and
-    ordered.
+    """Returns the factors of a site at the epoch, shape (P,), and all its ramps.
+
+    The ramps are those of the scenario and those that were ordered.
+
+    Raises:
+        LogError: a record names a change that is not valid.
     """
     start, scripted = list_scripted_ramps(log.scenario, site)
-    ordered = [
-        c.ramp for batch in log.commands(site).values() for c in batch if c.ramp is not None
-    ]
+    changes = [change for batch in log.commands(site).values() for change in batch]
+    ordered = [change.ramp for change in changes if change.ramp is not None]
     return start, [*scripted, *ordered]
 
 
 def find_users(scenario: Scenario) -> tuple[str, list[str]]:
-    """Returns the first slave, "" if there is none, and its users: the masters."""
-    slaves, users = (
-        [site for site, spec in scenario.sites.items() if spec.role == role]
-        for role in ("slave", "master")
-    )
-    return next(iter(slaves), ""), users
+    """Returns the first slave ("" if there is none) and its users, which are all masters."""
+    slaves = [site for site, spec in scenario.sites.items() if spec.role == "slave"]
+    masters = [site for site, spec in scenario.sites.items() if spec.role == "master"]
+    return next(iter(slaves), ""), masters
 
 
 class UserShares(NamedTuple):
-    """Who of its users leads a slave, over K times. Where that is not the program, somebody
-    intervenes.
+    """Shares of the users of a slave, over K times.
+
+    If the leader is not the user that the program holds, somebody intervenes.
 
     Attributes:
-        shares: alpha of the slave for each of them, shape (K, U).
-        leader: the user with the largest share, by its place; the program, if no share is larger.
-        program: the user that a program holds, by its place.
+        shares: the slave's dominance factors for its U users, shape (K, U).
+        leader: index of the user with the largest share, shape (K,); that of the program if no
+            share is larger than the program's.
+        program: index of the user that a program holds.
     """
 
     shares: Array
@@ -104,122 +116,153 @@ class UserShares(NamedTuple):
 
 
 def find_user_shares(scenario: Scenario, alpha: Array, program: str = "") -> UserShares:
-    """Returns who leads the slave of `find_users`, by its alpha, shape (K, P).
+    """Returns the shares of the users in the slave of `find_users`.
+
+    Args:
+        scenario: scenario of the run.
+        alpha: dominance factors of the slave, shape (K, P).
+        program: the user that a program holds; by default the last user.
 
     Raises:
-        UsageError: there is no such user; by default the program is the last one.
+        UsageError: there is no such user.
     """
     slave, users = find_users(scenario)
-    if (program := program or users[-1]) not in users:
+    program = program or users[-1]
+    if program not in users:
         raise UsageError(f"the program holds one of {', '.join(users)}, not {program!r}")
-    shares = alpha[:, [scenario.peers(slave).index(user) for user in users]]
-    place = users.index(program)
-    tied = shares[:, place] >= shares.max(axis=1)
-    return UserShares(shares, np.where(tied, place, shares.argmax(axis=1)), place)
+    peers = scenario.peers(slave)
+    shares = alpha[:, [peers.index(user) for user in users]]
+    program_index = users.index(program)
+    program_leads = shares[:, program_index] >= shares.max(axis=1)
+    leader = np.where(program_leads, program_index, shares.argmax(axis=1))
+    return UserShares(shares, leader, program_index)
 
 
 def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
-    """Returns which peers a site goes on without at some times, s, shape (K, P): see
-    `core.lost_peers`.
+    """Returns the peers without which a site goes on, over time; see `core.lost_peers`.
+
+    Args:
+        log: the log of a run.
+        site: name of the site.
+        t_s: times, shape (K,), s.
+
+    Returns:
+        True for each lost peer, shape (K, P).
     """
     part = log[site]
-    peers = len(log[site].peers)
-    lost = np.zeros((len(t_s), peers), dtype=bool)
+    peer_count = len(part.peers)
+    lost = np.zeros((len(t_s), peer_count), dtype=bool)
     if not log.scenario.sites[site].on_stale.rule.degrades or not len(part):
         return lost
-    gone = part.memory(part.layout.count_life_memory(peers), peers) != 0.0
+    first = part.layout.life_memory(peer_count)
+    is_lost = part.memory(first, peer_count) != 0.0
     rows = np.searchsorted(part.t_s, t_s + RAMP_TIME_TOLERANCE_S, side="right") - 1
-    lost[rows >= 0] = gone[rows[rows >= 0]]
+    recorded = rows >= 0
+    lost[recorded] = is_lost[rows[recorded]]
     return lost
 
 
 def list_losses(log: Log) -> list[str]:
-    """Returns the times in which a site went on without a peer, in words."""
-    found = []
+    """Returns sentences on the times in which a site went on without a peer."""
+    sentences = []
     for site in log.sites:
         part = log[site]
         lost = find_lost_peers(log, site, part.t_s).astype(int)
+        times_s = part.t_s
+        if len(part):
+            times_s = np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz)
         for j, peer in enumerate(part.peers):
             edges = np.diff(np.concatenate([[0], lost[:, j], [0]]))
-            times = (
-                np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz)
-                if len(part)
-                else part.t_s
-            )
-            for first, last in zip(
-                np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True
-            ):
-                found.append(f"{site} without {peer} {times[first]:.4g} to {times[last]:.4g} s")
-    return found
+            starts_s = times_s[np.flatnonzero(edges > 0)]
+            ends_s = times_s[np.flatnonzero(edges < 0)]
+            sentences += [
+                f"{site} without {peer} {from_s:.4g} to {to_s:.4g} s"
+                for from_s, to_s in zip(starts_s, ends_s, strict=True)
+            ]
+    return sentences
 
 
 def list_scripted_ramps(scenario: Scenario, site: str) -> tuple[Array, list[DominanceRamp]]:
-    """Returns the factors of a site at the epoch, shape (P,), and the ramps of the scenario's
-    timeline.
-    """
-    start = np.array([scenario.dominance[site].get(peer, 0.0) for peer in scenario.peers(site)])
+    """Returns the factors of a site at the epoch, shape (P,), and the scenario's ramps."""
+    factors = scenario.dominance[site]
+    start = np.array([factors.get(peer, 0.0) for peer in scenario.peers(site)])
     return start, scenario.scripted_ramps(site)
 
 
 def drop_finished_ramps(
     start: Array, ramps: Sequence[DominanceRamp], from_s: float
 ) -> tuple[Array, list[DominanceRamp]]:
-    """Returns factors and ramps that give the same history from a time on, without the ramps
-    before it.
+    """Returns factors and ramps with the same history from a time on, without earlier ramps.
+
+    Args:
+        start: factors at the epoch, shape (P,).
+        ramps: all ramps.
+        from_s: time from which the history must be the same, in s.
     """
     ordered = sorted(ramps, key=lambda ramp: ramp.start_ns)
-    begun = sum(ramp.start_ns * 1e-9 <= from_s for ramp in ordered)
-    if begun < 2:
+    started = sum(ramp.start_ns * 1e-9 <= from_s for ramp in ordered)
+    if started < 2:
         return start, ordered
-    turn_s = np.array([ordered[begun - 1].start_ns * 1e-9])
-    return evaluate_ramps(start, ordered[: begun - 1], turn_s, 0.0).alpha[0], ordered[
-        begun - 1 :
-    ]
+    finished = ordered[: started - 1]
+    remaining = ordered[started - 1 :]
+    turn_s = np.array([remaining[0].start_ns * 1e-9])
+    return evaluate_ramps(start, finished, turn_s, 0.0).alpha[0], remaining
 
 
 def evaluate_ramps(
     start: Array, ramps: Sequence[DominanceRamp], t_s: Array, h_s: float
 ) -> DominanceHistory:
-    """Returns dominance factors, at the epoch `start`, shape (P,), at ascending times, `h_s`
-    apart, s.
+    """Returns the dominance factors over time.
+
+    Args:
+        start: factors at the epoch, shape (P,).
+        ramps: ramps of the factors.
+        t_s: ascending times, one period apart, shape (K,), s.
+        h_s: the period, in s.
     """
     alpha = np.tile(start, (len(t_s), 1))
     rate = np.zeros((len(t_s), len(start)))
+    # the ramp in progress: its factors at start and end, and its times
     before = start
+    after = start
     start_s = 0.0
     end_s = 0.0
-    after = start
     for ramp in sorted(ramps, key=lambda ramp: ramp.start_ns):
-        at_s = ramp.start_ns * 1e-9
-        share = 1.0 if at_s >= end_s else (at_s - start_s) / (end_s - start_s)
+        next_start_s = ramp.start_ns * 1e-9
+        share = 1.0
+        if next_start_s < end_s:
+            share = (next_start_s - start_s) / (end_s - start_s)
+        # exact factors at the end of a finished ramp, which interpolation would round
         before = after if share == 1.0 else before + (after - before) * share
-        start_s = at_s
-        end_s = ramp.end_ns * 1e-9
         after = np.array(ramp.alpha)
-        later = t_s >= start_s - RAMP_TIME_TOLERANCE_S
-        climbs = later & (t_s < end_s - RAMP_TIME_TOLERANCE_S)
-        alpha[later] = after
-        rate[later] = 0.0
-        if climbs.any():
+        start_s = next_start_s
+        end_s = ramp.end_ns * 1e-9
+        is_later = t_s >= start_s - RAMP_TIME_TOLERANCE_S
+        is_climbing = is_later & (t_s < end_s - RAMP_TIME_TOLERANCE_S)
+        alpha[is_later] = after
+        rate[is_later] = 0.0
+        if is_climbing.any():
             slope = (after - before) / ((ramp.end_ns - ramp.start_ns) * 1e-9)
-            alpha[climbs] = before + slope * (t_s[climbs, np.newaxis] - start_s)
-            rate[climbs] = slope
+            alpha[is_climbing] = before + slope * (t_s[is_climbing, np.newaxis] - start_s)
+            rate[is_climbing] = slope
     return DominanceHistory(alpha, rate, alpha[:-1] + h_s * rate[:-1])
 
 
 KD_SHAPE_TOLERANCE = 1e-9
-"""Relative difference up to which two gains are one."""
+"""Relative difference up to which two gains count as equal."""
 
 
 class LyapunovWeights(NamedTuple):
-    """Weights beta, as far as they exist.
+    """Lyapunov weights beta, as far as they exist.
 
     Attributes:
-        beta: per site, sum N, so that equal shares give the paper's ones, shape (N,).
-        groups: the closed groups of sites, each a tuple of indices: none in it follows a site
-            outside. Of one group pi is unique, though some of its entries may be 0.
-        scales: c_i of Kd_i = c_i Kbar, c of the first site 1, shape (N,); None if the Kd differ
-            in shape.
+        beta: weight of each site, with the sum N, so that equal shares give the paper's ones,
+            shape (N,).
+        groups: the closed groups of sites, as tuples of indices: no site of a group follows a
+            site outside. If there is a single group, pi is unique, though some of its entries
+            may be 0.
+        scales: c_i of Kd_i = c_i Kbar, with 1 for the first site, shape (N,); None if the Kd
+            differ in shape.
     """
 
     beta: Array
@@ -228,8 +271,10 @@ class LyapunovWeights(NamedTuple):
 
 
 def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
-    """Returns the groups of sites that reach each other and no other along shares, alpha shape
-    (N, N).
+    """Returns the groups of sites that reach each other along shares, and no other site.
+
+    Args:
+        alpha: the dominance matrix, shape (N, N).
     """
     reach = find_reach(alpha)
     groups = []
@@ -241,10 +286,10 @@ def find_closed_groups(alpha: Array) -> tuple[tuple[int, ...], ...]:
 
 
 def left_perron_vector(alpha: Array) -> Array:
-    """Returns pi >= 0 with pi' alpha = pi' and sum 1, shape (N,); 0 for sites outside of closed
-    groups.
+    """Returns pi >= 0 with pi' alpha = pi' and sum 1, shape (N,).
 
-    If several closed groups make it ambiguous, each counts by its number of sites.
+    pi is 0 for sites outside closed groups. If several closed groups make it ambiguous, each
+    group counts by its number of sites.
     """
     pi = np.zeros(len(alpha))
     groups = find_closed_groups(alpha)
@@ -255,31 +300,41 @@ def left_perron_vector(alpha: Array) -> Array:
 
 
 def find_kd_scales(Kd: Array) -> Array | None:
-    """Returns c_i of Kd_i = c_i Kbar with c_1 = 1, or None if there are no such scalars, Kd
-    shape (N, n).
+    """Returns c_i of Kd_i = c_i Kbar with c_1 = 1; None if there are no such scalars.
 
-    A number that is NaN is of an axis of the task that its site does not follow. If every Kd is
-    zero, nothing couples the sites and any scale holds: ones.
+    If every Kd is zero, nothing couples the sites, and any scale holds: ones are returned.
+
+    Args:
+        Kd: gains, shape (N, n); NaN along an axis that a site does not follow.
     """
     if not np.nan_to_num(Kd).any():
         return np.ones(len(Kd))
-    sizes = Kd[:, np.isfinite(Kd).all(axis=0)].sum(axis=1)
+    is_common_axis = np.isfinite(Kd).all(axis=0)
+    sizes = Kd[:, is_common_axis].sum(axis=1)
     if not sizes.all():
         return None
     shapes = Kd / sizes[:, np.newaxis]
-    if (
-        np.nan_to_num(np.fmax.reduce(shapes) - np.fmin.reduce(shapes)).max()
-        > KD_SHAPE_TOLERANCE
-    ):
+    # fmax and fmin ignore NaN
+    differences = np.fmax.reduce(shapes) - np.fmin.reduce(shapes)
+    if np.nan_to_num(differences).max() > KD_SHAPE_TOLERANCE:
         return None
     scales: Array = sizes / sizes[0]
     return scales
 
 
 def compute_lyapunov_weights(alpha: Array, Kd: Array) -> LyapunovWeights:
-    """Returns beta_i = pi_i / c_i; if the Kd, shape (N, n), differ in shape, pi alone, which
-    lets V rise.
+    """Returns the weights beta_i = pi_i / c_i.
+
+    If the Kd differ in shape, pi alone is returned as beta, which lets V rise.
+
+    Args:
+        alpha: the dominance matrix, shape (N, N).
+        Kd: gains, shape (N, n).
     """
     scales = find_kd_scales(Kd)
     beta = left_perron_vector(alpha) / (1.0 if scales is None else scales)
-    return LyapunovWeights(beta * (len(beta) / beta.sum()), find_closed_groups(alpha), scales)
+    return LyapunovWeights(
+        beta=beta * (len(beta) / beta.sum()),
+        groups=find_closed_groups(alpha),
+        scales=scales,
+    )

@@ -1,15 +1,14 @@
-"""Overview of MCAP files: layout, channels, gaps and message rates; of a trilat-net log also
-its health.
+"""Gives an overview of MCAP files, and summarises runs, without executing anything again.
 
-That is: of its session, its loops, links and clocks, in numbers that need no re-execution.
+The overview has the files' layout, channels, gaps and message rates; for a trilat-net log also
+the health of its session, loops, links and clocks. The summary of a run is the content of
+`summary.json`.
 
-Invariant: the inventory decodes no message, so any MCAP file has one, also where its log cannot
-be opened; the overview then holds the reason. Gaps are counted only on channels with
-consecutive numbers. Keys end in their unit; a quantity that the log does not determine is None,
-never NaN.
-
-The summary of a run is the content of `summary.json`; there too keys end in their unit, and
-what the log does not determine is null.
+Invariant:
+    - The inventory decodes no message, so that any MCAP file has one. If a log cannot be
+      opened, the overview has the reason.
+    - Gaps are counted only in channels with consecutive numbers.
+    - Keys end in their unit. A quantity that the log does not determine is None, never NaN.
 """
 
 from array import array
@@ -18,6 +17,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -52,20 +52,31 @@ from .site_signals import (
 from .timeline import find_mode_intervals, list_changes
 
 MOST_LISTED_GAPS = 1000
-"""Gaps of a channel that are named."""
+"""Largest number of gaps that are listed per channel."""
 
 
 Absences = Mapping[str, Sequence[tuple[int, int]]]
-"""Per site the ticks that it did not make, as (first, last)."""
+"""Ticks that a site skipped, as spans (first, last), by site."""
+
+
+class _Messages(NamedTuple):
+    """The messages of a channel, in the order of the file."""
+
+    log_ns: "array[int]"
+    sequence: "array[int]"
+    size: "array[int]"
 
 
 class FileInventory:
-    """Content of a file, or of the files of one log; `progress` gets the bytes read and those
-    in all.
+    """Content of a file, or of all files of one log.
+
+    Args:
+        paths: the files.
+        progress: called with the number of bytes read so far, and of all bytes.
 
     Attributes:
-        files: facts of every file, keys ending in their units.
-        metadata: of all files, by name; of the last with a name.
+        files: facts of every file, with keys that end in their unit.
+        metadata: metadata records of all files, by name; a later file replaces an earlier one.
 
     Raises:
         LogError: a file cannot be read, or is no MCAP file.
@@ -74,124 +85,147 @@ class FileInventory:
     def __init__(self, paths: Sequence[Path], progress: Progress | None = None) -> None:
         self.files: list[JsonObject] = []
         self.metadata: dict[str, dict[str, str]] = {}
-        self._about: dict[str, ChannelInfo] = {}
-        self._came: defaultdict[str, tuple[array[int], ...]] = (
-            defaultdict(  # log time, sequence, size
-                lambda: (array("Q"), array("Q"), array("Q"))
-            )
+        self._channel_infos: dict[str, ChannelInfo] = {}
+        self._messages: defaultdict[str, _Messages] = defaultdict(
+            lambda: _Messages(array("Q"), array("Q"), array("Q"))
         )
-        total = sum(path.stat().st_size for path in paths if path.is_file())
-        before = 0
+        total_bytes = sum(path.stat().st_size for path in paths if path.is_file())
+        bytes_before = 0
         for path in paths:
+            file_progress = shift_progress(progress, bytes_before, total_bytes)
             with reading(path) as stream:
-                self._read(
-                    path, McapReader(stream, str(path), shift_progress(progress, before, total))
-                )
-            before += path.stat().st_size
+                self._read_file(path, McapReader(stream, str(path), file_progress))
+            bytes_before += path.stat().st_size
 
-    def _read(self, path: Path, walk: McapReader) -> None:
-        for topic, payload, log_ns, _, sequence in walk.messages():
-            times, sequences, sizes = self._came[topic]
-            times.append(log_ns)
-            sequences.append(sequence)
-            sizes.append(len(payload))
-        self._about = {**walk.channels, **self._about}
-        self.metadata.update(walk.metadata)
+    def _read_file(self, path: Path, reader: McapReader) -> None:
+        """Adds the content of a file."""
+        for topic, payload, log_ns, _, sequence in reader.messages():
+            messages = self._messages[topic]
+            messages.log_ns.append(log_ns)
+            messages.sequence.append(sequence)
+            messages.size.append(len(payload))
+        self._channel_infos = {**reader.channels, **self._channel_infos}
+        self.metadata.update(reader.metadata)
         self.files.append(
             {
                 "path": path.as_posix(),
-                "size_bytes": walk.size,
-                "library": walk.library,
-                "finished": walk.complete,
-                "cut_off_at_byte": None if walk.torn is None else walk.torn.offset,
-                "damaged": [part._asdict() for part in walk.damaged],
-                "chunks": walk.chunks.total(),
-                "compression": {name or "none": count for name, count in walk.chunks.items()},
-                "packed_bytes": walk.packed_bytes,
-                "unpacked_bytes": walk.unpacked_bytes,
-                "attachments": {name: len(data) for name, data in walk.attachments.items()},
-                "metadata": sorted(walk.metadata),
-                "part": walk.metadata.get("trilat.part", {}),
+                "size_bytes": reader.size,
+                "library": reader.library,
+                "finished": reader.complete,
+                "cut_off_at_byte": None if reader.torn is None else reader.torn.offset,
+                "damaged": [part._asdict() for part in reader.damaged],
+                "chunks": reader.chunks.total(),
+                "compression": {name or "none": count for name, count in reader.chunks.items()},
+                "packed_bytes": reader.packed_bytes,
+                "unpacked_bytes": reader.unpacked_bytes,
+                "attachments": {name: len(data) for name, data in reader.attachments.items()},
+                "metadata": sorted(reader.metadata),
+                "part": reader.metadata.get("trilat.part", {}),
             }
         )
 
     def channels(
         self, session: str, rates_hz: Mapping[str, int], absences: Absences
     ) -> dict[str, JsonObject]:
-        """Returns the facts of every channel by topic; gaps of those of a session's sites."""
-        names = [*self._about, *(topic for topic in self._came if topic not in self._about)]
-        return {
-            topic: self._channel(topic)
-            | _numbers(
+        """Returns the facts of every channel by topic.
+
+        Args:
+            session: name of the session whose channels' gaps are counted.
+            rates_hz: tick rates of the session's sites.
+            absences: ticks that the sites skipped.
+        """
+        topics_in_order = dict.fromkeys([*self._channel_infos, *self._messages])
+        channels = {}
+        for topic in topics_in_order:
+            gaps = _count_gaps(
                 topic=topic,
-                sequence=self._came[topic][1],
+                sequence=self._messages[topic].sequence,
                 session=session,
                 rates_hz=rates_hz,
                 absences=absences,
             )
-            for topic in names
-        }
+            channels[topic] = self._describe_channel(topic) | gaps
+        return channels
 
-    def _channel(self, topic: str) -> JsonObject:
-        about = self._about.get(
-            topic,
-            ChannelInfo(topic=topic, encoding="", schema="", schema_encoding="", metadata={}),
+    def _describe_channel(self, topic: str) -> JsonObject:
+        """Returns the facts of a channel, without its gaps."""
+        unknown = ChannelInfo(
+            topic=topic, encoding="", schema="", schema_encoding="", metadata={}
         )
-        log_ns, _, sizes = (np.frombuffer(c, dtype=np.uint64) for c in self._came[topic])
-        first_ns, last_ns = (
-            (int(log_ns.min()), int(log_ns.max())) if len(log_ns) else (None, None)
-        )
-        span_s = 0.0 if first_ns is None or last_ns is None else (last_ns - first_ns) / NS_PER_S
+        channel = self._channel_infos.get(topic, unknown)
+        log_ns = np.frombuffer(self._messages[topic].log_ns, dtype=np.uint64)
+        sizes = np.frombuffer(self._messages[topic].size, dtype=np.uint64)
+        first_ns = int(log_ns.min()) if len(log_ns) else None
+        last_ns = int(log_ns.max()) if len(log_ns) else None
+        span_s = 0.0
+        if first_ns is not None and last_ns is not None:
+            span_s = (last_ns - first_ns) / NS_PER_S
+        # a time beyond the range of int64 would turn negative
+        signed_ns = np.minimum(log_ns, (1 << 63) - 1).astype(np.int64)
         return {
             "messages": len(log_ns),
             "bytes": int(sizes.sum()),
             "rate_hz": (len(log_ns) - 1) / span_s if span_s else None,
             "first_log_time_ns": first_ns,
             "last_log_time_ns": last_ns,
-            # in the order of the file
-            "between_ms": compute_percentiles(
-                np.diff(np.minimum(log_ns, (1 << 63) - 1).astype(np.int64)), unit=1e6
-            ),
-            "encoding": about.encoding,
-            "schema": about.schema,
+            "between_ms": compute_percentiles(np.diff(signed_ns), unit=1e6),
+            "encoding": channel.encoding,
+            "schema": channel.schema,
         }
 
 
-def _numbers(
+def _count_gaps(
     topic: str,
     sequence: Sequence[int],
     session: str,
     rates_hz: Mapping[str, int],
     absences: Absences,
 ) -> JsonObject:
-    """Returns the gaps of a channel with consecutive numbers; else None for each."""
-    where = topics.parse_key(topic.removeprefix("/"))
-    of_a_site = where is not None and where.session == session and where.member in rates_hz
-    if where is None or not of_a_site or where.channel not in (topics.STATE, topics.LINK):
+    """Returns the gaps of a channel with consecutive numbers; None for those of other channels.
+
+    Args:
+        topic: topic of the channel.
+        sequence: tick of every message, in the order of the file.
+        session: name of the session.
+        rates_hz: tick rates of the session's sites.
+        absences: ticks that the sites skipped.
+    """
+    key = topics.parse_key(topic.removeprefix("/"))
+    if (
+        key is None
+        or key.session != session
+        or key.member not in rates_hz
+        or key.channel not in (topics.STATE, topics.LINK)
+    ):
         return {"missing": None, "gaps": None, "duplicates": None}
     account = Account()
-    channel = where.channel
-    rate_hz = rates_hz[where.member]
+    rate_hz = rates_hz[key.member]
     for tick in sequence:
-        account.receive(number_message(channel, tick, rate_hz))
-    for first, last in absences.get(where.member, ()):  # not made: they are not missing
-        account.mark_unpublished(
-            *(count_messages(channel, ticks, rate_hz) for ticks in (last + 1, first))
+        account.take(number_message(key.channel, tick, rate_hz))
+    # ticks that the site skipped are not missing
+    for first, last in absences.get(key.member, ()):
+        account.begin_anew(
+            count_messages(key.channel, last + 1, rate_hz),
+            count_messages(key.channel, first, rate_hz),
         )
-    gaps = account.gaps[:MOST_LISTED_GAPS]
-    return {"missing": account.missing, "gaps": gaps, "duplicates": account.duplicate}
+    return {
+        "missing": account.missing,
+        "gaps": account.gaps[:MOST_LISTED_GAPS],
+        "duplicates": account.duplicate,
+    }
 
 
 @dataclass(frozen=True, repr=False)
 class FileOverview(Result):
-    """What a file, or the parts of one log, hold; see `info`."""
+    """Content of a file, or of the parts of one log; see `info`."""
 
     facts: JsonObject
 
     def headline(self) -> str:
-        """Returns which files, and how many messages."""
+        """Returns the names of the files, and the number of messages."""
         messages = sum(channel["messages"] for channel in self.facts["channels"].values())
-        return f"{', '.join(file['path'] for file in self.facts['files'])}: {count_nouns(messages, 'message')}"
+        paths = ", ".join(file["path"] for file in self.facts["files"])
+        return f"{paths}: {count_nouns(messages, 'message')}"
 
     def to_dict(self) -> JsonObject:
         """Returns plain values, with the keys of `trilat log info --json`."""
@@ -205,80 +239,97 @@ class FileOverview(Result):
 
 
 def info(*files: str | Path, progress: Progress | None = None) -> FileOverview:
-    """Returns what an MCAP file holds, or the parts of one log; the command is `trilat log
-    info`.
+    """Returns the content of an MCAP file, or of the parts of one log, as `trilat log info`.
 
-    `kind` is "trilat" for a log of ours that could be opened, else "mcap", with the reason in
-    `problem`.
+    `kind` is "trilat" for a trilat-net log that could be opened. Otherwise it is "mcap", with
+    the reason in `problem`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("short.mcap")
     >>> tn.info(path).to_dict()["sites"]["m"]["records"]
     100
+
+    Args:
+        files: the file, or the parts of one log.
+        progress: called with the amount of work done so far, and in all.
 
     Raises:
         LogError: a file cannot be read, or is no MCAP file.
     """
     paths = [Path(file) for file in files]
 
-    def report(half: int) -> Progress | None:
-        return progress and (lambda done, total: progress(half * total + done, 2 * total))
+    def report_pass(number: int) -> Progress | None:
+        """Returns the progress of the first (0) or the second (1) pass over the files."""
+        return progress and (lambda done, total: progress(number * total + done, 2 * total))
 
-    inventory = FileInventory(paths, report(0))
+    inventory = FileInventory(paths, report_pass(0))
     facts: JsonObject = {
         "files": inventory.files,
         "kind": "mcap",
         "problem": None,
         "session": None,
+        "sites": {},
+        "links": {},
     }
-    facts |= {"sites": {}, "links": {}}
-    name = ""
+    session = ""
     rates_hz = {}
     absences = {}
     if SESSION in inventory.metadata:
         try:
-            log = open_log(*paths, progress=report(1))
-            facts |= {
-                "kind": "trilat",
-                "session": describe_session(log),
-                "sites": {site: describe_site_health(log, site) for site in log.sites},
-                "links": {
-                    f"{peer}->{site}": describe_link_health(log, peer, site)
-                    for site in log.sites
-                    for peer in log[site].peers
-                },
-            }
-            name = log.session["session"]
+            log = open_log(*paths, progress=report_pass(1))
+            facts |= _describe_log(log)
+            session = log.session["session"]
             absences = log.absences
             rates_hz = {site: log.scenario.sites[site].rate_hz for site in log.sites}
         except LogError as error:
             facts["problem"] = str(error)
-    facts["channels"] = inventory.channels(name, rates_hz, absences)
+    facts["channels"] = inventory.channels(session, rates_hz, absences)
     return FileOverview(facts)
 
 
+def _describe_log(log: Log) -> JsonObject:
+    """Returns the facts of a trilat-net log: of its session, sites and links."""
+    links = {}
+    for site in log.sites:
+        for peer in log[site].peers:
+            links[f"{peer}->{site}"] = describe_link_health(log, peer, site)
+    return {
+        "kind": "trilat",
+        "session": describe_session(log),
+        "sites": {site: describe_site_health(log, site) for site in log.sites},
+        "links": links,
+    }
+
+
 _PROVENANCE = ("commit", "commit_dirty", "fingerprint", "platform", "python", "schema_version")
-_LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S  # the year 9999
+_LAST_EPOCH_NS = 253_402_300_799 * NS_PER_S
+"""The last second of the year 9999, the latest time of `datetime`."""
 
 
 def describe_session(log: Log) -> JsonObject:
     """Returns the facts of a log's session."""
     session = log.session
     scenario = log.scenario
-    epoch_ns = _number(session.get("epoch_unix_ns", ""))
-    seconds = [
+    epoch_ns = _parse_number(session.get("epoch_unix_ns", ""))
+    last_ticks_s = [
         int(log[site].tick[-1]) / log[site].rate_hz for site in log.sites if len(log[site])
     ]
     began_utc = None
     if log.driver == "live" and epoch_ns is not None:
-        began_at = datetime.fromtimestamp(min(epoch_ns, _LAST_EPOCH_NS) // NS_PER_S, UTC)
-        began_utc = began_at.strftime("%Y-%m-%d %H:%M:%S")
+        began = datetime.fromtimestamp(min(epoch_ns, _LAST_EPOCH_NS) // NS_PER_S, UTC)
+        began_utc = began.strftime("%Y-%m-%d %H:%M:%S")
+    version_prefix = "version_"
+    versions = {
+        key.removeprefix(version_prefix): value
+        for key, value in session.items()
+        if key.startswith(version_prefix)
+    }
     return {
         "session": session["session"],
         "driver": log.driver,
         "complete": log.complete,
         "began_utc": began_utc,
         "epoch_unix_ns": epoch_ns,
-        "recorded_s": max(seconds, default=0.0),
+        "recorded_s": max(last_ticks_s, default=0.0),
         "ended": {event.member: event.ticks for event in log.events if event.kind == "end"},
         "unknown_ends": list(log.unknown_ends),
         "scenario": {
@@ -292,9 +343,7 @@ def describe_session(log: Log) -> JsonObject:
             "arms": list_arm_notes(scenario),
         },
         **{key: session.get(key) for key in _PROVENANCE},
-        "versions": {
-            key[8:]: value for key, value in session.items() if key.startswith("version_")
-        },
+        "versions": versions,
         "accounts": log.accounts,
     }
 
@@ -303,7 +352,7 @@ def describe_site_health(log: Log, site: str) -> JsonObject:
     """Returns the facts of a site's records and of its loop."""
     part = log[site]
     spec = log.scenario.sites[site]
-    timed = log.driver == "live"
+    is_timed = log.driver == "live"
     return {
         "role": spec.role,
         "rate_hz": spec.rate_hz,
@@ -311,22 +360,23 @@ def describe_site_health(log: Log, site: str) -> JsonObject:
         "made_ticks": count_executed_ticks(log, site),
         "expected_ticks": log.scenario.ticks(site),
         "missing": log.missing(site),
-        "late_us": compute_percentiles(part.late_us) if timed else None,
-        "busy_us": compute_percentiles(part.busy_us) if timed else None,
-        "overruns": count_overruns(part) if timed else None,
+        "late_us": compute_percentiles(part.late_us) if is_timed else None,
+        "busy_us": compute_percentiles(part.busy_us) if is_timed else None,
+        "overruns": count_overruns(part) if is_timed else None,
     }
 
 
 def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
-    """Returns the facts of a directed link, peer -> site."""
+    """Returns the facts of the directed link peer -> site."""
     clock = summarise_clock(log, peer, site)
     stats = log.link_stats(site)[-1:]
     counts = ("accepted", "lost", "late", "superseded", "duplicate", "refused")
-    one_way_us = np.zeros(0, dtype=np.int64)  # none is measured in virtual time
-    version = _number(log.session.get("schema_version", "")) or 0
+    one_way_us = np.zeros(0, dtype=np.int64)  # not measured in virtual time
+    version = _parse_number(log.session.get("schema_version", "")) or 0
     if log.driver == "live" and version >= ONE_WAY_SCHEMA_VERSION:
-        came = log[site].arrivals[1]
-        one_way_us = came[came[:, 0] == log[site].peers.index(peer), 2]
+        arrivals = log[site].arrivals[1]
+        is_from_peer = arrivals[:, 0] == log[site].peers.index(peer)
+        one_way_us = arrivals[is_from_peer, 2]
     return {
         "stated": log.scenario.links[f"{peer}->{site}"].describe(),
         "age_ms": compute_percentiles(sample_ages_ns(log, peer, site), unit=1e6),
@@ -338,57 +388,76 @@ def describe_link_health(log: Log, peer: str, site: str) -> JsonObject:
 
 
 PERCENTILES = {"p50": 50.0, "p99": 99.0, "max": 100.0}
+_LATENESS_PERCENTILES = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}
 
 
 def compute_percentiles(
     values: ArrayLike, shares: Mapping[str, float] = PERCENTILES, unit: float = 1.0
 ) -> dict[str, float] | None:
-    """Returns percentiles by name, in multiples of a unit; None of no values."""
+    """Returns percentiles by name; None without values.
+
+    Args:
+        values: the values.
+        shares: percentage by name.
+        unit: unit of the result, by which the values are divided.
+    """
     array = np.asarray(values)
     if not array.size:
         return None
-    found = (np.percentile(array, list(shares.values())) / unit).tolist()
-    return dict(zip(shares, found, strict=True))
+    percentiles = (np.percentile(array, list(shares.values())) / unit).tolist()
+    return dict(zip(shares, percentiles, strict=True))
 
 
 def count_executed_ticks(log: Log, site: str) -> int | None:
-    """Returns the number of ticks that a site made, by the event of its last start; None
-    without one.
-    """
-    made = [event.ticks for event in log.events if (event.kind, event.member) == ("end", site)]
-    return made[-1] if made else None
+    """Returns the number of ticks of a site by its last `end` event; None without one."""
+    end_ticks = [
+        event.ticks for event in log.events if event.kind == "end" and event.member == site
+    ]
+    return end_ticks[-1] if end_ticks else None
 
 
 def count_overruns(part: SiteLog) -> int:
-    """Returns how many ticks began later than a whole period."""
+    """Returns the number of ticks that started later than a whole period."""
     return int(np.count_nonzero(part.late_us >= 1e6 / part.rate_hz))
 
 
-def _number(text: str) -> int | None:
+def _parse_number(text: str) -> int | None:
+    """Returns the number that a text of at most 19 decimal digits stands for; else None."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < 20 else None
 
 
 def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
-    """Returns the numbers of a log, torn, short and empty ones too; `twin` is the run without
-    operators.
+    """Returns the numbers of a log, which may be torn, short or empty, for `summary.json`.
+
+    Args:
+        log: the log of a run.
+        twin: log of the same run without operators, if there is one.
     """
-    sites = {name: _describe_site(log, name, twin) for name in log.sites}
-    settled = [site["settle_s"] for site in sites.values()]
-    largest = [
-        site["max_error_end_rad"]
-        for site in sites.values()
-        if site["max_error_end_rad"] is not None
-    ]
+    sites = {site: _summarise_site(log, site, twin) for site in log.sites}
+    settling_times_s = [site["settle_s"] for site in sites.values()]
+    end_errors_rad = [site["max_error_end_rad"] for site in sites.values()]
+    known_end_errors_rad = [error_rad for error_rad in end_errors_rad if error_rad is not None]
     scenario = log.scenario
-    keys = ("name", "title", "sha256", "duration_s", "seed", "scheme")
-    delays_ms = {
-        name: finite_or_none(link.moments().mean_ms) for name, link in scenario.links.items()
-    }
+    scenario_keys = ("name", "title", "sha256", "duration_s", "seed", "scheme")
+    changes = [
+        {
+            "at_s": entry.change.at_s,
+            "about": entry.subject,
+            "to": entry.text,
+            "site": entry.site,
+            "taken_at_tick": entry.taken_at_tick,
+            "sentence": entry.sentence,
+        }
+        for entry in list_changes(log)
+    ]
     return {
         "scenario": {
-            **{key: getattr(scenario, key) for key in keys},
+            **{key: getattr(scenario, key) for key in scenario_keys},
             "sites": list(scenario.names),
-            "delay_ms": delays_ms,
+            "delay_ms": {
+                name: finite_or_none(link.moments().mean_ms)
+                for name, link in scenario.links.items()
+            },
             "dominance": scenario.dominance,
             "assumed": list(scenario.assumed),
             "arms": list_arm_notes(scenario),
@@ -399,85 +468,98 @@ def summarise_run(log: Log, twin: Log | None = None) -> JsonObject:
             "unknown_ends": list(log.unknown_ends),
         },
         "diverged": any(site["diverged_at_s"] is not None for site in sites.values()),
-        "settle_s": settling_time_of_all_s(settled),
+        "settle_s": settling_time_of_all_s(settling_times_s),
         "settle_below_rad": SETTLED_ERROR_RAD,
-        "max_error_end_rad": max(largest, default=None),
+        "max_error_end_rad": max(known_end_errors_rad, default=None),
         "records": sum(site["records"] for site in sites.values()),
         "missing": sum(site["missing"] for site in sites.values()),
         "sites": sites,
-        "links": {use.name: _describe_link(log, use) for use in summarise_links(log)},
-        "changes": [
-            {"at_s": one.change.at_s, "about": one.about, "to": one.text}
-            | {"site": one.site, "taken_at_tick": one.taken_at_tick, "sentence": one.sentence}
-            for one in list_changes(log)
-        ],
+        "links": {link.name: _summarise_link(log, link) for link in summarise_links(log)},
+        "changes": changes,
     }
 
 
-def _describe_site(log: Log, name: str, twin: Log | None) -> JsonObject:
-    part = log[name]
-    spec = log.scenario.sites[name]
-    end = part.t_s > part.t_s[-1] - END_WINDOW_S if len(part) else np.zeros(0, dtype=bool)
-    moved = operator_displacement(log, twin, name)[2] if twin is not None else part.q[:0]
-    made = count_executed_ticks(log, name)
-    expected = log.scenario.ticks(name)
-    late = {"p50": 50.0, "p99": 99.0, "p99_9": 99.9, "max": 100.0}
-    busy = PERCENTILES
+def _summarise_site(log: Log, site: str, twin: Log | None) -> JsonObject:
+    """Returns the numbers of a site for `summary.json`."""
+    part = log[site]
+    spec = log.scenario.sites[site]
+    at_end = np.zeros(0, dtype=bool)
+    if len(part):
+        at_end = part.t_s > part.t_s[-1] - END_WINDOW_S
+    displacement = part.q[:0]
+    if twin is not None:
+        displacement = operator_displacement(log, twin, site)[2]
+    executed = count_executed_ticks(log, site)
+    expected = log.scenario.ticks(site)
+    late_us = compute_percentiles(part.late_us, _LATENESS_PERCENTILES)
+    busy_us = compute_percentiles(part.busy_us)
     at_limit = np.abs(part.tau) >= spec.limits.tau_limit_nm
+    moved_max_rad = None
+    moved_end_rad = None
+    if len(displacement):
+        moved_max_rad = np.abs(displacement).max(axis=0).tolist()
+        moved_end_rad = displacement[-1].tolist()
     return {
         "role": spec.role,
         "rate_hz": spec.rate_hz,
         "records": len(part),
         "expected_ticks": expected,
-        "made_ticks": made,
-        "missing": max(0, (expected if made is None else made) - len(part)),
+        "made_ticks": executed,
+        "missing": max(0, (expected if executed is None else executed) - len(part)),
         "diverged_at_s": part.diverged_s,
-        "modes": [span._asdict() for span in find_mode_intervals(part)],
+        "modes": [interval._asdict() for interval in find_mode_intervals(part)],
         "q_end_rad": part.q[-1].tolist() if len(part) else None,
-        "max_error_rad": _largest(part.e),
-        "max_error_end_rad": _largest(part.e[end]),
+        "max_error_rad": _largest_magnitude(part.e),
+        "max_error_end_rad": _largest_magnitude(part.e[at_end]),
         "settle_s": settling_time_s(part),
-        "peak_tau_nm": _largest(part.tau),
+        "peak_tau_nm": _largest_magnitude(part.tau),
         "saturated_ticks": int(np.count_nonzero(at_limit.any(axis=1))),
-        "late_us": compute_percentiles(part.late_us, late) or dict.fromkeys(late),
-        "busy_us": compute_percentiles(part.busy_us, busy) or dict.fromkeys(busy),
+        "late_us": late_us or dict.fromkeys(_LATENESS_PERCENTILES),
+        "busy_us": busy_us or dict.fromkeys(PERCENTILES),
         "overruns": count_overruns(part),
-        "hands_moved_max_rad": np.abs(moved).max(axis=0).tolist() if len(moved) else None,
-        "hands_moved_end_rad": moved[-1].tolist() if len(moved) else None,
+        "hands_moved_max_rad": moved_max_rad,
+        "hands_moved_end_rad": moved_end_rad,
     }
 
 
-def _describe_link(log: Log, use: LinkSummary) -> JsonObject:
-    counts = use.counts
-    clock = summarise_clock(log, use.peer, use.site)
-    return {
-        "delay_ms": finite_or_none(use.stated[0].link.moments().mean_ms),
-        "stated": [
+def _summarise_link(log: Log, link: LinkSummary) -> JsonObject:
+    """Returns the numbers of a link for `summary.json`."""
+    counts = link.counts
+    clock = summarise_clock(log, link.peer, link.site)
+    stated = []
+    for model in link.stated:
+        moments = model.link.moments()
+        stated.append(
             {
-                "from_s": state.from_s,
-                "link": state.link.describe(),
-                "mean_ms": finite_or_none(state.link.moments().mean_ms),
-                "deviation_ms": finite_or_none(state.link.moments().deviation_ms),
+                "from_s": model.from_s,
+                "link": model.link.describe(),
+                "mean_ms": finite_or_none(moments.mean_ms),
+                "deviation_ms": finite_or_none(moments.deviation_ms),
             }
-            for state in use.stated
-        ],
-        "drawn_ms": use.drawn_ms._asdict() if use.drawn_ms else None,
-        "age_ms": use.age_ms._asdict()
-        if use.age_ms
-        else dict.fromkeys(ValueStatistics._fields),
-        "ages": use.ages._asdict() if use.ages else None,
-        **{
-            key: getattr(use, key) for key in ("first_use_s", "ticks_without_new", "silence_ms")
-        },
+        )
+    age_ms: JsonObject = dict.fromkeys(ValueStatistics._fields)
+    if link.age_ms:
+        age_ms = link.age_ms._asdict()
+    return {
+        "delay_ms": finite_or_none(link.stated[0].link.moments().mean_ms),
+        "stated": stated,
+        "drawn_ms": link.drawn_ms._asdict() if link.drawn_ms else None,
+        "age_ms": age_ms,
+        "ages": link.ages._asdict() if link.ages else None,
+        "first_use_s": link.first_use_s,
+        "ticks_without_new": link.ticks_without_new,
+        "silence_ms": link.silence_ms,
         "samples": counts._asdict() if counts else None,
         "late_samples": counts.late if counts else None,
         "duplicate_samples": counts.duplicate if counts else None,
-        **{key: getattr(use, key) for key in ("loss", "burst")},
-        "one_way_us": use.one_way_us._asdict() if use.one_way_us else None,
+        "loss": link.loss,
+        "burst": link.burst,
+        "one_way_us": link.one_way_us._asdict() if link.one_way_us else None,
         "clock": clock._asdict() if clock else None,
     }
 
 
-def _largest(values: ArrayLike) -> float | None:
+def _largest_magnitude(values: ArrayLike) -> float | None:
+    """Returns the largest absolute value; None without values."""
     array = np.abs(np.asarray(values))
     return float(array.max()) if array.size else None

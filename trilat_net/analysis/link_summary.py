@@ -1,15 +1,16 @@
-"""Statistics of every directed link: stated and effective delay, loss, bursts, sample counts
-and clocks.
+"""Summarises every directed link of a run: delays, loss, bursts, sample counts and clocks.
 
-Invariant: a quantity that the log does not determine is None. docs/definitions.md defines each:
-the effective delay is the age of the sample in use at a tick (age of information, Kaul, Yates
-and Gruteser 2012). Clock estimates are those in force while the session ran, without later
-improvement.
+The effective delay is the age of the sample in use at a tick (age of information, Kaul, Yates
+and Gruteser 2012). docs/definitions.md defines each quantity.
 
-Invariant (L4): the predicted delivery of a sample is a function of seed, link and index; the
-log's scenario and the changes that its records name determine it, also for samples that never
-arrived. Invariant (L3): a record names its inputs. Samples that only a missing record could
-name stay unknown and count neither as arrived nor as missing.
+Invariant:
+    - A quantity that the log does not determine is None.
+    - Clock estimates are those in force while the session ran, without later improvement.
+    - The predicted delivery of a sample is a function of seed, link and index (L4). The log's
+      scenario and the changes that its records name determine it, also for samples that never
+      arrived.
+    - A record names its inputs (L3). Samples that only a missing record could name stay
+      unknown, and count neither as arrived nor as missing.
 """
 
 from typing import NamedTuple
@@ -31,16 +32,17 @@ from .timeline import StatedModel, list_changes, list_stated_models
 
 
 class PredictedDelivery(NamedTuple):
-    """Delivery of the samples 0 to M - 1 of a link's peer, as its model predicts it; times
-    since the epoch.
+    """Delivery of the samples 0 to M - 1 of a link's peer, as the link's model predicts it.
+
+    Times are in ns since the epoch.
 
     Attributes:
-        stamp_ns, due_ns: the stamp of each, and when it is due, shape (M,), ns; `LOST` for a
-        lost one.
-        drawn_ns: the same by the model's own delay alone, without duplicates, order and
-            play-out.
-        measured: True if nothing is injected: a sample is due at once, shape (M,).
-        copies: duplicates that the link makes.
+        stamp_ns: stamps of the samples, shape (M,).
+        due_ns: times at which the samples are due, shape (M,); `LOST` for a lost sample.
+        drawn_ns: times at which they would be due by the model's own delay alone, without
+            duplicates, order and play-out, shape (M,).
+        measured: True if no delay is injected, so that a sample is due at once, shape (M,).
+        copies: number of duplicates that the link makes.
     """
 
     stamp_ns: Ints
@@ -57,55 +59,66 @@ class PredictedDelivery(NamedTuple):
 
     @property
     def drawn_ms(self) -> Array:
-        """The injected delays of the samples that are not lost, ms."""
-        kept = ~self.lost & ~self.measured
-        return (self.drawn_ns[kept] - self.stamp_ns[kept]) / 1e6
+        """The injected delays of the samples that are not lost, in ms."""
+        delivered = ~self.lost & ~self.measured
+        return (self.drawn_ns[delivered] - self.stamp_ns[delivered]) / 1e6
 
     def release(self, rate_hz: int) -> Ints:
-        """Returns the receiver's tick at which each comes into use if it has arrived, shape
-        (M,); or LOST.
+        """Returns the receiver's ticks at which the samples come into use, shape (M,).
+
+        A sample comes into use at this tick if it has arrived; `LOST` for a lost sample.
+
+        Args:
+            rate_hz: the receiver's tick rate.
         """
         ticks = first_ticks(np.maximum(self.due_ns, self.stamp_ns + 1), rate_hz)
         return np.where(self.lost, LOST, ticks)
 
 
 def predict_delivery(log: Log, peer: str, site: str, count: int) -> PredictedDelivery:
-    """Returns the predicted delivery of the first `count` samples of a link, peer -> site.
+    """Returns the predicted delivery of the first `count` samples of the link peer -> site.
 
     Raises:
-        LogError: a record names a change that is none.
+        LogError: a record names a change that is not valid.
     """
     setup = next(link for link in log.scenario.setup(site).links if link.peer == peer)
-    index = log[site].peers.index(peer)
-    commands = (command for batch in log.commands(site).values() for command in batch)
-    ordered = [one.model for one in commands if one.peer == index and one.model is not None]
-    whole = LinkSchedule(setup, ordered)
-    alone = LinkSchedule(setup, ordered)
-    alone.models["duplicate"] = 0.0
-    alone.models["in_order"] = 0
-    alone.models["playout_us"] = 0
-    models = whole.models
-    due_ns = whole.draw(count)
-    drawn_ns = due_ns if np.array_equal(alone.models, models) else alone.draw(count)
+    peer_index = log[site].peers.index(peer)
+    commands = [command for batch in log.commands(site).values() for command in batch]
+    ordered_models = [
+        command.model
+        for command in commands
+        if command.peer == peer_index and command.model is not None
+    ]
+    schedule = LinkSchedule(setup, ordered_models)
+    delay_alone = LinkSchedule(setup, ordered_models)
+    delay_alone.models["duplicate"] = 0.0
+    delay_alone.models["in_order"] = 0
+    delay_alone.models["playout_us"] = 0
+    models = schedule.models
+    due_ns = schedule.draw(count)
+    drawn_ns = due_ns
+    if not np.array_equal(delay_alone.models, models):
+        drawn_ns = delay_alone.draw(count)
     stamp_ns = np.arange(count, dtype=np.int64) * NS_PER_S // setup.rate_hz
-    kind = models["kind"][np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")]
+    model_index = np.searchsorted(models["from_ns"][1:], stamp_ns, side="right")
     return PredictedDelivery(
         stamp_ns=stamp_ns,
         due_ns=due_ns,
         drawn_ns=drawn_ns,
-        measured=kind == DelayKind.MEASURED,
-        copies=int(whole.row.copies),
+        measured=models["kind"][model_index] == DelayKind.MEASURED,
+        copies=int(schedule.row.copies),
     )
 
 
 class Arrivals(NamedTuple):
-    """Arrivals over a link, in the order of the records, shape (A,).
+    """Arrivals over a link, in the order of the records.
 
     Attributes:
-        tick, sample: the receiver's tick, and the sample's own.
-        delay_us: its one-way delay in the record.
-        refused: number of others with a stamp out of range, or of a tick that their sender
-            never makes.
+        tick: the receiver's ticks, shape (A,).
+        sample: indices of the samples, shape (A,).
+        delay_us: one-way delays in the records, shape (A,).
+        refused: number of further arrivals with a stamp out of range, or of a tick that the
+            sender never makes.
     """
 
     tick: Ints
@@ -116,77 +129,93 @@ class Arrivals(NamedTuple):
     @property
     def first(self) -> "Arrivals":
         """The first arrival of each sample, by sample."""
-        sample, place = np.unique(self.sample, return_index=True)
-        return Arrivals(self.tick[place], sample, self.delay_us[place], self.refused)
+        sample, rows = np.unique(self.sample, return_index=True)
+        return Arrivals(self.tick[rows], sample, self.delay_us[rows], self.refused)
 
 
 def read_arrivals(log: Log, site: str) -> dict[str, Arrivals]:
-    """Returns the arrivals at a site, per peer."""
+    """Returns the arrivals at a site by peer."""
     part = log[site]
     counts, entries = part.arrivals
-    tick = np.repeat(part.tick, counts)
-    found = {}
+    all_ticks = np.repeat(part.tick, counts)
+    arrivals = {}
     for index, peer in enumerate(part.peers):
-        here = entries[:, 0] == index
-        at = tick[here]
-        sample = entries[here, 1]
-        delay_us = entries[here, 2]
+        is_from_peer = entries[:, 0] == index
+        tick = all_ticks[is_from_peer]
+        sample = entries[is_from_peer, 1]
+        delay_us = entries[is_from_peer, 2]
         # a link accepts no stamp before the epoch, and none further ahead than the limit
-        latest_ns = at * NS_PER_S // part.rate_hz + AHEAD_LIMIT_NS
-        peer_hz = log.scenario.sites[peer].rate_hz
-        limit = (
-            (latest_ns + 1) * peer_hz - 1
-        ) // NS_PER_S  # in ticks: a stamp itself might overflow
-        known = (sample >= 0) & (sample <= limit) & (sample < log.scenario.ticks(peer))
-        refused = len(at) - int(np.count_nonzero(known))
-        found[peer] = Arrivals(at[known], sample[known], delay_us[known], refused)
-    return found
+        latest_ns = tick * NS_PER_S // part.rate_hz + AHEAD_LIMIT_NS
+        peer_rate_hz = log.scenario.sites[peer].rate_hz
+        # compared in ticks, because a stamp in ns might overflow
+        latest_sample = ((latest_ns + 1) * peer_rate_hz - 1) // NS_PER_S
+        is_in_range = (sample >= 0) & (sample <= latest_sample)
+        is_valid = is_in_range & (sample < log.scenario.ticks(peer))
+        arrivals[peer] = Arrivals(
+            tick=tick[is_valid],
+            sample=sample[is_valid],
+            delay_us=delay_us[is_valid],
+            refused=len(tick) - int(np.count_nonzero(is_valid)),
+        )
+    return arrivals
 
 
 def count_sent(log: Log, peer: str, newest: int) -> int:
-    """Returns how many samples a peer has sent, as far as the log shows; `newest` of them came,
-    or -1.
+    """Returns the number of samples that a peer has sent, as far as the log shows.
+
+    Args:
+        log: the log of a run.
+        peer: name of the peer.
+        newest: index of the newest sample that arrived anywhere; -1 if none did.
     """
     part = log[peer]
-    stated = [
+    end_ticks = [
         event.ticks for event in log.events if event.kind == "end" and event.member == peer
     ]
-    recorded = int(part.tick[-1]) + 1 if len(part) else 0
-    return min(max(newest + 1, recorded, *stated), log.scenario.ticks(peer))
+    recorded_ticks = int(part.tick[-1]) + 1 if len(part) else 0
+    return min(max(newest + 1, recorded_ticks, *end_ticks), log.scenario.ticks(peer))
 
 
 def mark_judged_samples(log: Log, site: str, stamp_ns: Ints, came: Arrivals) -> Bools:
-    """Returns for which samples it is known whether they arrived, shape (M,).
+    """Returns the samples of which it is known whether they arrived, shape (M,).
 
-    Known are those that arrived, those older than the newest that arrived, and those older than
-    the slowest took; except those that may have arrived in a tick whose record is missing.
-    Given are the stamps of the samples 0 to M - 1, ns since the epoch, and their first
-    arrivals.
+    These are the samples that arrived, those older than the newest arrival, and those older
+    than the slowest arrival took. Samples that may have arrived in a tick whose record is
+    missing are excluded.
+
+    Args:
+        log: the log of a run.
+        site: the receiver.
+        stamp_ns: stamps of the samples 0 to M - 1, ns since the epoch.
+        came: first arrivals of the samples.
     """
     part = log[site]
     count = len(stamp_ns)
     if not len(part):
         return np.zeros(count, dtype=np.bool_)
-    prompt = first_ticks(stamp_ns + 1, part.rate_hz)
-    slowest = int((came.tick - prompt[came.sample]).max(initial=0))
+    earliest_tick = first_ticks(stamp_ns + 1, part.rate_hz)
+    slowest_ticks = int((came.tick - earliest_tick[came.sample]).max(initial=0))
     newest = int(came.sample.max(initial=-1))
-    last = min(int(part.tick[-1]), log.scenario.ticks(site) - 1)
-    known: Bools = (np.arange(count) <= newest) | (prompt + slowest <= last)
-    absent = np.ones(last + 1, dtype=np.bool_)
-    absent[part.tick[part.tick <= last]] = False
-    lacking = np.flatnonzero(absent)
-    if len(lacking):
-        following = np.append(lacking, np.iinfo(np.int64).max)[np.searchsorted(lacking, prompt)]
-        known &= following - prompt > slowest
-    known[came.sample] = True
-    return known
+    last_tick = min(int(part.tick[-1]), log.scenario.ticks(site) - 1)
+    is_older_than_newest = np.arange(count) <= newest
+    judged: Bools = is_older_than_newest | (earliest_tick + slowest_ticks <= last_tick)
+    is_missing = np.ones(last_tick + 1, dtype=np.bool_)
+    is_missing[part.tick[part.tick <= last_tick]] = False
+    missing_ticks = np.flatnonzero(is_missing)
+    if len(missing_ticks):
+        never = np.iinfo(np.int64).max
+        following = np.searchsorted(missing_ticks, earliest_tick)
+        next_missing_tick = np.append(missing_ticks, never)[following]
+        judged &= next_missing_tick - earliest_tick > slowest_ticks
+    judged[came.sample] = True
+    return judged
 
 
 MOST_AGE_BINS = 50
-"""Most bins of a histogram of ages."""
+"""Largest number of bins of a histogram of ages."""
 
 ONE_WAY_SCHEMA_VERSION = 2
-"""First schema version whose records name the one-way delay of an arrival."""
+"""First schema version whose records have the one-way delay of an arrival."""
 
 
 class ValueStatistics(NamedTuple):
@@ -202,8 +231,12 @@ class ValueStatistics(NamedTuple):
 
 
 class AgeHistogram(NamedTuple):
-    """Number of ticks per age, in bins of equal width; bin n begins at `first_ms` + n
-    `width_ms`.
+    """Number of ticks by age, in bins of equal width.
+
+    Attributes:
+        first_ms: lower edge of the first bin.
+        width_ms: width of a bin.
+        ticks: number of ticks in each bin.
     """
 
     first_ms: float
@@ -214,8 +247,8 @@ class AgeHistogram(NamedTuple):
 class ClockSummary(NamedTuple):
     """The clock of a link's sender against the receiver's: `clock.*` of docs/definitions.md.
 
-    `drift` and `rtt_min_us` are None without an estimate; `faults` says that a clock has
-    stepped.
+    `drift_ppm`, `drift_bound_ppm` and `rtt_min_us` are None without an estimate. `faults`
+    counts the steps of a clock.
     """
 
     offset_us: int
@@ -230,37 +263,39 @@ class ClockSummary(NamedTuple):
 
     @property
     def shared(self) -> bool:
-        """True if both ends read one and the same clock."""
+        """True if both ends read the same clock."""
         return self.bound_max_us == 0 and self.offset_us == 0
 
 
 def summarise_clock(log: Log, peer: str, site: str) -> ClockSummary | None:
-    """Returns the estimates of a peer's clock at a site; None if nothing was measured, as in
-    virtual time.
-    """
-    stats = [stats for stats in log.link_stats(site) if peer in stats.offset_us]
+    """Returns the estimates of a peer's clock at a site; None in virtual time."""
+    stats = [report for report in log.link_stats(site) if peer in report.offset_us]
     if not stats:
         return None
-    bounds = [each.bound_us.get(peer, 0) for each in stats]
-    trips = [trip for each in stats if (trip := each.rtt_us.get(peer, -1)) >= 0]
-    drifts = [e for e in log.events if (e.kind, e.member, e.about) == ("clock", site, peer)]
+    bounds_us = [report.bound_us.get(peer, 0) for report in stats]
+    round_trips_us = [report.rtt_us.get(peer, -1) for report in stats]
+    measured_us = [trip_us for trip_us in round_trips_us if trip_us >= 0]
+    drift_ppm = None
+    drift_bound_ppm = None
+    for event in log.events:
+        if event.kind == "clock" and event.member == site and event.about == peer:
+            drift_ppm = event.drift_ppb / 1e3
+            drift_bound_ppm = event.drift_bound_ppb / 1e3
     return ClockSummary(
         offset_us=stats[-1].offset_us[peer],
         offset_first_us=stats[0].offset_us[peer],
-        drift_ppm=drifts[-1].drift_ppb / 1e3 if drifts else None,
-        drift_bound_ppm=drifts[-1].drift_bound_ppb / 1e3 if drifts else None,
-        bound_us=bounds[-1],
-        bound_p50_us=float(np.median(bounds)),
-        bound_max_us=max(bounds),
-        rtt_min_us=min(trips, default=None),
+        drift_ppm=drift_ppm,
+        drift_bound_ppm=drift_bound_ppm,
+        bound_us=bounds_us[-1],
+        bound_p50_us=float(np.median(bounds_us)),
+        bound_max_us=max(bounds_us),
+        rtt_min_us=min(measured_us, default=None),
         faults=stats[-1].clock_faults.get(peer, 0),
     )
 
 
 class SampleCounts(NamedTuple):
-    """Counts of the samples of a link, by the receiver's records: `samples.*` of
-    docs/definitions.md.
-    """
+    """Sample counts of a link by the receiver's records: `samples.*` of docs/definitions.md."""
 
     sent: int
     judged: int
@@ -275,11 +310,24 @@ class SampleCounts(NamedTuple):
 
 
 class LinkSummary(NamedTuple):
-    """One directed link in a run, peer -> site, as docs/definitions.md ("Links") defines each
-    quantity.
+    """Summary of the directed link peer -> site; docs/definitions.md ("Links") defines it.
 
-    What the log does not determine is None. `drawn_ms` is what the models in force, `stated`,
-    gave to the samples; `age_ms` and `ages` are the effective delay that the controller saw.
+    A quantity that the log does not determine is None.
+
+    Attributes:
+        peer: the sender.
+        site: the receiver.
+        stated: the models in force, over time.
+        drawn_ms: delays that these models gave to the samples.
+        age_ms: effective delay that the controller saw.
+        ages: histogram of the effective delay.
+        first_use_s: time at which the first sample came into use, in s.
+        ticks_without_new: share of ticks at which no new sample came into use.
+        silence_ms: longest time between two new samples in use.
+        counts: sample counts.
+        loss: share of judged samples that could not come into use.
+        burst: mean number of successive samples that were lost.
+        one_way_us: measured one-way delays.
     """
 
     peer: str
@@ -298,40 +346,41 @@ class LinkSummary(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The link as scenarios call it, "j->i"."""
+        """Name of the link in scenarios, "j->i"."""
         return f"{self.peer}->{self.site}"
 
     @property
     def plain(self) -> bool:
-        """True if one constant delay describes all of it."""
-        as_stated = self.counts is None or not (self.counts.late or self.counts.missing)
-        return as_stated and has_one_constant_delay(self.stated)
+        """True if one constant delay describes the whole link."""
+        counts = self.counts
+        is_as_stated = counts is None or not (counts.late or counts.missing)
+        return is_as_stated and has_one_constant_delay(self.stated)
 
 
 def has_one_constant_delay(states: list[StatedModel]) -> bool:
-    """True if the models of a link give every sample one and the same delay, and lose none."""
-    (_, link), *later = states
-    exact = link.to_core_model().kind == DelayKind.CONSTANT and not (
-        link.loss or link.duplicate or link.outages_s
-    )
-    return exact and not later
+    """True if a link's models give every sample the same delay, and lose no sample."""
+    link = states[0].link
+    is_constant = link.core().kind == DelayKind.CONSTANT
+    is_lossless = not (link.loss or link.duplicate or link.outages_s)
+    return is_constant and is_lossless and len(states) == 1
 
 
 def summarise_links(log: Log) -> list[LinkSummary]:
     """Returns a summary of every link, by receiver and then by peer, in scenario order.
 
     Raises:
-        LogError: a record names a change that is none.
+        LogError: a record names a change that is not valid.
     """
     changed = list_changes(log)
-    came = {site: read_arrivals(log, site) for site in log.sites}
-    newest = {
-        peer: max(
-            int(there[peer].sample.max(initial=-1)) for there in came.values() if peer in there
+    arrivals_by_site = {site: read_arrivals(log, site) for site in log.sites}
+    sent = {}
+    for peer in log.sites:
+        newest = max(
+            int(arrivals[peer].sample.max(initial=-1))
+            for arrivals in arrivals_by_site.values()
+            if peer in arrivals
         )
-        for peer in log.sites
-    }
-    sent = {peer: count_sent(log, peer, tick) for peer, tick in newest.items()}
+        sent[peer] = count_sent(log, peer, newest)
     return [
         _summarise_link(
             log=log,
@@ -339,24 +388,24 @@ def summarise_links(log: Log) -> list[LinkSummary]:
             peer=peer,
             site=site,
             sent=sent[peer],
-            came=over,
+            arrivals=arrivals,
         )
         for site in log.sites
-        for peer, over in came[site].items()
+        for peer, arrivals in arrivals_by_site[site].items()
     ]
 
 
 def sample_ages_ns(log: Log, peer: str, site: str) -> Ints:
-    """Returns the effective delay at every tick from the first sample in use on, ns."""
+    """Returns the age of the sample in use at every tick from the first sample on, in ns."""
     part = log[site]
-    used = log[site].used[peer]
-    known = used >= 0
-    stamp_ns = used[known] * NS_PER_S // log.scenario.sites[peer].rate_hz
-    return part.tick[known] * NS_PER_S // part.rate_hz - stamp_ns
+    used = part.used[peer]
+    has_sample = used >= 0
+    stamp_ns = used[has_sample] * NS_PER_S // log.scenario.sites[peer].rate_hz
+    return part.tick[has_sample] * NS_PER_S // part.rate_hz - stamp_ns
 
 
 def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
-    """Returns the statistics of numbers; None of none."""
+    """Returns the statistics of numbers; None without numbers."""
     array = np.asarray(values, dtype=np.float64)
     if not array.size:
         return None
@@ -373,86 +422,122 @@ def compute_statistics(values: ArrayLike) -> ValueStatistics | None:
 
 
 def bin_ages(age_ns: Ints) -> AgeHistogram | None:
-    """Returns a histogram of ages, ns, in at most `MOST_AGE_BINS` bins of 1, 2 or 5 times 10^n
-    ms.
+    """Returns a histogram of ages in at most `MOST_AGE_BINS` bins; None without ages.
+
+    The width of a bin is 1, 2 or 5 times a power of ten, from 10 us on.
+
+    Args:
+        age_ns: ages, shape (K,), ns.
     """
     if not len(age_ns):
         return None
-    low = int(age_ns.min())
-    high = int(age_ns.max())
-    # ns, from 10 us
-    widths = (step * 10**power for power in range(4, 15) for step in (1, 2, 5))
-    width_ns = next(width for width in widths if high // width - low // width < MOST_AGE_BINS)
-    ticks = np.bincount(age_ns // width_ns - low // width_ns).tolist()
-    return AgeHistogram(low // width_ns * width_ns / 1e6, width_ns / 1e6, ticks)
+    youngest_ns = int(age_ns.min())
+    oldest_ns = int(age_ns.max())
+    widths_ns = [step * 10**power for power in range(4, 15) for step in (1, 2, 5)]
+    width_ns = next(
+        width
+        for width in widths_ns
+        if oldest_ns // width - youngest_ns // width < MOST_AGE_BINS
+    )
+    first_bin = youngest_ns // width_ns
+    ticks = np.bincount(age_ns // width_ns - first_bin).tolist()
+    return AgeHistogram(first_bin * width_ns / 1e6, width_ns / 1e6, ticks)
 
 
 def _summarise_link(
-    log: Log, states: list[StatedModel], peer: str, site: str, sent: int, came: Arrivals
+    log: Log, states: list[StatedModel], peer: str, site: str, sent: int, arrivals: Arrivals
 ) -> LinkSummary:
+    """Returns the summary of the link peer -> site.
+
+    Args:
+        log: the log of a run.
+        states: models of the link over time.
+        peer: the sender.
+        site: the receiver.
+        sent: number of samples that the peer sent.
+        arrivals: arrivals over the link.
+    """
     part = log[site]
-    used = log[site].used[peer]
-    fate = predict_delivery(log, peer, site, sent)
+    used = part.used[peer]
+    delivery = predict_delivery(log, peer, site, sent)
     age_ns = sample_ages_ns(log, peer, site)
-    known = mark_judged_samples(log, site, fate.stamp_ns, came.first)
-    for first, last in log.absences.get(peer, ()):
-        known[first : last + 1] = False  # the peer made none of these
-    gone = np.ones(len(known), dtype=np.bool_)  # judged samples that could not come into use
-    gone[came.first.sample] = False
-    gone = (gone | fate.lost) & known
-    lost = int(np.count_nonzero(gone))
-    judged = int(np.count_nonzero(known))
-    bursts = int(np.count_nonzero(gone[1:] & ~gone[:-1])) + int(gone[:1].any())
-    pairs = (np.diff(part.tick) == 1) & (used[:-1] >= 0)
-    stamped = (
-        log.driver == "live" and len(part) > 0 and part.record(0).v >= ONE_WAY_SCHEMA_VERSION
-    )
-    first_use_s = silence_ms = None
+    first = arrivals.first
+    is_judged = mark_judged_samples(log, site, delivery.stamp_ns, first)
+    for first_skipped, last_skipped in log.absences.get(peer, ()):
+        is_judged[first_skipped : last_skipped + 1] = False  # the peer made none of these
+    has_not_arrived = np.ones(len(is_judged), dtype=np.bool_)
+    has_not_arrived[first.sample] = False
+    is_lost = (has_not_arrived | delivery.lost) & is_judged
+    lost = int(np.count_nonzero(is_lost))
+    judged = int(np.count_nonzero(is_judged))
+    bursts = int(np.count_nonzero(is_lost[1:] & ~is_lost[:-1])) + int(is_lost[:1].any())
+    ticks_without_new = None
+    is_successive = (np.diff(part.tick) == 1) & (used[:-1] >= 0)
+    if is_successive.any():
+        ticks_without_new = float(np.mean(np.diff(used)[is_successive] == 0))
+    first_use_s = None
+    silence_ms = None
     if (used >= 0).any():
         first_use_s = float(part.t_s[np.flatnonzero(used >= 0)[0]])
-        ticks = np.append(
-            part.tick[np.flatnonzero(np.diff(used, prepend=-1))], part.tick[-1] + 1
+        new_ticks = part.tick[np.flatnonzero(np.diff(used, prepend=-1))]
+        edges = np.append(new_ticks, part.tick[-1] + 1)
+        silence_ms = float(np.diff(edges * NS_PER_S // part.rate_hz).max()) / 1e6
+    counts = None
+    one_way_us = None
+    if len(part):
+        counts = _count_samples(
+            part=part, used=used, delivery=delivery, arrivals=arrivals, judged=judged
         )
-        silence_ms = float(np.diff(ticks * NS_PER_S // part.rate_hz).max()) / 1e6
+        if log.driver == "live" and part.record(0).v >= ONE_WAY_SCHEMA_VERSION:
+            one_way_us = compute_statistics(arrivals.delay_us)
     return LinkSummary(
-        peer,
-        site,
-        states,
-        drawn_ms=compute_statistics(fate.drawn_ms),
+        peer=peer,
+        site=site,
+        stated=states,
+        drawn_ms=compute_statistics(delivery.drawn_ms),
         age_ms=compute_statistics(age_ns / 1e6),
         ages=bin_ages(age_ns),
         first_use_s=first_use_s,
-        ticks_without_new=float(np.mean(np.diff(used)[pairs] == 0)) if pairs.any() else None,
+        ticks_without_new=ticks_without_new,
         silence_ms=silence_ms,
-        counts=_count_samples(part=part, used=used, fate=fate, came=came, judged=judged)
-        if len(part)
-        else None,
+        counts=counts,
         loss=lost / judged if judged else None,
         burst=lost / bursts if bursts else None,
-        one_way_us=compute_statistics(came.delay_us) if stamped else None,
+        one_way_us=one_way_us,
     )
 
 
 def _count_samples(
-    part: SiteLog, used: Ints, fate: PredictedDelivery, came: Arrivals, judged: int
+    part: SiteLog, used: Ints, delivery: PredictedDelivery, arrivals: Arrivals, judged: int
 ) -> SampleCounts:
-    first = came.first
-    release = fate.release(part.rate_hz)[first.sample]
-    lost = fate.lost[first.sample]
-    late = ~lost & ~fate.measured[first.sample] & (first.tick > release)
-    # the newest wins: at the tick that releases it a sample is in use, or a newer one is
-    at = np.maximum(release, first.tick)
-    place = np.minimum(np.searchsorted(part.tick, at), len(part) - 1)
-    superseded = ~lost & (part.tick[place] == at) & (used[place] != first.sample)
+    """Returns the sample counts of a link.
+
+    Args:
+        part: log of the receiver.
+        used: index of the sample in use at every record, shape (K,).
+        delivery: predicted delivery of all samples.
+        arrivals: arrivals over the link.
+        judged: number of judged samples.
+    """
+    first = arrivals.first
+    release_tick = delivery.release(part.rate_hz)[first.sample]
+    is_lost = delivery.lost[first.sample]
+    is_injected = ~delivery.measured[first.sample]
+    is_late = ~is_lost & is_injected & (first.tick > release_tick)
+    # the newest sample wins: at the tick that releases a sample, it or a newer sample is in use
+    use_tick = np.maximum(release_tick, first.tick)
+    row = np.minimum(np.searchsorted(part.tick, use_tick), len(part) - 1)
+    is_recorded = part.tick[row] == use_tick
+    is_superseded = ~is_lost & is_recorded & (used[row] != first.sample)
     return SampleCounts(
-        sent=len(fate.stamp_ns),
+        sent=len(delivery.stamp_ns),
         judged=judged,
         arrived=len(first.sample),
         missing=judged - len(first.sample),
-        lost=int(np.count_nonzero(lost)),
-        late=int(np.count_nonzero(late)),
-        superseded=int(np.count_nonzero(superseded)),
-        duplicate=len(came.sample) - len(first.sample),
-        copies=fate.copies,
-        refused=came.refused,
+        lost=int(np.count_nonzero(is_lost)),
+        late=int(np.count_nonzero(is_late)),
+        superseded=int(np.count_nonzero(is_superseded)),
+        duplicate=len(arrivals.sample) - len(first.sample),
+        copies=delivery.copies,
+        refused=arrivals.refused,
     )

@@ -1,15 +1,17 @@
-"""The judgement of a run: stable, not stable, or open, and what it rests on.
+"""Judges a run by its end: stable, not stable, or open.
 
-Invariant: every command takes its word from here (docs/definitions.md, "Stable"). Each joint of
-each site is judged by itself, and the worst decides; a word states what the record shows and
-predicts nothing. What else is known of a whole log (V, the roots at its end pose) may make a
-stable run open, never the reverse.
+The judged part is the second half of the run. It is the time after the last action of an
+operator and the last change of the loop instead, if that is shorter, and long enough. Trends
+of |e| and |qd| over the judged part are those of `envelope_trend`. A sustained oscillation of
+any size is steady. A joint that is steady while a faster joint of the coupled sites decays may
+receive its energy from that joint, since decaying modes beat; it is undecided.
 
-The judged part is the second half of the run, or what follows the last act of an operator and
-the last change of the loop if that is less and long enough. Trends of |e| and |qd| over it are
-those of `envelope_trend`. A sustained oscillation of any size is steady; a joint that is steady
-while a faster one of the coupled sites falls may live on that (modes that decay beat), and is
-undecided.
+Invariant:
+    - Every command takes its judgement from here (docs/definitions.md, "Stable").
+    - Each joint of each site is judged separately, and the worst joint decides.
+    - A judgement states what the record shows and predicts nothing.
+    - Further knowledge of a whole log (V, the roots at its end pose) may make a stable run
+      open, never the reverse.
 """
 
 import math
@@ -34,48 +36,48 @@ from .site_signals import SETTLED_ERROR_RAD
 from .torque_sources import compute_operator_script
 
 SETTLED_SPEED_RAD_S = 1e-2
-"""The largest speed of the last second of a converged run, rad/s: the arms have come to rest.
-"""
+"""Largest speed of the last second of a converged run, rad/s: the arms have come to rest."""
 
 STATIC_SPEED_RAD_S = 2e-3
-"""The largest speed in a static window of a log, rad/s: the torques on an arm balance each
-other.
-"""
+"""Largest speed in a static window, rad/s: the torques on an arm balance each other."""
 
 EQUILIBRIUM_SPEED_RAD_S = 1e-5
-"""The largest speed of the last second of a run whose end is an equilibrium, rad/s: the loop
-can be linearised there.
+"""Largest speed of the last second of a run that ends in an equilibrium, rad/s: the loop can be
+linearised there.
 """
 
 AGREEMENT_RAD = 2e-2
-"""Sites whose angles of a joint differ by more do not agree, rad."""
+"""Sites whose angles of a joint differ by more than this do not agree, rad."""
 
 THROWN_RAD = 0.5 * math.pi
-"""Arms that nobody pushed and that end further from every start pose were thrown there, rad."""
+"""Arms that nobody pushed and that end further than this from every start pose were thrown,
+rad.
+"""
 
 DRIFT_RAD = 0.05
-"""A joint that goes by more in one direction over the judged half may drift, rad; for one that
-is as slow as at rest, `SETTLED_ERROR_RAD` leaves that undecided.
+"""A joint that moves by more than this in one direction over the judged half may drift, rad.
+
+For a joint that is slow enough to be at rest, `SETTLED_ERROR_RAD` leaves that undecided.
 """
 
 FORCE_NM = 1e-3
-"""A larger torque of an operator or environment at the end may hold sites apart, N m, and"""
+"""A larger torque of an operator or environment at the end may hold sites apart, N m."""
 HELD_SHARE = 0.02
-"""an error of so much of their distance says that it does: what is pulled at has one."""
+"""Sites are held apart by such a torque if an error exceeds this share of their distance."""
 
 LEAST_JUDGED_S = 2.0
-"""What follows the last act of an operator or change of the loop is judged by itself if it
-lasts so long, s, and
-"""
+"""Least time after the last action or change for this time to be judged by itself, s."""
 LEAST_JUDGED_SHARE = 0.1
-"""this share of the run; else the second half is, with the act or the change in it."""
+"""It must also be at least this share of the run; otherwise the second half is judged, with the
+action or the change in it.
+"""
 
 MIN_SIGN_CHANGES = 6
 """Fewer changes of sign in the second half of a run show no period."""
 
 
 class Stability(StrEnum):
-    """The one judgement of a run; the text is the word for people."""
+    """The judgement of a run; the value is the word for people."""
 
     STABLE = "stable"
     NOT_STABLE = "not stable"
@@ -83,9 +85,7 @@ class Stability(StrEnum):
 
 
 class EndBehaviour(StrEnum):
-    """Behaviour of a run at its end, from the best to the worst; the text is the word for
-    people.
-    """
+    """Behaviour of a run at its end, from best to worst; the value is the text for people."""
 
     CONVERGED = "converged"
     DECAYS = "decaying"
@@ -99,32 +99,37 @@ class EndBehaviour(StrEnum):
 
     @property
     def stability(self) -> Stability:
-        """The judgement of a run of which nothing else is known."""
+        """The judgement of a run about which nothing else is known."""
         if self in (EndBehaviour.CONVERGED, EndBehaviour.DECAYS):
             return Stability.STABLE
-        undecided = self in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED, EndBehaviour.COASTS)
-        return Stability.OPEN if undecided else Stability.NOT_STABLE
+        if self in (EndBehaviour.HARDLY, EndBehaviour.UNDECIDED, EndBehaviour.COASTS):
+            return Stability.OPEN
+        return Stability.NOT_STABLE
 
 
-_MOVES_ON = (EndBehaviour.BOUNDED, EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
+_MAY_DRIFT = (EndBehaviour.BOUNDED, EndBehaviour.HARDLY, EndBehaviour.UNDECIDED)
+_FALLING = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
 
 
 class RunEnd(NamedTuple):
-    """End of a run, of all of its sites or of some.
+    """End of a run, of all of its sites or of some of them.
 
     Attributes:
-        behaviour: the class of the worst joint.
-        error, speed: trends of that joint's |e| and |qd|.
-        end_error_rad, end_speed_rad_s: largest |e| and |qd| of the last second, of all joints.
-        where: that joint, in words; "" if there is none.
-        reasons: what leaves the run open, in words.
-        operator_acts: True if an operator acts in the judged part, and not only holds.
-        diverged_at_s: when the first site left its limits, or None.
-        frequency_hz: frequency of a bounded oscillation; None without one.
+        behaviour: behaviour of the worst joint.
+        error: trend of that joint's |e|.
+        speed: trend of that joint's |qd|.
+        end_error_rad: largest |e| of the last second, of all joints.
+        end_speed_rad_s: largest |qd| of the last second, of all joints.
+        where: name of the worst joint; "" if there is no joint.
+        reasons: sentences on everything that leaves the run open.
+        operator_acts: True if an operator acts in the judged part, instead of only holding.
+        diverged_at_s: time at which the first site left its limits; None if no site did.
+        frequency_hz: frequency of a bounded oscillation; None otherwise.
         missing_sites: sites without any record, which leave the run undecided.
-        error_unit: of |e|: that of angles, or of places in task space.
-        counts_from_s: since when the run counts; the second half from there on is judged, s.
-        quiet_from_s: since when nobody acts on it, and its loop does not change, s.
+        error_unit: unit of |e|: "rad", or "m" in task space.
+        counts_from_s: time from which the run counts, in s: the second half from there on is
+            judged.
+        quiet_from_s: time from which nobody acts and the loop does not change, in s.
     """
 
     behaviour: EndBehaviour
@@ -144,59 +149,58 @@ class RunEnd(NamedTuple):
 
     @property
     def stability(self) -> Stability:
-        """The judgement; what may be an operator's doing is open, unless a site left its
-        limits.
-        """
-        own = self.behaviour.stability
-        if own is Stability.NOT_STABLE:
-            excused = self.operator_acts and self.behaviour is not EndBehaviour.DIVERGED
-            return Stability.OPEN if excused else own
-        return Stability.OPEN if self.reasons else own
+        """The judgement; motion that an operator may cause is open, unless a site diverged."""
+        stability = self.behaviour.stability
+        if stability is Stability.NOT_STABLE:
+            may_be_caused = self.behaviour is not EndBehaviour.DIVERGED and self.operator_acts
+            return Stability.OPEN if may_be_caused else stability
+        return Stability.OPEN if self.reasons else stability
 
     @property
     def text(self) -> str:
-        """The class with its numbers and reasons; part of the certificate's JSON."""
+        """The behaviour with its numbers, and the reasons; part of the certificate's JSON."""
         return "; ".join([self._behaviour_text, *self.reasons])
 
     @property
     def _behaviour_text(self) -> str:
         behaviour = self.behaviour
-        error = self.error
-        speed = self.speed
-        error_text = f"|e| {self.end_error_rad:.3g} {self.error_unit}"
-        end = f"{error_text} and |qd| {self.end_speed_rad_s:.3g} rad/s in the last second"
         if self.diverged_at_s is not None:
             return f"diverged at {self.diverged_at_s:.4g} s: a joint passed its qd_limit_rad_s"
         if self.missing_sites:
             return f"undecided: no record of {', '.join(self.missing_sites)}"
+        end_error = f"|e| {self.end_error_rad:.3g} {self.error_unit}"
+        end_speed = f"|qd| {self.end_speed_rad_s:.3g} rad/s"
+        end = f"{end_error} and {end_speed} in the last second"
         if behaviour is EndBehaviour.CONVERGED:
-            apart = self.end_error_rad > SETTLED_ERROR_RAD
-            return f"{'at rest, with errors that stay' if apart else 'converged'}: {end}"
-        at = f" at {self.where}" if self.where else ""
+            if self.end_error_rad > SETTLED_ERROR_RAD:
+                return f"at rest, with errors that stay: {end}"
+            return f"converged: {end}"
+        joint = f" at {self.where}" if self.where else ""
         if behaviour is EndBehaviour.BOUNDED:
-            hertz = self.frequency_hz
-            word = (
-                "bounded motion" if hertz is None else f"bounded oscillation at {hertz:.3g} Hz"
-            )
-            return f"{word}{at}: {end}"
+            motion = "bounded motion"
+            if self.frequency_hz is not None:
+                motion = f"bounded oscillation at {self.frequency_hz:.3g} Hz"
+            return f"{motion}{joint}: {end}"
         if behaviour is EndBehaviour.UNDECIDED:
-            return f"undecided, record longer{at}: |e| {error.text}, |qd| {speed.text}; {end}"
-        return f"{behaviour.value}{at} (|e| {error.rate_text}, |qd| {speed.rate_text}): {end}"
+            trends = f"|e| {self.error.text}, |qd| {self.speed.text}"
+            return f"undecided, record longer{joint}: {trends}; {end}"
+        rates = f"|e| {self.error.rate_text}, |qd| {self.speed.rate_text}"
+        return f"{behaviour.value}{joint} ({rates}): {end}"
 
 
 class RunTrace(NamedTuple):
-    """What the judgement of a run rests on, per site in scenario order.
+    """The data from which the end of a run is judged, per site in scenario order.
 
     Attributes:
-        buckets: of every `BUCKETS_PER_S`-th of a second since the epoch the largest |e| and
-            |qd| and the last q of every joint, shape (K, 3 n); -1 if it has no record. There
-            may be columns for more joints than the site has. A site's last bucket may be
-            incomplete: it enters no trend.
-        tau_x: the torque of operator and environment at its last record, shape (n,), N m.
-        diverged_at_s: when the first site left its limits, or None.
-        pushed_until_s: when an operator whom the scenario does not know last pushed, s; 0 for
-            never.
-        changed_until_s: when a command last changed the loop, s; 0 for never.
+        buckets: for every interval of 1 / `BUCKETS_PER_S` since the epoch, the largest |e| and
+            |qd| and the last q of every joint, shape (K, 3 n); -1 for an interval without a
+            record. There may be columns for more joints than the site has. A site's last
+            interval may be incomplete, and enters no trend.
+        tau_x: torque of operator and environment at the last record, shape (n,), N m.
+        diverged_at_s: time at which the first site left its limits; None if no site did.
+        pushed_until_s: time at which an operator whose action is not in the scenario last
+            pushed, in s; 0 if none did.
+        changed_until_s: time at which a command last changed the loop, in s; 0 if none did.
     """
 
     buckets: Sequence[Array]
@@ -211,120 +215,144 @@ NO_BUCKETS = np.zeros((0, 3))
 
 
 def reduce_to_buckets(bucket: Ints, e: Array, qd: Array, q: Array, into: Array) -> Array:
-    """Returns buckets with some more records of a site, which follow those in it; there may be
-    spare rows.
+    """Returns buckets with further records of a site added.
 
-    In task space e has as many columns as the task; the fewer of e and q are filled up with
-    zeros.
+    In task space e has as many columns as the task; e or q is filled up with zeros to the same
+    number of columns.
+
+    Args:
+        bucket: index of each record's bucket, ascending, shape (K,).
+        e: errors, shape (K, n).
+        qd: joint velocities, shape (K, n), rad/s.
+        q: joint angles, shape (K, n), rad.
+        into: buckets of all earlier records; may be changed in place, and have spare rows.
     """
     if not len(bucket):
         return into
     joints = max(q.shape[1], e.shape[1])
-    e, qd, q = (np.pad(one, ((0, 0), (0, joints - one.shape[1]))) for one in (e, qd, q))
+    e, qd, q = (np.pad(x, ((0, 0), (0, joints - x.shape[1]))) for x in (e, qd, q))
     if not len(into):
         into = np.zeros((0, 3 * joints))
     lacking = int(bucket[-1]) + 1 - len(into)
-    if lacking > 0:  # by half as much again: a long run is not copied for every batch
-        into = np.vstack([into, np.full((lacking + len(into) // 2, 3 * joints), -1.0)])
+    if lacking > 0:
+        # half as much again, so that a long run is not copied for every batch
+        extra = np.full((lacking + len(into) // 2, 3 * joints), -1.0)
+        into = np.vstack([into, extra])
     starts = np.flatnonzero(np.diff(bucket, prepend=-1))
+    last_records = np.append(starts[1:], len(q)) - 1
     rows = bucket[starts]
     peaks = np.maximum.reduceat(np.abs(np.hstack([e, qd])), starts, axis=0)
     into[rows, : 2 * joints] = np.maximum(into[rows, : 2 * joints], peaks)
-    into[rows, 2 * joints :] = q[np.append(starts[1:], len(q)) - 1]
+    into[rows, 2 * joints :] = q[last_records]
     return into
 
 
 def trace_log(log: Log) -> RunTrace:
-    """Returns what the judgement of a log rests on."""
+    """Returns the data from which the end of a log's run is judged."""
     parts = [log[site] for site in log.sites]
-    recorded = [part for part in parts if len(part)]
-    outside = [part for part in recorded if part.name in log.scenario.external]
-    pushed = [(part.t_s, part.tau_x.any(axis=1)) for part in outside]
-    pushed += [(part.t_s, part.hand[:, 0] > 0.0) for part in recorded if part.layout.hand]
+    buckets = [
+        reduce_to_buckets(
+            bucket=part.tick * BUCKETS_PER_S // part.rate_hz,
+            e=part.e,
+            qd=part.qd,
+            q=part.q,
+            into=NO_BUCKETS,
+        )
+        for part in parts
+    ]
+    # actions of operators that the scenario does not know: on external arms, and of live hands
+    push_times_s = []
+    for part in parts:
+        if not len(part):
+            continue
+        if part.name in log.scenario.external:
+            push_times_s.append(float(part.t_s[part.tau_x.any(axis=1)].max(initial=0.0)))
+        if part.layout.hand:
+            push_times_s.append(float(part.t_s[part.hand[:, 0] > 0.0].max(initial=0.0)))
+    change_times_s = [
+        tick / log[site].rate_hz for site in log.sites for tick in log.changes(site)
+    ]
     return RunTrace(
-        buckets=[
-            reduce_to_buckets(
-                bucket=part.tick * BUCKETS_PER_S // part.rate_hz,
-                e=part.e,
-                qd=part.qd,
-                q=part.q,
-                into=NO_BUCKETS,
-            )
-            for part in parts
-        ],
+        buckets=buckets,
         tau_x=[part.tau_x[-1] if len(part) else np.zeros(1) for part in parts],
         diverged_at_s=log.diverged_s,
-        pushed_until_s=max(
-            (float(t_s[rows].max(initial=0.0)) for t_s, rows in pushed), default=0.0
-        ),
-        changed_until_s=max(
-            (tick / log[site].rate_hz for site in log.sites for tick in log.changes(site)),
-            default=0.0,
-        ),
+        pushed_until_s=max(push_times_s, default=0.0),
+        changed_until_s=max(change_times_s, default=0.0),
     )
 
 
 def classify_log_end(log: Log) -> RunEnd:
-    """Returns the end of a log's run; torn and empty logs are undecided."""
+    """Returns the end of a log's run; the ends of torn and empty logs are undecided."""
     end = classify_run_end(log.scenario, trace_log(log))
-    bounded = end.behaviour is EndBehaviour.BOUNDED
-    return end._replace(
-        frequency_hz=_frequency_hz([log[site] for site in log.sites]) if bounded else None
-    )
+    if end.behaviour is not EndBehaviour.BOUNDED:
+        return end
+    return end._replace(frequency_hz=_find_frequency_hz([log[site] for site in log.sites]))
 
 
 def classify_run_end(scenario: Scenario, trace: RunTrace) -> RunEnd:
     """Returns the end of a run from its trace."""
-    joints = [max(arm.counts.joints, arm.counts.shared) for arm in scenario.arms.values()]
-    sites = [  # by kind and joint, shape (K, 3, n): |e|, |qd| and q
-        site.reshape(len(site), 3, -1)[:, :, :n] if len(site) else np.zeros((0, 3, n))
-        for n, site in zip(joints, trace.buckets, strict=True)
-    ]
+    # |e|, |qd| and q by kind and joint, shape (K, 3, n)
+    sites = []
+    for arm, buckets in zip(scenario.arms.values(), trace.buckets, strict=True):
+        joints = max(arm.counts.joints, arm.counts.shared)
+        by_kind = np.zeros((0, 3, joints))
+        if len(buckets):
+            by_kind = buckets.reshape(len(buckets), 3, -1)[:, :, :joints]
+        sites.append(by_kind)
     count = max(min(map(len, sites)) - 1, 0)
-    kept = np.flatnonzero(np.all([site[:count, 0, 0] >= 0.0 for site in sites], axis=0))
+    recorded = np.all([site[:count, 0, 0] >= 0.0 for site in sites], axis=0)
+    rows = np.flatnonzero(recorded)
     span_s = count / BUCKETS_PER_S
-    t_s = kept / BUCKETS_PER_S
+    all_t_s = rows / BUCKETS_PER_S
     acted_s = max(trace.pushed_until_s, find_last_operator_action(scenario, span_s))
     changed_s = max(trace.changed_until_s, find_last_change(scenario, span_s))
-    first, late = _choose_judged_part(t_s, max(acted_s, changed_s))
-    acts = late and _choose_judged_part(t_s, acted_s)[1]
-    t_s = t_s[first:]
-    columns = [site[kept[first:]] for site in sites]
-    missing = tuple(
-        name for name, site in zip(scenario.names, sites, strict=True) if not len(site)
-    )
-    end = _find_worst_joint(scenario, t_s, columns, sites)
-    counts_from_s = float(t_s[0]) if len(t_s) else 0.0
     quiet_from_s = max(acted_s, changed_s)
-    end = end._replace(
-        missing_sites=missing, counts_from_s=counts_from_s, quiet_from_s=quiet_from_s
+    first, is_disturbed = _choose_judged_part(all_t_s, quiet_from_s)
+    operator_acts = is_disturbed and _choose_judged_part(all_t_s, acted_s)[1]
+    t_s = all_t_s[first:]
+    columns = [site[rows[first:]] for site in sites]
+    missing = [site for site, data in zip(scenario.names, sites, strict=True) if not len(data)]
+    end = _find_worst_joint(scenario, t_s, columns, sites)._replace(
+        missing_sites=tuple(missing),
+        counts_from_s=float(t_s[0]) if len(t_s) else 0.0,
+        quiet_from_s=quiet_from_s,
     )
     if scenario.sites[scenario.names[0]].task.space == "position":
         end = end._replace(error_unit="m")
     if trace.diverged_at_s is not None:
         return end._replace(behaviour=EndBehaviour.DIVERGED, diverged_at_s=trace.diverged_at_s)
     if end.behaviour.stability is Stability.STABLE:
-        reasons = (
+        reasons = [
             *_find_disagreement(scenario, trace, t_s, columns),
             *_find_odd_pose(scenario, sites),
-        )
-        if late and not acts:
-            reasons += (f"the loop changes until {changed_s:.4g} s, within the judged part",)
-        return end._replace(reasons=reasons)
-    why = f"an operator acts until {acted_s:.4g} s, within the judged part"
-    return end._replace(operator_acts=True, reasons=(why,)) if acts else end
+        ]
+        if is_disturbed and not operator_acts:
+            reasons.append(f"the loop changes until {changed_s:.4g} s, within the judged part")
+        return end._replace(reasons=tuple(reasons))
+    if operator_acts:
+        reason = f"an operator acts until {acted_s:.4g} s, within the judged part"
+        return end._replace(operator_acts=True, reasons=(reason,))
+    return end
 
 
 def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
-    """Returns from which time on a run counts, of which the second half is judged, and if an
-    operator acts.
+    """Returns the start of the part of a run of which the second half is judged.
 
-    An operator that acts in the second half and then lets go for long enough shortens the
+    An operator that acts in the second half, and then lets go for long enough, shortens the
     judged part.
+
+    Args:
+        t_s: times of the run, in s.
+        acted_s: time of the last action, in s.
+
+    Returns:
+        Row at which the part starts.
+        True if the action falls in the judged half.
     """
     if not len(t_s) or acted_s <= 0.5 * (t_s[0] + t_s[-1]):
         return 0, False
-    if t_s[-1] - acted_s < max(LEAST_JUDGED_S, LEAST_JUDGED_SHARE * (t_s[-1] - t_s[0])):
+    least_s = max(LEAST_JUDGED_S, LEAST_JUDGED_SHARE * (t_s[-1] - t_s[0]))
+    if t_s[-1] - acted_s < least_s:
         return 0, True
     return int(np.searchsorted(t_s, 2.0 * acted_s - t_s[-1])), False
 
@@ -332,70 +360,95 @@ def _choose_judged_part(t_s: Array, acted_s: float) -> tuple[int, bool]:
 def _find_worst_joint(
     scenario: Scenario, t_s: Array, columns: Sequence[Array], sites: Sequence[Array]
 ) -> RunEnd:
-    """Returns the end of the joint of the worst class, the fastest of those; the maxima are of
-    all.
+    """Returns the end of the joint with the worst behaviour, and of these the fastest.
+
+    The largest |e| and |qd| of the last second are those of all joints.
+
+    Args:
+        scenario: scenario of the run.
+        t_s: times of the judged part and the part before it, shape (K,), s.
+        columns: |e|, |qd| and q at these times by site, shape (K, 3, n) each.
+        sites: |e|, |qd| and q over the whole run by site.
     """
     signals = [site[:, kind] for site in columns for kind in (0, 1)]
     fits = iter(fit_envelopes(t_s, np.hstack(signals)))
-    joints = []
-    for name, judged, site in zip(scenario.names, columns, sites, strict=True):
-        ends = site[-BUCKETS_PER_S:, :2].max(axis=0, initial=0.0).tolist()
-        trends = [[next(fits) for _ in kind] for kind in ends]
-        for joint, (end_error, end_speed) in enumerate(zip(*ends, strict=True)):
-            error, speed = (kind[joint] for kind in trends)
-            # too slow for a trend
-            still = speed.trend is EnvelopeTrend.DECAYS or end_speed <= FLOOR_RAD
-            settles = speed.trend is EnvelopeTrend.HARDLY or bool(scenario.external)
-            rests = end_speed <= SETTLED_SPEED_RAD_S and (still or (speed.calm and settles))
-            behaviour = _classify_joint(
-                error, speed, end_error, end_speed, still=still, rests=rests
+    ends = []
+    for name, judged, whole in zip(scenario.names, columns, sites, strict=True):
+        last_second = whole[-BUCKETS_PER_S:, :2].max(axis=0, initial=0.0)
+        end_errors, end_speeds = last_second.tolist()
+        error_fits = [next(fits) for _ in end_errors]
+        speed_fits = [next(fits) for _ in end_speeds]
+        for joint in range(len(end_errors)):
+            end = RunEnd(
+                behaviour=EndBehaviour.UNDECIDED,
+                error=error_fits[joint],
+                speed=speed_fits[joint],
+                end_error_rad=end_errors[joint],
+                end_speed_rad_s=end_speeds[joint],
+                where=f"{name} joint {joint + 1}" if len(t_s) else "",
             )
-            behaviour = _name_motion(
-                behaviour, judged[:, 2, joint], judged[:, 1, joint], t_s, still=still
-            )
-            where = f"{name} joint {joint + 1}" if len(t_s) else ""
-            joints.append(
-                RunEnd(
-                    behaviour=behaviour,
-                    error=error,
-                    speed=speed,
-                    end_error_rad=end_error,
-                    end_speed_rad_s=end_speed,
-                    where=where,
-                )
-            )
+            behaviour = _judge_joint(scenario, end, judged[:, :, joint], t_s)
+            ends.append(end._replace(behaviour=behaviour))
     end_s = float(t_s[-1]) if len(t_s) else 0.0
     owners = np.repeat(np.arange(len(sites)), [site.shape[2] for site in sites])
     for group in find_coupled_sites(scenario):
-        for n in _find_fed_joints(joints, owners, group):
-            joints[n] = joints[n]._replace(behaviour=EndBehaviour.UNDECIDED)
-        for n in _find_coasting_joints(
-            scenario=scenario, joints=joints, owners=owners, group=group, end_s=end_s
-        ):
-            joints[n] = joints[n]._replace(behaviour=EndBehaviour.COASTS)
-    worst = max(
-        joints, key=lambda one: (list(EndBehaviour).index(one.behaviour), one.end_speed_rad_s)
-    )
+        for n in _find_fed_joints(ends, owners, group):
+            ends[n] = ends[n]._replace(behaviour=EndBehaviour.UNDECIDED)
+        coasting = _find_coasting_joints(
+            scenario=scenario, joints=ends, owners=owners, group=group, end_s=end_s
+        )
+        for n in coasting:
+            ends[n] = ends[n]._replace(behaviour=EndBehaviour.COASTS)
+    order = list(EndBehaviour)
+    worst = max(ends, key=lambda end: (order.index(end.behaviour), end.end_speed_rad_s))
     return worst._replace(
-        end_error_rad=max(one.end_error_rad for one in joints),
-        end_speed_rad_s=max(one.end_speed_rad_s for one in joints),
+        end_error_rad=max(end.end_error_rad for end in ends),
+        end_speed_rad_s=max(end.end_speed_rad_s for end in ends),
     )
+
+
+def _judge_joint(scenario: Scenario, end: RunEnd, motion: Array, t_s: Array) -> EndBehaviour:
+    """Returns the behaviour of a joint.
+
+    Args:
+        scenario: scenario of the run.
+        end: trends and last values of the joint.
+        motion: |e|, |qd| and q of the joint over the judged part, shape (K, 3).
+        t_s: times of the judged part, shape (K,), s.
+    """
+    speed = end.speed
+    # a joint below the floor is too slow for a trend
+    is_still = speed.trend is EnvelopeTrend.DECAYS or end.end_speed_rad_s <= FLOOR_RAD
+    # the speed of arms outside the program is measured with noise, and need not decay
+    may_stay = speed.trend is EnvelopeTrend.HARDLY or bool(scenario.external)
+    is_slow = end.end_speed_rad_s <= SETTLED_SPEED_RAD_S
+    rests = is_slow and (is_still or (speed.calm and may_stay))
+    behaviour = _classify_joint(
+        error=end.error,
+        speed=speed,
+        end_error_rad=end.end_error_rad,
+        end_speed_rad_s=end.end_speed_rad_s,
+        still=is_still,
+        rests=rests,
+    )
+    return _refine_by_motion(behaviour, motion[:, 2], motion[:, 1], t_s, still=is_still)
 
 
 def _find_fed_joints(joints: Sequence[RunEnd], owners: Ints, group: Sequence[int]) -> list[int]:
-    """Returns the bounded joints of coupled sites of which a faster joint falls: they may live
-    on that.
+    """Returns the steady joints of coupled sites that may receive energy from a faster joint.
 
-    Modes that decay at several frequencies beat, and hand their energy on: some joint is steady
-    for a while.
+    Modes that decay at several frequencies beat and exchange energy, so that some joint is
+    steady for a while although all modes decay.
+
+    Args:
+        joints: ends of all joints.
+        owners: index of each joint's site.
+        group: indices of the coupled sites.
     """
-    own = np.flatnonzero(np.isin(owners, group)).tolist()
-    falling = (EnvelopeTrend.DECAYS, EnvelopeTrend.HARDLY)
-    fastest = max(
-        (joints[n].end_speed_rad_s for n in own if joints[n].speed.trend in falling),
-        default=0.0,
-    )
-    bounded = [n for n in own if joints[n].behaviour is EndBehaviour.BOUNDED]
+    members = np.flatnonzero(np.isin(owners, group)).tolist()
+    falling = [joints[n] for n in members if joints[n].speed.trend in _FALLING]
+    fastest = max((joint.end_speed_rad_s for joint in falling), default=0.0)
+    bounded = [n for n in members if joints[n].behaviour is EndBehaviour.BOUNDED]
     return [n for n in bounded if joints[n].end_speed_rad_s < fastest]
 
 
@@ -408,27 +461,32 @@ def _find_coasting_joints(
 ) -> list[int]:
     """Returns the drifting joints of coupled sites that nothing brakes.
 
-    That is so if the law of a site that nobody holds or resists at the end has no spring to a
-    peer, and the others follow it; or if that is so of all sites, and their laws take energy
-    from the links alone.
+    That is so if the law of a site whose arm nobody holds or resists at the end has no spring
+    to a peer, and the others follow this site. It is also so if nobody holds or resists any
+    arm, and all laws take energy from the links alone.
+
+    Args:
+        scenario: scenario of the run.
+        joints: ends of all joints.
+        owners: index of each joint's site.
+        group: indices of the coupled sites.
+        end_s: end of the run, in s.
     """
     specs = [scenario.sites[scenario.names[site]] for site in group]
-    alone = [
-        spec.control
-        for spec in specs
-        if not any(
-            one.actor.start_s <= end_s < one.actor.end_s
-            for one in (*spec.hands, *spec.environment)
-        )
+    free_laws = []
+    for spec in specs:
+        sources = [source.actor for source in (*spec.hands, *spec.environment)]
+        if not any(source.start_s <= end_s < source.end_s for source in sources):
+            free_laws.append(spec.control)
+    brakeless = [
+        law for law in free_laws if law.books_energy and not any(getattr(law, "d", ()))
     ]
-    brakeless = [law for law in alone if law.books_energy and not any(getattr(law, "d", ()))]
-    free = len(brakeless) == len(specs) or not all(
-        any(getattr(law, "K", (1.0,))) for law in alone
-    )
-    own = np.flatnonzero(np.isin(owners, group)).tolist() if free else []
+    all_have_springs = all(any(getattr(law, "K", (1.0,))) for law in free_laws)
+    if len(brakeless) != len(specs) and all_have_springs:
+        return []
     return [
         n
-        for n in own
+        for n in np.flatnonzero(np.isin(owners, group)).tolist()
         if joints[n].behaviour is EndBehaviour.DRIFTS
         and joints[n].speed.trend is not EnvelopeTrend.GROWS
     ]
@@ -443,207 +501,264 @@ def _classify_joint(
     still: bool,
     rests: bool,
 ) -> EndBehaviour:
-    """Returns the class that the trends of a joint's |e| and |qd| have together.
+    """Returns the behaviour of a joint by the trends of its |e| and |qd|.
 
-    Errors that grow while the joint gets no faster may start a drift, or follow from what an
-    operator has just done: undecided. The reverse is growth: arms that swing in unison have no
-    error. A joint is `still` if its speed decays, and `rests` if it is slow and falls, however
-    little; what goes on at a small speed may go on for ever, or grow. That of arms outside of
-    the program need not fall.
+    Errors that grow while the joint gets no faster may start a drift, or follow from an
+    operator's last action: undecided. A speed that grows without an error is growth: arms that
+    swing in unison have no error. A motion that goes on at a small speed may go on for ever,
+    or grow.
+
+    Args:
+        error: trend of |e|.
+        speed: trend of |qd|.
+        end_error_rad: largest |e| of the last second.
+        end_speed_rad_s: largest |qd| of the last second.
+        still: True if the speed decays, or is at the floor.
+        rests: True if the joint is slow, and its speed falls, however little. The speed of an
+            external arm need not fall.
     """
     if speed.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.GROWS
     if error.trend is EnvelopeTrend.GROWS:
         return EndBehaviour.UNDECIDED
     if not rests and not still:
-        # it hardly moves, and its trend says nothing
+        # the trend of a joint that hardly moves says nothing
         if end_speed_rad_s <= SETTLED_SPEED_RAD_S:
             return EndBehaviour.UNDECIDED
-        goes_on = {
-            EnvelopeTrend.HARDLY: EndBehaviour.HARDLY,
-            EnvelopeTrend.STEADY: EndBehaviour.BOUNDED,
-        }
-        return goes_on.get(speed.trend, EndBehaviour.UNDECIDED)
-    if error.calm and (
-        end_error_rad <= SETTLED_ERROR_RAD or error.trend is EnvelopeTrend.STEADY
-    ):
+        if speed.trend is EnvelopeTrend.HARDLY:
+            return EndBehaviour.HARDLY
+        if speed.trend is EnvelopeTrend.STEADY:
+            return EndBehaviour.BOUNDED
+        return EndBehaviour.UNDECIDED
+    is_small = end_error_rad <= SETTLED_ERROR_RAD
+    if error.calm and (is_small or error.trend is EnvelopeTrend.STEADY):
         return EndBehaviour.CONVERGED if rests else EndBehaviour.DECAYS
     if error.trend is EnvelopeTrend.DECAYS:
-        near = rests and end_error_rad <= SETTLED_ERROR_RAD
-        return EndBehaviour.CONVERGED if near else EndBehaviour.DECAYS
-    return (
-        EndBehaviour.HARDLY if error.trend is EnvelopeTrend.HARDLY else EndBehaviour.UNDECIDED
-    )
+        return EndBehaviour.CONVERGED if rests and is_small else EndBehaviour.DECAYS
+    if error.trend is EnvelopeTrend.HARDLY:
+        return EndBehaviour.HARDLY
+    return EndBehaviour.UNDECIDED
 
 
-def _name_motion(
-    behaviour: EndBehaviour, q: Array, fastest: Array, t_s: Array, *, still: bool
+def _refine_by_motion(
+    behaviour: EndBehaviour, q: Array, speed: Array, t_s: Array, *, still: bool
 ) -> EndBehaviour:
-    """Returns the class of a joint, and of one that moves on by where it goes in the judged
-    half.
+    """Returns the behaviour of a joint, refined by the direction of its motion.
 
-    It drifts if every quarter takes half of its share or more in one way, and its mean speed is
-    at least half of the largest: what swings on its way is no drift. A bounded oscillation
-    changes its sign. What is as slow as at rest, and goes one way, is undecided before that.
+    A joint drifts if every quarter of the judged half contributes at least half of its share in
+    one direction, and if its mean speed is at least half of the largest: a joint that swings on
+    its way does not drift. A bounded oscillation changes its sign. A joint that is slow enough
+    to be at rest, but moves in one direction, is undecided.
+
+    Args:
+        behaviour: behaviour by the trends.
+        q: joint angle, shape (K,), rad.
+        speed: largest |qd| since the time before, shape (K,), rad/s.
+        t_s: times, shape (K,), s.
+        still: True if the speed decays, or is at the floor.
     """
-    moves = behaviour in _MOVES_ON or (behaviour is EndBehaviour.CONVERGED and not still)
-    if not moves or len(t_s) < BUCKETS_PER_S:
+    may_rest = behaviour is EndBehaviour.CONVERGED and not still
+    if not (behaviour in _MAY_DRIFT or may_rest) or len(t_s) < BUCKETS_PER_S:
         return behaviour
-    first = int(np.searchsorted(t_s, 0.5 * (t_s[0] + t_s[-1])))
-    marks = np.linspace(first, len(t_s) - 1, 5).round().astype(int)
-    way = np.diff(q[marks])
-    total = abs(float(way.sum()))
-    steady = float((way * np.sign(way.sum())).min()) >= 0.125 * total
-    if steady and total >= 0.5 * (t_s[-1] - t_s[first]) * fastest[first:].max():
+    half = int(np.searchsorted(t_s, 0.5 * (t_s[0] + t_s[-1])))
+    marks = np.linspace(half, len(t_s) - 1, 5).round().astype(int)
+    steps = np.diff(q[marks])
+    total = abs(float(steps.sum()))
+    least_step = float((steps * np.sign(steps.sum())).min())
+    is_one_way = least_step >= 0.125 * total
+    if is_one_way and total >= 0.5 * (t_s[-1] - t_s[half]) * speed[half:].max():
         if total >= DRIFT_RAD:
             return EndBehaviour.DRIFTS
         if total >= SETTLED_ERROR_RAD and behaviour is EndBehaviour.CONVERGED:
             return EndBehaviour.UNDECIDED
-    swings = (
-        behaviour is not EndBehaviour.BOUNDED
-        or _count_sign_changes(q[first:]) >= MIN_SIGN_CHANGES
-    )
+    if behaviour is not EndBehaviour.BOUNDED:
+        return behaviour
+    swings = _count_sign_changes(q[half:]) >= MIN_SIGN_CHANGES
     return behaviour if swings else EndBehaviour.UNDECIDED
 
 
 def _count_sign_changes(values: Array) -> int:
+    """Returns how often values cross their mean."""
     signs = np.sign(values - values.mean())
     return int(np.count_nonzero(np.diff(signs[signs != 0.0])))
 
 
 def find_coupled_sites(scenario: Scenario) -> list[list[int]]:
     """Returns the groups of sites that shares connect, at any time and in either direction."""
-    joined = scenario.alpha.copy()
+    total_shares = scenario.alpha.copy()
     for change in scenario.timeline:
-        for peer, share in (change.to if change.dominance else {}).items():
-            joined[scenario.names.index(change.dominance), scenario.names.index(peer)] += share
-    reach = find_reach(joined + joined.T)
-    return [
-        list(map(int, rows))
-        for rows in {tuple(np.flatnonzero(row).tolist()): None for row in reach}
-    ]
+        if not change.dominance:
+            continue
+        site = scenario.names.index(change.dominance)
+        for peer, share in change.to.items():
+            total_shares[site, scenario.names.index(peer)] += share
+    reach = find_reach(total_shares + total_shares.T)
+    # each group once, in the order of its first site
+    groups = dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in reach)
+    return [list(group) for group in groups]
 
 
 def _find_disagreement(
     scenario: Scenario, trace: RunTrace, t_s: Array, columns: Sequence[Array]
 ) -> Iterable[str]:
+    """Yields a sentence for each group of coupled sites that end apart, but are not held.
+
+    Args:
+        scenario: scenario of the run.
+        trace: trace of the run.
+        t_s: times of the judged part, shape (K,), s.
+        columns: |e|, |qd| and q at these times by site, shape (K, 3, n) each.
+    """
     for group in find_coupled_sites(scenario):
         names = [scenario.names[n] for n in group]
-        places = any(scenario.sites[name].control.compares_positions for name in names)
-        if len(group) < 2 or places or any(scenario.arms[name].shares_pose for name in names):
-            continue  # e says if they agree
+        compares_places = any(scenario.sites[name].control.compares_places for name in names)
+        shares_pose = any(scenario.arms[name].shares_pose for name in names)
+        if len(group) < 2 or compares_places or shares_pose:
+            continue  # e itself shows whether the sites agree
         q = np.array([columns[n][:, 2] for n in group])
-        apart = np.ptp(q, axis=0)
-        joint = int(apart[-1].argmax())
-        nearer = (
-            fit_envelopes(t_s, apart.max(axis=1, keepdims=True))[0].trend
-            is EnvelopeTrend.DECAYS
-        )
-        pulled = max(np.abs(trace.tau_x[n]).max() for n in group) > FORCE_NM
-        held = (
-            pulled
-            and max(columns[n][-1, 0].max() for n in group) > HELD_SHARE * apart[-1, joint]
-        )
-        at = q[_find_held_sites(scenario, trace, joint, float(t_s[-1]))[group], -1, joint]
-        held |= len(at) > 0 and apart[-1, joint] - np.ptp(at) < AGREEMENT_RAD
-        if apart[-1, joint] > AGREEMENT_RAD and not (nearer or held):
-            ends = [
-                scenario.names[group[int(pick(q[:, -1, joint]))]]
-                for pick in (np.argmin, np.argmax)
-            ]
-            yield f"{' and '.join(ends)} stand {apart[-1, joint]:.3g} rad apart, and nothing holds them there"
+        distance = np.ptp(q, axis=0)
+        joint = int(distance[-1].argmax())
+        end_distance = distance[-1, joint]
+        envelope = distance.max(axis=1, keepdims=True)
+        is_approaching = fit_envelopes(t_s, envelope)[0].trend is EnvelopeTrend.DECAYS
+        largest_torque = max(np.abs(trace.tau_x[n]).max() for n in group)
+        largest_error = max(columns[n][-1, 0].max() for n in group)
+        is_held = largest_torque > FORCE_NM and largest_error > HELD_SHARE * end_distance
+        held_sites = _find_held_sites(scenario, trace, joint, float(t_s[-1]))[group]
+        held_q = q[held_sites, -1, joint]
+        if len(held_q) and end_distance - np.ptp(held_q) < AGREEMENT_RAD:
+            is_held = True
+        if end_distance > AGREEMENT_RAD and not (is_approaching or is_held):
+            lowest = names[int(np.argmin(q[:, -1, joint]))]
+            highest = names[int(np.argmax(q[:, -1, joint]))]
+            yield (
+                f"{lowest} and {highest} stand {end_distance:.3g} rad apart, "
+                "and nothing holds them there"
+            )
 
 
 def _find_held_sites(
     scenario: Scenario, trace: RunTrace, joint: int, end_s: float
 ) -> NDArray[np.bool_]:
-    """Returns at which sites a joint is held at the end, by the stiffness of a hand, or of what
-    is touched.
+    """Returns the sites at which a joint is held at the end, by the stiffness of a source.
 
-    A hand at the place that it wants needs no torque, and holds all the same. An own kind is
-    taken to hold.
+    A hand holds its arm even without torque, at the position that it wants; an environment
+    only if it is touched. Sources of an own kind are assumed to hold.
+
+    Args:
+        scenario: scenario of the run.
+        trace: trace of the run.
+        joint: index of the joint.
+        end_s: end of the run, in s.
     """
     held = np.zeros(len(scenario.names), dtype=np.bool_)
     for n, (spec, tau_x) in enumerate(zip(scenario.sites.values(), trace.tau_x, strict=True)):
-        touched = spec.environment if np.abs(tau_x).max() > FORCE_NM else ()
-        for actor in (one.actor for one in (*spec.hands, *touched)):
-            stiffness = actor.K[joint : joint + 1] if actor.kind == TorqueKind.HAND else actor.K
-            stiff = any(stiffness) or actor.kind in OWN_KINDS
-            held[n] |= actor.start_s <= end_s < actor.end_s and stiff
+        sources = [*spec.hands]
+        if np.abs(tau_x).max() > FORCE_NM:
+            sources += spec.environment
+        for source in sources:
+            actor = source.actor
+            stiffness = actor.K
+            if actor.acts == TorqueKind.HAND:
+                stiffness = actor.K[joint : joint + 1]
+            is_stiff = any(stiffness) or actor.acts in OWN_KINDS
+            held[n] |= actor.start_s <= end_s < actor.end_s and is_stiff
     return held
 
 
 def _find_odd_pose(scenario: Scenario, sites: Sequence[Array]) -> Iterable[str]:
+    """Yields a sentence if arms ended hanging, or far from every start pose without a push.
+
+    Args:
+        scenario: scenario of the run.
+        sites: |e|, |qd| and q over the whole run by site, shape (K, 3, n) each.
+    """
     starts = [np.array(spec.q0_rad) for spec in scenario.sites.values()]
     ends = [site[-1, 2, : len(start)] for site, start in zip(sites, starts, strict=True)]
     hanging = find_hanging_sites(scenario, dict(zip(scenario.names, ends, strict=True)))
-    away = []  # of each site the joint that is furthest from where any start pose of such an arm has it
-    for end in ends:
-        alike = np.array([q for q in starts if len(q) == len(end)])
-        away.append(float(np.maximum(alike.min(axis=0) - end, end - alike.max(axis=0)).max()))
-    n = int(np.argmax(away))
     if hanging:
-        yield f"{', '.join(hanging)} {'hangs' if len(hanging) == 1 else 'hang'}: the arms fell"
-    elif away[n] > THROWN_RAD and not (
-        scenario.external or any(s.hands for s in scenario.sites.values())
-    ):
-        yield f"{scenario.names[n]} ends {away[n]:.3g} rad away from every start pose, and nobody pushed"
+        verb = "hangs" if len(hanging) == 1 else "hang"
+        yield f"{', '.join(hanging)} {verb}: the arms fell"
+        return
+    # per site the largest distance of a joint from the range of all start poses of such arms
+    distances = []
+    for end in ends:
+        similar = np.array([q for q in starts if len(q) == len(end)])
+        below = similar.min(axis=0) - end
+        above = end - similar.max(axis=0)
+        distances.append(float(np.maximum(below, above).max()))
+    n = int(np.argmax(distances))
+    has_operator = any(spec.hands for spec in scenario.sites.values())
+    if distances[n] > THROWN_RAD and not (scenario.external or has_operator):
+        yield (
+            f"{scenario.names[n]} ends {distances[n]:.3g} rad away from every start pose, "
+            "and nobody pushed"
+        )
 
 
 def find_hanging_sites(scenario: Scenario, ends: Mapping[str, Array]) -> list[str]:
-    """Returns the sites, of those whose last angles are given, whose arms hang and did not at
-    the start.
+    """Returns the sites whose arms hang at the end, and did not at the start.
+
+    Args:
+        scenario: scenario of the run.
+        ends: last joint angles of the sites to be judged, shape (n,) each, rad.
     """
-    arms = {name: build_arm_rows(scenario, name) for name in ends}
-    starts = {name: np.array(scenario.sites[name].q0_rad) for name in ends}
-    return [
-        name
-        for name, q in ends.items()
-        if arms[name].hanging_angle(q) < HANGING_RAD <= arms[name].hanging_angle(starts[name])
-    ]
+    hanging = []
+    for site, q in ends.items():
+        arm = build_arm_rows(scenario, site)
+        start = np.array(scenario.sites[site].q0_rad)
+        if arm.hanging_angle(q) < HANGING_RAD <= arm.hanging_angle(start):
+            hanging.append(site)
+    return hanging
 
 
 def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
-    """Returns when an operator last changed what it does before the end of a run, s; 0 if none
-    ever did.
+    """Returns the last time before `span_s` at which an operator changed its action, in s.
+
+    Returns 0 if no operator ever did.
     """
     t_s = np.arange(0.0, span_s, 1.0 / BUCKETS_PER_S)
     last_s = 0.0
-    for name, spec in scenario.sites.items():
+    for site, spec in scenario.sites.items():
         start = np.array([spec.q0_rad])
-        J = build_arm_rows(scenario, name).place_end_effector(start, 0.0 * start).J[0]
-        for source in (one.actor for one in spec.hands if one.actor.kind not in LIVE_KINDS):
-            script = compute_operator_script(
-                source, t_s, np.eye(len(source.a)) if source.a else J
-            )
-            changed = np.abs(np.diff(script, axis=0)).max(axis=1, initial=0.0) > 0.0
-            edges = [at_s for at_s in (source.start_s, source.end_s) if at_s < span_s]
-            last_s = max(last_s, *edges, float(t_s[1:][changed].max(initial=0.0)))
+        J = build_arm_rows(scenario, site).place_end_effector(start, 0.0 * start).J[0]
+        for hand in spec.hands:
+            source = hand.actor
+            if source.acts in LIVE_KINDS:
+                continue
+            source_J = np.eye(len(source.a)) if source.a else J
+            script = compute_operator_script(source, t_s, source_J)
+            is_change = np.abs(np.diff(script, axis=0)).max(axis=1, initial=0.0) > 0.0
+            last_change_s = float(t_s[1:][is_change].max(initial=0.0))
+            edges_s = [edge_s for edge_s in (source.start_s, source.end_s) if edge_s < span_s]
+            last_s = max(last_s, *edges_s, last_change_s)
     return last_s
 
 
 def find_last_change(scenario: Scenario, span_s: float) -> float:
-    """Returns when the loop last changed before the end of a run, s: by its timeline or an
-    environment.
+    """Returns the last time before `span_s` at which the loop changed, in s; 0 if it never did.
+
+    The timeline changes the loop, and so do environments that start or end.
     """
-    ends_s = [
-        change.at_s + change.ramp_s for change in scenario.timeline if change.at_s < span_s
-    ]
+    changes = [change for change in scenario.timeline if change.at_s < span_s]
+    change_times_s = [change.at_s + change.ramp_s for change in changes]
     for spec in scenario.sites.values():
-        edges = (
-            at_s for one in spec.environment for at_s in (one.actor.start_s, one.actor.end_s)
-        )
-        ends_s += [at_s for at_s in edges if at_s < span_s]
-    return max([0.0, *ends_s])
+        for source in spec.environment:
+            edges_s = (source.actor.start_s, source.actor.end_s)
+            change_times_s += [edge_s for edge_s in edges_s if edge_s < span_s]
+    return max([0.0, *change_times_s])
 
 
-def _frequency_hz(parts: list[SiteLog]) -> float | None:
-    """Returns the frequency of the fastest joint in the second half, by its changes of sign, or
-    None.
+def _find_frequency_hz(parts: list[SiteLog]) -> float | None:
+    """Returns the frequency of the fastest joint in the second half, by its changes of sign.
+
+    Returns None if it changes its sign too rarely.
     """
     halves = [(part, part.qd[len(part) // 2 :]) for part in parts]
     part, half = max(halves, key=lambda pair: float(np.abs(pair[1]).max()))
-    column = half[:, int(np.abs(half).max(axis=0).argmax())]
-    crossings = _count_sign_changes(column)
+    fastest = int(np.abs(half).max(axis=0).argmax())
+    crossings = _count_sign_changes(half[:, fastest])
+    if crossings < MIN_SIGN_CHANGES:
+        return None
     span_s = float(part.tick[-1] - part.tick[len(part) // 2]) / part.rate_hz
-    return None if crossings < MIN_SIGN_CHANGES else 0.5 * crossings / span_s
+    return 0.5 * crossings / span_s

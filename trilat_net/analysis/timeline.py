@@ -1,8 +1,7 @@
-"""Timeline of a run: applied changes, link models in force, intervals of hold, brake and
-return, divergence.
+"""Lists what happened in a run, over time: changes, link models, modes of sites and alarms.
 
-Invariant: every entry comes from the scenario or from a record; none is inferred from a
-trajectory.
+Invariant:
+    - Every entry comes from the scenario or from a record; none is inferred from a trajectory.
 """
 
 from collections.abc import Sequence
@@ -26,14 +25,15 @@ from ..scenario.scenario_types import Change
 
 
 class AppliedChange(NamedTuple):
-    """A change of a link or of a site's dominance factors, or an order, and the site that
-    carried it out.
+    """A change or an order, and the site that carried it out.
 
     Attributes:
-        change: what was changed or ordered, and when.
-        site: who carried it out.
-        taken_at_tick: the tick whose record names it; None for a change of the scenario.
-        sentence: what people are told of it, with who asked for it as far as the log knows.
+        change: the change of a link or of a site's dominance factors, or the order, with its
+            time.
+        site: the site that carried it out.
+        taken_at_tick: tick of the record that names the change; None for a change of the
+            scenario.
+        sentence: a sentence for people, with the name of whoever ordered the change, if known.
     """
 
     change: Change
@@ -42,27 +42,30 @@ class AppliedChange(NamedTuple):
     sentence: str
 
     @property
-    def about(self) -> str:
-        """Its subject: a link "j->i", the shares of a site, or a site."""
+    def subject(self) -> str:
+        """The subject of the change: a link "j->i", the shares of a site, or a site."""
         return self.change.link or self.change.site or f"shares of {self.change.dominance}"
 
     @property
     def text(self) -> str:
-        """The value after it."""
-        if self.change.order:
-            ticks = f", {count_nouns(self.change.ticks, 'tick')}" if self.change.ticks else ""
-            return self.change.order.replace("_", " ") + ticks
-        if self.change.link:
-            return self.change.after.describe()
-        shares = ", ".join(
-            f"{peer} {share:g}" for peer, share in self.change.to.items() if share
-        )
-        return f"{shares} within {self.change.ramp_s:g} s" if self.change.ramp_s else shares
+        """The state after the change."""
+        change = self.change
+        if change.order:
+            order = change.order.replace("_", " ")
+            return f"{order}, {count_nouns(change.ticks, 'tick')}" if change.ticks else order
+        if change.link:
+            return change.after.describe()
+        shares = ", ".join(f"{peer} {share:g}" for peer, share in change.to.items() if share)
+        return f"{shares} within {change.ramp_s:g} s" if change.ramp_s else shares
 
 
 class ModeInterval(NamedTuple):
-    """An interval of hold, brake or return, up to the first tick after it, or the end of the
-    last period.
+    """An interval in which a site held, braked or returned.
+
+    Attributes:
+        mode: the mode.
+        from_s: time of the first tick in this mode, in s.
+        to_s: time of the first tick after it, or end of the site's last period, in s.
     """
 
     mode: str
@@ -71,70 +74,75 @@ class ModeInterval(NamedTuple):
 
     @property
     def meaning(self) -> ModeMeaning:
-        """What the mode means."""
+        """The meaning of the mode."""
         return MODES[self.mode]
 
 
 class StatedModel(NamedTuple):
-    """A link model, and the first stamp for which it holds, s after the epoch."""
+    """A link model, and the first stamp to which it applies, in s after the epoch."""
 
     from_s: float
     link: LinkBase
 
 
 def list_changes(log: Log) -> list[AppliedChange]:
-    """Returns the changes before the end of the run, in the order of the times from which they
-    held.
+    """Returns all changes before the end of the run, in the order in which they took effect.
 
-    Ticks that were not made are among them if they were so many that the site held.
+    Ticks that a site skipped are included if they were so many that the site held.
 
     Raises:
-        LogError: a record names a change that is none.
+        LogError: a record names a change that is not valid.
     """
-    planned = log.scenario.timeline
-    found = [
+    applied = [
         AppliedChange(change, find_owner(change), None, describe_change(change))
-        for change in planned
+        for change in log.scenario.timeline
     ]
-    said = {
+    change_events = {
         (event.member, event.command): event for event in log.events if event.kind == "change"
     }
     for site in log.sites:
-        log.commands(site)  # refuses what is no change of that site's
+        log.commands(site)  # raises if a record names a change that is not valid for the site
         for tick, texts in log.changes(site).items():
             for text in texts:
                 change = msgspec.json.decode(text, type=Change)
-                event = said.get((site, text))
-                sentence = describe_change(change)
-                if event is not None:
+                event = change_events.get((site, text))
+                if event is None:
+                    sentence = describe_change(change)
+                else:
                     sentence = describe_event(event.kind, event.text, event.command)
-                found.append(AppliedChange(change, site, tick, sentence))
-    before_s = recorded_end_s(log)
-    kept = (
-        c
-        for c in found
-        if c.change.at_s < before_s and not 0 < c.change.ticks <= HELD_OVERRUN_TICKS
-    )
-    return sorted(kept, key=lambda changed: changed.change.at_s)
+                applied.append(AppliedChange(change, site, tick, sentence))
+    end_s = recorded_end_s(log)
+    shown = [
+        entry
+        for entry in applied
+        if entry.change.at_s < end_s and not 0 < entry.change.ticks <= HELD_OVERRUN_TICKS
+    ]
+    return sorted(shown, key=lambda entry: entry.change.at_s)
 
 
 def list_stated_models(
     log: Log, link: str, changed: Sequence[AppliedChange]
 ) -> list[StatedModel]:
-    """Returns the models of a link, "j->i", from the start and after every listed change of it."""
-    later = [
-        StatedModel(c.change.at_s, c.change.after) for c in changed if c.change.link == link
+    """Returns the models of a link: the one at the start, and one after every change.
+
+    Args:
+        log: the log of a run.
+        link: name of the link, "j->i".
+        changed: changes of the run.
+    """
+    later_models = [
+        StatedModel(entry.change.at_s, entry.change.after)
+        for entry in changed
+        if entry.change.link == link
     ]
-    return [StatedModel(0.0, log.scenario.links[link]), *later]
+    return [StatedModel(0.0, log.scenario.links[link]), *later_models]
 
 
 def recorded_end_s(log: Log) -> float:
-    """Returns when the run ended, s: the end of the last record's period; without records, its
-    plan.
-    """
-    parts = [log[name] for name in log.sites]
-    ends = [float(part.t_s[-1]) + 1.0 / part.rate_hz for part in parts if len(part)]
-    return max(ends, default=log.scenario.duration_s)
+    """Returns the end of a run in s: that of the last record's period, or the planned end."""
+    parts = [log[site] for site in log.sites]
+    ends_s = [float(part.t_s[-1]) + 1.0 / part.rate_hz for part in parts if len(part)]
+    return max(ends_s, default=log.scenario.duration_s)
 
 
 def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
@@ -142,19 +150,27 @@ def find_mode_intervals(part: SiteLog) -> list[ModeInterval]:
     modes: list[str] = part.mode.tolist()
     if all(MODES[mode].follows for mode in modes):
         return []
-    found = []
-    times = np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz).tolist()
+    times_s = np.append(part.t_s, part.t_s[-1] + 1.0 / part.rate_hz).tolist()
+    intervals = []
     first = 0
-    for mode, group in groupby(modes):
-        last = first + len(list(group))
+    for mode, records in groupby(modes):
+        end = first + len(list(records))
         if not MODES[mode].follows:
-            found.append(ModeInterval(mode, times[first], times[last]))
-        first = last
-    return found
+            intervals.append(ModeInterval(mode, times_s[first], times_s[end]))
+        first = end
+    return intervals
 
 
 class RaisedAlarm(NamedTuple):
-    """A time in which a site held, was stopped, or was in fault, under the rule `glide`."""
+    """An alarm of a site under the rule `glide`: the site held, was stopped, or was in fault.
+
+    Attributes:
+        site: name of the site.
+        word: name of the alarm.
+        reason: reason of the alarm.
+        from_s: start of the alarm, in s.
+        to_s: end of the alarm, in s.
+    """
 
     site: str
     word: str
@@ -167,17 +183,17 @@ class RaisedAlarm(NamedTuple):
 
 
 def list_alarms(log: Log) -> list[RaisedAlarm]:
-    """Returns the alarms of all sites, in the order of their beginnings; of a stop with who
-    ordered it.
-    """
+    """Returns the alarms of all sites, in order; that of a stop names whoever ordered it."""
     orderers = {
-        (one.site, one.taken_at_tick): find_requester(one.sentence) for one in list_changes(log)
+        (entry.site, entry.taken_at_tick): find_orderer(entry.sentence)
+        for entry in list_changes(log)
     }
-    found = []
+    raised = []
     for site in log.sites:
+        if log.scenario.sites[site].on_stale.action != "glide":
+            continue
         part = log[site]
-        glides = log.scenario.sites[site].on_stale.action == "glide"
-        for mode, from_s, to_s in find_mode_intervals(part) if glides else ():
+        for mode, from_s, to_s in find_mode_intervals(part):
             state = part.states[int(np.searchsorted(part.t_s, from_s))]
             alarm = find_alarm(
                 session=log.scenario.name,
@@ -186,12 +202,9 @@ def list_alarms(log: Log) -> list[RaisedAlarm]:
                 mem=state.mem,
                 shared=len(state.q_des),
             )
-            if alarm is not None:
-                orderer = orderers.get((site, state.tick), "")
-                reason = f"ordered by {orderer}" if orderer else alarm.reason
-                found.append(
-                    RaisedAlarm(
-                        site=site, word=alarm.word, reason=reason, from_s=from_s, to_s=to_s
-                    )
-                )
-    return sorted(found, key=lambda one: one.from_s)
+            if alarm is None:
+                continue
+            orderer = orderers.get((site, state.tick), "")
+            reason = f"ordered by {orderer}" if orderer else alarm.reason
+            raised.append(RaisedAlarm(site, alarm.word, reason, from_s=from_s, to_s=to_s))
+    return sorted(raised, key=lambda alarm: alarm.from_s)

@@ -1,10 +1,13 @@
-"""Torque on an arm by its sources, operator and environment models, over all rows of a log at
-once.
+"""Splits the torque on an arm by its sources, and evaluates operator and environment models.
 
-Invariant: written from the definitions of the scenario, independently of the core; the tests
-compare the two. Torques act ON the arm. A torque that the scenario does not explain is the
-operator's: the record's torque less the environment's. An operator has a script only if its
-torque matches the scenario.
+All functions work over all rows of a log at once. Torques act ON the arm.
+
+Invariant:
+    - Everything is written from the definitions of the scenario, independently of the core; the
+      tests compare the two.
+    - A torque that the scenario does not explain is the operator's: the recorded torque less
+      the environment's.
+    - An operator has a script only if its torque matches the scenario.
 """
 
 from collections.abc import Iterable
@@ -17,125 +20,178 @@ from ..core.vectors import Array
 from ..log.log_reader import Log
 from ..scenario import Scenario, SiteSpec
 from ..scenario.operators import ActorBase
-from .aligned import AlignedRecords, align_records
+from .aligned import AlignedRecords, Bools, align_records
 from .arm_rows import EndEffectorRows, build_arm_rows
 
 SCRIPT_TORQUE_TOLERANCE = 1e-8
-"""Relative difference up to which a torque is the scenario's."""
+"""Relative difference up to which a torque matches that of the scenario."""
 
 
 def list_walls(spec: SiteSpec) -> list[TorqueSource]:
     """Returns the walls of a site, in scenario order."""
-    return [one.actor for one in spec.environment if one.actor.kind is TorqueKind.WALL]
+    actors = [source.actor for source in spec.environment]
+    return [actor for actor in actors if actor.acts is TorqueKind.WALL]
 
 
 def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
-    """Returns the depth of an end effector in a wall, shape (K,), m; negative outside of it."""
-    found: Array = (np.array(wall.a) - end_effector.position) @ np.array(wall.b)
-    return found
+    """Returns the depth of an end effector in a wall, shape (K,), m; negative outside."""
+    depth: Array = (np.array(wall.a) - end_effector.position) @ np.array(wall.b)
+    return depth
 
 
 def wall_force(wall: TorqueSource, t_s: Array, end_effector: EndEffectorRows) -> Array:
     """Returns the force of a wall along its normal, shape (K,), N: it pushes, and never pulls.
 
-    max(K depth - B outward speed, 0) inside of it, 0 outside, and before its start and after
-    its end.
+    The force is max(K depth - B outward speed, 0) inside the wall, and 0 outside, before the
+    wall's start and after its end.
+
+    Args:
+        wall: the wall.
+        t_s: times, shape (K,), s.
+        end_effector: motion of the end effector.
     """
     depth = wall_depth(wall, end_effector)
-    push = np.maximum(
-        wall.K[0] * depth - wall.B[0] * (end_effector.speed @ np.array(wall.b)), 0.0
-    )
-    there = (t_s >= wall.start_s) & (t_s < wall.end_s) & (depth > 0.0)
-    return np.where(there, push, 0.0)
+    outward_speed = end_effector.speed @ np.array(wall.b)
+    push = np.maximum(wall.K[0] * depth - wall.B[0] * outward_speed, 0.0)
+    is_inside = _is_active(wall, t_s) & (depth > 0.0)
+    return np.where(is_inside, push, 0.0)
+
+
+def _is_active(source: TorqueSource, t_s: Array) -> Bools:
+    """Returns the times between start and end of a source, shape (K,)."""
+    active: Bools = (t_s >= source.start_s) & (t_s < source.end_s)
+    return active
 
 
 def compute_target_motion(source: TorqueSource, t_s: Array) -> tuple[Array, Array]:
-    """Returns the target of a spring, which moves from a to b with minimum jerk, and its
-    velocity, (K, n).
+    """Returns the target of a spring and its velocity, shape (K, n) each.
+
+    The target moves from a to b with minimum jerk.
+
+    Args:
+        source: the spring.
+        t_s: times, shape (K,), s.
     """
     span_s = source.move_end_s - source.move_start_s
-    x = (t_s > source.move_start_s).astype(np.float64)
-    per_s = 0.0
+    progress = (t_s > source.move_start_s).astype(np.float64)
+    progress_rate = 0.0
     if span_s > 0.0:
-        x = np.clip((t_s - source.move_start_s) / span_s, 0.0, 1.0)
-        per_s = 1.0 / span_s
-    a = np.array(source.a)
-    way = np.array(source.b) - np.array(source.a)
-    x = x[:, None]
-    return a + x**3 * (10.0 + x * (6.0 * x - 15.0)) * way, 30.0 * x**2 * (
-        1.0 - x
-    ) ** 2 * per_s * way
+        progress = np.clip((t_s - source.move_start_s) / span_s, 0.0, 1.0)
+        progress_rate = 1.0 / span_s
+    start = np.array(source.a)
+    distance = np.array(source.b) - start
+    x = progress[:, None]
+    # minimum jerk: 10 x^3 - 15 x^4 + 6 x^5, and its derivative 30 x^2 (1 - x)^2
+    position = start + x**3 * (10.0 + x * (6.0 * x - 15.0)) * distance
+    velocity = 30.0 * x**2 * (1.0 - x) ** 2 * progress_rate * distance
+    return position, velocity
 
 
-def compute_spring_effort(source: TorqueSource, t_s: Array, at: Array, speed: Array) -> Array:
-    """Returns K (target - at) + B (its velocity - speed), per joint or axis, shape (K, n)."""
+def compute_spring_effort(
+    source: TorqueSource, t_s: Array, position: Array, speed: Array
+) -> Array:
+    """Returns K (target - position) + B (target velocity - speed), shape (K, n).
+
+    Args:
+        source: a spring with a damper.
+        t_s: times, shape (K,), s.
+        position: joint angles, or position of the end effector, shape (K, n).
+        speed: their velocities, shape (K, n).
+    """
     target, velocity = compute_target_motion(source, t_s)
-    found: Array = np.array(source.K) * (target - at) + np.array(source.B) * (velocity - speed)
-    return found
+    stiffness = np.array(source.K)
+    damping = np.array(source.B)
+    effort: Array = stiffness * (target - position) + damping * (velocity - speed)
+    return effort
+
+
+def _map_to_joints(J: Array, force: Array) -> Array:
+    """Returns the joint torque J'f of a force f at the end effector, shape (K, n), N m."""
+    torque: Array = np.einsum("kij,ki->kj", J, force)
+    return torque
 
 
 def compute_source_torque(
     source: TorqueSource, t_s: Array, q: Array, qd: Array, end_effector: EndEffectorRows
 ) -> Array:
-    """Returns the torque of a spring, a damper, a wall or an own kind ON the arm, shape (K, n),
-    N m.
+    """Returns the torque of a spring, damper, wall or own kind ON the arm, shape (K, n), N m.
+
+    Args:
+        source: the source.
+        t_s: times, shape (K,), s.
+        q: joint angles, shape (K, n), rad.
+        qd: joint velocities, shape (K, n), rad/s.
+        end_effector: motion of the end effector.
 
     Raises:
-        ValueError: it is another source: a scripted torque is no function of the state.
+        ValueError: the source is scripted, and therefore no function of the state.
     """
-    if source.kind is TorqueKind.WALL:
+    kind = source.acts
+    position = end_effector.position
+    speed = end_effector.speed
+    J = end_effector.J
+    if kind is TorqueKind.WALL:
         force = wall_force(source, t_s, end_effector)[:, None] * np.array(source.b)
-        pushed = np.einsum("kij,ki->kj", end_effector.J, force)
-    elif source.kind is TorqueKind.VISCOUS:
-        pushed = -np.array(source.B) * qd
-    elif source.kind is TorqueKind.HAND:
-        pushed = compute_spring_effort(source, t_s, q, qd)
-    elif source.kind is TorqueKind.TASK_HAND:
-        effort = compute_spring_effort(source, t_s, end_effector.position, end_effector.speed)
-        pushed = np.einsum("kij,ki->kj", end_effector.J, effort)
-    elif source.kind is TorqueKind.OWN_JOINTS:
-        pushed = source.model.effort(t_s, q, qd)
-    elif source.kind is TorqueKind.OWN_TIP:
-        effort = source.model.effort(t_s, end_effector.position, end_effector.speed)
-        pushed = np.einsum("kij,ki->kj", end_effector.J, effort)
+        torque = _map_to_joints(J, force)
+    elif kind is TorqueKind.VISCOUS:
+        torque = -np.array(source.B) * qd
+    elif kind is TorqueKind.HAND:
+        torque = compute_spring_effort(source, t_s, q, qd)
+    elif kind is TorqueKind.TASK_HAND:
+        torque = _map_to_joints(J, compute_spring_effort(source, t_s, position, speed))
+    elif kind is TorqueKind.OWN_JOINTS:
+        torque = source.model.effort(t_s, q, qd)
+    elif kind is TorqueKind.OWN_TIP:
+        torque = _map_to_joints(J, source.model.effort(t_s, position, speed))
     else:
-        raise ValueError(f"{source.kind.name} is no function of the state")
-    there = (t_s >= source.start_s) & (t_s < source.end_s)
-    return np.where(there[:, None], pushed, 0.0)
+        raise ValueError(f"{kind.name} is no function of the state")
+    return np.where(_is_active(source, t_s)[:, None], torque, 0.0)
 
 
 def compute_live_torque(
     source: TorqueSource, hand: Array, q: Array, qd: Array, end_effector: EndEffectorRows
 ) -> Array:
-    """Returns the torque of a live hand ON the arm, shape (K, n), N m, by the `hand` of its
-    records.
+    """Returns the torque of a live hand ON the arm, shape (K, n), N m.
+
+    Args:
+        source: the live hand.
+        hand: its recorded action, see `HandInForce`, shape (K, h): its share, two further
+            values, its target and the target's velocity.
+        q: joint angles, shape (K, n), rad.
+        qd: joint velocities, shape (K, n), rad/s.
+        end_effector: motion of the end effector.
     """
     size = (hand.shape[1] - 3) // 2
+    share = hand[:, 0]
     target = hand[:, 3 : 3 + size]
-    rate = hand[:, 3 + size :]
-    at_joints = source.kind is TorqueKind.LIVE_JOINT
-    at, speed = (q, qd) if at_joints else (end_effector.position, end_effector.speed)
-    pull = target
-    if source.kind is not TorqueKind.LIVE_FORCE:
-        pull = np.array(source.K) * (target - at) + np.array(source.B) * (rate - speed)
+    target_rate = hand[:, 3 + size :]
+    acts_on_joints = source.acts is TorqueKind.LIVE_JOINT
+    position = q if acts_on_joints else end_effector.position
+    speed = qd if acts_on_joints else end_effector.speed
+    if source.acts is TorqueKind.LIVE_FORCE:
+        pull = target
+    else:
+        stiffness = np.array(source.K)
+        damping = np.array(source.B)
+        pull = stiffness * (target - position) + damping * (target_rate - speed)
     norm = np.linalg.norm(pull, axis=1)
-    share = hand[:, 0] * np.where(
-        norm > source.limit, source.limit / np.maximum(norm, source.limit), 1.0
-    )
-    effort: Array = share[:, None] * pull
-    return effort if at_joints else np.einsum("kij,ki->kj", end_effector.J, effort)
+    limited_share = source.limit / np.maximum(norm, source.limit)
+    scale = share * np.where(norm > source.limit, limited_share, 1.0)
+    effort: Array = scale[:, None] * pull
+    return effort if acts_on_joints else _map_to_joints(end_effector.J, effort)
 
 
 class TorqueSplit(NamedTuple):
-    """The torque ON an arm over its rows, shape (K, n) each, N m; its stops are part of the
-    arm.
+    """The torque ON an arm by its sources, without the arm's stops, shape (K, n) each, N m.
 
     Attributes:
-        end_effector: its position, speed and Jacobian. operator_now, operator_held: of the
-        operator: a function of the present, and computed once a tick. environment_now,
-        environment_held: the same of the environment.
-        script: the operator's intention, see `compute_operator_script`; None if not asked for,
-            or if its torque does not match the scenario.
+        end_effector: motion of the end effector.
+        operator_now: the operator's torque that follows the state.
+        operator_held: the operator's torque that is computed once a tick and held.
+        environment_now: the environment's torque that follows the state.
+        environment_held: the environment's torque that is held.
+        script: the operator's intention, see `compute_operator_script`; None if not requested,
+            or if the operator's torque does not match the scenario.
     """
 
     end_effector: EndEffectorRows
@@ -147,29 +203,32 @@ class TorqueSplit(NamedTuple):
 
     @property
     def operator(self) -> Array:
-        """Of the operator in all, shape (K, n), N m."""
+        """The operator's whole torque, shape (K, n), N m."""
         return self.operator_now + self.operator_held
 
     @property
     def environment(self) -> Array:
-        """Of the environment in all, shape (K, n), N m."""
+        """The environment's whole torque, shape (K, n), N m."""
         return self.environment_now + self.environment_held
 
 
 def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
-    """Returns the torque on a site's arm by its sources, held and not; without the script."""
+    """Returns the torque on a site's arm by its sources, without the operator's script."""
     spec = scenario.sites[records.site]
     t_s = records.nominal_s
-    end_effector = build_arm_rows(scenario, records.site).place_end_effector(
-        records.q, records.qd
-    )
+    arm = build_arm_rows(scenario, records.site)
+    end_effector = arm.place_end_effector(records.q, records.qd)
 
-    def add(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
+    def add_torques(sources: Iterable[ActorBase], *, sampled: bool) -> Array:
+        """Returns the sum of the torques of sources that are held, or that follow the state."""
         total = np.zeros_like(records.q)
-        for source in (one.actor for one in sources if one.actor.sampled is sampled):
-            if source.kind in LIVE_KINDS:
+        for source in sources:
+            actor = source.actor
+            if actor.sampled is not sampled:
+                continue
+            if actor.acts in LIVE_KINDS:
                 torque = compute_live_torque(
-                    source=source,
+                    source=actor,
                     hand=records.hand,
                     q=records.q,
                     qd=records.qd,
@@ -177,7 +236,7 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
                 )
             else:
                 torque = compute_source_torque(
-                    source=source,
+                    source=actor,
                     t_s=t_s,
                     q=records.q,
                     qd=records.qd,
@@ -186,87 +245,97 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
             total = total + torque
         return total
 
-    now = add(spec.environment, sampled=False)
-    held = add(spec.environment, sampled=True)
-    operator_held = add(spec.hands, sampled=True)
-    operator_now = -records.tau_x - now - held - operator_held
+    environment_now = add_torques(spec.environment, sampled=False)
+    environment_held = add_torques(spec.environment, sampled=True)
+    operator_held = add_torques(spec.hands, sampled=True)
     return TorqueSplit(
         end_effector=end_effector,
-        operator_now=operator_now,
+        operator_now=-records.tau_x - environment_now - environment_held - operator_held,
         operator_held=operator_held,
-        environment_now=now,
-        environment_held=held,
+        environment_now=environment_now,
+        environment_held=environment_held,
     )
 
 
 def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array:
-    """Returns the intention of an operator, which does not depend on the arm's motion, shape
-    (K, n), N m.
+    """Returns the intention of an operator, shape (K, n), N m.
 
-    A scripted torque itself (pulse, recorded, chirp, multisine); of a spring K times the
-    displacement of its target and B times the target's speed, of one of the end effector by the
-    Jacobian J of one pose, shape (2, 2) or (3, n); of an own kind what it does to an arm at
-    zero, at rest. It moves if and only if the operator does.
+    The intention does not depend on the arm's motion, and changes if and only if the operator
+    moves. It is
+
+    - of a scripted torque (pulse, recorded, chirp, multisine) the torque itself;
+    - of a spring, K times the displacement of its target plus B times the target's speed; if it
+      acts at the end effector, mapped to joints by the Jacobian J of one pose;
+    - of an own kind, its effort on an arm at zero, at rest.
+
+    Args:
+        source: the operator.
+        t_s: times, shape (K,), s.
+        J: Jacobian of one pose, shape (2, 2) or (3, n).
     """
-    if source.kind is TorqueKind.PULSE:
-        x = np.clip((t_s - source.start_s) / (source.end_s - source.start_s), 0.0, 1.0)
+    kind = source.acts
+    since_start_s = t_s - source.start_s
+    if kind is TorqueKind.PULSE:
+        x = np.clip(since_start_s / (source.end_s - source.start_s), 0.0, 1.0)
         intent = np.sin(np.pi * x)[:, None] ** 2 * np.array(source.a)
-    elif source.kind is TorqueKind.RECORDED and source.table is not None:
-        at_s = source.table[:, 0]
-        rows = source.table[:, 1:]
-        columns = [np.interp(t_s, at_s, column, left=0.0, right=0.0) for column in rows.T]
+    elif kind is TorqueKind.RECORDED and source.table is not None:
+        table_s = source.table[:, 0]
+        torques = source.table[:, 1:].T
+        columns = [np.interp(t_s, table_s, torque, left=0.0, right=0.0) for torque in torques]
         intent = np.stack(columns, axis=1)
-    elif source.kind is TorqueKind.CHIRP:
+    elif kind is TorqueKind.CHIRP:
         span_s = source.move_end_s - source.move_start_s
-        (first_hz, last_hz) = source.b
-        x = np.mod(t_s - source.start_s, span_s)
+        first_hz, last_hz = source.b
+        x = np.mod(since_start_s, span_s)
         turns = first_hz * x + (last_hz - first_hz) * x**2 / (2.0 * span_s)
         intent = np.sin(2.0 * np.pi * turns)[:, None] * np.array(source.a)
-    elif source.kind is TorqueKind.MULTISINE and source.table is not None:
-        turns = np.outer(t_s - source.start_s, source.table[:, 0]) + source.table[:, 1]
+    elif kind is TorqueKind.MULTISINE and source.table is not None:
+        frequencies_hz = source.table[:, 0]
+        phases = source.table[:, 1]
+        turns = np.outer(since_start_s, frequencies_hz) + phases
         intent = np.sin(2.0 * np.pi * turns).sum(axis=1)[:, None] * np.array(source.a)
-    elif source.kind in OWN_KINDS:
-        at_tip = source.kind is TorqueKind.OWN_TIP
-        origin = np.zeros((len(t_s), J.shape[0 if at_tip else 1]))
-        pull = source.model.effort(t_s, origin, origin)
-        intent = pull @ J if at_tip else pull
+    elif kind in OWN_KINDS:
+        acts_at_tip = kind is TorqueKind.OWN_TIP
+        origin = np.zeros((len(t_s), J.shape[0 if acts_at_tip else 1]))
+        effort = source.model.effort(t_s, origin, origin)
+        intent = effort @ J if acts_at_tip else effort
     else:
         origin = np.zeros((len(t_s), len(source.a)))
-        pull = compute_spring_effort(source, t_s, origin, origin)
-        intent = pull @ J if source.kind is TorqueKind.TASK_HAND else pull
-    acting = (t_s >= source.start_s) & (t_s < source.end_s)
-    return np.where(acting[:, None], intent, 0.0)
+        effort = compute_spring_effort(source, t_s, origin, origin)
+        intent = effort @ J if kind is TorqueKind.TASK_HAND else effort
+    return np.where(_is_active(source, t_s)[:, None], intent, 0.0)
 
 
 def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
     """Returns the torque on a site's arm by its sources, with the operator's script.
 
-    Without an operator in the scenario, the operator's torque is exactly zero where only
-    rounding is left.
+    If the scenario has no operator, the operator's torque is set to zero where only rounding
+    errors are left.
     """
     split = split_torque(records, scenario)
     t_s = records.nominal_s
     spec = scenario.sites[records.site]
     expected = np.zeros_like(records.q)
-    scripts = np.zeros_like(records.q)
-    for source in (one.actor for one in spec.hands):
-        if source.kind in LIVE_KINDS:
-            at_start = np.broadcast_to(records.q[0], records.q.shape)
-            still = build_arm_rows(scenario, records.site).place_end_effector(
-                at_start, 0.0 * at_start
-            )
-            scripts = scripts + compute_live_torque(
+    script = np.zeros_like(records.q)
+    for hand in spec.hands:
+        source = hand.actor
+        if source.acts in LIVE_KINDS:
+            # the intention of a live hand is its torque on an arm that rests in the first pose
+            first_q = np.broadcast_to(records.q[0], records.q.shape)
+            rest = 0.0 * first_q
+            arm = build_arm_rows(scenario, records.site)
+            script = script + compute_live_torque(
                 source=source,
                 hand=records.hand,
-                q=at_start,
-                qd=0.0 * at_start,
-                end_effector=still,
+                q=first_q,
+                qd=rest,
+                end_effector=arm.place_end_effector(first_q, rest),
             )
             continue
-        script = compute_operator_script(source, t_s, split.end_effector.J[0])
-        scripts = scripts + script
-        if source.kind in SCRIPTED_KINDS:
-            expected = expected + script
+        source_script = compute_operator_script(source, t_s, split.end_effector.J[0])
+        script = script + source_script
+        if source.acts in SCRIPTED_KINDS:
+            expected = expected + source_script
         elif not source.sampled:
             torque = compute_source_torque(
                 source=source,
@@ -279,28 +348,31 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
     tolerance = SCRIPT_TORQUE_TOLERANCE * (1.0 + np.abs(records.tau_x))
     matches = np.abs(split.operator_now - expected) <= tolerance
     if matches[records.known].all():
-        split = split._replace(script=scripts)
+        split = split._replace(script=script)
     if not spec.hands:
         split = split._replace(operator_now=np.where(matches, 0.0, split.operator_now))
     return split
 
 
 class WallEnergy(NamedTuple):
-    """The energy that a touched wall gave which is held over a tick h, and the damping that
-    would take it.
+    """Energy that a sampled wall generates in contact, and the damping needed to dissipate it.
 
-    It does the work F_k (x_{k+1} - x_k); with its spring's energy K x^2 / 2 booked it gives K
-    (x_{k+1} - x_k)^2 / 2 in every tick of a contact, less what its damping B takes. A damper b
-    of the arm itself takes all of it if b > K h / 2 + B: Colgate and Schenkel, "Passivity of a
-    class of sampled-data systems", J. Robotic Systems 14 (1997). That is sufficient, for a B on
-    the speed at the tick while that is straight within one (docs/certificate.md); whether the
-    loop is stable in contact is told by the map from tick to tick, `trilat linear`.
+    The wall's force F_k is held over a tick h, and does the work F_k (x_{k+1} - x_k). Together
+    with the energy K x^2 / 2 of its spring, it generates K (x_{k+1} - x_k)^2 / 2 in every tick
+    of a contact, less the energy that its damping B dissipates. A damper b of the arm itself
+    dissipates all of this energy if b > K h / 2 + B: Colgate and Schenkel, "Passivity of a
+    class of sampled-data systems", J. Robotic Systems 14 (1997).
+
+    The condition is sufficient, if B acts on the speed at the tick, and the motion is straight
+    within a tick (docs/certificate.md). Whether the loop is stable in contact follows from the
+    map from tick to tick, `trilat linear`.
 
     Attributes:
-        site: whose wall.
-        generated_j: the most that it gave in qd beyond what its spring had stored, J.
-        required_damping_n_s_m: K h / 2 + B, N s/m.
-        arm_damping_n_s_m: the arm's own damping b along the normal, the least in contact, N s/m.
+        site: site of the wall.
+        generated_j: largest energy that the wall supplied in qd beyond the energy that its
+            spring had stored.
+        required_damping_n_s_m: K h / 2 + B.
+        arm_damping_n_s_m: the arm's own damping b along the normal, the least during contact.
     """
 
     site: str
@@ -310,54 +382,75 @@ class WallEnergy(NamedTuple):
 
 
 def list_sampled_walls(spec: SiteSpec) -> list[TorqueSource]:
-    """Returns the walls of a site that are held over a tick, and that push back."""
+    """Returns the walls of a site whose force is held over a tick and depends on the depth."""
     return [wall for wall in list_walls(spec) if wall.sampled and any(wall.K)]
 
 
 def find_wall_energies(log: Log) -> list[WallEnergy]:
-    """Returns the sampled walls that were touched, in scenario order."""
-    found = []
+    """Returns the energies of all sampled walls that were touched, in scenario order."""
+    energies = []
     for site, records in align_records(log).items():
         spec = log.scenario.sites[site]
-        end_effector = build_arm_rows(log.scenario, site).place_end_effector(
-            records.q, records.qd
-        )
+        arm = build_arm_rows(log.scenario, site)
+        end_effector = arm.place_end_effector(records.q, records.qd)
         for wall in list_sampled_walls(spec):
             force = wall_force(wall, records.nominal_s, end_effector)
             touched = force > 0.0
-            if touched.any():
-                needed = 0.5 * wall.K[0] * records.h_s + wall.B[0]
-                gave = _find_given_energy(wall, records, end_effector, force)
-                own = _find_own_damping(
-                    spec, wall, end_effector.J[touched], records.nominal_s[touched]
+            if not touched.any():
+                continue
+            arm_damping = _find_arm_damping(
+                spec, wall, end_effector.J[touched], records.nominal_s[touched]
+            )
+            energies.append(
+                WallEnergy(
+                    site=site,
+                    generated_j=_find_generated_energy(wall, records, end_effector, force),
+                    required_damping_n_s_m=0.5 * wall.K[0] * records.h_s + wall.B[0],
+                    arm_damping_n_s_m=arm_damping,
                 )
-                found.append(WallEnergy(site, gave, needed, own))
-    return found
+            )
+    return energies
 
 
-def _find_given_energy(
+def _find_generated_energy(
     wall: TorqueSource, records: AlignedRecords, end_effector: EndEffectorRows, force: Array
 ) -> float:
-    """Returns the largest rise of the wall's work on the arm with its spring's energy added, J."""
-    torque = np.einsum("kij,ki->kj", end_effector.J, force[:, None] * np.array(wall.b))
-    work = (torque[:-1] * np.diff(records.q, axis=0)).sum(axis=1)
-    spring = 0.5 * wall.K[0] * np.where(force > 0.0, wall_depth(wall, end_effector), 0.0) ** 2
-    change = np.where(records.known_periods, work + np.diff(spring), 0.0)
-    given = np.concatenate([[0.0], np.cumsum(change)])
-    return float((given - np.minimum.accumulate(given)).max())
+    """Returns the largest rise of the wall's work plus its spring's energy, in J.
 
-
-def _find_own_damping(spec: SiteSpec, wall: TorqueSource, J: Array, t_s: Array) -> float:
-    """Returns the least of 1 / (n'J D^-1 J'n), D the damping of joints that acts continuously,
-    N s/m.
-
-    J and t_s are of the rows in contact; what does not act at all of them is no damping.
+    Args:
+        wall: the wall.
+        records: records of its site.
+        end_effector: motion of the end effector.
+        force: force of the wall along its normal, shape (K,), N.
     """
-    actors = [one.actor for one in spec.environment]
-    lasting = [one for one in actors if one.start_s <= t_s[0] and one.end_s > t_s[-1]]
-    viscous = [one.B for one in lasting if one.kind is TorqueKind.VISCOUS and not one.sampled]
+    torque = _map_to_joints(end_effector.J, force[:, None] * np.array(wall.b))
+    work = (torque[:-1] * np.diff(records.q, axis=0)).sum(axis=1)
+    depth = np.where(force > 0.0, wall_depth(wall, end_effector), 0.0)
+    stored = 0.5 * wall.K[0] * depth**2
+    change = np.where(records.known_periods, work + np.diff(stored), 0.0)
+    supplied = np.concatenate([[0.0], np.cumsum(change)])
+    return float((supplied - np.minimum.accumulate(supplied)).max())
+
+
+def _find_arm_damping(spec: SiteSpec, wall: TorqueSource, J: Array, t_s: Array) -> float:
+    """Returns the arm's own least damping along a wall's normal n in contact, in N s/m.
+
+    It is 1 / (n'J D^-1 J'n), with D the damping of joints that acts continuously.
+
+    Args:
+        spec: site of the wall.
+        wall: the wall.
+        J: Jacobian of the rows in contact, shape (K, m, n).
+        t_s: times of the rows in contact, shape (K,), s.
+    """
+    actors = [source.actor for source in spec.environment]
+    # a damper that does not act in all of these rows does not count
+    lasting = [actor for actor in actors if actor.start_s <= t_s[0] and actor.end_s > t_s[-1]]
+    viscous = [
+        actor.B for actor in lasting if actor.acts is TorqueKind.VISCOUS and not actor.sampled
+    ]
     D = np.sum(viscous, axis=0) if viscous else np.zeros(J.shape[2])
-    arms = np.einsum("kij,i->kj", J, np.array(wall.b)) ** 2
+    squared_arms = np.einsum("kij,i->kj", J, np.array(wall.b)) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        compliance = np.where(arms > 0.0, arms / D, 0.0).sum(axis=1)
+        compliance = np.where(squared_arms > 0.0, squared_arms / D, 0.0).sum(axis=1)
         return float((1.0 / compliance).min())

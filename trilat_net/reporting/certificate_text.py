@@ -61,7 +61,7 @@ def compose_twins(found: PushedTwins) -> Iterator[Block]:
     if found.linear is not None or not found.growth.pushes:
         yield found.headline()
     yield from map(found.describe, found.growth.pushes)
-    if not found.growth.same:
+    if not found.growth.same_platform:
         yield "note: executed again, its last bits are not those of the records: another platform, or version"
 
 

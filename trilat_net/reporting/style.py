@@ -457,7 +457,7 @@ class TimeFigure:
             self.figure, entries, **({"title": title, "title_fontsize": 8.0} if title else {})
         )
         marked = [(n, c) for n, c in self._changes if c.change.link or not links]
-        words = [f"{n}: {c.about} {c.text}" for n, c in marked[:MOST_EXPLAINED_CHANGES]]
+        words = [f"{n}: {c.subject} {c.text}" for n, c in marked[:MOST_EXPLAINED_CHANGES]]
         if len(marked) > MOST_EXPLAINED_CHANGES:
             words.append(f"and {len(marked) - MOST_EXPLAINED_CHANGES} more")
         letters = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)

@@ -273,7 +273,7 @@ class SiteMotion:
         low, high = self.nearest_torques
         c = self.constants
         tau = self.records.tau
-        tolerance = 0.0
+        tolerance: Array | float = 0.0
         if np.any(np.isfinite(c.tau_rate)):
             tolerance = RATE_TOLERANCE * c.tau_limit
         limited: Bools = (tau <= low + tolerance) | (tau >= high - tolerance)

@@ -227,7 +227,7 @@ def estimate_impedances(view: RunView) -> list[ImpedanceEstimate]:
     runs = view.shared
     operators = [site for site, run in runs.items() if run.torque.operator.any()]
     environments = [site for site, run in runs.items() if run.torque.environment.any()]
-    estimates = []
+    estimates: list[ImpedanceEstimate] = []
     for site in operators:
         estimates += _estimate_joints(runs, site, "")
     for environment in environments:

@@ -110,7 +110,7 @@ def _find_resting_rows(run: SiteRun) -> Bools:
     """Returns the rows in which a site rests under constant shares and a constant script."""
     records = run.records
     slow = np.abs(records.qd).max(axis=1) < STATIC_SPEED_RAD_S
-    resting = records.follows & slow & ~run.dominance.rate.any(axis=1)
+    resting: Bools = records.follows & slow & ~run.dominance.rate.any(axis=1)
     script = run.torque.script
     if script is not None:  # without a script the variation of the torque decides
         moves = np.abs(np.diff(script, axis=0)).max(axis=1) > MOVING_SCRIPT_NM
