@@ -122,7 +122,7 @@ class AlignedRecords(NamedTuple):
     def e(self) -> Array:
         """Position error, Eq. (9), shape (K, n), rad; in task space (K, m), see `SiteLog.e`."""
         if self.x.size:
-            return find_task_errors(self.x, self.q_des, self.axes)
+            return compute_task_errors(self.x, self.q_des, self.axes)
         return self.q - self.q_des
 
     @property
@@ -333,7 +333,7 @@ class PeerTrajectory:
         vb = records.shared_rate[row + 1]
         # rotation vectors of different branches must not be interpolated
         if records.x.shape[1] == POSE:
-            qb[:, PLACE:] = bring_nearer(qb[:, PLACE:], qa[:, PLACE:])
+            qb[:, POSITION:] = choose_nearest_vectors(qb[:, POSITION:], qa[:, POSITION:])
         quadratic = 3 * (qb - qa) - h * (2 * va + vb)
         cubic = 2 * (qa - qb) + h * (va + vb)
         q = qa + x * (h * va + x * (quadratic + x * cubic))

@@ -154,7 +154,7 @@ def find_lost_peers(log: Log, site: str, t_s: Array) -> NDArray[np.bool_]:
     lost = np.zeros((len(t_s), peer_count), dtype=bool)
     if not log.scenario.sites[site].on_stale.rule.degrades or not len(part):
         return lost
-    first = part.layout.life_memory(peer_count)
+    first = part.layout.count_life_memory(peer_count)
     is_lost = part.memory(first, peer_count) != 0.0
     rows = np.searchsorted(part.t_s, t_s + RAMP_TIME_TOLERANCE_S, side="right") - 1
     recorded = rows >= 0

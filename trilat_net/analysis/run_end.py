@@ -724,7 +724,7 @@ def find_last_operator_action(scenario: Scenario, span_s: float) -> float:
         J = build_arm_rows(scenario, site).place_end_effector(start, 0.0 * start).J[0]
         for hand in spec.hands:
             source = hand.actor
-            if source.acts in LIVE_KINDS:
+            if source.kind in LIVE_KINDS:
                 continue
             source_J = np.eye(len(source.a)) if source.a else J
             script = compute_operator_script(source, t_s, source_J)

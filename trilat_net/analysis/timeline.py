@@ -185,7 +185,7 @@ class RaisedAlarm(NamedTuple):
 def list_alarms(log: Log) -> list[RaisedAlarm]:
     """Returns the alarms of all sites, in order; that of a stop names whoever ordered it."""
     orderers = {
-        (entry.site, entry.taken_at_tick): find_orderer(entry.sentence)
+        (entry.site, entry.taken_at_tick): find_requester(entry.sentence)
         for entry in list_changes(log)
     }
     raised = []

@@ -126,7 +126,7 @@ def compute_source_torque(
     Raises:
         ValueError: the source is scripted, and therefore no function of the state.
     """
-    kind = source.acts
+    kind = source.kind
     position = end_effector.position
     speed = end_effector.speed
     J = end_effector.J
@@ -165,10 +165,10 @@ def compute_live_torque(
     share = hand[:, 0]
     target = hand[:, 3 : 3 + size]
     target_rate = hand[:, 3 + size :]
-    acts_on_joints = source.acts is TorqueKind.LIVE_JOINT
+    acts_on_joints = source.kind is TorqueKind.LIVE_JOINT
     position = q if acts_on_joints else end_effector.position
     speed = qd if acts_on_joints else end_effector.speed
-    if source.acts is TorqueKind.LIVE_FORCE:
+    if source.kind is TorqueKind.LIVE_FORCE:
         pull = target
     else:
         stiffness = np.array(source.K)
@@ -273,7 +273,7 @@ def compute_operator_script(source: TorqueSource, t_s: Array, J: Array) -> Array
         t_s: times, shape (K,), s.
         J: Jacobian of one pose, shape (2, 2) or (3, n).
     """
-    kind = source.acts
+    kind = source.kind
     since_start_s = t_s - source.start_s
     if kind is TorqueKind.PULSE:
         x = np.clip(since_start_s / (source.end_s - source.start_s), 0.0, 1.0)
@@ -319,7 +319,7 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
     script = np.zeros_like(records.q)
     for hand in spec.hands:
         source = hand.actor
-        if source.acts in LIVE_KINDS:
+        if source.kind in LIVE_KINDS:
             # the intention of a live hand is its torque on an arm that rests in the first pose
             first_q = np.broadcast_to(records.q[0], records.q.shape)
             rest = 0.0 * first_q
@@ -334,7 +334,7 @@ def attribute_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit
             continue
         source_script = compute_operator_script(source, t_s, split.end_effector.J[0])
         script = script + source_script
-        if source.acts in SCRIPTED_KINDS:
+        if source.kind in SCRIPTED_KINDS:
             expected = expected + source_script
         elif not source.sampled:
             torque = compute_source_torque(

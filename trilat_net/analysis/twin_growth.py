@@ -685,10 +685,11 @@ def twin(
         target, _ = next(iter(targets), ("q", 0.0))
         sizes = _parse_sizes(delta)
         pushes = [
-            aim_push(scenario, target, size, at_s)._replace(largest=math.inf) for size in sizes
+            parse_push(scenario, target, size, at_s)._replace(largest=math.inf)
+            for size in sizes
         ]
     elif targets:
-        pushes = [aim_push(scenario, target, size, at_s) for target, size in targets]
+        pushes = [parse_push(scenario, target, size, at_s) for target, size in targets]
     else:
         pushes = [
             default._replace(at_s=at_s, again=False)

@@ -105,7 +105,8 @@ def test_a_damper_of_qd_may_give_energy_to_r() -> None:
 
 
 @pytest.mark.parametrize(
-    ("apart_rad", "says"), [(0.5, "the walls supplied up to"), (1e-8, "the walls only absorbed energy")]
+    ("apart_rad", "says"),
+    [(0.5, "the walls supplied up to"), (1e-8, "the walls only absorbed energy")],
 )
 def test_what_rounding_gives_is_not_given(apart_rad: float, says: str) -> None:
     """A damper of a motion of 1e-8 rad gives some 1e-17 J to r, of a V of known arms that is hardly more."""

@@ -48,10 +48,7 @@ def test_a_law_without_a_functional_is_judged_by_growth_alone(
     }
     found = certify(trilat_net.simulate(load_scenario("free", law)))
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
-    assert (
-        found.verdict.text
-        == "V cannot be judged: m1, m2, s: law p_d has no functional V"
-    )
+    assert found.verdict.text == "V cannot be judged: m1, m2, s: law p_d has no functional V"
     assert found.end.behaviour is motion
     assert found.passed is passed
 
@@ -90,10 +87,7 @@ def test_an_external_arm_is_judged_where_theta_explains_its_motion() -> None:
     change = lambda s: logs.replaced(s, qd=[1.1 * x for x in s.qd]) if s.site == "s" else s  # noqa: E731
     found = certify(outside(logs.rewritten(still_free(), change=change), known=True))
     assert found.verdict.finding is StabilityFinding.NOT_JUDGED
-    assert (
-        "the external arm of s does not move as its theta says"
-        in found.verdict.text
-    )
+    assert "the external arm of s does not move as its theta says" in found.verdict.text
 
 
 def test_records_with_none_beside_them_are_no_period() -> None:
