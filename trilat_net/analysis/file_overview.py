@@ -201,10 +201,10 @@ def _count_gaps(
     account = Account()
     rate_hz = rates_hz[key.member]
     for tick in sequence:
-        account.take(number_message(key.channel, tick, rate_hz))
+        account.receive(number_message(key.channel, tick, rate_hz))
     # ticks that the site skipped are not missing
     for first, last in absences.get(key.member, ()):
-        account.begin_anew(
+        account.mark_unpublished(
             count_messages(key.channel, last + 1, rate_hz),
             count_messages(key.channel, first, rate_hz),
         )

@@ -360,7 +360,7 @@ class LinkSummary(NamedTuple):
 def has_one_constant_delay(states: list[StatedModel]) -> bool:
     """True if a link's models give every sample the same delay, and lose no sample."""
     link = states[0].link
-    is_constant = link.core().kind == DelayKind.CONSTANT
+    is_constant = link.to_core_model().kind == DelayKind.CONSTANT
     is_lossless = not (link.loss or link.duplicate or link.outages_s)
     return is_constant and is_lossless and len(states) == 1
 

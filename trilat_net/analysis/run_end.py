@@ -611,9 +611,9 @@ def _find_disagreement(
     """
     for group in find_coupled_sites(scenario):
         names = [scenario.names[n] for n in group]
-        compares_places = any(scenario.sites[name].control.compares_places for name in names)
+        compares_positions = any(scenario.sites[name].control.compares_positions for name in names)
         shares_pose = any(scenario.arms[name].shares_pose for name in names)
-        if len(group) < 2 or compares_places or shares_pose:
+        if len(group) < 2 or compares_positions or shares_pose:
             continue  # e itself shows whether the sites agree
         q = np.array([columns[n][:, 2] for n in group])
         distance = np.ptp(q, axis=0)
@@ -659,9 +659,9 @@ def _find_held_sites(
         for source in sources:
             actor = source.actor
             stiffness = actor.K
-            if actor.acts == TorqueKind.HAND:
+            if actor.kind == TorqueKind.HAND:
                 stiffness = actor.K[joint : joint + 1]
-            is_stiff = any(stiffness) or actor.acts in OWN_KINDS
+            is_stiff = any(stiffness) or actor.kind in OWN_KINDS
             held[n] |= actor.start_s <= end_s < actor.end_s and is_stiff
     return held
 

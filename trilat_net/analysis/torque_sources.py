@@ -30,7 +30,7 @@ SCRIPT_TORQUE_TOLERANCE = 1e-8
 def list_walls(spec: SiteSpec) -> list[TorqueSource]:
     """Returns the walls of a site, in scenario order."""
     actors = [source.actor for source in spec.environment]
-    return [actor for actor in actors if actor.acts is TorqueKind.WALL]
+    return [actor for actor in actors if actor.kind is TorqueKind.WALL]
 
 
 def wall_depth(wall: TorqueSource, end_effector: EndEffectorRows) -> Array:
@@ -226,7 +226,7 @@ def split_torque(records: AlignedRecords, scenario: Scenario) -> TorqueSplit:
             actor = source.actor
             if actor.sampled is not sampled:
                 continue
-            if actor.acts in LIVE_KINDS:
+            if actor.kind in LIVE_KINDS:
                 torque = compute_live_torque(
                     source=actor,
                     hand=records.hand,
@@ -447,7 +447,7 @@ def _find_arm_damping(spec: SiteSpec, wall: TorqueSource, J: Array, t_s: Array) 
     # a damper that does not act in all of these rows does not count
     lasting = [actor for actor in actors if actor.start_s <= t_s[0] and actor.end_s > t_s[-1]]
     viscous = [
-        actor.B for actor in lasting if actor.acts is TorqueKind.VISCOUS and not actor.sampled
+        actor.B for actor in lasting if actor.kind is TorqueKind.VISCOUS and not actor.sampled
     ]
     D = np.sum(viscous, axis=0) if viscous else np.zeros(J.shape[2])
     squared_arms = np.einsum("kij,i->kj", J, np.array(wall.b)) ** 2

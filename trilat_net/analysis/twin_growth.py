@@ -757,7 +757,7 @@ def _find_linear_sizes(
             if grows and deviation[row] < 0.0:
                 outcome = "saturates"
             kinds = {
-                environment.actor.acts
+                environment.actor.kind
                 for site in scenario.sites.values()
                 for environment in site.environment
             }

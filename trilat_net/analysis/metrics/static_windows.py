@@ -398,7 +398,7 @@ def _rank_as_holder(scenario: Scenario, site: str, t_s: float) -> tuple[bool, bo
     """
     spec = scenario.sites[site]
     spring_kinds = (TorqueKind.HAND, TorqueKind.TASK_HAND)
-    springs = [hand.actor for hand in spec.hands if hand.actor.acts in spring_kinds]
+    springs = [hand.actor for hand in spec.hands if hand.actor.kind in spring_kinds]
     is_held = any(spring.start_s <= t_s < spring.end_s for spring in springs)
     return is_held and not spec.environment, spec.role == "master"
 
