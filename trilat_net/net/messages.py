@@ -1,8 +1,11 @@
-"""The logged and published messages of a session; the types are the schema.
+"""The messages that the members of a session publish, and that a log stores.
 
-Invariant: one definition validates a message, yields the JSON Schema that a log stores, and
-documents the format. Units stand in the field names or in the schema (`x-unit`); SI and radians
-throughout.
+The types define the schema. A log stores their JSON Schema, which includes their docstrings.
+
+Invariant:
+    - One definition validates a message, yields the JSON Schema, and documents the format.
+    - The unit of a number is in its field name or in the schema (`x-unit`). All units are SI
+      units and radians.
 """
 
 import ast
@@ -19,32 +22,35 @@ from ..core.ticks import Mode
 from ..core.user_law import MAX_LAW_MEMORY
 
 VERSION = 4
-"""The version sent, and the only one accepted from others."""
+"""Version of the schema that is sent, and the only one accepted from other members."""
 READABLE = (1, 2, 3, 4)
-"""The versions read in files: all released ones."""
+"""Versions of the schema that are read in files: all released ones."""
 SENT_TIME_SINCE = 2
-"""First version whose records hold their sending time."""
+"""First version of the schema whose records contain their sending time."""
 
 U64 = Annotated[int, Meta(ge=0)]
 TickNumber = Annotated[int, Meta(ge=0, lt=2**40)]
 Instant = Annotated[int, Meta(ge=-(2**59), lt=2**59)]
-"""Nanoseconds of a clock: eighteen years, so that sums and differences of some still fit a
-payload.
+"""Reading of a clock in ns, within eighteen years of 0.
+
+The limit keeps sums and differences of a few readings within the integers of a payload.
 """
 Stamp = Annotated[list[Instant], Meta(min_length=3, max_length=3)]
 MOST_PEERS = 32
-"""A scenario has no more sites."""
+"""Largest number of sites in a scenario."""
 
 
 class ModeMeaning(NamedTuple):
-    """What a mode of a site means to whoever reads its records.
+    """Meaning of a site's mode for readers of its records.
 
     Attributes:
-        does, did: what the site does, as verbs.
-        follows: False if the site is away from its peers.
-        rests: True if, under the rule `glide`, the arm comes to rest: its torque is not that of
-            the law alone, and what peers sent does not enter its reference.
-        halted: True if the site takes up its work again only when somebody asks it to.
+        mode: the mode.
+        does: verb that describes the site, in the present tense.
+        did: verb that describes the site, in the past tense.
+        follows: False if the site does not follow its peers.
+        rests: True if, under the rule `glide`, the arm comes to rest. Then the torque is not
+            that of the law alone, and the peers' samples do not enter the reference.
+        halted: True if the site resumes only on request.
     """
 
     mode: Mode
@@ -65,7 +71,7 @@ MODES = {
     "stopped": ModeMeaning(Mode.STOPPED, "is stopped", "stopped", rests=True, halted=True),
     "diverged": ModeMeaning(Mode.DIVERGED, "diverges", "diverged", follows=True),
 }
-"""The table of modes, by the words that records and messages have for them."""
+"""Meanings of the modes, by their names in records and messages."""
 MODE_WORDS = {meaning.mode: word for word, meaning in MODES.items()}
 HALTED_MODES = tuple(word for word, meaning in MODES.items() if meaning.halted)
 RESTING_MODES = tuple(word for word, meaning in MODES.items() if meaning.rests)
@@ -80,6 +86,8 @@ Speeds = Annotated[list[float], _unit("rad/s", "joint velocities")]
 Torques = Annotated[list[float], _unit("N m", "joint torques")]
 
 
+# Logs contain the docstrings of `State`, `LinkStats`, `Event` and `RecorderStats` in their
+# schemas: changing these docstrings changes the bytes of logs.
 class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The complete record of one tick of one site; what each vector means stands at
     `core.tick.Output`.
@@ -158,11 +166,11 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class PeerSample(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What peers need of a tick, sent at every tick; each field is bit for bit that of the
-    tick's `State`.
+    """The part of a tick's record that peers need, sent at every tick.
 
-    In task space its q, qd and tau_x are x, xd and wrench of the `State`. Of `ch` a peer takes
-    what is for all, and what is for itself.
+    Each field is bit for bit that of the tick's `State`. In task space, q, qd and tau_x are x,
+    xd and wrench of the `State`. Of `ch`, a peer reads the part for all peers and the part for
+    itself.
     """
 
     v: int
@@ -349,20 +357,26 @@ class RecorderStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
 
 
 class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A member's identity, in answer to a query.
+    """Identity of a member, sent in reply to a query.
 
     Attributes:
-        scenario_sha256: hash of the resolved scenario; "" for a recorder, which learns it.
-        scenario: the resolved text; "" for a recorder.
-        clock: identity of its monotonic clock.
-        fingerprint: of its platform's arithmetic.
-        needs_recorder: whether it waits for a recorder.
-        running: whether its session's epoch is fixed.
-        epoch_mono_ns: the epoch on its clock, once it is fixed.
+        v: version of this schema.
+        member: name of the member.
+        boot: random number of the member's process start.
+        scenario_sha256: hash of the resolved scenario; "" for a recorder, which learns the
+            scenario from the sites.
+        scenario: text of the resolved scenario; "" for a recorder.
+        host: name of the member's machine.
+        clock: identity of the member's monotonic clock.
+        fingerprint: fingerprint of the arithmetic on the member's platform.
+        needs_recorder: True if the member waits for a recorder.
+        running: True if the epoch of the member's session is fixed.
+        ticks: number of ticks that the member has made.
+        epoch_mono_ns: the epoch on the member's clock, once the epoch is fixed.
         epoch_unix_ns: the epoch in Unix time.
         boots: the members of the session and their boots.
-        grid_ns: the epoch on its clock by which its ticks lie at present, which follow the
-            first site's.
+        grid_ns: the epoch on the member's clock from which its ticks count at present; this
+            instant follows the clock of the first site.
     """
 
     v: int = VERSION
@@ -384,17 +398,17 @@ class Info(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True
 
 TASK_VECTORS = ("x", "xd", "wrench")
 STATE_VECTORS = (*Layout().lengths(), *TASK_VECTORS, "ch", "hand", "bodies")
-"""The vectors of a record; their lengths are those of the site's `Layout`."""
+"""Names of the vectors in a record; the site's `Layout` defines their lengths."""
 
 
 def json_schema(kind: type[msgspec.Struct]) -> dict[str, Any]:
-    """Returns the JSON Schema of a message type, with a root object as viewers need it."""
+    """Returns the JSON Schema of a message type, with the root object that viewers need."""
     (_,), components = msgspec.json.schema_components([kind])
     schema: dict[str, Any] = components[kind.__name__]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
-# `python -OO` takes away the docstrings, which stand in the schemas of a log
+# `python -OO` removes the docstrings, which the schemas of a log contain: restore them.
 if sys.flags.optimize > 1:
     for _node in ast.parse(Path(__file__).read_bytes()).body:
         if isinstance(_node, ast.ClassDef):

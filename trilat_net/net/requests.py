@@ -1,10 +1,11 @@
-"""Messages between two parties: pings, changes, backfill, external arms and their switches,
-hands.
+"""Messages between two parties: pings, changes, backfill, external arms, switches and hands.
 
-Invariant: none of these is logged. Their effects are: a change as an event, a backfilled
-message as itself, a measurement as q and qd of the record of the tick that used it, a hand as
-`hand` of the records of the ticks in which it acts. A site uses the newest measurement at each
-tick, and the newest goal of a hand.
+Invariant:
+    - No log contains these messages, but logs contain their effects: a change as an event, a
+      backfilled message as the message itself, a measurement as q and qd of the record of the
+      tick that used it, and a hand as `hand` of the records of the ticks in which it acts.
+    - At each tick, a site uses the newest measurement of the arm and the newest goal of the
+      hand.
 """
 
 import math
@@ -17,19 +18,26 @@ from ..errors import count_nouns
 from .messages import U64, VERSION, Angles, Instant, Speeds, TickNumber, Torques
 
 BACKFILL_MESSAGES = 64
+"""Largest number of messages in one `Backfill`."""
 BACKFILL_BYTES = 40_000
-"""Most messages in one `Backfill`, and most bytes of them, unless a single message has more."""
+"""Largest total size of the messages in one `Backfill`, unless a single message is larger."""
 
 
 class Request(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A message between two parties, of this version of the schema."""
+    """Base of the messages between two parties, in the present version of the schema."""
 
     v: int = VERSION
 
 
 class Pong(Request, frozen=True, kw_only=True):
-    """A member's answer to a ping: when that came and the answer left, on a clock of this
-    identity.
+    """A member's reply to a ping.
+
+    Attributes:
+        member: name of the member.
+        boot: boot of the member.
+        clock: identity of the member's clock.
+        came_ns: arrival of the ping on that clock.
+        left_ns: sending of the reply on that clock.
     """
 
     member: str
@@ -40,21 +48,25 @@ class Pong(Request, frozen=True, kw_only=True):
 
 
 OrderName = Literal["", "stop", "enable", "reset"]
-"""What a site may be ordered from outside; "" is no order."""
+"""Orders that a site accepts from outside; "" stands for no order."""
 
 
 class ChangeRequest(Request, frozen=True, kw_only=True):
-    """A change requested from a site, as in a scenario's timeline, from the earliest possible
-    tick on.
+    """A request to a site for a change, as in a scenario's timeline, from the next tick on.
 
-    It names a link, as in "m1->s", or the site whose dominance row changes during `ramp_s`; or
-    `stop_s`, the time since the epoch, s, before which the site's last tick lies; or `mark`, a
-    text for the log; or an `order`, which the site carries out in its next tick.
+    A request sets exactly one of `link`, `dominance`, `stop_s`, `mark` and `order`.
 
     Attributes:
-        source: who asks for it, for people: a noun phrase such as "the experimenter", which the
-            site's event repeats. A request without it has the bytes of a program that knows no
-            such field.
+        link: link whose settings change, as in "m1->s".
+        dominance: site whose row of dominance shares changes.
+        to: the new settings of the link, or the new shares.
+        ramp_s: duration of the transition to new shares, in s.
+        stop_s: time since the epoch, in s, before which the site's last tick lies.
+        mark: a text for the log.
+        order: an order, which the site executes in its next tick.
+        source: who requests the change, for people: a noun phrase such as "the experimenter",
+            which the site's event repeats. A request without a source has the same bytes as
+            one of a program that does not know the field.
     """
 
     link: str = ""
@@ -84,7 +96,11 @@ class ChangeReply(Request, frozen=True, kw_only=True):
 class BackfillRequest(Request, frozen=True, kw_only=True):
     """A recorder's request for missing messages of a site.
 
-    A message's number is its tick for a record, its place from 0 for statistics and events.
+    The number of a record is its tick. Statistics and events are numbered from 0.
+
+    Attributes:
+        channel: channel of the messages.
+        first, last: range of the numbers of the messages.
     """
 
     channel: Literal["state", "link", "event"]
@@ -93,11 +109,16 @@ class BackfillRequest(Request, frozen=True, kw_only=True):
 
 
 class Backfill(Request, frozen=True, kw_only=True):
-    """The requested messages that a site still has: consecutive, as they were published.
+    """Reply to a `BackfillRequest`: consecutive messages, as the site published them.
 
     Attributes:
-        first: number of the first message here: the one requested, or the oldest one kept.
-        payloads: the messages, a bounded number; empty if there are none (yet, or any more).
+        member: name of the site.
+        boot: boot of the site.
+        channel: channel of the messages.
+        first: number of the first message in this reply: the requested number, or that of the
+            oldest message that the site still has.
+        payloads: the messages, at most BACKFILL_MESSAGES; empty if the site has not published
+            them yet, or has them no longer.
         made: number of messages of this channel that the site has published.
     """
 
@@ -113,12 +134,15 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
     """One measurement of an external arm.
 
     Attributes:
-        boot: the start of the arm's program, random: a site listens to one of them.
-        n: number of the measurement of that start, from 0.
-        tau_x: torque of operator and environment, as a record has it: the torque ON the arm is
-            its negative; empty where it is not measured.
-        sent_ns: time of sending, ns of the program's own monotonic clock, or of measuring, on a
-            clock of the arm's; it is compared with no other clock.
+        site: name of the arm's site.
+        boot: random number of the start of the arm's program; a site follows one start.
+        n: number of the measurement since that start, from 0.
+        q: joint angles, rad.
+        qd: joint velocities, rad/s.
+        sent_ns: sending time on the program's monotonic clock, or time of the measurement on
+            the arm's clock, in ns. The time is compared with no other clock.
+        tau_x: torque of operator and environment in N m, with the sign of a record: the torque
+            ON the arm is the negative. Empty if the arm does not measure the torque.
     """
 
     site: str
@@ -130,23 +154,24 @@ class ArmMeasurement(Request, frozen=True, kw_only=True):
     tau_x: Torques = []
 
     def __post_init__(self) -> None:
-        if self.tau_x and not (
-            len(self.tau_x) == len(self.q) and all(map(math.isfinite, self.tau_x))
-        ):
+        if not self.tau_x:
+            return
+        if len(self.tau_x) != len(self.q) or not all(map(math.isfinite, self.tau_x)):
             raise ValueError(
                 f"tau_x must be {count_nouns(len(self.q), 'finite number')}, as q is"
             )
 
 
 class ArmEnable(Request, frozen=True, kw_only=True):
-    """Says that somebody holds the dead-man switch of an external arm, at least ten times a
-    second.
+    """Report of a dead-man switch of an external arm, sent at least ten times a second.
 
     Attributes:
-        boot: the start of the program, random: a switch is held by one of them.
-        n: number of the message of that start, from 0.
-        held: false: it was let go, and nobody waits for the silence.
-        sent_ns: time of sending, ns of the program's own monotonic clock.
+        site: name of the arm's site.
+        boot: random number of the start of the switch's program.
+        n: number of the message since that start, from 0.
+        held: True while somebody holds the switch. False releases the switch at once, without
+            waiting for its silence.
+        sent_ns: sending time on the program's monotonic clock, in ns.
     """
 
     site: str
@@ -157,18 +182,18 @@ class ArmEnable(Request, frozen=True, kw_only=True):
 
 
 class HandMessage(Request, frozen=True, kw_only=True):
-    """What somebody who holds an arm wants: sent when it changes, and again before `SILENCE_NS`
-    is over.
+    """Goal of a hand at an arm, sent when it changes and repeated within `SILENCE_NS`.
 
     Attributes:
-        boot: the hand, random and above 0: an arm is held by one of them.
-        source: who it is, for people.
-        n: number of its goal, from 0; the same again says that nothing has changed.
-        grip: false: it lets go.
-        target: where the end effector is to go, m, or the joints, rad; empty for a hand that
-            pushes.
-        force: the force ON the end effector, N; empty for any other hand.
-        sent_ns: time of sending, ns of the program's own monotonic clock.
+        site: name of the arm's site.
+        boot: random number of the hand, above 0; one hand at a time holds an arm.
+        source: name of the person or program, for people.
+        n: number of the goal, from 0; a repeated number states that nothing has changed.
+        grip: False to release the arm.
+        target: target position of the end effector in m, or of the joints in rad; empty for a
+            hand that pushes.
+        force: force ON the end effector in N; empty for all other hands.
+        sent_ns: sending time on the program's monotonic clock, in ns.
     """
 
     site: str
@@ -182,7 +207,7 @@ class HandMessage(Request, frozen=True, kw_only=True):
 
 
 class PeerSeen(Request, frozen=True, kw_only=True):
-    """A peer in a `HandViewMessage`, as `PeerView`."""
+    """A peer as a hand sees it, in a `HandViewMessage`; the fields are those of `PeerView`."""
 
     alpha: float
     tick: int
@@ -194,12 +219,13 @@ class PeerSeen(Request, frozen=True, kw_only=True):
 
 
 class HandViewMessage(Request, frozen=True, kw_only=True):
-    """What a hand of one's own in a process of its own sees at a tick, as `HandView`, and
-    decides by.
+    """State of a site at a tick, for a user's hand that runs in a separate process.
+
+    The fields other than `site` and `boot` are those of `HandView`.
 
     Attributes:
-        site: the site whose arm it holds.
-        boot: of the site.
+        site: name of the site whose arm the hand holds.
+        boot: boot of the site.
     """
 
     site: str
