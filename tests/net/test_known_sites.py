@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from trilat_net.net.clock import SystemClock
 from trilat_net.net.connection import Connection
 from trilat_net.net.known_sites import (
-    find_known_places,
+    find_known_endpoints,
     find_known_sites,
     make_site_known,
     stop_at_once,
@@ -81,14 +81,16 @@ def test_a_site_runs_where_no_file_can_be_written(state: Path) -> None:
 
 def test_endpoints_are_known_as_the_member_reaches_them() -> None:
     with make_site_known("t", "m", SITES, 6, HERE, b"order"):
-        assert find_known_places("t", Connection(connect=None)) is None
+        assert find_known_endpoints("t", Connection(connect=None)) is None
         with make_site_known("t", "s", SITES, 7, Connection(("tcp/127.0.0.1:2",)), b"order"):
-            assert find_known_places("t", Connection(connect=None)) == [
+            assert find_known_endpoints("t", Connection(connect=None)) == [
                 "tcp/127.0.0.1:1",
                 "tcp/127.0.0.1:2",
             ]
-            assert find_known_places("t", Connection(connect=None, keys_of="operator")) is None
-            assert find_known_places("t", Connection(connect=None, mode="client")) is None
+            assert (
+                find_known_endpoints("t", Connection(connect=None, keys_of="operator")) is None
+            )
+            assert find_known_endpoints("t", Connection(connect=None, mode="client")) is None
 
 
 def test_site_with_settings_of_its_user_is_for_nobody_else() -> None:

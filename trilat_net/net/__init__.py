@@ -1,3 +1,4 @@
-"""Clocks, messages, the bus, and how the members of a session find each other and agree on an
-epoch.
+"""Clocks, messages, the bus, and the start of a session.
+
+The members of a session find each other over the bus and agree on an epoch.
 """

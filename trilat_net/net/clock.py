@@ -1,7 +1,8 @@
 """Clocks: the only module that reads the time.
 
-Invariant (L1): code that needs the time takes a clock as an argument; times are integer
-nanoseconds, never floats.
+Invariant:
+    - Rule L1: code that needs the time takes a clock as an argument.
+    - Times are integer nanoseconds, never floating-point numbers.
 """
 
 import platform
@@ -9,45 +10,48 @@ import time
 from pathlib import Path
 from typing import Protocol
 
-NS_PER_S = 1_000_000_000  # `core.ticks` has it too, but loads the compiler, which a router does not need
+# Also in `core.ticks`, which loads the compiler; a router does not need the compiler.
+NS_PER_S = 1_000_000_000
 
 
 class Clock(Protocol):
-    """The time, as every driver gets it."""
+    """Interface of the clocks that drivers use."""
 
     def monotonic_ns(self) -> int:
-        """Returns nanoseconds of a clock that never steps; its zero is arbitrary."""
+        """Returns the reading of a clock that never steps, in ns; its zero is arbitrary."""
 
     def unix_ns(self) -> int:
-        """Returns nanoseconds since 1970, by the machine's wall clock, which may step."""
+        """Returns the time since 1970 in ns, by the machine's wall clock, which may step."""
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Returns at `deadline_ns` of the monotonic clock, or at once if that has passed."""
+        """Sleeps until `deadline_ns` of the monotonic clock, if that has not passed."""
 
     def identity(self) -> str:
-        """Names the monotonic clock: equal only where two processes can compare its readings."""
+        """Returns the identity of the monotonic clock.
+
+        Two processes may compare their readings only if their identities are equal.
+        """
 
 
 class SystemClock:
     """The machine's clocks."""
 
     monotonic_ns = staticmethod(time.perf_counter_ns)
-    """The same clock as `time.monotonic_ns`, but on Windows, where that one may go in steps of
-    16 ms.
-    """
+    """The clock of `time.monotonic_ns`, except on Windows, where that clock steps by 16 ms."""
     unix_ns = staticmethod(time.time_ns)
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """See `Clock`. CPython sleeps to an absolute deadline of its own, so signals do not
-        shorten it.
-        """
-        rest_ns = deadline_ns - self.monotonic_ns()
-        if rest_ns > 0:
-            time.sleep(rest_ns * 1e-9)
+        """See `Clock`."""
+        remaining_ns = deadline_ns - self.monotonic_ns()
+        if remaining_ns > 0:
+            # CPython sleeps until an absolute deadline, so signals do not shorten the sleep.
+            time.sleep(remaining_ns * 1e-9)
 
     def identity(self) -> str:
-        """See `Clock`. On Linux: boot of the kernel and time namespace; elsewhere the machine's
-        name.
+        """See `Clock`.
+
+        On Linux, the identity is the boot of the kernel and the time namespace; elsewhere, it
+        is the machine's name.
         """
         try:
             boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
@@ -58,11 +62,20 @@ class SystemClock:
 
 
 class SkewedClock:
-    """Another clock with an offset and a drift: test injection of another machine's clock.
+    """A clock with an offset and a drift against another clock, for tests.
 
-    It reads start + offset + (other - start) (1 + drift), where start is the other's reading
-    when this one was made. Its identity states all of it and is unique, so that a reader of a
-    log can undo it. The wall clock stays; the drift is in ns/s.
+    The clock stands for that of another machine. It reads
+
+        start + offset + (reading - start) (1 + drift),
+
+    where `start` is the reading of the other clock at the construction of this one. The wall
+    clock is not changed. The identity is unique and states the offset, the drift and the start,
+    so that readers of a log can convert the readings.
+
+    Args:
+        clock: the other clock.
+        offset_ns: offset against the other clock.
+        drift_ppb: drift against the other clock, ns/s.
     """
 
     def __init__(self, clock: Clock, offset_ns: int, drift_ppb: int) -> None:
@@ -101,7 +114,7 @@ class SkewedClock:
 
 
 def make_system_clock(offset_s: float = 0.0, drift_ppm: float = 0.0) -> Clock:
-    """Returns the machine's clock, with an offset (s) and a drift if they are injected."""
+    """Returns the machine's clock, for tests with an offset (s) and a drift (ppm)."""
     if not offset_s and not drift_ppm:
         return SystemClock()
     return SkewedClock(SystemClock(), round(offset_s * NS_PER_S), round(drift_ppm * 1000))

@@ -17,7 +17,7 @@ from . import topics
 from .bus import Bus
 from .clock import Clock
 from .connection import Connection, default_endpoint, default_endpoints, open_bus
-from .known_sites import find_known_places
+from .known_sites import find_known_endpoints
 from .membership import MemberQuery, liveliness_token
 from .messages import Event, Info
 from .requests import (
@@ -102,7 +102,7 @@ def connect_to_session(
             return None if bus is None else stack.enter_context(closing(bus))
 
         if connection.connect is None and recorder_boot is None:
-            connection = replace(connection, connect=find_known_places(session, connection))
+            connection = replace(connection, connect=find_known_endpoints(session, connection))
         if connection.connect is None:
             first = default_endpoint(session, 0)
             visitor = connect(replace(connection, listen=(), connect=[first]))

@@ -1,8 +1,10 @@
-"""Host names of endpoints, resolved before anything connects: Zenoh would try a misspelt name
-for ever.
+"""Check of the host names in endpoints, before anything connects.
 
-Invariant: what names no host (an address in digits, a socket file) is passed over, and nothing
-connects here.
+Zenoh would try to connect to a misspelt host name for ever.
+
+Invariant:
+    - Endpoints without a host name, such as numeric addresses and socket files, are skipped.
+    - Nothing connects here.
 """
 
 import ipaddress
@@ -12,28 +14,29 @@ from collections.abc import Iterable
 
 from ..errors import UsageError
 
-_PLACE = re.compile(r"[a-z]+(?:/|://)(\[[^\]]*\]|[^/?#]*):\d+(?:[/?#].*)?")
-"""An endpoint of Zenoh or an address of the web, with a host and a port."""
+_ENDPOINT = re.compile(r"[a-z]+(?:/|://)(\[[^\]]*\]|[^/?#]*):\d+(?:[/?#].*)?")
+"""Pattern of a Zenoh endpoint, or of a web address, with a host and a port."""
 
 
 class UnknownHost(UsageError):  # noqa: N818 - it names an outcome
     """An endpoint whose host name does not resolve."""
 
 
-def check_hosts(places: Iterable[str]) -> None:
+def check_hosts(endpoints: Iterable[str]) -> None:
     """Refuses endpoints whose host name does not resolve.
 
     Args:
-        places: endpoints as in tcp/arm.example:7447 and addresses as in tcp://arm.example:8786.
+        endpoints: endpoints like tcp/arm.example:7447, or addresses like
+            tcp://arm.example:8786.
 
     Raises:
-        UnknownHost: with the endpoint, the name and the resolver's reason.
+        UnknownHost: a host name does not resolve.
     """
-    for place in places:
-        found = _PLACE.fullmatch(place)
-        host = "" if found is None else found[1].strip("[]")
+    for endpoint in endpoints:
+        match = _ENDPOINT.fullmatch(endpoint)
+        host = "" if match is None else match[1].strip("[]")
         if host and not _is_address(host):
-            _resolve(host, place)
+            _resolve(host, endpoint)
 
 
 def _is_address(host: str) -> bool:
@@ -44,14 +47,13 @@ def _is_address(host: str) -> bool:
     return True
 
 
-def _resolve(host: str, place: str) -> None:
+def _resolve(host: str, endpoint: str) -> None:
     try:
         socket.getaddrinfo(host, None)
-    except (
-        OSError,
-        UnicodeError,
-    ) as error:  # UnicodeError: a part of the name is empty or too long
+    except (OSError, UnicodeError) as error:
+        # UnicodeError: a part of the name is empty or too long.
         reason = getattr(error, "strerror", None) or "it is no host name"
         raise UnknownHost(
-            f"{place}: the host name {host!r} does not resolve ({reason}): correct it, or give an address"
+            f"{endpoint}: the host name {host!r} does not resolve ({reason}): "
+            "correct it, or give an address"
         ) from None

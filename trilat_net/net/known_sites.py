@@ -1,9 +1,12 @@
-"""Sites that run on this machine, by a small file for each; and `trilat stop`, which therefore
-need not look.
+"""Files that announce the sites running on this machine, and the short way of `trilat stop`.
 
-Invariant: a file is a hint. A site runs without it, only its user may read it, and one whose
-process is gone counts for nothing. What cannot be stopped at once is left to the command's long
-way.
+Each running site has a small file with its endpoints. By these files `trilat stop` reaches the
+sites at once, without a search for the session.
+
+Invariant:
+    - A file is a hint: a site runs without it. Only the site's user may read the file, and a
+      file whose process is gone does not count.
+    - Whatever cannot be stopped at once is left to the long way of the command.
 """
 
 import os
@@ -11,7 +14,6 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -27,22 +29,29 @@ from .zenoh_config import Endpoint, ZenohMode, merge_settings
 if TYPE_CHECKING:
     from .connection import Connection
 
-ASK_NS = 50_000_000
+QUERY_PERIOD_NS = 50_000_000
+"""Time between two queries to the sites that have not replied, in ns."""
 POLL_NS = 1_000_000
 PATIENCE_NS = 1_500_000_000
+"""Time after which the short way is given up, in ns."""
 AT_ONCE = {"scouting": {"delay": 0}}
-"""Settings of Zenoh: nothing is scouted, so that nothing is waited for."""
+"""Settings of Zenoh that avoid its delay for scouting."""
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL
 
 
 class KnownSite(msgspec.Struct, frozen=True):
-    """A site that runs on this machine.
+    """Content of the file of a site that runs on this machine.
 
     Attributes:
-        sites: all of its session.
-        places: where it and those that it connects to are reached.
-        stop: the order, ready to be sent.
-        machine: identity of the machine's clock, another one after each start.
+        session: name of the session.
+        site: name of the site.
+        sites: names of all sites of the session.
+        mode: mode of the site's connection.
+        keyed: True if the site's links are encrypted by members' keys.
+        places: endpoints at which the site, and the members that it connects to, are reached.
+        stop: payload of the order to stop.
+        pid: process of the site.
+        machine: identity of the machine's clock, which differs after every start.
     """
 
     session: str
@@ -70,17 +79,35 @@ def make_site_known(
     connection: "Connection",
     stop: bytes,
 ) -> Iterator[None]:
-    """Keeps a site's file inside the block, if others need no settings of Zenoh to reach it."""
-    places = connection.reach([*connection.listen, *(connection.connect or ())])
-    how = (connection.mode, bool(connection.keys_of))
-    here = (os.getpid(), SystemClock().identity())
-    known = KnownSite(session, site, sites, *how, places, stop, *here)
-    with suppress(OSError, RuntimeError):  # RuntimeError: a user without a home
+    """Keeps the file of a site inside the block.
+
+    There is no file if the site can only be reached with Zenoh settings of its user.
+
+    Args:
+        session: name of the session.
+        site: name of the site.
+        sites: names of all sites of the session.
+        boot: boot of the site, which names the file.
+        connection: connection of the site.
+        stop: payload of the order to stop.
+    """
+    endpoints = [*connection.listen, *(connection.connect or ())]
+    known = KnownSite(
+        session=session,
+        site=site,
+        sites=sites,
+        mode=connection.mode,
+        keyed=bool(connection.keys_of),
+        places=connection.reach(endpoints),
+        stop=stop,
+        pid=os.getpid(),
+        machine=SystemClock().identity(),
+    )
+    with suppress(OSError, RuntimeError):  # RuntimeError: the user has no home folder
         if connection.keys_of or not connection.settings:
             _find_folder().mkdir(mode=0o700, parents=True, exist_ok=True)
-            with os.fdopen(
-                os.open(_find_folder() / f"{boot:016x}.json", _NEW_FILE, 0o600), "wb"
-            ) as stream:
+            descriptor = os.open(_find_folder() / f"{boot:016x}.json", _NEW_FILE, 0o600)
+            with os.fdopen(descriptor, "wb") as stream:
                 stream.write(msgspec.json.encode(known))
     try:
         yield
@@ -90,132 +117,182 @@ def make_site_known(
 
 
 def find_known_sites(session: str) -> list[KnownSite]:
-    """Returns the sites of a session that run on this machine; removes the files of those that
-    are gone.
+    """Returns the sites of a session that run on this machine.
+
+    Files of sites whose process is gone are removed.
     """
-    found = []
+    running = []
     machine = SystemClock().identity()
     with suppress(OSError, RuntimeError):
         for file in sorted(_find_folder().glob("*.json")):
-            with suppress(OSError, msgspec.MsgspecError):  # half written, or none of ours
-                one = msgspec.json.decode(file.read_bytes(), type=KnownSite)
-                if one.machine != machine or not _is_alive(one.pid):
+            # A file that is half written, or of another program, is skipped.
+            with suppress(OSError, msgspec.MsgspecError):
+                known = msgspec.json.decode(file.read_bytes(), type=KnownSite)
+                if known.machine != machine or not _is_alive(known.pid):
                     file.unlink()
-                elif one.session == session:
-                    found.append(one)
-    return found
+                elif known.session == session:
+                    running.append(known)
+    return running
 
 
 def _is_alive(pid: int) -> bool:
     with suppress(PermissionError):
         try:
-            if os.name == "posix":  # elsewhere to ask is to end it
+            if os.name == "posix":  # on other systems, `os.kill` would end the process
                 os.kill(pid, 0)
         except ProcessLookupError:
             return False
     return True
 
 
-def list_places(known: Sequence[KnownSite]) -> list[Endpoint]:
-    """Returns the endpoints by which sites are reached, each once."""
-    places = [place for one in known for place in one.places]
-    return [place for n, place in enumerate(places) if place not in places[:n]]
+def list_endpoints(known_sites: Sequence[KnownSite]) -> list[Endpoint]:
+    """Returns the endpoints at which sites are reached, each once."""
+    endpoints: list[Endpoint] = []
+    for known in known_sites:
+        for endpoint in known.places:
+            if endpoint not in endpoints:
+                endpoints.append(endpoint)
+    return endpoints
 
 
-def find_known_places(session: str, connection: "Connection") -> list[Endpoint] | None:
-    """Returns where the sites of a session are reached, if all of them run here and as this
-    member does.
-    """
-    how = connection.mode, bool(connection.keys_of)
-    known = [one for one in find_known_sites(session) if (one.mode, one.keyed) == how]
-    return (
-        list_places(known)
-        if known and {one.site for one in known} == set(known[0].sites)
-        else None
-    )
+def find_known_endpoints(session: str, connection: "Connection") -> list[Endpoint] | None:
+    """Returns the endpoints of a session whose sites all run on this machine.
 
-
-def stop_at_once(words: Sequence[str]) -> int | list[str]:
-    """Stops arms as the words behind `trilat stop` ask for it.
+    Args:
+        session: name of the session.
+        connection: connection of this member; sites with another mode, or with and without
+            keys, do not count.
 
     Returns:
-        The exit code; or the words with which the long way does it, or what is left.
+        The endpoints; None if not all sites of the session are known.
     """
-    given = {"--session": "", "--keys": ""}
-    sites = list[str]()
-    simple = True
-    rest = iter(words)
-    for word in rest:
-        name, equals, value = word.partition("=")
-        if name in given:
-            given[name] = value if equals else next(rest, "")
-        else:
-            simple = simple and not word.startswith("-")
-            sites.append(word)
-    if not given["--session"] or {"--end", "--help", "-h"}.intersection(sites):
-        return list(words)
-    names = f"{', '.join(sites) if simple and sites else 'every arm'} of session {given['--session']}"
-    _print(f"stopping {names} ...")
+    keyed = bool(connection.keys_of)
+    known_sites = [
+        known
+        for known in find_known_sites(session)
+        if known.mode == connection.mode and known.keyed == keyed
+    ]
+    if not known_sites:
+        return None
+    if {known.site for known in known_sites} != set(known_sites[0].sites):
+        return None
+    return list_endpoints(known_sites)
+
+
+def stop_at_once(arguments: Sequence[str]) -> int | list[str]:
+    """Stops arms as the arguments of `trilat stop` request.
+
+    Args:
+        arguments: the command line after `trilat stop`.
+
+    Returns:
+        The exit code; or the arguments with which the long way of the command does, or
+        finishes, the work.
+    """
+    options, sites, is_simple = _parse_arguments(arguments)
+    session = options["--session"]
+    if not session or {"--end", "--help", "-h"}.intersection(sites):
+        return list(arguments)
+    arms = ", ".join(sites) if is_simple and sites else "every arm"
+    _print(f"stopping {arms} of session {session} ...")
     try:
-        known = find_known_sites(given["--session"]) if simple else []
-        known = [one for one in known if one.mode == known[0].mode]
-        if known and known[0].keyed and not given["--keys"]:
-            print(f"error: the members of {names} have keys: add --keys DIR", file=sys.stderr)
+        known_sites = find_known_sites(session) if is_simple else []
+        known_sites = [known for known in known_sites if known.mode == known_sites[0].mode]
+        if not known_sites:
+            return list(arguments)
+        if known_sites[0].keyed and not options["--keys"]:
+            print(
+                f"error: the members of {arms} of session {session} have keys: add --keys DIR",
+                file=sys.stderr,
+            )
             return UsageError.exit_code
-        if not known:
-            return list(words)
-        if _order(known, sites, given["--keys"]):
+        if _order_stop(known_sites, sites, options["--keys"]):
             return 0
-        way = "--router" if known[0].mode == "client" else "--connect"
-        return [
-            *words,
-            *chain(*([way, place] for place in list_places(known) if isinstance(place, str))),
-        ]
+        way = "--router" if known_sites[0].mode == "client" else "--connect"
+        remaining = list(arguments)
+        for endpoint in list_endpoints(known_sites):
+            if isinstance(endpoint, str):
+                remaining += [way, endpoint]
+        return remaining
     except KeyboardInterrupt:
         return 130
-    except Exception:  # whatever it is: the long way is tried, and says what is wrong
-        return list(words)
+    except Exception:
+        # Whatever the error is: the long way is tried, and reports the error.
+        return list(arguments)
+
+
+def _parse_arguments(arguments: Sequence[str]) -> tuple[dict[str, str], list[str], bool]:
+    """Parses the command line after `trilat stop`.
+
+    Returns:
+        The values of --session and --keys ("" without them), all other arguments, and True if
+        none of these is an option.
+    """
+    options = {"--session": "", "--keys": ""}
+    others: list[str] = []
+    is_simple = True
+    rest = iter(arguments)
+    for argument in rest:
+        name, equals, value = argument.partition("=")
+        if name in options:
+            options[name] = value if equals else next(rest, "")
+        else:
+            is_simple = is_simple and not argument.startswith("-")
+            others.append(argument)
+    return options, others, is_simple
 
 
 def _print(text: object) -> None:
-    print(
-        "".join(letter if letter.isprintable() else "\ufffd" for letter in str(text)),
-        flush=True,
-    )
+    """Prints a text at once, without its control characters."""
+    letters = (letter if letter.isprintable() else "\ufffd" for letter in str(text))
+    print("".join(letters), flush=True)
 
 
-def _order(known: Sequence[KnownSite], sites: Sequence[str], keys: str) -> bool:
-    """Orders sites to stop, or all, until each has answered; prints the answers; true if all of
-    them stop.
+def _order_stop(known_sites: Sequence[KnownSite], sites: Sequence[str], keys: str) -> bool:
+    """Orders sites to stop until each site has replied, and prints the replies.
 
-    Of two sessions with one name both are meant: then as many answer a question as there are of
-    a site.
+    Two sessions with one name are both stopped: a query then has as many replies as there are
+    sites of the queried name.
+
+    Args:
+        known_sites: the known sites of the session.
+        sites: names of the sites to stop; empty for all sites.
+        keys: folder of the member's keys; "" without keys.
+
+    Returns:
+        True if all sites replied that they stop.
     """
-    own: Any = AT_ONCE
+    settings: Any = AT_ONCE
     if keys:
         from .member_keys import read_member_keys
 
-        own = merge_settings(read_member_keys(Path(keys), stops=True).settings, AT_ONCE)
-    left = set(sites or known[0].sites)
-    twins = Counter(one.site for one in known)
-    asked: list[tuple[str, Inbox, list[dict[str, Any]]]] = []
+        key_settings = read_member_keys(Path(keys), stops=True).settings
+        settings = merge_settings(key_settings, AT_ONCE)
+    remaining = set(sites or known_sites[0].sites)
+    starts_by_name = Counter(known.site for known in known_sites)
+    session = known_sites[0].session
+    order = known_sites[0].stop
+    queries: list[tuple[str, Inbox, list[dict[str, Any]]]] = []
+    all_stop = True
     clock = SystemClock()
-    session = known[0].session
-    stops = True
-    begun_ns = ask_ns = clock.monotonic_ns()
-    with closing(ZenohBus([], list_places(known), known[0].mode, own)) as bus:
-        while left and (now_ns := clock.monotonic_ns()) - begun_ns < PATIENCE_NS:
-            if now_ns >= ask_ns:  # again: a question reaches those that are connected by then
-                ask_ns = now_ns + ASK_NS
-                keyed = [(site, topics.key(session, site, topics.STOP)) for site in left]
-                asked += [(site, bus.query(key, known[0].stop), []) for site, key in keyed]
-            for site, inbox, answers in asked:
-                while (answer := inbox.poll()) is not None:
-                    answers.append(msgspec.msgpack.decode(answer[1]))
-                if site in left and len(answers) >= max(twins[site], 1):
-                    left.discard(site)
-                    for one in answers:
-                        _print(one["text"])
-                        stops = stops and one["accepted"]
+    begun_ns = clock.monotonic_ns()
+    next_query_ns = begun_ns
+    endpoints = list_endpoints(known_sites)
+    with closing(ZenohBus([], endpoints, known_sites[0].mode, settings)) as bus:
+        while remaining and (now_ns := clock.monotonic_ns()) - begun_ns < PATIENCE_NS:
+            # The query is repeated, because it reaches only members that are connected by then.
+            if now_ns >= next_query_ns:
+                next_query_ns = now_ns + QUERY_PERIOD_NS
+                for site in remaining:
+                    key = topics.key(session, site, topics.STOP)
+                    queries.append((site, bus.query(key, order), []))
+            for site, inbox, replies in queries:
+                while (message := inbox.poll()) is not None:
+                    replies.append(msgspec.msgpack.decode(message[1]))
+                if site in remaining and len(replies) >= max(starts_by_name[site], 1):
+                    remaining.discard(site)
+                    for reply in replies:
+                        _print(reply["text"])
+                        all_stop = all_stop and reply["accepted"]
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-    return stops and not left
+    return all_stop and not remaining

@@ -1,7 +1,8 @@
-"""Bus keys `trilat/<session>/<member>/<channel>`, a boot number after `alive`; and numbers of
-their messages.
+"""Keys of the bus, and the numbers of the messages of each channel.
 
-Each record has its tick's number, and statistics are numbered by themselves.
+A key is trilat/<session>/<member>/<channel>. The key of a liveliness token, whose channel is
+"alive", ends in the boot of the member. The number of a record is its tick; statistics are
+numbered from 0.
 """
 
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ ALIVE = "alive"
 PING = "ping"
 SET = "set"
 STOP = "stop"
-"""What every member may ask of a site; all other changes are asked for under `SET`."""
+"""Channel of the order to stop, which all members may send; other changes use `SET`."""
 SAMPLE = "sample"
 PAST = "past"
 STATS = "stats"
@@ -31,7 +32,14 @@ STATS_PER_SECOND = 10
 
 
 class KeyParts(NamedTuple):
-    """The parts of a key."""
+    """The parts of a key.
+
+    Attributes:
+        session: name of the session.
+        member: name of the member.
+        channel: name of the channel.
+        boot: boot of the member, in the key of a liveliness token; else "".
+    """
 
     session: str
     member: str
@@ -40,62 +48,73 @@ class KeyParts(NamedTuple):
 
 
 def presence_key(session: str, member: str) -> str:
-    """Returns the expression of the liveliness tokens of a member's starts; `*` stands for
-    every one.
+    """Returns the key expression of the liveliness tokens of all starts of a member.
+
+    The member `*` stands for all members.
     """
     return f"{key(session, member, ALIVE)}/*"
 
 
 def read_presence(inbox: PresenceInbox) -> Iterator[tuple[KeyParts, bool]]:
-    """Yields the changes of presence that wait in a ring: whose token, and whether it is alive
-    now.
+    """Yields the changes of presence that wait in a ring.
+
+    Each change is (key of the token, True if the token is alive now).
     """
     while (change := inbox.poll()) is not None:
-        if (parts := parse_key(change[0])) is not None:
-            yield parts, change[1]
+        token, is_alive = change
+        parts = parse_key(token)
+        if parts is not None:
+            yield parts, is_alive
 
 
 def key(session: str, member: str, channel: str) -> str:
-    """Returns the key of a member's channel; `*` stands for every member."""
+    """Returns the key of a member's channel; the member `*` stands for all members."""
     return f"{ROOT}/{session}/{member}/{channel}"
 
 
 def parse_key(key: str) -> KeyParts | None:
-    """Returns the parts of a key, or None if it is not a key of this program."""
+    """Returns the parts of a key, or None if the key is not one of this program."""
     root, _, rest = key.partition("/")
     parts = rest.split("/")
     return KeyParts(*parts) if root == ROOT and len(parts) in (3, 4) else None
 
 
 def ticks_per_stats(rate_hz: int) -> int:
-    """Returns the ticks from one statistics message to the next, from tick 0 on."""
+    """Returns the number of ticks from one statistics message to the next."""
     return max(1, rate_hz // STATS_PER_SECOND)
 
 
 def number_message(channel: str, tick: int, rate_hz: int) -> int:
-    """Returns the number in its channel of the record or the statistics of a tick."""
+    """Returns the number of a tick's record, or of its statistics, in their channel."""
     return tick // ticks_per_stats(rate_hz) if channel == LINK else tick
 
 
 def count_messages(channel: str, ticks: int, rate_hz: int) -> int:
-    """Returns how many records or statistics a site publishes in so many ticks."""
+    """Returns the number of records or statistics that a site publishes in `ticks` ticks."""
     return -(-ticks // ticks_per_stats(rate_hz)) if channel == LINK else ticks
 
 
 def count_under_way(channel: str, rate_hz: int) -> int:
-    """Returns how many messages that a site has sent may die with it when it is killed: those
-    of 20 ms.
+    """Returns the number of sent messages that may be lost with a killed site.
+
+    These are the messages of 20 ms.
     """
     return 1 if channel == LINK else rate_hz // 50
 
 
 def skipped_numbers(channel: str, tick: int, skipped: int, rate_hz: int) -> tuple[int, int]:
-    """Returns what a site does not publish that makes no ticks for so many before one, see
-    `begin_anew`.
+    """Returns the numbers of messages around ticks that a site skipped.
 
-    That is the number of the message with that tick, or that stands for it, and that of the
-    first not made.
+    Args:
+        channel: the channel.
+        tick: the first tick after the skipped ones.
+        skipped: number of skipped ticks.
+        rate_hz: tick rate of the site.
+
+    Returns:
+        The number of the first message after the skipped ticks, and the number of messages
+        published before them: the arguments of `Account.mark_unpublished`.
     """
-    return number_message(channel, tick, rate_hz), count_messages(
-        channel, tick - skipped, rate_hz
-    )
+    next_number = number_message(channel, tick, rate_hz)
+    published = count_messages(channel, tick - skipped, rate_hz)
+    return next_number, published
