@@ -53,7 +53,7 @@ def keys(made: Path, tmp_path: Path) -> Path:
 
 SITE = ("site", "m1", "--scenario", "paper", "--keys")
 RECORD = ("record", "--session", "paper", "--keys")
-TWO_NAMES = "--keys: these are the keys of {}, and this takes those of {}"
+TWO_NAMES = "--keys: these are the keys of {}; the keys of {} are needed"
 
 OF_ANOTHER = [
     (("site", "m1", "--scenario", "paper"), "m2", "m1"),

@@ -133,7 +133,7 @@ def test_with_keys_all_stop_an_arm_only_the_operator_enables(stage: Stage) -> No
         assert answer.startswith("s: stop at tick")
         code, text = order("enable s", whose)
         assert code != 0
-        assert f"these are the keys of {whose}, and this takes those of operator" in text
+        assert f"these are the keys of {whose}; the keys of operator are needed" in text
         code, text = order("enable s", OPERATOR)
         assert code == 0, text
     assert order("stop --end", "m")[0] != 0

@@ -126,7 +126,7 @@ def test_members_are_found_again_and_again_beside_unreadable_answers() -> None:
 
 def test_answers_of_another_version_alone_are_error_that_names_member() -> None:
     with pytest.raises(
-        SessionError, match=f"the answer of m0 cannot be read: .* version {VERSION + 1}"
+        SessionError, match=f"the reply of m0 cannot be read: .* version {VERSION + 1}"
     ):
         find(encode(told("m0", 1, v=VERSION + 1)))
 

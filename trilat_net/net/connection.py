@@ -1,11 +1,13 @@
-"""A member's connection to the network: endpoints, mode, the opened bus; and the router
-process.
+"""A member's connection to the network, and the router process.
 
-Invariant: default endpoints are explicit loopback addresses, a function of session and site, so
-that separate terminals meet and two sessions on one host do not. A named endpoint replaces the
-defaults; values given both on the command line and in a file are united or refused, never
-chosen between. A router carries Zenoh traffic and prints who joins and leaves; it adds no
-routing of its own.
+A connection has endpoints and a mode; opening it returns the bus.
+
+Invariant:
+    - Default endpoints are explicit loopback addresses. They are a function of session and
+      site, so that separate terminals find each other and two sessions on one host do not.
+    - A named endpoint replaces the defaults. Values on the command line and in a file are
+      united or refused; the program never chooses between them.
+    - A router forwards Zenoh traffic, and prints which members join and leave.
 """
 
 import ipaddress
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
 _FIRST_PORT = 10_240
 _BLOCKS = 340
 _BLOCK = 64
+"""Number of ports in a block; a session has the block that the CRC-32 of its name selects."""
 
 
 def default_endpoint(session: str, index: int) -> str:
@@ -46,19 +49,18 @@ def default_endpoints(
     session: str, sites: Sequence[str], *, encrypted: bool = False
 ) -> dict[str, str]:
     """Returns the default endpoint of every site of a session."""
-    places = {site: default_endpoint(session, index) for index, site in enumerate(sites)}
-    return {
-        site: place.replace("tcp/", "tls/") if encrypted else place
-        for site, place in places.items()
-    }
+    endpoints = {}
+    for index, site in enumerate(sites):
+        endpoint = default_endpoint(session, index)
+        endpoints[site] = endpoint.replace("tcp/", "tls/") if encrypted else endpoint
+    return endpoints
 
 
 @contextmanager
 def reserve_session_endpoints(session: str, sites: Sequence[str]) -> Iterator[list[str]]:
-    """Yields endpoints for the sites of a session: the defaults, or free ones if these are
-    taken.
+    """Yields endpoints for the sites of a session: the defaults, or else free ones.
 
-    Others who choose in this way get other endpoints, from here to the end of the block.
+    Inside the block, other callers of this function get other endpoints.
     """
     default = list(default_endpoints(session, sites).values())
     ports = [int(endpoint.rpartition(":")[2]) for endpoint in default]
@@ -72,16 +74,21 @@ def reserve_session_endpoints(session: str, sites: Sequence[str]) -> Iterator[li
 
 
 def find_free_endpoints(count: int) -> list[str]:
-    """Returns loopback endpoints whose ports are free now."""
+    """Returns loopback endpoints whose ports are free at present."""
     with ExitStack() as stack:
         return _bind_ports(stack, [0] * count, shared=False)
 
 
 def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list[str]:
-    """Binds loopback ports, of which 0 stands for any, until the stack ends; returns their
-    endpoints.
+    """Binds loopback ports until the stack is closed, and returns their endpoints.
 
-    A shared one can be listened at meanwhile. Raises OSError.
+    Args:
+        stack: closes the sockets.
+        ports: the ports; 0 stands for any free port.
+        shared: True if another program may listen at the ports meanwhile.
+
+    Raises:
+        OSError: a port is in use.
     """
     sockets = [stack.enter_context(socket.socket()) for _ in ports]
     for probe, port in zip(sockets, ports, strict=True):
@@ -91,9 +98,10 @@ def _bind_ports(stack: ExitStack, ports: Sequence[int], *, shared: bool) -> list
 
 
 ENDS_SOON = timedelta(days=7)
+"""Time before the end of keys from which on the user is warned."""
 DATE = "%Y-%m-%d %H:%M:%S UTC"
 RETRY_NS = 200_000_000
-"""Between two attempts to reach a router."""
+"""Time between two attempts to reach a router, in ns."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +109,14 @@ class Connection:
     """Endpoints and mode of a member.
 
     Attributes:
-        connect: endpoints to connect to; a client takes the first that answers. None: still to
-            be found.
-        mode: peer of the other members, client of a router, or a router.
+        listen: endpoints at which the member listens.
+        connect: endpoints to which the member connects; a client uses the first one that
+            answers. None if the endpoints are still to be found.
+        mode: "peer" of the other members, "client" of a router, or "router".
         settings: Zenoh settings of a user's file, or of a member's keys.
-        keys_of: the member whose keys it has: links are encrypted, and both ends prove by
-            certificates who they are; "": none.
-        keys_end: when these keys end, in UTC; None: there are none.
+        keys_of: the member whose keys the connection uses; "" without keys. With keys, links
+            are encrypted, and both ends prove their identities by certificates.
+        keys_end: end of the validity of these keys, in UTC; None without keys.
     """
 
     listen: Sequence[Endpoint] = ()
@@ -118,61 +127,63 @@ class Connection:
     keys_end: datetime | None = None
 
     def reach(self, endpoints: Sequence[Endpoint]) -> list[Endpoint]:
-        """Returns endpoints as this member opens them: with keys, the defaults over TLS."""
+        """Returns endpoints as this member opens them: with keys, TLS replaces TCP."""
         if not self.keys_of:
             return list(endpoints)
         return [
-            re.sub("^tcp/", "tls/", one) if isinstance(one, str) else one for one in endpoints
+            re.sub("^tcp/", "tls/", endpoint) if isinstance(endpoint, str) else endpoint
+            for endpoint in endpoints
         ]
 
     def open(self) -> ZenohBus:
-        """Opens it; see `ZenohBus`.
+        """Opens the connection; see `ZenohBus`.
 
         Raises:
-            UnknownHost: an endpoint names a host that does not resolve, which Zenoh would try
-                for ever.
+            UnknownHost: a host name does not resolve. Zenoh would try to resolve it for ever.
         """
-        listen, connect = (self.reach(side or ()) for side in (self.listen, self.connect))
+        listen = self.reach(self.listen)
+        connect = self.reach(self.connect or ())
         check_hosts(find_endpoint_addresses([*listen, *connect]))
         return ZenohBus(listen, connect, self.mode, self.settings)
 
     def require_keys_until(self, left_s: float) -> None:
         """Refuses keys that end before a session does.
 
-        An open link outlives the end of its certificate, but no link is made again after it: a
-        cable that is pulled for six seconds would end the session then.
+        An open link outlives the end of its certificate, but no link can be opened after that:
+        a cable that is pulled for six seconds would then end the session.
 
         Args:
-            left_s: how long the session lasts from now on, s.
+            left_s: remaining duration of the session, in s.
 
         Raises:
-            UsageError: the keys end before.
+            UsageError: the keys end before the session.
         """
-        if self.keys_end is None or self.keys_end > (
-            planned := datetime.now(UTC) + timedelta(seconds=left_s)
-        ):
+        if self.keys_end is None:
             return
-        raise UsageError(
-            f"--keys: the keys of {self.keys_of} end on {self.keys_end:{DATE}}, and the session is planned "
-            f"until {planned:{DATE}}: renew them with trilat keys renew (docs/network.md)"
-        )
+        planned_end = datetime.now(UTC) + timedelta(seconds=left_s)
+        if self.keys_end <= planned_end:
+            raise UsageError(
+                f"--keys: the keys of {self.keys_of} end on {self.keys_end:{DATE}}, and the "
+                f"session is planned until {planned_end:{DATE}}: renew them with "
+                "trilat keys renew (docs/network.md)"
+            )
 
     def describe_end(self) -> str:
-        """Returns a sentence on keys that end soon, "" for others."""
+        """Returns a sentence if the keys end soon, else ""."""
         if self.keys_end is None or self.keys_end - datetime.now(UTC) > ENDS_SOON:
             return ""
         remedy = "renew them with trilat keys renew (docs/network.md)"
         return f"the keys of {self.keys_of} end on {self.keys_end:{DATE}}: {remedy}"
 
     def require(self, member: str) -> "Connection":
-        """Returns itself.
+        """Returns this connection if it may be used by a member.
 
         Raises:
-            UsageError: it has the keys of another member than this.
+            UsageError: the connection uses the keys of another member.
         """
         if self.keys_of not in ("", member):
             raise UsageError(
-                f"--keys: these are the keys of {self.keys_of}, and this takes those of {member}"
+                f"--keys: these are the keys of {self.keys_of}; the keys of {member} are needed"
             )
         return self
 
@@ -180,73 +191,96 @@ class Connection:
 def secure_connection(
     connection: Connection, keys: "MemberKeys | str | Path | None", *, insecure: bool
 ) -> Connection:
-    """Returns a connection with a member's keys, or those of a folder; else it must not be open
-    to a network.
+    """Returns a connection with a member's keys, or checks that it is safe without keys.
+
+    Args:
+        connection: the connection.
+        keys: a member's keys, or the folder of these; None for no keys.
+        insecure: True to accept endpoints that other machines reach without keys.
 
     Raises:
-        UsageError: an endpoint is not encrypted, or reached from other machines without keys,
-            the user's own settings contradict the keys, or these cannot be used.
+        UsageError: an endpoint is not encrypted, or other machines reach it without keys; or
+            the user's settings contradict the keys; or the keys cannot be used.
     """
     if isinstance(keys, str | Path):
-        from .member_keys import read_member_keys  # loads what makes certificates
+        from .member_keys import read_member_keys  # loads the cryptography package
 
         keys = read_member_keys(keys)
-    own = connection.settings
-    named = (*connection.listen, *(connection.connect or ()))
-    if udp := [place for place in find_endpoint_addresses(named) if place.startswith("udp/")]:
+    endpoints = (*connection.listen, *(connection.connect or ()))
+    addresses = find_endpoint_addresses(endpoints)
+    for address in addresses:
+        if address.startswith("udp/"):
+            raise UsageError(
+                f"{address}: UDP loses, repeats and trusts everything: use tcp, tls or quic"
+            )
+    if keys is None:
+        _check_open_endpoints(connection, insecure=insecure)
+        return connection
+    for address in addresses:
+        _check_encrypted_endpoint(address)
+    _check_settings_without_keys(connection.settings)
+    return replace(
+        connection,
+        settings=merge_settings(keys.settings, connection.settings),
+        keys_of=keys.member,
+        keys_end=keys.ends,
+    )
+
+
+def _check_encrypted_endpoint(address: str) -> None:
+    """Refuses an endpoint that is not encrypted, or states how it is encrypted."""
+    if not address.startswith(ENCRYPTED):
         raise UsageError(
-            f"{udp[0]}: UDP loses, repeats and trusts everything: use tcp, tls or quic"
+            f"{address}: with --keys an endpoint is encrypted: tls/HOST:PORT or quic/HOST:PORT"
         )
-    if keys is not None:
-        for place in find_endpoint_addresses(named):
-            if not place.startswith(ENCRYPTED):
-                raise UsageError(
-                    f"{place}: with --keys an endpoint is encrypted: tls/HOST:PORT or quic/HOST:PORT"
-                )
-            if re.search(r"[#;](?!(iface|bind|dscp)=|so_)", place):
-                raise UsageError(
-                    f"{place}: how it is encrypted comes from --keys; leave out what follows the #"
-                )
-        if twice := sorted(set(own) & {"access_control", "low_pass_filter", "adminspace"}):
-            raise UsageError(
-                f"--zenoh-config: {twice[0]}: comes from --keys; give it in one place"
-            )
-        if twice := sorted(
-            set(own.get("transport", {}).get("link", {})) & {"tls", "protocols"}
-        ):
-            raise UsageError(
-                f"--zenoh-config: transport/link/{twice[0]}: comes from --keys; give it in one place"
-            )
-        return replace(
-            connection,
-            settings=merge_settings(keys.settings, own),
-            keys_of=keys.member,
-            keys_end=keys.ends,
+    if re.search(r"[#;](?!(iface|bind|dscp)=|so_)", address):
+        raise UsageError(
+            f"{address}: how it is encrypted comes from --keys; leave out what follows the #"
         )
-    mutual = own.get("transport", {}).get("link", {}).get("tls", {}).get("enable_mtls") is True
-    for place in find_endpoint_addresses(connection.listen):
-        if not (insecure or is_loopback(place) or (mutual and place.startswith(ENCRYPTED))):
+
+
+def _check_settings_without_keys(settings: Mapping[str, Any]) -> None:
+    """Refuses user settings that the keys set as well."""
+    for name in sorted(set(settings) & {"access_control", "low_pass_filter", "adminspace"}):
+        raise UsageError(f"--zenoh-config: {name}: comes from --keys; give it in one place")
+    link_settings = settings.get("transport", {}).get("link", {})
+    for name in sorted(set(link_settings) & {"tls", "protocols"}):
+        raise UsageError(
+            f"--zenoh-config: transport/link/{name}: comes from --keys; give it in one place"
+        )
+
+
+def _check_open_endpoints(connection: Connection, *, insecure: bool) -> None:
+    """Refuses endpoints without keys that other machines reach, unless `insecure`."""
+    link_settings = connection.settings.get("transport", {}).get("link", {})
+    has_mutual_tls = link_settings.get("tls", {}).get("enable_mtls") is True
+    for address in find_endpoint_addresses(connection.listen):
+        is_certified = has_mutual_tls and address.startswith(ENCRYPTED)
+        if not (insecure or is_loopback(address) or is_certified):
             raise UsageError(
-                f"--listen {place}: anybody on that network could take part: give --keys DIR (make them with "
-                "trilat keys new), or --insecure where you trust everybody on it"
+                f"--listen {address}: anybody on that network could take part: give "
+                "--keys DIR (make them with trilat keys new), or --insecure where you trust "
+                "everybody on it"
             )
-    return connection
 
 
 ENCRYPTED = ("tls/", "quic/")
 
 
 def find_endpoint_addresses(endpoints: Sequence[Endpoint]) -> list[str]:
-    """Returns the addresses of endpoints, those of Zenoh's groups of locators too."""
+    """Returns the addresses of endpoints, including those in Zenoh's groups of locators."""
     addresses: list[str] = []
-    for one in endpoints:
-        stated = one.get("locators", ()) if isinstance(one, Mapping) else [one]
-        addresses += [stated] if isinstance(stated, str) else map(str, stated)
+    for endpoint in endpoints:
+        locators = endpoint.get("locators", ()) if isinstance(endpoint, Mapping) else [endpoint]
+        if isinstance(locators, str):
+            addresses.append(locators)
+        else:
+            addresses += map(str, locators)
     return addresses
 
 
 def is_loopback(address: str) -> bool:
-    """True if nobody on another machine reaches an address."""
+    """True if other machines cannot reach an address."""
     protocol, _, rest = address.partition("/")
     host = re.split(r"[?#]", rest)[0].rpartition(":")[0].strip("[]")
     if protocol.startswith("unix") or host == "localhost":
@@ -267,11 +301,19 @@ def resolve_member_connection(
     *,
     routes: bool = False,
 ) -> Connection:
-    """Returns the connection of a site, a recorder or a tool; or of a router, which `routes`.
+    """Returns the connection of a member or a tool by the command line and a user's file.
 
     With a router, named by `--router` or by a file of mode "client", a member listens nowhere
-    and connects to nothing else. `listen_else` and `connect_else` hold where neither an option
-    nor the file names endpoints.
+    and connects only to the router.
+
+    Args:
+        listen: endpoints of --listen; None without the option.
+        connect: endpoints of --connect; None without the option.
+        routers: endpoints of --router; None without the option.
+        file: the user's Zenoh configuration.
+        listen_else: endpoints at which to listen if neither an option nor the file names any.
+        connect_else: endpoints to which to connect if neither an option nor the file names any.
+        routes: True for the connection of a router.
 
     Raises:
         UsageError: options and file contradict each other.
@@ -301,14 +343,15 @@ def resolve_member_connection(
             listen_else=listen_else,
             connect_else=connect_else,
         )
-    where = "--router" if routers else f"{file.source}: mode: client"
+    client_source = "--router" if routers else f"{file.source}: mode: client"
     if routers and file.mode == "peer":
         raise UsageError(
             f"{file.source}: mode: peer contradicts --router, which makes a client"
         )
     if listen is not None or file.endpoints("listen", "client"):
         raise UsageError(
-            f"{where}: a client of a router listens nowhere; leave out the endpoints to listen at"
+            f"{client_source}: a client of a router listens nowhere; "
+            "leave out the endpoints to listen at"
         )
     if routers and connect is not None:
         raise UsageError("--router: a client connects to a router only; leave out --connect")
@@ -319,10 +362,12 @@ def resolve_member_connection(
             raise UsageError(
                 f"--router: an endpoint is like tcp/192.0.2.1:7447, not {endpoint!r}"
             )
-    chosen = _merge_endpoints(routers or connect, file, "client", ())
-    if not chosen:
-        raise UsageError(f"{where}: there is no router to connect to; name it with --router")
-    return Connection((), chosen, "client", file.settings)
+    endpoints = _merge_endpoints(routers or connect, file, "client", ())
+    if not endpoints:
+        raise UsageError(
+            f"{client_source}: there is no router to connect to; name it with --router"
+        )
+    return Connection((), endpoints, "client", file.settings)
 
 
 def _join_options(
@@ -333,14 +378,17 @@ def _join_options(
     listen_else: Sequence[str],
     connect_else: Sequence[str] | None,
 ) -> Connection:
-    stated = file.endpoints("listen", mode)
-    if listen is not None and stated is not None:
+    """Returns the connection of a peer or a router; see `resolve_member_connection`."""
+    file_listen = file.endpoints("listen", mode)
+    if listen is not None and file_listen is not None:
         raise UsageError(
             f"{file.source}: listen/endpoints: given by --listen too; give them in one place"
         )
-    named = stated if listen is None else listen
+    listening = file_listen if listen is None else listen
+    if listening is None:
+        listening = listen_else
     connected = _merge_endpoints(connect, file, mode, connect_else)
-    return Connection(listen_else if named is None else named, connected, mode, file.settings)
+    return Connection(listening, connected, mode, file.settings)
 
 
 def _merge_endpoints(
@@ -349,11 +397,13 @@ def _merge_endpoints(
     mode: ZenohMode,
     otherwise: Sequence[str] | None,
 ) -> Sequence[Endpoint] | None:
-    stated = file.endpoints("connect", mode)
-    if named is None and stated is None:
+    """Returns the endpoints of options and file to which to connect, each once."""
+    file_endpoints = file.endpoints("connect", mode)
+    if named is None and file_endpoints is None:
         return otherwise
-    first: list[Endpoint] = list(named or ())
-    return first + [endpoint for endpoint in stated or () if endpoint not in first]
+    endpoints: list[Endpoint] = list(named or ())
+    more = [endpoint for endpoint in file_endpoints or () if endpoint not in endpoints]
+    return endpoints + more
 
 
 def open_bus(
@@ -363,31 +413,38 @@ def open_bus(
     timeout_s: float | None,
     say: Callable[[str], None],
 ) -> ZenohBus | None:
-    """Opens a connection whose `connect` is known; returns None if `stopped` before the router
-    answers.
+    """Opens a connection whose `connect` is known, and waits for a router.
 
-    It waits for a router for `timeout_s`, or for ever, and says so.
+    Args:
+        connection: the connection.
+        clock: clock of the caller.
+        stopped: returns True to give up.
+        timeout_s: time to wait for a router, in s; None for no limit.
+        say: receives messages for the user.
+
+    Returns:
+        The bus; None if `stopped` before a router answers.
 
     Raises:
         UsageError: an endpoint cannot be used.
-        UnknownHost: a host name does not resolve at the first attempt; later on it may be away
-            for a while.
+        UnknownHost: a host name does not resolve at the first attempt. Later attempts may fail
+            while the name service is away.
         SessionError: no router answered in time.
     """
     begun_ns = clock.monotonic_ns()
-    printed = False
+    has_reported = False
     while not stopped():
         try:
             return connection.open()
         except UnknownHost:
-            if not printed:
+            if not has_reported:
                 raise
         except RouterSilent as silent:
             if timeout_s is not None and clock.monotonic_ns() - begun_ns >= timeout_s * 1e9:
                 raise SessionError(f"{silent} within {timeout_s:g} s") from None
-            if not printed:
+            if not has_reported:
                 say(f"{silent} yet; trying again")
-            printed = True
+            has_reported = True
         clock.sleep_until(clock.monotonic_ns() + RETRY_NS)
     return None
 
@@ -402,17 +459,21 @@ def run_router(
     say: Callable[[str], None],
     until_idle_s: float | None = None,
 ) -> None:
-    """Runs a router until `stopped`, or until the last member has left `until_idle_s` ago."""
+    """Runs a router until `stopped`, or until `until_idle_s` after the last member has left."""
     presence = bus.presence(topics.presence_key("*", "*"))
     present: set[topics.KeyParts] = set()
     idle_ns = math.inf if until_idle_s is None else until_idle_s * 1e9
     empty_since_ns: int | None = None  # None before the first member
     while not stopped():
-        for parts, alive in topics.read_presence(presence):
-            if alive == (parts in present):
+        for parts, is_alive in topics.read_presence(presence):
+            if is_alive == (parts in present):
                 continue
-            (present.add if alive else present.remove)(parts)
-            say(f"session {parts.session}: {parts.member} {'is here' if alive else 'has left'}")
+            if is_alive:
+                present.add(parts)
+            else:
+                present.remove(parts)
+            change = "is here" if is_alive else "has left"
+            say(f"session {parts.session}: {parts.member} {change}")
             empty_since_ns = None if present else clock.monotonic_ns()
         now_ns = clock.monotonic_ns()
         if empty_since_ns is not None and now_ns - empty_since_ns >= idle_ns:

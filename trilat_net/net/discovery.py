@@ -1,10 +1,14 @@
 """Discovery of a session from outside: find its members, connect to it, request a change.
 
-Invariant: one way of asking who is present (`find_members`). A session name belongs to one
-session: a playback under a name that a site answers to is refused. A change is requested once,
-and the caller gets a reply or an error that names the member without one.
+Invariant:
+    - `find_members` is the only way to query who is present.
+    - A session name belongs to one session: a playback under the name of a session with a
+      present site is refused.
+    - A change is requested once. The caller gets a reply, or an error that names the member
+      that did not reply.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
@@ -33,10 +37,12 @@ from .wire import decode, encode
 POLL_NS = 5_000_000
 REPLY_TIMEOUT_S = 3.0
 NAME_CHECK_S = 0.7
-"""Time to look for other sites before a playback: they try to connect every half a second."""
+"""Time to look for sites before a playback, in s: sites try to connect every half a second."""
 
 SiteNamesOf = Callable[[str], tuple[str, ...]]
-"""Returns the sites that a scenario's text names, in order; raises ScenarioError if it is none.
+"""Returns the names of the sites in a scenario's text, in order.
+
+Raises ScenarioError if the text is not a scenario.
 """
 
 
@@ -48,25 +54,30 @@ def find_members(
     stopped: Callable[[], bool],
     timeout_s: float | None,
 ) -> Iterator[Info]:
-    """Yields identities of members as they arrive, each again and again, until the time, if
-    any, is over.
+    """Yields identities of members as they arrive; the identity of one member repeatedly.
+
+    Args:
+        bus: a bus that reaches the session.
+        clock: clock of the caller.
+        session: name of the session.
+        stopped: returns True to end the search.
+        timeout_s: duration of the search in s; None for no limit.
 
     Raises:
-        SessionError: the time is over, and all answers that arrived are unreadable.
+        SessionError: the time is over, and all replies that arrived are unreadable.
     """
     query = MemberQuery(bus, clock, session)
-    found = False
+    has_readable_reply = False
     begun_ns = clock.monotonic_ns()
-    while not stopped() and (
-        timeout_s is None or clock.monotonic_ns() - begun_ns < timeout_s * 1e9
-    ):
+    timeout_ns = math.inf if timeout_s is None else timeout_s * 1e9
+    while not stopped() and clock.monotonic_ns() - begun_ns < timeout_ns:
         for info in query.poll():
-            found = True
+            has_readable_reply = True
             yield info
         clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-    if query.unreadable and not found and not stopped():
+    if query.unreadable and not has_readable_reply and not stopped():
         member, reason = next(iter(query.unreadable.items()))
-        raise SessionError(f"the answer of {member} cannot be read: {reason}")
+        raise SessionError(f"the reply of {member} cannot be read: {reason}")
 
 
 @contextmanager
@@ -83,21 +94,31 @@ def connect_to_session(
 ) -> Iterator[Bus | None]:
     """Yields a bus that reaches a session's sites, or None if `stopped`; closes it at the end.
 
-    Without endpoints to connect to (`connect` is None) it takes those of sites that are known
-    to run on this machine, if all do. Else it asks the session's first site, on this machine,
-    for the others; if `names` returns none, that site's endpoint remains. It waits for the
-    first site, or for a router, for `timeout_s`, or for as long as it takes. A recorder is
-    announced by its boot meanwhile: then the session waits for it.
+    If the connection's `connect` is None, the endpoints are found as follows. If all sites of
+    the session are known to run on this machine, their endpoints are used. Otherwise, the
+    session's first site, on this machine, is queried for the other sites.
+
+    Args:
+        connection: endpoints and mode of the caller.
+        clock: clock of the caller.
+        session: name of the session.
+        names: returns the sites of a scenario; if it returns no sites, the endpoint of the
+            first site is used.
+        stopped: returns True to give up.
+        timeout_s: time to wait for the first site, or for a router, in s; None for no limit.
+        say: receives messages for the user.
+        recorder_boot: boot of a recorder, which is announced meanwhile, so that the session
+            waits for the recorder; None for other callers.
 
     Raises:
-        SessionError: no site or no router answers in time.
+        SessionError: no site, or no router, replies in time.
         UsageError: an endpoint cannot be used.
     """
     with ExitStack() as stack:
 
-        def connect(there: Connection) -> Bus | None:
+        def connect(target: Connection) -> Bus | None:
             bus = open_bus(
-                connection=there, clock=clock, stopped=stopped, timeout_s=timeout_s, say=say
+                connection=target, clock=clock, stopped=stopped, timeout_s=timeout_s, say=say
             )
             return None if bus is None else stack.enter_context(closing(bus))
 
@@ -108,8 +129,9 @@ def connect_to_session(
             visitor = connect(replace(connection, listen=(), connect=[first]))
             if visitor is not None and recorder_boot is not None:
                 visitor.announce(liveliness_token(session, topics.RECORDER, recorder_boot))
-            sites = (
-                _ask_for_sites(
+            sites = None
+            if visitor is not None:
+                sites = _query_sites(
                     bus=visitor,
                     clock=clock,
                     session=session,
@@ -117,19 +139,15 @@ def connect_to_session(
                     stopped=stopped,
                     timeout_s=timeout_s,
                 )
-                if visitor
-                else None
-            )
             if sites is None:
                 yield None
                 return
-            connection = replace(
-                connection, connect=list(default_endpoints(session, sites).values()) or [first]
-            )
+            endpoints = list(default_endpoints(session, sites).values()) or [first]
+            connection = replace(connection, connect=endpoints)
         yield connect(connection)
 
 
-def _ask_for_sites(
+def _query_sites(
     bus: Bus,
     clock: Clock,
     session: str,
@@ -137,6 +155,11 @@ def _ask_for_sites(
     stopped: Callable[[], bool],
     timeout_s: float | None,
 ) -> tuple[str, ...] | None:
+    """Returns the sites of the first member's scenario, or None if `stopped`.
+
+    Raises:
+        SessionError: no member with a scenario replies in time.
+    """
     for info in find_members(bus, clock, session, stopped=stopped, timeout_s=timeout_s):
         try:
             if info.scenario:
@@ -146,35 +169,36 @@ def _ask_for_sites(
     if stopped():
         return None
     raise SessionError(
-        f"no site of session {session!r} answered at {default_endpoint(session, 0)} within {timeout_s:g} s; "
-        "is that its name? name other endpoints with --connect"
+        f"no site of session {session!r} answered at {default_endpoint(session, 0)} "
+        f"within {timeout_s:g} s; is that its name? name other endpoints with --connect"
     )
 
 
 def send_change(
     bus: Bus, clock: Clock, session: str, site: str, request: ChangeRequest
 ) -> ChangeReply:
-    """Sends a request to a site of a session that runs, and returns its reply; any member may
-    ask to stop.
+    """Sends a request to a site of a running session, and returns the site's reply.
+
+    All members may send the order to stop.
 
     Raises:
         SessionError: the site does not reply.
     """
     channel = topics.STOP if request.order == "stop" else topics.SET
-    reply = _ask_once(bus, clock, topics.key(session, site, channel), request)
-    if reply is None:
-        whose = (
-            "" if channel == topics.STOP else "; with keys, only the operator's may ask for it"
-        )
+    payload = _query_once(bus, clock, topics.key(session, site, channel), request)
+    if payload is None:
+        hint = "; with keys, only the operator's may ask for it"
         raise SessionError(
-            f"{site} gave no answer; its records show whether it made the change{whose}"
+            f"{site} gave no answer; its records show whether it made the change"
+            f"{'' if channel == topics.STOP else hint}"
         )
     try:
-        answer = decode(reply, ChangeReply)
+        reply = decode(payload, ChangeReply)
     except WireError as error:
-        raise SessionError(f"the answer of {site} cannot be read: {error}") from None
-    if request.order == "stop" and not answer.accepted and request.source is not UNSET:
-        # A site of an older program knows no source and refuses the whole request; its arm has to stop too.
+        raise SessionError(f"the reply of {site} cannot be read: {error}") from None
+    if request.order == "stop" and not reply.accepted and request.source is not UNSET:
+        # A site of an older program does not know the field `source`, and refuses the whole
+        # request. The arm of that site must stop, too.
         return send_change(
             bus=bus,
             clock=clock,
@@ -182,37 +206,42 @@ def send_change(
             site=site,
             request=msgspec.structs.replace(request, source=UNSET),
         )
-    return answer
+    return reply
 
 
-def _ask_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | None:
+def _query_once(bus: Bus, clock: Clock, key: str, request: Request) -> bytes | None:
+    """Returns the payload of the first reply to a request, or None without a reply in time."""
     replies = bus.query(key, encode(request))
-    give_up_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
-    while clock.monotonic_ns() < give_up_ns:
+    deadline_ns = clock.monotonic_ns() + int(REPLY_TIMEOUT_S * 1e9)
+    while clock.monotonic_ns() < deadline_ns:
         clock.sleep_until(clock.monotonic_ns() + POLL_NS)
-        if (reply := replies.poll()) is not None:
+        reply = replies.poll()
+        if reply is not None:
             return reply[1]
     return None
 
 
 def list_past_events(bus: Bus, clock: Clock, session: str, site: str) -> Iterator[Event]:
-    """Yields the events of a site that runs, from its first one on, as far as it keeps them and
-    answers.
+    """Yields the events of a running site, in order.
+
+    The events start with the oldest one that the site still has. They end early if the site
+    does not reply.
     """
+    key = topics.key(session, site, topics.PAST)
     first = 0
-    made = 1
-    with suppress(WireError):  # a stranger's answer
-        while first < made:
-            wanted = BackfillRequest(
+    published = 1
+    with suppress(WireError):  # a reply of a stranger
+        while first < published:
+            request = BackfillRequest(
                 channel="event", first=first, last=first + BACKFILL_MESSAGES - 1
             )
-            reply = _ask_once(bus, clock, topics.key(session, site, topics.PAST), wanted)
-            past = None if reply is None else decode(reply, Backfill)
-            if past is None or not past.payloads:
+            reply = _query_once(bus, clock, key, request)
+            backfill = None if reply is None else decode(reply, Backfill)
+            if backfill is None or not backfill.payloads:
                 return
-            yield from (decode(payload, Event) for payload in past.payloads)
-            first = past.first + len(past.payloads)
-            made = past.made
+            yield from (decode(payload, Event) for payload in backfill.payloads)
+            first = backfill.first + len(backfill.payloads)
+            published = backfill.made
 
 
 def open_playback_bus(
@@ -222,10 +251,10 @@ def open_playback_bus(
     stopped: Callable[[], bool],
     say: Callable[[str], None],
 ) -> Bus | None:
-    """Returns the bus of a playback; None if `stopped`.
+    """Returns the bus of a playback, or None if `stopped`.
 
     Raises:
-        SessionError: the session of that name is running and holds the port.
+        SessionError: a running session of that name uses the port.
         UsageError: an endpoint cannot be used.
     """
     try:
@@ -235,9 +264,10 @@ def open_playback_bus(
     except UsageError:
         if not connection.listen:
             raise
-        there = replace(connection, listen=(), connect=connection.listen)
+        # The port may be in use by a site of a session with the same name.
+        target = replace(connection, listen=(), connect=connection.listen)
         visitor = open_bus(
-            connection=there, clock=clock, stopped=stopped, timeout_s=1.0, say=say
+            connection=target, clock=clock, stopped=stopped, timeout_s=1.0, say=say
         )
         if visitor is not None:
             with closing(visitor):
@@ -248,19 +278,18 @@ def open_playback_bus(
 def refuse_running_session(
     bus: Bus, clock: Clock, session: str, stopped: Callable[[], bool]
 ) -> None:
-    """Refuses a session name that a site answers to.
+    """Refuses the name of a session with a present site.
 
     Raises:
-        SessionError: a site of that session answers.
+        SessionError: a site of that session replies.
     """
     for info in find_members(bus, clock, session, stopped=stopped, timeout_s=NAME_CHECK_S):
-        if info.member != topics.RECORDER:
-            state = (
-                f"runs; {info.member} is at tick {info.ticks}"
-                if info.running
-                else "waits to begin"
-            )
-            raise SessionError(
-                f"session {session!r} is there already and {state}; play under another name with "
-                "--prefix or --session"
-            )
+        if info.member == topics.RECORDER:
+            continue
+        state = "waits to begin"
+        if info.running:
+            state = f"runs; {info.member} is at tick {info.ticks}"
+        raise SessionError(
+            f"session {session!r} is there already and {state}; play under another name with "
+            "--prefix or --session"
+        )
