@@ -1,8 +1,11 @@
-"""Check of the bytes of an MCAP file: checksums, records, and an index that agrees with them.
+"""Check of the bytes of an MCAP file: its checksums, its records, and its index.
 
-Invariant: each problem is reported once, with its place; its consequences are not. An index is
-compared with the records in the file, never followed. Any MCAP file is accepted. Conformance
-with every rule of the format is left to other programs (`pymcap-cli doctor`).
+Conformance with every rule of the format is left to other programs (pymcap-cli doctor).
+
+Invariant:
+    - Each problem is reported once, with its offset; its consequences are not reported.
+    - An index is compared with the records in the file, and never followed.
+    - Every MCAP file is accepted.
 """
 
 from array import array
@@ -17,19 +20,20 @@ from ..errors import count_nouns
 from . import mcap_records
 from .findings import Findings
 
-_INDEX_HEAD_BYTES = 6  # of a message index: channel, length of its entries
+_INDEX_HEAD_BYTES = 6
+"""Size of a message index before its entries: channel and length of the entries."""
 
 
 class FileCheck:
     """Check of one file, record by record.
 
     Args:
-        file: its name.
-        scanner: finds its records.
+        file: name of the file.
+        scanner: finds the records of the file.
         findings: receives the problems, as "whole", "checksums", "records" and "index".
 
     Attributes:
-        counts: its bytes, chunks and messages, and the checksums that were compared.
+        counts: numbers of bytes, chunks and messages, and of checksums that were compared.
     """
 
     def __init__(
@@ -40,110 +44,127 @@ class FileCheck:
         self._scanner = scanner
         self._findings = findings
         self._end = 0
-        self._defined: dict[tuple[int, int], Any] = {}  # by opcode and number
-        self._found: dict[
-            tuple[int, int], Any
-        ] = {}  # what an index should name: by its opcode and place
-        self._indexed: dict[tuple[int, int], Any] = {}  # what the index names
-        self._ends: dict[
-            int, Any
-        ] = {}  # statistics, end of the data and footer, each with its offset
-        self._unknown: set[int] = set()  # channels of messages that no record names
-        self._indexes: dict[int, int] | None = (
-            None  # of the last chunk: where the index of a channel is
-        )
-        self._entries: dict[
-            int, array[int]
-        ] = {}  # of the last chunk: log times and places, by channel
-        self._unreadable = False  # something unreadable may have named a channel
+        # Schemas and channels, by opcode and number.
+        self._defined: dict[tuple[int, int], Any] = {}
+        # Entries that the index should have, and has, by the opcode of the index record and the
+        # offset of the indexed record.
+        self._expected_index: dict[tuple[int, int], Any] = {}
+        self._stated_index: dict[tuple[int, int], Any] = {}
+        # Statistics, end of the data and footer: (offset, record) by opcode.
+        self._end_records: dict[int, Any] = {}
+        self._undefined_channels: set[int] = set()
+        # Of the last chunk, by channel: the offset of the message index, and the log times and
+        # offsets of the messages. None after a chunk that cannot be read.
+        self._message_indexes: dict[int, int] | None = None
+        self._entries: dict[int, array[int]] = {}
+        self._has_unreadable = False  # an unreadable record may have defined a channel
 
     def check_record(
         self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
     ) -> None:
-        """Checks one record of the file; `data` is what a chunk holds, empty if it cannot be
-        unpacked.
+        """Checks one record of the file.
+
+        Args:
+            frame: place of the record.
+            content: content of the record.
+            data: unpacked records of a chunk; empty if the chunk cannot be unpacked.
         """
         self._end = frame.end + len(mcap_records.MAGIC)
         if frame.offset == len(mcap_records.MAGIC) and frame.opcode != Opcode.HEADER:
             self._add("records", frame.offset, "the first record is no header")
         try:
-            self._take_content(frame, content, data)
+            self._check_content(frame, content, data)
         except mcap_records.UnreadableRecord as error:
             check = "checksums" if "CRC" in str(error) else "records"
             self._add(check, frame.offset, str(error))
-            self._unreadable = True
+            self._has_unreadable = True
 
     def _add(self, check: str, offset: int, text: str) -> None:
         self._findings[check].add(self._file, offset, text)
 
-    def _take_content(
+    def _check_content(
         self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
     ) -> None:
         match frame.opcode:
             case Opcode.CHUNK:
-                self._take_chunk(frame, content, data)
+                self._check_chunk(frame, content, data)
             case Opcode.MESSAGE_INDEX:
-                self._take_message_index(frame, content)
+                self._check_message_index(frame, content)
             case Opcode.MESSAGE:
-                self._take_message(frame, content, 0, len(content))
+                self._check_message(frame, content, 0, len(content))
             case Opcode.SCHEMA | Opcode.CHANNEL:
                 self._define(frame, frame.opcode, content)
             case kind if kind in mcap_records.KINDS:
-                self._take_other(frame, content, mcap_records.parse_record(kind, content))
+                self._check_other(frame, content, mcap_records.parse_record(kind, content))
             case kind if kind < 0x80:
                 self._add(
                     "records", frame.offset, f"a record of kind {kind} is none of the format"
                 )
 
-    def _take_other(self, frame: mcap_records.RecordFrame, content: bytes, record: Any) -> None:
-        """Takes metadata, an attachment, or a record of the end; those of the index by what
-        they name.
-        """
+    def _check_other(
+        self, frame: mcap_records.RecordFrame, content: bytes, record: Any
+    ) -> None:
+        """Checks metadata, an attachment, or a record at the end of the file."""
         match frame.opcode:
             case Opcode.METADATA:
-                self._found[Opcode.METADATA_INDEX, frame.offset] = frame.size, record.name
+                self._expected_index[Opcode.METADATA_INDEX, frame.offset] = (
+                    frame.size,
+                    record.name,
+                )
             case Opcode.ATTACHMENT:
                 if not mcap_records.has_right_crc(content):
                     raise mcap_records.UnreadableRecord("an attachment's CRC differs")
                 self.counts["crcs"] += content[-4:] != bytes(4)
-                self._found[Opcode.ATTACHMENT_INDEX, frame.offset] = frame.size, record.name
+                self._expected_index[Opcode.ATTACHMENT_INDEX, frame.offset] = (
+                    frame.size,
+                    record.name,
+                )
             case Opcode.METADATA_INDEX | Opcode.ATTACHMENT_INDEX:
-                self._indexed[frame.opcode, record.offset] = record.length, record.name
+                self._stated_index[frame.opcode, record.offset] = record.length, record.name
             case Opcode.CHUNK_INDEX:
-                times = record.message_start_time, record.message_end_time
-                entry = record.chunk_length, *times, record.message_index_offsets
-                self._indexed[frame.opcode, record.chunk_start_offset] = entry
+                entry = (
+                    record.chunk_length,
+                    record.message_start_time,
+                    record.message_end_time,
+                    record.message_index_offsets,
+                )
+                self._stated_index[frame.opcode, record.chunk_start_offset] = entry
             case _:
-                self._ends[frame.opcode] = frame.offset, record
+                self._end_records[frame.opcode] = frame.offset, record
 
     def _define(self, frame: mcap_records.RecordFrame, opcode: int, content: bytes) -> None:
-        """Takes a schema or a channel; one that came before must be the same."""
+        """Checks a schema or a channel; repeated definitions must be equal."""
         record = mcap_records.parse_record(opcode, content)
         name = "schema" if opcode == Opcode.SCHEMA else "channel"
         if self._defined.setdefault((opcode, record.id), record) != record:
             self._add("records", frame.offset, f"{name} {record.id} is not what it was before")
         schema = record.schema_id if opcode == Opcode.CHANNEL else 0
-        if schema and (Opcode.SCHEMA, schema) not in self._defined and not self._unreadable:
+        if schema and (Opcode.SCHEMA, schema) not in self._defined and not self._has_unreadable:
             text = f"channel {record.id} names schema {schema}, which comes nowhere before"
             self._add("records", frame.offset, text)
 
-    def _take_message(
+    def _check_message(
         self, frame: mcap_records.RecordFrame, data: bytes, begin: int, end: int
     ) -> tuple[int, int]:
-        """Takes a message; returns its channel and its log time."""
+        """Checks a message; returns its channel and its log time."""
         if end - begin < mcap_records.MESSAGE_HEAD.size:
             raise mcap_records.UnreadableRecord("a message is shorter than its head")
         channel, _, log_ns, _ = mcap_records.MESSAGE_HEAD.unpack_from(data, begin)
-        if (Opcode.CHANNEL, channel) not in self._defined and channel not in self._unknown:
-            self._unknown.add(channel)
-            if not self._unreadable:
+        if (
+            Opcode.CHANNEL,
+            channel,
+        ) not in self._defined and channel not in self._undefined_channels:
+            self._undefined_channels.add(channel)
+            if not self._has_unreadable:
                 text = f"messages of channel {channel}, which comes nowhere before"
                 self._add("records", frame.offset, text)
         self.counts["messages"] += 1
         return channel, log_ns
 
-    def _take_chunk(self, frame: mcap_records.RecordFrame, content: bytes, data: bytes) -> None:
-        self._indexes = None
+    def _check_chunk(
+        self, frame: mcap_records.RecordFrame, content: bytes, data: bytes
+    ) -> None:
+        self._message_indexes = None
         head = self._scanner.head(frame)
         self.counts["chunks"] += 1
         data = data or mcap_records.unpack_chunk(content)
@@ -151,7 +172,7 @@ class FileCheck:
         self._entries.clear()
         for opcode, begin, end in mcap_records.iterate_records(data):
             if opcode == mcap_records.OP_MESSAGE:
-                channel, log_ns = self._take_message(frame, data, begin, end)
+                channel, log_ns = self._check_message(frame, data, begin, end)
                 entries = self._entries.setdefault(channel, array("Q"))
                 entries.append(log_ns)
                 entries.append(begin - mcap_records.RECORD_HEAD_BYTES)
@@ -159,12 +180,13 @@ class FileCheck:
                 self._define(frame, opcode, data[begin:end])
             else:
                 self._add("records", frame.offset, f"a chunk holds a record of kind {opcode}")
-        self._indexes = {}
-        found = frame.size, head.start_ns, head.end_ns, self._indexes
-        self._found[Opcode.CHUNK_INDEX, frame.offset] = found
+        self._message_indexes = {}
+        # The offsets of the message indexes are added when those records follow.
+        entry = frame.size, head.start_ns, head.end_ns, self._message_indexes
+        self._expected_index[Opcode.CHUNK_INDEX, frame.offset] = entry
 
-    def _take_message_index(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
-        if self._indexes is None:
+    def _check_message_index(self, frame: mcap_records.RecordFrame, content: bytes) -> None:
+        if self._message_indexes is None:
             return  # the chunk could not be read
         channel = int.from_bytes(content[:2], "little")
         length = int.from_bytes(content[2:6], "little")
@@ -173,47 +195,40 @@ class FileCheck:
             raise mcap_records.UnreadableRecord(
                 f"a message index of {count_nouns(len(body), 'byte')} says that it has {length}"
             )
-        self._indexes[channel] = frame.offset
-        if not np.array_equal(
-            _sort_by_place(body), _sort_by_place(self._entries.get(channel, b""))
-        ):
+        self._message_indexes[channel] = frame.offset
+        stated = _sort_by_offset(body)
+        expected = _sort_by_offset(self._entries.get(channel, b""))
+        if not np.array_equal(stated, expected):
             text = f"the index of channel {channel} in a chunk is not what is there"
             self._add("index", frame.offset, text)
 
     def finish(self) -> None:
-        """Takes the damaged parts; compares the end of a finished file with its data, and
-        checksums there.
-        """
+        """Reports the damaged parts, and compares the end of a finished file with its data."""
         scanner = self._scanner
         if not scanner.begins:
-            self._add(
-                "whole",
-                0,
-                "does not begin as an MCAP file does" if scanner.size else "is empty",
-            )
+            problem = "does not begin as an MCAP file does" if scanner.size else "is empty"
+            self._add("whole", 0, problem)
             return
         for damage in scanner.damaged:
             self._add("whole", damage.offset, str(damage))
         if scanner.torn is not None:
             self._add("whole", scanner.torn.offset, f"is cut off: {scanner.torn.problem}")
         elif scanner.finished and 0 < self._end < scanner.size:
-            self._add(
-                "whole",
-                self._end,
-                f"{count_nouns(scanner.size - self._end, 'byte follows', 'bytes follow')} the end mark",
-            )
+            rest = count_nouns(scanner.size - self._end, "byte follows", "bytes follow")
+            self._add("whole", self._end, f"{rest} the end mark")
         if scanner.finished and not scanner.damaged:
             self._compare_end()
 
     def _compare_end(self) -> None:
-        if not self._unreadable:
+        """Compares the index, the statistics and the checksums at the end with the data."""
+        if not self._has_unreadable:
             self._compare_index()
             self._compare_statistics()
         footer = self._scanner.footer()
-        if Opcode.DATA_END not in self._ends:
+        if Opcode.DATA_END not in self._end_records:
             self._add("records", self._scanner.size, "there is no end of the data")
             return
-        offset, data_end = self._ends[Opcode.DATA_END]
+        offset, data_end = self._end_records[Opcode.DATA_END]
         self.counts["crcs"] += bool(data_end.data_section_crc)
         if (
             data_end.data_section_crc
@@ -223,24 +238,28 @@ class FileCheck:
         if footer is not None and footer.summary_crc:
             self.counts["crcs"] += 1
             if not self._scanner.is_summary_intact(footer):
-                offset, _ = self._ends[Opcode.FOOTER]
+                offset, _ = self._end_records[Opcode.FOOTER]
                 self._add("checksums", offset, "the CRC of the index differs")
 
     def _compare_index(self) -> None:
-        kinds = {opcode for opcode, _ in self._indexed}
-        for (opcode, offset), entry in sorted(self._found.items()):
-            if opcode in kinds and self._indexed.pop((opcode, offset), None) != entry:
-                text = f"the {_INDEXED_NAMES[opcode]} that begins here is not in the index as it is"
+        """Compares the index with the records; kinds that the index lacks are not required."""
+        indexed_kinds = {opcode for opcode, _ in self._stated_index}
+        for (opcode, offset), entry in sorted(self._expected_index.items()):
+            if opcode not in indexed_kinds:
+                continue
+            if self._stated_index.pop((opcode, offset), None) != entry:
+                name = _INDEXED_NAMES[opcode]
+                text = f"the {name} that begins here is not in the index as it is"
                 self._add("index", offset, text)
-        for opcode, offset in sorted(self._indexed):
+        for opcode, offset in sorted(self._stated_index):
             text = f"the index names {_INDEXED_NAMES[opcode]} that is not there"
             self._add("index", offset, text)
 
     def _compare_statistics(self) -> None:
-        if Opcode.STATISTICS not in self._ends:
+        if Opcode.STATISTICS not in self._end_records:
             return
-        offset, statistics = self._ends[Opcode.STATISTICS]
-        kinds = Counter(opcode for opcode, _ in (*self._defined, *self._found))
+        offset, statistics = self._end_records[Opcode.STATISTICS]
+        kinds = Counter(opcode for opcode, _ in (*self._defined, *self._expected_index))
         counts = {
             "messages": (statistics.message_count, self.counts["messages"]),
             "schemas": (statistics.schema_count, kinds[Opcode.SCHEMA]),
@@ -249,13 +268,14 @@ class FileCheck:
             "attachments": (statistics.attachment_count, kinds[Opcode.ATTACHMENT_INDEX]),
             "metadata": (statistics.metadata_count, kinds[Opcode.METADATA_INDEX]),
         }
-        for name, (stated, there) in counts.items():
-            if stated != there:
-                text = f"the statistics say {stated} {name}, there are {there}"
+        for name, (stated, actual) in counts.items():
+            if stated != actual:
+                text = f"the statistics say {stated} {name}, there are {actual}"
                 self._add("index", offset, text)
 
 
-def _sort_by_place(entries: "bytes | array[int]") -> NDArray[np.uint64]:
+def _sort_by_offset(entries: "bytes | array[int]") -> NDArray[np.uint64]:
+    """Returns the (log time, offset) pairs of a message index, sorted by offset."""
     pairs = np.frombuffer(entries, dtype="<u8").reshape(-1, 2)
     return pairs[np.argsort(pairs[:, 1], kind="stable")]
 
