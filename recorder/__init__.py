@@ -1,3 +1,1 @@
-"""Records every channel of a session into one MCAP file (`record_process`), and plays logs
-(`play`).
-"""
+"""Record the messages of a session in a log (`record_process`), and play logs (`play`)."""

@@ -1,9 +1,11 @@
-"""The recorder as one process: find and join a session, write its messages, end with it.
+"""Run the recorder as a process: join a session, write its messages, and end with the session.
 
-Invariant: no message is lost that arrived, or that a site still buffers. Messages are stamped
-on arrival and wait in one bounded queue; one thread writes. The file is flushed every 100 ms
-and completed on every orderly end of the process. A signal ends it when it has what the sites
-hold, a second one at once.
+Invariant:
+    - No message is lost that has arrived or that a site still holds.
+    - Messages are stamped on arrival and wait in one bounded queue. One thread writes them.
+    - The file is flushed every 100 ms, and completed at every orderly end of the process.
+    - The first signal ends the recorder once it has the messages that the sites still hold. The
+      second signal ends it at once.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,7 +27,7 @@ from trilat_net.net.pinging import describe_clocks
 from trilat_net.net.session import SessionJoin
 from trilat_net.net.zenoh_bus import share_threads
 from trilat_net.process import Interrupt
-from trilat_net.scenario import embedded_names_reader, parse_embedded
+from trilat_net.scenario import Scenario, embedded_names_reader, parse_embedded
 
 from .session_recording import RecorderReport, Recording
 from .site_reception import InboundQueue
@@ -33,28 +35,28 @@ from .site_reception import InboundQueue
 POLL_NS = 10_000_000
 END_S = 10
 END_NS = END_S * 1_000_000_000
-"""Longest time after a signal for what the sites still hold; they hold it as long as that, see
-`sites`.
+"""Longest time after a signal to get the messages that sites still hold. Sites hold messages
+for that long, see `sites`.
 """
 FLUSH_NS = 65_000_000
-"""Between two turns of writing, each of which ends in a flush: a crash loses this. Fewer turns
-cost less.
+"""Period of writing; each turn ends with a flush. A crash loses at most this time. A longer
+period costs less computing time.
 """
 
 
 class Recorder:
-    """One recording, from the first poll to the end mark of the file.
+    """The recorder of one session, from the first poll to the end mark of the file.
 
     Args:
         bus: the connection to the session.
         clock: the time.
-        session: the session's name.
-        boot: the number of this start of the recorder.
-        storage: where the log goes.
-        stopped: returns True once it is to end at once.
+        session: name of the session.
+        boot: number of this start of the recorder.
+        storage: where the log is written.
+        stopped: returns True if the recorder has to end at once.
         say: prints a line for the user.
-        is_ending: returns True once it is to end as soon as it has what the sites hold, after
-            `END_NS` at most.
+        is_ending: returns True if the recorder has to end once it has the messages that the
+            sites still hold, after `END_NS` at most.
     """
 
     def __init__(
@@ -87,11 +89,16 @@ class Recorder:
         )
 
     def join(self, timeout_s: float | None) -> Epoch | None:
-        """Waits for a session to begin, without a timeout for ever; returns its epoch, or None
-        if `stopped`.
+        """Waits for the session to begin and returns its epoch.
+
+        Args:
+            timeout_s: longest time to wait, s; None: no limit.
+
+        Returns:
+            The epoch; None if the recorder has to end before the session begins.
 
         Raises:
-            SessionError: none began in time.
+            SessionError: the session did not begin in time.
         """
         begun_ns = self._clock.monotonic_ns()
         while not (self._stopped() or self._is_ending()):
@@ -100,10 +107,10 @@ class Recorder:
                 return epoch
             now_ns = self._clock.monotonic_ns()
             if timeout_s is not None and now_ns - begun_ns > timeout_s * 1e9:
-                met = ", ".join(self._joining.membership.others) or "nobody"
+                members = ", ".join(self._joining.membership.others) or "nobody"
                 raise SessionError(
-                    f"the recorder waited {timeout_s:g} s for session {self._session!r} to begin; "
-                    f"it met {met}"
+                    f"the recorder waited {timeout_s:g} s for session {self._session!r} "
+                    f"to begin; it met {members}"
                 )
             self._clock.sleep_until(now_ns + self._joining.pinger.pause_ns(POLL_NS))
         return None
@@ -112,24 +119,25 @@ class Recorder:
         """Writes the session from its epoch to its end, and returns the finished recording.
 
         Raises:
-            UsageError: the file cannot be made.
-            LogRefused: the disk refused; the message names what is kept.
+            UsageError: the file cannot be created.
+            LogRefused: the disk refused to store the log; the error names the part that is
+                kept.
         """
-        scenario = next(
-            parse_embedded(info.scenario, info.member)
-            for info in self._joining.membership.others.values()
-            if info.scenario and epoch.boots.get(info.member) == info.boot
-        )
+        scenario = self._find_scenario(epoch)
 
-        def begin(stream: Sink, part: Mapping[str, str]) -> LogWriter:
+        def open_part(stream: Sink, part: Mapping[str, str]) -> LogWriter:
             return LogWriter(
-                *(stream, scenario, self._session, "live", epoch.unix_ns),
+                stream=stream,
+                scenario=scenario,
+                session=self._session,
+                driver="live",
+                epoch_unix_ns=epoch.unix_ns,
                 part=part,
                 choice=self._storage.choice,
                 views_hz=self._storage.views_hz,
             )
 
-        with LogParts(self._storage, begin) as log:
+        with LogParts(self._storage, open_part) as log:
             recording = Recording(
                 writer=log,
                 scenario=scenario,
@@ -146,8 +154,8 @@ class Recorder:
                 queue=self._queue,
                 size=lambda: log.written_bytes,
             )
-            self._begin(recording, epoch, log.path)
-            has_room = True  # on a full disk there is none for the queue
+            self._announce_start(recording, epoch, log.path)
+            has_room = True  # a full disk has no room for the messages in the queue
             try:
                 self._run(recording, report)
             except LogRefused:
@@ -162,46 +170,57 @@ class Recorder:
                     raise
         return recording
 
-    def _begin(self, recording: Recording, epoch: Epoch, path: Path) -> None:
-        own = self._publisher.info
+    def _find_scenario(self, epoch: Epoch) -> Scenario:
+        """Returns the scenario that a member of the session states."""
+        return next(
+            parse_embedded(info.scenario, info.member)
+            for info in self._joining.membership.others.values()
+            if info.scenario and epoch.boots.get(info.member) == info.boot
+        )
+
+    def _announce_start(self, recording: Recording, epoch: Epoch, path: Path) -> None:
+        """Publishes that the recorder runs, and requests old messages if it joins late."""
+        info = self._publisher.info
         now_ns = self._clock.monotonic_ns()
         self._publisher.update(running=True)
         text = "the session begins"
-        if epoch.boots.get(own.member) != own.boot:
+        if epoch.boots.get(info.member) != info.boot:
             text = f"joins the session, which runs since {(now_ns - epoch.mono_ns) / 1e9:.1f} s"
             recording.assume_gone()
-            self._watch_presence(recording)
+            self._receive_presence(recording)
             recording.join_late(now_ns)
         self._say(f"recorder: {text}, writing {path}")
         for clock_text in describe_clocks(self._joining.pinger, epoch.boots, epoch.mono_ns):
             self._say(f"recorder: {clock_text}")
 
-    def _watch_presence(self, recording: Recording) -> None:
+    def _receive_presence(self, recording: Recording) -> None:
         while (change := self._presence.poll()) is not None:
-            recording.note_presence(*change)
+            key, alive = change
+            recording.note_presence(key, alive)
 
     def _run(self, recording: Recording, report: RecorderReport) -> None:
+        """Writes the session until it is over, or until the recorder has to end."""
         ending_ns: int | None = None
         while not (self._stopped() or recording.is_over(self._clock.monotonic_ns())):
-            since_ns = self._clock.monotonic_ns()
+            now_ns = self._clock.monotonic_ns()
             if ending_ns is None and self._is_ending():
-                ending_ns = since_ns
+                ending_ns = now_ns
                 self._say(
                     f"recorder: asks for the records that are missing, {END_S} s at most; "
                     "Ctrl-C a second time ends it at once"
                 )
-            if ending_ns is not None and (
-                since_ns - ending_ns > END_NS or recording.is_up_to_date(ending_ns, since_ns)
-            ):
-                return
+            if ending_ns is not None:
+                has_waited = now_ns - ending_ns > END_NS
+                if has_waited or recording.is_up_to_date(ending_ns, now_ns):
+                    return
             self._publisher.answer_queries()
-            recording.write(self._queue, since_ns)
-            self._watch_presence(recording)
+            recording.write(self._queue, now_ns)
+            self._receive_presence(recording)
             report.poll()
             written_ns = self._clock.monotonic_ns()
             recording.flush()
             report.note_flush(self._clock.monotonic_ns() - written_ns)
-            self._clock.sleep_until(since_ns + FLUSH_NS)
+            self._clock.sleep_until(now_ns + FLUSH_NS)
 
 
 def record_session(
@@ -214,21 +233,21 @@ def record_session(
     afterwards: Callable[[], None] = lambda: None,
     warn: Callable[[], None] = lambda: None,
 ) -> int:
-    """Records one session, as a process of its own.
+    """Records one session in this process.
 
     Args:
-        session: the session's name.
-        storage: where the log goes.
-        connection: how to reach the session, see `connect_to_session`.
-        join_timeout_s: how long to wait for the session to begin, s, or None.
+        session: name of the session.
+        storage: where the log is written.
+        connection: how to connect to the session, see `connect_to_session`.
+        join_timeout_s: longest time to wait for the session to begin, s; None: no limit.
         clock: the time.
         say: prints a line for the user.
-        afterwards: works on the finished log of a session that was not interrupted. The
-            recorder remains a member until that is done: sites with `--stay` wait for it.
-        warn: warns the user of what may harm the recording, once the connection is open.
+        afterwards: processes the finished log, unless the session was interrupted. The recorder
+            remains a member of the session until then; sites with `--stay` wait for that.
+        warn: called once the connection is open; warns the user of risks for the recording.
 
     Returns:
-        The exit code: 0, or 128 and the number of the signal that ended it.
+        The exit code: 0, or 128 plus the number of the signal that ended the recorder.
 
     Raises:
         TrilatError: the session did not begin, the file cannot be written, or records are
@@ -264,7 +283,7 @@ def record_session(
             say=say,
             is_ending=interrupt.is_requested,
         )
-        process.freeze_gc()  # in a session its pauses would be time that a crash can lose
+        process.freeze_gc()  # a pause of the collector would delay the next flush
         epoch = recorder.join(join_timeout_s)
         if epoch is None:
             say("recorder: ended before the session began; nothing was written")
@@ -276,6 +295,7 @@ def record_session(
                 afterwards()
     if interrupt.is_requested():
         return interrupt.exit_code
-    if problem := recording.describe_problem():
+    problem = recording.describe_problem()
+    if problem:
         raise RunFailed(problem)
     return 0

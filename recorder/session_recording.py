@@ -122,7 +122,8 @@ class Recording:
         sites = ", ".join(name for name in self._sites if name not in self._gone)
         self.publisher.publish(
             "late",
-            f"the recorder joins at t = {t_ns / 1e9:.3f} s; what was before is asked of {sites}",
+            f"the recorder joins at t = {t_ns / 1e9:.3f} s; "
+            f"what was before is asked of {sites}",
             t_ns=t_ns,
         )
         for name in self._gone:
@@ -223,7 +224,7 @@ class Recording:
             self._admit_starts()
 
     def _note_admission(self, event: object) -> None:
-        """Notes a start that another site admits, and the last tick known of the start before."""
+        """Notes a start that another site admits, or the last known tick before a start."""
         if not isinstance(event, Event) or event.about not in self._sites:
             return
         boot = event.boots.get(event.about)
@@ -327,9 +328,9 @@ class Recording:
 
     def is_over(self, now_ns: int) -> bool:
         """True once every site has all its messages stored, or is gone for good."""
-        # not `all` of a generator: `_has_left` notes for every site since when it is gone
-        have_left = [self._has_left(name, now_ns) for name in self._sites]
-        return all(have_left)
+        # asked of every site, because `_has_left` notes since when a site is gone
+        left = [self._has_left(name, now_ns) for name in self._sites]
+        return all(left)
 
     def _has_left(self, site: str, now_ns: int) -> bool:
         """True if all messages of a site are stored, or if the site is gone for good."""
@@ -395,7 +396,7 @@ class Recording:
         return texts
 
     def render_summary(self) -> list[str]:
-        """Returns lines on every site, on messages that did not fit, and on dropped messages."""
+        """Returns lines of text on the sites and on messages that were not written."""
         lines = [self._summarize_site(site) for site in self._sites.values()]
         if self._overflowed:
             messages = count_nouns(self._overflowed, "message")

@@ -1,3 +1,1 @@
-"""Plays a log on the network again: the same bytes with the same timing, under another session
-name.
-"""
+"""Play a log on the network again: the same bytes at the same times, in a session of its own."""

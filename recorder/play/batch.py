@@ -1,12 +1,13 @@
-"""Batches of messages in play order: an array of numbers over a few large byte buffers.
+"""Hold messages in play order: a table of numbers over a few large byte buffers.
 
-Invariant: messages play by time and never out of order within a channel, whose order is that of
-its numbers. A message that stands later in the file than its number says (a backfilled one)
-plays in its place: at the latest together with the next one of its channel. Messages of one
-instant keep the order of the file.
-
-A minute of 9000 messages/s takes some 100 MiB in this form, a third of the size as Python
+A minute of 9000 messages/s takes some 100 MiB in this form, a third of its size as Python
 objects.
+
+Invariant:
+    - Messages play in order of time, and within a channel in order of their numbers.
+    - A message that is later in the file than its number says (a backfilled message) plays at
+      the latest together with the next message of its channel.
+    - Messages of the same time keep the order of the file.
 """
 
 from array import array
@@ -19,48 +20,54 @@ import numpy as np
 from trilat_net.log.record_columns import Ints
 
 PlayedMessage = tuple[int, int, int, bytes]
-"""Time in ns since the epoch, channel, number in it, and payload of a message.
+"""A message: time in ns since the epoch, channel, number in the channel, and payload.
 
-The number is the tick of a record, the place from 0 of another message of a site (of its events
-in each of its starts, which are `NUMBERS_OF_A_START` apart), else the time.
+The number is the tick of a record and the number from 0 of statistics or an event of a site.
+The events of two successive starts differ by `NUMBERS_OF_A_START`. For other messages it is the
+time.
 """
 PIECE_BYTES = 65_536
-"""Payload of a piece: small enough that preparing or receiving one does not delay the player.
+"""Payload of a piece, bytes: small enough that preparing or receiving it does not delay the
+player.
 """
 
 
 def order_for_play(times_ns: Ints, channels: Ints, numbers: Ints) -> tuple[Ints, Ints]:
-    """Returns the places of messages in play order, and their deadlines.
+    """Returns the play order of messages, and their deadlines.
 
     Args:
-        times_ns: time of sending or arrival, ns, shape (K,), in file order.
-        channels: channel of each, shape (K,).
-        numbers: number in its channel, shape (K,); equal ones stay in file order.
+        times_ns: time of sending or of arrival, ns, shape (K,), in file order.
+        channels: channel of each message, shape (K,).
+        numbers: number of each message in its channel, shape (K,). Messages with equal numbers
+            stay in file order.
 
     Returns:
-        The places, shape (K,), and the deadlines in that order, ns, shape (K,): ascending, and
-        none later than the message's time.
+        The indices of the messages in play order, shape (K,), and their deadlines in that
+        order, ns, shape (K,). The deadlines ascend, and no deadline is later than the time of
+        its message.
     """
-    places = np.arange(len(times_ns), dtype=np.int64)
+    indices = np.arange(len(times_ns), dtype=np.int64)
     due_ns = times_ns.copy()
-    file_places = places.copy()
+    file_order = indices.copy()
     for channel in np.unique(channels):
-        own = np.flatnonzero(channels == channel)
-        own = own[np.argsort(numbers[own], kind="stable")]
-        # no message after the next one of its channel, in time or, within an instant, in place
-        due_ns[own] = np.minimum.accumulate(times_ns[own][::-1])[::-1]
-        file_places[own] = np.minimum.accumulate(places[own][::-1])[::-1]
-    order = np.lexsort((numbers, file_places, due_ns)).astype(np.int64)
+        members = np.flatnonzero(channels == channel)
+        members = members[np.argsort(numbers[members], kind="stable")]
+        # no message plays after the next message of its channel: not at a later time, and among
+        # messages of the same time not at a later position
+        due_ns[members] = np.minimum.accumulate(times_ns[members][::-1])[::-1]
+        file_order[members] = np.minimum.accumulate(indices[members][::-1])[::-1]
+    order = np.lexsort((numbers, file_order, due_ns)).astype(np.int64)
     return order, due_ns[order]
 
 
 @dataclass(frozen=True, slots=True)
 class MessageBatch:
-    """Messages: a row of numbers each, over the bytes of their payloads.
+    """Messages: a table of numbers, and the bytes of the payloads.
 
     Attributes:
-        rows: time in ns since the epoch, channel, number in the channel, bounds of the payload;
-            shape (K, 5).
+        rows: per message the time in ns since the epoch, the channel, the number in the
+            channel, and start and end of the payload in `data`; shape (K, 5).
+        data: the payloads.
     """
 
     rows: Ints
@@ -71,21 +78,26 @@ class MessageBatch:
 
     @property
     def times_ns(self) -> Ints:
-        """Deadline of each, ns since the epoch of its log, shape (K,)."""
+        """Deadline of each message, ns since the epoch of its log, shape (K,)."""
         return self.rows[:, 0]
 
     @property
     def channels(self) -> Ints:
-        """Channel of each, shape (K,)."""
+        """Channel of each message, shape (K,)."""
         return self.rows[:, 1]
 
     @property
     def numbers(self) -> Ints:
-        """Number of each in its channel, shape (K,)."""
+        """Number of each message in its channel, shape (K,)."""
         return self.rows[:, 2]
 
+    @property
+    def _sizes(self) -> Ints:
+        """Size of each payload, bytes, shape (K,)."""
+        return self.rows[:, 4] - self.rows[:, 3]
+
     def payload(self, index: int) -> bytes:
-        """Returns a payload."""
+        """Returns the payload of the message at an index."""
         start, end = self.rows[index, 3:].tolist()
         return bytes(self.data[start:end])
 
@@ -95,34 +107,34 @@ class MessageBatch:
         for t_ns, channel, number, start, end in self.rows.tolist():
             yield t_ns, channel, number, bytes(view[start:end])
 
-    def part(self, places: slice | Ints) -> "MessageBatch":
-        """Returns some of the messages, over the same bytes."""
-        return MessageBatch(self.rows[places], self.data)
+    def part(self, indices: slice | Ints) -> "MessageBatch":
+        """Returns the messages at some indices, over the same bytes."""
+        return MessageBatch(self.rows[indices], self.data)
 
     def pieces(self, size: int = PIECE_BYTES) -> Iterator["MessageBatch"]:
-        """Yields the messages in pieces of some bytes, one message at least, over the same
-        bytes.
+        """Yields the messages in pieces of about `size` bytes, over the same bytes.
+
+        A piece has at least one message.
         """
-        filled = np.cumsum(self.rows[:, 4] - self.rows[:, 3]) // size
-        edges = [0, *(np.flatnonzero(np.diff(filled)) + 1).tolist(), len(self)]
-        for begin, end in pairwise(edges):
-            if end > begin:
-                yield self.part(slice(begin, end))
+        piece_numbers = np.cumsum(self._sizes) // size
+        changes = np.flatnonzero(np.diff(piece_numbers)) + 1
+        for start, end in pairwise([0, *changes.tolist(), len(self)]):
+            if end > start:
+                yield self.part(slice(start, end))
 
     def compact(self) -> "MessageBatch":
-        """Returns the messages over bytes of their own, one payload behind the other."""
+        """Returns the messages over a copy of only their bytes, without gaps."""
+        view = memoryview(self.data)
+        payloads = [view[start:end] for start, end in self.rows[:, 3:].tolist()]
         rows = self.rows.copy()
-        rows[:, 4] = np.cumsum(self.rows[:, 4] - self.rows[:, 3])
+        rows[:, 4] = np.cumsum(self._sizes)
         rows[1:, 3] = rows[:-1, 4]
         rows[:1, 3] = 0
-        view = memoryview(self.data)
-        return MessageBatch(
-            rows, b"".join(view[start:end] for start, end in self.rows[:, 3:].tolist())
-        )
+        return MessageBatch(rows, b"".join(payloads))
 
 
 class BatchBuilder:
-    """Messages as they are read from a file, until they are put in order.
+    """Collects messages in the order of a file and puts them in play order.
 
     Args:
         kept: messages that were put in order before; they come first.
@@ -132,27 +144,27 @@ class BatchBuilder:
         self._payloads = bytearray()
         self._rows = array("q")
         if kept is not None:
-            kept = kept.part(
-                np.argsort(kept.rows[:, 3], kind="stable")
-            ).compact()  # in the order of their file
+            file_order = np.argsort(kept.rows[:, 3], kind="stable")
+            kept = kept.part(file_order).compact()
             self._payloads += kept.data
             self._rows.frombytes(kept.rows.tobytes())
 
     @property
     def memory(self) -> int:
-        """Bytes that all messages take."""
+        """Memory of all messages, bytes."""
         return len(self._payloads) + 8 * len(self._rows)
 
     def add(self, t_ns: int, channel: int, number: int, payload: bytes) -> None:
-        """Adds a message."""
+        """Adds a message, see `PlayedMessage`."""
         start = len(self._payloads)
         self._payloads += payload
         self._rows.extend((t_ns, channel, number, start, len(self._payloads)))
 
     def ordered(self) -> MessageBatch:
-        """Returns the messages in play order, each once; the payloads stay in place."""
+        """Returns the messages in play order, without repeated messages."""
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, 5)
-        if repeats := self._find_repeats(rows):
+        repeats = self._find_repeats(rows)
+        if repeats:
             rows = np.delete(rows, repeats, axis=0)
         order, due_ns = order_for_play(rows[:, 0], rows[:, 1], rows[:, 2])
         rows = rows[order]
@@ -160,17 +172,17 @@ class BatchBuilder:
         return MessageBatch(rows, self._payloads)
 
     def _find_repeats(self, rows: Ints) -> list[int]:
-        """Returns the places of messages that are there before already, as in two parts of one
-        session.
-        """
+        """Returns the indices of repeated messages, as in two parts of a session."""
         order = np.lexsort((rows[:, 2], rows[:, 1]))
-        same = (np.diff(rows[order, 1:3], axis=0) == 0).all(axis=1)
+        # only messages with equal channel and number are compared
+        is_equal = (np.diff(rows[order, 1:3], axis=0) == 0).all(axis=1)
+        candidates = np.union1d(order[1:][is_equal], order[:-1][is_equal])
         seen: set[tuple[int, int, bytes]] = set()
         repeats = []
-        for place in np.union1d(order[1:][same], order[:-1][same]).tolist():
-            _, channel, number, start, end = rows[place].tolist()
-            message = channel, number, bytes(self._payloads[start:end])
+        for index in candidates.tolist():
+            _, channel, number, start, end = rows[index].tolist()
+            message = (channel, number, bytes(self._payloads[start:end]))
             if message in seen:
-                repeats.append(place)
+                repeats.append(index)
             seen.add(message)
         return repeats

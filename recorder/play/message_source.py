@@ -1,9 +1,11 @@
-"""The source of a player's messages: a preloaded batch, or a process that reads ahead and
-sorts.
+"""Supply a player with messages: from a preloaded batch, or from a process that reads ahead.
 
-Invariant: polling the source never waits. The reader process is bounded (L6) by `HORIZON_NS` of
-the log, the farthest that a message may stand from its turn, and by `LIMIT_BYTES`; it blocks on
-the pipe when the player does not read, and the two share nothing else.
+Invariant:
+    - Polling the source never waits.
+    - The memory of the reader process is bounded (L6), by `HORIZON_NS` of the log, the largest
+      distance of a message from its turn, and by `LIMIT_BYTES`.
+    - The reader process blocks on the pipe while the player does not read. The two processes
+      share only that pipe.
 """
 
 import multiprocessing
@@ -26,19 +28,27 @@ from .batch import BatchBuilder, MessageBatch, PlayedMessage
 from .session_reader import HORIZON_NS, PlaySelection, SessionHeader, SessionReader
 
 SIZE = struct.Struct("<Q")
-"""Number of bytes of the pickle that follows, in the pipe of a reader process."""
+"""Number of bytes of the pickle that follows in the pipe of a reader process."""
 READ_BYTES = 65_536
+"""Largest number of bytes that are read from the pipe at once."""
 AHEAD_BYTES = 16 * 1024 * 1024
+"""Payloads that the player's process holds ahead of the present message, bytes."""
 STEP_NS = 10_000_000_000
-"""Length of log that is put in order at a time."""
+"""Length of log that is put in order at a time, ns."""
 LIMIT_BYTES = 512 * 1024 * 1024
+"""Largest memory of the messages that wait for their turn, bytes."""
 NICENESS = -5
-"""Priority over others if permitted, because the player waits for it; below the player's."""
+"""Priority of the reader process, if permitted: below the player, which waits for the reader,
+and above other processes.
+"""
 
 
 class RoundEnd(NamedTuple):
-    """The end of a round: messages that stood too far from their turn, and damaged files with
-    the reason.
+    """The end of a round.
+
+    Attributes:
+        strays: number of messages that were too far from their turn.
+        torn: damaged files, with the reason.
     """
 
     strays: int
@@ -46,7 +56,12 @@ class RoundEnd(NamedTuple):
 
 
 class ReadPiece(NamedTuple):
-    """What the reader process sends: messages, and the topics of all channels so far."""
+    """Messages that the reader process sends.
+
+    Attributes:
+        topics: the topics of all channels that were found so far.
+        batch: the messages.
+    """
 
     topics: list[str]
     batch: MessageBatch
@@ -56,14 +71,15 @@ class MessageSource:
     """Messages in play order, round after round.
 
     Args:
-        header: content of the files; gets the topics and damages that a reader process finds.
-        batch: all messages; None: `read` starts a process that reads them.
+        header: content of the files; receives the topics and damages that a reader process
+            finds.
+        batch: all messages; None: `start_reader` starts a process that reads the messages.
 
     Attributes:
-        ended: True once all messages of this round were given.
-        whole: True if one batch is the whole round.
-        strays: messages that stood so far from their turn in the file that they are not played
-            in it.
+        ended: True once `poll` has returned all messages of this round.
+        whole: True if one batch holds the whole round.
+        strays: number of messages that were so far from their turn in the file that they do not
+            play at their turn.
     """
 
     def __init__(self, header: SessionHeader, batch: MessageBatch | None) -> None:
@@ -78,21 +94,29 @@ class MessageSource:
         self._process: multiprocessing.process.BaseProcess | None = None
         self.restart()
 
-    def read(self, paths: Sequence[Path], selection: PlaySelection, *, loop: bool) -> None:
-        """Starts the reader process; `loop`: it reads round after round."""
+    def start_reader(
+        self, paths: Sequence[Path], selection: PlaySelection, *, loop: bool
+    ) -> None:
+        """Starts the reader process.
+
+        Args:
+            paths: the files.
+            selection: the messages that are played.
+            loop: whether the process reads the files again and again.
+        """
         context = multiprocessing.get_context("spawn")
-        self._pipe, theirs = context.Pipe(duplex=False)
-        # as its own methods would wait for the rest of a piece
+        self._pipe, reader_pipe = context.Pipe(duplex=False)
+        # the methods of the pipe would wait for the rest of a piece
         os.set_blocking(self._pipe.fileno(), False)
         self._process = context.Process(
-            target=feed_player, args=(theirs, paths, selection, loop), daemon=True
+            target=feed_player, args=(reader_pipe, paths, selection, loop), daemon=True
         )
-        with process.hold_sigint():  # Ctrl-C is the player's, which ends this process
+        with process.hold_sigint():  # on Ctrl-C the player ends the reader process
             self._process.start()
-        theirs.close()
+        reader_pipe.close()
 
     def poll(self) -> MessageBatch | None:
-        """Returns the next messages, or None if there are none, or none yet; never waits.
+        """Returns the next messages; None if no messages have been read. Never waits.
 
         Raises:
             LogError: a file cannot be read any more.
@@ -112,25 +136,33 @@ class MessageSource:
         return None
 
     def fill(self) -> bool:
-        """Reads a little ahead; False if there is nothing to read now.
+        """Reads a little from the reader process.
+
+        Returns:
+            False if there is nothing to read now, or enough has been read ahead.
 
         Raises:
-            RuntimeFault: the process failed.
+            RuntimeFault: the reader process failed.
         """
         if self._process is None or self._ahead_bytes > AHEAD_BYTES:
             return False
         try:
-            read = os.read(self._pipe.fileno(), READ_BYTES)
+            data = os.read(self._pipe.fileno(), READ_BYTES)
         except BlockingIOError:
             return False
-        if not read:
-            # None while it ends, which takes time that the player does not have
+        if not data:
+            # None while the process ends; the player has no time to wait for the exit code
             if self._process.exitcode:
                 raise RuntimeFault(
                     f"the process that reads the log ended with {self._process.exitcode}"
                 )
             return False
-        self._received += read
+        self._received += data
+        self._unpickle_received()
+        return True
+
+    def _unpickle_received(self) -> None:
+        """Moves the complete items of the received bytes to the queue."""
         while len(self._received) >= SIZE.size:
             end = SIZE.size + SIZE.unpack_from(self._received)[0]
             if len(self._received) < end:
@@ -138,17 +170,18 @@ class MessageSource:
             item = pickle.loads(self._received[SIZE.size : end])
             del self._received[:end]
             self._ahead.append(item)
-            self._ahead_bytes += len(item.batch.data) if isinstance(item, ReadPiece) else 0
-        return True
+            if isinstance(item, ReadPiece):
+                self._ahead_bytes += len(item.batch.data)
 
     def restart(self) -> None:
-        """Begins another round."""
+        """Starts another round."""
         self.ended = False
         if self._batch is not None:
-            self._ahead.extend((ReadPiece(self._header.topics, self._batch), RoundEnd(0, {})))
+            self._ahead.append(ReadPiece(self._header.topics, self._batch))
+            self._ahead.append(RoundEnd(0, {}))
 
     def close(self) -> None:
-        """Ends the source; safe to call again."""
+        """Ends the reader process; safe to call again."""
         if self._process is not None:
             self._process.terminate()
             self._process.join()
@@ -161,56 +194,84 @@ def sort_messages(
     step_ns: int = STEP_NS,
     limit_bytes: int = LIMIT_BYTES,
 ) -> Iterator[tuple[MessageBatch, int]]:
-    """Yields messages in play order that stand in the file at most a horizon from their turn.
+    """Sorts messages into play order, with bounded memory.
 
     Args:
-        messages: in file order.
-        horizon_ns: that horizon.
-        step_ns: length of log that is put in order at a time.
-        limit_bytes: most memory; a longer horizon is shortened.
+        messages: the messages, in file order.
+        horizon_ns: largest distance of a message in the file from its turn, ns.
+        step_ns: length of log that is put in order at a time, ns.
+        limit_bytes: largest memory; if it is exceeded, messages are released earlier.
 
     Yields:
-        Messages, and how many of them stood further from their turn.
+        Messages in play order, and how many of them were too far from their turn.
     """
-    waiting = BatchBuilder()
-    given: dict[int, int] = {}  # per channel the last number
+    sorter = _MessageSorter()
+    newest_ns = -(2**62)
+    next_release_ns = None
+    for message in messages:
+        sorter.add(message)
+        newest_ns = max(newest_ns, message[0])
+        if next_release_ns is None:
+            next_release_ns = newest_ns + horizon_ns + step_ns
+        if newest_ns >= next_release_ns:
+            yield sorter.release_until(newest_ns - horizon_ns)
+            next_release_ns = newest_ns + step_ns
+        elif sorter.memory > limit_bytes:
+            yield sorter.release_half()
+    yield sorter.release_until(1 << 62)
 
-    def release(until_ns: int | None) -> tuple[MessageBatch, int]:
-        """Returns the messages that are due until then, or half of all, and keeps the rest."""
-        nonlocal waiting
-        ordered = waiting.ordered()
-        strays = 0
-        count = (len(ordered) + 1) // 2
-        if until_ns is not None:
-            count = int(np.searchsorted(ordered.times_ns, until_ns, side="right"))
-        waiting = BatchBuilder(ordered.part(slice(count, None)))
+
+class _MessageSorter:
+    """Messages that wait for their turn."""
+
+    def __init__(self) -> None:
+        self._waiting = BatchBuilder()
+        self._last_numbers: dict[int, int] = {}  # by channel the largest released number
+
+    @property
+    def memory(self) -> int:
+        """Memory of the waiting messages, bytes."""
+        return self._waiting.memory
+
+    def add(self, message: PlayedMessage) -> None:
+        """Adds a message in file order."""
+        t_ns, channel, number, payload = message
+        self._waiting.add(t_ns, channel, number, payload)
+
+    def release_until(self, until_ns: int) -> tuple[MessageBatch, int]:
+        """Returns the messages that are due until a time, and the number of strays."""
+        ordered = self._waiting.ordered()
+        count = int(np.searchsorted(ordered.times_ns, until_ns, side="right"))
+        return self._release(ordered, count)
+
+    def release_half(self) -> tuple[MessageBatch, int]:
+        """Returns the first half of the messages, and the number of strays."""
+        ordered = self._waiting.ordered()
+        return self._release(ordered, (len(ordered) + 1) // 2)
+
+    def _release(self, ordered: MessageBatch, count: int) -> tuple[MessageBatch, int]:
+        self._waiting = BatchBuilder(ordered.part(slice(count, None)))
         released = ordered.part(slice(count))
+        strays = 0
         for channel in np.unique(released.channels).tolist():
             numbers = released.numbers[released.channels == channel]
-            last = given.get(channel, int(numbers.min()))
+            last = self._last_numbers.get(channel, int(numbers.min()))
             strays += int(np.count_nonzero(numbers < last))
-            given[channel] = max(last, int(numbers.max()))
+            self._last_numbers[channel] = max(last, int(numbers.max()))
         return released, strays
-
-    newest_ns = -(2**62)
-    next_ns = None
-    for message in messages:
-        waiting.add(*message)
-        newest_ns = max(newest_ns, message[0])
-        if next_ns is None:
-            next_ns = newest_ns + horizon_ns + step_ns
-        if newest_ns >= next_ns:
-            yield release(newest_ns - horizon_ns)
-            next_ns = newest_ns + step_ns
-        elif waiting.memory > limit_bytes:
-            yield release(None)
-    yield release(1 << 62)
 
 
 def feed_player(
     pipe: Connection, paths: Sequence[Path], selection: PlaySelection, loop: bool
 ) -> None:
-    """Sends rounds of messages, until everything is read or the player has ended."""
+    """Sends rounds of messages until all files are read or the player has ended.
+
+    Args:
+        pipe: connection to the player.
+        paths: the files.
+        selection: the messages that are played.
+        loop: whether the files are read again and again.
+    """
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
 
@@ -228,8 +289,8 @@ def feed_player(
             while True:
                 reader = SessionReader(paths, selection)
                 strays = 0
-                for batch, further in sort_messages(reader.messages()):
-                    strays += further
+                for batch, batch_strays in sort_messages(reader.messages()):
+                    strays += batch_strays
                     for piece in batch.pieces():
                         assert reader.header is not None  # there was a message
                         send(ReadPiece(reader.header.topics, piece.compact()))

@@ -1,6 +1,7 @@
-"""Playback as one process, from a log to its summary.
+"""Play a log as a process, from its first message to the summary of the playback.
 
-Invariant: it stays until its recorders have every message, or request none any more.
+Invariant:
+    - The process stays until its recorders have every message, or send no more requests.
 """
 
 import math
@@ -25,24 +26,31 @@ from .session_reader import HORIZON_NS, PlaySelection, SessionHeader
 from .site_stand_ins import PlayedHistory, SiteStandIns
 
 POLL_NS = 5_000_000
+"""Pause between two polls while the playback waits for recorders."""
 AHEAD_NS = 500_000_000
-"""Time before its first message at which a playback announces it."""
+"""Time from the announcement of a playback to its first message."""
 LISTEN_NS = 5_000_000_000
-"""Longest wait for an announced recorder to listen."""
+"""Longest wait for a recorder that is present to reply."""
 LINGER_NS = 5_000_000_000
-"""How long to stay for recorders at the end, after their last query."""
+"""Time for which the playback stays at the end after the last query of a recorder."""
 LAST_EVENT_NS = 100_000_000
+"""Time for which the playback stays after the recorders have stored everything."""
 NICE = -10
+"""Priority of the process, if permitted."""
 PROGRESS_EVERY_NS = 500_000_000
+"""Period of progress reports."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlayOptions:
-    """How a log is played.
+    """Options of a playback.
 
     Attributes:
-        rate: seconds of the log per second; `math.inf`: as fast as all receivers take it.
-        low_cpu: whether to sleep to the deadlines.
+        session: name of the playback's session.
+        rate: seconds of the log per second; `math.inf`: as fast as all receivers accept it.
+        loop: whether the log is played again and again.
+        low_cpu: whether the player sleeps until a deadline instead of polling the clock.
+        needs_recorder: whether the playback waits for a recorder before it starts.
     """
 
     session: str
@@ -56,15 +64,18 @@ class PlaybackSummary(NamedTuple):
     """The result of a playback.
 
     Attributes:
-        counts: messages published, by topic of the file.
-        lateness: their lateness; None if they had no deadline.
+        counts: number of published messages, by topic of the file.
+        rounds: number of rounds that were started.
+        lateness: lateness of the messages; None if they had no deadlines.
+        took_s: duration of the play, s.
         held_s: time spent waiting for receivers that did not keep up, s.
-        cut: how often a receiver took nothing for 5 s and was cut off.
-        strays: messages that stood so far from their turn in the file that they were not played
-            in it.
-        recorders: recorders that were present after the last message.
-        stored: whether all of them reported that they have everything.
-        refilled: messages given again to recorders that had missed them.
+        cut: how often a receiver accepted no message for 5 s and was disconnected.
+        strays: number of messages that were so far from their turn in the file that they did
+            not play at their turn.
+        recorders: number of recorders that were present after the last message.
+        stored: whether all these recorders reported that they stored everything.
+        refilled: number of messages that were sent to recorders by backfill.
+        torn: damaged files, with the reason.
     """
 
     counts: dict[str, int]
@@ -82,7 +93,18 @@ class PlaybackSummary(NamedTuple):
 
 @dataclass
 class Playback:
-    """One playback in a session of its own."""
+    """One playback in a session of its own.
+
+    Attributes:
+        bus: the connection to the session.
+        clock: the time.
+        header: content of the files.
+        source: supplies the messages.
+        options: the options.
+        stopped: returns True if the playback has to end.
+        say: prints a line for the user.
+        show: reports the progress to the user.
+    """
 
     bus: Bus
     clock: Clock
@@ -102,11 +124,18 @@ class Playback:
             header=self.header,
             history=history,
         )
-        self._shown_ns = self.clock.monotonic_ns()
-        own = history, self.clock, self._publisher, self._serve, self.stopped
-        self._player = Player(self.source, *own, low_cpu=self.options.low_cpu)
+        self._reported_ns = self.clock.monotonic_ns()
+        self._player = Player(
+            source=self.source,
+            history=history,
+            clock=self.clock,
+            publisher=self._make_publisher,
+            serve=self._serve,
+            stopped=self.stopped,
+            low_cpu=self.options.low_cpu,
+        )
 
-    def _publisher(self, channel: int) -> Callable[[bytes], None]:
+    def _make_publisher(self, channel: int) -> Callable[[bytes], None]:
         key = map_key_to_session(
             self.header.topics[channel], self.header.session, self.options.session
         )
@@ -115,26 +144,27 @@ class Playback:
     def _serve(self, progress: PlayProgress) -> None:
         self._stand_ins.serve_queries()
         now_ns = self.clock.monotonic_ns()
-        if now_ns - self._shown_ns >= PROGRESS_EVERY_NS:
-            self._shown_ns = now_ns
+        if now_ns - self._reported_ns >= PROGRESS_EVERY_NS:
+            self._reported_ns = now_ns
             self.show(progress)
 
     def play(self, start_ns: int | None) -> PlaybackSummary:
-        """Plays from `start_ns` since the epoch of the log (None: from the first message) to
-        the end.
+        """Plays the log to its end, and stays until all recorders have every message.
 
-        It stays until all recorders have everything.
+        Args:
+            start_ns: beginning of the play, ns since the epoch of the log; None: the first
+                message.
         """
         clock = self.clock
         options = self.options
         first_ns = self._player.prepare()
-        self._await_recorders()
-        begun_ns = clock.monotonic_ns() + AHEAD_NS
+        self._wait_for_recorders()
+        origin_ns = clock.monotonic_ns() + AHEAD_NS
         if first_ns is not None:
-            pace = Pace(begun_ns, first_ns if start_ns is None else start_ns, options.rate)
-            self._stand_ins.begin(pace.due_ns(0))
+            pace = Pace(origin_ns, first_ns if start_ns is None else start_ns, options.rate)
+            self._stand_ins.start_session(pace.due_ns(0))
             self._player.play(pace, loop=options.loop)
-        took_ns = max(0, clock.monotonic_ns() - begun_ns)
+        duration_ns = max(0, clock.monotonic_ns() - origin_ns)
         self._stand_ins.serve_queries()
         recorders = set(self._stand_ins.recorders)
         self._linger()
@@ -142,7 +172,7 @@ class Playback:
             counts=dict(zip(self.header.topics, self._player.counts, strict=False)),
             rounds=self._player.rounds,
             lateness=self._player.lateness.summary() if math.isfinite(options.rate) else None,
-            took_s=took_ns / NS_PER_S,
+            took_s=duration_ns / NS_PER_S,
             held_s=self._player.held_ns / NS_PER_S,
             cut=self._player.stalls,
             strays=self.source.strays,
@@ -152,7 +182,8 @@ class Playback:
             torn=self.header.torn,
         )
 
-    def _await_recorders(self) -> None:
+    def _wait_for_recorders(self) -> None:
+        """Waits until every recorder that is present has replied, `LISTEN_NS` at most."""
         clock = self.clock
         stand_ins = self._stand_ins
         if self.options.needs_recorder:
@@ -169,6 +200,7 @@ class Playback:
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
     def _linger(self) -> None:
+        """Replies to queries until the recorders have every message, or send no query."""
         clock = self.clock
         stand_ins = self._stand_ins
         give_up_ns = clock.monotonic_ns() + LINGER_NS
@@ -176,7 +208,7 @@ class Playback:
             if stand_ins.serve_queries():
                 give_up_ns = clock.monotonic_ns() + LINGER_NS
                 continue
-            # the last messages may still be under way
+            # the last messages may still be in transit
             if stand_ins.have_stored(stand_ins.recorders):
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + LAST_EVENT_NS)
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
@@ -193,15 +225,29 @@ def play_log(
     say: Callable[[str], None],
     show: Callable[[PlayProgress], None],
 ) -> PlaybackSummary | None:
-    """Plays a log over Zenoh; None if it was stopped before it began.
+    """Plays a log over Zenoh.
+
+    Args:
+        loaded: content of the files, and the messages if they were preloaded.
+        paths: the files.
+        selection: the messages that are played.
+        options: the options.
+        connection: how to connect to the network.
+        clock: the time.
+        stopped: returns True if the playback has to end.
+        say: prints a line for the user.
+        show: reports the progress to the user.
+
+    Returns:
+        The summary; None if the playback was stopped before it began.
 
     Raises:
-        SessionError: there is a session of that name.
+        SessionError: a session of that name is running.
         UsageError: an endpoint cannot be used.
         LogError: a file cannot be read any more.
     """
     header, batch = loaded
-    # not SCHED_FIFO, as sites: polling the clock would starve Zenoh's own threads
+    # not SCHED_FIFO as for sites: polling the clock would starve the threads of Zenoh
     with suppress(OSError, AttributeError):
         os.setpriority(os.PRIO_PROCESS, 0, NICE)
     with ExitStack() as stack:
@@ -219,7 +265,7 @@ def play_log(
         refuse_running_session(bus, clock, options.session, stopped)
         source = stack.enter_context(closing(MessageSource(header, batch)))
         if batch is None:
-            source.read(paths, selection, loop=options.loop)
+            source.start_reader(paths, selection, loop=options.loop)
         playback = Playback(
             bus=bus,
             clock=clock,
@@ -236,9 +282,10 @@ def play_log(
 def map_key_to_session(topic: str, recorded_session: str, session: str) -> str:
     """Returns the key of a channel in the playback's session.
 
-    A topic of the recorded session becomes one of the new session; any other topic is played
-    below the new session, so that it meets no other.
+    The name of the recorded session is replaced. The topic of another session is placed below
+    the playback's session as a whole, so that it cannot collide with another topic.
     """
     chunks = topic.strip("/").split("/")
-    own = chunks[:2] == [topics.ROOT, recorded_session]
-    return "/".join([topics.ROOT, session, *(chunks[2:] if own else chunks)])
+    if chunks[:2] == [topics.ROOT, recorded_session]:
+        chunks = chunks[2:]
+    return "/".join([topics.ROOT, session, *chunks])

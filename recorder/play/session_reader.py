@@ -1,10 +1,12 @@
-"""Reads the messages to play out of a log: channel and time selection, one pass over the files,
-preloading.
+"""Read the messages of a log that are played, selected by channel and time.
 
-Invariant: payloads pass through unchanged; only an event's number and a sender's boot are
-decoded. The default selection is what the sites published: neither the recorder's statistics
-nor the file's views. A preloaded log is bounded (L6); a larger one is read by another process
-during play (`message_source`).
+Invariant:
+    - Payloads pass through unchanged. Only the number of an event and the boot of a sender are
+      decoded.
+    - By default the messages of the sites are played, without the recorder's statistics and
+      without the channels for viewers.
+    - The memory of a preloaded log is bounded (L6). Another process reads a larger log during
+      play (`message_source`).
 """
 
 import math
@@ -36,7 +38,7 @@ from trilat_net.scenario import Scenario, parse_embedded
 from .batch import BatchBuilder, MessageBatch, PlayedMessage
 
 PlayTime = Literal["publish", "log"]
-"""The time that orders messages: of sending, or of arrival."""
+"""The time by which messages are played: the time of sending or of arrival."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +46,11 @@ class PlaySelection:
     """The messages of a log that are played.
 
     Attributes:
-        channels: the channels that are played; if it includes none by name: those that sites
-            published.
-        start_ns: messages before this are not played, ns since the epoch; None: from the first
-            one on.
-        stop_ns: messages after this are not played; None: to the last one.
+        channels: the channels that are played; if the filter includes no channel by name, the
+            channels of the sites.
+        start_ns: time of the earliest message, ns since the epoch; None: no limit.
+        stop_ns: time of the latest message, ns since the epoch; None: no limit.
+        time: the time by which messages are played.
     """
 
     channels: ChannelFilter = ALL_CHANNELS
@@ -57,22 +59,25 @@ class PlaySelection:
     time: PlayTime = "publish"
 
     def accepts(self, topic: str, sites: Collection[str]) -> bool:
-        """True if a channel is played, by its topic ("/trilat/paper/m1/state") and the
-        scenario's sites.
-        """
-        parsed = topics.parse_key(topic.strip("/"))
-        published = (
-            parsed is not None and parsed.member in sites and parsed.channel in SITE_CHANNELS
-        )
-        return self.channels.accepts(topic.strip("/")) and (
-            published or bool(self.channels.include)
-        )
+        """True if a channel is played.
 
-    def holds(self, t_ns: int) -> bool:
-        """True if an instant is played, ns since the epoch."""
-        return (self.start_ns is None or t_ns >= self.start_ns) and (
-            self.stop_ns is None or t_ns <= self.stop_ns
+        Args:
+            topic: topic of the channel, as "/trilat/paper/m1/state".
+            sites: names of the sites of the scenario.
+        """
+        key = topic.strip("/")
+        parts = topics.parse_key(key)
+        is_of_site = (
+            parts is not None and parts.member in sites and parts.channel in SITE_CHANNELS
         )
+        is_candidate = is_of_site or bool(self.channels.include)
+        return is_candidate and self.channels.accepts(key)
+
+    def contains(self, t_ns: int) -> bool:
+        """True if messages of a time are played, ns since the epoch."""
+        is_before = self.start_ns is not None and t_ns < self.start_ns
+        is_after = self.stop_ns is not None and t_ns > self.stop_ns
+        return not (is_before or is_after)
 
 
 def parse_selection(
@@ -85,8 +90,16 @@ def parse_selection(
 ) -> PlaySelection:
     """Returns the selection that a user's options describe.
 
+    Args:
+        include: key expressions of `--include`.
+        exclude: key expressions of `--exclude`.
+        start_s: `--start`, s since the epoch.
+        stop_s: `--stop`, s since the epoch.
+        duration_s: `--duration`, s; in place of `stop_s`.
+        time: `--time`, see `PlayTime`.
+
     Raises:
-        UsageError: the options contradict each other, or one is not valid.
+        UsageError: the options contradict each other, or an option is not valid.
     """
     if time not in get_args(PlayTime):
         raise UsageError(
@@ -103,26 +116,33 @@ def parse_selection(
         stop_s = (start_s or 0.0) + duration_s
     if start_s is not None and stop_s is not None and stop_s <= start_s:
         raise UsageError(f"--stop is after --start ({start_s:g} s), not {stop_s:g} s")
-    start_ns, stop_ns = (
-        None if at_s is None else round(at_s * NS_PER_S) for at_s in (start_s, stop_s)
-    )
     return PlaySelection(
-        parse_channel_filter(include, exclude), start_ns, stop_ns, cast(PlayTime, time)
+        channels=parse_channel_filter(include, exclude),
+        start_ns=None if start_s is None else round(start_s * NS_PER_S),
+        stop_ns=None if stop_s is None else round(stop_s * NS_PER_S),
+        time=cast(PlayTime, time),
     )
 
 
 HORIZON_NS = 70 * NS_PER_S
-"""How much later than its turn a message may stand in a file: sites keep a minute for recorders
-that missed something.
+"""Largest distance of a message in a file from its turn. Sites keep messages for a minute for
+recorders that missed them.
 """
 _LAST = 1 << 61
-"""Bound of times and numbers, whatever a file says."""
+"""Bound of times and numbers, also in damaged files."""
 NUMBERS_OF_A_START = 1 << 40
-"""Each start of a site numbers its events from 0: those of the next one come so much later."""
+"""Offset between the event numbers of two successive starts of a site. Each start numbers its
+events from 0.
+"""
 
 
 class _PayloadHeader(msgspec.Struct):
-    """The decoded part of a payload, of any schema version."""
+    """The decoded part of a payload, of any schema version.
+
+    Attributes:
+        boot: start of the sender; -1 if the payload cannot be decoded.
+        n: number of an event; -1 without a number.
+    """
 
     boot: int = -1
     n: int = -1
@@ -140,13 +160,19 @@ def _decode_header(payload: bytes) -> _PayloadHeader:
 
 @dataclass(slots=True)
 class SessionHeader:
-    """The session that files hold.
+    """The session of the files.
 
     Attributes:
+        session: name of the session.
+        scenario: the scenario.
+        scenario_text: the scenario as it is in the file.
+        fingerprint: fingerprint of the platform that recorded the session.
         version: schema version of the messages; 0 if unknown.
-        topics: topics of the channels that are played, by number.
-        first_ns: the earliest message of any channel so far, ns since the epoch; `last_ns`: the
-            latest one.
+        boots: first start of each site.
+        topics: topics of the channels that are played; the index is the number of the channel.
+        torn: damaged files, with the reason.
+        first_ns: time of the earliest message that was read, ns since the epoch.
+        last_ns: time of the latest message that was read, ns since the epoch.
     """
 
     session: str
@@ -162,45 +188,64 @@ class SessionHeader:
 
 
 class _PlayedChannel:
-    """One channel of a file: its number if it is played, else -1, and the numbers of its
-    messages.
+    """A channel of a file.
+
+    Args:
+        topic: topic of the channel.
+        header: the session; receives the topic if the channel is played.
+        selection: the messages that are played.
+
+    Attributes:
+        site: name of the site; "" for the channel of another member or session.
+        kind: "state", "link" or "event" of a site; else "".
+        rate_hz: tick rate of the site, Hz; 0 without a site.
+        channel_number: number of the channel in `header.topics`; -1 if it is not played.
     """
 
     def __init__(self, topic: str, header: SessionHeader, selection: PlaySelection) -> None:
-        parsed = topics.parse_key(topic.strip("/"))
+        parts = topics.parse_key(topic.strip("/"))
         sites = header.scenario.sites
-        own = parsed is not None and parsed.member in sites and parsed.session == header.session
-        self.site, self.kind = (
-            (parsed.member, parsed.channel) if parsed is not None and own else ("", "")
-        )
-        self.rate_hz = sites[self.site].rate_hz if self.site else 0
-        self.place = -1
+        self.site = ""
+        self.kind = ""
+        self.rate_hz = 0
+        is_of_session = parts is not None and parts.session == header.session
+        if parts is not None and is_of_session and parts.member in sites:
+            self.site = parts.member
+            self.kind = parts.channel
+            self.rate_hz = sites[self.site].rate_hz
+        self.channel_number = -1
         if selection.accepts(topic, sites):
             if topic not in header.topics:
                 header.topics.append(topic)
-            self.place = header.topics.index(topic)
-        self._count = 0
-        self._starts: dict[int, int] = {}
+            self.channel_number = header.topics.index(topic)
+        self._event_count = 0
+        self._starts: dict[int, int] = {}  # by boot the number of the start
 
-    def number(self, item: McapMessage, t_ns: int) -> int:
-        """Returns the number of a message, or its time if it has none."""
+    def find_number(self, item: McapMessage, t_ns: int) -> int:
+        """Returns the number of a message in the channel, see `PlayedMessage`."""
         if self.kind in (topics.STATE, topics.LINK):
             return number_message(self.kind, item.sequence, self.rate_hz)
         if self.kind != topics.EVENT:
             return t_ns
         header = _decode_header(item.payload)
-        self._count += 1
+        self._event_count += 1
         if header.n < 0:  # before version 3 events had no number
-            return self._count - 1
+            return self._event_count - 1
         start = self._starts.setdefault(header.boot, len(self._starts))
-        return min(min(header.n, NUMBERS_OF_A_START - 1) + start * NUMBERS_OF_A_START, _LAST)
+        number = min(header.n, NUMBERS_OF_A_START - 1)
+        return min(start * NUMBERS_OF_A_START + number, _LAST)
 
 
 class SessionReader:
-    """One pass over the files of a session; several are its parts in their order.
+    """Reads the files of a session once.
 
-    `progress` is called with the bytes read and their total. `header` is None before the first
-    message.
+    Args:
+        paths: the files; several files are the parts of a session, in their order.
+        selection: the messages that are played.
+        progress: called now and then with the number of bytes read and their total.
+
+    Attributes:
+        header: the session; None before the first message.
     """
 
     def __init__(
@@ -212,46 +257,40 @@ class SessionReader:
         self._progress = progress
 
     def messages(self) -> Iterator[PlayedMessage]:
-        """Yields the messages to play, in file order.
+        """Yields the messages that are played, in file order.
 
         Raises:
-            LogError: a file is missing, no log of trilat-net, or of another session than the
-                first.
+            LogError: a file is missing, is no log of trilat-net, or is of another session than
+                the first file.
         """
         for path in self._paths:
             with reading(path) as stream:
-                yield from self._read_file(
-                    path, McapReader(stream, str(path), self._progress, kept=False)
-                )
+                reader = McapReader(stream, str(path), self._progress, kept=False)
+                yield from self._read_file(path, reader)
 
     def _read_file(self, path: Path, reader: McapReader) -> Iterator[PlayedMessage]:
         epoch_ns: int | None = None
         channels: dict[str, _PlayedChannel] = {}
-        by_log = self._selection.time == "log"
         stop_ns = self._selection.stop_ns
-        holds = self._selection.holds
         for item in reader.messages():
             if epoch_ns is None:
                 epoch_ns, header = self._read_session(path, reader)
-            t_ns = item.log_time_ns
-            if not by_log and abs(item.publish_time_ns - t_ns) <= HORIZON_NS:
-                t_ns = item.publish_time_ns  # an impossible stamp: the arrival counts
-            t_ns = min(max(t_ns - epoch_ns, -_LAST), _LAST)
+            t_ns = self._find_time_ns(item, epoch_ns)
             if stop_ns is not None and item.log_time_ns - epoch_ns > stop_ns + HORIZON_NS:
-                return  # all that follows came later still
+                return  # all further messages arrived even later
             channel = channels.get(item.topic)
             if channel is None:
-                channel = channels[item.topic] = _PlayedChannel(
-                    item.topic, header, self._selection
-                )
+                channel = _PlayedChannel(item.topic, header, self._selection)
+                channels[item.topic] = channel
             header.first_ns = min(header.first_ns, t_ns)
             header.last_ns = max(header.last_ns, t_ns)
             if channel.site and channel.site not in header.boots:
                 boot = _decode_header(item.payload).boot
-                header.boots.update({channel.site: boot} if boot >= 0 else {})
-            number = channel.number(item, t_ns)
-            if channel.place >= 0 and holds(t_ns):
-                yield t_ns, channel.place, number, item.payload
+                if boot >= 0:
+                    header.boots[channel.site] = boot
+            number = channel.find_number(item, t_ns)
+            if channel.channel_number >= 0 and self._selection.contains(t_ns):
+                yield t_ns, channel.channel_number, number, item.payload
         if epoch_ns is None:
             _, header = self._read_session(path, reader)
         if not reader.complete:
@@ -259,9 +298,24 @@ class SessionReader:
         elif reader.damaged:
             header.torn[path] = f"damaged in {count_nouns(len(reader.damaged), 'place')}"
 
+    def _find_time_ns(self, item: McapMessage, epoch_ns: int) -> int:
+        """Returns the time at which a message is played, ns since the epoch."""
+        t_ns = item.log_time_ns
+        # an impossible time of sending is replaced by the time of arrival
+        is_possible = abs(item.publish_time_ns - t_ns) <= HORIZON_NS
+        if self._selection.time == "publish" and is_possible:
+            t_ns = item.publish_time_ns
+        return min(max(t_ns - epoch_ns, -_LAST), _LAST)
+
     def _read_session(self, path: Path, reader: McapReader) -> tuple[int, SessionHeader]:
-        """Returns a file's epoch in Unix time, ns, and the session; refuses one of another
-        session.
+        """Reads the session of a file.
+
+        Returns:
+            The epoch of the file in Unix time, ns, and the session.
+
+        Raises:
+            LogError: the file is no log of trilat-net, or is of another session than the files
+                before it.
         """
         metadata = reader.metadata.get(SESSION, {})
         if "session" not in metadata or SCENARIO not in reader.attachments:
@@ -271,27 +325,25 @@ class SessionReader:
             epoch_ns = int(metadata.get("epoch_unix_ns", "0"))
             version = int(metadata.get("schema_version", "0"))
             if self.header is None:
-                scenario = parse_embedded(text, f"{path}: scenario")
-                fingerprint = metadata.get("fingerprint", "")
                 self.header = SessionHeader(
                     session=metadata["session"],
-                    scenario=scenario,
+                    scenario=parse_embedded(text, f"{path}: scenario"),
                     scenario_text=text,
-                    fingerprint=fingerprint,
+                    fingerprint=metadata.get("fingerprint", ""),
                     version=version,
                 )
         except (ScenarioError, ValueError) as error:
             raise LogError(f"{path}: its session cannot be read: {error}") from None
         if (self.header.session, self.header.scenario_text) != (metadata["session"], text):
             raise LogError(
-                f"{path}: is of another session than {self._paths[0]}; the files of one replay are the "
-                "parts of one log"
+                f"{path}: is of another session than {self._paths[0]}; the files of one replay "
+                "are the parts of one log"
             )
         return epoch_ns, self.header
 
 
 SEARCH_LIMIT = 100_000
-"""Further messages in which to look for sites without a boot yet."""
+"""Number of further messages that are searched for the boots of sites."""
 
 
 def preload_messages(
@@ -300,12 +352,21 @@ def preload_messages(
     limit_bytes: int,
     progress: Progress | None = None,
 ) -> tuple[SessionHeader, MessageBatch | None]:
-    """Reads the session and the messages to play, in order; None in place of more than the
-    limit of memory.
+    """Reads the session of files, and the messages that are played if they fit in memory.
+
+    Args:
+        paths: the files.
+        selection: the messages that are played.
+        limit_bytes: largest memory of the messages, bytes.
+        progress: called now and then with the number of bytes read and their total.
+
+    Returns:
+        The session, and the messages in play order; None in place of the messages if they need
+        more memory.
 
     Raises:
-        LogError: a file is missing, or no log of trilat-net.
-        UsageError: no message is to be played.
+        LogError: a file is missing, or is no log of trilat-net.
+        UsageError: no message is selected.
     """
     reader = SessionReader(paths, selection, progress)
     waiting = BatchBuilder()
@@ -335,9 +396,11 @@ def _describe_empty_selection(
         return f"{path}: holds no message"
     span = f"from {header.first_ns / NS_PER_S:.3f} s to {header.last_ns / NS_PER_S:.3f} s"
     if selection.start_ns is not None and selection.start_ns > header.last_ns:
-        return f"--start {selection.start_ns / NS_PER_S:g} s: is beyond the end; the log goes {span}"
+        option = f"--start {selection.start_ns / NS_PER_S:g} s"
+        return f"{option}: is beyond the end; the log goes {span}"
     if selection.stop_ns is not None and selection.stop_ns < header.first_ns:
-        return f"--stop {selection.stop_ns / NS_PER_S:g} s: is before the beginning; the log goes {span}"
+        option = f"--stop {selection.stop_ns / NS_PER_S:g} s"
+        return f"{option}: is before the beginning; the log goes {span}"
     return (
         f"{path}: has no message for this selection; its topics are like "
         f"trilat/{header.session}/{header.scenario.names[0]}/state, and it goes {span}"

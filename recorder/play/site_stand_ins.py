@@ -1,16 +1,19 @@
-"""Stand-ins for the sites of a played session: tokens, identities, pings and backfill.
+"""Stand in for the sites of a played session: their tokens, identities, pings and backfill.
 
-Invariant: recorders, viewers and pings find what a running session would show a late joiner;
-apart from identities, nothing is published in a site's name that the log does not hold.
-Backfill covers messages already
-played: a minute of them when the log is read during play (L6), all of them when it is
-preloaded.
+Invariant:
+    - Recorders, viewers and pings find everything that a running session shows to a member that
+      joins late.
+    - Apart from identities, no message is published in the name of a site that the log does not
+      hold.
+    - Backfill covers the messages that were played: the last minute if the log is read during
+      play (L6), all messages if it is preloaded.
 """
 
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Collection
 from contextlib import suppress
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -34,90 +37,116 @@ from trilat_net.net.wire import decode, encode
 from .batch import MessageBatch
 from .session_reader import NUMBERS_OF_A_START, SessionHeader
 
-_PlayedRun = tuple[Ints, Ints, MessageBatch]
-"""Messages of one channel within one batch: their numbers, ascending, their places in it, and
-the batch.
-"""
+
+class _ChannelMessages(NamedTuple):
+    """The messages of one channel in a batch.
+
+    Attributes:
+        numbers: numbers of the messages, ascending, shape (K,).
+        indices: indices of the messages in the batch, shape (K,).
+        batch: the batch.
+    """
+
+    numbers: Ints
+    indices: Ints
+    batch: MessageBatch
+
+    def list_from(self, number: int) -> list[tuple[int, int]]:
+        """Returns number and index of the messages from a number on, enough for one reply."""
+        start = int(np.searchsorted(self.numbers, number))
+        selected = slice(start, start + BACKFILL_MESSAGES + 1)
+        numbers = self.numbers[selected].tolist()
+        return list(zip(numbers, self.indices[selected].tolist(), strict=True))
 
 
 class PlayedHistory:
-    """Per channel the messages that were given to the player.
+    """The messages that were given to the player, by channel.
 
     Args:
-        kept_ns: length of log that is kept, ns; None: everything.
+        kept_ns: length of log that is kept, ns; None: all messages are kept.
 
     Attributes:
-        next_numbers: per channel the number after that of its last played message.
+        next_numbers: per channel the number after that of the last played message.
     """
 
     def __init__(self, kept_ns: int | None = None) -> None:
         self.next_numbers: dict[int, int] = {}
         self._kept_ns = kept_ns
-        self._runs: dict[int, deque[_PlayedRun]] = {}
+        self._messages: dict[int, deque[_ChannelMessages]] = {}
 
     def add(self, batch: MessageBatch) -> None:
-        """Adds messages that are about to be played, and drops the oldest."""
+        """Adds messages that are about to be played, and drops the oldest messages."""
         for channel in np.unique(batch.channels).tolist():
-            places = np.flatnonzero(batch.channels == channel)
-            runs = self._runs.setdefault(channel, deque())
-            runs.append((batch.numbers[places], places, batch))
+            indices = np.flatnonzero(batch.channels == channel)
+            parts = self._messages.setdefault(channel, deque())
+            parts.append(_ChannelMessages(batch.numbers[indices], indices, batch))
             if self._kept_ns is not None:
                 oldest_ns = int(batch.times_ns[-1]) - self._kept_ns
-                while int(runs[0][2].times_ns[-1]) < oldest_ns:
-                    runs.popleft()
+                while int(parts[0].batch.times_ns[-1]) < oldest_ns:
+                    parts.popleft()
 
     def clear(self) -> None:
-        """Drops all messages, but not how many were played: another round begins."""
-        self._runs.clear()
+        """Drops all messages before another round; `next_numbers` is kept."""
+        self._messages.clear()
 
     def find_messages(self, channel: int, first: int, last: int) -> tuple[int, list[bytes]]:
-        """Returns the number of the first message and the consecutive messages of one answer.
+        """Returns successive messages for one reply to a backfill request.
 
         Args:
             channel: the channel.
-            first: number of the first one wanted; without a message of that number, the next
-                one comes first.
-            last: number of the last one wanted.
+            first: number of the first requested message. If that message is not kept, the reply
+                begins with the next message.
+            last: number of the last requested message.
+
+        Returns:
+            The number of the first message of the reply, and the payloads. A reply is limited
+            to `BACKFILL_MESSAGES` messages and about `BACKFILL_BYTES` bytes.
         """
-        runs = list(self._runs.get(channel, ()))
-        made = self.next_numbers.get(channel, 0)
+        played = self.next_numbers.get(channel, 0)
         payloads: list[bytes] = []
         size = 0
-        wanted = first
-        begun = first
-        for numbers, places, batch in runs[
-            bisect_left(runs, first, key=lambda run: int(run[0][-1])) :
-        ]:
-            begin = int(np.searchsorted(numbers, wanted))
-            part = slice(begin, begin + BACKFILL_MESSAGES + 1)
-            for number, place in zip(
-                numbers[part].tolist(), places[part].tolist(), strict=True
-            ):
+        start = first
+        next_number = first
+        parts = list(self._messages.get(channel, ()))
+        first_part = bisect_left(parts, first, key=lambda part: int(part.numbers[-1]))
+        for part in parts[first_part:]:
+            for number, index in part.list_from(next_number):
                 if not payloads:
-                    begun = wanted = max(first, min(number, made))
-                if number < wanted:
+                    start = max(first, min(number, played))
+                    next_number = start
+                if number < next_number:
                     continue  # a repeated number
-                payload = batch.payload(place)
+                payload = part.batch.payload(index)
                 size += len(payload)
-                full = len(payloads) == BACKFILL_MESSAGES or (
-                    payloads and size > BACKFILL_BYTES
-                )
-                if number > min(last, made - 1) or number > wanted or full:
-                    return begun, payloads
+                has_gap = number > next_number
+                is_full = len(payloads) == BACKFILL_MESSAGES
+                is_large = bool(payloads) and size > BACKFILL_BYTES
+                if number > min(last, played - 1) or has_gap or is_full or is_large:
+                    return start, payloads
                 payloads.append(payload)
-                wanted = number + 1
-        return (begun if payloads or first >= made else made), payloads
+                next_number = number + 1
+        if payloads or first >= played:
+            return start, payloads
+        return played, payloads
 
 
 REFRESH_NS = 500_000_000
-"""Longest age of an encoded identity: it holds a whole scenario, which takes long to encode."""
+"""Longest age of an encoded identity, which holds a whole scenario and takes long to encode."""
 
 
 class SiteStandIns:
-    """The stand-ins for all sites of a session, and the recorders that listen.
+    """The stand-ins for all sites of a session.
+
+    Args:
+        bus: the connection to the playback's session.
+        clock: the time.
+        session: name of the playback's session.
+        header: content of the files.
+        history: the messages that were played.
 
     Attributes:
-        refilled: number of messages given to recorders that had missed them.
+        recorders: starts of the recorders that are present.
+        refilled: number of messages that were sent to recorders by backfill.
     """
 
     def __init__(
@@ -133,9 +162,11 @@ class SiteStandIns:
         self._clock = clock
         self._header = header
         self._history = history
-        self._stored: dict[str, set[str]] = {}
-        self._met: set[str] = set()
-        self._boots: dict[str, tuple[int, int]] = {}
+        self._stored: dict[str, set[str]] = {}  # by recorder the sites that it has stored
+        self._listening: set[str] = set()  # recorders that sent their identity
+        self._boots: dict[
+            str, tuple[int, int]
+        ] = {}  # by site start and boot, see `_find_start`
         self._presence = bus.presence(topics.presence_key(session, topics.RECORDER))
         self._recorder_events = bus.inbox(
             topics.key(session, topics.RECORDER, topics.EVENT), 256
@@ -147,21 +178,20 @@ class SiteStandIns:
             )
             for site, boot in header.boots.items()
         }
-        self._encoded: dict[
-            str, tuple[int, bytes]
-        ] = {}  # per site its identity, and since when
-        self._queries = {}
+        # by site the time at which its identity was encoded, and the identity
+        self._encoded: dict[str, tuple[int, bytes]] = {}
+        self._identity_queries = {}
+        self._backfill_queries = {}
         for site, info in self._infos.items():
-            keys = (
-                topics.key(session, site, topics.INFO),
-                topics.key(session, site, topics.PAST),
-            )
-            self._queries[site] = bus.query_inbox(keys[0]), bus.query_inbox(keys[1])
+            info_key = topics.key(session, site, topics.INFO)
+            past_key = topics.key(session, site, topics.PAST)
+            self._identity_queries[site] = bus.query_inbox(info_key)
+            self._backfill_queries[site] = bus.query_inbox(past_key)
             answer_pings(bus, clock, session, info)
             bus.announce(liveliness_token(session, site, info.boot))
 
-    def begin(self, epoch_mono_ns: int) -> None:
-        """Shows the session as running, with tick 0 at an instant of the clock."""
+    def start_session(self, epoch_mono_ns: int) -> None:
+        """Announces the session as running, with tick 0 at a time of the clock, ns."""
         running = {
             "running": True,
             "epoch_mono_ns": epoch_mono_ns,
@@ -174,75 +204,83 @@ class SiteStandIns:
         self._encoded.clear()
 
     def serve_queries(self) -> bool:
-        """Answers identity queries, notes presence and events of recorders, and answers one
-        backfill query.
+        """Replies to identity queries and one backfill query, and receives news of recorders.
 
         Returns:
             True if there was a backfill query.
         """
-        for site, (identity_queries, _) in self._queries.items():
-            while (query := identity_queries.poll()) is not None:
-                query.reply(self._identity(site))
+        for site, queries in self._identity_queries.items():
+            while (query := queries.poll()) is not None:
+                query.reply(self._encode_identity(site))
         for parts, alive in topics.read_presence(self._presence):
-            (self.recorders.add if alive else self.recorders.discard)(parts.boot)
+            if alive:
+                self.recorders.add(parts.boot)
+            else:
+                self.recorders.discard(parts.boot)
         for event in read_messages(self._recorder_events, Event):
             if event.kind == "stored":
                 self._stored.setdefault(str(event.boot), set()).add(event.about)
-        for site, (_, backfill_queries) in self._queries.items():
-            query = backfill_queries.poll()
+        for site, queries in self._backfill_queries.items():
+            query = queries.poll()
             if query is not None:
-                self._answer_backfill(site, query)
+                self._reply_backfill(site, query)
                 return True
         return False
 
-    def _identity(self, site: str) -> bytes:
-        encoded_ns, answer = self._encoded.get(site, (0, b""))
+    def _encode_identity(self, site: str) -> bytes:
+        """Returns the identity of a site, encoded at most `REFRESH_NS` ago."""
+        encoded_ns, identity = self._encoded.get(site, (0, b""))
         now_ns = self._clock.monotonic_ns()
-        if not answer or now_ns - encoded_ns >= REFRESH_NS:
-            ticks = self._history.next_numbers.get(self._find_channel(site, topics.STATE), 0)
-            answer = encode(msgspec.structs.replace(self._infos[site], ticks=ticks))
-            self._encoded[site] = now_ns, answer
-        return answer
+        if not identity or now_ns - encoded_ns >= REFRESH_NS:
+            channel = self._find_channel(site, topics.STATE)
+            ticks = self._history.next_numbers.get(channel, 0)
+            identity = encode(msgspec.structs.replace(self._infos[site], ticks=ticks))
+            self._encoded[site] = (now_ns, identity)
+        return identity
 
     def are_recorders_listening(self) -> bool:
-        """Asks the present recorders for their identities; True once all have answered."""
-        self._met |= {str(info.boot) for info in self._recorder_query.poll()}
-        return not self.recorders - self._met
+        """Requests the identities of recorders; True once all of them have replied."""
+        self._listening |= {str(info.boot) for info in self._recorder_query.poll()}
+        return not self.recorders - self._listening
 
     def have_stored(self, recorders: Collection[str]) -> bool:
-        """True if all of these recorders have reported that they stored everything of every
-        site.
-        """
+        """True if all these recorders have published `stored` about every site."""
         return all(self._stored.get(boot, set()) >= self._infos.keys() for boot in recorders)
 
     def _find_channel(self, site: str, channel: str) -> int:
+        """Returns the number of a site's channel among the played channels; -1 if none."""
         topic = "/" + topics.key(self._header.session, site, channel)
         return self._header.topics.index(topic) if topic in self._header.topics else -1
 
     def _find_start(self, site: str) -> tuple[int, int]:
-        """Returns which start of a site is played, from 0, and its boot: that of its newest
-        event.
+        """Returns the start of a site that is played, counted from 0, and its boot.
+
+        The newest played event of the site determines both.
         """
         channel = self._find_channel(site, topics.EVENT)
         newest = self._history.next_numbers.get(channel, 0) - 1
         start = max(newest, 0) // NUMBERS_OF_A_START
-        if start and self._boots.get(site, (0, 0))[0] != start:
-            for payload in self._history.find_messages(channel, newest, newest)[1]:
+        first_start = (0, self._infos[site].boot)
+        if not start:
+            return first_start
+        if self._boots.get(site, first_start)[0] != start:
+            _, payloads = self._history.find_messages(channel, newest, newest)
+            for payload in payloads:
                 with suppress(WireError):
-                    self._boots[site] = start, decode(payload, Event).boot
-        first = 0, self._infos[site].boot
-        return self._boots.get(site, first) if start else first
+                    self._boots[site] = (start, decode(payload, Event).boot)
+        return self._boots.get(site, first_start)
 
-    def _answer_backfill(self, site: str, query: Query) -> None:
+    def _reply_backfill(self, site: str, query: Query) -> None:
         start, boot = self._find_start(site)
 
-        def find(wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
-            channel = self._find_channel(site, wanted.channel)
-            before = start * NUMBERS_OF_A_START if wanted.channel == topics.EVENT else 0
-            made = self._history.next_numbers.get(channel, 0) - before
+        def find(request: BackfillRequest) -> tuple[int, list[bytes], int]:
+            # the requested numbers of events are those of the present start
+            offset = start * NUMBERS_OF_A_START if request.channel == topics.EVENT else 0
+            channel = self._find_channel(site, request.channel)
+            played = self._history.next_numbers.get(channel, 0) - offset
             first, payloads = self._history.find_messages(
-                channel, wanted.first + before, wanted.last + before
+                channel, request.first + offset, request.last + offset
             )
-            return max(first - before, 0), payloads, max(made, 0)
+            return max(first - offset, 0), payloads, max(played, 0)
 
         self.refilled += answer_backfill(query, site, boot, find)

@@ -1,3 +1,1 @@
-"""Drivers that run `Site.step` again: in virtual time, from a log, and from a log with changed
-settings.
-"""
+"""Run `Site.step` in virtual time, again from a log, or from a log with changed settings."""

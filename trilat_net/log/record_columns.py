@@ -1,8 +1,11 @@
-"""Fields of many encoded records as arrays.
+"""Decode fields of many records into arrays.
 
-Invariant: only the requested fields are decoded, and each is checked as in a complete record:
-type, length, finite values. Every function raises `WireError` for the first payload that is no
-such record.
+Every function raises `WireError` for the first payload that is not a valid record.
+
+Invariant:
+    - Only the requested fields are decoded.
+    - Each field is checked as in a complete record: its type, its length, and that its numbers
+      are finite.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -30,127 +33,164 @@ _TYPES: dict[str, Any] = {
     "mode": _MODE,
     "rx": list[Stamp],
 }
-"""Types of fields that are narrower here than in `State`, as vectors are: of a fixed length."""
+"""Types of fields that are narrower here than in `State`, where any value is decoded."""
 _DEFAULTS = {"sent_ns": 0}
-"""Values of fields that records of older versions lack."""
+"""Values of fields that records of older versions do not have."""
 
 
 def decode_ticks(payloads: Sequence[bytes]) -> Ints:
-    """Returns the tick of every record, shape (K,); records of every readable version are
-    accepted.
+    """Returns the tick of every record, shape (K,).
+
+    Records of every readable version are accepted.
     """
     if any(len(payload) > MAX_BYTES for payload in payloads):
-        raise _explain(payloads)
-    pairs = decode_ints(payloads, "v", "tick").reshape(-1, 2)
-    if not np.isin(pairs[:, 0], READABLE).all():
-        raise _explain(payloads)
-    return pairs[:, 1].copy()
+        raise _find_error(payloads)
+    versions_and_ticks = decode_ints(payloads, "v", "tick").reshape(-1, 2)
+    if not np.isin(versions_and_ticks[:, 0], READABLE).all():
+        raise _find_error(payloads)
+    return versions_and_ticks[:, 1].copy()
 
 
 def decode_ints(payloads: Sequence[bytes], *fields: str) -> Ints:
-    """Returns whole numbers of 64 bits of every record, one record after the other."""
-    found = _decode_fields(payloads, *fields)
-    values = found if len(fields) == 1 else chain.from_iterable(found)
+    """Returns integer fields of every record, shape (K times number of fields,).
+
+    The values of one record follow each other, in the order of `fields`.
+    """
+    values = _decode_fields(payloads, *fields)
+    if len(fields) > 1:  # each value is a tuple with one number per field
+        values = chain.from_iterable(values)
     return _to_array(payloads, values, np.int64, len(fields) * len(payloads))
 
 
 def decode_vectors(payloads: Sequence[bytes], layout: Layout, *fields: str) -> dict[str, Array]:
-    """Returns vectors of every record by their fields, shape (K, length of the vector) each, in
-    one pass.
+    """Returns vectors of every record, by field.
 
-    Of what records of this layout leave out the length is 0.
+    Args:
+        payloads: K records.
+        layout: the lengths of the vectors.
+        fields: names of the fields.
+
+    Returns:
+        Per field an array of shape (K, length of the vector). A field that the layout does not
+        have gets an array of shape (K, 0).
     """
     lengths = layout.lengths()
-    if absent := {
-        field: np.zeros((len(payloads), 0)) for field in fields if field not in lengths
-    }:
-        there = [field for field in fields if field in lengths]
-        return absent | (decode_vectors(payloads, layout, *there) if there else {})
-    counts = [lengths[field] for field in fields]
-    values = chain.from_iterable(_decode_fields(payloads, *fields, layout=layout))
-    if len(fields) > 1:
+    present = [field for field in fields if field in lengths]
+    vectors = {field: np.zeros((len(payloads), 0)) for field in fields if field not in lengths}
+    if not present:
+        return vectors
+    row_length = sum(lengths[field] for field in present)
+    values = chain.from_iterable(_decode_fields(payloads, *present, layout=layout))
+    if len(present) > 1:  # each value is a vector of one field
         values = chain.from_iterable(values)
-    rows: Array = _to_array(
+    numbers: Array = _to_array(
         payloads=payloads,
         values=values,
         kind=np.float64,
-        count=sum(counts) * len(payloads),
+        count=row_length * len(payloads),
         layout=layout,
     )
-    rows = rows.reshape(-1, sum(counts))
-    if not np.isfinite(rows).all():
-        raise _explain(payloads, layout=layout)
-    if len(fields) == 1:
-        return {fields[0]: rows}
-    parts = np.split(rows, np.cumsum(counts)[:-1], axis=1)
-    return {field: part.copy() for field, part in zip(fields, parts, strict=True)}
+    if not np.isfinite(numbers).all():
+        raise _find_error(payloads, layout=layout)
+    rows = numbers.reshape(-1, row_length)
+    if len(present) == 1:
+        vectors[present[0]] = rows
+        return vectors
+    start = 0
+    for field in present:
+        stop = start + lengths[field]
+        vectors[field] = rows[:, start:stop].copy()
+        start = stop
+    return vectors
 
 
 def decode_strings(payloads: Sequence[bytes], field: str) -> NDArray[np.object_]:
-    """Returns a word, or another object, of every record, shape (K,)."""
+    """Returns a field of every record as an array of objects, such as strings, shape (K,)."""
     return _to_array(payloads, _decode_fields(payloads, field), np.object_, len(payloads))
 
 
 def decode_per_peer(
     payloads: Sequence[bytes], field: str, peers: Sequence[str], absent: int
 ) -> dict[str, Ints]:
-    """Returns a field with a whole number per peer, shape (K,) each; `absent` where a record
-    names none.
+    """Returns a field that has an integer for each peer, as the field `used`.
+
+    Args:
+        payloads: K records.
+        field: name of the field, a map from peers to integers.
+        peers: names of the peers.
+        absent: the number for a peer that the map of a record does not have.
+
+    Returns:
+        Per peer the integers of all records, shape (K,).
     """
-    places = [f"peer{n}" for n in range(len(peers))]
-    entry = msgspec.defstruct(
+    # a struct with an attribute per peer decodes faster than a dict; names of peers need not be
+    # identifiers, so the attributes have names of their own
+    attributes = [f"peer{n}" for n in range(len(peers))]
+    peer_struct = msgspec.defstruct(
         "Peers",
-        [(place, int, absent) for place in places],
-        rename=dict(zip(places, peers, strict=True)),
+        [(attribute, int, absent) for attribute in attributes],
+        rename=dict(zip(attributes, peers, strict=True)),
         gc=False,
     )
-    decoder = _make_decoder({field: entry})
-    take = attrgetter(*(f"{field}.{place}" for place in places))
-    found = map(take, map(decoder.decode, payloads))
-    values = found if len(peers) == 1 else chain.from_iterable(found)
-    rows = _to_array(payloads, values, np.int64, len(peers) * len(payloads)).reshape(
-        -1, len(peers)
-    )
+    decoder = _make_decoder({field: peer_struct})
+    get_numbers = attrgetter(*(f"{field}.{attribute}" for attribute in attributes))
+    values: Iterator[Any] = map(get_numbers, map(decoder.decode, payloads))
+    if len(peers) > 1:  # each value is a tuple with one number per peer
+        values = chain.from_iterable(values)
+    numbers = _to_array(payloads, values, np.int64, len(peers) * len(payloads))
+    rows = numbers.reshape(-1, len(peers))
     return {peer: rows[:, n].copy() for n, peer in enumerate(peers)}
 
 
 def decode_arrivals(payloads: Sequence[bytes]) -> tuple[Ints, Ints]:
-    """Returns the arrivals: how many per record, shape (K,), and all in order as in `rx`, shape
-    (N, 3).
+    """Returns the arrivals of all records.
+
+    Returns:
+        The number of arrivals of each record, shape (K,), and all arrivals in order, as in
+        `rx`, shape (N, 3).
     """
     counts = np.zeros(len(payloads), dtype=np.int64)
 
-    def iterate_entries() -> Iterator[int]:
-        for n, arrivals in enumerate(_decode_fields(payloads, "rx")):
-            counts[n] = len(arrivals)
+    def iterate_numbers() -> Iterator[int]:
+        for row, arrivals in enumerate(_decode_fields(payloads, "rx")):
+            counts[row] = len(arrivals)
             for entry in arrivals:
                 yield from entry
 
-    return counts, _to_array(payloads, iterate_entries(), np.int64, -1).reshape(-1, 3)
+    numbers = _to_array(payloads, iterate_numbers(), np.int64, -1)
+    return counts, numbers.reshape(-1, 3)
 
 
 def _decode_fields(
     payloads: Sequence[bytes], *fields: str, layout: Layout | None = None
 ) -> Iterator[Any]:
-    take: Callable[[Any], Any] = attrgetter(*fields)
-    return map(take, map(_find_decoder(fields, layout).decode, payloads))
+    """Yields the value of a field of every record; of several fields a tuple of values."""
+    get_values: Callable[[Any], Any] = attrgetter(*fields)
+    decoder = _find_decoder(fields, layout)
+    return map(get_values, map(decoder.decode, payloads))
 
 
 @cache
 def _find_decoder(
     fields: tuple[str, ...], layout: Layout | None
 ) -> msgspec.msgpack.Decoder[Any]:
-    types = {field.name: field.type for field in msgspec.structs.fields(State)} | _TYPES
-    for field, count in layout.lengths().items() if layout else ():
-        types[field] = tuple.__class_getitem__((float,) * count)
+    """Returns a decoder of some fields; with a layout, vectors must have its lengths."""
+    types = {field.name: field.type for field in msgspec.structs.fields(State)}
+    types.update(_TYPES)
+    if layout is not None:
+        for field, length in layout.lengths().items():
+            types[field] = tuple.__class_getitem__((float,) * length)
     return _make_decoder({field: types[field] for field in fields})
 
 
 def _make_decoder(types: dict[str, Any]) -> msgspec.msgpack.Decoder[Any]:
-    fields = [
-        (name, kind, _DEFAULTS[name]) if name in _DEFAULTS else (name, kind)
-        for name, kind in types.items()
-    ]
+    """Returns a decoder of fields with these types, by name."""
+    fields: list[Any] = []
+    for name, kind in types.items():
+        if name in _DEFAULTS:
+            fields.append((name, kind, _DEFAULTS[name]))
+        else:
+            fields.append((name, kind))
     return msgspec.msgpack.Decoder(msgspec.defstruct("Fields", fields, frozen=True, gc=False))
 
 
@@ -161,23 +201,37 @@ def _to_array(
     count: int,
     layout: Layout | None = None,
 ) -> NDArray[Any]:
+    """Returns decoded values as an array.
+
+    Args:
+        payloads: the records, for the error.
+        values: the values; they are decoded while they are iterated.
+        kind: data type of the array.
+        count: number of values; -1: unknown.
+        layout: the lengths of the vectors, for the error.
+
+    Raises:
+        WireError: a record is not valid.
+    """
     try:
         return np.fromiter(values, kind, count)
     except (ValueError, OverflowError, RecursionError) as error:
-        raise _explain(payloads, str(error), layout) from None
+        raise _find_error(payloads, str(error), layout) from None
 
 
-def _explain(
+def _find_error(
     payloads: Sequence[bytes],
-    else_text: str = "a number is out of range",
+    default: str = "a number is out of range",
     layout: Layout | None = None,
 ) -> WireError:
-    """Returns the error of the first payload that is no record, as that record alone would
-    raise it.
+    """Returns the error of the first payload that is not a valid record.
+
+    The error is the same as if that record were decoded alone. `default` is its text if every
+    record is valid.
     """
     for payload in payloads:
         try:
             decode(payload, State, READABLE, layout)
         except WireError as error:
             return error
-    return WireError("malformed", else_text)
+    return WireError("malformed", default)

@@ -1,8 +1,10 @@
-"""One site's part of a log: its records as arrays over time, or one by one.
+"""The records of one site of a log: as arrays over time, or one by one.
 
-Invariant: only what is requested is decoded; an invalid record is an error that names the site.
-Memory stays bounded for a log of any length: long sequences of records are decoded in blocks on
-access.
+Invariant:
+    - Only requested fields and records are decoded.
+    - An invalid record is an error that names the site.
+    - Memory is bounded for a log of any length: long sequences of records are decoded in blocks
+      when they are accessed.
 """
 
 from bisect import bisect_right
@@ -31,73 +33,98 @@ M = TypeVar("M")
 T = TypeVar("T")
 
 MAX_DECODED_RECORDS = 1 << 16
-"""Records of a site that are held decoded, at most: a minute at 1 kHz, some 150 MB."""
+"""Largest number of decoded records of a site: a minute at 1 kHz, some 150 MB."""
 BLOCK_RECORDS = 1 << 11
-"""Records that are decoded together."""
+"""Number of records that are decoded together."""
 HEAVY_BYTES = 12 << 20
 HEAVY_RATIO = 10
-"""Records whose decoded form takes more than this, and than so many times their payloads, are
-held few at a
-time: they were made to take much.
+"""Records are heavy if their decoded form needs more memory than `HEAVY_BYTES` and than
+`HEAVY_RATIO` times their payloads. Only few heavy records are kept decoded, because a file can
+be built to need much memory.
 """
 HEAVY_BLOCK = 128
+"""Number of heavy records that are decoded together."""
 HEAVY_BLOCKS = 8
-"""Heavy records that are decoded together, and how many times that many are held."""
+"""Number of blocks of heavy records that are kept decoded."""
 
 DecodeStates = Callable[[Sequence[bytes]], list[State]]
-"""Decodes some records, or raises an error for one that is none."""
+"""Decodes some records; raises an error if a payload is not a valid record."""
 
 
 def freeze(value: T) -> T:
-    """Makes arrays read-only, also those in a tuple or by name: nobody changes a log by
-    accident.
+    """Makes arrays read-only, also arrays in a tuple or a dict, and returns the value.
+
+    A user cannot change a log by accident.
     """
     if isinstance(value, np.ndarray):
         value.setflags(write=False)
-    elif isinstance(value, dict | tuple):
-        for one in value.values() if isinstance(value, dict) else value:
-            freeze(one)
+    elif isinstance(value, dict):
+        for item in value.values():
+            freeze(item)
+    elif isinstance(value, tuple):
+        for item in value:
+            freeze(item)
     return value
 
 
 def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
-    """Returns x - x_des of places, and of orientations the turn from one to the other, shape
-    (K, m).
+    """Returns the errors of a pose from its reference, shape (K, m).
 
-    It is 0 along an axis that the site does not follow: `axes` has 0 there and 1 elsewhere.
+    The error of a position is x - x_des. The error of an orientation is the rotation vector
+    from the reference to the orientation, rad.
+
+    Args:
+        x: positions, or positions and rotation vectors, shape (K, m), m and rad.
+        x_des: their references, shape (K, m).
+        axes: per coordinate 1 if the site follows along that axis; else 0, and the error is 0.
     """
     e: Array = x - x_des
     if e.shape[1] > POSITION:
-        e[:, POSITION:] = _find_turns(x[:, POSITION:], x_des[:, POSITION:])
+        e[:, POSITION:] = _compute_rotation_errors(x[:, POSITION:], x_des[:, POSITION:])
     e *= np.array(axes)
     return e
 
 
-def _find_turns(turn: Array, reference: Array) -> Array:
-    (a, u), (b, v) = map(compute_quaternion_parts, (turn, reference))
+def _compute_rotation_errors(rotation: Array, reference: Array) -> Array:
+    """Returns the rotation vectors from references to orientations, shape (K, 3), rad.
+
+    The orientation (a, u) times the conjugate (b, -v) of the reference is the quaternion (w, p):
+
+        w = a b + u . v
+        p = b u - a v - u x v
+
+    It turns by 2 atan2(|p|, w) about p.
+    """
+    a, u = compute_quaternion_parts(rotation)
+    b, v = compute_quaternion_parts(reference)
     w = a * b + np.sum(u * v, axis=1, keepdims=True)
     p = b * u - a * v - np.cross(u, v)
-    # of two quaternions that turn alike that of the shorter turn
+    # two quaternions stand for the same rotation: choose the shorter turn
     p *= np.where(w < 0.0, -1.0, 1.0)
     sine = np.linalg.norm(p, axis=1, keepdims=True)
-    by_sine = np.divide(
+    angle_by_sine = np.divide(
         2.0 * np.arctan2(sine, abs(w)), sine, out=np.full_like(w, 2.0), where=sine > 0.0
     )
-    return np.asarray(by_sine * p)
+    return np.asarray(angle_by_sine * p)
 
 
 class LazyRecords(Sequence[State]):
-    """Records decoded a block at a time; the blocks used last are held, fewer of heavy records."""
+    """Records that are decoded in blocks; the blocks accessed last are kept.
+
+    Args:
+        payloads: the records.
+        decode_block: decodes some of them.
+        heavy: whether only few records are kept decoded.
+    """
 
     def __init__(
         self, payloads: Sequence[bytes], decode_block: DecodeStates, *, heavy: bool = False
     ) -> None:
-        self._size, held = (
-            (HEAVY_BLOCK, HEAVY_BLOCKS) if heavy else (BLOCK_RECORDS, MAX_DECODED_RECORDS)
-        )
+        size = HEAVY_BLOCK if heavy else BLOCK_RECORDS
+        blocks = HEAVY_BLOCKS if heavy else MAX_DECODED_RECORDS // size
         self._payloads = payloads
-        size = self._size
-        self._block = lru_cache(maxsize=held if heavy else held // size)(
+        self._size = size
+        self._get_block = lru_cache(maxsize=blocks)(
             lambda number: decode_block(payloads[number * size : (number + 1) * size])
         )
 
@@ -106,56 +133,68 @@ class LazyRecords(Sequence[State]):
 
     def __iter__(self) -> Iterator[State]:
         for number in range(-(-len(self._payloads) // self._size)):
-            yield from self._block(number)
+            yield from self._get_block(number)
 
     @overload
-    def __getitem__(self, place: int) -> State: ...
+    def __getitem__(self, index: int) -> State: ...
     @overload
-    def __getitem__(self, place: slice) -> list[State]: ...
-    def __getitem__(self, place: int | slice) -> State | list[State]:
-        if isinstance(place, slice):
-            return [self[n] for n in range(*place.indices(len(self)))]
-        index = place + len(self) if place < 0 else place
-        if not 0 <= index < len(self):
-            raise IndexError(f"record {place} of {len(self)}")
-        return self._block(index // self._size)[index % self._size]
+    def __getitem__(self, index: slice) -> list[State]: ...
+    def __getitem__(self, index: int | slice) -> State | list[State]:
+        if isinstance(index, slice):
+            return [self[n] for n in range(*index.indices(len(self)))]
+        row = index + len(self) if index < 0 else index
+        if not 0 <= row < len(self):
+            raise IndexError(f"record {index} of {len(self)}")
+        return self._get_block(row // self._size)[row % self._size]
 
 
 def decode_records(payloads: Sequence[bytes], decode_block: DecodeStates) -> Sequence[State]:
-    """Returns the records of a site, in the order of their payloads: a list if they are not too
-    many.
+    """Returns the records of a site, in the order of their payloads.
+
+    Few records are decoded at once into a list; many or heavy records are decoded when they are
+    accessed.
+
+    Args:
+        payloads: the records.
+        decode_block: decodes some of them.
     """
     if len(payloads) > MAX_DECODED_RECORDS:
         return LazyRecords(payloads, decode_block)
-    room = max(HEAVY_BYTES, HEAVY_RATIO * sum(map(len, payloads)))
-    held: list[State] = []
+    remaining_bytes = max(HEAVY_BYTES, HEAVY_RATIO * sum(map(len, payloads)))
+    states: list[State] = []
     with process.pause_gc():
         for first in range(0, len(payloads), BLOCK_RECORDS):
             block = decode_block(payloads[first : first + BLOCK_RECORDS])
-            room -= sum(map(_estimate_bytes, block))
-            if room < 0:
+            remaining_bytes -= sum(map(_estimate_bytes, block))
+            if remaining_bytes < 0:
                 return LazyRecords(payloads, decode_block, heavy=True)
-            held += block
-    return held
+            states += block
+    return states
 
 
 def _estimate_bytes(state: State) -> int:
-    lists = len(state.rx) + len(state.echo) + len(state.cmd)
-    return 2_000 + 130 * lists + 100 * len(state.used) + 32 * len(state.mem)
+    """Returns the approximate memory of a decoded record, bytes."""
+    entries = len(state.rx) + len(state.echo) + len(state.cmd)
+    return 2_000 + 130 * entries + 100 * len(state.used) + 32 * len(state.mem)
 
 
 class RecordsByTick(Mapping[int, State]):
-    """Records, in order of their ticks (K,), by tick; of several with one tick, the last."""
+    """Records by tick; of several records with one tick, the last.
+
+    Args:
+        states: the records, in order of their ticks.
+        ticks: the ticks, shape (K,).
+    """
 
     def __init__(self, states: Sequence[State], ticks: Ints) -> None:
         self._states = states
         self._ticks = ticks.tolist()
 
     def __getitem__(self, tick: int) -> State:
-        place = bisect_right(self._ticks, tick) - 1
-        if place < 0 or self._ticks[place] != tick:
+        row = bisect_right(self._ticks, tick) - 1
+        if row < 0 or self._ticks[row] != tick:
             raise KeyError(tick)
-        return self._states[place]
+        return self._states[row]
 
     def __iter__(self) -> Iterator[int]:
         return iter(dict.fromkeys(self._ticks))
@@ -165,7 +204,13 @@ class RecordsByTick(Mapping[int, State]):
 
 
 class TimedMessages(NamedTuple, Generic[M]):
-    """Messages with the times at which they came and were sent, Unix ns, shape (K,) each."""
+    """Messages with their times.
+
+    Attributes:
+        messages: K messages.
+        log_ns: times of arrival at the recorder, Unix ns, shape (K,).
+        publish_ns: times of sending, Unix ns, shape (K,).
+    """
 
     messages: list[M]
     log_ns: Ints
@@ -173,8 +218,13 @@ class TimedMessages(NamedTuple, Generic[M]):
 
 
 class _RecordField(cached_property[T]):
-    """A field of every record as an array, by the attribute's name; it is decoded on first
-    access.
+    """A field of every record as an array, decoded on first access.
+
+    The name of the attribute is the name of the field.
+
+    Args:
+        decode_column: decodes the field of all records, by its name.
+        meaning: the docstring of the attribute.
     """
 
     def __init__(
@@ -185,7 +235,7 @@ class _RecordField(cached_property[T]):
 
 
 class _RecordVector(cached_property[Array]):
-    """A vector of every record; as `_RecordField`."""
+    """A vector of every record as an array, decoded on first access; see `_RecordField`."""
 
     def __init__(self, meaning: str) -> None:
         super().__init__(lambda site: site._read_vectors(self.attrname)[self.attrname])
@@ -193,28 +243,31 @@ class _RecordVector(cached_property[Array]):
 
 
 _HTML = "trilat_net.reporting.site_html"
-"""What shows the records of a site in a notebook; it is imported when a notebook asks."""
+"""Module that renders the records of a site in a notebook, imported when a notebook needs it.
+"""
 
 
 class SiteLog:
     """The records of one site, in tick order.
 
     Args:
-        name: the site.
-        peers: its peers, in scenario order.
-        rate_hz: its tick rate, Hz.
+        name: name of the site.
+        peers: names of its peers, in scenario order.
+        rate_hz: tick rate of the site, Hz.
         payloads: the records as published.
-        source: the file's name in errors.
-        times: when they came and when they were sent, Unix ns, shape (K,) each; by default 0.
-        layout: how many numbers the vectors of its records have; n joints, m shared, P
+        source: name of the file in errors.
+        times: times of arrival and of sending of each record, Unix ns, shape (K,) each; by
+            default 0.
+        layout: lengths of the vectors of a record: n joints, m shared coordinates, P
             parameters.
-        channel: what the site's law sends to its peers.
-        axes: in task space per coordinate 1 if the site follows along it, else 0.
+        channel: the numbers that the site's law sends to its peers.
+        axes: in task space per coordinate 1 if the site follows along that axis, else 0.
 
     Attributes:
         payloads: the records as published, in tick order.
-        tick: their ticks, shape (K,). log_time_ns, publish_time_ns: when each came, and was
-        sent by its own stamp, shape (K,), Unix ns.
+        tick: tick of each record, shape (K,).
+        log_time_ns: time of arrival of each record, Unix ns, shape (K,).
+        publish_time_ns: time of sending of each record by its own stamp, Unix ns, shape (K,).
 
     Raises:
         LogError: a record cannot be read; every property raises it too, for the fields that it
@@ -261,9 +314,11 @@ class SiteLog:
     def __repr__(self) -> str:
         if not len(self):
             return f"<{self.name}: no records>"
-        first_s, last_s = (self.tick[n] / self.rate_hz for n in (0, -1))
-        records = f"{count_nouns(len(self), 'record')} of {self.rate_hz} Hz, {first_s:.3f} s to {last_s:.3f} s"
-        return f"<{self.name}: {records}, {self.missing or 'none'} missing>"
+        first_s = self.tick[0] / self.rate_hz
+        last_s = self.tick[-1] / self.rate_hz
+        records = f"{count_nouns(len(self), 'record')} of {self.rate_hz} Hz"
+        span = f"{first_s:.3f} s to {last_s:.3f} s"
+        return f"<{self.name}: {records}, {span}, {self.missing or 'none'} missing>"
 
     def _repr_html_(self) -> str:
         html: str = import_module(_HTML).render_site_html(self)
@@ -278,38 +333,43 @@ class SiteLog:
             ) from None
 
     def prepare(self, *fields: str) -> None:
-        """Decodes several vectors by their names in one pass, three times as fast as one by
-        one.
+        """Decodes several vectors in one pass, three times as fast as one after the other.
+
+        Args:
+            fields: names of the vectors.
         """
-        if absent := [field for field in fields if field not in self.__dict__]:
-            self.__dict__.update(self._read_vectors(*absent))
+        missing = [field for field in fields if field not in self.__dict__]
+        if missing:
+            self.__dict__.update(self._read_vectors(*missing))
 
     def _read_vectors(self, *fields: str) -> dict[str, Array]:
         return self._read(record_columns.decode_vectors, self.layout, *fields)
 
     def numbers(self, field: str) -> Ints:
-        """Returns a whole number of every record, shape (K,), by the name of its field in
-        `State`.
-        """
+        """Returns an integer field of every record, shape (K,), by its name in `State`."""
         return self._read(record_columns.decode_ints, field)
 
     def memory(self, first: int, count: int) -> Array:
-        """Returns so many numbers of `mem` from a place on, of every record, shape (K, count).
+        """Returns `count` numbers of `mem` of every record, shape (K, count).
+
+        Args:
+            first: index of the first number in `mem`.
+            count: how many numbers.
 
         Raises:
-            LogError: a record does not have them.
+            LogError: the `mem` of a record is shorter.
         """
         try:
             rows = np.array([row[first : first + count] for row in self.mem], dtype=np.float64)
             return rows.reshape(len(self), count)
-        except ValueError:  # they are of several lengths, or too short
+        except ValueError:  # rows of different lengths, or too short rows
             needed = f"{count_nouns(first + count, 'number')} in `mem`"
             raise LogError(
                 f"{self._source}: a record of {self.name} does not have {needed}"
             ) from None
 
     def record(self, n: int) -> State:
-        """Returns the record at a place, decoded and checked alone; -1 is the last one."""
+        """Returns the record at index `n`, decoded alone; -1 is the last record."""
         return self._decode([self.payloads[n]])[0]
 
     def _decode(self, payloads: Sequence[bytes]) -> list[State]:
@@ -324,35 +384,38 @@ class SiteLog:
 
     @cached_property
     def by_tick(self) -> "dict[int, State] | RecordsByTick":
-        """The same, by their ticks; of several with one tick the last."""
+        """The records by tick; of several records with one tick, the last."""
         if isinstance(self.states, LazyRecords):
             return RecordsByTick(self.states, self.tick)
         return {state.tick: state for state in self.states}
 
     @property
     def last_tick(self) -> int:
-        """Tick of the last record, -1 if there is none."""
+        """Tick of the last record; -1 without records."""
         return int(self.tick[-1]) if len(self) else -1
 
     @property
     def diverged_s(self) -> float | None:
-        """When the site left its limits, s; None if it did not."""
-        last = self.record(-1) if len(self) else None
-        return last.t_ns / NS_PER_S if last is not None and last.mode == "diverged" else None
+        """Time at which the site left its limits, s; None if it did not."""
+        if not len(self):
+            return None
+        last = self.record(-1)
+        return last.t_ns / NS_PER_S if last.mode == "diverged" else None
 
     @property
     def missing(self) -> int:
-        """How many ticks before the last record have none."""
+        """Number of ticks before the last record that have no record."""
         return self.last_tick - int(np.count_nonzero(np.diff(self.tick))) if len(self) else 0
 
     @property
     def skipped(self) -> int:
-        """How many ticks the site did not make, as its records say."""
+        """Number of ticks that the site skipped, as its records state."""
         return sum(count_skipped_ticks(texts) for texts in self._changes.values())
 
     mode = _RecordField(
         record_columns.decode_strings,
-        'Mode, shape (K,): "run", "hold", "brake", "return", "waiting", "fault", "stopped" or "diverged".',
+        'Mode, shape (K,): "run", "hold", "brake", "return", "waiting", "fault", "stopped" '
+        'or "diverged".',
     )
     q = _RecordVector("Joint angles, shape (K, n), rad.")
     qd = _RecordVector("Joint velocities, shape (K, n), rad/s.")
@@ -360,20 +423,24 @@ class SiteLog:
     qd_des = _RecordVector("Its derivative, shape (K, m), rad/s.")
     tau = _RecordVector("Control torque of Eq. (13), shape (K, n), N m.")
     tau_x = _RecordVector(
-        "Exogenous torque in the sign of Eq. (8), shape (K, n), N m; ON the arm acts its negative.",
+        "Exogenous torque in the sign of Eq. (8), shape (K, n), N m; the torque ON the arm is "
+        "its negative.",
     )
     theta_hat = _RecordVector(
         "Estimate of the parameters, Eq. (15), shape (K, P), of two links as in Eq. (24)."
     )
     x = _RecordVector(
-        "In task space the end effector's place and rotation vector as recorded, shape (K, m), m and rad. "
+        "In task space the position and rotation vector of the end effector as recorded, "
+        "shape (K, m), m and rad. "
         "The vector jumps where it passes half a turn; `orientation` does not."
     )
-    xd = _RecordVector("Its derivative, shape (K, m).")
-    wrench = _RecordVector("What tau_x amounts to there, shape (K, m), N and N m.")
-    ch = _RecordVector("All that the site's law sends, shape (K, C); `sent` has it by name.")
+    xd = _RecordVector("Derivative of x, shape (K, m), m/s and rad/s.")
+    wrench = _RecordVector("Wrench equal to tau_x in task space, shape (K, m), N and N m.")
+    ch = _RecordVector(
+        "All numbers that the site's law sends, shape (K, C); `sent` has them by name."
+    )
     hand = _RecordVector(
-        "What somebody who holds the arm does, shape (K, h), see `HandInForce`."
+        "Action of the person or program that holds the arm, shape (K, h), see `HandInForce`."
     )
     bodies = _RecordVector(
         "Poses of the bodies of its plant as recorded, shape (K, 7 b), m and quaternions."
@@ -389,7 +456,8 @@ class SiteLog:
     )
     sent_ns = _RecordField(
         record_columns.decode_ints,
-        "When each record was sent, by the site's own clock since the epoch on it, shape (K,), ns.",
+        "Time at which each record was sent, by the site's own clock since the epoch on that "
+        "clock, shape (K,), ns.",
     )
 
     @cached_property
@@ -399,29 +467,29 @@ class SiteLog:
 
     @cached_property
     def orientation(self) -> Array:
-        """Of sites that follow orientations that of the end effector, shape (K, 4); else shape
-        (K, 0).
+        """Orientation of the end effector as unit quaternions w, x, y, z, shape (K, 4).
 
-        Unit quaternions w, x, y, z, each nearest to the one before.
+        Each quaternion is nearest to the quaternion before. Sites that do not follow
+        orientations have shape (K, 0).
         """
-        return self._make_orientation(self.x)
+        return self._compute_orientation(self.x)
 
     @cached_property
     def orientation_des(self) -> Array:
-        """The same of the reference, shape (K, 4)."""
-        return self._make_orientation(self.q_des)
+        """Orientation of the reference as unit quaternions, as in `orientation`."""
+        return self._compute_orientation(self.q_des)
 
-    def _make_orientation(self, poses: Array) -> Array:
+    def _compute_orientation(self, poses: Array) -> Array:
         if not self.layout.task or self.layout.shared != POSE:
             return freeze(np.zeros((len(self), 0)))
         return freeze(compute_quaternions(poses[:, POSITION:]))
 
     @cached_property
     def body_poses(self) -> Array:
-        """Poses of the bodies of its plant, shape (K, b, 7): x, y, z, m, and the unit
-        quaternion w, x, y, z.
+        """Poses of the bodies of the plant, shape (K, b, 7).
 
-        Each quaternion is nearest to the one before, whichever sign the plant gave it.
+        A pose is x, y, z, m, and a unit quaternion w, x, y, z. Each quaternion is nearest to
+        the quaternion before, whichever sign the plant gave it.
         """
         poses = self.bodies.reshape(len(self), -1, POSITION + 4).copy()
         for body in range(poses.shape[1]):
@@ -430,42 +498,43 @@ class SiteLog:
 
     @property
     def e(self) -> Array:
-        """Position error q - q_des, Eq. (9), shape (K, n), rad; in task space x - x_des, shape
-        (K, m), m.
+        """Position error q - q_des, Eq. (9), shape (K, n), rad.
 
-        The error of an orientation is the turn from the reference to the end effector, rad, at
-        most half a turn long: that of the control law, which jumps where it passes half a turn.
+        In task space it is x - x_des, shape (K, m), m. The error of an orientation is the
+        rotation vector from the reference to the end effector, rad, at most half a turn long.
+        It is the error of the control law, and jumps where it passes half a turn.
         """
-        return (
-            compute_task_errors(self.x, self.q_des, self.axes)
-            if self.layout.task
-            else self.q - self.q_des
-        )
+        if self.layout.task:
+            return compute_task_errors(self.x, self.q_des, self.axes)
+        return self.q - self.q_des
 
     @cached_property
     def sent(self) -> dict[str, Array]:
-        """What the law sends, shape (K, length) each: by name, as in "E", or name and peer, as
-        in "u[m2]".
+        """The numbers that the law sends, shape (K, length) each.
+
+        The keys are a name, as "E", or a name and a peer, as "u[m2]".
         """
-        places: dict[str, list[int]] = {}
-        for n, entry in enumerate(self.channel.entries(self.peers)):
-            places.setdefault(entry.key, []).append(n)
-        return freeze({key: self.ch[:, columns] for key, columns in places.items()})
+        columns: dict[str, list[int]] = {}
+        for column, entry in enumerate(self.channel.entries(self.peers)):
+            columns.setdefault(entry.key, []).append(column)
+        return freeze({key: self.ch[:, indices] for key, indices in columns.items()})
 
     @cached_property
     def busy_us(self) -> Ints:
-        """Computing time of each tick, shape (K - 1,), us: record k + 1 carries that of tick k."""
+        """Computing time of ticks, shape (K - 1,), us; record k + 1 has that of tick k."""
         return self.numbers("busy_us")[1:]
 
     @cached_property
     def used(self) -> dict[str, Ints]:
-        """Per peer the tick of the sample in use, shape (K,); -1 before the first."""
+        """Per peer the tick of the sample in use, shape (K,); -1 before the first sample."""
         return self._read(record_columns.decode_per_peer, "used", self.peers, -1)
 
     @cached_property
     def arrivals(self) -> tuple[Ints, Ints]:
-        """How many samples each record took in, shape (K,), and all of them as in `rx`, shape
-        (N, 3).
+        """The samples that arrived.
+
+        The first array has the number of arrivals of each record, shape (K,); the second array
+        has all arrivals as in `rx`, shape (N, 3).
         """
         return self._read(record_columns.decode_arrivals)
 
@@ -477,14 +546,18 @@ class SiteLog:
         }
 
     def changes(self) -> dict[int, list[str]]:
-        """Returns the changes that the site took in, by tick, as `cmd` names them."""
+        """Returns the changes that the site applied, by tick, as texts of `cmd`."""
         return {tick: list(texts) for tick, texts in self._changes.items()}
 
     def age_s(self, peer: str, rate_hz: int) -> Array:
-        """Returns now minus the stamp of the sample in use of a peer with that tick rate, shape
-        (K,), s.
+        """Returns the age of the sample in use of a peer, shape (K,), s.
 
-        NaN stands for none, before the first sample.
+        The age is the time of the record minus the stamp of the sample; NaN before the first
+        sample.
+
+        Args:
+            peer: name of the peer.
+            rate_hz: tick rate of the peer, Hz.
         """
         used = self.used[peer]
         age_ns = self.t_ns - used * NS_PER_S // rate_hz

@@ -81,7 +81,7 @@ def test_messages_beyond_the_memory_limit_are_given_early() -> None:
 def reading(path: Path, *, loop: bool) -> Iterator[tuple[MessageSource, SessionHeader]]:
     header, _ = preload_messages([path], PlaySelection(), 0)
     with closing(MessageSource(header, None)) as source:
-        source.read([path], PlaySelection(), loop=loop)
+        source.start_reader([path], PlaySelection(), loop=loop)
         yield source, header
     source.close()  # again
 
@@ -134,7 +134,7 @@ def test_what_the_process_cannot_read_is_an_error_here(
     path = write(tmp_path / "run.mcap", [("m1", 0, 0, 0)])
     header, _ = preload_messages([path], PlaySelection(), 0)
     with closing(MessageSource(header, None)) as source:
-        source.read([path], PlaySelection(), loop=True)
+        source.start_reader([path], PlaySelection(), loop=True)
         happens(source, path)
         with pytest.raises(error, match=says):
             list(rounds(source, 1000))
