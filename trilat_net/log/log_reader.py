@@ -1,14 +1,18 @@
-"""Reader of logs: one file, or several that are parts of one session.
+"""Read a log from one file, or from several files that are parts of one session.
 
     log = open_log("run.mcap")
     log["m1"].t_s, log["m1"].q
 
-Invariant: files of every released schema version open; one that is cut off opens up to there,
-with `complete` false. Messages are decoded on access; an invalid record is an error that names
-the file, an invalid event or statistic is left out and reported (`unreadable`). Channels of
-other sessions and members are none of the log's. Measured link delays, for scenarios with
-`model = "trace"`, leave out what the log does not know: a sample counts as lost only if records
-cover every tick at which it could have come, up to the longest delay of the link.
+`read_link_delays` reads the measured delays of a link, for scenarios with `model = "trace"`.
+
+Invariant:
+    - Files of every released schema version can be opened. A file that is cut off is read up to
+      its end, and its `complete` is false.
+    - Messages are decoded when they are accessed. An invalid record is an error that names the
+      file. An invalid event or statistics message is left out and reported (`unreadable`).
+    - Channels of other sessions and members are ignored.
+    - A sample counts as lost only if records cover every tick at which it could have arrived,
+      up to the longest delay of the link. Other samples whose arrival is unknown are left out.
 """
 
 import hashlib
@@ -72,27 +76,27 @@ M = TypeVar("M", Event, LinkStats, RecorderStats)
 
 
 class Log(Result, Mapping[str, SiteLog]):
-    """A recorded session, a mapping: `log["m1"]` is a site's part, `log.items()` has them by
-    name.
+    """A recorded session: a mapping from the names of the sites to their records.
 
     Args:
         contents: the contents of its file, or of its files together.
 
     Attributes:
-        source: the file's name; of several files the first one's, and how many there are.
-        sources: the names of its files, in order.
+        source: name of the file; of several files the name of the first file and their number.
+        sources: names of the files, in order.
         session: metadata of the session: driver, seed, epoch, versions, commit, fingerprint.
-        driver: that of the session: "live" or "virtual".
+        driver: driver of the session: "live", "virtual" or "rerun".
         scenario: the scenario that ran.
+        scenario_text: the scenario as it is in the file.
+        scenario_sha256: SHA-256 of that text.
         sites: names of the sites, in scenario order.
-        scenario_text, scenario_sha256: its text, as it is in the file, and the hash of that.
-        events: the events, per member in order.
+        events: the events of all members, per member in order.
         damaged: parts of the file that cannot be read, a sentence each.
-        chain: agreement with the digest chain of its files, the worst of several.
-        unreadable: channels some of whose messages cannot be read, a sentence each.
+        chain: agreement with the digest chain; of several files the worst.
+        unreadable: channels with messages that cannot be read, a sentence each.
 
     Raises:
-        LogError: its scenario cannot be read.
+        LogError: the scenario cannot be read.
     """
 
     def __init__(self, contents: LogContents) -> None:
@@ -119,23 +123,25 @@ class Log(Result, Mapping[str, SiteLog]):
         ]
 
     def headline(self) -> str:
-        """Returns the session, and how many records it has, in one line."""
+        """Returns a line on the session: its driver, sites, length and records."""
         try:
-            seconds = max(
-                (float(self[name].t_s[-1]) for name in self.sites if len(self[name])),
-                default=0.0,
-            )
-            records = sum(len(self[name]) for name in self.sites)
-            missing = sum(map(self.missing, self.sites)) or "none"
-            holds = f"{seconds:.3f} s, {count_nouns(records, 'record')}, {missing} missing"
-            holds += (
-                f"; {describe_unknown_ends(self.unknown_ends)}" if self.unknown_ends else ""
-            )
-            holds += "" if self.diverged_s is None else f"; DIVERGED at {self.diverged_s:.3f} s"
+            summary = self._describe_records()
         except LogError:
-            holds = "with records that cannot be read"
+            summary = "with records that cannot be read"
         kind = f"{self.driver} session {self.session['session']} of {', '.join(self.sites)}"
-        return f"{self.source}: {kind}; {holds}{'' if self.complete else '; not finished'}"
+        return f"{self.source}: {kind}; {summary}{'' if self.complete else '; not finished'}"
+
+    def _describe_records(self) -> str:
+        last_times_s = [float(self[name].t_s[-1]) for name in self.sites if len(self[name])]
+        length_s = max(last_times_s, default=0.0)
+        records = sum(len(self[name]) for name in self.sites)
+        missing = sum(map(self.missing, self.sites)) or "none"
+        text = f"{length_s:.3f} s, {count_nouns(records, 'record')}, {missing} missing"
+        if self.unknown_ends:
+            text += f"; {describe_unknown_ends(self.unknown_ends)}"
+        if self.diverged_s is not None:
+            text += f"; DIVERGED at {self.diverged_s:.3f} s"
+        return text
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat sim --json`."""
@@ -166,8 +172,11 @@ class Log(Result, Mapping[str, SiteLog]):
         ]
 
     def to_frame(self, name: str = "", kind: str = "") -> "pandas.DataFrame":
-        """Returns a table of the log as a pandas data frame, see `table`; without a name a row
-        per site.
+        """Returns a table of the log as a pandas data frame.
+
+        Args:
+            name: name of the table, see `table`; "": a row per site.
+            kind: kind of the table, see `table`.
         """
         return to_pandas_frame(self.table(name, kind)) if name else super().to_frame()
 
@@ -194,59 +203,63 @@ class Log(Result, Mapping[str, SiteLog]):
         return self._contents.channels.get(topic) or ChannelMessages()
 
     def _decode(self, topic: str, kind: type[M]) -> list[M]:
-        """Returns the messages of a channel; those that cannot be read leave it, and are
-        reported once.
+        """Returns the messages of a channel.
+
+        Messages that cannot be read are removed from the channel and reported once.
         """
         channel = self._channel(topic)
         readable = ChannelMessages()
         problem = ""
         messages: list[M] = []
-        for payload, *times in zip(
+        for payload, log_ns, publish_ns in zip(
             channel.payloads, channel.log_ns, channel.publish_ns, strict=True
         ):
             try:
                 messages.append(decode(payload, kind, READABLE))
-                readable.add(payload, *times)
+                readable.add(payload, log_ns, publish_ns)
             except WireError as error:
                 problem = problem or str(error)
         if problem:
-            lost = len(channel.payloads) - len(messages)
+            lost = count_nouns(len(channel.payloads) - len(messages), "message")
             self.unreadable.append(
-                f"{self.source}: {count_nouns(lost, 'message')} on {topic} cannot be read: {problem[:200]}"
+                f"{self.source}: {lost} on {topic} cannot be read: {problem[:200]}"
             )
             self._contents.channels[topic] = readable
             self._contents.complete = False
         return messages
 
     def _read_events(self, topic: str) -> list[Event]:
+        """Returns the events of a member, start by start, in order of their numbers."""
         events = self._decode(topic, Event)
-        boots = {
-            boot: n for n, boot in enumerate(dict.fromkeys(event.boot for event in events))
-        }
-        return sorted(events, key=lambda event: (boots[event.boot], event.n))
+        boots = list(dict.fromkeys(event.boot for event in events))
+        starts = {boot: start for start, boot in enumerate(boots)}
+        return sorted(events, key=lambda event: (starts[event.boot], event.n))
 
     @cached_property
     def diverged_s(self) -> float | None:
-        """When the first site left its limits, s, which ended the run; None if none did."""
-        return min(
-            (at_s for part in self.values() if (at_s := part.diverged_s) is not None),
-            default=None,
-        )
+        """Time at which the first site left its limits, s, which ended the run; else None."""
+        times_s = [part.diverged_s for part in self.values()]
+        return min((time_s for time_s in times_s if time_s is not None), default=None)
 
     def warn_if_diverged(self) -> None:
-        """Warns the caller of the caller, in Python, of a run that diverged."""
+        """Issues a Python warning if the run diverged.
+
+        The warning names the line of code that called the caller of this method.
+        """
         if self.diverged_s is not None:
-            when = f"the run diverged at {self.diverged_s:.3f} s, and ends there"
             warnings.warn(
-                f"{when}: a joint passed its qd_limit_rad_s", RuntimeWarning, stacklevel=3
+                f"the run diverged at {self.diverged_s:.3f} s, and ends there: "
+                "a joint passed its qd_limit_rad_s",
+                RuntimeWarning,
+                stacklevel=3,
             )
 
     @cached_property
     def complete(self) -> bool:
-        """False if the file was not finished.
+        """True if the file was finished.
 
-        Of several files all must be finished, or the last one, if no record is missing all the
-        same.
+        A log of several files is complete if all files were finished, or if the last file was
+        finished and no record is missing.
         """
         if self._contents.complete or len(self.sources) == 1:
             return self._contents.complete
@@ -258,27 +271,27 @@ class Log(Result, Mapping[str, SiteLog]):
     def executed_sites(self) -> tuple[str, ...]:
         """The sites whose records can be executed from the file.
 
-        All of them, except in an open-loop rerun: the records of its other sites were made
-        against sites that the file does not hold.
+        These are all sites, except in an open-loop rerun. The records of its recorded sites
+        depend on samples that the file does not hold.
         """
-        named = self.session.get(EXECUTED_SITES_KEY) if self.driver == RERUN_DRIVER else None
-        return tuple(name for name in self.sites if named is None or name in named.split())
+        executed = self.session.get(EXECUTED_SITES_KEY)
+        if self.driver != RERUN_DRIVER or executed is None:
+            return tuple(self.sites)
+        return tuple(name for name in self.sites if name in executed.split())
 
     @property
     def part(self) -> int:
-        """Its number among the parts of a log; 0 of several parts, and of a log without parts."""
+        """Number of the file among the parts of a log; 0 for a whole log or several parts."""
         number = self._contents.metadata.get(PART, {}).get("index", "0")
-        return (
-            int(number)
-            if len(self.sources) == 1 and number.isdecimal() and len(number) < 10
-            else 0
-        )
+        is_number = number.isdecimal() and len(number) < 10
+        return int(number) if len(self.sources) == 1 and is_number else 0
 
     @cached_property
     def accounts(self) -> dict[str, str]:
-        """Per topic what arrived and what is missing, as written at the end; {} in a torn file.
+        """Per topic the numbers of received and missing messages, as texts.
 
-        Of several files, what is in all of them together.
+        A finished file states them at its end; a torn file has none ({}). For several files the
+        messages of all files are counted together.
         """
         written = self._contents.metadata.get(ACCOUNTS, {})
         if len(self.sources) == 1:
@@ -302,129 +315,143 @@ class Log(Result, Mapping[str, SiteLog]):
         return {**accounts.format_accounts(), **written}
 
     def account(self, site: str) -> str:
-        """Returns what arrived of a site's records and what is missing; "" in an unfinished
-        file.
-        """
+        """Returns the account of a site's records, see `accounts`; "" in a torn file."""
         return self.accounts.get(self._topic(site, topics.STATE), "")
 
     @cached_property
     def unknown_ends(self) -> tuple[str, ...]:
-        """The sites whose event at their end never arrived: nobody knows how many ticks they
-        made.
+        """Sites whose end event never arrived, so that their number of ticks is unknown.
 
-        None of a part that others follow or of a log that takes no events: there it is not to
-        be expected.
+        Empty for a log without events, and for a part of a log, because the end events may be
+        in a later part.
         """
-        choice = parse_filter_facts(self.session)
-        key = {
-            site: topics.key(self.session["session"], site, topics.EVENT) for site in self.sites
-        }
-        is_part = bool(self.part) and len(self.sources) == 1
+        if self.part and len(self.sources) == 1:
+            return ()
+        channel_filter = parse_filter_facts(self.session)
         ended = {event.member for event in self.events if event.kind == "end"}
-        silent = [
-            site for site in self.sites if site not in ended and choice.accepts(key[site])
-        ]
-        return () if is_part else tuple(silent)
+        sites = []
+        for site in self.sites:
+            key = topics.key(self.session["session"], site, topics.EVENT)
+            if site not in ended and channel_filter.accepts(key):
+                sites.append(site)
+        return tuple(sites)
 
     @cached_property
     def _stated_ticks(self) -> dict[str, int]:
-        most = {name: self.scenario.ticks(name) for name in self.sites}
-        ends = [event for event in self.events if event.kind == "end" and event.member in most]
-        return {event.member: min(max(event.ticks, 0), most[event.member]) for event in ends}
+        """Number of ticks that each site states in its end event."""
+        ticks = {}
+        for event in self.events:
+            if event.kind == "end" and event.member in self.scenario.sites:
+                largest = self.scenario.ticks(event.member)
+                ticks[event.member] = min(max(event.ticks, 0), largest)
+        return ticks
 
     @cached_property
     def starts(self) -> dict[str, list[tuple[int, int]]]:
-        """Per site that joined the running session the first ticks of those starts, and their
-        boots.
-        """
-        joins = [e for e in self.events if e.kind == "join" and e.member in self.scenario.sites]
-        found: dict[str, list[tuple[int, int]]] = {}
-        for event in joins:
+        """Per site that joined the running session its starts, as (first tick, boot)."""
+        starts: dict[str, list[tuple[int, int]]] = {}
+        for event in self.events:
+            if event.kind != "join" or event.member not in self.scenario.sites:
+                continue
             if 0 < event.ticks < self.scenario.ticks(event.member):
-                found.setdefault(event.member, []).append((event.ticks, event.boot))
-        return {site: sorted(starts) for site, starts in found.items()}
+                starts.setdefault(event.member, []).append((event.ticks, event.boot))
+        return {site: sorted(site_starts) for site, site_starts in starts.items()}
 
     @cached_property
     def absences(self) -> dict[str, list[tuple[int, int]]]:
-        """Per site the ticks before each of these starts that were not made, as (first, last).
+        """Per site the ranges of ticks before its `starts` without execution, as (first, last).
 
-        They begin after those of which there are records, that the start before stated at its
-        end, or that others heard of.
+        A range begins after the last tick of the previous start that is known: by a record, by
+        the end event of that start, or by another site that received the tick.
         """
         return {site: self._find_absences(site, starts) for site, starts in self.starts.items()}
 
     def _find_absences(self, site: str, starts: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        ends = [
+        end_ticks = [
             event.ticks - 1
             for event in self.events
             if event.kind == "end" and event.member == site
         ]
-        made = np.array([*self[site].tick.tolist(), *ends], dtype=np.int64)
-        found: list[tuple[int, int]] = []
+        executed = np.array([*self[site].tick.tolist(), *end_ticks], dtype=np.int64)
+        under_way = count_under_way(topics.STATE, self[site].rate_hz)
+        absences: list[tuple[int, int]] = []
         for first, boot in starts:
-            heard = [
-                e.ticks for e in self.events if e.kind == LAST and e.boots.get(site) == boot
+            begin = int(executed[executed < first].max(initial=-1)) + 1
+            received_ticks = [
+                event.ticks
+                for event in self.events
+                if event.kind == LAST and event.boots.get(site) == boot
             ]
-            begin = int(made[made < first].max(initial=-1)) + 1
-            known = min(first, max(heard, default=0))
-            if known - begin > count_under_way(topics.STATE, self[site].rate_hz):
+            known = min(first, max(received_ticks, default=0))
+            # a few more ticks may be records that were in transit when the site was lost
+            if known - begin > under_way:
                 begin = known
-            if found and begin == found[-1][0]:  # the start in between made no tick
-                found.pop()
+            if absences and begin == absences[-1][0]:  # the start in between had no tick
+                absences.pop()
             if begin < first:
-                found.append((begin, first - 1))
-        return found
+                absences.append((begin, first - 1))
+        return absences
 
     def absent_ticks(self, site: str) -> int:
-        """Returns how many ticks that is for a site, and how many it left out as its records
-        say.
+        """Returns the number of ticks that a site did not execute.
+
+        These are the ticks of its `absences`, and the ticks that its records state as skipped.
         """
         between = sum(last - first + 1 for first, last in self.absences.get(site, ()))
         return between + self[site].skipped
 
     def expected_ticks(self, site: str) -> int:
-        """Returns how many ticks of a site belong to the run.
+        """Returns the number of ticks of a site that belong to the run.
 
-        Those that it stated at its end; of a site that others lost for good, those up to its
-        last known one; else those of the scenario; without those that it did not make between
-        two of its starts.
+        The end event of the site states that number. Without an end event, the ticks up to the
+        last record count if the site was lost for good, else the ticks of the scenario. Ticks
+        that the site did not execute are subtracted.
         """
-        stated = self._stated_ticks.get(site)
-        there = self[site].last_tick + 1
-        if stated is None:
-            kinds = ("lost", "left", "back", "admit")
-            told = [
-                event for event in self.events if event.about == site and event.kind in kinds
-            ]
-            gone = bool(told) and max(told, key=lambda event: event.t_ns).kind in (
-                "lost",
-                "left",
-            )
-            stated = there if gone and there else self.scenario.ticks(site)
-        return max(stated, there) - self.absent_ticks(site)
+        recorded = self[site].last_tick + 1
+        ticks = self._stated_ticks.get(site)
+        if ticks is None:
+            ticks = self.scenario.ticks(site)
+            if recorded and self._is_gone(site):
+                ticks = recorded
+        return max(ticks, recorded) - self.absent_ticks(site)
+
+    def _is_gone(self, site: str) -> bool:
+        """True if the last event about a site states that it was lost or left."""
+        kinds = ("lost", "left", "back", "admit")
+        events = [event for event in self.events if event.about == site and event.kind in kinds]
+        if not events:
+            return False
+        return max(events, key=lambda event: event.t_ns).kind in ("lost", "left")
 
     def missing(self, site: str) -> int:
-        """Returns how many records of a site are missing: of those that it made, else up to its
-        last one.
+        """Returns the number of missing records of a site.
+
+        The end event states how many ticks the site executed. Without an end event, only
+        records before the last record can be missing.
         """
         part = self[site]
-        missing = part.missing + max(0, self._stated_ticks.get(site, 0) - (part.last_tick + 1))
-        return max(0, missing - self.absent_ticks(site))
+        after_last = max(0, self._stated_ticks.get(site, 0) - (part.last_tick + 1))
+        return max(0, part.missing + after_last - self.absent_ticks(site))
 
     @cached_property
     def last_ticks(self) -> dict[str, int]:
-        """The last tick that each site is known to have made, -1 if none is known.
+        """Last tick that each site is known to have executed; -1 if no tick is known.
 
-        The event at its end tells; without one, its records and those of its peers.
+        The end event of a site states that tick. Without an end event, the records of the site
+        and of its peers are used.
         """
         stated = self._stated_ticks
         last = {name: stated.get(name, self[name].last_tick + 1) - 1 for name in self.sites}
         for name in self.sites:
-            unknown = {n: peer for n, peer in enumerate(self[name].peers) if peer not in stated}
-            for state in self[name].states if unknown else ():
-                for n, tick, _ in state.rx:
-                    if n in unknown and tick < self.scenario.ticks(unknown[n]):
-                        last[unknown[n]] = max(last[unknown[n]], tick)
+            peers = self[name].peers
+            unknown = {index: peer for index, peer in enumerate(peers) if peer not in stated}
+            if not unknown:
+                continue
+            for state in self[name].states:
+                for index, tick, _ in state.rx:
+                    peer = unknown.get(index)
+                    if peer is not None and tick < self.scenario.ticks(peer):
+                        last[peer] = max(last[peer], tick)
         return last
 
     def __getitem__(self, site: str) -> SiteLog:
@@ -433,123 +460,123 @@ class Log(Result, Mapping[str, SiteLog]):
                 f"no site {site!r} in {self.source}; it has {', '.join(self.sites)}"
             )
         if site not in self._sites:
-            channel = self._channel(self._topic(site, topics.STATE))
-            rate_hz = self.scenario.sites[site].rate_hz
-            times = channel.times()
-            peers = self.scenario.peers(site)
-            layout = self.scenario.layout(site)
-            sent = self.scenario.channel(site)
-            axes = self.scenario.arms[site].axes
-            payloads = channel.payloads
-            source = self.source
-            part = SiteLog(
-                name=site,
-                peers=peers,
-                rate_hz=rate_hz,
-                payloads=payloads,
-                source=source,
-                times=times,
-                layout=layout,
-                channel=sent,
-                axes=axes,
-            )
-            most = self.scenario.ticks(site)
-            last = part.last_tick
-            if last >= most:  # a tick of others is nothing to count up to
-                raise LogError(
-                    f"{self.source}: {site} has a record of tick {last}; the scenario has {most}"
-                )
-            self._sites[site] = part
+            self._sites[site] = self._read_site(site)
         return self._sites[site]
 
-    def changes(self, site: str) -> dict[int, list[str]]:
-        """Returns the texts of the changes that a site took in, by tick, in order.
+    def _read_site(self, site: str) -> SiteLog:
+        """Returns the records of a site, whose ticks are checked against the scenario."""
+        channel = self._channel(self._topic(site, topics.STATE))
+        part = SiteLog(
+            name=site,
+            peers=self.scenario.peers(site),
+            rate_hz=self.scenario.sites[site].rate_hz,
+            payloads=channel.payloads,
+            source=self.source,
+            times=channel.times(),
+            layout=self.scenario.layout(site),
+            channel=self.scenario.channel(site),
+            axes=self.scenario.arms[site].axes,
+        )
+        ticks = self.scenario.ticks(site)
+        last = part.last_tick
+        if last >= ticks:  # a damaged tick would make counts and arrays of any size
+            raise LogError(
+                f"{self.source}: {site} has a record of tick {last}; the scenario has {ticks}"
+            )
+        return part
 
-        They are in its records, and in its events, which also have those whose record is
-        missing.
+    def changes(self, site: str) -> dict[int, list[str]]:
+        """Returns the texts of the changes that a site applied, by tick, in order.
+
+        They are in its records. Changes whose record is missing are taken from its events.
         """
-        named = self[site].changes()
+        changes = self[site].changes()
         events = [
             event for event in self.events if event.kind == "change" and event.member == site
         ]
         recorded = set(self[site].tick.tolist()) if events else set()
         for event in events:
             if event.ticks not in recorded:
-                named.setdefault(event.ticks, []).append(event.command)
-        return dict(sorted(named.items()))
+                changes.setdefault(event.ticks, []).append(event.command)
+        return dict(sorted(changes.items()))
 
     def commands(self, site: str) -> dict[int, list[CoreChange]]:
-        """Returns the same, as the site took them in.
+        """Returns the changes that a site applied, by tick, as `Site.step` gets them.
 
         Raises:
-            LogError: the log names a change that is none.
+            LogError: the log holds a text that is not a change of the scenario.
         """
-        named = self.changes(site).items()
+        commands = {}
         try:
-            return {
-                tick: [parse_core_change(self.scenario, site, one) for one in texts]
-                for tick, texts in named
-            }
+            for tick, texts in self.changes(site).items():
+                commands[tick] = [
+                    parse_core_change(self.scenario, site, text) for text in texts
+                ]
         except ScenarioError as error:
             raise LogError(f"{self.source}: {error}") from None
+        return commands
 
     def shown(self, site: str) -> dict[str, Ints]:
-        """Returns the tick of each peer that a site's user was shown at its records, -1 before
-        the first.
+        """Returns the ticks of the peers' samples that the user of a site saw.
 
-        That is the sample in use; with `[sites.NAME.view]` the newest that had come over the
-        view by then.
+        A user sees the sample in use. With `[sites.NAME.view]` the user sees the newest sample
+        that had arrived over the view.
+
+        Returns:
+            Per peer the tick of the visible sample at each record of the site, shape (K,); -1
+            before the first sample.
         """
         part = self[site]
-        every = PictureDelay(self.scenario, site).list_shown_samples(part.last_tick + 1)
-        shown = {
-            peer: np.minimum(ticks[part.tick], self[peer].last_tick)
-            for peer, ticks in every.items()
-        }
-        return {**part.used, **shown}
+        samples = PictureDelay(self.scenario, site).list_shown_samples(part.last_tick + 1)
+        ticks = dict(part.used)
+        for peer, peer_ticks in samples.items():
+            ticks[peer] = np.minimum(peer_ticks[part.tick], self[peer].last_tick)
+        return ticks
 
     def link_stats(self, site: str) -> list[LinkStats]:
         """Returns the statistics that a site published, in order."""
         return self.timed_link_stats(site).messages
 
     def timed_link_stats(self, site: str) -> TimedMessages[LinkStats]:
-        """Returns the same with the times at which they came and were sent."""
+        """Returns the statistics of a site with their times of arrival and of sending."""
         topic = self._topic(site, topics.LINK)
         stats = self._decode(topic, LinkStats)
         order = sorted(range(len(stats)), key=lambda n: stats[n].tick)
-        times = (column[order] for column in self._channel(topic).times())
-        return TimedMessages([stats[n] for n in order], *times)
+        log_ns, publish_ns = self._channel(topic).times()
+        return TimedMessages([stats[n] for n in order], log_ns[order], publish_ns[order])
 
     def timed_events(self) -> TimedMessages[Event]:
-        """Returns the events in the order in which they came to the recorder, with times as
-        well.
-        """
-        found = self._event_topics()
-        events = [event for topic in found for event in self._decode(topic, Event)]
-        if not events:
-            return TimedMessages([], *ChannelMessages().times())
-        times = [self._channel(topic).times() for topic in found]
-        log_ns, publish_ns = (np.concatenate(column) for column in zip(*times, strict=True))
+        """Returns the events in order of their arrival, with arrival and sending times."""
+        events: list[Event] = []
+        log_times = [np.zeros(0, np.int64)]
+        publish_times = [np.zeros(0, np.int64)]
+        for topic in self._event_topics():
+            events += self._decode(topic, Event)
+            topic_log_ns, topic_publish_ns = self._channel(topic).times()
+            log_times.append(topic_log_ns)
+            publish_times.append(topic_publish_ns)
+        log_ns = np.concatenate(log_times)
+        publish_ns = np.concatenate(publish_times)
         order = np.argsort(log_ns, kind="stable")
         return TimedMessages(
             [events[n] for n in order.tolist()], log_ns[order], publish_ns[order]
         )
 
     def recorder_stats(self) -> list[RecorderStats]:
-        """Returns the recorder's statistics of its own work, in order."""
+        """Returns the statistics of the recorder, in order."""
         return self._decode(self._topic(topics.RECORDER, topics.STATS), RecorderStats)
 
     def table(self, name: str, kind: str = "") -> Table:
-        """Returns a part of the log as a table: columns with names, units and meanings.
+        """Returns a table of the log: columns with names, units and meanings.
 
         Args:
             name: a site, or "events".
-            kind: of a site, "state" (a row per record), "link" (its statistics) or "arrivals"
-                (a row per sample that came in).
+            kind: kind of a site's table: "state" (a row per record), "link" (a row per
+                statistics message) or "arrivals" (a row per sample that arrived).
 
         Raises:
-            UnknownName: there is no such part.
-            LogError: its messages cannot be read.
+            UnknownName: the log has no such table.
+            LogError: the messages cannot be read.
         """
         if name == EVENTS_TABLE and name not in self.sites:
             return build_events_table(self.timed_events(), self.source)
@@ -566,14 +593,14 @@ class Log(Result, Mapping[str, SiteLog]):
         )
 
     def tables(self) -> Iterator[Table]:
-        """Yields every table, one at a time: of each site, and the events."""
+        """Yields every table, one at a time: the tables of each site, and the events."""
         for site in self.sites:
             for kind in SITE_TABLE_KINDS:
                 yield self.table(site, kind)
         yield build_events_table(self.timed_events(), self.source)
 
     def frame(self, name: str, kind: str = "") -> "polars.DataFrame":
-        """Returns the same as a polars data frame; for pandas there is `to_frame`.
+        """Returns a table as a polars data frame, see `table`. `to_frame` is for pandas.
 
         Raises:
             UsageError: polars is not installed.
@@ -589,7 +616,7 @@ def open_log(
     other_version: bool = False,
     remember: bool = False,
 ) -> Log:
-    """Returns the log in a file, or in files that are parts of one session, in any order.
+    """Opens a log in a file, or in files that are parts of one session, in any order.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("run.mcap")
     >>> tn.open_log(path)["m"].t_s[-1]
@@ -598,17 +625,17 @@ def open_log(
     Args:
         source: a path, or a file opened for reading.
         more: further parts.
-        progress: called while they are read.
-        law: files of control laws that the log names, which may run when it is executed, see
-            docs/code-that-runs.md. Laws of runs that this process has made may.
-        other_version: whether these may have another hash than the log names.
-        remember: whether they may run for other logs that name their hashes, with the same
-            settings.
+        progress: called now and then with the number of bytes read and their total.
+        law: files of control laws that the log names and that may run when the log is executed,
+            see docs/code-that-runs.md. Laws of runs of this process may run without that.
+        other_version: whether these files may have another hash than the log names.
+        remember: whether these laws may also run for other logs that name their hashes, with
+            the same settings.
 
     Raises:
-        UsageError: `law` is none that the log names.
-        LogError: a file is missing, is no MCAP file, or no log of trilat-net; files are of
-            different sessions, or disagree on a message.
+        UsageError: the log does not name a law of `law`.
+        LogError: a file is missing, is no MCAP file, or is no log of trilat-net; or files are
+            of different sessions, or disagree on a message.
     """
     log = Log(merge_parts(_read_parts((source, *more), progress)))
     allow_logged_code(log.scenario, law, other_version=other_version, remember=remember)
@@ -616,14 +643,19 @@ def open_log(
 
 
 def open_logs(*sources: str | Path, progress: Progress | None = None) -> list[Log]:
-    """Returns the logs in files and folders, see `open_log`; files of one session are its
-    parts.
+    """Opens the logs in files and folders, see `open_log`.
+
+    Files of one session are the parts of one log.
     """
     files: list[Path] = []
     for path in map(Path, sources):
-        if not (found := sorted(path.glob("*.mcap")) if path.is_dir() else [path]):
+        if not path.is_dir():
+            files.append(path)
+            continue
+        logs = sorted(path.glob("*.mcap"))
+        if not logs:
             raise LogError(f"{path}: no log is in this directory")
-        files += found
+        files += logs
     sessions: dict[str, list[LogContents]] = {}
     for part in _read_parts(files, progress):
         sessions.setdefault(str(identify_session(part)), []).append(part)
@@ -636,26 +668,28 @@ def _read_parts(
     files: list[tuple[BinaryIO, str]] = []
     parts: list[LogContents] = []
     with ExitStack() as stack:
-        for one in sources:
-            if isinstance(one, str | Path):
-                with _reading(str(one)):
-                    files.append((stack.enter_context(open_regular(Path(one))), str(one)))
-            elif hasattr(one, "seek"):
-                files.append((one, "log"))
+        for source in sources:
+            if isinstance(source, str | Path):
+                with _convert_errors(str(source)):
+                    stream = stack.enter_context(open_regular(Path(source)))
+                files.append((stream, str(source)))
+            elif hasattr(source, "seek"):
+                files.append((source, "log"))
             else:
                 raise LogError(
-                    f"a log is a path, or a file opened for reading, not {one!r:.80}"
+                    f"a log is a path, or a file opened for reading, not {source!r:.80}"
                 )
-        sizes = [_measure(stream) for stream, _ in files]
+        sizes = [_measure_size(stream) for stream, _ in files]
         for n, (stream, name) in enumerate(files):
-            with _reading(name):
+            with _convert_errors(name):
                 shifted = shift_progress(progress, sum(sizes[:n]), sum(sizes))
                 parts.append(read_contents(stream, name, shifted))
     return parts
 
 
 @contextmanager
-def _reading(name: str) -> Iterator[None]:
+def _convert_errors(name: str) -> Iterator[None]:
+    """Converts an error of the operating system to a `LogError` that names the file."""
     try:
         yield
     except OSError as error:
@@ -664,26 +698,32 @@ def _reading(name: str) -> Iterator[None]:
         ) from None
 
 
-def _measure(stream: BinaryIO) -> int:
-    here = stream.tell()
-    size = stream.seek(0, os.SEEK_END)
-    stream.seek(here)
-    return size - here
+def _measure_size(stream: BinaryIO) -> int:
+    """Returns the number of bytes from the present position to the end of a stream."""
+    position = stream.tell()
+    end = stream.seek(0, os.SEEK_END)
+    stream.seek(position)
+    return end - position
 
 
 def read_link_delays(path: Path, link: str) -> list[TracePoint]:
-    """Returns the delays of the samples of a link such as "m1->s", by their own stamps.
+    """Returns the measured delays of the samples of a link, in order of their stamps.
 
-    These are the delays of the network that carried them, as the receiver's records have them
-    in `rx`, without those that the session's scenario injected. A negative one comes of the
-    clocks and counts as none; of a sample that came twice the shorter one counts. A tick of
-    which the sender has a record was sent.
+    These are the delays of the network, as the receiver's records have them in `rx`, without
+    the delays that the scenario injected. A negative delay is an error of the clocks and counts
+    as
+    0. If a sample arrived twice, the shorter delay counts. A sample was sent if the sender has
+    a record of its tick; a lost sample has an infinite delay.
+
+    Args:
+        path: the log.
+        link: name of the link, such as "m1->s".
 
     Raises:
         OSError: the file cannot be opened.
-        ValueError: it is no log, or has no such link, or no sample came over it.
+        ValueError: the file is no log, has no such link, or no sample arrived over the link.
     """
-    status = path.stat()  # raises what open would, in the same words
+    status = path.stat()  # raises the same errors as opening the file
     links = _read_links(path, status.st_mtime_ns, status.st_size)
     if link not in links:
         hint = suggest_nearest(link, list(links)) or "."
@@ -695,21 +735,31 @@ def read_link_delays(path: Path, link: str) -> list[TracePoint]:
 
 @lru_cache(maxsize=1)
 def _read_links(path: Path, modified_ns: int, size: int) -> dict[str, list[TracePoint]]:  # noqa: ARG001
-    """Returns the rows of every link of a log; a scenario asks for one after the other."""
+    """Returns the delays of every link of a log.
+
+    The last log is cached, because a scenario reads one link after the other. `modified_ns` and
+    `size` detect that the file has changed.
+    """
+    delays = {}
     try:
         log = open_log(path)
-        links = (
-            (site, *link) for site in log.sites for link in enumerate(log.scenario.peers(site))
-        )
-        return {
-            f"{peer}->{site}": list(_iterate_delays(log, site, n, peer))
-            for site, n, peer in links
-        }
+        for site in log.sites:
+            for index, peer in enumerate(log.scenario.peers(site)):
+                delays[f"{peer}->{site}"] = list(_iterate_delays(log, site, index, peer))
     except LogError as error:
         raise ValueError(str(error).removeprefix(f"{path}: ")) from None
+    return delays
 
 
 def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[TracePoint]:
+    """Yields the stamp, s, and delay, ms, of every sample of a link, in order of the stamps.
+
+    Args:
+        log: the log.
+        site: the receiver.
+        index: index of the sender among the receiver's peers.
+        peer: the sender.
+    """
     states = log[site].states
     delays_us: dict[int, int] = {}
     for state in states:
@@ -722,24 +772,32 @@ def _iterate_delays(log: Log, site: str, index: int, peer: str) -> Iterator[Trac
     gaps = _find_gaps_ns(states)
     rate_hz = log.scenario.sites[peer].rate_hz
     sent = log[peer].tick.tolist() if peer in log.sites else []
-    # what the peer sent before the first arrival and after the last one was lost as well
+    # samples that were sent before the first or after the last arrival were lost as well
     ticks = {*sent, *delays_us} if sent else range(max(delays_us) + 1)
     for tick in sorted(ticks):
         stamp_ns = tick * NS_PER_S // rate_hz
-        came = tick in delays_us
-        if came or not any(
-            stamp_ns <= end and stamp_ns + longest_ns >= start for start, end in gaps
-        ):
-            # the microsecond in which the stamp lies, as the core counts it
-            yield stamp_ns // 1000 / 1e6, delays_us[tick] / 1e3 if came else math.inf
+        stamp_s = stamp_ns // 1000 / 1e6  # whole microseconds, as the core counts
+        if tick in delays_us:
+            yield stamp_s, delays_us[tick] / 1e3
+            continue
+        may_be_unseen = any(
+            stamp_ns <= end_ns and stamp_ns + longest_ns >= start_ns
+            for start_ns, end_ns in gaps
+        )
+        if not may_be_unseen:
+            yield stamp_s, math.inf
 
 
 def _find_gaps_ns(states: Sequence[State]) -> list[tuple[int, float]]:
-    """Returns when samples may have come unseen, ns: where records are missing, and after the
-    last one.
+    """Returns the times, (start, end) in ns, in which a sample may have arrived unseen.
+
+    Records are missing in these times: between records, before the first record, and after the
+    last record.
     """
     gaps: list[tuple[int, float]] = [
-        (a.t_ns, b.t_ns) for a, b in pairwise(states) if b.tick != a.tick + 1
+        (before.t_ns, after.t_ns)
+        for before, after in pairwise(states)
+        if after.tick != before.tick + 1
     ]
     if states and states[0].tick > 0:
         gaps.append((0, states[0].t_ns))

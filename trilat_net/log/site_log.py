@@ -88,7 +88,8 @@ def compute_task_errors(x: Array, x_des: Array, axes: Sequence[float]) -> Array:
 def _compute_rotation_errors(rotation: Array, reference: Array) -> Array:
     """Returns the rotation vectors from references to orientations, shape (K, 3), rad.
 
-    The orientation (a, u) times the conjugate (b, -v) of the reference is the quaternion (w, p):
+    The orientation (a, u) times the conjugate (b, -v) of the reference is the quaternion (w,
+    p):
 
         w = a b + u . v
         p = b u - a v - u x v
