@@ -1,8 +1,8 @@
-"""Findings of checks: what was looked at, the result in one line, and every problem with its
-place.
+"""Hold the findings of checks: the name of the check, its result, and every problem.
 
-Invariant: a finding with a problem has not passed; problems beyond `MAX_LISTED_PROBLEMS` are
-counted only.
+Invariant:
+    - A finding with a problem has not passed.
+    - Problems beyond `MAX_LISTED_PROBLEMS` are only counted.
 """
 
 from dataclasses import dataclass, field
@@ -12,12 +12,16 @@ from ..errors import CodeWithheld
 from ..results import Result
 
 MAX_LISTED_PROBLEMS = 1000
-"""Problems that a finding keeps; more are counted."""
+"""Largest number of problems that a finding keeps; further problems are only counted."""
 
 
 class ProblemPlace(NamedTuple):
-    """A problem of a file, at a byte or in the chunk that begins there; None if the whole file
-    is meant.
+    """A problem of a file.
+
+    Attributes:
+        file: name of the file.
+        offset: byte of the problem, or first byte of its chunk; None: the whole file.
+        text: description of the problem.
     """
 
     file: str
@@ -30,17 +34,17 @@ class ProblemPlace(NamedTuple):
 
 @dataclass(slots=True)
 class Finding:
-    """Result of one check.
+    """The result of one check.
 
     Attributes:
-        check: its name: of a file "whole", "checksums", "records", "index"; of a trilat-net log
-            also "sequence", "accounts", "chain", "schema", "times", "rates", "scenario"; of an
-            execution its subject.
+        check: name of the check: for a file "whole", "checksums", "records" or "index"; for a
+            trilat-net log also "sequence", "accounts", "chain", "schema", "times", "rates" or
+            "scenario"; for an execution its subject.
         text: the result in one line.
-        passed: True if it passed.
-        judged: False if it needs code from outside that nobody allowed to run; then it did not
-            pass.
-        places: problems, at most `MAX_LISTED_PROBLEMS`.
+        passed: True if the check passed.
+        judged: False if the check needs code from outside that may not run; the check then did
+            not pass.
+        places: the problems, at most `MAX_LISTED_PROBLEMS`.
         wrong: number of problems.
     """
 
@@ -59,20 +63,21 @@ class Finding:
             self.places.append(ProblemPlace(file, offset, text))
 
     def summary(self) -> str:
-        """Returns the first problem, and the number of others."""
-        return (
-            f"{self.places[0]}; and {self.wrong - 1} more"
-            if self.wrong > 1
-            else str(self.places[0])
-        )
+        """Returns the first problem, and the number of further problems."""
+        first = str(self.places[0])
+        return f"{first}; and {self.wrong - 1} more" if self.wrong > 1 else first
 
     def conclude(self, sound: str) -> "Finding":
-        """Takes `sound` as its text if there is no problem, else their summary; returns itself."""
+        """Sets the text of the finding and returns the finding.
+
+        Args:
+            sound: the text if there is no problem; else the text is the summary of problems.
+        """
         self.text = self.summary() if self.wrong else sound
         return self
 
     def to_row(self) -> dict[str, Any]:
-        """Returns it as a line, ready for JSON."""
+        """Returns the finding as plain values for JSON."""
         return {
             "label": self.check,
             "text": self.text,
@@ -82,7 +87,7 @@ class Finding:
 
 
 class Findings(dict[str, Finding]):
-    """The findings of some checks by name; each begins with its first use."""
+    """The findings of checks by name; a finding is created when it is first used."""
 
     def __missing__(self, check: str) -> Finding:
         self[check] = finding = Finding(check)
@@ -90,7 +95,11 @@ class Findings(dict[str, Finding]):
 
 
 class CheckReport(Result):
-    """A result that rests on checks: `findings` has one of each."""
+    """A result of several checks.
+
+    Attributes:
+        findings: one finding per check.
+    """
 
     findings: list[Finding]
 
@@ -101,9 +110,10 @@ class CheckReport(Result):
 
     @property
     def exit_code(self) -> int:
-        """1 if a check failed, else that of `CodeWithheld` if one was not judged, else 0."""
-        failed = any(finding.judged and not finding.passed for finding in self.findings)
-        return 1 if failed else 0 if self.passed else CodeWithheld.exit_code
+        """1 if a check failed; that of `CodeWithheld` if a check was not judged; else 0."""
+        if any(finding.judged and not finding.passed for finding in self.findings):
+            return 1
+        return 0 if self.passed else CodeWithheld.exit_code
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per check."""

@@ -1,8 +1,9 @@
-"""Layout of a log: names of files, metadata and channels, the channel filter, and provenance.
+"""Define the layout of a log: file names, metadata, channels, channel filter and provenance.
 
-Invariant: a channel that the filter excludes is neither in the file nor in its accounts, and
-the file states the filter. Provenance holds versions, commit and platform, but no path, time or
-host name.
+Invariant:
+    - A channel that the filter excludes is neither in the file nor in its accounts. The file
+      states the filter.
+    - The provenance holds versions, commit and platform, but no path, time or host name.
 """
 
 import glob
@@ -26,120 +27,140 @@ from ..net.messages import Event, LinkStats, RecorderStats, State
 
 ACTIVE_SUFFIX = ".active"
 """Ending of a file's name until it is complete."""
-_NUMBER = re.compile(r"(.+)-(\d{3,})")
+_PART_STEM = re.compile(r"(.+)-(\d{3,})")
+"""Stem of a part's file name: stem of the log, and number of the part."""
 _CHUNK = re.compile(r"\*\*?|(?:\$\*|[^*$#?])+", re.DOTALL)
 """A part of a key expression, between slashes."""
 
 
 def active_path(path: Path) -> Path:
-    """Returns the name of a log while it is written; "." is a folder, and refused as one."""
+    """Returns the name of a log while it is written.
+
+    A path without a name, such as ".", is returned as it is, and is refused as a folder.
+    """
     return path.with_name(path.name + ACTIVE_SUFFIX) if path.name else path
 
 
 def describe_unfinished(path: Path) -> str:
-    """Returns a hint at an unfinished log of a name that is not there; else ""."""
-    if path.exists() or not active_path(path).exists():
+    """Returns a hint at an unfinished log if the finished log does not exist; else ""."""
+    unfinished = active_path(path)
+    if path.exists() or not unfinished.exists():
         return ""
-    torn = active_path(path)
-    return f"; {torn} is there, which was not finished; make it whole with: trilat log recover {torn}"
+    return (
+        f"; {unfinished} is there, which was not finished; "
+        f"make it whole with: trilat log recover {unfinished}"
+    )
 
 
 def part_path(path: Path, number: int) -> Path:
-    """Returns the name of a part: that of the log with a number, or the log's own for part 0."""
+    """Returns the name of a part of a log; number 0 is the log itself."""
     return path.with_name(f"{path.stem}-{number:03}{path.suffix}") if number else path
 
 
 def find_parts(path: Path) -> dict[int, Path]:
-    """Returns the files of a log that are there, finished or not, by number; one without number
-    is part 1.
+    """Returns the existing files of a log, finished or not, by the number of the part.
+
+    A file without a number is part 1.
     """
-    found: dict[int, Path] = {}
-    for name in (path, active_path(path)):
-        if name.exists():
-            found.setdefault(1, name)
-    for name in sorted(path.parent.glob(f"{glob.escape(path.stem)}-*")):
-        bare = name.with_name(name.name.removesuffix(ACTIVE_SUFFIX))
-        number = _NUMBER.fullmatch(bare.stem)
-        if number and number[1] == path.stem and bare.suffix == path.suffix:
-            found.setdefault(int(number[2]), name)
-    return found
+    parts: dict[int, Path] = {}
+    for file in (path, active_path(path)):
+        if file.exists():
+            parts.setdefault(1, file)
+    for file in sorted(path.parent.glob(f"{glob.escape(path.stem)}-*")):
+        finished = file.with_name(file.name.removesuffix(ACTIVE_SUFFIX))
+        match = _PART_STEM.fullmatch(finished.stem)
+        if match and match[1] == path.stem and finished.suffix == path.suffix:
+            parts.setdefault(int(match[2]), file)
+    return parts
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelFilter:
-    """Filter of channels by key expressions; an empty `include` takes all that `exclude` does
-    not match.
+    """A filter of channels by key expressions.
+
+    Attributes:
+        include: expressions of accepted channels; empty: all channels.
+        exclude: expressions of channels that are not accepted, even if they are included.
     """
 
     include: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
 
     def accepts(self, key: str) -> bool:
-        """True if the filter takes a channel."""
-        included, excluded = (
-            any(matches_key(expression, key) for expression in expressions)
-            for expressions in (self.include, self.exclude)
+        """True if the filter accepts a channel, by its key."""
+        if any(matches_key(expression, key) for expression in self.exclude):
+            return False
+        return not self.include or any(
+            matches_key(expression, key) for expression in self.include
         )
-        return not excluded and (included or not self.include)
 
     def facts(self) -> Mapping[str, str]:
-        """Returns the filter as metadata of the session; {} if it takes all."""
+        """Returns the filter as metadata of the session; {} if it accepts all channels."""
         texts = {"include": " ".join(self.include), "exclude": " ".join(self.exclude)}
         return {name: text for name, text in texts.items() if text}
 
 
 ALL_CHANNELS = ChannelFilter()
+"""The filter that accepts all channels."""
 
 
 def parse_channel_filter(include: Collection[str], exclude: Collection[str]) -> ChannelFilter:
-    """Returns the filter for the options of a command; a leading slash, as topics have it, is
-    ignored.
+    """Returns the filter that the options of a command describe.
+
+    A leading slash, as in topics, is ignored.
+
+    Args:
+        include: key expressions of `--include`.
+        exclude: key expressions of `--exclude`.
 
     Raises:
-        UsageError: a text is no key expression; it would silently match nothing.
+        UsageError: a text is not a key expression, and would match no channel.
     """
     for option, texts in (("--include", include), ("--exclude", exclude)):
         for text in texts:
             if not all(map(_CHUNK.fullmatch, text.strip("/").split("/"))):
                 raise UsageError(
-                    f"{option} is a key expression like 'trilat/*/m1/**' or '**/link': names, * for one of "
-                    f"them, ** for any number, $* for a part of one; not {text!r}"
+                    f"{option} is a key expression like 'trilat/*/m1/**' or '**/link': names, "
+                    f"* for one of them, ** for any number, $* for a part of one; not {text!r}"
                 )
     return ChannelFilter(
-        *(tuple(text.strip("/") for text in texts) for texts in (include, exclude))
+        include=tuple(text.strip("/") for text in include),
+        exclude=tuple(text.strip("/") for text in exclude),
     )
 
 
 def parse_filter_facts(about: Mapping[str, str]) -> ChannelFilter:
     """Returns the filter that the metadata of a session state, see `ChannelFilter.facts`."""
     return ChannelFilter(
-        tuple(about.get("include", "").split()), tuple(about.get("exclude", "").split())
+        include=tuple(about.get("include", "").split()),
+        exclude=tuple(about.get("exclude", "").split()),
     )
 
 
 _PACKAGES = ("numpy", "numba", "msgpack", "msgspec", "mcap", "eclipse-zenoh")
+"""Packages whose versions are part of the provenance."""
 
 
-def _git(*arguments: str) -> str | None:
-    """Returns the output of git for this source tree, or None if it is no checkout."""
+def _run_git(*arguments: str) -> str | None:
+    """Returns the output of git for this source tree; None if it is not a checkout."""
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
         return None
     command = ["git", "-C", str(root), *arguments]
     try:
-        done = subprocess.run(
+        completed = subprocess.run(
             command, capture_output=True, encoding="utf-8", check=True, timeout=10
         )
-        return done.stdout.strip()
+        return completed.stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
 
 
 @cache
 def collect_provenance() -> dict[str, str]:
-    """Returns versions, commit and platform of the program."""
-    commit = _git("rev-parse", "HEAD")
-    changed = _git("status", "--porcelain", "--untracked-files=no")
+    """Returns versions, commit and platform of the program, as metadata of a log."""
+    commit = _run_git("rev-parse", "HEAD")
+    changed = _run_git("status", "--porcelain", "--untracked-files=no")
     facts = {
         "commit": commit or "unknown",
         "commit_dirty": "unknown" if changed is None else str(bool(changed)).lower(),
@@ -157,9 +178,9 @@ def collect_provenance() -> dict[str, str]:
 
 
 VIZ_ROOT = "/viz/"
-"""How topics of channels for viewers begin."""
+"""Prefix of the topics of channels for viewers."""
 MAX_TIME_NS = (1 << 64) - 1
-"""Largest time stamp of a message in a file; longer ones of others are cut to it."""
+"""Largest time stamp of a message in a file; larger times are reduced to it."""
 SESSION = "trilat.session"
 PART = "trilat.part"
 ACCOUNTS = "trilat.accounts"
@@ -171,9 +192,10 @@ CHANNEL_TYPES: dict[str, type[msgspec.Struct]] = {
     topics.STATS: RecorderStats,
 }
 EXECUTED_SITES_KEY = "rerun_executed"
-"""Entry of the session's metadata in a log that a rerun wrote: the sites that it executed."""
+"""Key of the session's metadata, in the log of a rerun: the sites that the rerun executed."""
 RERUN_DRIVER = "rerun"
-"""Driver of such a log."""
+"""Driver of the log of a rerun."""
 SITE_CHANNELS = (topics.STATE, topics.LINK, topics.EVENT)
-"""Channels of a site, each with a number per message that tells what is missing."""
+"""Channels of a site. Their messages are numbered, so that missing messages are known."""
 RECORDER_CHANNELS = (topics.EVENT, topics.STATS)
+"""Channels of the recorder."""

@@ -1,22 +1,21 @@
-"""Orientations as time series without jumps: unit quaternions of consistent sign, or six
-numbers.
+"""Convert orientations to time series without jumps: unit quaternions, or six numbers.
 
 A record has an orientation as a rotation vector, axis times angle, at most half a turn long.
-That vector jumps by a whole turn where the angle passes half a turn, as for a tool that points
-down, although nothing jumps. Near half a turn its steps are up to pi / 2 times those of the
-motion, and no choice of branches is continuous for every motion of several turns. Series that
-leave the program are therefore made of one of these:
+This vector jumps by a whole turn where the angle passes half a turn, as for a tool that points
+down, although the orientation does not jump. Near half a turn the vector moves up to pi / 2
+times as far as the orientation, and no choice of branches is continuous for every motion of
+several turns. Time series that leave the program therefore have one of these forms:
 
-- unit quaternions w, x, y, z. Each is nearest to the one before; the first has w >= 0. A turn
-  by a small angle moves the quaternion by half of that angle.
-- six numbers, the first and the second column of the rotation matrix. They depend on the
+- Unit quaternions w, x, y, z. Each quaternion is nearest to the quaternion before, and the
+  first has w >= 0. A turn by a small angle moves the quaternion by half of that angle.
+- Six numbers: the first and the second column of the rotation matrix. They depend on the
   orientation alone and not on the past, as observations and actions of a policy must (Y. Zhou
   et al., "On the continuity of rotation representations in neural networks", CVPR 2019). A turn
   by a small angle moves them by at most sqrt(2) times that angle.
 
 Invariant:
-- The rotation is that of the record, to rounding; only its numbers differ.
-- Rotation vectors of any length are taken.
+    - The rotation is that of the record, to rounding. Only its representation differs.
+    - Rotation vectors of any length are accepted.
 """
 
 from collections.abc import Sequence
@@ -36,23 +35,36 @@ SIX_AXES = (*TASK_AXES[:POSITION], *MATRIX_ENTRIES)
 
 
 def compute_quaternion_parts(turns: Array) -> tuple[Array, Array]:
-    """Returns w, shape (K, 1), and x, y, z, shape (K, 3), of rotation vectors, shape (K, 3),
-    rad.
+    """Returns unit quaternions of rotation vectors, as scalar and vector parts.
+
+    The quaternion of a rotation vector r with the angle a = |r| is
+
+        w = cos(a / 2),  (x, y, z) = r sin(a / 2) / a
+
+    Args:
+        turns: rotation vectors, shape (K, 3), rad.
+
+    Returns:
+        w, shape (K, 1), and (x, y, z), shape (K, 3).
     """
     angle = np.linalg.norm(turns, axis=1, keepdims=True)
     return np.cos(0.5 * angle), 0.5 * np.sinc(angle / (2.0 * np.pi)) * turns
 
 
 def compute_quaternions(turns: Array) -> Array:
-    """Returns unit quaternions w, x, y, z of consistent sign, shape (K, 4), of rotation
-    vectors, rad.
+    """Returns unit quaternions w, x, y, z of consistent sign, shape (K, 4).
+
+    Args:
+        turns: rotation vectors, shape (K, 3), rad.
     """
     return align_signs(np.hstack(compute_quaternion_parts(turns)))
 
 
 def align_signs(quaternions: Array) -> Array:
-    """Returns quaternions, shape (K, 4), with signs such that each is nearest to the one
-    before.
+    """Returns quaternions with signs such that each is nearest to the quaternion before.
+
+    Args:
+        quaternions: the quaternions, shape (K, 4), in order of time.
     """
     dots = np.einsum("ki,ki->k", quaternions[1:], quaternions[:-1])
     signs = np.cumprod(np.where(dots < 0.0, -1.0, 1.0))
@@ -62,27 +74,33 @@ def align_signs(quaternions: Array) -> Array:
 
 
 def compute_matrix_columns(turns: Array) -> Array:
-    """Returns the first two columns of the matrices of rotation vectors, shape (..., 6), of
-    (..., 3), rad.
+    """Returns the first two columns of the rotation matrices of rotation vectors.
+
+    Args:
+        turns: rotation vectors, shape (..., 3), rad.
+
+    Returns:
+        The entries `MATRIX_ENTRIES`, shape (..., 6).
     """
     rows = np.reshape(turns, (-1, 3))
     w, v = compute_quaternion_parts(rows)
-    two = 2.0 * v
-    wx, wy, wz = (w * two).T
-    xx, yy, zz = (v * two).T
+    double = 2.0 * v
+    # twice the products of the components of the quaternion
+    wx, wy, wz = (w * double).T
+    xx, yy, zz = (v * double).T
     xy = 2.0 * v[:, 0] * v[:, 1]
     xz = 2.0 * v[:, 0] * v[:, 2]
     yz = 2.0 * v[:, 1] * v[:, 2]
-    columns = np.stack(
-        [1.0 - yy - zz, xy + wz, xz - wy, xy - wz, 1.0 - xx - zz, yz + wx], axis=1
-    )
+    first_column = [1.0 - yy - zz, xy + wz, xz - wy]
+    second_column = [xy - wz, 1.0 - xx - zz, yz + wx]
+    columns = np.stack([*first_column, *second_column], axis=1)
     return columns.reshape(*np.shape(turns)[:-1], len(MATRIX_ENTRIES))
 
 
 def expand_poses(x: Array) -> Array:
     """Returns poses with six numbers in place of their rotation vectors.
 
-    An environment observes poses so, and a hand of one's own gets the same numbers from
+    An environment observes poses in this form, and a user's hand gets the same numbers from
     `HandView`:
 
     >>> import numpy as np
@@ -91,12 +109,12 @@ def expand_poses(x: Array) -> Array:
     [5, 0, 2, 0, 10, 0, -10, 0, 0]
 
     Args:
-        x: what sites share in task space: places, shape (..., 3), m, or places and rotation
-            vectors, shape (..., 6), m and rad.
+        x: positions, shape (..., 3), m; or poses, which are positions and rotation vectors,
+            shape (..., 6), m and rad.
 
     Returns:
-        Places and the first two columns of the rotation matrices, shape (..., 9); places alone
-        as they are.
+        Positions and the first two columns of the rotation matrices, shape (..., 9). Positions
+        without rotation vectors are returned as they are.
     """
     if x.shape[-1] != POSE:
         return x
@@ -106,36 +124,47 @@ def expand_poses(x: Array) -> Array:
 
 
 def choose_nearest_vectors(turns: Array, references: Array) -> Array:
-    """Returns rotation vectors of the same rotations that are nearest to other ones, shape (K,
-    3), rad.
+    """Returns the rotation vectors of the same rotations that are nearest to references.
 
-    They may be longer than half a turn.
+    The vectors differ from `turns` by whole turns about the same axis, and may be longer than
+    half a turn.
+
+    Args:
+        turns: rotation vectors, shape (K, 3), rad.
+        references: the references, shape (K, 3), rad.
     """
     angle = np.linalg.norm(turns, axis=1, keepdims=True)
     axis = np.divide(turns, angle, out=np.zeros_like(turns), where=angle > 0.0)
-    along = np.einsum("ki,ki->k", axis, references)[:, np.newaxis]
-    return np.asarray(turns + 2.0 * np.pi * np.round((along - angle) / (2.0 * np.pi)) * axis)
+    projection = np.einsum("ki,ki->k", axis, references)[:, np.newaxis]
+    whole_turns = np.round((projection - angle) / (2.0 * np.pi))
+    return np.asarray(turns + 2.0 * np.pi * whole_turns * axis)
 
 
 def compute_continuous_vectors(turns: Array) -> Array:
-    """Returns rotation vectors, shape (K, 3), rad, without jumps at half a turn; whole turns
-    have them.
+    """Returns rotation vectors of the same rotations without jumps at half a turn.
+
+    They may be up to a whole turn long, and jump there.
+
+    Args:
+        turns: rotation vectors, shape (K, 3), rad, in order of time.
     """
     quaternions = compute_quaternions(turns)
     w = quaternions[:, :1]
     v = quaternions[:, 1:]
     sine = np.linalg.norm(v, axis=1, keepdims=True)
-    by_sine = np.divide(
+    angle_by_sine = np.divide(
         2.0 * np.arctan2(sine, w), sine, out=np.full_like(w, 2.0), where=sine > 0.0
     )
-    return np.asarray(by_sine * v)
+    return np.asarray(angle_by_sine * v)
 
 
 class QuaternionSigns:
-    """Sign of the quaternions of one stream: each is nearest to the one before; the first has w
-    >= 0.
+    """Chooses the signs of the quaternions of a stream.
 
-    The order of the four numbers is free; `w` says where w stands.
+    Each quaternion is nearest to the quaternion before, and the first has w >= 0.
+
+    Args:
+        w: index of w among the four numbers of a quaternion.
     """
 
     def __init__(self, w: int = 3) -> None:
@@ -143,10 +172,12 @@ class QuaternionSigns:
         self._last: tuple[float, ...] = ()
 
     def align(self, quaternion: Sequence[float]) -> tuple[float, ...]:
-        """Returns a quaternion or its negative, which is the same rotation."""
-        last = self._last
+        """Returns the next quaternion or its negative, which is the same rotation."""
         dot = quaternion[self._w]
-        if last:
-            dot = sum(a * b for a, b in zip(quaternion, last, strict=True))
-        self._last = tuple(-one for one in quaternion) if dot < 0.0 else tuple(quaternion)
+        if self._last:
+            dot = sum(a * b for a, b in zip(quaternion, self._last, strict=True))
+        if dot < 0.0:
+            self._last = tuple(-number for number in quaternion)
+        else:
+            self._last = tuple(quaternion)
         return self._last
