@@ -353,7 +353,7 @@ def test_a_law_is_given_as_its_class() -> None:
     class Local(Adaptive):
         """Of no file's own."""
 
-    with pytest.raises(ScenarioError, match="is no class of a file"):
+    with pytest.raises(ScenarioError, match="is not a class in a file"):
         tn.simulate("two_sites", {"control.law": Local})
 
 

@@ -171,7 +171,7 @@ def test_limit_has_same_words_wherever_scenario_comes_from() -> None:
     problems = []
     for read in (parse_scenario, parse_embedded):
         with pytest.raises(
-            ScenarioError, match=r"its links would take \d+ MiB, at most 64 are given"
+            ScenarioError, match=r"its links would take \d+ MiB, at most 64 MiB are allowed"
         ) as caught:
             read(text)
         problems.append((caught.value.path, caught.value.problem))

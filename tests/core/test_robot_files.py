@@ -136,7 +136,7 @@ REFUSED = {
     "allegro_hand_description/urdf/allegro_right_hand.urdf": ("link_3.0_tip", "'link_3.0'"),
     "bolt_description/robots/bolt.urdf": ("FL_FOOT", "no mass"),
     "hector_description/robots/quadrotor_base.urdf": ("", "no joint"),
-    "hyq_description/robots/hyq_no_sensors.urdf": ("lf_foot", "two others together"),
+    "hyq_description/robots/hyq_no_sensors.urdf": ("lf_foot", "sum of the other two"),
     "iris_description/robots/iris_simple.urdf": ("", "no joint"),
     "ur_description/urdf/ur3.urdf": ("", "no links"),
 }

@@ -135,7 +135,7 @@ def test_limits_that_cannot_be_are_refused(limits: dict[str, object], words: str
 
 def test_limits_of_position_need_the_rule_that_keeps_them() -> None:
     with pytest.raises(
-        ScenarioError, match=r"limits.q_max_rad: is kept under on_stale.action = 'glide' alone"
+        ScenarioError, match=r"limits.q_max_rad: applies only with on_stale.action = 'glide'"
     ):
         load_scenario("free", {"limits.q_max_rad": 9.0})
 

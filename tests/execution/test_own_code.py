@@ -260,7 +260,7 @@ def test_compiled_run_pauses_where_a_plant_moves(rate_hz: int) -> None:
 
 
 def test_a_sweep_takes_no_plant_and_says_so() -> None:
-    with pytest.raises(ScenarioError, match="is a plant of one's own") as refused:
+    with pytest.raises(ScenarioError, match="is a user's own plant") as refused:
         FusedRun(load_scenario("paper", with_plant()))
     assert refused.value.path == "sites.s.plant"
 

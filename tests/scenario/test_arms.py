@@ -93,7 +93,7 @@ def test_shipped_arms_weigh_and_reach_what_their_makers_say() -> None:
         (
             {"arm.payload_kg": 1.0, "arm.payload_inertia_kg_m2": [0.1, 0, 0.1, 0, 0, 0.3]},
             "arm.payload_inertia_kg_m2",
-            "two others together",
+            "sum of the other two",
         ),
         ({"arm.payload_kg": "x"}, "arm.payload_kg", "expected float, got text"),
         ({"arm.payload_kg": -1.0}, "arm.payload_kg", ">= 0"),

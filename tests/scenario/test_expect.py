@@ -167,7 +167,7 @@ def test_a_window_may_name_joints_as_their_file_does() -> None:
     assert named == windows(q3_rad=[0.0, 1.0], push4_mean_nm=[-1.0, 1.0])
     for keys, words in (
         ({"q_elbo_rad": [0, 1]}, r"expect\.windows\[0\]\.q_elbo_rad: unknown key"),
-        ({"q_elbow_rad": [0, 1], "q3_rad": [0, 1]}, "is q3_rad once more"),
+        ({"q_elbow_rad": [0, 1], "q3_rad": [0, 1]}, "repeats q3_rad"),
     ):
         with pytest.raises(ScenarioError, match=words):
             windows(**keys)

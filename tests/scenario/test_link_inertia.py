@@ -265,7 +265,7 @@ def test_a_mass_of_zero_leaves_a_link_out() -> None:
         (
             {"finger": {"inertia_kg_m2": [1.0, 0.0, 1.0, 0.0, 0.0, 3.0]}},
             "links.finger.inertia_kg_m2",
-            "two others together",
+            "sum of the other two",
         ),
         (
             {"upper": {"inertia_kg_m2": [-1.0, 0.0, 1.0, 0.0, 0.0, 1.0]}},

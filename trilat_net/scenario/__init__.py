@@ -1,7 +1,8 @@
-"""Scenarios: experiments, typed, frozen and validated.
+"""Scenarios: experiments that are typed, frozen and validated.
 
-Invariant: a scenario that loads also runs; every mistake that a person can make is refused
-here, with the path of the key and the nearest valid name.
+Invariant:
+    - A scenario that loads also runs. Every mistake that a person can make is refused when the
+      scenario is loaded, with the path of the key and the nearest valid name.
 """
 
 from .expect import Expect as Expect

@@ -538,8 +538,8 @@ def _build_chain_model(arm: Arm, task: Task, urdf_chain: UrdfChain) -> ArmModel:
     joint_count = len(urdf_chain.joints)
     if len(arm.armature_kg_m2) not in (1, joint_count):
         problem = (
-            f"has {count_nouns(len(arm.armature_kg_m2), 'number')}, "
-            f"and the arm has {count_nouns(joint_count, 'joint')}"
+            f"has {count_nouns(len(arm.armature_kg_m2), 'number')}, and the arm has "
+            f"{count_nouns(joint_count, 'joint')}"
         )
         raise ScenarioError(problem, path="armature_kg_m2")
     armature_kg_m2 = np.broadcast_to(arm.armature_kg_m2, joint_count).tolist()

@@ -1,12 +1,13 @@
-"""Which code from outside may run: that of one's own scenario, and for a log that whose file
-one names.
+"""Permissions for code from outside: which laws, hands and plants of users may run.
+
+The code of a user's own scenario may run. The code that a log or a member of a session names
+may run only if a person names its file.
 
 Invariant:
-- What a log or a member of a session names may run if a person names its file, and that file
-  has the hash that the log names, unless another version is asked for.
-- A permission, remembered or not, covers one class of that file with the settings of that log.
-  A log with other settings needs a permission of its own, and the refusal says which settings
-  differ.
+    - The named file must have the hash that the log names, unless another version is asked for.
+    - A permission, remembered or not, covers one class of that file with the settings of that
+      log. A log with other settings needs a permission of its own, and the refusal says which
+      settings differ.
 """
 
 import json
@@ -40,18 +41,21 @@ if TYPE_CHECKING:
     from .scenario_types import Scenario
 
 LawFiles = str | Path | Sequence[str | Path]
-"""The file of a law, or those of several."""
+"""The file of a law, or the files of several laws."""
 
 
 ImportedCode = ImportedLaw | ProgramHand | OwnPlant
-"""What a scenario may have that is a class from outside."""
+"""The parts of a scenario that may be classes from outside."""
 
 
 def list_imported_code(scenarios: "Iterable[Scenario]") -> list[ImportedCode]:
-    """Returns the laws, hands and plants of users' own that some scenarios need."""
-    sites = [site for scenario in scenarios for site in scenario.sites.values()]
-    found = (one for site in sites for one in (site.control, *site.hands, site.plant))
-    return [one for one in found if isinstance(one, ImportedCode)]
+    """Returns the users' own laws, hands and plants in some scenarios."""
+    imported = []
+    for scenario in scenarios:
+        for site in scenario.sites.values():
+            candidates = (site.control, *site.hands, site.plant)
+            imported += [part for part in candidates if isinstance(part, ImportedCode)]
+    return imported
 
 
 def allow_own_code(
@@ -59,35 +63,36 @@ def allow_own_code(
     codes: Container[Any] | None = None,
     changed_from: "Scenario | None" = None,
 ) -> "Scenario":
-    """Returns a scenario after its code was allowed to run.
+    """Allows the code of a scenario to run, and returns the scenario.
 
     Args:
         scenario: the scenario.
-        codes: the places of the classes that a person names; None: a person wrote the whole
-            scenario.
+        codes: the classes that a person named, as in "package.module:Law"; None: a person wrote
+            the whole scenario, and all its code may run.
         changed_from: the scenario that a person changed into this one. Code that may run there
-            may also run here, with the settings that the person has given it.
+            may also run here, with the settings that the person gave it.
     """
-    sources = (
-        [] if changed_from is None else map(CodeKey.of, list_imported_code([changed_from]))
-    )
-    consents = {
-        key[:2]: consent for key in sources if (consent := find_consent(key)) is not None
-    }
+    earlier_consents: dict[tuple[str, str], CodeConsent] = {}
+    if changed_from is not None:
+        for key in map(CodeKey.of, list_imported_code([changed_from])):
+            consent = find_consent(key)
+            if consent is not None:
+                earlier_consents[key.code, key.sha256] = consent
     for key in map(CodeKey.of, list_imported_code([scenario])):
+        earlier_consent = earlier_consents.get((key.code, key.sha256))
         if codes is None or key.code in codes:
             allowed_code[key] = CodeConsent(None, key.sha256)
-        elif key[:2] in consents:
-            allowed_code[key] = consents[key[:2]]
+        elif earlier_consent is not None:
+            allowed_code[key] = earlier_consent
     return scenario
 
 
 class RememberedFile(msgspec.Struct):
-    """A file that a person has remembered.
+    """A file whose code a person allowed for good.
 
     Attributes:
-        file: where the file is.
-        classes: by the name of a class, the settings with which it may run.
+        file: the path of the file.
+        classes: the settings with which each class may run, by the name of the class.
     """
 
     file: str
@@ -101,43 +106,60 @@ def allow_logged_code(
     other_version: bool = False,
     remember: bool = False,
 ) -> None:
-    """Lets that code of a log run that is in files, or in remembered ones, see `open_log`.
+    """Allows the code of a log that is in named or remembered files to run, see `open_log`.
+
+    Args:
+        scenario: the scenario of the log.
+        law: the files that a person names.
+        other_version: whether a file may differ from the one that ran.
+        remember: whether the permission is remembered for later logs.
 
     Raises:
-        UsageError: a file is none that the log names, or another version of it; or there is
-            none.
-        ScenarioError: a file cannot be read, or defines no such law. Nothing has run.
+        UsageError: a file does not define code that the log names, or is another version of it;
+            or an option needs a file and none is named.
+        ScenarioError: a file cannot be read, or does not define such a law. No code has run.
     """
     files = [Path(law)] if isinstance(law, str | Path) else list(map(Path, law))
     if (other_version or remember) and not files:
-        raise UsageError("--other-version and --remember are about a file: give --law FILE too")
-    named = {CodeKey.of(imported): imported for imported in list_imported_code([scenario])}
-    known = _read_store() if named else {}
-    remembered_settings.clear()
-    for sha256, entry in known.items():
-        for name, settings in entry.classes.items():
-            texts = [json.dumps(one, sort_keys=True, default=str) for one in settings]
-            remembered_settings[sha256, name] = texts
-    for key in named:
+        raise UsageError("--other-version and --remember need a file: give --law FILE, too")
+    logged = {CodeKey.of(imported): imported for imported in list_imported_code([scenario])}
+    remembered = _read_store() if logged else {}
+    _load_remembered_settings(remembered)
+    for key in logged:
         texts = remembered_settings.get((key.sha256, _class_of(key)), [])
-        if key.sha256 in known and key.settings in texts:
-            allowed_code.setdefault(key, CodeConsent(Path(known[key.sha256].file), key.sha256))
+        if key.sha256 in remembered and key.settings in texts:
+            file = Path(remembered[key.sha256].file)
+            allowed_code.setdefault(key, CodeConsent(file, key.sha256))
     for file in files:
-        sha256, meant = _allow_file(file, named, other_version=other_version)
+        sha256, keys = _allow_file(file, logged, other_version=other_version)
         if remember:
-            entry = known.setdefault(sha256, RememberedFile(""))
+            entry = remembered.setdefault(sha256, RememberedFile(""))
             entry.file = str(file.resolve())
-            for key in meant:
+            for key in keys:
                 settings = entry.classes.setdefault(_class_of(key), [])
-                if named[key].settings not in settings:
-                    settings.append(named[key].settings)
-            make_folder(_find_store().parent)
-            store = _find_store().resolve()  # people link their own settings
-            write_whole(store, msgspec.json.format(msgspec.json.encode(known), indent=1))
+                if logged[key].settings not in settings:
+                    settings.append(logged[key].settings)
+            _write_store(remembered)
+
+
+def _load_remembered_settings(remembered: Mapping[str, RememberedFile]) -> None:
+    """Replaces the settings that a refusal compares by those of the remembered files."""
+    remembered_settings.clear()
+    for sha256, entry in remembered.items():
+        for name, settings in entry.classes.items():
+            remembered_settings[sha256, name] = [
+                json.dumps(values, sort_keys=True, default=str) for values in settings
+            ]
 
 
 def _class_of(key: CodeKey) -> str:
     return key.code.partition(":")[2]
+
+
+def _find_store() -> Path:
+    """Returns the path of the file that holds remembered permissions."""
+    folder = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+    return Path(folder, "trilat-net", "laws.json")
 
 
 def _read_store() -> dict[str, RememberedFile]:
@@ -145,7 +167,8 @@ def _read_store() -> dict[str, RememberedFile]:
 
     An entry without settings, which earlier versions wrote, allows nothing.
     """
-    with suppress(OSError, ValueError, RuntimeError):  # the last: there is no home
+    # A RuntimeError is raised if the user has no home folder.
+    with suppress(OSError, ValueError, RuntimeError):
         entries = msgspec.json.decode(
             _find_store().read_bytes(), type=dict[str, RememberedFile | str]
         )
@@ -156,45 +179,55 @@ def _read_store() -> dict[str, RememberedFile]:
     return {}
 
 
+def _write_store(remembered: Mapping[str, RememberedFile]) -> None:
+    make_folder(_find_store().parent)
+    # The file may be a link: people link their settings to a folder under version control.
+    store = _find_store().resolve()
+    write_whole(store, msgspec.json.format(msgspec.json.encode(remembered), indent=1))
+
+
 def _allow_file(
-    file: Path, named: Mapping[CodeKey, ImportedCode], *, other_version: bool
+    file: Path, logged: Mapping[CodeKey, ImportedCode], *, other_version: bool
 ) -> tuple[str, list[CodeKey]]:
-    """Lets a file run as the code that has its hash, or else its name; returns its hash, and
-    that code.
+    """Allows a file to run as the logged code that has its hash, or else its name.
+
+    Returns:
+        The hash of the file, and the keys of the code that was allowed.
     """
     source = read_code("", "--law", file.resolve())
-    now = source.sha256
-    stem = (source.file.parent if file.stem == "__init__" else file).stem
-    alike = [key for key in named if re.split(r"[.:]", key.code)[-2] == stem]
-    meant = [key for key in named if key.sha256 == now] or alike
-    if not meant:
-        names = ", ".join(sorted({key.code for key in named})) or "none from outside"
+    sha256 = source.sha256
+    # A package is named by its folder.
+    module = (source.file.parent if file.stem == "__init__" else file).stem
+    keys = [key for key in logged if key.sha256 == sha256]
+    if not keys:
+        keys = [key for key in logged if re.split(r"[.:]", key.code)[-2] == module]
+    if not keys:
+        names = ", ".join(sorted({key.code for key in logged})) or "none from outside"
         raise UsageError(f"--law {file}: is no law that the log names: these are {names}")
-    for key in meant:
-        if key.sha256 != now and not other_version:
-            versions = f"its sha256 is {now[:16]}, and was {key.sha256[:16]}"
+    for key in keys:
+        if key.sha256 != sha256 and not other_version:
+            versions = _compare_hashes(key, sha256)
             problem = f"is not the file that ran as {key.code}: {versions}"
-            raise UsageError(f"--law {file}: {problem}; --other-version takes it all the same")
-        check_class(source, key.code, "--law", named[key].method)
-        allowed_code[key] = CodeConsent(source.file, now)
-    return now, meant
+            raise UsageError(f"--law {file}: {problem}; --other-version accepts it")
+        check_class(source, key.code, "--law", logged[key].method)
+        allowed_code[key] = CodeConsent(source.file, sha256)
+    return sha256, keys
 
 
-def _find_store() -> Path:
-    return Path(
-        os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config", "trilat-net", "laws.json"
-    )
+def _compare_hashes(key: CodeKey, sha256: str) -> str:
+    return f"its sha256 is {sha256[:16]}, and was {key.sha256[:16]}"
 
 
 class LoggedUserLaw(NamedTuple):
     """A user law that a log names, and its sites.
 
     Attributes:
-        code: the place of its class.
+        code: the class of the law, as in "package.module:Law".
         sites: the sites that it controls.
         settings: the arguments of its class, as text.
         allowed: whether its file may run with these settings.
-        file: that file, else what Python finds by the name of its module; None: nothing.
+        file: that file, else the file that Python finds by the name of its module; None: there
+            is no such file.
         changed: how the file differs from the one that ran, or "".
         other_settings: how its settings differ from those that are allowed, or "".
     """
@@ -208,59 +241,53 @@ class LoggedUserLaw(NamedTuple):
     other_settings: str = ""
 
     def __str__(self) -> str:
-        named = f"{self.code} of {', '.join(self.sites)}"
+        law = f"{self.code} of {', '.join(self.sites)}"
         settings = f" with {self.settings}" if self.settings else ""
         state = f"was changed, {self.changed}" if self.changed else "is the one that ran"
         if self.allowed:
-            return f"{named}{settings}; its file {state}"
-        hint = (
-            f"{self.file}{' --other-version' * bool(self.changed)} (it {state})"
-            if self.file
-            else "FILE"
-        )
-        problem = f"{named} is code from outside, which may not run{settings}"
-        problem = f"{problem} ({self.other_settings})" if self.other_settings else problem
-        return f"{problem}; if you trust it: --law {hint}"
+            return f"{law}{settings}; its file {state}"
+        option = "FILE"
+        if self.file:
+            version = " --other-version" if self.changed else ""
+            option = f"{self.file}{version} (it {state})"
+        difference = f" ({self.other_settings})" if self.other_settings else ""
+        problem = f"{law} is code from outside, which may not run{settings}{difference}"
+        return f"{problem}; if you trust it: --law {option}"
 
 
 def find_user_laws(scenario: "Scenario") -> list[LoggedUserLaw]:
-    """Returns the user laws of a scenario without running any code of theirs."""
+    """Returns the user laws of a scenario without running any code of them."""
     sites: dict[CodeKey, tuple[str, ...]] = {}
-    settings: dict[CodeKey, str] = {}
+    laws: dict[CodeKey, ImportedLaw] = {}
     for name, spec in scenario.sites.items():
-        if isinstance(law := spec.control, ImportedLaw):
-            key = CodeKey.of(law)
+        if isinstance(spec.control, ImportedLaw):
+            key = CodeKey.of(spec.control)
             sites[key] = (*sites.get(key, ()), name)
-            settings[key] = ", ".join(
-                f"{argument} = {describe_setting(value)}"
-                for argument, value in law.settings.items()
-            )
-    laws = []
-    for key, owners in sites.items():
-        consent = find_consent(key)
-        now = ""
-        file = None
-        with suppress(ScenarioError):
-            source = read_code(key.code, "", consent and consent.file)
-            check_class(source, key.code, "")
-            now = source.sha256
-            file = source.file
-        allowed = consent is not None and consent.sha256 == now
-        changed = (
-            ""
-            if now in ("", key.sha256)
-            else f"its sha256 is {now[:16]}, and was {key.sha256[:16]}"
-        )
-        other = "" if allowed else describe_new_settings(key)
-        laws.append(
-            LoggedUserLaw(
-                code=key.code,
-                sites=owners,
-                settings=settings[key],
-                allowed=allowed,
-                file=file,
-                changed=changed,
-                other_settings=other,
-            )
-        )
-    return laws
+            laws[key] = spec.control
+    return [_inspect_user_law(key, law, sites[key]) for key, law in laws.items()]
+
+
+def _inspect_user_law(key: CodeKey, law: ImportedLaw, sites: tuple[str, ...]) -> LoggedUserLaw:
+    """Returns the state of a user law: its file, and whether it may run."""
+    consent = find_consent(key)
+    sha256 = ""
+    file = None
+    with suppress(ScenarioError):
+        source = read_code(key.code, "", consent and consent.file)
+        check_class(source, key.code, "")
+        sha256 = source.sha256
+        file = source.file
+    is_allowed = consent is not None and consent.sha256 == sha256
+    is_changed = sha256 not in ("", key.sha256)
+    settings = ", ".join(
+        f"{argument} = {describe_setting(value)}" for argument, value in law.settings.items()
+    )
+    return LoggedUserLaw(
+        code=key.code,
+        sites=sites,
+        settings=settings,
+        allowed=is_allowed,
+        file=file,
+        changed=_compare_hashes(key, sha256) if is_changed else "",
+        other_settings="" if is_allowed else describe_new_settings(key),
+    )

@@ -32,13 +32,12 @@ from .urdf import UrdfJoint
 
 COUPLED_OPERATORS = (
     "beta differs between sites: it weighs operators of one site each, and says nothing of "
-    "hands "
-    "that are coupled to one another (one user at two handles)"
+    "hands that are coupled to one another (one user at two handles)"
 )
 IRREVERSIBLE_SHARES = (
     "the shares are not reversible (alpha_ij alpha_jk alpha_ki is not alpha_ik alpha_kj "
-    "alpha_ji): "
-    "some passive operators make the loop unstable, whatever its damping (docs/errata.md, 14)"
+    "alpha_ji): some passive operators make the loop unstable, whatever its damping "
+    "(docs/errata.md, 14)"
 )
 
 
@@ -190,8 +189,7 @@ def _describe_shares(scenario: Scenario) -> list[str]:
         )
     lines = [
         "pi, the left null vector of Upsilon, sum N (beta_i = pi_i / c_i with Kd_i = c_i "
-        "Kbar): "
-        f"{weights}"
+        f"Kbar): {weights}"
     ]
     if beta is not None and np.ptp(beta) >= ROW_SUM_TOLERANCE:
         lines.append(COUPLED_OPERATORS)

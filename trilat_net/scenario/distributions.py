@@ -1,9 +1,9 @@
-"""Distributions in place of numbers: start poses, masses, gains and operators that each seed
-draws.
+"""Distributions in place of numbers: a seed draws start poses, masses and gains.
 
-Invariant (L4): a draw is a function of the seed and of the number's dotted key, rounded to nine
-digits. A resolved scenario holds the number drawn and, under `drawn`, its distribution: another
-seed draws it again. A number that an override replaced stays as it is.
+Invariant (L4):
+    - A draw is a function of the seed and of the number's dotted key, rounded to nine digits.
+    - A resolved scenario holds the number that was drawn and, under `drawn`, its distribution:
+      another seed draws it again. A number that an override replaced stays as it is.
 """
 
 import re
@@ -18,18 +18,19 @@ from ..core.philox import link_key
 from ..errors import ScenarioError
 from ..fields import Frozen, NotNegative, Real, TomlTable, is_distribution, is_number
 
-_MOST_ENTRIES = 64
+_MAX_LIST_LENGTH = 64
 """Longer lists are recorded tables, in which nothing is drawn."""
 
 
 class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
-    """The origin of a number: one of the two distributions, or none for a pose that follows the
-    start pose.
+    """The origin of a number: a normal or a uniform distribution.
+
+    A pose that follows the start pose has neither of the two.
 
     Attributes:
         normal: mean and standard deviation.
         uniform: lower and upper end.
-        value: the number drawn, or the pose.
+        value: the number that was drawn, or the pose.
     """
 
     normal: tuple[Real, NotNegative] | None = None
@@ -37,27 +38,29 @@ class Distribution(Frozen, frozen=True, omit_defaults=True, kw_only=True):
     value: float | Annotated[list[float], Meta(max_length=MAX_JOINTS)]
 
     def draw(self, seed: int, key: str) -> float:
-        """Returns the number of a seed under a dotted key."""
-        from statistics import NormalDist  # takes some ms, which few scenarios need
+        """Returns the number that a seed draws for a dotted key."""
+        # Imported here: it takes some milliseconds, and few scenarios need it.
+        from statistics import NormalDist
 
-        share = ((link_key(seed, key) >> 12) + 0.5) / 2.0**52
+        # 52 bits of the key, in the middle of an interval: never 0 or 1.
+        uniform_number = ((link_key(seed, key) >> 12) + 0.5) / 2.0**52
         if self.normal is not None:
             mean, deviation = self.normal
-            number = mean + deviation * NormalDist().inv_cdf(share)
+            number = mean + deviation * NormalDist().inv_cdf(uniform_number)
         else:
             low, high = self.uniform or (0.0, 0.0)
-            number = low + share * (high - low)
+            number = low + uniform_number * (high - low)
         return float(f"{number:.9g}")
 
     def describe(self) -> str:
-        """Returns the distribution in words."""
+        """Returns the distribution as text."""
         if self.normal is not None:
-            return f"normal, {self.normal[0]:g} with a deviation of {self.normal[1]:g}"
-        return (
-            f"uniform, {self.uniform[0]:g} to {self.uniform[1]:g}"
-            if self.uniform
-            else "as the start pose"
-        )
+            mean, deviation = self.normal
+            return f"normal, {mean:g} with a deviation of {deviation:g}"
+        if self.uniform is not None:
+            low, high = self.uniform
+            return f"uniform, {low:g} to {high:g}"
+        return "as the start pose"
 
 
 def dotted_key(path: str) -> str:
@@ -69,7 +72,7 @@ class Draws:
     """Draws the numbers of one scenario.
 
     Args:
-        seed: the scenario's; one that is not valid is refused later, at its own key.
+        seed: the seed of the scenario. An invalid seed is refused later, at its own key.
         known: the table `drawn` of a scenario that was resolved before.
 
     Attributes:
@@ -85,23 +88,24 @@ class Draws:
         self.drawn: dict[str, Distribution] = {}
 
     def draw_numbers(self, table: TomlTable, path: str) -> TomlTable:
-        """Returns a table with a number in place of each distribution, also within its lists."""
+        """Returns a table with a number in place of each distribution, also in its lists."""
         return {key: self._draw_entry(value, f"{path}.{key}") for key, value in table.items()}
 
     def _draw_entry(self, value: Any, path: str) -> Any:
-        if isinstance(value, list) and len(value) <= _MOST_ENTRIES:
+        """Returns the number of a distribution, or of a number that was drawn before.
+
+        Other values are returned as they are.
+        """
+        if isinstance(value, list) and len(value) <= _MAX_LIST_LENGTH:
             return [
                 entry if isinstance(entry, list) else self._draw_entry(entry, f"{path}[{n}]")
                 for n, entry in enumerate(value)
             ]
         key = dotted_key(path)
+        known = self._known.get(key)
         if is_distribution(value):
             origin = _read_distribution(value, path)
-        elif (
-            (known := self._known.get(key)) is not None
-            and is_number(value)
-            and known.value == value
-        ):
+        elif known is not None and is_number(value) and known.value == value:
             origin = known
         else:
             return value
@@ -112,26 +116,36 @@ class Draws:
     def follow_start(
         self, table: TomlTable, key: str, pose: Sequence[float], path: str
     ) -> None:
-        """Writes the start pose under a key that is absent, or that followed an earlier draw of
-        it.
+        """Writes the start pose into a table, in place, unless the key has another pose.
+
+        A pose that followed an earlier draw of the start pose is replaced.
+
+        Args:
+            table: the table of an operator.
+            key: the key of the pose.
+            pose: the start pose.
+            path: the path of the table.
         """
-        place = dotted_key(f"{path}.{key}")
-        before = self._known.get(place)
-        if key in table and (before is None or table[key] != before.value):
+        pose_key = dotted_key(f"{path}.{key}")
+        known = self._known.get(pose_key)
+        if key in table and (known is None or table[key] != known.value):
             return
         table[key] = pose
-        site = place.partition(".hands.")[0]
-        if any(one.startswith((f"{site}.q0_rad", f"{site}.arm.l")) for one in self.drawn):
-            self.drawn[place] = Distribution(value=list(pose))
+        site = pose_key.partition(".hands.")[0]
+        start_keys = (f"{site}.q0_rad", f"{site}.arm.l")
+        if any(drawn_key.startswith(start_keys) for drawn_key in self.drawn):
+            self.drawn[pose_key] = Distribution(value=list(pose))
 
 
 def _read_distribution(table: TomlTable, path: str) -> Distribution:
+    """Returns the distribution of a table; refuses a table that is not one."""
     try:
         origin = msgspec.convert({**table, "value": 0.0}, Distribution)
     except msgspec.ValidationError:
         origin = None
     uniform = origin.uniform if origin else None
-    if origin is None or len(table) != 1 or (uniform is not None and uniform[1] < uniform[0]):
+    is_reversed = uniform is not None and uniform[1] < uniform[0]
+    if origin is None or len(table) != 1 or is_reversed:
         problem = "must be { normal = [mean, deviation] } or { uniform = [low, high] }"
         raise ScenarioError(f"{problem}, is {table}", path=path)
     return origin

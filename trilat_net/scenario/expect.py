@@ -152,7 +152,7 @@ def _number_joints(table: TomlTable, names: tuple[str, ...], path: str) -> TomlT
         if name in names:
             numbered_key = f"{prefix}{names.index(name) + 1}{suffix}"
         if numbered_key in window or (numbered_key != key and numbered_key in table):
-            raise ScenarioError(f"is {numbered_key} once more", path=f"{path}.{key}")
+            raise ScenarioError(f"repeats {numbered_key}", path=f"{path}.{key}")
         window[numbered_key] = value
     return window
 

@@ -1,11 +1,16 @@
-"""Laws that are imported from a user's module.
+"""Import users' classes from outside of the program: laws, hands and plants.
 
-Invariant: a user's law is named `law = "package.module:Law"`. The scenario holds the hash of
-the file that defines it, so a log shows if the law executed again is the one that ran. Naming a
-law runs nothing, not even the package that contains it. `import_class` is the one door to code
-from outside: it opens for `allowed_code`, if the file is still that one and defines a law of
-that name. A permission covers the arguments of the class as well: harmless code with other
-arguments may open another file.
+A user's law is named `law = "package.module:Law"`.
+
+Invariant:
+    - A scenario holds the hash of the file that defines a class, so that a log shows if the
+      code that is executed again is the code that ran.
+    - Naming a class runs no code, not even that of the package that contains it.
+    - `import_class` is the only way to run code from outside. It imports a class only if
+      `allowed_code` permits it, and if its file still has the permitted hash and defines a
+      class of that name.
+    - A permission covers the arguments of the class as well: harmless code with other arguments
+      may open another file.
 """
 
 import ast
@@ -32,16 +37,16 @@ from ..laws.sent_vectors import SentVectorSpecs, convert_sends, parse_classes
 CLASS_PATTERN = r"^[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*$"
 
 _imported: dict[str, str] = {}
-"""Per imported module of a law the hash of its file at that time."""
+"""The hash of the file of each module of a law that was imported, when it was imported."""
 
 
 Watch = Callable[[int, Callable[[], Any]], Any]
-"""Calls code of a user's own at a tick, and returns what it gives."""
+"""A function that calls a user's code at a tick and returns its result."""
 
 
-def call_directly(_k: int, call: Callable[[], Any]) -> Any:
-    """Calls it, as in virtual time, where nobody waits."""
-    return call()
+def call_directly(_k: int, function: Callable[[], Any]) -> Any:
+    """Calls a user's code without a time limit, as in virtual time, where nobody waits."""
+    return function()
 
 
 class NamedCode(Protocol):
@@ -49,7 +54,7 @@ class NamedCode(Protocol):
 
     @property
     def code(self) -> str:
-        """The place of the class, as in "package.module:Law"."""
+        """The module and the class, as in "package.module:Law"."""
 
     @property
     def source_sha256(self) -> str:
@@ -61,16 +66,14 @@ class NamedCode(Protocol):
 
 
 ANY_SETTINGS = "*"
-"""In place of settings: whatever they are. Only the workers of a study may be given such a
-permission.
-"""
+"""Stands for any settings. Only the workers of a study may be given such a permission."""
 
 
 class CodeKey(NamedTuple):
-    """What a permission covers.
+    """The code that a permission covers.
 
     Attributes:
-        code: the place of the class, as in "package.module:Law".
+        code: the module and the class, as in "package.module:Law".
         sha256: the hash of its file, as the scenario names it.
         settings: the arguments of the class, as JSON with sorted keys; or `ANY_SETTINGS`.
     """
@@ -90,8 +93,11 @@ class CodeKey(NamedTuple):
 
 
 class CodeConsent(NamedTuple):
-    """A file that may run: where it is, None for where Python finds its module; and its
-    SHA-256.
+    """A file that may run.
+
+    Attributes:
+        file: the path of the file; None: the file that Python finds for the module.
+        sha256: the SHA-256 of the file.
     """
 
     file: Path | None
@@ -100,7 +106,7 @@ class CodeConsent(NamedTuple):
 
 CodeConsents = dict[CodeKey, CodeConsent]
 allowed_code: CodeConsents = {}
-"""The code that may run in this process; workers are given it."""
+"""The code that may run in this process. Worker processes get a copy."""
 remembered_settings: dict[tuple[str, str], list[str]] = {}
 """The remembered settings, as in a `CodeKey`, by the hash of a file and the name of a class."""
 
@@ -112,8 +118,10 @@ def find_consent(key: CodeKey) -> CodeConsent | None:
 
 @contextmanager
 def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
-    """Lets the code of a study run with any settings inside the block: a study chooses them by
-    itself.
+    """Allows code with any settings inside the block, because a study chooses settings itself.
+
+    Args:
+        allowed: the permissions that are widened.
     """
     widened = {key._replace(settings=ANY_SETTINGS): consent for key, consent in allowed.items()}
     added = {key: consent for key, consent in widened.items() if key not in allowed_code}
@@ -126,45 +134,48 @@ def allowing_any_settings(allowed: CodeConsents) -> Iterator[None]:
 
 
 def describe_new_settings(key: CodeKey) -> str:
-    """Returns how the settings of withheld code differ from the nearest that may run; "" if
-    none may.
+    """Returns how the settings of withheld code differ from the nearest allowed settings.
+
+    The result is "" if the code may not run with any settings.
     """
-    alike = {
-        one.settings
-        for one in allowed_code
-        if one[:2] == key[:2] and one.settings != ANY_SETTINGS
+    allowed_settings = {
+        allowed.settings
+        for allowed in allowed_code
+        if (allowed.code, allowed.sha256) == (key.code, key.sha256)
+        and allowed.settings != ANY_SETTINGS
     }
-    alike |= set(remembered_settings.get((key.sha256, key.code.partition(":")[2]), ()))
+    class_name = key.code.partition(":")[2]
+    allowed_settings |= set(remembered_settings.get((key.sha256, class_name), ()))
+    settings = json.loads(key.settings)
     differences = [
-        _list_differences(json.loads(text), json.loads(key.settings)) for text in sorted(alike)
+        _list_differences(json.loads(text), settings) for text in sorted(allowed_settings)
     ]
     nearest = min(differences, key=len, default=[])
-    return (
-        f"it was allowed with other settings, and here {', '.join(nearest)}" if nearest else ""
-    )
+    if not nearest:
+        return ""
+    return f"it was allowed with other settings, and here {', '.join(nearest)}"
 
 
 def _list_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    texts = [
-        {key: describe_setting(value) for key, value in side.items()} for side in (before, now)
-    ]
-    old, new = texts
-    changed = (key for key in sorted({*old, *new}) if old.get(key) != new.get(key))
+    """Returns a text on each setting whose description changed."""
+    old = {key: describe_setting(value) for key, value in before.items()}
+    new = {key: describe_setting(value) for key, value in now.items()}
+    default = "its default"
     return [
-        f"{key} = {new.get(key, 'its default')} (was {old.get(key, 'its default')})"
-        for key in changed
+        f"{key} = {new.get(key, default)} (was {old.get(key, default)})"
+        for key in sorted({*old, *new})
+        if old.get(key) != new.get(key)
     ]
 
 
 LONGEST_SETTING = 300
-"""Characters of a setting that are shown; paths of files are shorter."""
+"""Largest length of a setting that is shown completely; paths of files are shorter."""
 
 
 def describe_setting(value: Any) -> str:
     """Returns the value of a setting as a text without control characters.
 
-    Of a long value the beginning and the end are shown: the end of a path is what tells files
-    apart.
+    A long value is shortened in the middle, because paths of files differ at their ends.
     """
     text = json.dumps(value, default=str)
     if len(text) <= LONGEST_SETTING:
@@ -174,17 +185,17 @@ def describe_setting(value: Any) -> str:
 
 
 _executed: dict["CodeSource", Any] = {}
-"""Modules of the files that were executed."""
+"""The modules of the files that were executed."""
 
 
 class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     """A user's law.
 
     Attributes:
-        code: its place, as in "package.module:Law".
-        source_sha256: hash of the file of that module.
-        settings: the arguments of its class, by name.
-        sends: what it sends to its peers, as its class declares it.
+        code: the module and the class, as in "package.module:Law".
+        source_sha256: the hash of the file of that module.
+        settings: the arguments of the class, by name.
+        sends: the vectors that the law sends to its peers, as its class declares them.
     """
 
     method: ClassVar[str] = "torque"
@@ -195,21 +206,28 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
     sends: SentVectorSpecs = field(default_factory=dict)
 
     def build_factory(self, sites: int, scheme: str) -> UserLawFactory:
-        """Returns the factory of the law, for a site of an experiment of so many sites."""
+        """Returns the factory of the law for a site.
+
+        Args:
+            sites: the number of sites of the experiment.
+            scheme: the scheme of the experiment.
+        """
 
         def make(context: LawContext) -> UserLaw:
             path = f"sites.{context.site}.control"
             kind = import_class(CodeKey.of(self), f"{path}.law")
-            # before anything of it is called
+            # The class is checked before any of its code is called.
             check_law_class(
                 kind=kind, code=self.code, context=context, sites=sites, scheme=scheme
             )
             declared = convert_sends(getattr(kind, "sends", {}), self.code, path)
-            if [*declared.items()] != [*self.sends.items()]:
+            # The order of the vectors counts, too.
+            if list(declared.items()) != list(self.sends.items()):
                 raise ScenarioError(
-                    f"{self.code} sends other vectors than the scenario names: write sends out in the body "
-                    f"of that class, and law = {self.code!r} to take what is there",
-                    path=f"sites.{context.site}.control.sends",
+                    f"{self.code} sends other vectors than the scenario names: write sends out "
+                    f"in the body of that class, and set law = {self.code!r} again to read "
+                    "them",
+                    path=f"{path}.sends",
                 )
             law: UserLaw = make_instance(kind, self.code, context, self.settings)
             return law
@@ -218,7 +236,13 @@ class ImportedLaw(LawSettings, frozen=True, tag_field="law", tag="own"):
 
 
 class CodeSource(NamedTuple):
-    """The file of a law, as it is: where, its content, and the SHA-256 of that."""
+    """The file of a class from outside.
+
+    Attributes:
+        file: its path.
+        content: its content.
+        sha256: the SHA-256 of the content.
+    """
 
     file: Path
     content: bytes
@@ -226,95 +250,122 @@ class CodeSource(NamedTuple):
 
 
 def read_code(code: str, path: str, file: Path | None = None) -> CodeSource:
-    """Returns a law's file, or that which Python finds, of which nothing runs; errors call the
-    key `path`.
+    """Returns the file of a class, without running any code of it.
+
+    Args:
+        code: the module and the class, as in "package.module:Law".
+        path: the path of the key in errors.
+        file: the file; None: the file that Python finds for the module.
 
     Raises:
         ScenarioError: there is no such file, or it cannot be read.
     """
-    place = file or _find_file(code, path)
+    source_file = file or _find_file(code, path)
     try:
-        with open_regular(place) as stream:
+        with open_regular(source_file) as stream:
             content = stream.read()
     except OSError as error:
-        raise ScenarioError(f"{place} cannot be read: {error.strerror}", path=path) from None
-    return CodeSource(place, content, hashlib.sha256(content).hexdigest())
+        raise ScenarioError(
+            f"{source_file} cannot be read: {error.strerror}", path=path
+        ) from None
+    return CodeSource(source_file, content, hashlib.sha256(content).hexdigest())
 
 
 def _find_file(code: str, path: str) -> Path:
+    """Returns the file that Python finds for the module of a class."""
     module = code.partition(":")[0]
     with _searching(None):
         spec = _find_spec(module)
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         raise ScenarioError(
-            f"there is no module {module}, where {code} is; install it, or be in the folder that it lies in "
-            "(PYTHONPATH counts too)",
+            f"there is no module {module}, where {code} is; install it, or run the command in "
+            "its folder (PYTHONPATH counts, too)",
             path=path,
         )
     return Path(spec.origin)
 
 
 def _find_spec(module: str) -> ModuleSpec | None:
-    """Finds a module as an import would, without running the packages that it is in.
+    """Returns the spec of a module as an import finds it, without importing its packages.
 
-    Finders of other packages are not asked: that of `distutils` imports the nearest setuptools.
+    Only Python's path finder and the finders of editable installations are used. Other finders
+    may run code: that of `distutils` imports the nearest setuptools.
     """
-    spec = None
-    folders = None
     finders = [
-        one
-        for one in sys.meta_path
-        if one is PathFinder or one.__module__.startswith("__editable__")
+        finder
+        for finder in sys.meta_path
+        if finder is PathFinder or finder.__module__.startswith("__editable__")
     ]
+    spec = None
+    search_folders = None
     parts = module.split(".")
     for depth in range(1, len(parts) + 1):
         name = ".".join(parts[:depth])
         try:
-            found = (finder.find_spec(name, folders) for finder in finders)
-            spec = next((one for one in found if one is not None), None)
+            specs = (finder.find_spec(name, search_folders) for finder in finders)
+            spec = next((candidate for candidate in specs if candidate is not None), None)
         except (ImportError, ValueError, AttributeError, LookupError):
             return None
-        folders = None if spec is None else spec.submodule_search_locations
-        if spec is None or (folders is None and name != module):
+        if spec is None:
+            return None
+        search_folders = spec.submodule_search_locations
+        if search_folders is None and name != module:
             return None
     return spec
 
 
 def import_class(key: CodeKey, path: str, method: str = "torque") -> Any:
-    """Returns the class that a scenario names by a hash, from the file that may run for it.
+    """Returns the class of a key, from the file that may run for it.
+
+    Args:
+        key: the class, with the hash of its file and its settings.
+        path: the path of the key in errors.
+        method: the method that the class must have.
 
     Raises:
-        CodeWithheld: none may.
-        ScenarioError: it is not as it was when it was let, or defines no such class: nothing
-            has run; or it cannot be imported.
+        CodeWithheld: no file may run for the class.
+        ScenarioError: the file differs from the one that was allowed, or does not define such a
+            class, and no code of it has run; or it cannot be imported.
     """
     code = key.code
     module, _, name = code.partition(":")
-    if (consent := find_consent(key)) is None:
-        problem = f"{code} is code from outside, which may not run"
-        problem = (
-            f"{problem} ({difference})"
-            if (difference := describe_new_settings(key))
-            else problem
+    consent = find_consent(key)
+    if consent is None:
+        difference = describe_new_settings(key)
+        reason = f" ({difference})" if difference else ""
+        raise CodeWithheld(
+            f"{code} is code from outside, which may not run{reason}: --law FILE lets its file "
+            "(in Python tn.open_log(..., law=FILE))",
+            path=path,
         )
-        remedy = "--law FILE lets its file (in Python tn.open_log(..., law=FILE))"
-        raise CodeWithheld(f"{problem}: {remedy}", path=path)
     source = read_code(code, path, consent.file)
     if source.sha256 != consent.sha256:
-        problem = f"the file of {code} is not the one that the scenario names by its hash; put that one"
         raise ScenarioError(
-            f"{problem} there, or write {code!r} anew to take the one that is", path=path
+            f"the file of {code} is not the one that the scenario names by its hash; restore "
+            f"that file, or write {code!r} in the scenario again to use the present one",
+            path=path,
         )
     check_class(source, code, path, method)
-    folders = source.file.parents  # its own, or that of its package
-    depth = min(module.count(".") + (source.file.stem == "__init__"), len(folders) - 1)
-    with _searching(consent.file and folders[depth]):
+    search_folder = consent.file and _find_import_folder(module, source.file)
+    with _searching(search_folder):
         try:
-            found = _execute(module, source) if consent.file else _import(module, source.sha256)
-        except (Exception, SystemExit) as error:  # the user's code
+            imported = (
+                _execute(module, source) if consent.file else _import(module, source.sha256)
+            )
+        # The user's code may raise anything.
+        except (Exception, SystemExit) as error:
             problem = f"{module} cannot be imported: {type(error).__name__}: {error}"
             raise ScenarioError(problem, path=path) from None
-    return getattr(found, name)
+    return getattr(imported, name)
+
+
+def _find_import_folder(module: str, file: Path) -> Path:
+    """Returns the folder from which a module and its neighbours are imported.
+
+    It is the folder of the file, or for a module of a package that of the outermost package.
+    """
+    depth = module.count(".") + (file.stem == "__init__")
+    return file.parents[min(depth, len(file.parents) - 1)]
 
 
 PAGES = {
@@ -322,16 +373,17 @@ PAGES = {
     "act": ("hand", "policies.md"),
     "step": ("plant", "policies.md"),
 }
-"""What a class is called that has such a method, and the page that describes it."""
+"""The name of a class that has such a method, and the page that describes it."""
 
 
 def check_class(source: CodeSource, code: str, path: str, method: str = "torque") -> None:
-    """Refuses a file that does not define a class with a method, by its syntax alone: nothing
-    of it runs.
+    """Refuses a file that does not define a class with a method.
+
+    The check reads the syntax of the file and runs no code of it.
 
     Raises:
-        ScenarioError: it is no Python, or has no such class, or that neither the method nor a
-            base.
+        ScenarioError: the file is not Python, has no such class, or the class has neither the
+            method nor a base class that may have it.
     """
     kind, page = PAGES[method]
     name = code.partition(":")[2]
@@ -340,47 +392,51 @@ def check_class(source: CodeSource, code: str, path: str, method: str = "torque"
         hint = suggest_nearest(name, list(classes)) or f"; see {find_page(page)}"
         raise ScenarioError(f"{source.file} defines no class {name}{hint}", path=path)
     node = classes[name]
-    named = {getattr(one, "name", getattr(one, "id", "")) for one in ast.walk(node)}
-    if not (node.bases or node.keywords or node.decorator_list or method in named):
+    identifiers = {getattr(part, "name", getattr(part, "id", "")) for part in ast.walk(node)}
+    may_inherit_method = node.bases or node.keywords or node.decorator_list
+    if not may_inherit_method and method not in identifiers:
         raise ScenarioError(
             f"{code} is no {kind}: it has no {method}; see {find_page(page)}", path=path
         )
 
 
 def _import(module: str, sha256: str) -> Any:
-    found = importlib.import_module(module)
-    if _imported.setdefault(module, sha256) != sha256:  # edited while this program runs
-        found = importlib.reload(found)
+    """Returns a module as Python imports it; a file that was edited meanwhile is reloaded."""
+    imported = importlib.import_module(module)
+    if _imported.setdefault(module, sha256) != sha256:
+        imported = importlib.reload(imported)
         _imported[module] = sha256
-    return found
+    return imported
 
 
 def _execute(module: str, source: CodeSource) -> Any:
-    """Returns a module of the content that was checked, and of nothing that is cached beside
-    the file.
+    """Returns a module of the content that was checked.
+
+    Python's own import could take a compiled file that lies beside the source.
     """
     if source in _executed:
         return _executed[source]
     file = str(source.file)
-    before = sys.modules.get(module)
+    previous_module = sys.modules.get(module)
     spec = spec_from_file_location(module, file, loader=SourceFileLoader(module, file))
-    made = sys.modules[module] = module_from_spec(cast(ModuleSpec, spec))
+    executed = module_from_spec(cast(ModuleSpec, spec))
+    sys.modules[module] = executed
     try:
-        exec(compile(source.content, file, "exec"), made.__dict__)
+        exec(compile(source.content, file, "exec"), executed.__dict__)
     finally:
-        # whatever a log calls it, it takes no other module's place
+        # A log may give its module any name: it must not replace another module for good.
         sys.modules.pop(module, None)
-        if before is not None:
-            sys.modules[module] = before
-    _executed[source] = made
-    return made
+        if previous_module is not None:
+            sys.modules[module] = previous_module
+    _executed[source] = executed
+    return executed
 
 
 def name_law_class(kind: type) -> str:
-    """Returns what a scenario calls a class, as in "mylaws:Spring".
+    """Returns the name of a class in a scenario, as in "mylaws:Spring".
 
     Raises:
-        ScenarioError: it stands in no file, or within something else there.
+        ScenarioError: the class is not in a file, or not at the top level of its module.
     """
     module = kind.__module__
     name = kind.__qualname__
@@ -388,35 +444,42 @@ def name_law_class(kind: type) -> str:
         module = Path(getattr(sys.modules[module], "__file__", None) or "").stem
     if not module or not name.isidentifier():
         raise ScenarioError(
-            f"{name} is no class of a file, which a log could name: write it into one, in a notebook with "
-            f"%%writefile mylaws.py, and import it from there; see {find_page('own-controller.md')}"
+            f"{name} is not a class in a file, so that no log can name it: write it into a "
+            "file, "
+            "in a notebook with %%writefile mylaws.py, and import it from there; see "
+            f"{find_page('own-controller.md')}"
         )
     return f"{module}:{name}"
 
 
 def name_law_classes(value: Any) -> Any:
-    """Returns a value of a scenario as plain ones: classes by `name_law_class`, NumPy's as
-    numbers.
+    """Returns a value of a scenario in plain types.
+
+    A class becomes its name by `name_law_class`, and a number or an array of NumPy a number or
+    a list.
     """
     if isinstance(value, type):
         return name_law_class(value)
     if isinstance(value, Mapping):
-        return {str(key): name_law_classes(one) for key, one in value.items()}
+        return {str(key): name_law_classes(entry) for key, entry in value.items()}
     return value.tolist() if hasattr(value, "tolist") else value
 
 
 @contextmanager
 def _searching(folder: Path | None) -> Iterator[None]:
-    """Lets modules be found in a folder before all others; None: the working directory, unless
-    it is one.
+    """Makes Python find modules in a folder before all others, inside the block.
+
+    Args:
+        folder: the folder; None: the working directory, unless Python searches it already.
     """
-    first = str(folder or Path.cwd())
-    if folder is None and first in sys.path:
+    search_path = str(folder or Path.cwd())
+    if folder is None and search_path in sys.path:
         yield
         return
-    sys.path.insert(0, first)
-    importlib.invalidate_caches()  # a file may be a moment old
+    sys.path.insert(0, search_path)
+    # A file may have been written a moment ago.
+    importlib.invalidate_caches()
     try:
         yield
     finally:
-        sys.path.remove(first)
+        sys.path.remove(search_path)

@@ -1,8 +1,8 @@
-"""The control laws that a scenario can choose, by name: each file of the room `laws` that has
-one.
+"""The control laws that a scenario can choose, by name.
 
-Invariant: a law is found by its file alone, whose class bears the same name; nothing else lists
-laws.
+Invariant:
+    - A law is found by its file in the package `trilat_net.laws` alone, whose class bears the
+      same name. Nothing else lists laws.
 """
 
 import pkgutil
@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, Any, Union
 from ..laws.interface import ControlLaw, LawSettings, format_class_name
 from .imported_code import ImportedLaw
 
-_ROOM = "trilat_net.laws"
+_LAWS_PACKAGE = "trilat_net.laws"
 
 
 def _find_laws() -> Iterator[type[ControlLaw]]:
-    for found in pkgutil.iter_modules(import_module(_ROOM).__path__):
-        kind = getattr(
-            import_module(f"{_ROOM}.{found.name}"), format_class_name(found.name), None
-        )
+    """Yields the law of each file that has one."""
+    for file in pkgutil.iter_modules(import_module(_LAWS_PACKAGE).__path__):
+        module = import_module(f"{_LAWS_PACKAGE}.{file.name}")
+        kind = getattr(module, format_class_name(file.name), None)
         if isinstance(kind, type) and issubclass(kind, ControlLaw):
             yield kind
 
@@ -33,14 +33,15 @@ LAWS: dict[str, type[LawSettings]] = {
     **{name: law.Settings for name, law in BUILT_IN.items()},
     str(ImportedLaw.__struct_config__.tag): ImportedLaw,
 }
-"""By name the gains that a scenario may have, those of a user's law too."""
+"""The type of the gains of each law, by name; the users' laws have one name together."""
 if TYPE_CHECKING:
     ChosenLaw = LawSettings
 else:
-    ChosenLaw = Union[tuple(LAWS.values())]  # noqa: UP007 - made of what was found
+    # Built at run time from the laws that were found.
+    ChosenLaw = Union[tuple(LAWS.values())]  # noqa: UP007
     """The type of a site's control."""
 
 
 def identify_law(law: Any) -> str:
-    """Returns what a scenario calls a law; an imported one as in "package.module:Law"."""
+    """Returns the name of a law in a scenario; a user's law as in "package.module:Law"."""
     return law.code if isinstance(law, ImportedLaw) else str(law.tag)

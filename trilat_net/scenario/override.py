@@ -1,9 +1,10 @@
-"""Overrides KEY=VALUE: written into an author's tables, or expanded onto a resolved scenario.
+"""Overrides KEY=VALUE of an author's tables or of a resolved scenario.
 
-Invariant: in a resolved scenario, as a log holds it, a key of a group (`control.Kd`,
-`link.delay_ms`, `rate_hz`) applies to every site or link that can have it; a key of a single
-one (`sites.s.control.Kd`) takes precedence, in any order. A key that no built-in law has is a
-setting of a user's law.
+Invariant:
+    - In a resolved scenario, as a log holds it, a key of a group (`control.Kd`,
+      `link.delay_ms`, `rate_hz`) applies to every site or link that can have it.
+    - A key of a single site or link (`sites.s.control.Kd`) takes precedence, in any order.
+    - A key that no built-in law has is a setting of a user's law.
 """
 
 import tomllib
@@ -19,79 +20,83 @@ from .resolve import PRESETS, TRACE_KEYS
 from .scenario_types import SITE_GROUPS, Scenario
 
 _KIND_KEYS = {"control": ("law",), "link": ("model", "preset")}
-"""Groups whose keys depend on a kind, and the keys that name it."""
+"""Groups whose keys depend on a kind, and the keys that name the kind."""
 _USER_LAW = "own"
 
 Override = tuple[str, Any]
+"""A dotted key and its value."""
 
 
 def expand_overrides(scenario: Scenario, pairs: Sequence[Override]) -> dict[str, Any]:
-    """Returns overrides of a resolved scenario with every key of a group written out.
+    """Returns overrides of a resolved scenario with the keys of groups written out.
+
+    A key of a group becomes a key of each site or link that can have it.
 
     Raises:
         ScenarioError: a group has no such key, or nothing in the scenario can have it.
     """
-    flat: list[Override] = []
-    for key, value in pairs:
-        # a whole group
-        if isinstance(value, Mapping) and (key in SITE_GROUPS or key in _KIND_KEYS):
-            flat += [(f"{key}.{name}", entry) for name, entry in value.items()]
-        else:
-            flat.append((key, value))
-    given = dict(flat)
-    every: dict[str, Any] = {}
-    single: dict[str, Any] = {}
-    for key, value in flat:
+    flat_pairs = _flatten_groups(pairs)
+    overridden = dict(flat_pairs)
+    group_values: dict[str, Any] = {}
+    single_values: dict[str, Any] = {}
+    for key, value in flat_pairs:
         group, _, name = key.partition(".")
         if key == "rate_hz":
-            every |= {f"sites.{site}.rate_hz": value for site in scenario.names}
+            group_values |= {f"sites.{site}.rate_hz": value for site in scenario.names}
         elif group in SITE_GROUPS and name:
-            check_keys(
-                {_split_entry(name)[0].split(".")[0]: value},
-                field_names(SITE_GROUPS[group]),
-                group,
-            )
-            every |= {f"sites.{site}.{key}": value for site in scenario.names}
+            first_key = _split_entry(name)[0].split(".")[0]
+            check_keys({first_key: value}, field_names(SITE_GROUPS[group]), group)
+            group_values |= {f"sites.{site}.{key}": value for site in scenario.names}
         elif group in _KIND_KEYS and name:
-            every |= dict.fromkeys(_expand_group(scenario, group, name, given), value)
+            members = _expand_group(scenario, group, name, overridden)
+            group_values |= dict.fromkeys(members, value)
         else:
-            single[_expand_single(scenario, key, given)] = value
-    return every | single
+            single_values[_expand_single(scenario, key, overridden)] = value
+    return group_values | single_values
 
 
-def _expand_single(scenario: Scenario, key: str, given: Mapping[str, Any]) -> str:
+def _flatten_groups(pairs: Sequence[Override]) -> list[Override]:
+    """Returns overrides in which the table of a whole group is written key by key."""
+    flat_pairs: list[Override] = []
+    for key, value in pairs:
+        is_group = key in SITE_GROUPS or key in _KIND_KEYS
+        if is_group and isinstance(value, Mapping):
+            flat_pairs += [(f"{key}.{name}", entry) for name, entry in value.items()]
+        else:
+            flat_pairs.append((key, value))
+    return flat_pairs
+
+
+def _expand_single(scenario: Scenario, key: str, overridden: Mapping[str, Any]) -> str:
+    """Returns a key that is not of a group; a setting of a user's law gets its full path."""
     group, _, rest = key.partition(".")
     site, _, name = rest.partition(".control.")
-    if (
-        group == "sites"
-        and site in scenario.sites
-        and name
-        and _law(scenario, site, given) == _USER_LAW
-    ):
+    is_control_key = group == "sites" and site in scenario.sites and bool(name)
+    if is_control_key and _find_law(scenario, site, overridden) == _USER_LAW:
         return _user_law_key(f"sites.{site}.control", name)
     return key
 
 
 def _user_law_key(path: str, name: str) -> str:
-    settings = "" if name.split(".")[0] in ("law", *field_names(ImportedLaw)) else "settings."
-    return f"{path}.{settings}{name}"
+    """Returns the path of a key of a user's law; keys that are not its fields are settings."""
+    is_field = name.split(".")[0] in ("law", *field_names(ImportedLaw))
+    return f"{path}.{name}" if is_field else f"{path}.settings.{name}"
 
 
 def _expand_group(
-    scenario: Scenario, group: str, name: str, given: Mapping[str, Any]
+    scenario: Scenario, group: str, name: str, overridden: Mapping[str, Any]
 ) -> list[str]:
-    """Returns a key of a group for each law or link, of its future kind, that can have it."""
-    if group == "control":
-        kinds = {
-            f"sites.{site}.control": str(_law(scenario, site, given)) for site in scenario.names
-        }
-        keys: dict[str, tuple[str, ...]] = {
-            law: field_names(kind) for law, kind in LAWS.items() if law != _USER_LAW
-        }
-    else:
-        kinds = {f"links.{link}": str(_model(scenario, link, given)) for link in scenario.links}
-        keys = {model: field_names(kind) for model, kind in DELAY_MODELS.items()}
-        keys["trace"] = (*keys["trace"], *TRACE_KEYS)
+    """Returns the paths of a key of a group, for each law or link that can have it.
+
+    The kind of a law or link is that after the overrides.
+
+    Args:
+        scenario: the scenario.
+        group: "control" or "link".
+        name: the key in the group.
+        overridden: all overrides, by key.
+    """
+    kinds, keys_by_kind = _list_group_kinds(scenario, group, overridden)
     if name in _KIND_KEYS[group]:
         return [f"{path}.{name}" for path in kinds]
     user_laws = {
@@ -100,34 +105,57 @@ def _expand_group(
         if group == "control" and (law == _USER_LAW or ":" in law)
     }
     built_in = {path: kind for path, kind in kinds.items() if path not in user_laws}
-    valid = sorted({key for names in keys.values() for key in names})
+    valid_keys = sorted({key for keys in keys_by_kind.values() for key in keys})
     vector = _split_entry(name)[0]
     members = [
-        f"{path}.{name}" for path, kind in built_in.items() if vector in keys.get(kind, valid)
+        f"{path}.{name}"
+        for path, kind in built_in.items()
+        if vector in keys_by_kind.get(kind, valid_keys)
     ]
     if user_laws and not members:
         return [
             _user_law_key(path, name) if law == _USER_LAW else f"{path}.{name}"
             for path, law in user_laws.items()
         ]
-    if vector not in valid:
-        hint = (
-            suggest_nearest(vector, [*_KIND_KEYS[group], *valid])
-            or f"; valid are {', '.join(valid)}"
-        )
+    if vector not in valid_keys:
+        hint = suggest_nearest(vector, [*_KIND_KEYS[group], *valid_keys])
+        hint = hint or f"; valid are {', '.join(valid_keys)}"
         raise ScenarioError(f"unknown key{hint}", path=f"{group}.{name}")
     if not members:
-        word = _KIND_KEYS[group][0]
-        owners = [kind for kind, names in keys.items() if vector in names]
-        is_now = ", ".join(dict.fromkeys(kinds.values()))
-        problem = f"belongs to {word} {', '.join(owners)}, and here is only {is_now}: set {group}.{word} too"
-        raise ScenarioError(problem, path=f"{group}.{name}")
+        kind_key = _KIND_KEYS[group][0]
+        owners = ", ".join(kind for kind, keys in keys_by_kind.items() if vector in keys)
+        present = ", ".join(dict.fromkeys(kinds.values()))
+        raise ScenarioError(
+            f"belongs to {kind_key} {owners}, and here is only {present}: set "
+            f"{group}.{kind_key} too",
+            path=f"{group}.{name}",
+        )
     return members
 
 
+def _list_group_kinds(
+    scenario: Scenario, group: str, overridden: Mapping[str, Any]
+) -> tuple[dict[str, str], dict[str, tuple[str, ...]]]:
+    """Returns the kind of each law or link by its path, and the keys of each built-in kind."""
+    if group == "control":
+        laws = {
+            f"sites.{site}.control": str(_find_law(scenario, site, overridden))
+            for site in scenario.names
+        }
+        gains = {law: field_names(kind) for law, kind in LAWS.items() if law != _USER_LAW}
+        return laws, gains
+    models = {
+        f"links.{link}": str(_find_model(scenario, link, overridden)) for link in scenario.links
+    }
+    keys = {model: field_names(kind) for model, kind in DELAY_MODELS.items()}
+    keys["trace"] = (*keys["trace"], *TRACE_KEYS)
+    return models, keys
+
+
 def _split_entry(key: str) -> tuple[str, str]:
-    """Returns a key of an entry of a list as the key of the list and the entry's number, else
-    "" for that.
+    """Returns the key of a list and the number of an entry; the key itself and "" for others.
+
+    "q0_rad.1" is split into "q0_rad" and "1".
     """
     vector, _, entry = key.rpartition(".")
     return (vector, entry) if vector and entry.isdecimal() else (key, "")
@@ -136,103 +164,118 @@ def _split_entry(key: str) -> tuple[str, str]:
 def split_entries(
     tables: TomlTable, pairs: Sequence[Override]
 ) -> tuple[dict[str, Any], list[Override]]:
-    """Returns overrides of an author's tables, and those of entries of vectors that they do not
-    write out.
+    """Returns overrides that apply to an author's tables, and those that must wait.
 
-    A vector may be one number, or be that of a group: its entries are there once the tables are
-    resolved.
+    An override of an entry of a vector waits if the tables do not write the vector out: it may
+    be a single number, or that of a group, and has entries only in the resolved scenario.
     """
-    own = {}
-    of_entries = []
+    applicable = {}
+    waiting = []
     for key, value in pairs:
         vector, entry = _split_entry(key)
-        reached: Any = tables if entry else []
-        for name in vector.split(".") if entry else ():
-            if isinstance(reached, list) and name.isdecimal() and int(name) < len(reached):
-                reached = reached[int(name)]
-            else:
-                reached = reached.get(name) if isinstance(reached, dict) else None
-        if isinstance(reached, list):
-            own[key] = value
+        if not entry or isinstance(_find_value(tables, vector), list):
+            applicable[key] = value
         else:
-            of_entries.append((key, value))
-    return own, of_entries
+            waiting.append((key, value))
+    return applicable, waiting
 
 
-def _law(scenario: Scenario, site: str, given: Mapping[str, Any]) -> Any:
-    now = scenario.sites[site].control.__struct_config__.tag
-    return given.get(f"sites.{site}.control.law", given.get("control.law", now))
+def _find_value(tables: TomlTable, key: str) -> Any:
+    """Returns the value at a dotted key, in which a number is an entry of a list; or None."""
+    value: Any = tables
+    for name in key.split("."):
+        if isinstance(value, list) and name.isdecimal() and int(name) < len(value):
+            value = value[int(name)]
+        else:
+            value = value.get(name) if isinstance(value, dict) else None
+    return value
 
 
-def _model(scenario: Scenario, link: str, given: Mapping[str, Any]) -> Any:
-    """Returns a link's model after the overrides; an unknown one is refused when the tables are
-    resolved.
+def _find_law(scenario: Scenario, site: str, overridden: Mapping[str, Any]) -> Any:
+    """Returns the name of a site's law after the overrides."""
+    current = scenario.sites[site].control.__struct_config__.tag
+    return overridden.get(f"sites.{site}.control.law", overridden.get("control.law", current))
+
+
+def _find_model(scenario: Scenario, link: str, overridden: Mapping[str, Any]) -> Any:
+    """Returns the name of a link's model after the overrides.
+
+    An unknown model or preset is refused when the tables are resolved.
     """
     for path in (f"links.{link}", "link"):
-        if f"{path}.model" in given:
-            return given[f"{path}.model"]
-        if f"{path}.preset" in given:
-            return PRESETS.get(str(given[f"{path}.preset"]), {}).get("model", "constant")
+        if f"{path}.model" in overridden:
+            return overridden[f"{path}.model"]
+        if f"{path}.preset" in overridden:
+            preset = PRESETS.get(str(overridden[f"{path}.preset"]), {})
+            return preset.get("model", "constant")
     return scenario.links[link].__struct_config__.tag
 
 
 def apply_overrides(tables: TomlTable, overrides: Mapping[str, Any] | Sequence[str]) -> None:
     """Writes overrides into the tables of a scenario as read from TOML, in place.
 
-    A number in a key means the entry of a list, counted from 0, as in
+    A number in a key is an entry of a list, counted from 0, as in
     sites.s.environment.0.stiffness_n_m. A key that names a kind (a link's model or preset, a
-    law, an arm's urdf) replaces the table's other keys.
+    law, an arm's urdf) removes the other keys of its table, which belong to another kind.
     """
     pairs = parse_overrides(overrides)
-    overridden = {key for key, _ in pairs}
+    overridden_keys = {key for key, _ in pairs}
     for key, value in pairs:
-        *folders, last = key.split(".")
-        sites = tables.get("sites")
-        if (
-            len(folders) > 1
-            and folders[0] == "sites"
-            and isinstance(sites, dict)
-            and folders[1] not in sites
-        ):
-            hint = (
-                suggest_nearest(folders[1], list(sites))
-                or f"; its sites are {', '.join(sites)}"
-            )
-            raise ScenarioError(f"no such site{hint}", path=key)
-        table = _reach_table(tables, folders, last)
+        *parents, last = key.split(".")
+        _check_site_exists(tables, parents, key)
+        table = _reach_table(tables, parents, last)
         if isinstance(table, list):
             table[_list_index(table, last, key)] = value
             continue
-        kinds = (
-            ("urdf",)
-            if folders[-1:] == ["arm"]
-            else [key for keys in _KIND_KEYS.values() for key in keys]
-        )
-        if last in kinds:  # the file's other keys are of another kind
-            for other in [k for k in table if ".".join([*folders, k]) not in overridden]:
-                del table[other]
+        if last in _list_kind_keys(parents):
+            for other in list(table):
+                if ".".join([*parents, other]) not in overridden_keys:
+                    del table[other]
         table[last] = value
 
 
-def _reach_table(tables: TomlTable, folders: Sequence[str], last: str) -> TomlTable | list[Any]:
-    """Returns the table or list at dotted keys, in which `last` is next; missing tables are
-    added.
+def _list_kind_keys(parents: Sequence[str]) -> list[str]:
+    """Returns the keys that name a kind, in the table at the keys `parents`."""
+    if parents and parents[-1] == "arm":
+        return ["urdf"]
+    return [key for keys in _KIND_KEYS.values() for key in keys]
+
+
+def _check_site_exists(tables: TomlTable, parents: Sequence[str], key: str) -> None:
+    """Refuses a key of a site that the tables do not have."""
+    sites = tables.get("sites")
+    if len(parents) < 2 or parents[0] != "sites" or not isinstance(sites, dict):
+        return
+    if parents[1] not in sites:
+        hint = suggest_nearest(parents[1], list(sites))
+        hint = hint or f"; its sites are {', '.join(sites)}"
+        raise ScenarioError(f"no such site{hint}", path=key)
+
+
+def _reach_table(tables: TomlTable, parents: Sequence[str], last: str) -> TomlTable | list[Any]:
+    """Returns the table or list at the keys `parents`; tables that are missing are added.
+
+    Args:
+        tables: the tables of the scenario.
+        parents: the keys of the table, one after the other.
+        last: the key in that table. If it is a number, a missing table is a list.
     """
-    reached: Any = tables
-    for depth, name in enumerate(folders):
-        path = ".".join(folders[: depth + 1])
-        if isinstance(reached, list):
-            entry = reached[_list_index(reached, name, path)]
+    container: Any = tables
+    for depth, name in enumerate(parents):
+        path = ".".join(parents[: depth + 1])
+        if isinstance(container, list):
+            entry = container[_list_index(container, name, path)]
         else:
-            after = (*folders, last)[depth + 1]
-            entry = reached.setdefault(name, [] if after.isdecimal() else {})
+            next_key = (*parents, last)[depth + 1]
+            entry = container.setdefault(name, [] if next_key.isdecimal() else {})
         if not isinstance(entry, dict | list):
             raise ScenarioError("is a value, not a table", path=path)
-        reached = entry
-    return reached  # type: ignore[no-any-return]
+        container = entry
+    return container  # type: ignore[no-any-return]
 
 
 def _list_index(entries: list[Any], name: str, path: str) -> int:
+    """Returns the number of an entry of a list; refuses an entry that does not exist."""
     if not name.isdecimal() or int(name) >= len(entries):
         counted = f"it has {len(entries)}, counted from 0" if entries else "it has none"
         raise ScenarioError(f"no such entry: {counted}", path=path)
@@ -240,14 +283,20 @@ def _list_index(entries: list[Any], name: str, path: str) -> int:
 
 
 def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Override]:
-    """Returns overrides as keys and values; a text is KEY=VALUE, whose value is TOML or a bare
-    word.
+    """Returns overrides as keys and values.
+
+    Args:
+        overrides: a mapping, or texts KEY=VALUE whose values are TOML or bare words.
+
+    Raises:
+        ScenarioError: a text is not of that form.
     """
     if isinstance(overrides, Mapping):
         return list(name_law_classes(overrides).items())
     pairs = []
     for text in overrides:
-        if (pair := split_assignment(str(text))) is None:
+        pair = split_assignment(str(text))
+        if pair is None:
             raise ScenarioError(
                 f"an override reads KEY=VALUE, as in control.Kd=5, not {text!r}"
             )
@@ -256,13 +305,15 @@ def parse_overrides(overrides: Mapping[str, Any] | Sequence[str]) -> list[Overri
 
 
 def split_assignment(text: str) -> Override | None:
-    """Returns the key and the value, TOML or a bare word, of a text KEY=VALUE; None if it is
-    none.
+    """Returns the key and the value of a text KEY=VALUE; None if it is not of that form.
+
+    The value is TOML, or else a bare word.
     """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():
         return None
     try:
         return key.strip(), tomllib.loads(f"value = {value}")["value"]
-    except ValueError:  # TOMLDecodeError is one; a number of 5000 digits is another
+    # TOMLDecodeError is a ValueError; a number of 5000 digits raises another one.
+    except ValueError:
         return key.strip(), value.strip()

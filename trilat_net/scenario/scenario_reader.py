@@ -49,9 +49,8 @@ def read_shipped(name: str) -> str:
     shipped_names = list_shipped()
     if name not in shipped_names and not (len(name) < _MAX_NAME_LENGTH and file.is_file()):
         raise ScenarioError(
-            f"no scenario of that name{suggest_nearest(name, shipped_names)}; "
-            f"shipped are {', '.join(shipped_names)}; a file is named by its path, as in "
-            "./mine.toml",
+            f"no scenario of that name{suggest_nearest(name, shipped_names)}; shipped are "
+            f"{', '.join(shipped_names)}; a file is named by its path, as in ./mine.toml",
             source=name,
         )
     return file.read_text(encoding="utf-8")

@@ -1,9 +1,10 @@
-"""The types of a complete scenario: sites, scripted changes, itself, and the core's setup of
-each site.
+"""The types of a complete scenario: sites, changes and the core's setup of a site.
 
-Invariant: keys end in their unit; symbols are the paper's. `Scenario.text` is canonical: it
-loads to the same scenario, and its SHA-256 names the experiment. A change names the time from
-which it holds and is complete in itself.
+Invariant:
+    - Keys end in their unit; symbols are the paper's.
+    - `Scenario.text` is canonical: it loads to the same scenario, and its SHA-256 names the
+      experiment.
+    - A change names the time from which it holds, and is complete in itself.
 """
 
 import hashlib
@@ -49,21 +50,23 @@ from .own_plant import OwnPlant
 
 
 class OnStale(Frozen, frozen=True, omit_defaults=True):
-    """The rule for a peer whose sample in use is too old.
+    """The rule for a peer whose sample in use is too old, or who is silent.
 
     Attributes:
-        action: "use": goes on with it; "hold": stays at the last reference; "brake": stays
-            where the arm is; "glide": begins by waiting for all peers, lets its reference come
-            to rest when none of a peer's samples came into use for a time, and aligns with its
-            peers without a jump.
-        age_ms: the age beyond which it is too old, ms; not of "glide".
-        return_s: duration of the return once a fresh sample is in use, s; not of "glide".
-        silence_ms: of "glide", the time without a new sample in use after which a peer is
+        action: "use": the site goes on with the sample; "hold": it stays at the last reference;
+            "brake": it stays where the arm is; "glide": at the start it waits for all peers,
+            it lets its reference come to rest if no sample of a peer came into use for a time,
+            and it aligns with its peers without a jump.
+        age_ms: age of a sample beyond which it is too old, ms; not for "glide".
+        return_s: duration of the return once a fresh sample is in use, s; not for "glide".
+        silence_ms: for "glide", the time without a new sample in use after which a peer is
             silent, ms.
-        align_speed_rad_s: of "glide", how fast it goes to its peers, rad/s; of a place m/s.
-        align_limit_rad: of "glide", the longest way that it goes by itself, rad; of a place m.
-        on_lost: of "glide", "hold": holds while a peer is silent; "degrade": goes on without a
-            master that is, as long as the others reach each other.
+        align_speed_rad_s: for "glide", the speed with which the site goes to its peers, rad/s;
+            m/s for a position.
+        align_limit_rad: for "glide", the longest way that the site goes by itself, rad; m for a
+            position.
+        on_lost: for "glide", "hold": the site holds while a peer is silent; "degrade": it goes
+            on without a silent master, as long as the others reach each other.
     """
 
     action: Literal["use", "hold", "brake", "glide"] = "use"
@@ -76,17 +79,19 @@ class OnStale(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def rule(self) -> site_setup.StaleRule:
-        """The rule as the core has it."""
+        """The rule in the form of the core."""
         if self.action == "glide":
-            silence_ns = round(self.silence_ms * 1e6)
-            limits = self.align_speed_rad_s, self.align_limit_rad
             return site_setup.StaleRule(
-                site_setup.StaleAction.GLIDE, silence_ns, 1, *limits, self.on_lost == "degrade"
+                action=site_setup.StaleAction.GLIDE,
+                age_ns=round(self.silence_ms * 1e6),
+                align_speed=self.align_speed_rad_s,
+                align_limit=self.align_limit_rad,
+                degrades=self.on_lost == "degrade",
             )
         return site_setup.StaleRule(
-            site_setup.StaleAction[self.action.upper()],
-            round(self.age_ms * 1e6),
-            round(self.return_s * 1e9),
+            action=site_setup.StaleAction[self.action.upper()],
+            age_ns=round(self.age_ms * 1e6),
+            return_ns=round(self.return_s * 1e9),
         )
 
 
@@ -95,25 +100,31 @@ SpeedLimits = Annotated[tuple[SpeedLimit, ...], Meta(min_length=1, max_length=MA
 
 
 GLIDE_TAU_RATE_NM_S = 1000.0
-"""Under the rule "glide" a torque changes by 1 N m a millisecond at most, as Franka's arms ask
-for it.
+"""Default limit of the torque's rate of change under the rule "glide".
+
+1 N m per millisecond is what Franka's arms ask for.
 """
 
 
+def _or_infinity(limit: Any) -> Any:
+    return math.inf if limit is None else limit
+
+
 class Limits(Frozen, frozen=True):
-    """The limits of a site.
+    """The limits of a site. A limit is one number, or one number per joint.
 
     Attributes:
-        tau_limit_nm: largest control torque of a joint, N m; more is cut off. One number, or
-            one per joint; left out, a chain has the efforts that its file states.
-        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s; so
-            too. Under the rule "glide" the site is in fault in its place, and the run goes on.
-        tau_rate_limit_nm_s: largest change of the control torque of a joint in a second, N m/s.
-            Left out, there is none, but under the rule "glide" it is `GLIDE_TAU_RATE_NM_S`.
-        qd_des_limit_rad_s: largest speed of the reference, rad/s; of a place m/s.
-        q_min_rad: least angle of a joint, rad; only of the rule "glide": beyond it the site is
-            in fault.
-        q_max_rad: largest angle, likewise.
+        tau_limit_nm: largest control torque of a joint, N m; a larger torque is cut off. Left
+            out: the efforts that the file of a chain states.
+        qd_limit_rad_s: joint speed beyond which a run counts as diverged and ends, rad/s. Under
+            the rule "glide" the site is in fault instead, and the run goes on. Left out: the
+            speeds that the file of a chain states.
+        tau_rate_limit_nm_s: largest rate of change of the control torque of a joint, N m/s.
+            Left out: no limit, but `GLIDE_TAU_RATE_NM_S` under the rule "glide".
+        qd_des_limit_rad_s: largest speed of the reference, rad/s; m/s for a position.
+        q_min_rad: least angle of a joint, rad; only with the rule "glide": beyond it the site
+            is in fault.
+        q_max_rad: largest angle of a joint, rad, likewise.
     """
 
     tau_limit_nm: Positive | PositiveJoints = 200.0
@@ -125,31 +136,34 @@ class Limits(Frozen, frozen=True):
 
     @property
     def motion(self) -> site_setup.MotionLimits:
-        """Those that the core has besides the first two."""
+        """The limits of the motion in the form of the core; infinite if left out."""
         return site_setup.MotionLimits(
             q_min=-math.inf if self.q_min_rad is None else self.q_min_rad,
-            q_max=math.inf if self.q_max_rad is None else self.q_max_rad,
-            qd_des_limit=math.inf
-            if self.qd_des_limit_rad_s is None
-            else self.qd_des_limit_rad_s,
-            tau_rate=math.inf if self.tau_rate_limit_nm_s is None else self.tau_rate_limit_nm_s,
+            q_max=_or_infinity(self.q_max_rad),
+            qd_des_limit=_or_infinity(self.qd_des_limit_rad_s),
+            tau_rate=_or_infinity(self.tau_rate_limit_nm_s),
         )
 
 
 class SiteSpec(Frozen, frozen=True):
-    """One manipulator.
+    """A site: an arm with its control loop.
 
     Attributes:
-        role: its role for a reader of figures; enters no formula.
-        rate_hz: tick rate of its loop, Hz.
+        role: the role of the site for a reader of figures; it enters no formula.
+        rate_hz: tick rate of the loop, Hz.
         q0_rad: start pose, rad.
         qd0_rad_s: start velocity, rad/s.
-        on_stale: its rule for a peer whose samples are too old.
-        task: what it follows: joints, or its end effector.
+        arm: the arm.
+        control: the control law and its gains.
+        limits: the limits of torques, speeds and positions.
+        on_stale: the rule for a peer whose samples are too old.
+        task: the coordinates that the site follows: joint angles, or those of the end effector.
+        hands: the operators who act on the arm.
+        environment: the walls and other bodies that act on the arm.
         plant: "simulated"; "external": an arm outside of the program, whose state is measured;
-            or a class of one's own that moves the arm.
-        view: delay, loss and order of the picture by which the site's user sees its peers, as
-            of a link; None: the user sees the samples in use. It enters no formula.
+            or a user's class that moves the arm.
+        view: delay, loss and order of the picture in which the site's user sees its peers, as
+            for a link; None: the user sees the samples in use. It enters no formula.
     """
 
     role: Literal["master", "slave"]
@@ -167,11 +181,15 @@ class SiteSpec(Frozen, frozen=True):
     view: Link | None = None
 
     def find_live_hand(self, *, is_open: bool = False) -> LiveHand | None:
-        """Returns the hand that is led while the session runs; `is_open`: one that anybody may
-        hold.
+        """Returns the hand that acts while the session runs, or None.
+
+        Args:
+            is_open: true: only a hand that anybody in the session may hold.
         """
-        hands = (one for one in self.hands if isinstance(one, LiveHand))
-        return next((one for one in hands if one.is_open or not is_open), None)
+        for hand in self.hands:
+            if isinstance(hand, LiveHand) and (hand.is_open or not is_open):
+                return hand
+        return None
 
 
 SITE_GROUPS: dict[str, type[Frozen]] = {
@@ -180,7 +198,7 @@ SITE_GROUPS: dict[str, type[Frozen]] = {
     "on_stale": OnStale,
     "task": Task,
 }
-"""Tables that a scenario may have for all sites, and each site for itself."""
+"""Tables that a scenario may have for all sites, and each site for itself, with their types."""
 
 
 SiteOrder = Literal[
@@ -195,25 +213,29 @@ SiteOrder = Literal[
     "released",
     "held",
 ]
-"""What a site may be ordered, from outside (the first three) or by itself."""
+"""Orders to a site; "": none.
+
+Stop, enable and reset come from outside; the site gives the others to itself.
+"""
 TIMELINE_KEYS = ("at_s", "link", "dominance", "to", "ramp_s")
-"""Keys of a change that a scenario may have."""
+"""Keys of a change on the timeline of a scenario."""
 
 
 class Change(Frozen, frozen=True, omit_defaults=True):
-    """One change. Exactly one of `link`, `dominance` and `site` is given; the last is of
-    records alone.
+    """A change of a link or of dominance factors, or an order to a site.
+
+    Exactly one of `link`, `dominance` and `site` is given. Only records have `site`.
 
     Attributes:
-        at_s: when it takes effect, s after the epoch; on a link, for samples stamped from then
-            on.
-        link: the link that it changes, as in "m1->s".
-        dominance: the site whose dominance factors it changes.
-        to: the whole link from then on, or all factors of the row.
+        at_s: when the change takes effect, s after the epoch; for a link, the stamp from which
+            samples are affected.
+        link: the link that changes, as in "m1->s".
+        dominance: the site whose dominance factors change.
+        to: the whole link after the change, or all factors of the row.
         ramp_s: duration of the linear change of the factors, s.
-        site: the site that is given an order.
-        order: that order, see `core.ticks.LifeOrder`.
-        ticks: of "overrun", how many ticks the site did not make.
+        site: the site that gets an order.
+        order: the order, see `core.ticks.LifeOrder`.
+        ticks: for "overrun", how many ticks the site missed.
     """
 
     at_s: Annotated[float, Meta(ge=0.0, le=1e6)]
@@ -227,23 +249,23 @@ class Change(Frozen, frozen=True, omit_defaults=True):
 
     @property
     def start_ns(self) -> int:
-        """When it takes effect, ns since the epoch."""
+        """When the change takes effect, ns since the epoch."""
         return round(self.at_s * 1e9)
 
     @property
     def after(self) -> LinkBase:
-        """The link from then on."""
+        """The link after the change."""
         return msgspec.convert(self.to, Link)
 
 
 def scheduled_links(timeline: Sequence[Change], name: str) -> Iterator[tuple[int, LinkBase]]:
-    """Yields the later states of a link, each with its first stamp, ns, in order."""
+    """Yields the later states of a link in order, each with its first stamp, ns."""
     for change in timeline:
         if change.link == name:
             yield change.start_ns, change.after
 
 
-_ABSENT: dict[str, tuple[Any, ...]] = {
+_ABSENT_VALUES: dict[str, tuple[Any, ...]] = {
     **dict.fromkeys(("timeline", "environment"), ((), [])),
     **dict.fromkeys(("expect", "drawn", "urdf", "on_stale", "task", "sends"), ({},)),
     "plant": ("simulated",),
@@ -251,23 +273,39 @@ _ABSENT: dict[str, tuple[Any, ...]] = {
         ("tau_rate_limit_nm_s", "qd_des_limit_rad_s", "q_min_rad", "q_max_rad", "view"), (None,)
     ),
 }
-"""Keys that older scenarios lack, and their values that mean nothing; those are not in the
-text.
+"""Keys that older scenarios lack, with the values that have no effect.
+
+These values are left out of the text, so that the text of an older scenario stays the same.
 """
-_SLAVE = 2
-"""The slave's place in a palette of colours."""
-_NUMBERS = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
-"""A list of numbers, one a line."""
+_POSE_NUMBERS = 7
+"""Numbers of the pose of a body: a position and a quaternion."""
+_SLAVE_COLOUR = 2
+"""Index of the slave's colour in a palette."""
+_NUMBER_LIST = re.compile(r"\[\n(?:    [-+.\de]+,\n)+\]")
+"""A list of numbers that is written one number per line."""
 
 
-def _drop_unused(arm: dict[str, Any]) -> None:
-    """Leaves out of an arm's table what its kind of arm has not, and what means nothing."""
+def _drop_unused_keys(arm: dict[str, Any]) -> None:
+    """Removes from an arm's table the keys of other kinds of arms, and defaults of a chain."""
     defaults = msgspec.to_builtins(Arm())
-    planar = () if arm["urdf"] else (*ArmLinks._fields, "g_m_s2")
-    unused = ArmLinks._fields if arm["urdf"] else ()
+    is_chain = bool(arm["urdf"])
+    unused_keys = ArmLinks._fields if is_chain else ()
+    kept_keys = () if is_chain else (*ArmLinks._fields, "g_m_s2")
     for key, value in list(arm.items()):
-        if key in unused or (key not in planar and value == defaults[key]):
+        if key in unused_keys or (key not in kept_keys and value == defaults[key]):
             del arm[key]
+
+
+def _drop_absent_values(table: dict[str, Any]) -> None:
+    """Removes from a table the values that mean the same as their absence."""
+    for key, absent_values in _ABSENT_VALUES.items():
+        if key in table and table[key] in absent_values:
+            del table[key]
+
+
+def _join_number_list(match: re.Match[str]) -> str:
+    """Returns a list of numbers in one line."""
+    return " ".join(match[0].split()).replace("[ ", "[").replace(", ]", "]")
 
 
 class Scenario(Frozen, frozen=True, dict=True):
@@ -282,9 +320,9 @@ class Scenario(Frozen, frozen=True, dict=True):
         about: a paragraph for people.
         assumed: assumptions that the source of the experiment does not state.
         duration_s: its duration, s.
-        seed: every random draw is a function of it.
+        seed: the seed; every random draw is a function of it.
         scheme: "second_order" or "digital", see `Scheme`.
-        sites: the manipulators, in order; the first leads a live session.
+        sites: the sites, in order; the first leads a live session.
         dominance: row i, column j: factor of site j in the reference of site i, Eq. (6).
         links: "j->i" for every pair of sites.
         timeline: changes during the run.
@@ -309,8 +347,9 @@ class Scenario(Frozen, frozen=True, dict=True):
     assumed: tuple[str, ...] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Takes the text along: a default that is left out of it is known by its identity
-        alone.
+        """Returns the state for a copy in another process, with the text.
+
+        Defaults are left out of the text by their identity, which a copy does not keep.
         """
         return (*super().__reduce__(), {"text": self.text})
 
@@ -332,7 +371,9 @@ class Scenario(Frozen, frozen=True, dict=True):
             try:
                 model = build_arm(spec.arm, spec.task, self.urdf, chains)
             except ScenarioError as error:
-                path = f"sites.{name}.arm" + (f".{error.path}" if error.path else "")
+                path = f"sites.{name}.arm"
+                if error.path:
+                    path = f"{path}.{error.path}"
                 raise ScenarioError(error.problem, path=path) from None
             models[name] = model.widen_stops(spec.q0_rad)
         return models
@@ -346,43 +387,39 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @cached_property
     def controls(self) -> tuple[ChosenLaw, ...]:
-        """The law of every site, with what it takes of the dominance factors at the start."""
+        """The law of every site, with the gains that follow from the shares at the start."""
         laws = [spec.control for spec in self.sites.values()]
         return tuple(law.resolve_shares(self.names, self.alpha) for law in laws)
 
     @property
     def beta(self) -> Array | None:
-        """Left null vector of Upsilon, shape (N,), sum 1, Eq. (20); None if alpha is reducible."""
-        return (
-            dominance.perron_vector(self.alpha)
-            if dominance.is_irreducible(self.alpha)
-            else None
-        )
+        """Left null vector of Upsilon, shape (N,), sum 1, Eq. (20).
+
+        None if alpha is reducible.
+        """
+        if not dominance.is_irreducible(self.alpha):
+            return None
+        return dominance.perron_vector(self.alpha)
 
     @cached_property
     def text(self) -> str:
         """The canonical TOML text."""
         tables: dict[str, Any] = msgspec.to_builtins(self)
-        words = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
-        words = {key: value for key, value in words.items() if value}
-        sites = tables["sites"].values()
-        for site in sites:
-            _drop_unused(site["arm"])
-        for table in (
-            tables,
-            *sites,
-            *(site[group] for site in sites for group in ("control", "limits")),
-        ):
-            for key, absent in _ABSENT.items():
-                if key in table and table[key] in absent:
-                    del table[key]
-        urdf = tables.pop("urdf", None)
-        numbers = _NUMBERS.sub(
-            lambda one: " ".join(one[0].split()).replace("[ ", "[").replace(", ]", "]"),
-            tomli_w.dumps(tables),
-        )
-        files = tomli_w.dumps({"urdf": urdf}, multiline_strings=True) if urdf else ""
-        return tomli_w.dumps(words, multiline_strings=True) + numbers + files
+        descriptions = {key: tables.pop(key) for key in ("name", "title", "about", "assumed")}
+        descriptions = {key: value for key, value in descriptions.items() if value}
+        for site in tables["sites"].values():
+            _drop_unused_keys(site["arm"])
+        _drop_absent_values(tables)
+        for site in tables["sites"].values():
+            _drop_absent_values(site)
+            _drop_absent_values(site["control"])
+            _drop_absent_values(site["limits"])
+        urdf_texts = tables.pop("urdf", None)
+        numbers = _NUMBER_LIST.sub(_join_number_list, tomli_w.dumps(tables))
+        files = ""
+        if urdf_texts:
+            files = tomli_w.dumps({"urdf": urdf_texts}, multiline_strings=True)
+        return tomli_w.dumps(descriptions, multiline_strings=True) + numbers + files
 
     @cached_property
     def sha256(self) -> str:
@@ -390,17 +427,28 @@ class Scenario(Frozen, frozen=True, dict=True):
         return hashlib.sha256(self.text.encode()).hexdigest()
 
     def assign_colours(self, colours: int) -> list[int]:
-        """Returns the places of a palette in the order of the sites; sites beyond them begin
-        anew.
+        """Returns the index of a colour for each site, then those of the unused colours.
+
+        A slave gets the slave's colour. Sites beyond the number of colours begin anew.
+
+        Args:
+            colours: the number of colours of the palette.
         """
         free = list(range(colours))
-        order = []
+        assigned = []
         roles = [site.role for site in self.sites.values()]
         for n, role in enumerate(roles[:colours]):
-            kept = [place for place in free if place != _SLAVE or "slave" not in roles[n:]]
-            order.append(_SLAVE if role == "slave" and _SLAVE in free else kept[0])
-            free.remove(order[-1])
-        return [*order, *free]
+            if role == "slave" and _SLAVE_COLOUR in free:
+                colour = _SLAVE_COLOUR
+            else:
+                is_reserved = "slave" in roles[n:]
+                allowed = [
+                    index for index in free if not (is_reserved and index == _SLAVE_COLOUR)
+                ]
+                colour = allowed[0]
+            assigned.append(colour)
+            free.remove(colour)
+        return [*assigned, *free]
 
     def ticks(self, site: str) -> int:
         """Returns the number of ticks of a site."""
@@ -411,39 +459,37 @@ class Scenario(Frozen, frozen=True, dict=True):
         return tuple(name for name in self.names if name != site)
 
     def _all_links(self) -> list[LinkBase]:
-        later = [
+        """Returns the links at the start and all their later states."""
+        later_links = [
             link for name in self.links for _, link in scheduled_links(self.timeline, name)
         ]
-        return [*self.links.values(), *later]
+        return [*self.links.values(), *later_links]
 
     @property
     def random(self) -> bool:
-        """True if anything is drawn: then another seed is another run."""
+        """True if any number is drawn: another seed is then another run."""
         return bool(self.drawn) or self.links_random
 
     @property
     def links_random(self) -> bool:
-        """True if some link draws its delays or losses while the run goes on."""
+        """True if some link draws its delays or losses during the run."""
         return any(link.random for link in self._all_links())
 
     @property
     def measured(self) -> bool:
-        """True if some link injects no delay: then the real network decides."""
+        """True if some link injects no delay, so that the real network decides."""
         return any(link.measured for link in self._all_links())
 
     @property
     def external(self) -> tuple[str, ...]:
-        """The sites whose arms are measured: they are outside of the program, or plants of
-        one's own.
-        """
+        """The sites whose arms are measured: outside of the program, or users' plants."""
         return tuple(name for name, spec in self.sites.items() if spec.plant != "simulated")
 
     @property
     def slave(self) -> str:
-        """The first site whose role is slave, else the last one."""
-        return next(
-            (name for name, spec in self.sites.items() if spec.role == "slave"), self.names[-1]
-        )
+        """The first site whose role is slave, else the last site."""
+        slaves = [name for name, spec in self.sites.items() if spec.role == "slave"]
+        return slaves[0] if slaves else self.names[-1]
 
     @property
     def outside(self) -> tuple[str, ...]:
@@ -452,49 +498,58 @@ class Scenario(Frozen, frozen=True, dict=True):
 
     @property
     def open_hands(self) -> tuple[str, ...]:
-        """The sites whose arms anybody may hold who comes."""
-        found = {name: spec.find_live_hand(is_open=True) for name, spec in self.sites.items()}
-        return tuple(name for name, hand in found.items() if hand is not None)
+        """The sites whose arms anybody in the session may hold."""
+        return tuple(
+            name
+            for name, spec in self.sites.items()
+            if spec.find_live_hand(is_open=True) is not None
+        )
 
     @property
     def sites_may_return(self) -> bool:
-        """True if a session outlives its sites: each waits for its peers, and aligns with them
-        anew.
+        """True if a session outlives its sites.
+
+        Each site then waits for its peers and aligns with them again.
         """
         return all(spec.on_stale.action == "glide" for spec in self.sites.values())
 
     def draw_seed(self, site: str) -> int:
-        """Returns the seed for what code of one's own at a site draws."""
+        """Returns the seed for the random numbers of users' code at a site."""
         return zlib.crc32(f"{self.seed}/{site}".encode())
 
     def channel(self, site: str) -> LawChannel:
-        """Returns what the law of a site sends to its peers."""
+        """Returns the vectors that the law of a site sends to its peers."""
         sends: SentVectorSpecs = getattr(self.sites[site].control, "sends", {})
-        return build_channel(
-            sends, site_setup.Layout.of_arm(self.arms[site].chain), len(self.names) - 1
-        )
+        layout = site_setup.Layout.of_arm(self.arms[site].chain)
+        return build_channel(sends, layout, len(self.names) - 1)
 
     def layout(self, site: str) -> site_setup.Layout:
-        """Returns how many numbers the vectors of a site have."""
-        live = self.sites[site].find_live_hand()
-        actors = () if live is None else (live.actor,)
-        found = site_setup.Layout.of_arm(
+        """Returns the lengths of a site's vectors."""
+        live_hand = self.sites[site].find_live_hand()
+        actors = () if live_hand is None else (live_hand.actor,)
+        layout = site_setup.Layout.of_arm(
             self.arms[site].chain, self.channel(site).record_size, actors
         )
-        return found._replace(bodies=7 * len(self.bodies_m(site)))
+        return layout._replace(bodies=_POSE_NUMBERS * len(self.bodies_m(site)))
 
     def bodies_m(self, site: str) -> dict[str, tuple[float, float, float]]:
-        """Returns the bodies that a site's plant moves besides its arm: their sizes along their
-        axes, m.
+        """Returns the bodies that a site's plant moves besides its arm.
+
+        Returns:
+            The sizes of each body along its own axes, m, by name.
         """
         plant = self.sites[site].plant
         return plant.bodies if isinstance(plant, OwnPlant) else {}
 
     def setup(self, site: str) -> site_setup.SiteSetup:
-        """Returns all that the core needs to build a site."""
+        """Returns the setup from which the core builds a site."""
         spec = self.sites[site]
         arm = self.arms[site]
-        control = self.controls[self.names.index(site)]
+        index = self.names.index(site)
+        control = self.controls[index]
+        rest_gains = site_setup.RestGains()
+        if spec.on_stale.action == "glide":
+            rest_gains = self._rest_gains(site)
         return site_setup.SiteSetup(
             name=site,
             rate_hz=spec.rate_hz,
@@ -507,7 +562,7 @@ class Scenario(Frozen, frozen=True, dict=True):
             qd_limit_rad_s=spec.limits.qd_limit_rad_s,
             q0=spec.q0_rad,
             qd0=spec.qd0_rad_s,
-            actors=tuple(one.actor for one in (*spec.hands, *spec.environment)),
+            actors=tuple(actor.actor for actor in (*spec.hands, *spec.environment)),
             links=tuple(self._link_setup(peer, site) for peer in self.peers(site)),
             ramps=tuple(self.scripted_ramps(site)),
             on_stale=spec.on_stale.rule,
@@ -518,44 +573,36 @@ class Scenario(Frozen, frozen=True, dict=True):
             channel=self.channel(site),
             bodies=len(self.bodies_m(site)),
             limits=self.motion_limits(site),
-            rest=self._rest_gains(site)
-            if spec.on_stale.action == "glide"
-            else site_setup.RestGains(),
-            bit=1 << self.names.index(site),
+            rest=rest_gains,
+            bit=1 << index,
         )
 
     def motion_limits(self, site: str) -> site_setup.MotionLimits:
-        """Returns the limits of a site's motion, with room for a start pose a little beyond a
-        limit.
+        """Returns the limits of a site's motion, with room for its start pose.
 
         A joint that starts beyond `q_min_rad` or `q_max_rad` by no more than the margin may be
-        there during the whole run: its limit on that side lies the margin further out.
+        there during the whole run: its limit on that side lies the margin farther out.
         """
         spec = self.sites[site]
         arm = self.arms[site]
         motion = spec.limits.motion
         start = np.array(spec.q0_rad)
-        low, high = (
-            np.broadcast_to(limit, start.shape) for limit in (motion.q_min, motion.q_max)
-        )
+        low = np.broadcast_to(motion.q_min, start.shape)
+        high = np.broadcast_to(motion.q_max, start.shape)
+        if not np.any((start < low) | (start > high)):
+            return motion
         margin = np.full(start.shape, START_MARGIN_RAD)
         if arm.chain is not None:
             margin = np.array([start_margin(joint) for joint in arm.chain.joints])
-        if not np.any((start < low) | (start > high)):
-            return motion
+        starts_below = (start < low) & (start >= low - margin)
+        starts_above = (start > high) & (start <= high + margin)
         return motion._replace(
-            q_min=tuple(
-                np.where((start < low) & (start >= low - margin), low - margin, low).tolist()
-            ),
-            q_max=tuple(
-                np.where(
-                    (start > high) & (start <= high + margin), high + margin, high
-                ).tolist()
-            ),
+            q_min=tuple(np.where(starts_below, low - margin, low).tolist()),
+            q_max=tuple(np.where(starts_above, high + margin, high).tolist()),
         )
 
     def gains(self, site: str) -> site_setup.Gains:
-        """Returns the gains of a site's law; under the rule `glide` its estimates are in a box."""
+        """Returns the gains of a site's law; under the rule `glide` with a box of estimates."""
         spec = self.sites[site]
         arm = self.arms[site]
         gains = spec.control.gains(arm.theta)
@@ -564,52 +611,58 @@ class Scenario(Frozen, frozen=True, dict=True):
         return bound_estimates(gains, arm, spec.limits.tau_limit_nm, spec.arm.g_m_s2)
 
     def _rest_gains(self, site: str) -> site_setup.RestGains:
+        """Returns the gains with which a site's arm comes to rest."""
         spec = self.sites[site]
         arm = self.arms[site]
-        control = spec.control
-        gains = control.linear_gains(arm.theta) or control.gains(arm.theta)
-        own: Array = np.zeros(arm.counts.joints) + gains.Kp + gains.d
-        limit = spec.limits.tau_limit_nm
-        known = spec.arm.known
+        gains = spec.control.linear_gains(arm.theta) or spec.control.gains(arm.theta)
+        law_damping: Array = np.zeros(arm.counts.joints) + gains.Kp + gains.d
         return compute_rest_gains(
             arm=arm,
             q0=spec.q0_rad,
-            law_damping=own,
-            limit_nm=limit,
+            law_damping=law_damping,
+            limit_nm=spec.limits.tau_limit_nm,
             rate_hz=spec.rate_hz,
-            known=known,
+            known=spec.arm.known,
         )
 
     def _link_setup(self, peer: str, site: str) -> site_setup.LinkSetup:
+        """Returns the setup of the link from a peer to a site."""
         name = f"{peer}->{site}"
-        first = self.links[name]
-        models: list[tuple[int, LinkBase]] = [(0, first), *scheduled_links(self.timeline, name)]
+        first_link = self.links[name]
+        later_links = scheduled_links(self.timeline, name)
+        links: list[tuple[int, LinkBase]] = [(0, first_link), *later_links]
+        peer_index = self.names.index(peer)
+        speed_limit: tuple[float, ...] = ()
+        if self.sites[site].on_stale.action == "glide":
+            speed_limit = self._speed_limit(peer)
         return site_setup.LinkSetup(
             peer=peer,
             alpha=self.dominance[site].get(peer, 0.0),
             rate_hz=self.sites[peer].rate_hz,
             q0=self.arms[peer].shared_pose(self.sites[peer].q0_rad),
             key=link_key(self.seed, name),
-            models=tuple(link.to_core_model(from_ns) for from_ns, link in models),
-            traces=tuple(link.points for _, link in models),
-            outages=tuple((round(a * 1e9), round(b * 1e9)) for a, b in first.outages_s),
+            models=tuple(link.to_core_model(from_ns) for from_ns, link in links),
+            traces=tuple(link.points for _, link in links),
+            outages=tuple(
+                (round(start_s * 1e9), round(end_s * 1e9))
+                for start_s, end_s in first_link.outages_s
+            ),
             channel=self.channel(peer),
             index_at_peer=self.peers(peer).index(site),
-            speed_limit=self._speed_limit(peer)
-            if self.sites[site].on_stale.action == "glide"
-            else (),
-            bit=1 << self.names.index(peer),
-            followed=sum(
-                1 << n
-                for n, share in enumerate(self.alpha[self.names.index(peer)])
-                if share > 0.0
-            ),
+            speed_limit=speed_limit,
+            bit=1 << peer_index,
+            followed=self._followed_sites(peer_index),
             dispensable=self.sites[peer].role == "master",
         )
 
+    def _followed_sites(self, index: int) -> int:
+        """Returns the set of sites that a site follows, as bits."""
+        return sum(1 << n for n, share in enumerate(self.alpha[index]) if share > 0.0)
+
     def _speed_limit(self, site: str) -> tuple[float, ...]:
-        """Returns the largest speed of a site's joints, rad/s; () if peers do not get their
-        angles.
+        """Returns the largest speed of each joint of a site, rad/s.
+
+        The result is () if the sites do not share joint angles.
         """
         spec = self.sites[site]
         joints = self.arms[site].counts.joints
@@ -620,21 +673,29 @@ class Scenario(Frozen, frozen=True, dict=True):
     def ramp(
         self, site: str, shares: dict[str, float], start_ns: int, ramp_s: float
     ) -> DominanceRamp:
-        """Returns a change of a site's dominance factors, as the core has it."""
+        """Returns a change of a site's dominance factors in the form of the core.
+
+        Args:
+            site: the site.
+            shares: its dominance factors after the change, by peer.
+            start_ns: when the change begins, ns since the epoch.
+            ramp_s: how long the change lasts, s.
+        """
         alpha = tuple(shares.get(peer, 0.0) for peer in self.peers(site))
         return DominanceRamp(start_ns, start_ns + round(ramp_s * 1e9), alpha)
 
     def scripted_ramps(self, site: str) -> list[DominanceRamp]:
-        """Returns the changes of a site's dominance factors on the timeline, as the core has
-        them.
-        """
-        changes = [change for change in self.timeline if change.dominance == site]
-        return [self.ramp(site, one.to, one.start_ns, one.ramp_s) for one in changes]
+        """Returns the changes of a site's dominance factors on the timeline."""
+        return [
+            self.ramp(site, change.to, change.start_ns, change.ramp_s)
+            for change in self.timeline
+            if change.dominance == site
+        ]
 
     def without_hands(self) -> "Scenario":
         """Returns the same experiment without operators."""
         sites = {
             name: msgspec.structs.replace(spec, hands=()) for name, spec in self.sites.items()
         }
-        drawn = {key: one for key, one in self.drawn.items() if ".hands." not in key}
+        drawn = {key: origin for key, origin in self.drawn.items() if ".hands." not in key}
         return msgspec.structs.replace(self, sites=sites, drawn=drawn)

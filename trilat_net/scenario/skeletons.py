@@ -1,8 +1,9 @@
-"""Skeletons of code of one's own: a law, a hand or a plant that works, with comments, and its
-test.
+"""Skeletons of users' code: a law, a hand or a plant that works, and its test.
 
-Invariant: a skeleton is a file of this package, as `scenarios/_law.txt`; mylaw.py gets the
-class MyLaw. What is written runs as it is, and its test passes.
+Invariant:
+    - A skeleton is a file of this package, such as `scenarios/_law.txt`. The file mylaw.py gets
+      the class MyLaw.
+    - The code that is written runs as it is, and its test passes.
 """
 
 import keyword
@@ -16,14 +17,17 @@ from .resolve import SHIPPED_FOLDER
 
 
 def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes the skeleton of a law, and its test beside it; the command is `trilat new law`.
+    """Writes the skeleton of a law and its test; the command is `trilat new law`.
 
     >>> [path.name for path in tn.new_law("mylaw.py")]
     ['mylaw.py', 'test_mylaw.py']
 
     Args:
-        path: the file, whose name becomes that of the module: mylaw.py has the class MyLaw.
+        path: the file; its name becomes that of the module, and mylaw.py has the class MyLaw.
         force: whether files of these names may be replaced.
+
+    Returns:
+        The files that were written.
 
     Raises:
         UsageError: a file exists, or Python would find another module by that name.
@@ -32,8 +36,9 @@ def new_law(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes the skeleton of a hand, a program that acts as a user, as `new_law`: `trilat new
-    hand`.
+    """Writes the skeleton of a hand and its test; the command is `trilat new hand`.
+
+    A hand is a program that acts as a user. The arguments are those of `new_law`.
 
     >>> [path.name for path in tn.new_hand("myhand.py")]
     ['myhand.py', 'test_myhand.py']
@@ -42,7 +47,9 @@ def new_hand(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
-    """Writes the skeleton of a plant, which moves an arm, as `new_law`: `trilat new plant`.
+    """Writes the skeleton of a plant and its test; the command is `trilat new plant`.
+
+    A plant moves an arm. The arguments are those of `new_law`.
 
     >>> [path.name for path in tn.new_plant("myplant.py")]
     ['myplant.py', 'test_myplant.py']
@@ -51,26 +58,35 @@ def new_plant(path: str | Path, *, force: bool = False) -> list[Path]:
 
 
 def _write_skeleton(kind: str, file: Path, *, force: bool) -> list[Path]:
+    """Writes the skeleton of a law, hand or plant and its test; returns the two files."""
     module = file.stem
     if file.suffix != ".py" or not module.isidentifier() or keyword.iskeyword(module):
-        named = f"my{kind}.py or my_{kind}.py"
-        raise UsageError(f"{file}: a {kind} is in a Python module, whose name is as in {named}")
-    files = {file: f"_{kind}.txt", file.with_name(f"test_{file.name}"): f"_{kind}_test.txt"}
-    for one in files:
-        refuse_existing(one, force=force)
-    known = find_spec(module)
-    if known is not None and not (
-        known.origin and file.exists() and file.samefile(known.origin)
-    ):
-        raise UsageError(f"{file}: Python has a module {module} already; choose another name")
-    for one, template in files.items():
+        examples = f"my{kind}.py or my_{kind}.py"
+        raise UsageError(
+            f"{file}: a {kind} is in a Python module, whose name is as in {examples}"
+        )
+    templates = {
+        file: f"_{kind}.txt",
+        file.with_name(f"test_{file.name}"): f"_{kind}_test.txt",
+    }
+    for new_file in templates:
+        refuse_existing(new_file, force=force)
+    spec = find_spec(module)
+    if spec is not None:
+        is_this_file = spec.origin is not None and file.exists() and file.samefile(spec.origin)
+        if not is_this_file:
+            raise UsageError(
+                f"{file}: Python has a module {module} already; choose another name"
+            )
+    for new_file, template in templates.items():
         text = (SHIPPED_FOLDER / template).read_text(encoding="utf-8")
-        named = text.replace(f"My{kind.title()}", name_skeleton_class(module, kind))
-        write_whole(one, named.replace(f"my{kind}", module), force=force)
-    return list(files)
+        text = text.replace(f"My{kind.title()}", name_skeleton_class(module, kind))
+        text = text.replace(f"my{kind}", module)
+        write_whole(new_file, text, force=force)
+    return list(templates)
 
 
 def name_skeleton_class(module: str, kind: str = "law") -> str:
     """Returns the class of a module's skeleton: MyLaw of mylaw and my_law, Spring of spring."""
-    words = re.sub(rf"(?<=[a-z0-9]){kind}$", f"_{kind}", module).split("_")
-    return "".join(word[:1].upper() + word[1:] for word in words) or kind.title()
+    parts = re.sub(rf"(?<=[a-z0-9]){kind}$", f"_{kind}", module).split("_")
+    return "".join(part[:1].upper() + part[1:] for part in parts) or kind.title()

@@ -343,8 +343,8 @@ def _parse_xml(text: str) -> Element:
             tag = element.tag.rpartition("}")[2]
             _refuse(
                 f"<{tag[:_MAX_QUOTED_LENGTH]}>",
-                "is xacro, a template of URDF: expand it with "
-                "`xacro FILE.urdf.xacro > FILE.urdf`",
+                "is xacro, a template of URDF: expand it with `xacro FILE.urdf.xacro > "
+                "FILE.urdf`",
             )
     if root.tag != "robot":
         tag = root.tag[:_MAX_QUOTED_LENGTH]
@@ -385,7 +385,7 @@ def _read_tree(root: Element) -> _Robot:
             _refuse(
                 _link(edge.child),
                 f"hangs on two joints, {_quote(above[edge.child].name)} and {_quote(name)}: "
-                "a closed loop is no arm of this program; leave out one of them",
+                "closed loops are not supported; leave out one of the two joints",
             )
         above[edge.child] = edge
         below[edge.parent].append(edge)
@@ -417,7 +417,8 @@ def _read_edge(name: str, element: Element, links: Mapping[str, Element]) -> _Ed
         if end not in links:
             hint = suggest_nearest(end, list(links))
             _refuse(
-                subject, f"its <{tag}> is {_link(end)}, and there is none of that name{hint}"
+                subject,
+                f"its <{tag}> is {_link(end)}, and there is no link of that name{hint}",
             )
         ends.append(end)
     return _Edge(name=name, kind=kind, parent=ends[0], child=ends[1], element=element)
@@ -489,15 +490,13 @@ def _find_path(robot: _Robot, base: str, tip: str) -> list[_Edge]:
             _refuse(
                 _joint(edge.name),
                 f"is {edge.kind}: joints of an arm are revolute, continuous, prismatic or "
-                "fixed; "
-                f"give a base behind it, such as {_quote(edge.child)}",
+                f"fixed; give a base behind it, such as {_quote(edge.child)}",
             )
         if edge.element.find("mimic") is not None:
             _refuse(
                 _joint(edge.name),
                 "follows another joint (<mimic>), which has no torque of its own: make it "
-                "fixed, or give a "
-                f"tip before it, such as {_quote(edge.parent)}",
+                f"fixed, or give a tip before it, such as {_quote(edge.parent)}",
             )
     moving = sum(edge.moves for edge in path)
     if not 1 <= moving <= MAX_JOINTS:
@@ -962,7 +961,7 @@ def _find_moments_problem(moments: Sequence[float], bound: float, slack: float) 
     if least < bound:
         return f"{stated}, and all must be positive"
     if most - least - middle > slack:
-        return f"{stated}, and of a body, no one is more than the two others together"
+        return f"{stated}, and none of a body's moments exceeds the sum of the other two"
     return ""
 
 

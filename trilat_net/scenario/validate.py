@@ -54,14 +54,13 @@ def refuse_external_arms(scenario: Scenario, exempt: Collection[str] = ()) -> No
         if name in exempt:
             continue
         problem = (
-            "is a plant of one's own, which moves in `trilat sim` and live, and not here: "
-            "plant = 'simulated' takes the arm of the scenario"
+            "is a user's own plant, which runs in `trilat sim` and live, but not here: "
+            "plant = 'simulated' uses the arm of the scenario"
         )
         if name in scenario.outside:
             problem = (
                 "is external: that arm is outside of the program, and such a scenario runs "
-                "live only; "
-                "plant = 'simulated' runs it in virtual time"
+                "live only; plant = 'simulated' runs it in virtual time"
             )
         raise ScenarioError(problem, path=f"sites.{name}.plant", source=scenario.name)
 
@@ -86,16 +85,16 @@ def check_outside_arms(scenario: Scenario) -> None:
                 raise ScenarioError(
                     "is missing: an arm outside of the program needs limits of its position "
                     "(q_min_rad, q_max_rad), its reference (qd_des_limit_rad_s) and the rate "
-                    "of its torque "
-                    "(tau_rate_limit_nm_s), besides tau_limit_nm and qd_limit_rad_s",
+                    "of its torque (tau_rate_limit_nm_s), besides tau_limit_nm and "
+                    "qd_limit_rad_s",
                     path=f"sites.{name}.limits.{key}",
                     source=scenario.name,
                 )
         if site.on_stale.action != "glide":
             raise ScenarioError(
                 f"is {site.on_stale.action!r}, and an arm outside of the program needs "
-                "'glide': only so does "
-                f"its site wait, hold and stop without a jump ({find_page('links.md')})",
+                "'glide': its site then waits, holds and stops without a jump "
+                f"({find_page('links.md')})",
                 path=f"sites.{name}.on_stale.action",
                 source=scenario.name,
             )
@@ -114,8 +113,7 @@ def refuse_live_only(scenario: Scenario) -> None:
         path = f"links.{measured_links[0]}.model" if measured_links else "timeline"
         raise ScenarioError(
             "is measured: that is the delay of a real network, and such a scenario runs live "
-            "only; give it a "
-            "model, as in link.model=constant and link.delay_ms=50",
+            "only; give it a model, as in link.model=constant and link.delay_ms=50",
             path=path,
             source=scenario.name,
         )
@@ -146,10 +144,9 @@ def check_law(name: str, site: SiteSpec, sites: int) -> None:
     feeds_gravity = getattr(law, "gravity", 0.0) * site.arm.g_m_s2 > 0.0
     if not site.arm.known and not learns_arm and feeds_gravity:
         raise ScenarioError(
-            f"{law.tag} takes gravity from the arm's masses, which are unknown "
-            "(arm.known = false): set gravity = 0 if the arm carries itself, arm.g_m_s2 = 0 if "
-            "it moves in a "
-            "horizontal plane, or choose adaptive, which learns it",
+            f"{law.tag} takes gravity from the arm's masses, which are unknown (arm.known = "
+            "false): set gravity = 0 if the arm carries itself, arm.g_m_s2 = 0 if it moves in "
+            "a horizontal plane, or choose adaptive, which learns it",
             path=f"{path}.control.gravity",
         )
 
@@ -160,8 +157,7 @@ def _check_plant(path: str, site: SiteSpec) -> None:
     if not site.arm.known and not external:
         raise ScenarioError(
             "a simulated arm moves by its masses: leave it true, or set plant = 'external' for "
-            "an arm "
-            "outside of the program",
+            "an arm outside of the program",
             path=f"{path}.arm.known",
         )
     if site.arm.dead_man and site.plant != "external":
@@ -175,7 +171,8 @@ def _check_plant(path: str, site: SiteSpec) -> None:
     for group in ("hands", "environment"):
         if getattr(site, group):
             raise ScenarioError(
-                "an arm outside of the program, or of a plant of one's own, is pushed there: "
+                "an arm that is outside of the program, or a user's own plant, is pushed "
+                "there: "
                 "leave them out",
                 path=f"{path}.{group}",
             )
@@ -280,16 +277,15 @@ def _check_joint_space(scenario: Scenario) -> None:
         if spaces[name] == "joints" and joints != joint_counts[first]:
             raise ScenarioError(
                 f"its arm has {count_nouns(joints, 'joint')}, and that of {first} has "
-                f"{joint_counts[first]}: joint angles are "
-                "compared one by one, so all arms need as many joints, or a task (task.space)",
+                f"{joint_counts[first]}: joint angles are compared one by one, so all arms "
+                "need the same number of joints, or a task (task.space)",
                 path=f"sites.{name}.arm",
             )
         law = scenario.sites[name].control
         if scenario.arms[name].chain is not None and law.planar:
             raise ScenarioError(
                 f"{law.tag} has the regressor of the planar arm of two links, and this arm is "
-                "a chain: "
-                "choose adaptive",
+                "a chain: choose adaptive",
                 path=f"sites.{name}.control.law",
             )
 
@@ -335,10 +331,8 @@ def _check_damping(scenario: Scenario) -> None:
             worst = int(np.argmax(np.abs(modes[:, -1])))
             raise ScenarioError(
                 f"damps joint {model.joint_names[worst]} by {damping[worst]:g} N m s/rad in "
-                "all, "
-                f"{ratio / limit:.3g} times what its inertia can take at "
-                f"{site.rate_hz} Hz: lower Kp, Kd or d there, raise rate_hz, or state the "
-                "drive's "
+                f"all, {ratio / limit:.3g} times what its inertia can take at {site.rate_hz} "
+                "Hz: lower Kp, Kd or d there, raise rate_hz, or state the drive's "
                 "armature_kg_m2",
                 path=f"sites.{name}.control",
             )
@@ -354,8 +348,7 @@ def _check_received(scenario: Scenario) -> None:
                 if first_length != length:
                     raise ScenarioError(
                         f"has {count_nouns(length, 'number')}, and {name} of {first} has "
-                        f"{first_length}; {site} gets both: give "
-                        "them one length or two names",
+                        f"{first_length}; {site} gets both: give them one length or two names",
                         path=f"sites.{peer}.control.sends.{name}",
                     )
 
@@ -381,13 +374,15 @@ def _check_energy_law(
     for other_name, other_law in laws.items():
         if type(other_law) is not type(law):
             raise ScenarioError(
-                f"{name} has {tag}, of which all sites are an end: choose {tag} here, or "
-                "another there",
+                f"{name} has {tag}, which all sites must have: choose {tag} here, or another "
+                "law "
+                f"at {name}",
                 path=f"sites.{other_name}.control.law",
             )
     if scheme not in law.kind.schemes:
         raise ScenarioError(
-            f"is {scheme!r}, and {tag} books the torque of a tick as held: choose 'digital'",
+            f"is {scheme!r}, and {tag} computes energies for a torque that is held during a "
+            "tick: choose 'digital'",
             path="scheme",
         )
     problem = law.find_problem(rates_hz)
@@ -411,8 +406,7 @@ def _check_start_poses(scenario: Scenario) -> None:
             drawn = f", drawn with seed {scenario.seed}" if is_drawn else ""
             raise ScenarioError(
                 f"is {start:g} {unit}{drawn}, beyond a stop of joint {model.joint_names[n]}, "
-                "which moves "
-                f"from {joint.lower:g} to {joint.upper:g} {unit}: start at most "
+                f"which moves from {joint.lower:g} to {joint.upper:g} {unit}: start at most "
                 f"{start_margin(joint):g} {unit} beyond, or set stops = false",
                 path=path,
             )
@@ -428,7 +422,7 @@ def _check_limits(scenario: Scenario, name: str) -> None:
     for key in ("q_min_rad", "q_max_rad"):
         if getattr(site.limits, key) is not None and site.on_stale.action != "glide":
             raise ScenarioError(
-                "is kept under on_stale.action = 'glide' alone, and here that is "
+                "applies only with on_stale.action = 'glide', and here that is "
                 f"{site.on_stale.action!r}",
                 path=f"{path}.{key}",
             )
@@ -440,8 +434,7 @@ def _check_limits(scenario: Scenario, name: str) -> None:
         joint = int(np.argmax(is_beyond))
         raise ScenarioError(
             f"is {start[joint]:g} rad, beyond q_min_rad or q_max_rad: start at most "
-            f"{START_MARGIN_RAD:g} rad "
-            f"({START_MARGIN_M:g} m of a sliding joint) beyond",
+            f"{START_MARGIN_RAD:g} rad ({START_MARGIN_M:g} m of a sliding joint) beyond",
             path=f"sites.{name}.q0_rad[{joint}]",
         )
 
@@ -466,8 +459,7 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
         if np.abs(row).max() < RANK_TOLERANCE:
             raise ScenarioError(
                 f"has {axis}, along which no joint moves the end effector from its start pose: "
-                "name the "
-                "axes that the site shall follow, or start elsewhere (q0_rad)",
+                "name the axes that the site shall follow, or start elsewhere (q0_rad)",
                 path=path,
             )
     if len(followed) > joints:
@@ -486,8 +478,7 @@ def _check_task_pose(scenario: Scenario, name: str) -> None:
         )
         raise ScenarioError(
             f"is a singular pose: its end effector cannot move along {lost_direction}; bend a "
-            "joint, or follow "
-            "fewer axes (task.axes)",
+            "joint, or follow fewer axes (task.axes)",
             path=f"sites.{name}.q0_rad",
         )
 
@@ -513,9 +504,8 @@ def _check_hands(site: SiteSpec, path: str) -> None:
     ]
     if live_hands and site.plant != "simulated":
         raise ScenarioError(
-            "is a live hand, and the arm is outside of the program, or a plant of one's own: "
-            "who holds that "
-            "arm is measured there, as tau_x of its measurements",
+            "is a live hand, and the arm is outside of the program, or a user's own plant: the "
+            "torque of a person who holds such an arm is measured, as tau_x",
             path=f"{path}[{live_hands[0]}].kind",
         )
     if len(live_hands) > 1:
@@ -542,8 +532,8 @@ def check_links_memory(scenario: Scenario, site: str) -> None:
     if size_bytes > MAX_LINKS_BYTES:
         raise ScenarioError(
             f"its links would take {size_bytes / 2**20:.0f} MiB, at most "
-            f"{MAX_LINKS_BYTES >> 20} are given: "
-            "shorten the delays, lower rate_hz, or have fewer sites",
+            f"{MAX_LINKS_BYTES >> 20} MiB are allowed: shorten the delays, lower rate_hz, or "
+            "have fewer sites",
             path=f"sites.{site}",
         )
 
@@ -588,15 +578,14 @@ def _check_lost(scenario: Scenario) -> None:
     for name in degrading:
         if scenario.sites[name].on_stale.action != "glide":
             raise ScenarioError(
-                "degrade is of on_stale.action = 'glide' alone: only so does a reference not "
-                "jump",
+                "degrade needs on_stale.action = 'glide': otherwise a reference would jump",
                 path=f"sites.{name}.on_stale.on_lost",
             )
     if degrading and not any(_can_lose_master(scenario, name) for name in degrading):
         raise ScenarioError(
-            "no master can be lost: a site goes on without one only if it follows another one, "
-            "and if those "
-            "that are left all reach each other (a chain of shares above 0 from each to each)",
+            "no master can be lost: a site goes on without a master only if it follows another "
+            "site as well, and if the remaining sites all reach each other (through shares "
+            "above 0)",
             path=f"sites.{degrading[0]}.on_stale.on_lost",
         )
 

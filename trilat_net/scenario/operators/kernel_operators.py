@@ -402,8 +402,8 @@ def _check_frame(frame: list[Any], axes: int, path: str) -> None:
     lines.discard(())
     if not len(frame) == axes == len(lines):
         expected = (
-            f"one of {', '.join(DIRECTIONS)} for each of "
-            f"{count_nouns(axes, 'axis')}, and no two of one line"
+            f"one of {', '.join(DIRECTIONS)} for each of {count_nouns(axes, 'axis')}, and no "
+            "two of one line"
         )
         raise ScenarioError(f"must be {expected}, is {frame}", path=path)
 
