@@ -690,10 +690,15 @@ def _complete_link(
 
 
 def resolve_link(written: Any, base: TomlTable, path: str) -> TomlTable:
-    """Returns a link: the written keys upon those of its base.
+    """Returns a link: its written keys, and all other keys from its base.
 
-    A link that names a model or a preset starts from the preset, or from nothing, instead of
-    its base. The file of a trace is not read yet.
+    A link that names a preset takes the other keys from the preset, and a link that names a
+    model takes none. The file of a trace is not read yet.
+
+    Args:
+        written: the table of the link as its author wrote it.
+        base: a resolved link.
+        path: the path of the table in errors.
     """
     if not isinstance(written, dict):
         raise ScenarioError("must be a table", path=path)
@@ -751,7 +756,8 @@ def _read_trace_file(link: TomlTable, name: str, path: str, folder: Path | None)
 def resolve_timeline(written: Any, links: TomlTable, names: list[str]) -> list[TomlTable]:
     """Returns the changes of the timeline, each complete in itself.
 
-    A change of a link states the whole link, completed upon the changes before it.
+    A change of a link states the whole link: keys that it leaves out are those after the
+    changes before it.
 
     Args:
         written: the author's list of changes.

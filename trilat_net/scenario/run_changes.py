@@ -3,7 +3,7 @@
 Orders to a site (stop, enable, reset, …) are changes as well.
 
 Invariant:
-    - A change is completed upon the state before it, and its text in a record is the whole
+    - A change is completed with the state before it, and its text in a record is the whole
       change. Every reader therefore derives the same `CoreChange` from a record.
 """
 
