@@ -91,7 +91,7 @@ class HandServer:
             memory=self._memory,
             t_ns=t_ns,
             commands=commands,
-            place=self._place,
+            locate=self._place,
         )
         self._memory = step.memory
         for reason in step.refused:

@@ -123,7 +123,7 @@ def test_names_of_several_senders_are_joined() -> None:
 REFUSED = {
     "CallsPlain": r"it uses plain \(line \d+\), which is neither a number nor a function with @tri",
     "CallsMethod": "it calls its method double: use a function with @trilat_net.compiled",
-    "ReadsText": "self.name is a str: a number, or a list of numbers of fixed length, is taken",
+    "ReadsText": "self.name is a str: a number, or a list of numbers of fixed length, is accepted",
     "ReadsNothing": "self.gain is no attribute of it",
     "MakesList": r"it makes an array or a list \(line \d+\): arithmetic goes number by number, as in now",
     "Returns": "torque returns something: compiled, it writes now.tau instead",

@@ -1,26 +1,27 @@
-"""A serial chain of revolute and prismatic joints: kinematics, inverse and forward dynamics, by
-recursion.
+"""A serial chain of revolute and prismatic joints: kinematics and dynamics by recursion.
 
-Invariant: nothing is allocated, and every sum has a fixed order. Each link has ten inertial
-parameters, pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) about the origin of its own frame, in
-which all dynamics are linear; theta is theirs one after the other, shape (10 n,). A link's
-frame is that of its joint, whose axis is constant in it. Of a spatial vector the linear half
-comes first, at the frame's origin.
+Each link has ten inertial parameters, pi = (m, m c, Ixx, Ixy, Iyy, Ixz, Iyz, Izz), about the
+origin of its own frame. All dynamics are linear in them; theta lists the parameters of one link
+after the other, shape (10 n,). A link's frame is that of its joint, and the joint's axis is
+constant in this frame. A spatial vector has its linear half first, at the frame's origin.
 
-Equations: Newton-Euler recursion with the two velocities that Eq. (12) of the paper needs
-apart,
+The Newton-Euler recursion uses two separate velocities, as Eq. (12) of the paper requires:
 
     V_i = X V_p + S qd      W_i = X W_p + S v      A_i = X A_p + S a + V_i x (S v)
     f_i = I A_i + 1/2 (V_i x* I W_i + W_i x* I V_i - I (V_i x W_i))      tau_i = S' f_i
 
-whose product of velocities is the one by Christoffel symbols, so that dM/dt - 2 C is skew, Eq.
-(4). With s = V - W the gradient of r' tau by pi is Y' r of Eq. (15), link by link, without a
-regressor.
+This product of velocities corresponds to the Christoffel symbols, so that dM/dt - 2 C is skew,
+Eq. (4). With s = V - W, the gradient of r' tau with respect to pi is Y' r of Eq. (15), which is
+computed link by link without a regressor.
 
 Source: R. Featherstone, "Rigid Body Dynamics Algorithms" (2008), for spatial vectors,
 Newton-Euler and composite bodies; G. Niemeyer and J.-J. Slotine, "Performance in adaptive
 manipulator control", Int. J. Robotics Research 10 (1991), for the recursion of the adaptive
 law.
+
+Invariant:
+    - Functions of the kernel allocate nothing.
+    - Each sum has a fixed order.
 """
 
 from collections.abc import Sequence
@@ -37,30 +38,28 @@ from .vectors import Array, Row, RowArray, Vector
 LINK_PARAMETERS = 10
 MAX_JOINTS = 12
 COULOMB_SPEED = 0.01
-"""The speed, rad/s or m/s, at which Coulomb friction has 71 % of its full size: it is smooth
-through 0.
-"""
+"""Speed at which the smoothed Coulomb friction has 71 % of its full value, rad/s or m/s."""
 
 Three = tuple[float, float, float]
 Matrix = tuple[Three, Three, Three]
 
 
 class ChainJoint(NamedTuple):
-    """One joint of a chain; the parameters of the link that it moves stand in theta.
+    """One joint of a chain; theta contains the parameters of the link that it moves.
 
     Attributes:
-        prismatic: true: it slides (m, N), else it turns (rad, N m).
-        axis: of motion, length 1, in the link's frame.
-        rotation: orientation of the link's frame in that of the link before, at position 0:
+        prismatic: true: the joint slides (m, N); false: it turns (rad, N m).
+        axis: axis of motion in the link's frame, length 1.
+        rotation: orientation of the link's frame in the previous link's frame at position 0,
             three rows.
-        origin_m: its place there.
-        armature_kg_m2: inertia of the drive as the joint has it; kg of a prismatic joint.
+        origin_m: origin of the link's frame in the previous link's frame, m.
+        armature_kg_m2: inertia of the drive at the joint, kg m^2; kg for a prismatic joint.
         viscous: friction per speed, N m s/rad or N s/m.
         coulomb: friction that hardly depends on the speed, N m or N, see `COULOMB_SPEED`.
-        lower: position of its lower stop, rad or m; -inf: it has none.
-        upper: position of its upper stop; inf: it has none.
-        stop_stiffness: of both stops, N m/rad or N/m.
-        stop_damping: of both, N m s/rad or N s/m.
+        lower: position of the lower stop, rad or m; -inf without a stop.
+        upper: position of the upper stop, rad or m; inf without a stop.
+        stop_stiffness: stiffness of both stops, N m/rad or N/m.
+        stop_damping: damping of both stops, N m s/rad or N s/m.
     """
 
     prismatic: bool
@@ -91,52 +90,50 @@ _TIP = ("J_lin", "J_ang", "p_base", "axis_base")
 
 @cache
 def chain_dtype(joints: int) -> np.dtype[np.void]:
-    """Returns the layout of a chain of so many joints: a row each, of constants and of work
-    space.
+    """Returns the layout of a joint's row, with constants and work space.
+
+    Args:
+        joints: the number of joints of the chain.
     """
-    return np.dtype(
-        (
-            np.record,
-            [
-                ("prismatic", "i8"),
-                *(
-                    (name, "f8", (3, 3))
-                    for name in ("at_rest", "by_sine", "by_cosine", "R", "R_base")
-                ),
-                *(
-                    (name, "f8", (3,))
-                    for name in ("axis", "origin", "slide", "p", *_MOTIONS, *_TIP)
-                ),
-                *((name, "f8") for name in (*_DRIVE, "bias")),
-                ("composite", "f8", (LINK_PARAMETERS,)),
-                ("M", "f8", (joints,)),
-            ],
-        )
-    )
+    matrices = ("at_rest", "by_sine", "by_cosine", "R", "R_base")
+    vectors = ("axis", "origin", "slide", "p", *_MOTIONS, *_TIP)
+    numbers = (*_DRIVE, "bias")
+    fields: list[Any] = [("prismatic", "i8")]
+    fields += [(name, "f8", (3, 3)) for name in matrices]
+    fields += [(name, "f8", (3,)) for name in vectors]
+    fields += [(name, "f8") for name in numbers]
+    fields.append(("composite", "f8", (LINK_PARAMETERS,)))
+    fields.append(("M", "f8", (joints,)))
+    return np.dtype((np.record, fields))
 
 
 def build_chain(joints: Sequence[ChainJoint], width: int = 0) -> RowArray:
-    """Returns the rows of a chain, shape (n,), see `chain_dtype`, which may be of a longer
-    chain.
+    """Returns the rows of a chain, shape (n,), see `chain_dtype`.
 
-    The rotation of a joint is F + sin q F [a] + (1 - cos q) F [a]^2 (Rodrigues), three constant
-    matrices.
+    The rotation of a joint by the angle q about its axis a (Rodrigues) uses three constant
+    matrices, where F is the rotation at q = 0:
+
+        R = F + sin(q) F [a] + (1 - cos(q)) F [a]^2
+
+    Args:
+        joints: the joints.
+        width: number of joints for which the rows have room; by default that of the chain.
     """
     rows = np.zeros(len(joints), chain_dtype(width or len(joints)))
     row: Row
     for row, joint in zip(rows, joints, strict=True):
         x, y, z = joint.axis
-        across = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
-        turned = joint.rotation
+        cross_matrix = ((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0))
         row.prismatic = int(joint.prismatic)
         row.axis = joint.axis
         row.origin = joint.origin_m
-        row.at_rest = turned
+        row.at_rest = joint.rotation
         if joint.prismatic:
-            row.slide = apply(turned, joint.axis)
+            row.slide = apply(joint.rotation, joint.axis)
         else:
-            row.by_sine = by_sine = multiply(turned, across)
-            row.by_cosine = multiply(by_sine, across)
+            by_sine = multiply(joint.rotation, cross_matrix)
+            row.by_sine = by_sine
+            row.by_cosine = multiply(by_sine, cross_matrix)
         for name in _DRIVE:
             row[name] = getattr(joint, name)
     return rows
@@ -156,14 +153,17 @@ def put_three(a: Array, values: Three) -> None:
 
 @leaf
 def dot(a: Three, b: Three) -> float:
-    """Returns the scalar product."""
+    """Returns the scalar product a' b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @leaf
 def cross(a: Three, b: Three) -> Three:
     """Returns the vector product a x b."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+    x = a[1] * b[2] - a[2] * b[1]
+    y = a[2] * b[0] - a[0] * b[2]
+    z = a[0] * b[1] - a[1] * b[0]
+    return x, y, z
 
 
 @leaf
@@ -180,7 +180,7 @@ def subtract(a: Three, b: Three) -> Three:
 
 @leaf
 def scale(factor: float, a: Three) -> Three:
-    """Returns a number times a vector."""
+    """Returns factor * a."""
     return factor * a[0], factor * a[1], factor * a[2]
 
 
@@ -215,33 +215,43 @@ def apply(a: Matrix, b: Three) -> Three:
 
 
 def multiply(a: Matrix, b: Matrix) -> Matrix:
-    """Returns a b by sums in a fixed order; those of a library may differ in the last bit."""
+    """Returns the product a b of two matrices.
+
+    The sums have a fixed order. The sums of a library may differ in the last bit.
+    """
     columns = tuple(zip(*b, strict=True))
-    rows: Any = tuple(tuple(x * u + y * v + z * w for u, v, w in columns) for x, y, z in a)
-    return rows  # type: ignore[no-any-return]
+    rows: list[Any] = []
+    for x, y, z in a:
+        rows.append(tuple(x * u + y * v + z * w for u, v, w in columns))
+    return tuple(rows)  # type: ignore[return-value]
 
 
 @leaf
 def place_joints(chain: RowArray, q: Vector) -> None:
-    """Writes R and p of every link in the frame of the link before, at positions q."""
+    """Writes R and p of each link in the previous link's frame, at joint positions q."""
     for i in range(chain.shape[0]):
         row: Row = chain[i]
-        s = c = 0.0
+        sine = 0.0
+        versine = 0.0
         if row.prismatic == 0:
-            s, c = sincos(q[i])
-            c = 1.0 - c
+            sine, cosine = sincos(q[i])
+            versine = 1.0 - cosine
         for j in range(3):
             for k in range(3):
-                row.R[j, k] = (
-                    row.at_rest[j, k] + s * row.by_sine[j, k] + c * row.by_cosine[j, k]
-                )
+                turn = row.at_rest[j, k] + sine * row.by_sine[j, k]
+                row.R[j, k] = turn + versine * row.by_cosine[j, k]
             row.p[j] = row.origin[j] + q[i] * row.slide[j]
 
 
 @leaf
 def _move(row: Row, linear: Three, angular: Three, rate: float) -> tuple[Three, Three]:
-    """Returns X V_p + S rate: a spatial velocity of the link before, in this frame, and the
-    joint's.
+    """Returns X V_p + S rate, a spatial velocity of a link from that of the previous link.
+
+    Args:
+        row: the joint's row.
+        linear: linear half of V_p, in the previous link's frame.
+        angular: angular half of V_p, in the previous link's frame.
+        rate: velocity of the joint.
     """
     lin = rotate_back(row.R, add(linear, cross(angular, three(row.p))))
     ang = rotate_back(row.R, angular)
@@ -252,7 +262,14 @@ def _move(row: Row, linear: Three, angular: Three, rate: float) -> tuple[Three, 
 
 @leaf
 def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> tuple[Three, Three]:
-    """Returns I(pi) times a spatial velocity, pi beginning at index `first`."""
+    """Returns the spatial momentum I(pi) V.
+
+    Args:
+        pi: inertial parameters of the links.
+        first: index of the link's first parameter.
+        linear: linear half of V.
+        angular: angular half of V.
+    """
     mc = (pi[first + 1], pi[first + 2], pi[first + 3])
     xx = pi[first + 4]
     xy = pi[first + 5]
@@ -260,23 +277,26 @@ def _momentum(pi: Vector, first: int, linear: Three, angular: Three) -> tuple[Th
     xz = pi[first + 7]
     yz = pi[first + 8]
     zz = pi[first + 9]
-    turned = (
-        xx * angular[0] + xy * angular[1] + xz * angular[2],
-        xy * angular[0] + yy * angular[1] + yz * angular[2],
-        xz * angular[0] + yz * angular[1] + zz * angular[2],
-    )
-    return add(scale(pi[first], linear), cross(angular, mc)), add(cross(mc, linear), turned)
+    spin_x = xx * angular[0] + xy * angular[1] + xz * angular[2]
+    spin_y = xy * angular[0] + yy * angular[1] + yz * angular[2]
+    spin_z = xz * angular[0] + yz * angular[1] + zz * angular[2]
+    linear_momentum = add(scale(pi[first], linear), cross(angular, mc))
+    angular_momentum = add(cross(mc, linear), (spin_x, spin_y, spin_z))
+    return linear_momentum, angular_momentum
 
 
 @leaf
 def _along_axis(row: Row, linear: Three, angular: Three) -> float:
-    """Returns S' f: the part of a spatial force that a joint bears."""
+    """Returns S' f, the component of a spatial force along a joint's axis."""
     return dot(three(row.axis), angular if row.prismatic == 0 else linear)
 
 
 @leaf
 def friction_torque(row: Row, speed: float) -> float:
-    """Returns the torque that friction takes at a speed; it rises with the speed everywhere."""
+    """Returns the friction torque at a speed, N m or N; it increases with the speed.
+
+    f(v) = viscous v + coulomb x / sqrt(1 + x^2),    x = v / COULOMB_SPEED
+    """
     x = speed / COULOMB_SPEED
     torque: float = row.viscous * speed + row.coulomb * (x / sqrt(1.0 + x * x))
     return torque
@@ -284,7 +304,7 @@ def friction_torque(row: Row, speed: float) -> float:
 
 @leaf
 def _pass_force(row: Row, before: Row) -> None:
-    """Adds a link's force to that of the link before, in its frame."""
+    """Adds a link's spatial force to that of the previous link, in the previous frame."""
     linear = rotate(row.R, three(row.f_lin))
     angular = add(rotate(row.R, three(row.f_ang)), cross(three(row.p), linear))
     put_three(before.f_lin, add(three(before.f_lin), linear))
@@ -295,7 +315,7 @@ def _pass_force(row: Row, before: Row) -> None:
 def propagate_motion(
     chain: RowArray, gravity: Vector, qd: Vector, v: Vector, a: Vector
 ) -> None:
-    """Writes V, W and A of every link, after `place_joints`.
+    """Writes V, W and A of each link, after `place_joints`.
 
     Args:
         chain: the chain's rows.
@@ -341,11 +361,12 @@ def _force_cross(V: tuple[Three, Three], f: tuple[Three, Three]) -> tuple[Three,
 def inverse_dynamics(
     chain: RowArray, theta: Vector, v: Vector, a: Vector, torque: Array
 ) -> None:
-    """Writes M a + C(q, qd) v + G + armature a + friction(v), shape (n,), after
-    `propagate_motion`.
+    """Writes the torque of the inverse dynamics, shape (n,), after `propagate_motion`.
 
-    Friction at the reference velocity makes r' (friction(qd) - friction(v)) >= 0: it only ever
-    takes energy.
+        M a + C(q, qd) v + G + armature a + friction(v)
+
+    With friction at the reference velocity, r' (friction(qd) - friction(v)) >= 0: friction can
+    only dissipate energy.
     """
     n = chain.shape[0]
     for i in range(n):
@@ -374,7 +395,15 @@ def inverse_dynamics(
 def _add_products(
     factor: float, x: tuple[Three, Three], y: tuple[Three, Three], first: int, gradient: Array
 ) -> None:
-    """Adds factor times the gradient of x' I(pi) y by pi to ten entries of `gradient`."""
+    """Adds factor times the gradient of x' I(pi) y with respect to pi.
+
+    Args:
+        factor: the factor.
+        x: a spatial velocity.
+        y: a spatial velocity.
+        first: index of the link's first parameter.
+        gradient: changed in its ten entries from `first`.
+    """
     (x_lin, x_ang) = x
     (y_lin, y_ang) = y
     lever = add(cross(y_lin, x_ang), cross(x_lin, y_ang))
@@ -414,8 +443,9 @@ def parameter_gradient(chain: RowArray, gradient: Array) -> None:
 
 @leaf
 def _add_composite(row: Row, before: Row) -> None:
-    """Adds a composite body to the one of the link before, about the origin of that link's
-    frame.
+    """Adds a composite body to that of the previous link, about the previous link's origin.
+
+    The parallel-axis theorem is written out for the ten parameters of a body.
     """
     pi = row.composite
     total = before.composite
@@ -425,7 +455,8 @@ def _add_composite(row: Row, before: Row) -> None:
     h = rotate(R, (pi[1], pi[2], pi[3]))
     x = rotate(R, (pi[4], pi[5], pi[7]))
     y = rotate(R, (pi[5], pi[6], pi[8]))
-    z = rotate(R, (pi[7], pi[8], pi[9]))  # R I, by columns; I is symmetric
+    z = rotate(R, (pi[7], pi[8], pi[9]))
+    # x, y and z are the columns of R I; I is symmetric.
     I_x = rotate(R, (x[0], y[0], z[0]))
     I_y = rotate(R, (x[1], y[1], z[1]))
     I_z = rotate(R, (x[2], y[2], z[2]))
@@ -443,8 +474,9 @@ def _add_composite(row: Row, before: Row) -> None:
 
 @leaf
 def mass_matrix(chain: RowArray, theta: Vector) -> None:
-    """Writes M(q) with the drives' inertia, lower triangle, into the rows' `M`, after
-    `place_joints`.
+    """Writes M(q) with the drives' inertia into the rows' `M`, after `place_joints`.
+
+    Only the lower triangle is written. Method: composite rigid bodies (Featherstone).
     """
     n = chain.shape[0]
     for i in range(n):
@@ -471,7 +503,7 @@ def mass_matrix(chain: RowArray, theta: Vector) -> None:
 
 @leaf
 def _stop_torque(row: Row, q: float, qd: float) -> float:
-    """Returns the torque of a joint's stops on it: a spring and a damper that never pull."""
+    """Returns the torque of a joint's stops, a spring and a damper that never pull."""
     if q < row.lower:
         push: float = row.stop_stiffness * (row.lower - q) - row.stop_damping * qd
         return max(push, 0.0)
@@ -504,9 +536,8 @@ def _bias(chain: RowArray, theta: Vector, gravity: Vector, q: Vector, qd: Vector
         put_three(row.f_ang, add(f[1], turning[1]))
     for i in range(n - 1, -1, -1):
         row = chain[i]
-        row.bias = _along_axis(row, three(row.f_lin), three(row.f_ang)) + friction_torque(
-            row, qd[i]
-        )
+        rigid = _along_axis(row, three(row.f_lin), three(row.f_ang))
+        row.bias = rigid + friction_torque(row, qd[i])
         row.bias -= _stop_torque(row, q[i], qd[i])
         if i > 0:
             _pass_force(row, chain[i - 1])
@@ -522,8 +553,16 @@ def put_model(
     M: Array,
     bias: Array,
 ) -> None:
-    """Writes M, shape (n, n), and C qd + G + friction - stops, shape (n,), after
-    `place_joints`.
+    """Writes M and the bias torque C qd + G + friction - stops, after `place_joints`.
+
+    Args:
+        chain: the chain's rows.
+        theta: inertial parameters, shape (10 n,).
+        gravity: gravitational acceleration in the base's frame, m/s^2, shape (3,).
+        q: joint positions, shape (n,).
+        qd: joint velocities, shape (n,).
+        M: written, shape (n, n).
+        bias: written, shape (n,).
     """
     _bias(chain=chain, theta=theta, gravity=gravity, q=q, qd=qd)
     mass_matrix(chain, theta)
@@ -544,10 +583,12 @@ def find_acceleration(
     torque: Vector,
     qdd: Array,
 ) -> None:
-    """Writes the accelerations, Eq. (8), shape (n,), after `place_joints`.
+    """Writes the joint accelerations qdd, Eq. (8), shape (n,), after `place_joints`.
 
-    M qdd = torque - C qd - G - friction + stops, `torque` being the whole torque on the joints.
-    M is factored as L D L' in place, which needs no square root.
+        M qdd = torque - C qd - G - friction + stops
+
+    `torque` is the whole torque on the joints. M is factored in place as L D L', which needs no
+    square roots.
     """
     n = chain.shape[0]
     _bias(chain=chain, theta=theta, gravity=gravity, q=q, qd=qd)
@@ -573,41 +614,44 @@ def find_acceleration(
 
 @leaf
 def place_end_effector(chain: RowArray, tip: Vector) -> Three:
-    """Returns the end effector's place, and writes Jacobian and orientations into the rows, all
-    in base axes.
+    """Writes the Jacobian and the links' orientations into the rows, in base axes.
 
     Args:
-        chain: the chain's rows, after `place_joints`; written: J_lin, m/rad or 1, J_ang, 1 or
-            0, and of every link its orientation R_base, its joint's place p_base and axis
-            axis_base.
+        chain: the chain's rows, after `place_joints`. Written are the columns of the Jacobian
+            J_lin, m/rad or 1, and J_ang, 1 or 0, and for each link its orientation R_base, its
+            joint's position p_base and its joint's axis axis_base.
         tip: the end effector in the last link's frame, m, shape (3,).
+
+    Returns:
+        The position of the end effector, m.
     """
     n = chain.shape[0]
-    place = (0.0, 0.0, 0.0)
+    position = (0.0, 0.0, 0.0)
     for i in range(n):
         row: Row = chain[i]
         R = row.R
         R_base = row.R_base
         if i == 0:
-            place = three(row.p)
+            position = three(row.p)
             for j in range(3):
                 put_three(R_base[j], three(R[j]))
         else:
             before = chain[i - 1].R_base
-            place = add(place, rotate(before, three(row.p)))
+            position = add(position, rotate(before, three(row.p)))
             for k in range(3):
                 column = rotate(before, (R[0, k], R[1, k], R[2, k]))
                 R_base[0, k], R_base[1, k], R_base[2, k] = column
         put_three(row.axis_base, rotate(R_base, three(row.axis)))
-        put_three(row.p_base, place)
-    place = add(place, rotate(chain[n - 1].R_base, three(tip)))
+        put_three(row.p_base, position)
+    position = add(position, rotate(chain[n - 1].R_base, three(tip)))
     for i in range(n):
         row = chain[i]
         axis = three(row.axis_base)
         if row.prismatic == 0:
-            put_three(row.J_lin, cross(axis, subtract(place, three(row.p_base))))
+            lever = subtract(position, three(row.p_base))
+            put_three(row.J_lin, cross(axis, lever))
             put_three(row.J_ang, axis)
         else:
             put_three(row.J_lin, axis)
             put_three(row.J_ang, (0.0, 0.0, 0.0))
-    return place
+    return position

@@ -1,8 +1,11 @@
-"""The stages of a tick that depend on the arm, for a chain of n joints: by recursion, in rows
-of arrays.
+"""The stages of a tick that depend on the arm, for a chain of n joints.
 
-Invariant: `two_link_stages` has the same functions for the planar two-link arm, and `kernel`
-takes one or the other. `chain` is the rows of the site's joints, see `chain_dtype`.
+The dynamics are recursions over the joints. `chain` holds the rows of the site's joints, see
+`chain_dtype`.
+
+Invariant:
+    - `two_link_stages` has the same functions for the planar two-link arm; `kernel` calls one
+      or the other.
 """
 
 from math import isfinite
@@ -33,7 +36,7 @@ _ADAPTIVE = int(Law.ADAPTIVE)
 
 @leaf
 def place_chain(s: Row, chain: RowArray) -> None:
-    """Places the joints, and in task space the end effector."""
+    """Updates the frames of the joints and, in task space, the end effector's pose."""
     place_joints(chain, s.q)
     if s.task:
         update_pose(s, chain)
@@ -63,7 +66,7 @@ def _update_joint_errors(s: Row, joints: int) -> None:
 
 @leaf
 def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
-    """Advances the estimate by a time of `gain_s`, Eq. (15), within its box."""
+    """Advances the estimate by the time `gain_s`, Eq. (15), within its box."""
     for p in range(s.parameters):
         estimate = s.theta_hat[p] - gain_s * s.Gamma[p] * Yr[p]
         s.theta_hat[p] = min(max(estimate, s.low[p]), s.high[p])
@@ -71,8 +74,10 @@ def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
 
 @leaf
 def update_torque(s: Row, chain: RowArray) -> None:
-    """Writes the torque of the site's law, within its limits: Eq. (13), or
-    `control.damped_torque`'s.
+    """Writes the torque of the site's law, within its limits.
+
+    The law is Eq. (13) with its robust term, or the law of known gravity
+    (`control.damped_torque`).
     """
     if s.law == _ADAPTIVE:
         inverse_dynamics(chain=chain, theta=s.theta_hat, v=s.v, a=s.a, torque=s.tau)
@@ -102,26 +107,24 @@ def update_torque(s: Row, chain: RowArray) -> None:
 
 @leaf
 def put_gravity(s: Row, chain: RowArray, theta: Array, torque: Array) -> None:
-    """Writes G of these parameters, N m, shape (n,), for the pose in which the joints are
-    placed.
-    """
+    """Writes the gravity torque for these parameters, N m, shape (n,), after `place_joints`."""
     propagate_motion(chain=chain, gravity=s.gravity, qd=s.zeros, v=s.zeros, a=s.zeros)
     inverse_dynamics(chain=chain, theta=theta, v=s.zeros, a=s.zeros, torque=torque)
 
 
 @leaf
 def put_gravity_torque(s: Row, chain: RowArray, q: Array, torque: Array) -> None:
-    """Writes G(q), N m, shape (n,)."""
+    """Writes the gravity torque G(q), N m, shape (n,)."""
     place_joints(chain, q)
     put_gravity(s, chain, s.theta, torque)
 
 
 @leaf
 def update_model(s: Row, chain: RowArray) -> None:
-    """Writes what a law may know of the arm in this tick: G, and if it wants them M and the
-    bias torque.
+    """Writes the arm's model for a plugged law, after `place_joints`.
 
-    The bias is C qd + G with friction, less the torque of the stops. The joints are placed.
+    The model is G and, if the law needs it, M and the bias torque: C qd + G with friction, less
+    the torque of the stops.
     """
     put_gravity(s, chain, s.known, s.G)
     if s.needs_model != 0:
@@ -141,7 +144,18 @@ def put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Writes the torque of actors with this `sampled` ON the arm whose q and qd are `state`."""
+    """Writes the torque of the actors with this `sampled` ON the arm, N m.
+
+    Args:
+        t_s: time since the epoch, s.
+        s: the site's row.
+        chain: the chain's rows.
+        state: q and qd of the arm, shape (2 n,).
+        actors: operators and environments.
+        table: their recorded torques.
+        sampled: 1: the actors that are held over a tick; 0: the others.
+        torque: written, shape (n,), N m.
+    """
     place_joints(chain, state)
     qd = state[chain.shape[0] :]
     put_torque_on_chain(
@@ -161,9 +175,7 @@ def put_source_torque(
 def update_external_torque(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments now, the part of it held, and the force
-    of a wall.
-    """
+    """Writes the torque of operators and environments, its held part, and the wall force."""
     place_joints(chain, s.q)
     held_n = put_torque_on_chain(
         t_s=t_s,
@@ -189,7 +201,8 @@ def update_external_torque(
     )
     s.wall_n = max(held_n, now_n)
     for i in range(chain.shape[0]):
-        s.on_arm[i] += s.held[i] + s.sensed[i]  # one of the two is zero
+        # Either `held` or `sensed` is zero.
+        s.on_arm[i] += s.held[i] + s.sensed[i]
     if s.task:
         update_wrench(s)
 
@@ -198,8 +211,9 @@ def update_external_torque(
 def _put_acceleration(
     t_s: float, s: Row, chain: RowArray, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes `stage_qdd`: the acceleration at a stage's q and qd under the held u and the
-    actors then.
+    """Writes `stage_qdd`, the acceleration at a stage of the integrator.
+
+    The torque is the held u plus the torque of the actors at the time and state of the stage.
     """
     place_joints(chain, s.stage_q)
     put_torque_on_chain(
@@ -228,8 +242,13 @@ def _put_acceleration(
 
 @leaf
 def _use_stage(s: Row, joints: int, weight: float, ahead_s: float) -> None:
-    """Adds a stage's rates to the sums, and writes the q and qd of the next, `ahead_s` from the
-    beginning.
+    """Adds a stage's rates to the sums, and writes q and qd of the next stage.
+
+    Args:
+        s: the site's row.
+        joints: the number of joints.
+        weight: weight of the stage in the sums, 1 or 2.
+        ahead_s: time of the next stage after the beginning of the period, s.
     """
     for i in range(joints):
         s.sum_qd[i] += weight * s.stage_qd[i]
@@ -247,8 +266,10 @@ def advance_arm(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> bool:
-    """Advances q and qd by one period under the torque `s.u`; false where the result is not
-    finite.
+    """Advances q and qd by one period under the torque `s.u`.
+
+    Returns:
+        False if the result is not finite; q and qd are unchanged then.
     """
     n = chain.shape[0]
     for i in range(n):

@@ -1,9 +1,10 @@
-"""A control law whose `torque` is compiled: the same class, the same bits, the speed of the
-kernel.
+"""Control laws whose `torque` is compiled: same class, same bits, speed of the kernel.
 
-Invariant: a law is compiled for the layout of its rows alone; its numbers stand in a row of
-floats, and the kernel calls it by its address, so that no law recompiles the kernel. An index
-out of range and a division by zero raise as they do in plain Python.
+Invariant:
+    - A law is compiled for the layout of its rows alone. Its numbers are in a row of floats, so
+      that other gains do not recompile the law.
+    - The kernel calls a law by its address, so that no law recompiles the kernel.
+    - An index out of range and a division by zero raise as they do in plain Python.
 """
 
 import dis
@@ -43,8 +44,7 @@ T = TypeVar("T")
 
 
 def compiled(law: T) -> T:
-    """Has the `torque` of a control law compiled, or a function that it calls; for use as a
-    decorator.
+    """Marks a control law, or a function that its `torque` calls, to be compiled (decorator).
 
     >>> @tn.compiled
     ... class Damper:
@@ -54,8 +54,8 @@ def compiled(law: T) -> T:
     ...         for i in range(now.joints):
     ...             now.tau[i] = -now.qd[i]
 
-    A class with memory needs `remembers`. What Numba does not take is refused when a site is
-    built.
+    A class with memory needs `remembers`. Code that Numba cannot compile is refused when a site
+    is built.
     """
     if not isinstance(law, type):
         return cast(T, numba.njit(**_CHECKED)(law))
@@ -64,17 +64,17 @@ def compiled(law: T) -> T:
 
 
 def is_compiled(law: Any) -> bool:
-    """True if the `torque` of a law is to be compiled; without a compiler it runs as it is."""
+    """True if the `torque` of a law will be compiled; False if Numba is disabled."""
     config: Any = numba.config
     return bool(getattr(law, "is_compiled", False)) and not config.DISABLE_JIT
 
 
 @leaf
 def _all_finite(values: Array) -> bool:
-    finite = True
+    are_finite = True
     for i in range(values.shape[0]):
-        finite = finite and np.isfinite(values[i])
-    return finite
+        are_finite = are_finite and np.isfinite(values[i])
+    return are_finite
 
 
 @leaf
@@ -89,8 +89,23 @@ def law_stage(
     channel: ChannelArrays,
     sent: Array,
 ) -> None:
-    """Stage 6 of a compiled law, whose numbers are `law`; while it is `asked`, what is raised
-    is its own.
+    """Computes stage 6 of a tick by a compiled law.
+
+    An exception that is raised while the row's `asked` is 1 comes from the law.
+
+    Args:
+        k: the tick.
+        t_ns: nominal time of the tick, ns since the epoch.
+        address: address of the law's machine code.
+        law: the law's numbers.
+        site: the site's row.
+        links: the rows of its links.
+        chain: the chain's rows, or None for the planar arm.
+        channel: the vectors that the peers' laws sent.
+        sent: the vectors that this law sends; written.
+
+    Raises:
+        FloatingPointError: a result is not finite.
     """
     update_law_view(k=k, t_ns=t_ns, site=site, links=links, chain=chain)
     s: Row = site[0]
@@ -109,13 +124,13 @@ class _Form(NamedTuple):
     """The layouts for which a law is compiled.
 
     Attributes:
-        law: of its numbers.
-        site: of its site's row.
-        link: of its links' rows.
-        received: of what a peer sends; None: nothing.
-        to_all: of what it sends to all; None: nothing.
-        sent: of what it sends to one peer; None: nothing.
-        peers: how many there are.
+        law: layout of the law's numbers.
+        site: layout of the site's row.
+        link: layout of the links' rows.
+        received: layout of the vectors that a peer sends, or None without any.
+        to_all: layout of the vectors that go to all peers, or None without any.
+        sent: layout of the vectors that go to one peer alone, or None without any.
+        peers: the number of peers.
     """
 
     law: np.dtype[np.void]
@@ -128,168 +143,198 @@ class _Form(NamedTuple):
 
 
 def _vectors_dtype(vectors: Sequence[SentVector], width: int = 0) -> np.dtype[np.void] | None:
-    """Returns the layout of some vectors, of `width` numbers if more of them stand in an
-    array's row.
+    """Returns the layout of vectors that stand one after another, or None without any.
+
+    Args:
+        vectors: the vectors.
+        width: count of numbers in an array's row, if the row is longer than the vectors.
     """
     if not vectors:
         return None
     lengths = [vector.length for vector in vectors]
-    table: Any = {
+    layout: Any = {
         "names": [vector.name for vector in vectors],
         "formats": [("f8", (length,)) for length in lengths],
         "offsets": [8 * sum(lengths[:n]) for n in range(len(lengths))],
         "itemsize": 8 * (width or sum(lengths)),
     }
-    return np.dtype((np.record, table))
+    return np.dtype((np.record, layout))
 
 
 @cache
 def _compile_law(torque: Callable[..., Any], form: _Form) -> Any:
-    """Returns a compiled function of the law's numbers, the site, its links, what came and what
-    is sent.
+    """Returns the compiled form of a law's `torque`.
+
+    Its arguments are the law's numbers, the site's row, its links' rows, and the arrays of the
+    received and the sent vectors.
+
+    Raises:
+        NumbaError: the law cannot be compiled.
     """
     law_dtype = form.law
     received_dtype = form.received
     to_all_dtype = form.to_all
     sent_dtype = form.sent
-    numbers = form.law.itemsize // 8
-    peers = form.peers
-    common = 0 if to_all_dtype is None else to_all_dtype.itemsize // 8
-    own = 0 if sent_dtype is None else sent_dtype.itemsize // 8
+    law_size = form.law.itemsize // 8
+    to_all_size = 0 if to_all_dtype is None else to_all_dtype.itemsize // 8
+    peer_size = 0 if sent_dtype is None else sent_dtype.itemsize // 8
+    sent_end = to_all_size + form.peers * peer_size
     compute = numba.njit(**_CHECKED)(torque)
 
     def call(law: Any, site: Any, links: Any, received: Any, sent: Any) -> None:
         s = site[0]
-        got = () if received_dtype is None else received.reshape(-1).view(received_dtype)
-        each = (
-            () if sent_dtype is None else sent[common : common + peers * own].view(sent_dtype)
+        # Conditional expressions: Numba removes the branch whose type does not apply.
+        from_peers = () if received_dtype is None else received.reshape(-1).view(received_dtype)
+        to_peers = () if sent_dtype is None else sent[to_all_size:sent_end].view(sent_dtype)
+        to_all = None if to_all_dtype is None else sent[:to_all_size].view(to_all_dtype)[0]
+        now = LawInput(
+            k=s.k,
+            t_s=s.t_s,
+            h_s=s.h_s,
+            q=s.q,
+            qd=s.qd,
+            q_des=s.q_des,
+            qd_des=s.qd_des,
+            felt=s.felt,
+            joints=s.joints,
+            coordinates=s.shared,
+            tau=s.tau,
+            peers=links,
+            received=from_peers,
+            sent=to_peers,
+            to_all=to_all,
+            tau_x=s.tau_x,
+            tau_before=s.tau_before,
+            q_before=s.q_before,
+            gravity=s.G,
+            theta_hat=s.theta_hat,
+            inertia=s.M,
+            bias=s.bias,
         )
-        every = None if to_all_dtype is None else sent[:common].view(to_all_dtype)[0]
-        first = (
-            s.k,
-            s.t_s,
-            s.h_s,
-            s.q,
-            s.qd,
-            s.q_des,
-            s.qd_des,
-            s.felt,
-            s.joints,
-            s.shared,
-            s.tau,
-        )
-        last = (s.tau_x, s.tau_before, s.q_before, s.G, s.theta_hat, s.M, s.bias)
-        now = LawInput(*first, links, got, each, every, *last)
-        compute(law[:numbers].view(law_dtype)[0], now)
+        compute(law[:law_size].view(law_dtype)[0], now)
 
-    kinds: Any = numba
-    rows = [kinds.typeof(np.zeros(1, dtype)) for dtype in (form.site, form.link)]
+    numba_types: Any = numba
+    site_type = numba_types.typeof(np.zeros(1, form.site))
+    link_type = numba_types.typeof(np.zeros(1, form.link))
     floats = types.float64
-    signature = types.none(floats[::1], *rows, floats[:, ::1], floats[::1])
-    if made_of := digest_sibling_sources(torque):
-        name = hashlib.sha256(
-            f"{made_of} {torque.__module__} {torque.__qualname__} {form}".encode()
-        )
-        return compile_named(call, f"law_{name.hexdigest()[:32]}", signature, **_CHECKED)
-    called = numba.njit(signature, **_CHECKED)(call)
+    signature = types.none(floats[::1], site_type, link_type, floats[:, ::1], floats[::1])
+    sources = digest_sibling_sources(torque)
+    if sources:
+        text = f"{sources} {torque.__module__} {torque.__qualname__} {form}"
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        return compile_named(call, f"law_{digest[:32]}", signature, **_CHECKED)
+    function = numba.njit(signature, **_CHECKED)(call)
     if any(known.return_type != types.none for known in compute.nopython_signatures):
         raise NumbaError("torque returns something: compiled, it writes now.tau instead")
-    return called
+    return function
 
 
 def _read_numbers(law: Any) -> dict[str, np.ndarray[Any, Any]]:
-    """Returns the attributes of a law that are numbers: what it remembers, then the others.
+    """Returns the attributes of a law that are numbers: the remembered ones, then the others.
 
-    A number that `torque` writes, and a list, is of floats; other integers stay integers.
+    Numbers that `torque` writes, and lists, become floats; other integers remain integers.
     """
     code = list(dis.get_instructions(type(law).torque))
-    written = {one.argval for one in code if one.opname == "STORE_ATTR"}
-    named = {
-        one.argval for one in code if one.opname in ("LOAD_ATTR", "LOAD_METHOD", "STORE_ATTR")
-    }
-    named |= vars(law).keys()  # which functions that `torque` calls may name
-    found = {}
-    for name in dict.fromkeys(
-        [*list_remembered(law), *sorted(filter(lambda one: hasattr(law, one), named))]
-    ):
+    written = {step.argval for step in code if step.opname == "STORE_ATTR"}
+    access = ("LOAD_ATTR", "LOAD_METHOD", "STORE_ATTR")
+    used = {step.argval for step in code if step.opname in access}
+    # Functions that `torque` calls may use any attribute of the instance.
+    used |= vars(law).keys()
+    remembered = list_remembered(law)
+    others = sorted(name for name in used if hasattr(law, name))
+    numbers_by_name = {}
+    for name in dict.fromkeys([*remembered, *others]):
         value = getattr(law, name)
         try:
             numbers = np.asarray(value)
-        except ValueError:  # rows of several lengths
+        except ValueError:  # a list of rows with different lengths
             continue
-        if numbers.dtype.kind not in "fiub" or not numbers.size:
+        kind = numbers.dtype.kind
+        if kind not in "fiub" or not numbers.size:
             continue
-        changes = name in list_remembered(law) or name in written or isinstance(value, list)
-        found[name] = numbers.astype(
-            np.float64 if changes or numbers.dtype.kind == "f" else np.int64
-        )
-    return found
+        is_changed = name in remembered or name in written or isinstance(value, list)
+        dtype = np.float64 if is_changed or kind == "f" else np.int64
+        numbers_by_name[name] = numbers.astype(dtype)
+    return numbers_by_name
 
 
 def _explain(error: Exception, law: Any) -> str:
-    """Returns what Numba does not take of a law, in a sentence."""
+    """Returns a sentence that says which part of a law Numba cannot compile."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
     file = re.escape(Path(type(law).torque.__code__.co_filename).name)
     lines = re.findall(rf'{file}"?,? (?:line |\()(\d+)', text)
-    where = f" (line {lines[-1]})" if lines else ""
+    location = f" (line {lines[-1]})" if lines else ""
     if "NRT required" in text or "returning of array" in text:
-        how = "arithmetic goes number by number, as in now.tau[i] = -now.qd[i]; a list is made in __init__"
-        return f"it makes an array or a list{where}: {how}, and written into here"
-    found = re.search(r"Unknown attribute '(\w+)' of type Record", text)
-    if name := error.args[0] if isinstance(error, KeyError) else found and found[1]:
-        if hasattr(law, name) and callable(getattr(law, name)):
-            return (
-                f"it calls its method {name}{where}: use a function with @trilat_net.compiled"
-            )
-        kind = (
-            f"a {type(getattr(law, name)).__name__}"
-            if hasattr(law, name)
-            else "no attribute of it"
+        return (
+            f"it makes an array or a list{location}: arithmetic goes number by number, as in "
+            "now.tau[i] = -now.qd[i]; a list is made in __init__, and written into here"
         )
-        return f"self.{name} is {kind}{where}: a number, or a list of numbers of fixed length, is taken"
-    if found := re.search(r"Untyped global name '(\w+)'", text):
-        return f"it uses {found[1]}{where}, which is neither a number nor a function with @trilat_net.compiled"
-    plain = [line.strip() for line in text.splitlines() if line.strip()]
-    told = [
-        line
-        for line in plain
-        if not line.startswith(("Failed in", "File", "During", "-", "^", "<", "["))
-    ]
-    return f"{(told or plain)[0].rstrip('.:')}{where}"
+    attribute = re.search(r"Unknown attribute '(\w+)' of type Record", text)
+    if isinstance(error, KeyError):
+        return _explain_attribute(error.args[0], law, location)
+    if attribute:
+        return _explain_attribute(attribute[1], law, location)
+    unknown = re.search(r"Untyped global name '(\w+)'", text)
+    if unknown:
+        return (
+            f"it uses {unknown[1]}{location}, which is neither a number nor a function with "
+            "@trilat_net.compiled"
+        )
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    noise = ("Failed in", "File", "During", "-", "^", "<", "[")
+    sentences = [line for line in lines if not line.startswith(noise)]
+    return f"{(sentences or lines)[0].rstrip('.:')}{location}"
+
+
+def _explain_attribute(name: str, law: Any, location: str) -> str:
+    """Returns why a compiled law cannot use an attribute."""
+    if not hasattr(law, name):
+        kind = "no attribute of it"
+    elif callable(getattr(law, name)):
+        return f"it calls its method {name}{location}: use a function with @trilat_net.compiled"
+    else:
+        kind = f"a {type(getattr(law, name)).__name__}"
+    return (
+        f"self.{name} is {kind}{location}: a number, or a list of numbers of fixed length, is "
+        "accepted"
+    )
 
 
 class CompiledLaw:
     """A compiled law at its site.
 
     Args:
-        law: the law as it was made.
-        setup: of its site.
-        arrays: of its site; its vectors may be longer than the site's.
-        sent: what its record names as sent, see `LawChannel`.
+        law: an instance of the law's class.
+        setup: the setup of the site.
+        arrays: the arrays of the site; their vectors may be longer than the site's.
+        sent: the sent vectors in the site's record, see `LawChannel`.
 
     Attributes:
-        row: its numbers, what it remembers first.
-        address: of its machine code.
+        row: the law's numbers, the remembered ones first.
+        address: address of its machine code.
 
     Raises:
-        ScenarioError: Numba does not take it.
+        ScenarioError: Numba cannot compile the law.
     """
 
     def __init__(self, law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
         path = f"sites.{setup.name}.control.law"
         numbers = _read_numbers(law)
-        received = 0 if arrays.channel is None else arrays.channel.received.shape[-1]
-        if missing := [name for name in list_remembered(law) if name not in numbers]:
-            problem = (
-                f"{missing[0]}, which it remembers, is neither a number nor a list of numbers"
+        remembered = list_remembered(law)
+        missing = [name for name in remembered if name not in numbers]
+        if missing:
+            raise ScenarioError(
+                f"{law_name(law)}: {missing[0]}, which it remembers, is neither a number nor a "
+                "list of numbers",
+                path=path,
             )
-            raise ScenarioError(f"{law_name(law)}: {problem}", path=path)
+        received_size = 0 if arrays.channel is None else arrays.channel.received.shape[-1]
         fields: Any = [(name, value.dtype, value.shape) for name, value in numbers.items()]
         form = _Form(
             law=np.dtype((np.record, fields or [("nothing", "f8")])),
             site=arrays.site.dtype,
             link=arrays.links.dtype,
-            received=_vectors_dtype(setup.received_vectors, received),
+            received=_vectors_dtype(setup.received_vectors, received_size),
             to_all=_vectors_dtype(setup.channel.select_vectors(per_peer=False)),
             sent=_vectors_dtype(setup.channel.select_vectors(per_peer=True)),
             peers=len(setup.links),
@@ -301,30 +346,40 @@ class CompiledLaw:
                 f"{law_name(law)} cannot be compiled: {_explain(error, law)}", path=path
             ) from None
         self.address = find_address(self._function)
-        whole = np.zeros(1, form.law)
+        row = np.zeros(1, form.law)
         for name, value in numbers.items():
-            whole[0][name] = value
-        self.row: Array = whole.view(np.float64)
+            row[0][name] = value
+        self.row: Array = row.view(np.float64)
         self._law = law
         self._name = setup.name
         self._arrays = arrays
         self._sent = sent
         self._stage = law_stage
-        self._remembered = sum(numbers[name].size for name in list_remembered(law))
+        self._remembered = sum(numbers[name].size for name in remembered)
         arrays.site["remembered"] = self._remembered
 
     def bind(self) -> None:
-        """Compiles what `compute` calls, and looks up its types once for all."""
+        """Compiles the stage that `compute` calls, and looks up its types once and for all."""
         a = self._arrays
         assert a.channel is not None
-        rows = (self.row, a.site, a.links, a.chain, a.channel, self._sent)
-        self._stage = bind_leaf(law_stage, 0, 0, self.address, *rows)
+        self._stage = bind_leaf(
+            law_stage,
+            0,
+            0,
+            self.address,
+            self.row,
+            a.site,
+            a.links,
+            a.chain,
+            a.channel,
+            self._sent,
+        )
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Stage 6 of tick k, see `law_stage`; returns the law's memory.
+        """Computes stage 6 of tick k, see `law_stage`, and returns the law's memory.
 
         Raises:
-            LawFailed: it failed.
+            LawFailed: the law failed.
         """
         a = self._arrays
         assert a.channel is not None
@@ -332,13 +387,13 @@ class CompiledLaw:
             self._stage(
                 k, t_ns, self.address, self.row, a.site, a.links, a.chain, a.channel, self._sent
             )
-        except Exception as error:  # whatever the law raises
+        except Exception as error:  # the user's code may raise anything
             raise self.find_failure(error) or error from None
         return self.memory
 
     @property
     def memory(self) -> list[float]:
-        """What the law remembers now."""
+        """The numbers that the law remembers now."""
         memory: list[float] = self.row[: self._remembered].tolist()
         return memory
 
@@ -347,31 +402,33 @@ class CompiledLaw:
         self.row[: self._remembered] = memory
 
     def find_failure(self, error: Exception) -> LawFailed | None:
-        """Returns the failure of this law that made its machine code raise; None: it was not
-        asked.
-        """
+        """Returns the failure of the law, or None if the error does not come from the law."""
         s: Row = self._arrays.site[0]
         if not s.asked:
             return None
         if isinstance(error, FloatingPointError):
-            numbers = (s.tau, s.theta_hat, self.row[: self._remembered], self._sent)
+            results = LawResults(
+                torque=s.tau.tolist(),
+                theta_hat=s.theta_hat.tolist(),
+                memory=self.memory,
+                sent=self._sent.tolist(),
+            )
             try:
-                check_results(
-                    self._law, self._name, s.k, LawResults(*(one.tolist() for one in numbers))
-                )
-            except LawFailed as failed:
-                return failed
+                check_results(self._law, self._name, s.k, results)
+            except LawFailed as failure:
+                return failure
         return describe_failure(self._law, self._name, int(s.k), error)
 
 
 def plug_law(
     law: Any, setup: SiteSetup, arrays: SiteArrays, sent: Array
 ) -> PlainLaw | CompiledLaw:
-    """Returns a law at its site, ready to be asked, see `PlainLaw`.
+    """Returns a law at its site, ready to compute torques; for the arguments see `PlainLaw`.
 
     Raises:
-        ScenarioError: it is to be compiled, and Numba does not take it.
+        ScenarioError: the law is to be compiled, and Numba cannot compile it.
     """
     arrays.site["needs_model"] = getattr(law, "needs_model", False)
     arrays.site["holds"] = getattr(law, "holds", False)
-    return (CompiledLaw if is_compiled(law) else PlainLaw)(law, setup, arrays, sent)
+    kind = CompiledLaw if is_compiled(law) else PlainLaw
+    return kind(law, setup, arrays, sent)

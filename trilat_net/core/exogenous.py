@@ -1,11 +1,12 @@
 """Exogenous torque: the effect of operators and environments on the arm.
 
-Invariant: the torque is a function of time and of the arm's state, so each stage of the
-integrator evaluates it; a `sampled` source is evaluated once a tick and held, as in a digital
-haptic wall.
+Scenarios state the torque ON the arm; the paper's tau_x, which Eq. (8) subtracts, is the
+negative of this torque. In the code an actor is one operator or environment.
 
-Scenarios state the torque ON the arm; the paper's tau_x, which Eq. (8) subtracts, is its
-negative.
+Invariant:
+    - The torque is a function of time and of the arm's state, so each stage of the integrator
+      evaluates it.
+    - A `sampled` source is evaluated once per tick and held, as in a digital haptic wall.
 """
 
 import math
@@ -27,14 +28,18 @@ from .vectors import Array, Pair, Row, RowArray, Vector, count_started
 class TorqueKind(IntEnum):
     """The kinds of operators and environments.
 
-    PULSE is a scripted torque, smooth at both ends. HAND and TASK_HAND are a spring and a
-    damper towards a target that moves along a minimum-jerk path, of the joints or of the end
-    effector. RECORDED is torque by a table. VISCOUS resists motion of the joints. WALL pushes
-    the end effector out of a half-space, and never pulls. CHIRP is a sine whose frequency rises
-    or falls in straight lines, again and again. MULTISINE is a sum of sines of one amplitude.
-    OWN_JOINTS and OWN_TIP have a compiled function of their own, of the joints or of the end
-    effector. LIVE_TIP and LIVE_JOINT are springs and dampers towards a target that somebody
-    moves while the run goes on, LIVE_FORCE is a force that somebody sets, see `live_hand`.
+    - PULSE is a scripted torque, smooth at both ends.
+    - HAND and TASK_HAND are a spring and a damper towards a target that moves along a
+      minimum-jerk path, of the joints or of the end effector.
+    - RECORDED interpolates a table of torques.
+    - VISCOUS resists motion of the joints.
+    - WALL pushes the end effector out of a half-space, and never pulls.
+    - CHIRP is a sine whose frequency changes linearly with time, in repeated sweeps.
+    - MULTISINE is a sum of sines with the same amplitude.
+    - OWN_JOINTS and OWN_TIP call a user's compiled function, of the joints or of the end
+      effector.
+    - LIVE_TIP and LIVE_JOINT are a spring and a damper towards a target that a person moves
+      during the run; LIVE_FORCE is a force that a person sets, see `live_hand`.
     """
 
     PULSE = 0
@@ -55,35 +60,38 @@ class TorqueKind(IntEnum):
 SCRIPTED_KINDS = (TorqueKind.PULSE, TorqueKind.RECORDED, TorqueKind.CHIRP, TorqueKind.MULTISINE)
 """The kinds whose torque is a function of time alone."""
 LIVE_KINDS = (TorqueKind.LIVE_TIP, TorqueKind.LIVE_FORCE, TorqueKind.LIVE_JOINT)
-"""The kinds that act only while somebody takes hold: they come last."""
+"""The kinds that act only while a hand holds the arm. Their numbers are the largest, and leaves
+test for them by `>=`.
+"""
 OWN_KINDS = (TorqueKind.OWN_JOINTS, TorqueKind.OWN_TIP)
-"""The kinds with a function of their own."""
+"""The kinds that call a user's function."""
 
 
 class TorqueSource(NamedTuple):
     """One operator or environment; the meaning of its vectors depends on its kind.
 
     Attributes:
-        kind: how it acts.
-        start_s: when it begins to act, s since the epoch.
-        end_s: when it ends, s.
-        move_start_s: when its target begins to move, s; CHIRP: beginning of its first sweep.
-        move_end_s: when its target arrives, s; CHIRP: end of its first sweep.
+        kind: the kind of operator or environment.
+        start_s: start of the action, s since the epoch.
+        end_s: end of the action, s.
+        move_start_s: start of the target's motion, s; CHIRP: start of the first sweep.
+        move_end_s: end of the target's motion, s; CHIRP: end of the first sweep.
         a: PULSE, CHIRP: peak, N m. MULTISINE: amplitude of each sine, N m. HAND, TASK_HAND:
-            target before, rad or m. WALL: a point of it, m.
-        b: HAND, TASK_HAND: target after. WALL: its normal, length 1, away from the wall. CHIRP:
-            frequencies at the beginning and the end of a sweep, Hz.
-        K: stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (the first one).
-        B: damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (the first
-            one).
-        sampled: true: evaluated once a tick and held.
+            target before the motion, rad or m. WALL: a point of the wall, m. Live hand: target
+            or force.
+        b: HAND, TASK_HAND: target after the motion. WALL: the normal that points away from the
+            wall, length 1. CHIRP: frequencies at the start and the end of a sweep, Hz. Live
+            hand: position of the target one second later.
+        K: stiffness: HAND N m/rad, TASK_HAND N/m per axis, WALL N/m (first number).
+        B: damping: HAND and VISCOUS N m s/rad, TASK_HAND N s/m per axis, WALL N s/m (first
+            number).
+        sampled: true: evaluated once per tick and held.
         table: RECORDED: rows of time, s, and torque ON each joint, N m, shape (rows, 1 + n).
-            MULTISINE: rows of frequency, Hz, phase at the start in turns, and columns that are
+            MULTISINE: rows of frequency, Hz, and phase at the start, turns; further columns are
             not used.
-        limit: of a live hand: the largest norm of its force, N, or torque, N m.
-        grip: of a live hand: how much of its force acts, 0 to 1. Its `a` is its target, or its
-            force, and its `b` where the target would be a second later.
-        model: of an own kind what its numbers and its function `act` are of; see `plugged`.
+        limit: live hand: the largest norm of its force, N, or torque, N m.
+        grip: live hand: share of its force that acts, 0 to 1.
+        model: user's kind: the object with its numbers and its function `act`, see `plugged`.
     """
 
     kind: TorqueKind
@@ -108,20 +116,20 @@ _NUMBERS = ("a", "b", "K", "B")
 
 @cache
 def torque_source_dtype(width: int) -> np.dtype[np.void]:
-    """Returns the layout of operators and environments whose vectors have up to so many
-    numbers.
+    """Returns the layout of an actor's row.
 
-    A function of its own, at the address `call`, reads t_s, coordinates, at and speed, and
-    writes effort.
+    A user's function, at the address `call`, reads t_s, coordinates, at and speed, and writes
+    effort.
+
+    Args:
+        width: largest length of the actors' vectors.
     """
-    fields = [
-        *(
-            (name, "i8")
-            for name in ("kind", "sampled", "table_first", "table_count", "call", "coordinates")
-        ),
-        *((name, "f8") for name in (*_SCALARS, "t_s")),
-        *((name, "f8", (width,)) for name in (*_NUMBERS, "at", "speed", "effort")),
-    ]
+    integers = ("kind", "sampled", "table_first", "table_count", "call", "coordinates")
+    scalars = (*_SCALARS, "t_s")
+    vectors = (*_NUMBERS, "at", "speed", "effort")
+    fields: list[Any] = [(name, "i8") for name in integers]
+    fields += [(name, "f8") for name in scalars]
+    fields += [(name, "f8", (width,)) for name in vectors]
     return np.dtype((np.record, fields))
 
 
@@ -145,10 +153,12 @@ _LIVE_TIP, _LIVE_FORCE, _LIVE_JOINT = map(int, LIVE_KINDS)
 def torque_source_rows(
     actors: tuple[TorqueSource, ...], joints: int = 2, axes: int = 2
 ) -> tuple[TorqueSourceRows, TorqueTable]:
-    """Returns the actors of an arm of so many joints in a space of so many axes, and all their
-    tables in one.
+    """Returns a row per actor, and one table with the tables of all actors.
 
-    Each actor has a row.
+    Args:
+        actors: operators and environments.
+        joints: the number of joints of the arm.
+        axes: the number of axes of its space.
     """
     rows = np.zeros(len(actors), torque_source_dtype(max(joints, axes)))
     tables = [np.zeros((0, 1 + joints))]
@@ -158,57 +168,63 @@ def torque_source_rows(
         for name in _SCALARS:
             row[name] = getattr(actor, name)
         for name in _NUMBERS:
-            row[name][: len(getattr(actor, name))] = getattr(actor, name)
+            numbers = getattr(actor, name)
+            row[name][: len(numbers)] = numbers
         row.kind = int(actor.kind)
         row.sampled = int(actor.sampled)
         row.coordinates = axes if actor.kind is TorqueKind.OWN_TIP else joints
-        given = actor.table
+        content = actor.table
         if actor.kind in OWN_KINDS:
             row.call = compile_to_address(actor.model, "act", rows.dtype)
             numbers = list_numbers(actor.model)
-            given = np.resize(numbers, (-(-len(numbers) // (1 + joints)), 1 + joints))
-        if given is not None:
-            table = np.zeros((len(given), 1 + joints))
-            table[:, : np.shape(given)[1]] = given
-            tables.append(table)
-            row.table_first = first
-            row.table_count = len(table)
-            first += len(table)
+            row_count = math.ceil(len(numbers) / (1 + joints))
+            content = np.resize(numbers, (row_count, 1 + joints))
+        if content is None:
+            continue
+        table = np.zeros((len(content), 1 + joints))
+        table[:, : np.shape(content)[1]] = content
+        tables.append(table)
+        row.table_first = first
+        row.table_count = len(table)
+        first += len(table)
     return rows, np.ascontiguousarray(np.concatenate(tables))
 
 
 @leaf
 def minimum_jerk(t_s: float, start_s: float, end_s: float) -> Pair:
-    """Returns the progress of a minimum-jerk move, 0 to 1, and its rate, 1/s.
+    """Returns the progress of a minimum-jerk motion, 0 to 1, and its rate, 1/s.
 
-    10 x^3 - 15 x^4 + 6 x^5 between start and end, after Flash and Hogan, "The coordination of
-    arm movements", J. Neuroscience 5 (1985).
+        10 x^3 - 15 x^4 + 6 x^5,    x = (t - start) / (end - start)
+
+    After Flash and Hogan, "The coordination of arm movements", J. Neuroscience 5 (1985).
     """
     if t_s <= start_s:
         return 0.0, 0.0
     if t_s >= end_s:
         return 1.0, 0.0
     x = (t_s - start_s) / (end_s - start_s)
-    return x * x * x * (10.0 + x * (6.0 * x - 15.0)), 30.0 * x * x * (1.0 - x) * (1.0 - x) / (
-        end_s - start_s
-    )
+    progress = x * x * x * (10.0 + x * (6.0 * x - 15.0))
+    rate = 30.0 * x * x * (1.0 - x) * (1.0 - x) / (end_s - start_s)
+    return progress, rate
 
 
 @leaf
 def _spring_along(
     actor: Row, i: int, progress: float, rate: float, at: float, speed: float
 ) -> float:
-    """Returns K (target - at) + B (its velocity - speed) along one coordinate."""
-    way: float = actor.b[i] - actor.a[i]
-    pull: float = actor.K[i] * (actor.a[i] + progress * way - at) + actor.B[i] * (
-        rate * way - speed
-    )
-    return pull
+    """Returns the force of a hand's spring and damper along one coordinate.
+
+    K (target - at) + B (target' - speed),    target = a + progress (b - a)
+    """
+    distance: float = actor.b[i] - actor.a[i]
+    spring: float = actor.K[i] * (actor.a[i] + progress * distance - at)
+    damper: float = actor.B[i] * (rate * distance - speed)
+    return spring + damper
 
 
 @leaf
 def _target_progress(actor: Row, t_s: float) -> Pair:
-    """Returns how far a target has moved from `a` to `b`, and its rate, 1/s."""
+    """Returns the progress of a target from `a` to `b`, and its rate, 1/s."""
     if actor.kind >= _LIVE_TIP:
         return 0.0, 1.0
     return minimum_jerk(t_s, actor.move_start_s, actor.move_end_s)
@@ -216,8 +232,11 @@ def _target_progress(actor: Row, t_s: float) -> Pair:
 
 @leaf
 def _live_share(actor: Row, square: float) -> float:
-    """Returns the factor of a live hand's force, whose square is given: its grip, within its
-    limit.
+    """Returns the share of a live hand's force that acts: its grip, reduced to its limit.
+
+    Args:
+        actor: the actor's row.
+        square: the square of the norm of the whole force.
     """
     share: float = actor.grip
     if square > actor.limit * actor.limit:
@@ -227,6 +246,7 @@ def _live_share(actor: Row, square: float) -> float:
 
 @leaf
 def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
+    """Returns the force of a hand along two coordinates, N or N m."""
     progress, rate = _target_progress(actor, t_s)
     x = _spring_along(actor=actor, i=0, progress=progress, rate=rate, at=at[0], speed=speed[0])
     y = _spring_along(actor=actor, i=1, progress=progress, rate=rate, at=at[1], speed=speed[1])
@@ -240,9 +260,10 @@ def _spring_force(actor: Row, t_s: float, at: Vector, speed: Vector) -> Pair:
 
 
 @leaf
-def _table_place(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, float]:
-    """Returns the two rows of a table around a time and the part of the way between; -1 outside
-    of it.
+def _find_table_rows(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, float]:
+    """Returns the two rows of a table around a time, and the fraction between them.
+
+    The rows are -1 outside of the table.
     """
     first = actor.table_first
     count = actor.table_count
@@ -251,40 +272,45 @@ def _table_place(actor: Row, t_s: float, table: TorqueTable) -> tuple[int, int, 
     before = count_started(table, first, count, t_s) - 1
     low = first + max(min(before, count - 2), 0)
     high = min(low + 1, first + count - 1)
-    span = table[high, 0] - table[low, 0]
-    x = (t_s - table[low, 0]) / span if span > 0.0 else 0.0
-    return low, high, x
+    span_s = table[high, 0] - table[low, 0]
+    fraction = (t_s - table[low, 0]) / span_s if span_s > 0.0 else 0.0
+    return low, high, fraction
 
 
 @leaf
 def _recorded_torque(actor: Row, t_s: float, table: TorqueTable) -> Pair:
-    """Interpolates a table linearly; 0 before its first row and after its last."""
-    low, high, x = _table_place(actor, t_s, table)
+    """Returns the torque of a table by linear interpolation, and 0 outside of the table."""
+    low, high, x = _find_table_rows(actor, t_s, table)
     if low < 0:
         return 0.0, 0.0
-    return (
-        table[low, 1] + x * (table[high, 1] - table[low, 1]),
-        table[low, 2] + x * (table[high, 2] - table[low, 2]),
-    )
+    first = table[low, 1] + x * (table[high, 1] - table[low, 1])
+    second = table[low, 2] + x * (table[high, 2] - table[low, 2])
+    return first, second
 
 
 @leaf
 def _sine_of_turns(turns: float) -> float:
+    """Returns sin(2 pi turns), with the whole turns removed first."""
     s, _ = sincos(2.0 * math.pi * (turns - math.floor(turns)))
     return s
 
 
 @leaf
 def _chirp_size(actor: Row, t_s: float) -> float:
-    """Returns sin(2 pi x (f0 + (f1 - f0) x / (2 span))), x the time within the present sweep."""
+    """Returns the sine of a chirp, where x is the time within the present sweep.
+
+    sin(2 pi x (f0 + (f1 - f0) x / (2 span)))
+    """
     span_s = actor.move_end_s - actor.move_start_s
     x = t_s - actor.start_s
     x -= span_s * math.floor(x / span_s)
-    return _sine_of_turns(x * (actor.b[0] + 0.5 * (actor.b[1] - actor.b[0]) / span_s * x))
+    mean_hz = actor.b[0] + 0.5 * (actor.b[1] - actor.b[0]) / span_s * x
+    return _sine_of_turns(x * mean_hz)
 
 
 @leaf
 def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
+    """Returns the sum of the sines of a multisine, each with amplitude 1."""
     total = 0.0
     for n in range(actor.table_first, actor.table_first + actor.table_count):
         total += _sine_of_turns(table[n, 0] * (t_s - actor.start_s) + table[n, 1])
@@ -293,22 +319,25 @@ def _multisine_size(actor: Row, t_s: float, table: TorqueTable) -> float:
 
 @leaf
 def _scripted_size(actor: Row, t_s: float, table: TorqueTable) -> float:
-    """Returns the torque of a pulse, chirp or multisine in parts of `a`.
+    """Returns the torque of a pulse, chirp or multisine as a multiple of `a`.
 
-    A pulse is sin^2(pi (t - start) / (end - start)): smooth at both ends, as in Fig. 3 of the
-    paper, whose numbers are not printed.
+    A pulse is sin^2(pi (t - start) / (end - start)), which is smooth at both ends as in Fig. 3
+    of the paper. The paper does not print the numbers of its pulses.
     """
     if actor.kind == _PULSE:
         s, _ = sincos(math.pi * (t_s - actor.start_s) / (actor.end_s - actor.start_s))
         return s * s
-    return (
-        _chirp_size(actor, t_s) if actor.kind == _CHIRP else _multisine_size(actor, t_s, table)
-    )
+    if actor.kind == _CHIRP:
+        return _chirp_size(actor, t_s)
+    return _multisine_size(actor, t_s, table)
 
 
 @leaf
 def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
-    """Returns the force of a wall on the end effector, N: along its normal, and never a pull."""
+    """Returns the force of a wall on the end effector, N.
+
+    The force acts along the wall's normal and never pulls.
+    """
     depth = (actor.a[0] - at[0]) * actor.b[0] + (actor.a[1] - at[1]) * actor.b[1]
     if not depth > 0.0:
         return 0.0, 0.0
@@ -319,13 +348,14 @@ def _wall_force(actor: Row, at: Pair, speed: Pair) -> Pair:
 
 @leaf
 def _is_at_end_effector(actor: Row) -> bool:
-    acts: int = actor.kind
-    return acts in (_TASK_HAND, _WALL, _OWN_TIP, _LIVE_TIP, _LIVE_FORCE)
+    """True if an actor acts on the end effector, False if it acts on the joints."""
+    kind: int = actor.kind
+    return kind in (_TASK_HAND, _WALL, _OWN_TIP, _LIVE_TIP, _LIVE_FORCE)
 
 
 @leaf
-def _ask_own(actor: Row, t_s: float, table: TorqueTable) -> None:
-    """Has the function of an own kind write its effort; `at` and `speed` are in its row."""
+def _call_user_function(actor: Row, t_s: float, table: TorqueTable) -> None:
+    """Calls a user's function, which reads `at` and `speed` and writes `effort`."""
     actor.t_s = t_s
     for i in range(actor.coordinates):
         actor.effort[i] = 0.0
@@ -334,12 +364,12 @@ def _ask_own(actor: Row, t_s: float, table: TorqueTable) -> None:
 
 
 @leaf
-def _own_pair(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTable) -> Pair:
-    """Returns the effort of an own kind along two joints or axes."""
+def _user_effort(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTable) -> Pair:
+    """Returns the effort of a user's function along two joints or axes, N m or N."""
     for i in range(2):
         actor.at[i] = at[i]
         actor.speed[i] = speed[i]
-    _ask_own(actor, t_s, table)
+    _call_user_function(actor, t_s, table)
     return actor.effort[0], actor.effort[1]
 
 
@@ -347,9 +377,7 @@ def _own_pair(actor: Row, t_s: float, at: Vector, speed: Vector, table: TorqueTa
 def _end_effector_torque(
     actor: Row, t_s: float, q: Vector, qd: Vector, lengths: Vector, table: TorqueTable
 ) -> SourceTorque:
-    """Returns J' F of a force at the end effector: an operator's, or a wall's, and |F| of a
-    wall.
-    """
+    """Returns the joint torque J' F of an actor at the end effector, and |F| of a wall, N."""
     _, at = forward_kinematics(lengths, q)
     x, y = end_effector_jacobian(lengths, q)
     speed = (x[0] * qd[0] + x[1] * qd[1], y[0] * qd[0] + y[1] * qd[1])
@@ -358,17 +386,19 @@ def _end_effector_torque(
         force = _wall_force(actor, at, speed)
         wall_n = math.sqrt(force[0] * force[0] + force[1] * force[1])
     elif actor.kind == _OWN_TIP:
-        force = _own_pair(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
+        force = _user_effort(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
     else:
         force = _spring_force(actor, t_s, at, speed)
-    return x[0] * force[0] + y[0] * force[1], x[1] * force[0] + y[1] * force[1], wall_n
+    torque_0 = x[0] * force[0] + y[0] * force[1]
+    torque_1 = x[1] * force[0] + y[1] * force[1]
+    return torque_0, torque_1, wall_n
 
 
 @leaf
 def source_torque(
     t_s: float, q: Vector, qd: Vector, lengths: Vector, actor: Row, table: TorqueTable
 ) -> SourceTorque:
-    """Returns the torque of one actor ON the planar arm at time t."""
+    """Returns the torque of one actor ON the planar arm, N m, and its wall force, N."""
     if not actor.start_s <= t_s < actor.end_s:
         return 0.0, 0.0, 0.0
     if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
@@ -378,7 +408,7 @@ def source_torque(
     elif actor.kind == _RECORDED:
         torque = _recorded_torque(actor, t_s, table)
     elif actor.kind == _OWN_JOINTS:
-        torque = _own_pair(actor=actor, t_s=t_s, at=q, speed=qd, table=table)
+        torque = _user_effort(actor=actor, t_s=t_s, at=q, speed=qd, table=table)
     elif _is_at_end_effector(actor):
         return _end_effector_torque(
             actor=actor, t_s=t_s, q=q, qd=qd, lengths=lengths, table=table
@@ -399,10 +429,20 @@ def torque_on_arm(
     table: TorqueTable,
     sampled: int,
 ) -> SourceTorque:
-    """Returns the torque of all actors with this `sampled` (1 or 0) ON the arm; -tau_x of Eq.
-    (8).
+    """Returns the torque of the actors ON the planar arm, -tau_x of Eq. (8).
+
+    Args:
+        t_s: time since the epoch, s.
+        q: joint angles, rad.
+        qd: joint velocities, rad/s.
+        lengths: lengths of the two links, m.
+        actors: operators and environments.
+        table: their tables.
+        sampled: 1: the actors that are held over a tick; 0: the others.
     """
-    total_0 = total_1 = largest_n = 0.0
+    total_0 = 0.0
+    total_1 = 0.0
+    largest_n = 0.0
     for n in range(actors.shape[0]):
         actor: Row = actors[n]
         if actor.sampled == sampled:
@@ -419,14 +459,12 @@ def torque_on_arm(
 def _force_in_space(
     actor: Row, t_s: float, at: Three, speed: Three, table: TorqueTable
 ) -> Three:
-    """Returns the force of a spring, a wall or an own kind on an end effector in three
-    dimensions, N.
-    """
+    """Returns the force of an actor on an end effector in three dimensions, N."""
     if actor.kind == _OWN_TIP:
         for i in range(3):
             actor.at[i] = at[i]
             actor.speed[i] = speed[i]
-        _ask_own(actor, t_s, table)
+        _call_user_function(actor, t_s, table)
         return three(actor.effort)
     if actor.kind != _WALL:
         progress, rate = _target_progress(actor, t_s)
@@ -464,7 +502,7 @@ def _add_joint_torque(
     table: TorqueTable,
     torque: Array,
 ) -> None:
-    """Adds the torque of an actor that acts on the joints themselves."""
+    """Adds the torque of an actor that acts on the joints of a chain."""
     if actor.kind == _HAND or actor.kind == _LIVE_JOINT:
         progress, rate = _target_progress(actor, t_s)
         share = 1.0
@@ -484,7 +522,7 @@ def _add_joint_torque(
         for i in range(joints):
             torque[i] -= actor.B[i] * qd[i]
     elif actor.kind == _RECORDED:
-        low, high, x = _table_place(actor, t_s, table)
+        low, high, x = _find_table_rows(actor, t_s, table)
         if low >= 0:
             for i in range(joints):
                 torque[i] += table[low, 1 + i] + x * (table[high, 1 + i] - table[low, 1 + i])
@@ -492,7 +530,7 @@ def _add_joint_torque(
         for i in range(joints):
             actor.at[i] = q[i]
             actor.speed[i] = qd[i]
-        _ask_own(actor, t_s, table)
+        _call_user_function(actor, t_s, table)
         for i in range(joints):
             torque[i] += actor.effort[i]
     else:
@@ -503,8 +541,9 @@ def _add_joint_torque(
 
 @leaf
 def _tip_motion(qd: Vector, tip: Vector, chain: RowArray) -> tuple[Three, Three]:
-    """Returns place and velocity of a chain's end effector, and leaves its Jacobian in the
-    chain's rows.
+    """Returns position and velocity of a chain's end effector, m and m/s.
+
+    Its Jacobian remains in the chain's rows.
     """
     at = place_end_effector(chain, tip)
     v_0 = v_1 = v_2 = 0.0
@@ -528,16 +567,28 @@ def put_torque_on_chain(
     sampled: int,
     torque: Array,
 ) -> float:
-    """Writes the torque of all actors with this `sampled` ON a chain whose joints are placed,
-    shape (n,).
+    """Writes the torque of the actors ON a chain, after `place_joints`.
 
-    Returns the largest force of a wall in it, N.
+    Args:
+        t_s: time since the epoch, s.
+        q: joint positions, shape (n,).
+        qd: joint velocities, shape (n,).
+        tip: the end effector in the last link's frame, m.
+        chain: the chain's rows.
+        actors: operators and environments.
+        table: their tables.
+        sampled: 1: the actors that are held over a tick; 0: the others.
+        torque: written, shape (n,), N m.
+
+    Returns:
+        The largest force of a wall, N.
     """
     n = chain.shape[0]
     for i in range(n):
         torque[i] = 0.0
-    at = speed = (0.0, 0.0, 0.0)
-    placed = False
+    at = (0.0, 0.0, 0.0)
+    speed = (0.0, 0.0, 0.0)
+    has_motion = False
     largest_n = 0.0
     for m in range(actors.shape[0]):
         actor: Row = actors[m]
@@ -548,9 +599,9 @@ def put_torque_on_chain(
                 actor=actor, t_s=t_s, q=q, qd=qd, joints=n, table=table, torque=torque
             )
             continue
-        if not placed:
+        if not has_motion:
             at, speed = _tip_motion(qd, tip, chain)
-            placed = True
+            has_motion = True
         force = _force_in_space(actor=actor, t_s=t_s, at=at, speed=speed, table=table)
         for i in range(n):
             torque[i] += dot(three(chain[i].J_lin), force)

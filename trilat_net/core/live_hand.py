@@ -1,29 +1,32 @@
-"""A live hand: what somebody who takes hold of an arm does in each tick, by the messages that
-came in.
+"""A live hand: the action of a person at an arm in each tick, by the messages received.
 
-Invariant: `advance_hand` is the whole state machine, a pure function of what it remembers and
-of the messages that came in before a tick. What is in force in a tick is an input of the tick
-and stands in its record, so a log repeats people without their messages.
+A new hold starts with no force at the arm's pose, and the grip grows from 0 to 1 within
+`GRIP_NS`. If an earlier grip is still fading, the hold starts from that grip, its target and
+the target's velocity. A target glides to its newest goal in a straight line. The glide takes a
+quarter more than the time between the last two messages, so that the target does not stop when
+a message is a little late. A hand that is silent for `SILENCE_NS` releases the arm: the target
+comes to rest, and the grip fades within `GRIP_NS`.
 
-Whoever takes hold begins where the arm is, with no force: the grip grows from 0 to 1 within
-`GRIP_NS`; while a grip still fades, from that grip, its target and the target's velocity. A
-target glides to its newest goal in a straight line, over a quarter more than the time between
-the last two messages, so that it does not stop where one is a little late. A hand that is
-silent for `SILENCE_NS` lets go: the target comes to rest and the grip fades within `GRIP_NS`.
+Goals beyond the arm's reach are moved to the nearest point within reach. From tick to tick the
+velocity of a target changes by at most its acceleration limit times the period, for any
+sequence of messages. While it glides, its speed does not exceed the largest speed from which it
+can stop at its goal, Eq. (L1):
 
-Goals lie within the arm's reach: one beyond is moved to the nearest point of it. From tick to
-tick the velocity of a target changes by at most its acceleration limit times the period,
-whatever messages come and however unevenly, and while it glides its speed does not exceed the
-largest one from which it can stop at its goal, Eq. (L1):
+    v(d) = a h (D / (n + 1) + n / 2)                                                        (L1)
+    D = d / (a h^2),    n = floor((sqrt(1 + 8 D) - 1) / 2)
 
-    v(d) = a h (D / (n + 1) + n / 2),  D = d / (a h^2),  n = floor((sqrt(1 + 8 D) - 1) / 2)
-    (L1)
+where d is the distance to the goal, a the acceleration limit and h the period. A target at that
+speed needs n more ticks, each a h slower than the one before, and the steps h v, h (v - a h),
+... add up to d exactly. A target that starts at rest therefore moves in a straight line and
+comes to rest at a still goal without overshoot. If the goal moves back along that line, the
+target overshoots it by at most the stopping distance, V^2 / (2 a) + V h / 2 at the speed limit
+V.
 
-with d the distance to the goal, a the acceleration limit and h the period. A target at that
-speed needs n more ticks, each a h slower, and their ways h v, h (v - a h), ... add up to d
-exactly. A target that begins at rest therefore moves in a straight line and comes to rest at a
-still goal without overshoot. If the goal comes back along that line, the target passes it by no
-more than the way in which it can stop, at most V^2 / (2 a) + V h / 2 at the speed limit V.
+Invariant:
+    - `advance_hand` is the whole state machine: a pure function of its memory and of the
+      messages received before a tick.
+    - The action of the hand in a tick is an input of the tick and part of its record, so a log
+      repeats people without their messages.
 """
 
 import math
@@ -34,29 +37,29 @@ from .jit import leaf
 from .vectors import Array, Vector
 
 SILENCE_NS = 200_000_000
-"""A longer silence of who holds an arm lets it go."""
+"""A longer silence of the holder releases the arm."""
 GRIP_NS = 100_000_000
-"""Time in which a grip becomes firm, and in which it fades."""
+"""Time in which a grip becomes firm, and time in which it fades."""
 GLIDE_NS = 50_000_000
-"""Longest time that a target takes to its goal, unless its speed is limited."""
+"""Longest time of a glide to the goal, unless a limit of the target prolongs it."""
 
 ANOTHER_HOLDS = "hand: another one holds the arm"
 OUT_OF_ORDER = "hand: out of order"
 TAKEN = "takes hold"
 RELEASED = "lets go"
 SILENT = "is silent: let go"
-"""What a tick changed in who holds an arm."""
+"""Outcomes of a message or a silence: refusals, and changes of the holder."""
 
 
 class HandReach(NamedTuple):
-    """The goals that an arm can get to, or a bound of them: a shell around a centre, and a box.
+    """The goals that an arm can reach, or a bound of them: a shell and a box.
 
     Attributes:
-        centre: of the shell, m; (): there is no shell.
-        inner_m: its least radius.
-        outer_m: its largest radius.
-        low: least coordinates, rad or m; (): there is no box.
-        high: largest coordinates.
+        centre: centre of the shell, m; () without a shell.
+        inner_m: inner radius of the shell, m.
+        outer_m: outer radius of the shell, m.
+        low: least coordinates of the box, rad or m; () without a box.
+        high: largest coordinates of the box, rad or m.
     """
 
     centre: Vector = ()
@@ -66,7 +69,7 @@ class HandReach(NamedTuple):
     high: Vector = ()
 
     def find_nearest(self, goal: Sequence[float]) -> tuple[float, ...]:
-        """Returns the nearest goal within reach; a goal within reach is not changed."""
+        """Returns the nearest reachable goal; a reachable goal is returned unchanged."""
         nearest = tuple(goal)
         if self.low:
             nearest = tuple(
@@ -75,30 +78,32 @@ class HandReach(NamedTuple):
             )
         if not self.centre:
             return nearest
-        way = [x - middle for x, middle in zip(nearest, self.centre, strict=True)]
-        radius = math.sqrt(sum(x * x for x in way))
+        offset = [x - middle for x, middle in zip(nearest, self.centre, strict=True)]
+        radius = math.sqrt(sum(x * x for x in offset))
         if self.inner_m <= radius <= self.outer_m:
             return nearest
         allowed_m = min(max(radius, self.inner_m), self.outer_m)
-        if radius == 0.0:  # every direction is as near
-            way[0] = radius = 1.0
-        share = allowed_m / radius
-        return tuple(middle + share * x for x, middle in zip(way, self.centre, strict=True))
+        if radius == 0.0:
+            # From the centre all directions are equally near: choose the first axis.
+            offset[0] = 1.0
+            radius = 1.0
+        factor = allowed_m / radius
+        pairs = zip(offset, self.centre, strict=True)
+        return tuple(middle + factor * x for x, middle in pairs)
 
 
 class HandRules(NamedTuple):
-    """What a live hand may do.
+    """The limits of a live hand.
 
     Attributes:
-        size: how many numbers its target has: one per axis, or per joint.
-        rate_hz: tick rate of the site.
+        size: count of the target's numbers: one per axis, or one per joint.
+        rate_hz: tick rate of the site, Hz.
         speed_limit: largest speed of the target, m/s or rad/s.
-        starts_at_arm: true: the target begins where the arm is; false: it is a force, which begins
-            at 0.
-        max_goal_norm: largest norm of a goal that is taken, m, rad or N.
-        acceleration_limit: largest change of the target's velocity in a second, m/s^2 or
-            rad/s^2; inf: none.
-        reach: where goals may lie.
+        starts_at_arm: true: the target starts at the arm's pose; false: the target is a force,
+            which starts at 0.
+        max_goal_norm: largest norm of an accepted goal, m, rad or N.
+        acceleration_limit: largest acceleration of the target, m/s^2 or rad/s^2; inf: no limit.
+        reach: the reachable goals.
     """
 
     size: int
@@ -114,11 +119,11 @@ class HandCommand(NamedTuple):
     """One message of a hand.
 
     Attributes:
-        source: who sends, a random number above 0.
-        number: which target of that source it is; the same again says that nothing has changed.
-        grip: false: it lets go.
-        target: its goal, m or rad, or its force, N.
-        sent_ns: when it was sent, on the sender's clock.
+        source: the sender, a random number above 0.
+        number: number of the sender's target; a repeated number means an unchanged target.
+        grip: false releases the arm.
+        target: the goal, m or rad, or the force, N.
+        sent_ns: time of sending by the sender's clock, ns.
     """
 
     source: int
@@ -129,18 +134,19 @@ class HandCommand(NamedTuple):
 
 
 class HandMemory(NamedTuple):
-    """What a live hand remembers from tick to tick.
+    """The state of a live hand from tick to tick.
 
     Attributes:
-        source: who holds the arm; 0: nobody, though a grip may still fade.
-        number: of the newest message taken; -1: none.
-        grip: how firm it is, 0 to 1.
-        target, rate: where the target is, and its velocity.
-        goal: where it goes to.
-        arrives_ns: when it arrives there, ns since the epoch.
-        sent_ns: when the message of that goal was sent.
-        received_ns: the tick that took in the newest message, ns since the epoch.
-        before: who let go last, and the number of that message.
+        source: the holder of the arm; 0: nobody, though a grip may still fade.
+        number: number of the newest accepted message; -1 without a message.
+        grip: firmness of the grip, 0 to 1.
+        target: position of the target, m or rad, or the force, N.
+        rate: velocity of the target.
+        goal: the goal of the target.
+        arrives_ns: time at which the target arrives at the goal, ns since the epoch.
+        sent_ns: time of sending of the goal's message, ns.
+        received_ns: time of the tick that accepted the newest message, ns since the epoch.
+        before: the last holder that released the arm, and the number of its last message.
     """
 
     source: int = 0
@@ -156,14 +162,14 @@ class HandMemory(NamedTuple):
 
 
 class HandInForce(NamedTuple):
-    """What a hand does in a tick, as the field `hand` of its record has it, in this order.
+    """The action of a hand in a tick, in the order of the record's field `hand`.
 
     Attributes:
-        grip: how firm it is, 0 to 1.
-        number: of the newest message that it follows; -1: nobody holds the arm.
-        source: who holds it; 0: nobody.
+        grip: firmness of the grip, 0 to 1.
+        number: number of the newest message that the hand follows; -1: nobody holds the arm.
+        source: the holder of the arm; 0: nobody.
         target: the target, or the force, in the tick.
-        rate: its velocity.
+        rate: velocity of the target.
     """
 
     grip: float
@@ -174,27 +180,26 @@ class HandInForce(NamedTuple):
 
     @classmethod
     def read(cls, vector: Sequence[float]) -> "HandInForce":
-        """Returns the hand of a record's vector."""
+        """Returns the action that the field `hand` of a record describes."""
         size = (len(vector) - 3) // 2
-        grip, number, source, *rest = vector
+        grip, number, source, *numbers = vector
         return cls(
             grip=grip,
             number=int(number),
             source=int(source),
-            target=tuple(rest[:size]),
-            rate=tuple(rest[size:]),
+            target=tuple(numbers[:size]),
+            rate=tuple(numbers[size:]),
         )
 
 
 class HandStep(NamedTuple):
-    """What a tick made of the messages.
+    """The result of a tick of a hand.
 
     Attributes:
-        memory: for the next tick.
-        vector: what is in force, see `HandInForce`.
-        refused: reasons, one for each message that had no effect.
-        changes: who took hold or let go, in order: the source, and one of TAKEN, RELEASED,
-            SILENT.
+        memory: the state for the next tick.
+        vector: the action in the tick, see `HandInForce`.
+        refused: a reason for each message that had no effect.
+        changes: changes of the holder in order: the source, and TAKEN, RELEASED or SILENT.
     """
 
     memory: HandMemory
@@ -204,12 +209,12 @@ class HandStep(NamedTuple):
 
 
 def count_hand_numbers(size: int) -> int:
-    """Returns how many numbers the field `hand` of a record has, for a target of so many."""
+    """Returns the length of a record's field `hand` for a target of `size` numbers."""
     return 3 + 2 * size
 
 
 def empty_hand_vector(size: int) -> list[float]:
-    """Returns the field `hand` of a tick in which nobody holds the arm."""
+    """Returns the field `hand` of a record while nobody holds the arm."""
     return [0.0, -1.0, 0.0, *[0.0] * (2 * size)]
 
 
@@ -218,30 +223,23 @@ def advance_hand(
     memory: HandMemory,
     t_ns: int,
     commands: Sequence[HandCommand],
-    place: Callable[[], Sequence[float]],
+    locate: Callable[[], Sequence[float]],
 ) -> HandStep:
-    """Returns what a hand does in a tick.
+    """Returns the action of a hand in a tick.
 
     Args:
-        rules: what it may do.
-        memory: what it remembers of the tick before.
+        rules: the limits of the hand.
+        memory: its state after the previous tick.
         t_ns: the nominal time of the tick, ns since the epoch.
-        commands: the messages that came in since the tick before, in order.
-        place: returns where the arm is now, in the coordinates of the target.
+        commands: the messages received since the previous tick, in order.
+        locate: returns the arm's pose now, in the coordinates of the target.
     """
-    h_s = 1.0 / rules.rate_hz
-    firmer = 1e9 / (GRIP_NS * rules.rate_hz)
     refused: list[str] = []
     changes: list[tuple[int, str]] = []
-    now = memory
-    if now.target:
-        target = tuple([x + v * h_s for x, v in zip(now.target, now.rate, strict=True)])
-        grip = min(now.grip + firmer, 1.0) if now.source else max(now.grip - firmer, 0.0)
-        held = now.source or grip > 0.0
-        now = now._replace(target=target, grip=grip) if held else HandMemory(before=now.before)
+    now = _move_target(rules, memory) if memory.target else memory
     for command in commands:
-        now, outcome = _take_command(
-            rules=rules, memory=now, t_ns=t_ns, command=command, place=place
+        now, outcome = _accept_command(
+            rules=rules, memory=now, t_ns=t_ns, command=command, locate=locate
         )
         if outcome in (TAKEN, RELEASED):
             changes.append((command.source, outcome))
@@ -249,14 +247,28 @@ def advance_hand(
             refused.append(outcome)
     if now.source and t_ns - now.received_ns > SILENCE_NS:
         changes.append((now.source, SILENT))
-        now = _let_go(now, now.number - 1)
+        # One less: the silent holder may repeat its number and so take hold again.
+        now = _release(now, now.number - 1)
     if not now.target:
         return HandStep(now, empty_hand_vector(rules.size), tuple(refused), tuple(changes))
-    now = now._replace(
-        rate=_find_rate(rules, now, t_ns) if now.source else _find_fading_rate(rules, now)
-    )
+    rate = _find_rate(rules, now, t_ns) if now.source else _find_fading_rate(rules, now)
+    now = now._replace(rate=rate)
     vector = [now.grip, float(now.number), float(now.source), *now.target, *now.rate]
     return HandStep(now, vector, tuple(refused), tuple(changes))
+
+
+def _move_target(rules: HandRules, memory: HandMemory) -> HandMemory:
+    """Returns the state one period later: target moved, grip firmer or weaker."""
+    h_s = 1.0 / rules.rate_hz
+    grip_step = 1e9 / (GRIP_NS * rules.rate_hz)
+    # A list instead of a generator: it is faster, and this runs in each tick.
+    target = tuple([x + v * h_s for x, v in zip(memory.target, memory.rate, strict=True)])
+    if memory.source:
+        return memory._replace(target=target, grip=min(memory.grip + grip_step, 1.0))
+    grip = max(memory.grip - grip_step, 0.0)
+    if grip > 0.0:
+        return memory._replace(target=target, grip=grip)
+    return HandMemory(before=memory.before)
 
 
 @leaf
@@ -264,19 +276,19 @@ def find_stopping_speed(distance: float, acceleration: float, h_s: float) -> flo
     """Returns the largest speed from which a target can stop at a distance, Eq. (L1).
 
     Args:
-        distance: to the goal, m or rad.
-        acceleration: the largest change of speed in a second, m/s^2 or rad/s^2.
+        distance: distance to the goal, m or rad.
+        acceleration: largest acceleration, m/s^2 or rad/s^2.
         h_s: period of the ticks, s.
     """
-    step = acceleration * h_s
-    ways = distance / (step * h_s)
-    ticks = math.floor(0.5 * (math.sqrt(1.0 + 8.0 * ways) - 1.0))
-    return step * (ways / (ticks + 1.0) + 0.5 * ticks)
+    speed_step = acceleration * h_s
+    D = distance / (speed_step * h_s)
+    n = math.floor(0.5 * (math.sqrt(1.0 + 8.0 * D) - 1.0))
+    return speed_step * (D / (n + 1.0) + 0.5 * n)
 
 
 _plain_stopping_speed = getattr(find_stopping_speed, "py_func", find_stopping_speed)
-"""Without compilation: a call from Python into compiled code takes longer than its few
-operations.
+"""The same function, uncompiled: a call from Python into compiled code takes longer than these
+few operations.
 """
 
 
@@ -293,18 +305,31 @@ def glide(
     rate: Array,
     rows: Array,
 ) -> float:
-    """Does as `advance_hand` of a held arm in ticks without a message, compiled: a row of
-    `rows` each.
+    """Computes the actions of a held arm in ticks without a message.
 
-    A row is as `HandInForce`, but for number and source. Target and rate are changed; returns
-    the grip.
+    The result equals that of `advance_hand`, bit for bit, and is compiled.
+
+    Args:
+        first: the first tick.
+        rate_hz: tick rate of the site, Hz.
+        grip: firmness of the grip before, 0 to 1.
+        arrives_ns: time at which the target arrives at the goal, ns since the epoch.
+        speed_limit: largest speed of the target, m/s or rad/s.
+        acceleration: largest acceleration of the target, m/s^2 or rad/s^2; inf: no limit.
+        goal: the goal, shape (size,).
+        target: the target before; changed, shape (size,).
+        rate: its velocity before; changed, shape (size,).
+        rows: written: one row per tick as `HandInForce`, except number and source.
+
+    Returns:
+        The firmness of the grip afterwards.
     """
     h_s = 1.0 / rate_hz
-    firmer = 1e9 / (GRIP_NS * rate_hz)
+    grip_step = 1e9 / (GRIP_NS * rate_hz)
     size = target.shape[0]
     for n in range(rows.shape[0]):
         t_ns = (first + n) * 1_000_000_000 // rate_hz
-        grip = min(grip + firmer, 1.0)
+        grip = min(grip + grip_step, 1.0)
         left_s = max((arrives_ns - t_ns) * 1e-9, h_s)
         if acceleration < math.inf:
             _glide_tick(
@@ -323,9 +348,9 @@ def glide(
                 rate[i] = (goal[i] - target[i]) / left_s
                 square += rate[i] * rate[i]
             speed = math.sqrt(square)
-            share = speed_limit / speed if speed > speed_limit else 1.0
+            factor = speed_limit / speed if speed > speed_limit else 1.0
             for i in range(size):
-                rate[i] *= share
+                rate[i] *= factor
         rows[n, 0] = grip
         for i in range(size):
             rows[n, 3 + i] = target[i]
@@ -343,77 +368,107 @@ def _glide_tick(
     target: Array,
     rate: Array,
 ) -> None:
-    """Moves a target on by a tick and changes its rate within both limits, as
-    `_find_limited_rate`.
+    """Moves a target by a tick, and changes its velocity as `_find_limited_rate` does.
+
+    Args:
+        left_s: time that remains until the target arrives at the goal, s.
+        h_s: the period, s.
+        speed_limit: largest speed of the target, m/s or rad/s.
+        acceleration: largest acceleration of the target, m/s^2 or rad/s^2.
+        goal: the goal, shape (size,).
+        target: the target; changed, shape (size,).
+        rate: its velocity; changed, shape (size,).
     """
     size = target.shape[0]
     square = 0.0
     for i in range(size):
         target[i] += rate[i] * h_s
-        way = goal[i] - target[i]
-        square += way * way
+        offset = goal[i] - target[i]
+        square += offset * offset
     distance = math.sqrt(square)
-    stopping = find_stopping_speed(distance, acceleration, h_s)
-    speed = min(speed_limit, min(distance / left_s, stopping))
-    per_way = speed / distance if distance > 0.0 else 0.0
+    stopping_speed = find_stopping_speed(distance, acceleration, h_s)
+    speed = min(speed_limit, min(distance / left_s, stopping_speed))
+    speed_per_distance = speed / distance if distance > 0.0 else 0.0
     square = 0.0
     for i in range(size):
-        change = per_way * (goal[i] - target[i]) - rate[i]
+        change = speed_per_distance * (goal[i] - target[i]) - rate[i]
         square += change * change
-    size_of_change = math.sqrt(square)
+    change_norm = math.sqrt(square)
     most = acceleration * h_s
-    share = most / size_of_change if size_of_change > most else 1.0
+    factor = most / change_norm if change_norm > most else 1.0
     for i in range(size):
-        rate[i] += share * (per_way * (goal[i] - target[i]) - rate[i])
+        rate[i] += factor * (speed_per_distance * (goal[i] - target[i]) - rate[i])
 
 
-def _take_command(
+def _accept_command(
     rules: HandRules,
     memory: HandMemory,
     t_ns: int,
     command: HandCommand,
-    place: Callable[[], Sequence[float]],
+    locate: Callable[[], Sequence[float]],
 ) -> tuple[HandMemory, str]:
-    """Returns the memory after a message, and why it has no effect, or what it changes, or ""."""
+    """Returns the state after a message, and the outcome.
+
+    The outcome is a reason why the message has no effect, a change of the holder, or "".
+    """
     if memory.source not in (0, command.source):
         return memory, ANOTHER_HOLDS
     last = memory.number if memory.source else memory.before[1]
-    known = memory.source or memory.before[0] == command.source
-    if known and (command.number < last or (command.number == last and not memory.source)):
-        return memory, OUT_OF_ORDER
+    is_known = memory.source or memory.before[0] == command.source
+    if is_known:
+        is_repeated = command.number == last and not memory.source
+        if command.number < last or is_repeated:
+            return memory, OUT_OF_ORDER
     if not command.grip:
-        return (_let_go(memory, command.number), RELEASED) if memory.source else (memory, "")
+        if not memory.source:
+            return memory, ""
+        return _release(memory, command.number), RELEASED
     if not memory.source:
-        still = (0.0,) * rules.size
-        start = memory.target or (tuple(map(float, place())) if rules.starts_at_arm else still)
-        held = HandMemory(
-            source=command.source,
-            number=command.number,
-            grip=memory.grip,
-            target=start,
-            rate=memory.rate or still,
-        )
-        held = held._replace(received_ns=t_ns, before=memory.before)
-        return _aim(rules, held, command, t_ns + GLIDE_NS), TAKEN
+        return _take_hold(rules, memory, t_ns, command, locate), TAKEN
     memory = memory._replace(received_ns=t_ns)
     if command.number == memory.number:
         return memory, ""
     period_ns = 1_000_000_000 // rules.rate_hz
-    between_ns = min(max((command.sent_ns - memory.sent_ns) * 5 // 4, period_ns), GLIDE_NS)
-    return _aim(rules, memory, command, t_ns + between_ns), ""
+    glide_ns = min(max((command.sent_ns - memory.sent_ns) * 5 // 4, period_ns), GLIDE_NS)
+    return _aim(rules, memory, command, t_ns + glide_ns), ""
+
+
+def _take_hold(
+    rules: HandRules,
+    memory: HandMemory,
+    t_ns: int,
+    command: HandCommand,
+    locate: Callable[[], Sequence[float]],
+) -> HandMemory:
+    """Returns the state after a message with which a source takes hold of a free arm."""
+    zeros = (0.0,) * rules.size
+    target = memory.target
+    if not target:
+        target = tuple(map(float, locate())) if rules.starts_at_arm else zeros
+    held = HandMemory(
+        source=command.source,
+        number=command.number,
+        grip=memory.grip,
+        target=target,
+        rate=memory.rate or zeros,
+        received_ns=t_ns,
+        before=memory.before,
+    )
+    return _aim(rules, held, command, t_ns + GLIDE_NS)
 
 
 def _aim(
     rules: HandRules, memory: HandMemory, command: HandCommand, arrives_ns: int
 ) -> HandMemory:
+    """Returns the state with the goal of a message, moved within reach."""
     goal = rules.reach.find_nearest(command.target)
     return memory._replace(
         number=command.number, goal=goal, arrives_ns=arrives_ns, sent_ns=command.sent_ns
     )
 
 
-def _let_go(memory: HandMemory, number: int) -> HandMemory:
-    """Returns the memory of a grip that fades; messages of its source up to `number` are over."""
+def _release(memory: HandMemory, number: int) -> HandMemory:
+    """Returns the state of a fading grip; the source's messages up to `number` are outdated."""
     before = (memory.source, number)
     return HandMemory(grip=memory.grip, target=memory.target, rate=memory.rate, before=before)
 
@@ -432,34 +487,40 @@ def _find_limited_rate(
 ) -> tuple[float, ...]:
     """Returns the velocity of a target whose acceleration is limited, see Eq. (L1).
 
-    Both limits are balls around a velocity within them, so that a velocity between the last one
-    and the wanted one keeps them too.
+    Both limits are balls in the space of velocities. The last and the desired velocity lie
+    within the limits, and so does any velocity between them.
+
+    Args:
+        rules: the limits of the hand.
+        memory: its state, with the target already moved.
+        left_s: time that remains until the target arrives at the goal, s.
     """
     h_s = 1.0 / rules.rate_hz
-    way = [goal - x for goal, x in zip(memory.goal, memory.target, strict=True)]
+    offset = [goal - x for goal, x in zip(memory.goal, memory.target, strict=True)]
+    # Sums in a loop: the order of additions is that of `_glide_tick`.
     square = 0.0
-    for x in way:
+    for x in offset:
         square += x * x
     distance = math.sqrt(square)
-    stopping = _plain_stopping_speed(distance, rules.acceleration_limit, h_s)
-    speed = min(rules.speed_limit, distance / left_s, stopping)
-    per_way = speed / distance if distance > 0.0 else 0.0
-    changes = [per_way * x - v for x, v in zip(way, memory.rate, strict=True)]
+    stopping_speed = _plain_stopping_speed(distance, rules.acceleration_limit, h_s)
+    speed = min(rules.speed_limit, distance / left_s, stopping_speed)
+    speed_per_distance = speed / distance if distance > 0.0 else 0.0
+    changes = [speed_per_distance * x - v for x, v in zip(offset, memory.rate, strict=True)]
     square = 0.0
     for change in changes:
         square += change * change
-    size = math.sqrt(square)
+    change_norm = math.sqrt(square)
     most = rules.acceleration_limit * h_s
-    share = most / size if size > most else 1.0
-    return tuple(v + share * change for v, change in zip(memory.rate, changes, strict=True))
+    factor = most / change_norm if change_norm > most else 1.0
+    return tuple(v + factor * change for v, change in zip(memory.rate, changes, strict=True))
 
 
 def _find_rate(rules: HandRules, memory: HandMemory, t_ns: int) -> tuple[float, ...]:
-    """Returns the velocity at which a target goes to its goal, within its limits."""
+    """Returns the velocity of a target towards its goal, within its limits."""
     left_s = max((memory.arrives_ns - t_ns) * 1e-9, 1.0 / rules.rate_hz)
     if rules.acceleration_limit < math.inf:
         return _find_limited_rate(rules, memory, left_s)
     rate = [(goal - x) / left_s for goal, x in zip(memory.goal, memory.target, strict=True)]
     speed = math.sqrt(sum(v * v for v in rate))
-    share = rules.speed_limit / speed if speed > rules.speed_limit else 1.0
-    return tuple(share * v for v in rate)
+    factor = rules.speed_limit / speed if speed > rules.speed_limit else 1.0
+    return tuple(factor * v for v in rate)

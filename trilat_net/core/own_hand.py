@@ -1,16 +1,17 @@
-"""A hand of one's own: a program that sees what its site knows, and moves, turns or pushes the
-arm.
+"""A user's hand program, which sees its site's knowledge and moves, turns or pushes the arm.
 
-Invariant: what is decided at a tick by what was seen at that tick acts a fixed time later,
-whoever decides and wherever, as a sample is in use a fixed time after its stamp (L2). A
-decision that comes later than that acts at once. What acts is an input of the tick, as of any
-live hand, so a log repeats it without the program.
+Invariant:
+    - A decision that is based on tick k acts a fixed time after tick k, wherever it is made, as
+      a sample is in use a fixed time after its stamp (L2).
+    - A decision that arrives later than that acts at once.
+    - The action is an input of the tick, as for any live hand, so a log repeats it without the
+      program.
 """
 
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -31,11 +32,11 @@ from .user_law import PeerView
 from .vectors import Array
 
 PROGRAM = 1
-"""The source of every action of a hand of one's own, in a record."""
+"""The source that a record names for each action of a hand program."""
 
 
 class HandContext(NamedTuple):
-    """What a hand of one's own knows before it begins.
+    """The facts that a hand program gets before the run.
 
     >>> class Still:
     ...     def __init__(self, facts: tn.HandContext) -> None:
@@ -44,16 +45,16 @@ class HandContext(NamedTuple):
     ...         return [0.0] * self.size
 
     Attributes:
-        site: the site whose arm it holds.
+        site: the site whose arm the hand holds.
         peers: names of the peers, in scenario order.
-        mode: "tip": it moves the end effector; "joint": it turns the joints; "force": it
+        mode: "tip": the hand moves the end effector; "joint": it turns the joints; "force": it
             pushes.
-        size: how many numbers it acts with: an axis each, m or N; or a joint each, rad.
-        rate_hz: how often it is asked, Hz.
-        delay_s: time from what it sees to what it does, s.
-        speed_limit: largest speed of the target, m/s or rad/s; inf for one that pushes.
-        limit: the largest force, N, or the largest norm of its torques, N m.
-        seed: for what it draws: of the scenario and the site.
+        size: count of the numbers of an action: one per axis, m or N, or one per joint, rad.
+        rate_hz: rate of decisions, Hz.
+        delay_s: time from a view to the action that is based on it, s.
+        speed_limit: largest speed of the target, m/s or rad/s; inf for a hand that pushes.
+        limit: the largest force, N, or the largest norm of the hand's torques, N m.
+        seed: seed for random numbers, derived from the scenario and the site.
     """
 
     site: str
@@ -68,25 +69,26 @@ class HandContext(NamedTuple):
 
 
 class HandView(NamedTuple):
-    """What a hand of one's own sees at a tick, by what its site knows then.
+    """The knowledge of a site at a tick, as its hand program sees it.
 
     >>> def act(self, now: tn.HandView) -> list[float]:
     ...     return now.pose + 0.3 * (self.goal_m - now.pose)
 
     Attributes:
         k: the tick.
-        t_s: its nominal time since the epoch, s.
+        t_s: nominal time of the tick since the epoch, s.
         q: joint angles of the arm, rad, shape (n,).
         qd: joint velocities, rad/s.
-        pose: where the arm is in the coordinates of the hand: its end effector, m, or its
+        pose: pose of the arm in the coordinates of the hand: its end effector, m, or its
             joints, rad.
-        q_des: the reference of the tick before, rad or m, shape (m,).
-        tau_x: exogenous torque of the tick before, N m; the torque ON the arm is its negative.
-        target: where the hand's own target is, m or rad, or its force, N; zeros while it does
-            not hold.
-        grip: how firm it holds, 0 to 1.
-        peers: the peers in scenario order, by the samples that were in use at the tick before:
-            q and qd have m numbers, and an age is that at this tick.
+        q_des: the reference of the previous tick, rad or m, shape (m,).
+        tau_x: exogenous torque of the previous tick, N m; the torque ON the arm is its
+            negative.
+        target: the hand's current target, m or rad, or its force, N; zeros while it does not
+            hold the arm.
+        grip: firmness of the hand's grip, 0 to 1.
+        peers: the peers in scenario order, by the samples that were in use at the previous
+            tick: q and qd have m numbers, and ages are those at this tick.
     """
 
     k: int
@@ -102,173 +104,205 @@ class HandView(NamedTuple):
 
 
 class HandProgram(Protocol):
-    """A hand of one's own; its class is called with `HandContext` and its settings, by name."""
+    """A user's hand program.
+
+    Its class is called with `HandContext` and with its settings by name.
+    """
 
     def act(self, now: HandView) -> Sequence[float] | None:
-        """Returns the target of the end effector, m, or of the joints, rad, or a force, N;
-        None: lets go.
+        """Returns the target of the end effector, m, or of the joints, rad, or a force, N.
+
+        None releases the arm.
         """
 
 
 class OwnHand:
-    """The hand of one's own at one site: when it is asked, and when what it decides acts.
+    """The hand program at one site: the ticks of its decisions, and when a decision acts.
 
     Args:
-        rules: what it may do.
-        every: ticks from one question to the next.
-        delay: ticks from what it sees to what it does.
-        place: returns where the arm is by its joint angles, in the coordinates of the target.
+        rules: limits of the hand.
+        period_ticks: ticks from one decision to the next.
+        delay_ticks: ticks from a view to the action that is based on it.
+        locate: returns the arm's pose in the coordinates of the target, by its joint angles.
     """
 
     def __init__(
         self,
         rules: HandRules,
-        every: int,
-        delay: int,
-        place: Callable[[Sequence[float]], Sequence[float]],
+        period_ticks: int,
+        delay_ticks: int,
+        locate: Callable[[Sequence[float]], Sequence[float]],
     ) -> None:
         self._rules = rules
-        self.period_ticks = every
-        self.delay_ticks = delay
-        self._place = place
+        self.period_ticks = period_ticks
+        self.delay_ticks = delay_ticks
+        self._locate = locate
         self._due: deque[tuple[int, HandCommand]] = deque()
         self._memory = HandMemory()
         self._newest = -1
 
     def is_decision_tick(self, k: int) -> bool:
-        """True if it decides at this tick."""
+        """True if the program decides at tick k."""
         return k % self.period_ticks == 0
 
     def find_next_event(self, k: int) -> int:
-        """Returns the first tick after this one at which it is asked, or what it decided begins
-        to act.
-        """
-        asked = (k // self.period_ticks + 1) * self.period_ticks
-        return min([asked, *(due for due, _ in self._due if due > k)])
+        """Returns the first tick after k at which a decision is made or starts to act."""
+        next_decision = (k // self.period_ticks + 1) * self.period_ticks
+        return min([next_decision, *(due for due, _ in self._due if due > k)])
 
     def build_view(self, k: int, arrays: SiteArrays, layout: Layout) -> HandView:
-        """Returns what it sees at tick k, which its site is about to make."""
-        own = np.asarray(arrays.site)
-        links = np.asarray(arrays.links)  # records are slow to read
+        """Returns the program's view at tick k, which the site has not computed yet."""
+        # NumPy reads fields of plain arrays faster than those of records.
+        site = np.asarray(arrays.site)
+        links = np.asarray(arrays.links)
         n = layout.joints
         m = layout.shared
-        rate_hz = self._rules.rate_hz
-        q = own["q"][0, :n].copy()
-        now_ns = tick_ns(k, rate_hz)
-        numbers = [links[name].tolist() for name in ("alpha", "used", "rate_hz", "new")]
-        shared = [links[name][:, :m].copy() for name in ("q", "qd", "tau_x")]
-        peers = tuple(
-            PeerView(
-                alpha, used, (now_ns - tick_ns(max(used, 0), its_rate_hz)) * 1e-9, new, *states
-            )
-            for alpha, used, its_rate_hz, new, *states in zip(*numbers, *shared, strict=True)
-        )
+        q = site["q"][0, :n].copy()
         return HandView(
             k=k,
-            t_s=k / rate_hz,
+            t_s=k / self._rules.rate_hz,
             q=q,
-            qd=own["qd"][0, :n].copy(),
-            pose=np.asarray(self._place(q.tolist()), dtype=np.float64),
-            q_des=own["q_des"][0, :m].copy(),
-            tau_x=0.0 - own["on_arm"][0, :n],
+            qd=site["qd"][0, :n].copy(),
+            pose=np.asarray(self._locate(q.tolist()), dtype=np.float64),
+            q_des=site["q_des"][0, :m].copy(),
+            tau_x=0.0 - site["on_arm"][0, :n],
             target=np.array(self._memory.target or (0.0,) * self._rules.size),
             grip=self._memory.grip,
-            peers=peers,
+            peers=self._view_peers(k, links, m),
         )
 
-    def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
-        """Takes in what it decided by what it saw at tick k.
+    def _view_peers(self, k: int, links: Any, coordinates: int) -> tuple[PeerView, ...]:
+        """Returns the peers at tick k, by the samples in use at the previous tick."""
+        now_ns = tick_ns(k, self._rules.rate_hz)
+        vectors = {name: links[name][:, :coordinates].copy() for name in ("q", "qd", "tau_x")}
+        alpha = links["alpha"].tolist()
+        used = links["used"].tolist()
+        rates_hz = links["rate_hz"].tolist()
+        new = links["new"].tolist()
+        peers = []
+        for j in range(len(links)):
+            stamp_ns = tick_ns(max(used[j], 0), rates_hz[j])
+            peers.append(
+                PeerView(
+                    alpha=alpha[j],
+                    tick=used[j],
+                    age_s=(now_ns - stamp_ns) * 1e-9,
+                    new=new[j],
+                    q=vectors["q"][j],
+                    qd=vectors["qd"][j],
+                    tau_x=vectors["tau_x"][j],
+                )
+            )
+        return tuple(peers)
 
-        One that is older than the newest is passed over.
+    def accept_decision(self, k: int, goal: Sequence[float] | None) -> None:
+        """Schedules the decision that is based on the view of tick k.
+
+        A decision that is older than the newest one is ignored.
+
+        Args:
+            k: the tick of the view.
+            goal: the target or the force; None releases the arm.
 
         Raises:
-            ValueError: it is no target or force that such a hand may have.
+            ValueError: the hand may not have such a target or force.
         """
-        numbers = () if goal is None else tuple(float(one) for one in goal)
+        numbers = () if goal is None else tuple(float(number) for number in goal)
         if goal is not None and len(numbers) != self._rules.size:
             raise ValueError(
                 f"it acts with {count_nouns(len(numbers), 'number')}, not {self._rules.size}"
             )
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"it acts with {list(numbers)}, which is not finite")
-        if (size := math.hypot(*numbers)) > self._rules.max_goal_norm:
-            raise ValueError(
-                f"it acts with a norm of {size:g}, at most {self._rules.max_goal_norm:g} is taken"
-            )
+        norm = math.hypot(*numbers)
+        most = self._rules.max_goal_norm
+        if norm > most:
+            raise ValueError(f"it acts with a norm of {norm:g}, at most {most:g} is accepted")
         if k <= self._newest:
             return
         self._newest = k
-        due = k + self.delay_ticks
+        self._schedule(k, k + self.delay_ticks, numbers, grip=goal is not None)
+
+    def release(self, k: int) -> None:
+        """Releases the arm at tick k, and cancels all earlier decisions."""
+        self._due.clear()
+        self._schedule(k, k, (), grip=False)
+
+    def _schedule(self, k: int, due: int, target: tuple[float, ...], *, grip: bool) -> None:
+        """Appends the command of tick k that acts at tick `due`."""
         command = HandCommand(
             source=PROGRAM,
             number=k // self.period_ticks,
-            grip=goal is not None,
-            target=numbers,
+            grip=grip,
+            target=target,
             sent_ns=tick_ns(due, self._rules.rate_hz),
         )
         self._due.append((due, command))
 
-    def release(self, k: int) -> None:
-        """Lets go at tick k, whatever was decided before."""
-        self._due.clear()
-        command = HandCommand(
-            source=PROGRAM,
-            number=k // self.period_ticks,
-            grip=False,
-            target=(),
-            sent_ns=tick_ns(k, self._rules.rate_hz),
-        )
-        self._due.append((k, command))
+    def advance_to(self, k: int, read_angles: Callable[[], Sequence[float]]) -> HandStep:
+        """Returns the hand's action in tick k, see `advance_hand`.
 
-    def advance_to(self, k: int, angles: Callable[[], Sequence[float]]) -> HandStep:
-        """Returns what it does in tick k, see `advance_hand`; `angles` returns those of the
-        joints, rad.
+        Args:
+            k: the tick after the one of the previous call.
+            read_angles: returns the joint angles, rad.
         """
         commands = []
         while self._due and self._due[0][0] <= k:
             commands.append(self._due.popleft()[1])
-        t_ns = tick_ns(k, self._rules.rate_hz)
         step = advance_hand(
             rules=self._rules,
             memory=self._memory,
-            t_ns=t_ns,
+            t_ns=tick_ns(k, self._rules.rate_hz),
             commands=commands,
-            place=lambda: self._place(angles()),
+            locate=lambda: self._locate(read_angles()),
         )
         self._memory = step.memory
         return step
 
-    def advance_span(self, k: int, end: int, angles: Callable[[], Sequence[float]]) -> Array:
-        """Returns what it does from tick k until it needs the arm again, before tick `end`.
+    def advance_span(
+        self, k: int, end: int, read_angles: Callable[[], Sequence[float]]
+    ) -> Array:
+        """Returns the hand's actions from tick k until it needs the arm again.
 
-        Of each tick there is a row, as `HandInForce`. The same as `advance_to` tick by tick, bit
-        for bit.
+        The result equals that of `advance_to`, tick by tick, bit for bit.
+
+        Args:
+            k: the first tick.
+            end: the actions end before this tick at the latest.
+            read_angles: returns the joint angles at tick k, rad.
+
+        Returns:
+            One row per tick, with the numbers of `HandInForce`.
         """
         size = self._rules.size
         rate_hz = self._rules.rate_hz
-        first = self.advance_to(k, angles).vector
-        rows = np.zeros((max(min(self.find_next_event(k), end), k + 1) - k, 3 + 2 * size))
+        first = self.advance_to(k, read_angles).vector
+        last = max(min(self.find_next_event(k), end), k + 1)
+        rows = np.zeros((last - k, 3 + 2 * size))
         rows[0] = first
-        held = self._memory
-        if held.source and tick_ns(k + len(rows) - 1, rate_hz) - held.received_ns <= SILENCE_NS:
-            goal, target, rate = (np.array(one) for one in (held.goal, held.target, held.rate))
-            grip = glide(
-                first=k + 1,
-                rate_hz=rate_hz,
-                grip=held.grip,
-                arrives_ns=held.arrives_ns,
-                speed_limit=self._rules.speed_limit,
-                acceleration=self._rules.acceleration_limit,
-                goal=goal,
-                target=target,
-                rate=rate,
-                rows=rows[1:],
-            )
-            rows[1:, 1] = held.number
-            rows[1:, 2] = held.source
-            ends = tuple(target.tolist()), tuple(rate.tolist())
-            self._memory = held._replace(grip=grip, target=ends[0], rate=ends[1])
-        else:
+        memory = self._memory
+        silence_ns = tick_ns(last - 1, rate_hz) - memory.received_ns
+        if not memory.source or silence_ns > SILENCE_NS:
             for n in range(1, len(rows)):
-                rows[n] = self.advance_to(k + n, angles).vector
+                rows[n] = self.advance_to(k + n, read_angles).vector
+            return rows
+        target = np.array(memory.target)
+        rate = np.array(memory.rate)
+        grip = glide(
+            first=k + 1,
+            rate_hz=rate_hz,
+            grip=memory.grip,
+            arrives_ns=memory.arrives_ns,
+            speed_limit=self._rules.speed_limit,
+            acceleration=self._rules.acceleration_limit,
+            goal=np.array(memory.goal),
+            target=target,
+            rate=rate,
+            rows=rows[1:],
+        )
+        rows[1:, 1] = memory.number
+        rows[1:, 2] = memory.source
+        self._memory = memory._replace(
+            grip=grip, target=tuple(target.tolist()), rate=tuple(rate.tolist())
+        )
         return rows

@@ -1,11 +1,14 @@
-"""Rotations as vectors: axis times angle, rad, by plain arithmetic with the same bits on every
-machine.
+"""Rotations as vectors (axis times angle, rad), with the same bits on any machine.
 
-Invariant: a rotation vector is at most half a turn long; `rotation_matrix` and
-`rotation_vector` undo each other. The arc tangent is that of S. Moshier's Cephes library. A
-turn of which only the vector changes has the angular velocity J(vector) vector', with J the
-left Jacobian of the rotation group (J. Sola, J. Deray and D. Atchuthan, "A micro Lie theory for
-state estimation in robotics", arXiv 1812.01537, Eq. 145, 146).
+The angular velocity of a changing rotation vector u is J(u) u', where J is the left Jacobian of
+the rotation group (J. Sola, J. Deray and D. Atchuthan, "A micro Lie theory for state estimation
+in robotics", arXiv 1812.01537, Eq. 145, 146). The arc tangent is that of S. Moshier's Cephes
+library.
+
+Invariant:
+    - A rotation vector is at most half a turn long.
+    - `rotation_matrix` and `rotation_vector` are inverse to each other.
+    - Only basic arithmetic and square roots are used, which all machines round alike.
 """
 
 import math
@@ -16,19 +19,20 @@ from .jit import leaf
 from .vectors import Array
 
 _SMALL = 1e-8
-"""Below this, a sine is its angle to the last bit."""
+"""Below this angle, rad, the sine equals the angle to the last bit."""
 _SHORT = 0.02
-"""Below this, rad, the first terms of a series are exact to the last bit, and closed forms are
-not.
+"""Below this angle, rad, the first terms of a series are exact to the last bit, in contrast to
+closed forms.
 """
 
 
 @leaf
 def arctan(x: float) -> float:
-    """Returns the arc tangent of a number from 0 to 1, rad."""
-    turned = 0.0
+    """Returns the arc tangent of a number from 0 to 1, rad (Cephes, `atan`)."""
+    offset = 0.0
     if x > 0.66:
-        turned = 0.25 * math.pi
+        # arctan(x) = pi / 4 + arctan((x - 1) / (x + 1))
+        offset = 0.25 * math.pi
         x = (x - 1.0) / (x + 1.0)
     z = x * x
     P = -8.750608600031904122785e-1
@@ -41,12 +45,12 @@ def arctan(x: float) -> float:
     Q = Q * z + 4.328810604912902668951e2
     Q = Q * z + 4.853903996359136964868e2
     Q = Q * z + 1.945506571482613964425e2
-    return turned + (x + x * (z * P / Q))
+    return offset + (x + x * (z * P / Q))
 
 
 @leaf
 def rotation_matrix(vector: Three) -> Matrix:
-    """Returns the rotation by a vector, three rows (Rodrigues)."""
+    """Returns the rotation matrix of a rotation vector, three rows (Rodrigues)."""
     angle = math.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])
     s, c = sincos(angle)
     by_sine = 1.0
@@ -73,7 +77,10 @@ def rotation_matrix(vector: Three) -> Matrix:
 
 @leaf
 def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
-    """Returns the quaternion of a rotation with w >= 0, from its largest part (Shepperd, 1978)."""
+    """Returns the quaternion (w, v) of a rotation, with w >= 0.
+
+    It is computed from its largest component (Shepperd, 1978).
+    """
     (xx, xy, xz) = R[0]
     (yx, yy, yz) = R[1]
     (zx, zy, zz) = R[2]
@@ -98,7 +105,7 @@ def _quaternion(R: Array | Matrix) -> tuple[float, Three]:
 
 @leaf
 def rotation_vector(R: Array | Matrix) -> Three:
-    """Returns the vector of a rotation matrix (rows)."""
+    """Returns the rotation vector of a rotation matrix (rows), rad."""
     w, v = _quaternion(R)
     n = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     if n < _SMALL:
@@ -109,39 +116,38 @@ def rotation_vector(R: Array | Matrix) -> Three:
 
 @leaf
 def relative_rotation(R: Array | Matrix, other: Array | Matrix) -> Three:
-    """Returns the vector of R other': the turn from the other orientation to this one, in base
-    axes.
+    """Returns the rotation vector of R other', in base axes, rad.
+
+    This is the rotation from the orientation `other` to the orientation R.
     """
     a = other[0]
     b = other[1]
     c = other[2]
-    rows = (
-        _times_rows(R[0], a, b, c),
-        _times_rows(R[1], a, b, c),
-        _times_rows(R[2], a, b, c),
-    )
-    return rotation_vector(rows)
+    first = _times_rows(R[0], a, b, c)
+    second = _times_rows(R[1], a, b, c)
+    third = _times_rows(R[2], a, b, c)
+    return rotation_vector((first, second, third))
 
 
 @leaf
 def _times_rows(row: Three, a: Three, b: Three, c: Three) -> Three:
-    """Returns the products of a row with three rows."""
-    return (
-        row[0] * a[0] + row[1] * a[1] + row[2] * a[2],
-        row[0] * b[0] + row[1] * b[1] + row[2] * b[2],
-        row[0] * c[0] + row[1] * c[1] + row[2] * c[2],
-    )
+    """Returns the scalar products of a row with three rows."""
+    x = row[0] * a[0] + row[1] * a[1] + row[2] * a[2]
+    y = row[0] * b[0] + row[1] * b[1] + row[2] * b[2]
+    z = row[0] * c[0] + row[1] * c[1] + row[2] * c[2]
+    return x, y, z
 
 
 @leaf
 def compose_rotations(turn: Three, vector: Three) -> Three:
-    """Returns the orientation `vector` turned by another rotation vector, in base axes."""
-    return relative_rotation(rotation_matrix(turn), rotation_matrix(scale(-1.0, vector)))
+    """Returns the rotation `vector` followed by the rotation `turn` in base axes, rad."""
+    inverse = rotation_matrix(scale(-1.0, vector))
+    return relative_rotation(rotation_matrix(turn), inverse)
 
 
 @leaf
 def rotate_by_vector(turn: Three, vector: Three) -> Three:
-    """Returns a vector turned by a rotation vector."""
+    """Returns a vector rotated by a rotation vector."""
     x, y, z = rotation_matrix(turn)
     return _times_rows(vector, x, y, z)
 
@@ -154,24 +160,26 @@ def length(vector: Three) -> float:
 
 @leaf
 def angular_velocity(turn: Three, rate: Three) -> Three:
-    """Returns the angular velocity of a turn whose vector has this derivative."""
+    """Returns the angular velocity of a rotation vector with this derivative, rad/s."""
     angle = length(turn)
     a2 = angle * angle
     if angle < _SHORT:
-        by_cross = 0.5 - a2 / 24.0 + a2 * a2 / 720.0
+        by_once = 0.5 - a2 / 24.0 + a2 * a2 / 720.0
         by_twice = 1.0 / 6.0 - a2 / 120.0 + a2 * a2 / 5040.0
     else:
         s, c = sincos(angle)
-        by_cross = (1.0 - c) / a2
+        by_once = (1.0 - c) / a2
         by_twice = (angle - s) / (a2 * angle)
-    across = cross(turn, rate)
-    return add(rate, add(scale(by_cross, across), scale(by_twice, cross(turn, across))))
+    once = cross(turn, rate)
+    twice = cross(turn, once)
+    return add(rate, add(scale(by_once, once), scale(by_twice, twice)))
 
 
 @leaf
 def rotation_vector_rate(turn: Three, velocity: Three) -> Three:
-    """Returns the derivative of a turn's vector at this angular velocity: undoes
-    `angular_velocity`.
+    """Returns the derivative of a rotation vector at this angular velocity, rad/s.
+
+    It is the inverse of `angular_velocity`.
     """
     angle = length(turn)
     a2 = angle * angle
@@ -180,5 +188,6 @@ def rotation_vector_rate(turn: Three, velocity: Three) -> Three:
     else:
         s, c = sincos(0.5 * angle)
         by_twice = (1.0 - 0.5 * angle * c / s) / a2
-    across = cross(turn, velocity)
-    return add(velocity, add(scale(-0.5, across), scale(by_twice, cross(turn, across))))
+    once = cross(turn, velocity)
+    twice = cross(turn, once)
+    return add(velocity, add(scale(-0.5, once), scale(by_twice, twice)))

@@ -1,25 +1,26 @@
-"""Following in task space: end effectors agree on a place, or on a place and an orientation, of
-unlike arms.
+"""Following in task space: the end effectors of unlike arms agree on a position or a pose.
 
-Invariant: all vectors of the task are in the frame that the sites share, `shared` of them: 3 of
-a place, m, and 3 more of an orientation as `rotation_vector`. An axis that a site does not
-follow has no effect on it.
+Let J be the Jacobian of the followed axes, Jd its derivative, x the pose of the end effector
+and e = x - x_des. The reference velocity v of the joints and its derivative a are
 
-With J the Jacobian of the followed axes, x the end effector's pose and e = x - x_des, the
-reference velocity of the joints and its derivative are
+    v = psi + J' y          J J' y  = -Lambda e - J psi
+    a = v'                  J J' y' = -Lambda e' - Jd psi - J psi' - (Jd J' + J Jd') y
 
-    v = psi + J' y,    J J' y = -Lambda e - J psi            (v = J+ (-Lambda e) + (I - J+ J)
-    psi) a = v' ,           J J' y' = -Lambda e' - J' psi - J psi' - (J' J^T + J J'^T) y
+where psi = -k (q - q_posture) acts in the null space; v is J+ (-Lambda e) + (I - J+ J) psi. The
+velocity r = qd - v then satisfies J r = x' + Lambda e. A prime at a matrix is its transpose.
 
-with psi = -k (q - q_posture) in the null space, so that r = qd - v gives J r = x' + Lambda e.
-
-J J' gets a damping that is zero while 1 / trace((J J')^-1), a lower bound of the square of the
-least singular value, is above that of `singular_value`.
+Near singular poses, J J' is damped. The damping is zero while 1 / trace((J J')^-1), a lower
+bound of the square of the least singular value, is above the square of `singular_value`.
 
 Source: Y.-C. Liu and N. Chopra, "Controlled synchronization of heterogeneous robotic
 manipulators in the task space", IEEE Trans. Robotics 28 (2012); damping after Y. Nakamura and
 H. Hanafusa, "Inverse kinematic solutions with singularity robustness", J. Dynamic Systems,
 Measurement, and Control 108 (1986).
+
+Invariant:
+    - All vectors of the task are in the frame that the sites share. They have `shared` numbers:
+      3 for a position, m, and for a pose 3 more for the orientation (`rotation_vector`).
+    - An axis that a site does not follow has no effect on the site.
 """
 
 from .chain import Three, add, cross, place_end_effector, put_three, scale, subtract, three
@@ -29,22 +30,23 @@ from .vectors import Array, Row, RowArray
 
 POSITION = 3
 POSE = 6
-"""Numbers of a task without and with an orientation."""
+"""Count of a task's coordinates without and with an orientation."""
 TINY = 1e-12
-"""A pivot of J J' below this is of an axis along which the end effector cannot move at all."""
+"""Below this pivot of J J', the end effector cannot move along the axis at all."""
 
 
 @leaf
 def has_orientation(s: Row) -> bool:
-    """True if sites agree on an orientation besides the place."""
-    found: bool = s.task != 0 and s.shared == POSE
-    return found
+    """True if the sites agree on an orientation in addition to a position."""
+    is_pose: bool = s.task != 0 and s.shared == POSE
+    return is_pose
 
 
 @leaf
 def count_linear_coordinates(s: Row) -> int:
-    """Returns how many of the first coordinates have differences: all but those of an
-    orientation.
+    """Returns the number of leading coordinates that may be subtracted from one another.
+
+    These are all coordinates except those of an orientation.
     """
     return POSITION if has_orientation(s) else s.q_des.shape[0]
 
@@ -52,10 +54,11 @@ def count_linear_coordinates(s: Row) -> int:
 @leaf
 def update_pose(s: Row, chain: RowArray) -> None:
     """Writes x, xd, J and its derivative from q and qd, after `place_joints`."""
-    place = place_end_effector(chain, s.tip)
-    put_three(s.x[:3], scale(s.scale, place))
+    position = place_end_effector(chain, s.tip)
+    put_three(s.x[:3], scale(s.scale, position))
     if s.shared == POSE:
-        put_three(s.x[3:], relative_rotation(chain[chain.shape[0] - 1].R_base, s.tip_back))
+        last: Row = chain[chain.shape[0] - 1]
+        put_three(s.x[3:], relative_rotation(last.R_base, s.tip_back))
     for j in range(s.shared):
         s.xd[j] = 0.0
     for i in range(chain.shape[0]):
@@ -66,31 +69,43 @@ def update_pose(s: Row, chain: RowArray) -> None:
             if s.shared == POSE:
                 s.J[3 + j, i] = row.J_ang[j]
                 s.xd[3 + j] += row.J_ang[j] * s.qd[i]
-    _update_jacobian_rate(s, chain, place)
+    _update_jacobian_rate(s, chain, position)
 
 
 @leaf
 def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
-    """Writes the derivative of J along qd: axes turn with their links, and origins move."""
-    still = (0.0, 0.0, 0.0)
-    turning = speed = tip_speed = before = still
+    """Writes the derivative of J along qd.
+
+    The axes turn with their links, and the joints' origins move.
+
+    Args:
+        s: the site's row.
+        chain: the chain's rows, after `place_end_effector`.
+        tip: position of the end effector in base axes, m.
+    """
+    zeros = (0.0, 0.0, 0.0)
+    angular_speed = zeros
+    origin_speed = zeros
+    tip_speed = zeros
+    origin_before = zeros
     for i in range(chain.shape[0]):
         tip_speed = add(tip_speed, scale(s.qd[i], three(chain[i].J_lin)))
     for i in range(chain.shape[0]):
         row: Row = chain[i]
         axis = three(row.axis_base)
-        place = three(row.p_base)
-        speed = add(speed, cross(turning, subtract(place, before)))
-        before = place
+        origin = three(row.p_base)
+        step = cross(angular_speed, subtract(origin, origin_before))
+        origin_speed = add(origin_speed, step)
+        origin_before = origin
         if row.prismatic == 0:
-            turning = add(turning, scale(s.qd[i], axis))
-            angular = cross(turning, axis)
-            away = cross(axis, subtract(tip_speed, speed))
-            linear = add(cross(angular, subtract(tip, place)), away)
+            angular_speed = add(angular_speed, scale(s.qd[i], axis))
+            angular = cross(angular_speed, axis)
+            lever_rate = cross(axis, subtract(tip_speed, origin_speed))
+            linear = add(cross(angular, subtract(tip, origin)), lever_rate)
         else:
-            speed = add(speed, scale(s.qd[i], axis))
-            angular = still
-            linear = cross(turning, axis)
+            origin_speed = add(origin_speed, scale(s.qd[i], axis))
+            angular = zeros
+            linear = cross(angular_speed, axis)
         for j in range(3):
             s.Jd[j, i] = s.scale * linear[j]
             if s.shared == POSE:
@@ -99,28 +114,33 @@ def _update_jacobian_rate(s: Row, chain: RowArray, tip: Three) -> None:
 
 @leaf
 def update_orientation_reference(s: Row, links: RowArray) -> None:
-    """Writes the orientation of the reference: the own one less the sum of alpha_ij Log(R_i
-    R_j').
+    """Writes the orientation of the reference and its angular velocity.
 
-    Its derivative is the sum of alpha_ij w_j, which is exact only for orientations that agree.
+    The reference is the site's own orientation R_i, turned back by the weighted differences
+    from its peers, sum_j alpha_ij Log(R_i R_j'). The velocity sum_j alpha_ij w_j is exact only
+    if the orientations agree.
     """
-    own = rotation_matrix(three(s.x[3:]))
-    apart = rate = (0.0, 0.0, 0.0)
+    orientation = rotation_matrix(three(s.x[3:]))
+    difference = (0.0, 0.0, 0.0)
+    velocity = (0.0, 0.0, 0.0)
     for j in range(links.shape[0]):
         link: Row = links[j]
-        turn = relative_rotation(own, rotation_matrix(three(link.q[3:])))
-        apart = add(apart, scale(link.alpha, turn))
-        rate = add(
-            rate, add(scale(link.alpha, three(link.qd[3:])), scale(-link.alpha_rate, turn))
-        )
-    put_three(s.q_des[3:], compose_rotations(scale(-1.0, apart), three(s.x[3:])))
-    put_three(s.qd_des[3:], rate)
+        peer_orientation = rotation_matrix(three(link.q[3:]))
+        turn = relative_rotation(orientation, peer_orientation)
+        difference = add(difference, scale(link.alpha, turn))
+        peer_velocity = scale(link.alpha, three(link.qd[3:]))
+        ramp_velocity = scale(-link.alpha_rate, turn)
+        velocity = add(velocity, add(peer_velocity, ramp_velocity))
+    reference = compose_rotations(scale(-1.0, difference), three(s.x[3:]))
+    put_three(s.q_des[3:], reference)
+    put_three(s.qd_des[3:], velocity)
 
 
 @leaf
 def _factor(s: Row, damping: float) -> None:
-    """Writes the factors L D L' of J J' + damping, for the axes that are followed, into s.A
-    (lower part).
+    """Writes the factors L D L' of J J' + damping I into the lower part of `s.A`.
+
+    An axis that is not followed has a row of zeros in J, and gets a unit pivot.
     """
     for j in range(s.shared):
         for k in range(j + 1):
@@ -149,7 +169,11 @@ def _solve(s: Row, b: Array, y: Array) -> None:
 
 @leaf
 def _factor_damped(s: Row) -> None:
-    """Factors J J' with the damping that its nearness to a singular pose asks for."""
+    """Masks J and Jd by the followed axes, and factors J J' with its damping.
+
+    The damping is the amount by which 1 / trace((J J')^-1) is below the square of
+    `s.singular_value`.
+    """
     for j in range(s.shared):
         for i in range(s.joints):
             s.J[j, i] *= s.axes[j]
@@ -170,19 +194,30 @@ def _factor_damped(s: Row) -> None:
 
 
 @leaf
-def update_task_errors(s: Row) -> None:
-    """Writes e and ed of the followed axes, v and a of the joints, and r."""
-    n = s.joints
-    m = s.shared
-    for j in range(m):
+def _update_axis_errors(s: Row) -> None:
+    """Writes e and ed of the task; they are zero along axes that are not followed."""
+    for j in range(s.shared):
         s.e[j] = s.x[j] - s.q_des[j]
         s.ed[j] = s.xd[j] - s.qd_des[j]
-    if m == POSE:
+    if s.shared == POSE:
+        orientation = rotation_matrix(three(s.x[3:]))
         reference = rotation_matrix(three(s.q_des[3:]))
-        put_three(s.e[3:], relative_rotation(rotation_matrix(three(s.x[3:])), reference))
-    for j in range(m):
+        put_three(s.e[3:], relative_rotation(orientation, reference))
+    for j in range(s.shared):
         s.e[j] *= s.axes[j]
         s.ed[j] *= s.axes[j]
+
+
+@leaf
+def update_task_errors(s: Row) -> None:
+    """Writes e and ed of the followed axes, v and a of the joints, and r.
+
+    The equations are those at the head of this module. The arrays `stage_q` and `stage_qd` of
+    the integrator serve as work space for Jd' y and J' y.
+    """
+    n = s.joints
+    m = s.shared
+    _update_axis_errors(s)
     _factor_damped(s)
     k = s.posture_rate
     for j in range(m):
@@ -194,16 +229,16 @@ def update_task_errors(s: Row) -> None:
         s.a[i] = -k * s.qd[i]
     _solve(s, s.b, s.y)
     for i in range(n):
-        s.stage_q[i] = s.stage_qd[i] = 0.0  # J'^T y and J^T y
+        s.stage_q[i] = 0.0
+        s.stage_qd[i] = 0.0
         for j in range(m):
             s.stage_q[i] += s.Jd[j, i] * s.y[j]
             s.stage_qd[i] += s.J[j, i] * s.y[j]
     for j in range(m):
         s.b[j] = -s.Lambda[j] * s.ed[j]
         for i in range(n):
-            s.b[j] -= s.Jd[j, i] * (s.v[i] + s.stage_qd[i]) + s.J[j, i] * (
-                s.a[i] + s.stage_q[i]
-            )
+            turning = s.Jd[j, i] * (s.v[i] + s.stage_qd[i])
+            s.b[j] -= turning + s.J[j, i] * (s.a[i] + s.stage_q[i])
     _solve(s, s.b, s.y)
     for i in range(n):
         s.v[i] += s.stage_qd[i]
@@ -215,7 +250,15 @@ def update_task_errors(s: Row) -> None:
 
 @leaf
 def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: Array) -> None:
-    """Adds factor J' (gains * values) to a torque of the joints: a force in the task."""
+    """Adds the joint torque of a force in the task, factor J' (gains * values).
+
+    Args:
+        s: the site's row.
+        gains: gain per coordinate of the task.
+        values: value per coordinate of the task.
+        factor: factor of the force.
+        torque: changed, shape (n,), N m.
+    """
     for i in range(s.joints):
         for j in range(s.shared):
             torque[i] += factor * s.J[j, i] * (gains[j] * values[j])
@@ -223,9 +266,7 @@ def add_task_torque(s: Row, gains: Array, values: Array, factor: float, torque: 
 
 @leaf
 def update_wrench(s: Row) -> None:
-    """Writes what tau_x amounts to at the end effector, along the followed axes: (J J')^-1 J
-    tau_x.
-    """
+    """Writes the wrench at the end effector that corresponds to tau_x, (J J')^-1 J tau_x."""
     for j in range(s.shared):
         s.b[j] = 0.0
         for i in range(s.joints):

@@ -1,8 +1,10 @@
-"""The stages of a tick that depend on the arm, for the planar two-link arm: unrolled, in
-registers.
+"""The stages of a tick that depend on the arm, for the planar two-link arm.
 
-Invariant: `chain_stages` has the same functions for a chain of n joints, which take its rows as
-well; `kernel` takes one or the other.
+The loops over two joints are unrolled, so that the numbers stay in registers.
+
+Invariant:
+    - `chain_stages` has the same functions for a chain of n joints, with the chain's rows as an
+      additional argument; `kernel` calls one or the other.
 """
 
 from math import inf, isfinite
@@ -37,7 +39,7 @@ def update_errors(s: Row) -> None:
 
 @leaf
 def advance_estimate(s: Row, gain_s: float, Yr: Vector) -> None:
-    """Advances the estimate by a time of `gain_s`, Eq. (15), within its box."""
+    """Advances the estimate by the time `gain_s`, Eq. (15), within its box."""
     estimate = control.update_estimate(s.theta_hat, gain_s, s.Gamma, Yr)
     put(s.theta_hat, control.project_estimate(estimate, s.low, s.high))
 
@@ -51,28 +53,40 @@ def update_torque(s: Row) -> None:
             Y=Y, theta_hat=five(s.theta_hat), Kp=s.Kp, Kd=s.Kd, r=s.r, ed=s.ed, limit=inf
         )
         if s.rho[0] > 0.0 or s.rho[1] > 0.0:
-            opposing = (
-                control.robust_torque(s.rho[0], s.width[0], s.r[0]),
-                control.robust_torque(s.rho[1], s.width[1], s.r[1]),
-            )
-            tau = (tau[0] - opposing[0], tau[1] - opposing[1])
+            robust_0 = control.robust_torque(s.rho[0], s.width[0], s.r[0])
+            robust_1 = control.robust_torque(s.rho[1], s.width[1], s.r[1])
+            tau = (tau[0] - robust_0, tau[1] - robust_1)
     else:
-        gains = (s.K, s.d, s.Kd, s.k_f)
-        tau = control.damped_torque(s.known, s.g, *gains, s.q, s.qd, s.e, s.ed, s.felt, inf)
-    limit = s.tau_limit
-    put(s.tau, (control.limit_torque(tau[0], limit[0]), control.limit_torque(tau[1], limit[1])))
+        tau = control.damped_torque(
+            theta=s.known,
+            g=s.g,
+            K=s.K,
+            d=s.d,
+            Kd=s.Kd,
+            k_f=s.k_f,
+            q=s.q,
+            qd=s.qd,
+            e=s.e,
+            ed=s.ed,
+            felt=s.felt,
+            limit=inf,
+        )
+    tau_0 = control.limit_torque(tau[0], s.tau_limit[0])
+    tau_1 = control.limit_torque(tau[1], s.tau_limit[1])
+    put(s.tau, (tau_0, tau_1))
 
 
 @leaf
 def put_gravity_torque(s: Row, torque: Array) -> None:
-    """Writes G(q), N m, of this tick."""
+    """Writes the gravity torque G(q) of this tick, N m."""
     put_gravity(s, s.theta, torque)
 
 
 @leaf
 def put_gravity(s: Row, theta: Array, torque: Array) -> None:
-    """Writes G of these parameters: the regressor's last columns are g cos q_1 and g cos(q_1 +
-    q_2).
+    """Writes the gravity torque for these parameters, N m.
+
+    The last columns of the regressor are g cos q_1 and g cos(q_1 + q_2).
     """
     outer = s.Y[1, 4] * theta[4]
     put(torque, (s.Y[0, 3] * theta[3] + outer, outer))
@@ -80,9 +94,7 @@ def put_gravity(s: Row, theta: Array, torque: Array) -> None:
 
 @leaf
 def update_model(s: Row) -> None:
-    """Writes what a law may know of the arm in this tick: G, and if it wants them M and C qd +
-    G.
-    """
+    """Writes the arm's model for a plugged law: G and, if the law needs it, M and C qd + G."""
     put_gravity(s, s.known, s.G)
     if s.needs_model != 0:
         q = pair(s.q)
@@ -107,7 +119,17 @@ def put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
-    """Writes the torque of actors with this `sampled` ON the arm whose q and qd are `state`."""
+    """Writes the torque of the actors with this `sampled` ON the arm, N m.
+
+    Args:
+        t_s: time since the epoch, s.
+        s: the site's row.
+        state: q and qd of the arm, shape (4,).
+        actors: operators and environments.
+        table: their recorded torques.
+        sampled: 1: the actors that are held over a tick; 0: the others.
+        torque: written, shape (2,), N m.
+    """
     q = (state[0], state[1])
     qd = (state[2], state[3])
     on_arm = torque_on_arm(
@@ -126,9 +148,7 @@ def put_source_torque(
 def update_external_torque(
     t_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments now, the part of it held, and the force
-    of a wall.
-    """
+    """Writes the torque of operators and environments, its held part, and the wall force."""
     q = pair(s.q)
     qd = pair(s.qd)
     lengths = pair(s.lengths)
@@ -148,7 +168,7 @@ def update_external_torque(
 
 @leaf
 def add_scaled(x: Vector, step_s: float, rate: Vector) -> Pair:
-    """Returns x + step * rate."""
+    """Returns x + step_s * rate."""
     return x[0] + step_s * rate[0], x[1] + step_s * rate[1]
 
 
@@ -164,8 +184,9 @@ def _acceleration(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> Pair:
-    """Returns qdd at one stage: under the held u, and the actors at that stage's time and
-    state.
+    """Returns qdd at a stage of the integrator, rad/s^2.
+
+    The torque is the held u plus the torque of the actors at the time and state of the stage.
     """
     on_arm = torque_on_arm(
         t_s=t_s, q=q, qd=qd, lengths=lengths, actors=actors, table=table, sampled=0
@@ -188,9 +209,19 @@ def rk4_step(
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> tuple[Pair, Pair]:
-    """Returns q and qd one period of h_s later, Eq. (8).
+    """Returns q and qd one period later, Eq. (8), by the classical Runge-Kutta method.
 
-    u, shape (2,), N m, is the torque that is held over the period: control and sampled actors.
+    Args:
+        t_s: time at the beginning of the period, s since the epoch.
+        h_s: the period, s.
+        q: joint angles at the beginning, rad.
+        qd: joint velocities at the beginning, rad/s.
+        u: torque that is held over the period (control and sampled actors), shape (2,), N m.
+        theta: the arm's parameters, shape (5,).
+        g: gravitational acceleration, m/s^2.
+        lengths: lengths of the two links, m.
+        actors: operators and environments.
+        table: their recorded torques.
     """
     half = 0.5 * h_s
     sixth = h_s / 6.0
@@ -238,23 +269,23 @@ def rk4_step(
         actors=actors,
         table=table,
     )
-    v_sum = (
-        v1[0] + 2.0 * v2[0] + 2.0 * v3[0] + v4[0],
-        v1[1] + 2.0 * v2[1] + 2.0 * v3[1] + v4[1],
-    )
-    a_sum = (
-        a1[0] + 2.0 * a2[0] + 2.0 * a3[0] + a4[0],
-        a1[1] + 2.0 * a2[1] + 2.0 * a3[1] + a4[1],
-    )
-    return add_scaled(q1, sixth, v_sum), add_scaled(v1, sixth, a_sum)
+    v_sum_0 = v1[0] + 2.0 * v2[0] + 2.0 * v3[0] + v4[0]
+    v_sum_1 = v1[1] + 2.0 * v2[1] + 2.0 * v3[1] + v4[1]
+    a_sum_0 = a1[0] + 2.0 * a2[0] + 2.0 * a3[0] + a4[0]
+    a_sum_1 = a1[1] + 2.0 * a2[1] + 2.0 * a3[1] + a4[1]
+    q_next = add_scaled(q1, sixth, (v_sum_0, v_sum_1))
+    qd_next = add_scaled(v1, sixth, (a_sum_0, a_sum_1))
+    return q_next, qd_next
 
 
 @leaf
 def advance_arm(
     t_s: float, h_s: float, s: Row, actors: TorqueSourceRows, table: TorqueTable
 ) -> bool:
-    """Advances q and qd by one period under the torque `s.u`; false where the result is not
-    finite.
+    """Advances q and qd by one period under the torque `s.u`.
+
+    Returns:
+        False if the result is not finite; q and qd are unchanged then.
     """
     q, qd = rk4_step(
         t_s=t_s,
@@ -268,7 +299,8 @@ def advance_arm(
         actors=actors,
         table=table,
     )
-    if not (isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])):
+    is_finite = isfinite(q[0]) and isfinite(q[1]) and isfinite(qd[0]) and isfinite(qd[1])
+    if not is_finite:
         return False
     put(s.q, q)
     put(s.qd, qd)

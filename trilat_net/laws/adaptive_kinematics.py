@@ -1,4 +1,4 @@
-"""The paper's law for end-effector positions, with unknown masses and unknown link lengths.
+"""The paper's law for end-effector positions, with unknown masses and link lengths.
 
 The position x of the end effector and its velocity are measured. The Jacobian is computed from
 estimated lengths, J_hat = J + J~. With

@@ -1,4 +1,4 @@
-"""Impedance control of several users and a slave: each arm moves like mass, damper and spring.
+"""Impedance control: each arm of the users and the slave moves like a mass and a spring.
 
     impedance     M qdd + B (qd - qd_ref) + K (q - q_ref) = tau_h + sum_j f_j(t - T)
     inner loop    tau = M(q) qdd + C qd + G - tau_h

@@ -1,4 +1,4 @@
-"""Adaptive synchronisation of the outputs r = qd + Lambda q, with its defect under gravity.
+"""Adaptive synchronisation of outputs r = qd + Lambda q, with its defect under gravity.
 
 The output r contains the absolute pose. With gravity each equilibrium has Y_G' r = 0, where Y_G
 is the regressor of gravity, so the arms end at q = 0.

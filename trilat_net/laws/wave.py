@@ -1,4 +1,4 @@
-"""Wave variables: each pair of sites is joined by a line with an impedance that carries waves.
+"""Wave variables: lines with an impedance join the sites and carry waves.
 
 For one line and one joint, with c = sqrt(2 b) and v the wave that an end plays:
 
