@@ -1,17 +1,16 @@
-"""A device at the arm of a site: its motion leads the arm, and it renders what the arm gives
-back.
+"""A device that leads the arm of a site by its motion, and renders the arm's reaction force.
 
 Invariant:
-    - Only changes of the device's place move the target, and only while its clutch is pressed:
-      a state that is not finite, or a jump, moves nothing, and neither does a device that comes
-      back.
-    - The target stays within the arm's reach, however often the clutch is pressed: a motion of
-      the device that leads out of it is lost, and one that leads back in acts at once.
-    - Whoever has let go, by the device's silence too, takes hold again by pressing the clutch
-      anew.
-    - The force is that of the newest record, turned, scaled and limited as the scenario says;
-      it is zero while the clutch is open, or the record is old.
-    - The hand has no heartbeat but the device's: a loop that hangs is a silent hand.
+    - Only changes of the device's position move the target, and only while its clutch is
+      pressed. A state that is not finite, a jump, and a device that reconnects move nothing.
+    - The target stays within the arm's reach, however often the clutch is pressed. A motion of
+      the device out of that reach is lost; a motion back into it acts at once.
+    - After a release, also one by the device's silence, the arm is held again only when the
+      clutch is pressed anew.
+    - The force is that of the newest record, rotated, scaled and limited as the scenario says.
+      It is zero while the clutch is open, or the record is old.
+    - The hand has no heartbeat but the device's states: if the loop hangs, the hand is silent
+      and the site releases the arm.
 """
 
 import math
@@ -30,9 +29,12 @@ from trilat_net.scenario.operators.kernel_operators import DeviceSettings
 from .devices import Device, DeviceState, Vector
 
 RETRY_NS = 1_000_000_000
-LEAST_S = 0.005
-MOST_S = 0.05
-"""Within these a jump is judged by the time since the state before: machines hand over late."""
+MIN_STATE_GAP_S = 0.005
+MAX_STATE_GAP_S = 0.05
+"""Largest and, above, smallest time between two states by which a jump is judged.
+
+The operating system may deliver states late, and several at once.
+"""
 TRIPS_KEPT = 60_000
 
 
@@ -41,136 +43,159 @@ class DeviceHand:
 
     Args:
         hand: the connection to the site.
-        device: what is held.
-        how: how the device leads the arm, and what it renders.
+        device: the device.
+        settings: how the device leads the arm, and how it renders force.
         clock: the clock of this machine.
-        reach: where the target may be.
+        reach: the region that the target may not leave.
 
     Attributes:
-        states, jumps, unreadable: how many states came, and how many of them moved nothing for
-        that reason.
-        trips_ns: from the place of the device to the force that it has caused.
+        states: the number of states that were read.
+        jumps: the number of states that moved nothing because they jumped.
+        unreadable: the number of states that moved nothing because they were not finite.
+        trips_ns: the times from a position of the device to the force that it has caused.
     """
 
     def __init__(
-        self, hand: Hand, device: Device, how: DeviceSettings, clock: Clock, reach: HandReach
+        self,
+        hand: Hand,
+        device: Device,
+        settings: DeviceSettings,
+        clock: Clock,
+        reach: HandReach,
     ) -> None:
         self._hand = hand
         self._device = device
-        self._how = how
+        self._settings = settings
         self._clock = clock
         self._reach = reach
-        self._rows = how.rows(len(hand.pose))
-        self.states = self.jumps = self.unreadable = 0
+        self._axes = settings.rows(len(hand.pose))
+        self.states = 0
+        self.jumps = 0
+        self.unreadable = 0
         self.trips_ns = deque[int](maxlen=TRIPS_KEPT)
-        self._asked = deque[tuple[int, int]](maxlen=TRIPS_KEPT)
+        self._sent = deque[tuple[int, int]](maxlen=TRIPS_KEPT)
         self._period_ns = 1_000_000_000 // device.rate_hz
         self._due_ns = 0
-        self.let_go()
+        self.release()
 
-    def let_go(self) -> None:
-        """Lets go of the arm, until the clutch is pressed anew."""
+    def release(self) -> None:
+        """Releases the arm until the clutch is pressed anew."""
         self._hand.release()
         self._target: list[float] = []
-        self._place: Vector | None = None
+        self._position_m: Vector | None = None
         self._was_pressed = True
-        self._since_ns = 0
-        self._came_ns = self._clock.monotonic_ns()
-        self._asked.clear()
+        self._closed_ns = 0
+        self._received_ns = self._clock.monotonic_ns()
+        self._sent.clear()
 
     def serve(self) -> None:
-        """Reads a state, moves the target by it, and renders a force; takes a period of the
-        device.
+        """Reads a state, moves the target by it, and renders a force.
+
+        The call takes one period of the device.
         """
         state = self._device.read()
         now_ns = self._clock.monotonic_ns()
-        if now_ns - self._came_ns > SILENCE_NS:
-            self.let_go()  # the device, or this process, was away
+        if now_ns - self._received_ns > SILENCE_NS:
+            self.release()  # the device was silent, or this process was suspended
         self.states += 1
         if all(map(math.isfinite, (*state.position_m, *state.velocity_m_s))):
             self._follow(state, now_ns)
         else:
             self.unreadable += 1
         if self._target:
-            self._asked.append((self._hand.move(*self._target), now_ns))
+            number = self._hand.move(*self._target)
+            self._sent.append((number, now_ns))
         self._due_ns = max(self._due_ns + self._period_ns, now_ns)
-        self._clock.sleep_until(self._due_ns)  # the site may have answered then
-        self._device.render(self._find_force())
+        self._clock.sleep_until(self._due_ns)  # by then the site may have replied
+        self._device.render(self._compute_force())
         self._measure_trips()
 
     def _follow(self, state: DeviceState, now_ns: int) -> None:
-        how = self._how
-        before = self._place
-        passed_s = (now_ns - self._came_ns) * 1e-9
-        self._place = state.position_m
-        self._came_ns = now_ns
-        pressed = state.buttons.get(how.clutch, False)
-        closes = pressed and not self._was_pressed
-        self._was_pressed = pressed
-        if state.buttons.get(how.release, False):
-            self.let_go()
-        elif closes:
+        """Applies the buttons of a state, and moves the target if the clutch is pressed."""
+        settings = self._settings
+        previous_m = self._position_m
+        elapsed_s = (now_ns - self._received_ns) * 1e-9
+        self._position_m = state.position_m
+        self._received_ns = now_ns
+        is_pressed = state.buttons.get(settings.clutch, False)
+        is_closing = is_pressed and not self._was_pressed
+        self._was_pressed = is_pressed
+        if state.buttons.get(settings.release, False):
+            self.release()
+        elif is_closing:
             self._target = self._target or list(self._hand.pose)
-            self._since_ns = now_ns
-        elif not pressed:
-            self._since_ns = 0
-        elif self._since_ns and before is not None:
-            moved = list(map(operator.sub, state.position_m, before))
-            if math.hypot(*moved) > how.jump_m_s * min(max(passed_s, LEAST_S), MOST_S):
-                self.jumps += 1
-            else:
-                steps = (how.scale * sum(map(operator.mul, row, moved)) for row in self._rows)
-                moved_target = list(map(operator.add, self._target, steps))
-                self._target = list(self._reach.find_nearest(moved_target))
+            self._closed_ns = now_ns
+        elif not is_pressed:
+            self._closed_ns = 0
+        elif self._closed_ns and previous_m is not None:
+            step_m = list(map(operator.sub, state.position_m, previous_m))
+            self._move_target(step_m, elapsed_s)
 
-    def _find_force(self) -> Vector:
-        """Returns the reaction of the arm; of a clutch that has just been closed it grows."""
-        if not (self._since_ns and self._hand.fresh and self._hand.holds):
+    def _move_target(self, step_m: list[float], elapsed_s: float) -> None:
+        """Moves the target by a step of the device, unless the step is a jump."""
+        settings = self._settings
+        gap_s = min(max(elapsed_s, MIN_STATE_GAP_S), MAX_STATE_GAP_S)
+        if math.hypot(*step_m) > settings.jump_m_s * gap_s:
+            self.jumps += 1
+            return
+        target_steps = [
+            settings.scale * sum(map(operator.mul, axis, step_m)) for axis in self._axes
+        ]
+        target = list(map(operator.add, self._target, target_steps))
+        self._target = list(self._reach.find_nearest(target))
+
+    def _compute_force(self) -> Vector:
+        """Returns the reaction force of the arm, N; it fades in when the clutch closes."""
+        if not (self._closed_ns and self._hand.fresh and self._hand.holds):
             return 0.0, 0.0, 0.0
-        closed = min(1.0, (self._clock.monotonic_ns() - self._since_ns) / GRIP_NS)
-        force = [-self._how.force_scale * closed * one for one in self._hand.force]
-        share = min(1.0, self._how.force_limit_n / max(math.hypot(*force), 1e-9))
+        settings = self._settings
+        closed_share = min(1.0, (self._clock.monotonic_ns() - self._closed_ns) / GRIP_NS)
+        force = [
+            -settings.force_scale * closed_share * component for component in self._hand.force
+        ]
+        share = min(1.0, settings.force_limit_n / max(math.hypot(*force), 1e-9))
         x, y, z = (
             share * sum(map(operator.mul, force, column))
-            for column in zip(*self._rows, strict=True)
+            for column in zip(*self._axes, strict=True)
         )
         return x, y, z
 
     def _measure_trips(self) -> None:
         number = self._hand.number
         now_ns = self._clock.monotonic_ns()
-        while self._asked and self._asked[0][0] <= number:
-            self.trips_ns.append(now_ns - self._asked.popleft()[1])
+        while self._sent and self._sent[0][0] <= number:
+            _, sent_ns = self._sent.popleft()
+            self.trips_ns.append(now_ns - sent_ns)
 
     def describe(self) -> str:
-        """Returns what came of it, in a line."""
-        told = (
+        """Returns a line with the numbers of states and the round-trip times."""
+        counts = (
             f"{count_nouns(self.states, 'state')} of the device, dropped "
             f"{count_nouns(self.jumps, 'jump')}, {self.unreadable} unreadable"
         )
         if not self.trips_ns:
-            return told
+            return counts
         p50, p99 = np.percentile(self.trips_ns, [50, 99]) / 1e6
-        return f"{told}; from its place to the force of it p50 {p50:.1f} ms, p99 {p99:.1f} ms"
+        return f"{counts}; from its place to the force of it p50 {p50:.1f} ms, p99 {p99:.1f} ms"
 
     def run(self, stopped: Callable[[], bool], say: Callable[[str], None]) -> None:
-        """Leads the arm until the end; says once each time that the device is lost, and is
-        there.
+        """Leads the arm until the session ends or `stopped` returns True.
+
+        It connects to the device again after each loss, and prints each loss and each return.
         """
-        there: bool | None = None
+        is_present: bool | None = None
         while not (stopped() or self._hand.over):
             try:
                 with self._device:
                     while not (stopped() or self._hand.over):
                         self.serve()
-                        if not there:
-                            say(
-                                f"the device is there: its button {self._how.clutch!r} takes hold"
-                            )
-                        there = True
+                        if not is_present:
+                            button = repr(self._settings.clutch)
+                            say(f"the device is there: its button {button} takes hold")
+                        is_present = True
             except OSError as problem:
-                self.let_go()
-                if there is not False:
+                self.release()
+                if is_present is not False:
                     say(f"{problem}; the arm is let go, and the device is tried again")
-                there = False
+                is_present = False
                 self._clock.sleep_until(self._clock.monotonic_ns() + RETRY_NS)

@@ -386,11 +386,15 @@ class Rehearsal(LoopStats):
         """Steps the site."""
         return self._stepped.step(TickInput(k, arrivals))
 
-    def attend(self, *_: object) -> bool:
+    def run_housekeeping(self, *_: object) -> bool:
         """Drops what a site would send and tell; nobody asks anything, or ends it."""
         return False
 
-    publish_sample = publish_link = report = should_stop = use_slack = attend
+    publish_sample = run_housekeeping
+    publish_link = run_housekeeping
+    report_tick = run_housekeeping
+    should_stop = run_housekeeping
+    use_slack = run_housekeeping
 
 
 def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:

@@ -1,10 +1,15 @@
-"""Measurements of an external arm (`plant = "external"`) and its dead-man switch, as its site
-receives them.
+"""The site's side of an external arm (`plant = "external"`) and of its dead-man switch.
 
-Invariant: no arriving measurement can raise out of the loop, and the inbox is bounded. The
-newest measurement counts; a site does not begin without one, holds when none arrive for a
-moment, and is in fault when none arrive any more. One that the arm cannot have made since the
-last is dropped, and is none. A switch of which nothing is heard is not held.
+`ExternalArm` receives the measurements of the arm's joints, and `DeadManSwitch` the messages of
+whoever holds the switch. Both turn silence into orders to the site.
+
+Invariant:
+    - No received message can raise out of the loop, and the inbox is bounded.
+    - Only the newest measurement counts. The site does not start without a measurement, holds
+      after `HELD_SILENCE_NS` without any, and is in fault after `SILENCE_LIMIT_NS`.
+    - A measurement that the arm cannot have reached since the previous one is dropped and does
+      not count as received.
+    - A switch that sends nothing for `SWITCH_SILENCE_NS` is not held.
 """
 
 from collections import Counter
@@ -26,27 +31,39 @@ from .site_loop import STEP_MARGIN_RAD
 MEASUREMENTS_KEPT = 64
 """Capacity of the inbox: older measurements are useless."""
 HELD_SILENCE_NS = 30_000_000
-"""After a longer silence the site holds."""
+"""Silence of the arm after which the site holds."""
 SILENCE_LIMIT_NS = 200_000_000
-"""After a longer one it is in fault."""
+"""Silence of the arm after which the site is in fault."""
 SWITCH_SILENCE_NS = 100_000_000
-"""A dead-man switch of which nothing is heard for longer is not held."""
+"""Silence of a dead-man switch after which the switch counts as released."""
 STARTS_KEPT = 64
-"""So many programs at a switch are told apart by their messages; of more one is forgotten,
-rather one that does not hold it.
+"""Number of programs at a switch whose state is kept.
+
+If there are more, a program that does not hold the switch is forgotten first.
 """
 START_POSE_TOLERANCE_RAD = 0.01
-"""A larger distance of the arm from its `q0_rad` at the start is reported."""
+"""Largest distance of the arm from its `q0_rad` at the start that is not reported."""
 POLL_NS = 5_000_000
 _MAX_POLL_GAP_NS = 20_000_000
-"""Silence that one poll can add: a site that slept cannot know what it would have received."""
+"""Largest silence that one poll can add.
+
+A site that was suspended cannot know which messages it would have received in the meantime.
+"""
 
 
 class ExternalArm:
-    """The measurements of one arm.
+    """The measurements of one external arm.
+
+    Args:
+        site: the site of the arm.
+        ring: the inbox of the measurements.
+        clock: the clock of this machine.
+        dropped: counts dropped measurements by reason.
+        address: where the site waits for measurements, for messages to the user.
 
     Attributes:
-        taken: number of measurements taken; the others are counted in `dropped`, by reason.
+        newest: the newest accepted measurement; None before the first.
+        accepted: the number of accepted measurements.
     """
 
     def __init__(
@@ -55,50 +72,54 @@ class ExternalArm:
         ring: StampedInbox[bytes],
         clock: Clock,
         dropped: Counter[str],
-        place: str,
+        address: str,
     ) -> None:
         self.newest: PlantState | None = None
-        self.taken = 0
+        self.accepted = 0
         self._site = site.name
         self._layout = site.layout
         self._ring = ring
         self._dropped = dropped
         self._speed_limits = site.speed_limits
-        self._taken_ns = 0
-        self._told = ""
+        self._accepted_ns = 0
+        self._reported_order = ""
         self._clock = clock
-        self._place = place
-        self._boot = self._n = -1
-        self._bound = self._counting = False
+        self._address = address
+        self._boot = -1
+        self._n = -1
+        self._is_bound = False
+        self._is_counting = False
         self._silent_ns = 0
         self._polled_ns: int | None = None
 
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
-        """Waits for the first measurement; False if `stopped` comes first.
+        """Waits for the first measurement; returns False if `stopped` returns True first.
 
         Raises:
-            SessionError: none arrived in time.
+            SessionError: no measurement arrived before `give_up_ns`.
         """
-        say(f"waiting for its arm on {self._place}")
-        told: set[str] = set()
+        say(f"waiting for its arm on {self._address}")
+        reported: set[str] = set()
         while not stopped():
             self.poll()
             if self.newest is not None:
                 return True
-            for reason in [
-                one for one in self._dropped if one.startswith("of ") and one not in told
-            ]:
-                told.add(reason)  # as in: of 6 joints; the scenario has 7
-                say(f"its arm sends measurements {reason}")
+            # A reason such as "of 6 joints; the scenario has 7" tells the user what to change.
+            mismatches = [reason for reason in self._dropped if reason.startswith("of ")]
+            for reason in mismatches:
+                if reason not in reported:
+                    reported.add(reason)
+                    say(f"its arm sends measurements {reason}")
             now_ns = self._clock.monotonic_ns()
             if now_ns > give_up_ns:
                 dropped = ", ".join(
                     f"{count} {reason}" for reason, count in self._dropped.items()
                 )
                 raise SessionError(
-                    f"{self._site} waited in vain for its arm: no measurement came on {self._place}"
+                    f"{self._site} waited in vain for its arm: "
+                    f"no measurement came on {self._address}"
                     + (f"; dropped: {dropped}" if dropped else "")
                     + f"; see {find_page('external-arm.md')}"
                 )
@@ -106,58 +127,66 @@ class ExternalArm:
         return False
 
     def bind(self, q0_rad: Sequence[float]) -> str:
-        """Accepts from now on only the program that sends now.
+        """Accepts measurements only from the present program from now on.
 
-        Returns a warning if the arm is off the start pose that the peers assume, else "".
+        Args:
+            q0_rad: the start pose that the peers assume, rad, one angle per joint.
+
+        Returns:
+            A warning if the arm is off that start pose, else "".
         """
         self.poll()
-        self._bound = True
+        self._is_bound = True
         self._silent_ns = 0
-        pairs = zip(self.newest.q if self.newest else q0_rad, q0_rad, strict=True)
-        off_rad = max(abs(a - b) for a, b in pairs)
-        told = (
-            f"its arm stands {off_rad:.3g} rad off q0_rad, which its peers take for its start"
+        pose = self.newest.q if self.newest else q0_rad
+        distance_rad = max(abs(a - b) for a, b in zip(pose, q0_rad, strict=True))
+        warning = (
+            f"its arm stands {distance_rad:.3g} rad off q0_rad, "
+            "which its peers take for its start: their references will jump"
         )
-        return (
-            f"{told}: their references will jump" if off_rad > START_POSE_TOLERANCE_RAD else ""
-        )
+        return warning if distance_rad > START_POSE_TOLERANCE_RAD else ""
 
     def poll(self) -> None:
-        """Takes the measurements that have arrived."""
+        """Accepts the measurements that have arrived, and updates the arm's silence."""
         now_ns = self._clock.monotonic_ns()
-        before = self.taken
+        accepted_before = self.accepted
         while (message := self._ring.poll()) is not None:
-            self._take(message[0])
-        passed_ns = (
-            0 if self._polled_ns is None else min(now_ns - self._polled_ns, _MAX_POLL_GAP_NS)
-        )
-        self._silent_ns = 0 if self.taken > before else self._silent_ns + passed_ns
+            payload, _ = message
+            self._accept(payload)
+        passed_ns = 0
+        if self._polled_ns is not None:
+            passed_ns = min(now_ns - self._polled_ns, _MAX_POLL_GAP_NS)
+        has_arrived = self.accepted > accepted_before
+        self._silent_ns = 0 if has_arrived else self._silent_ns + passed_ns
         self._polled_ns = now_ns
 
-    def take_order(self, mode: Mode) -> SiteOrder:
-        """Returns what its arm's silence asks of the site, which is in some mode; "": nothing
-        new.
-        """
-        told = self._told
-        self._told = ""
-        if self._silent_ns > SILENCE_LIMIT_NS:
-            self._told = "arm_lost"
-            return "" if told == "arm_lost" and mode is Mode.FAULT else "arm_lost"
-        if self._silent_ns > HELD_SILENCE_NS:
-            self._told = "arm_silent"
-            return "" if told else "arm_silent"
-        return "arm_back" if told == "arm_silent" else ""
+    def pop_order(self, mode: Mode) -> SiteOrder:
+        """Returns the order that follows from the arm's silence, "" if nothing has changed.
 
-    def _take(self, payload: bytes) -> None:
+        Args:
+            mode: the present mode of the site. "arm_lost" is repeated until the site is in
+                fault.
+        """
+        reported = self._reported_order
+        self._reported_order = ""
+        if self._silent_ns > SILENCE_LIMIT_NS:
+            self._reported_order = "arm_lost"
+            return "" if reported == "arm_lost" and mode is Mode.FAULT else "arm_lost"
+        if self._silent_ns > HELD_SILENCE_NS:
+            self._reported_order = "arm_silent"
+            return "" if reported else "arm_silent"
+        return "arm_back" if reported == "arm_silent" else ""
+
+    def _accept(self, payload: bytes) -> None:
         try:
             message = decode(payload, ArmMeasurement, layout=self._layout)
         except WireError as error:
             self._dropped[error.reason] += 1
             return
-        lost = self._silent_ns > SILENCE_LIMIT_NS  # its program may have been started anew
-        if message.site != self._site or (
-            self._bound and not lost and message.boot != self._boot
-        ):
+        # After so long a silence the arm's program may have been restarted with a new boot.
+        is_lost = self._silent_ns > SILENCE_LIMIT_NS
+        is_other_boot = self._is_bound and not is_lost and message.boot != self._boot
+        if message.site != self._site or is_other_boot:
             self._dropped["stranger"] += 1
             return
         if message.boot != self._boot:
@@ -167,32 +196,36 @@ class ExternalArm:
             self._dropped["old measurement"] += 1
             return
         now_ns = self._clock.monotonic_ns()
-        if self._bound and not self._is_plausible(message.q, (now_ns - self._taken_ns) * 1e-9):
+        elapsed_s = (now_ns - self._accepted_ns) * 1e-9
+        if self._is_bound and not self._is_plausible(message.q, elapsed_s):
             self._dropped["implausible measurement"] += 1
             return
-        self._taken_ns = now_ns
-        if self._counting and message.n > self._n + 1:
+        self._accepted_ns = now_ns
+        if self._is_counting and message.n > self._n + 1:
             self._dropped["missing measurement"] += message.n - self._n - 1
-        self._counting = self._bound
+        self._is_counting = self._is_bound
         self._n = message.n
         self.newest = PlantState(message.q, message.qd, message.tau_x)
-        self.taken += 1
+        self.accepted += 1
 
-    def _is_plausible(self, q: Sequence[float], passed_s: float) -> bool:
+    def _is_plausible(self, q: Sequence[float], elapsed_s: float) -> bool:
+        """True if no joint has moved farther than its speed limit allows."""
         if self.newest is None:
             return True
-        way = [limit * passed_s + STEP_MARGIN_RAD for limit in self._speed_limits]
-        return all(abs(a - b) <= most for a, b, most in zip(q, self.newest.q, way, strict=True))
+        reach = [limit * elapsed_s + STEP_MARGIN_RAD for limit in self._speed_limits]
+        steps = zip(q, self.newest.q, reach, strict=True)
+        return all(abs(angle - previous) <= limit for angle, previous, limit in steps)
 
 
 @dataclass
 class _Holder:
-    """A start of a program at the switch.
+    """One start of a program at the switch.
 
     Attributes:
-        n: of its newest message.
-        pressed_ns: when it last said that it is held; None: it is not.
-        counts: False while it is held since before another one let go.
+        n: the number of its newest message.
+        pressed_ns: when its newest message "held" arrived; None while it does not hold.
+        counts: False if it still holds the switch since before another holder released it. It
+            then has to release the switch and press it again.
     """
 
     n: int = -1
@@ -201,11 +234,17 @@ class _Holder:
 
 
 class DeadManSwitch:
-    """The dead-man switch of one arm: whoever holds it and lets go, or is silent, stops the
-    arm.
+    """The dead-man switch of one arm; the arm stops if any holder releases it or falls silent.
 
-    Who held it besides has then to let go and press anew. Its age is taken on the own clock
-    from where a message came in, so that a site that slept is not held.
+    All other holders then have to release the switch and press it again. The age of a message
+    is measured on this machine's clock from its arrival, so the switch of a site that was
+    suspended is not held.
+
+    Args:
+        site: the site of the arm.
+        ring: the inbox of the switch's messages, with the times of their arrival.
+        clock: the clock of this machine.
+        dropped: counts dropped messages by reason.
     """
 
     def __init__(
@@ -216,54 +255,57 @@ class DeadManSwitch:
         self._clock = clock
         self._dropped = dropped
         self._programs: dict[int, _Holder] = {}
-        self._was_let_go = False
+        self._was_released = False
 
-    def _holders(self) -> list[_Holder]:
+    def _list_holders(self) -> list[_Holder]:
         return [
-            one for one in self._programs.values() if one.counts and one.pressed_ns is not None
+            program
+            for program in self._programs.values()
+            if program.counts and program.pressed_ns is not None
         ]
 
-    def _is_silent(self, one: _Holder) -> bool:
-        return (
-            one.pressed_ns is None
-            or self._clock.monotonic_ns() - one.pressed_ns > SWITCH_SILENCE_NS
-        )
+    def _is_silent(self, holder: _Holder) -> bool:
+        if holder.pressed_ns is None:
+            return True
+        return self._clock.monotonic_ns() - holder.pressed_ns > SWITCH_SILENCE_NS
 
     @property
     def held(self) -> bool:
-        """True if all that hold it said so a moment ago, and there is one."""
-        holders = self._holders()
+        """True if there is a holder and no holder is silent."""
+        holders = self._list_holders()
         return bool(holders) and not any(map(self._is_silent, holders))
 
     def poll(self) -> None:
-        """Takes in the messages that have arrived."""
+        """Accepts the arrived messages, and releases the switch for silent holders."""
         while (message := self._ring.poll()) is not None:
-            self._take(*message)
-        self._let_go([one for one in self._holders() if self._is_silent(one)])
+            payload, received_ns = message
+            self._accept(payload, received_ns)
+        self._release([holder for holder in self._list_holders() if self._is_silent(holder)])
 
-    def take_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
-        """Returns what the switch asks of its site, which is in some mode for a reason; "":
-        nothing.
+    def pop_order(self, mode: Mode, reason: LifeReason) -> SiteOrder:
+        """Returns the order that follows from the switch, "" if there is none.
+
+        Args:
+            mode: the present mode of the site.
+            reason: the reason of that mode.
         """
-        was_let_go = self._was_let_go
-        self._was_let_go = False
-        if was_let_go or not self.held:
+        was_released = self._was_released
+        self._was_released = False
+        if was_released or not self.held:
             return "" if mode in (Mode.STOPPED, Mode.FAULT) else "released"
         return "held" if (mode, reason) == (Mode.STOPPED, LifeReason.RELEASED) else ""
 
-    def _let_go(self, released: Sequence[_Holder]) -> None:
-        """Takes note of holders that let go or are silent: the others count no more until they
-        press anew.
-        """
+    def _release(self, released: Sequence[_Holder]) -> None:
+        """Ends the hold of some holders; all others stop counting until they press again."""
         if not released:
             return
-        for one in released:
-            one.pressed_ns = None
-        for other in self._holders():
+        for holder in released:
+            holder.pressed_ns = None
+        for other in self._list_holders():
             other.counts = False
-        self._was_let_go = True
+        self._was_released = True
 
-    def _take(self, payload: bytes, came_ns: int) -> None:
+    def _accept(self, payload: bytes, received_ns: int) -> None:
         try:
             message = decode(payload, ArmEnable)
         except WireError as error:
@@ -273,17 +315,22 @@ class DeadManSwitch:
             self._dropped["stranger"] += 1
             return
         if message.boot not in self._programs and len(self._programs) >= STARTS_KEPT:
-            idle = (boot for boot, one in self._programs.items() if one.pressed_ns is None)
-            del self._programs[next(idle, next(iter(self._programs)))]
-        one = self._programs.setdefault(message.boot, _Holder())
-        if message.n <= one.n:
+            self._forget_program()
+        program = self._programs.setdefault(message.boot, _Holder())
+        if message.n <= program.n:
             self._dropped["old switch message"] += 1
             return
-        one.n = message.n
+        program.n = message.n
         if message.held:
-            one.pressed_ns = came_ns
+            program.pressed_ns = received_ns
             return
-        if one.counts and one.pressed_ns is not None:
-            self._let_go([one])
-        one.pressed_ns = None
-        one.counts = True
+        if program.counts and program.pressed_ns is not None:
+            self._release([program])
+        program.pressed_ns = None
+        program.counts = True
+
+    def _forget_program(self) -> None:
+        """Forgets the oldest program that does not hold the switch, else the oldest of all."""
+        idle = [boot for boot, program in self._programs.items() if program.pressed_ns is None]
+        oldest = idle[0] if idle else next(iter(self._programs))
+        del self._programs[oldest]

@@ -1,8 +1,10 @@
 """The messages of whoever holds a site's arm, as the site receives them.
 
-Invariant: no message can raise out of the loop, and few are read in one tick. What somebody
-wants is limited here, whatever the sender says: `HandRules` and the operator's limits hold, and
-one of them holds the arm at a time. What is refused is counted by reason.
+Invariant:
+    - No message can raise out of the loop, and a tick reads few of them.
+    - The site limits the motion of the hand, whatever the sender requests: `HandRules` and the
+      limits of the operator hold, and only one hand holds the arm at a time.
+    - Refused messages are counted by reason.
 """
 
 import math
@@ -27,7 +29,9 @@ from trilat_net.scenario.operators.kernel_operators import LiveHand
 from trilat_net.scenario.operators.program_hand import HandPlayer, HandSite
 
 MESSAGES_KEPT = 32
-"""Capacity of the inbox, and most messages that a tick reads: newer ones push older ones out.
+"""Capacity of the inbox, and largest number of messages that a tick reads.
+
+Newer messages push older ones out.
 """
 POLL_NS = 5_000_000
 
@@ -35,7 +39,14 @@ POLL_NS = 5_000_000
 def _read_messages(
     inbox: Inbox, site: str, dropped: Counter[str], source: str | None = None
 ) -> Iterator[HandMessage]:
-    """Yields the messages to a site of hands, or of one source; counts those that it drops."""
+    """Yields the hand messages to a site, and counts those that are dropped.
+
+    Args:
+        inbox: the inbox of the hand messages.
+        site: the name of the site.
+        dropped: counts dropped messages by reason.
+        source: the only accepted sender; None accepts all.
+    """
     for _ in range(MESSAGES_KEPT):
         if (waiting := inbox.poll()) is None:
             return
@@ -53,8 +64,17 @@ def _read_messages(
 class HandServer:
     """The live hand of one site.
 
-    `news` are ticks, and sentences on who has taken hold and let go that no event names yet.
-    `limits` are those of the site's motion.
+    Args:
+        site: the kernel's site.
+        hand: the live hand of the scenario.
+        arm: the arm of the site.
+        inbox: the inbox of the hand messages.
+        dropped: counts dropped messages by reason.
+        limits: the limits of the site's motion.
+
+    Attributes:
+        news: who has taken hold of the arm or released it: ticks, and sentences that no event
+            holds yet.
     """
 
     def __init__(
@@ -71,27 +91,31 @@ class HandServer:
         self._inbox = inbox
         self._dropped = dropped
         self._rules = hand.make_rules(site.rate_hz, arm, limits)
-        self._place = lambda: site.q if hand.mode == "joint" else arm.end_effector(site.q)
+        self._compute_pose = lambda: (
+            site.q if hand.mode == "joint" else arm.end_effector(site.q)
+        )
         self._memory = HandMemory()
-        self._free = empty_hand_vector(self._rules.size)
+        self._free_state = empty_hand_vector(self._rules.size)
         self._names: dict[int, str] = {}
         self.news: list[tuple[int, str]] = []
 
     def track(self, _site: Site, k: int) -> list[float]:
-        """Returns what the hand does in tick k, by the messages that have come; see
-        `HandInForce`.
+        """Returns the state of the hand at tick `k`, by the received messages.
+
+        `HandInForce` describes the numbers of that state.
         """
-        came = _read_messages(self._inbox, self._site, self._dropped)
-        commands = [command for message in came if (command := self._read(message)) is not None]
+        messages = _read_messages(self._inbox, self._site, self._dropped)
+        parsed = [self._parse_command(message) for message in messages]
+        commands = [command for command in parsed if command is not None]
         if not commands and not self._memory.target:
-            return self._free
+            return self._free_state
         t_ns = tick_ns(k, self._rules.rate_hz)
         step = advance_hand(
             rules=self._rules,
             memory=self._memory,
             t_ns=t_ns,
             commands=commands,
-            locate=self._place,
+            place=self._compute_pose,
         )
         self._memory = step.memory
         for reason in step.refused:
@@ -101,107 +125,123 @@ class HandServer:
             self.news.append((k, f"{self._site}: {name} {change} at t = {t_ns * 1e-9:.3f} s"))
         return step.vector
 
-    def _read(self, message: HandMessage) -> HandCommand | None:
-        pushes = self._hand.mode == "force"
-        target, other = (message.force, message.target)[:: 1 if pushes else -1]
-        if message.grip and (other or len(target) != self._rules.size):
-            self._dropped[
-                f"hand: no {'force' if pushes else 'target'} of {count_nouns(self._rules.size, 'number')}"
-            ] += 1
-        elif message.grip and math.hypot(*target) > self._rules.max_goal_norm:
-            self._dropped["hand: out of range"] += 1
+    def _parse_command(self, message: HandMessage) -> HandCommand | None:
+        """Returns the command of a message; None if it is refused."""
+        if self._hand.mode == "force":
+            noun = "force"
+            goal = message.force
+            other_goal = message.target
         else:
-            if len(self._names) > MESSAGES_KEPT and message.boot not in self._names:
-                kept = self._memory.source
-                self._names = {kept: self._names[kept]} if kept else {}
-            self._names[message.boot] = message.source or f"hand {message.boot:08x}"
-            return HandCommand(
-                source=message.boot,
-                number=message.n,
-                grip=message.grip,
-                target=tuple(target),
-                sent_ns=message.sent_ns,
-            )
-        return None
+            noun = "target"
+            goal = message.target
+            other_goal = message.force
+        if message.grip and (other_goal or len(goal) != self._rules.size):
+            size = count_nouns(self._rules.size, "number")
+            self._dropped[f"hand: no {noun} of {size}"] += 1
+            return None
+        if message.grip and math.hypot(*goal) > self._rules.max_goal_norm:
+            self._dropped["hand: out of range"] += 1
+            return None
+        if len(self._names) > MESSAGES_KEPT and message.boot not in self._names:
+            # Only the holder's name is kept, so that many senders cannot fill the memory.
+            holder = self._memory.source
+            self._names = {holder: self._names[holder]} if holder else {}
+        self._names[message.boot] = message.source or f"hand {message.boot:08x}"
+        return HandCommand(
+            source=message.boot,
+            number=message.n,
+            grip=message.grip,
+            target=tuple(goal),
+            sent_ns=message.sent_ns,
+        )
 
 
 class RemoteHand(HandPlayer):
-    """A hand of one's own in a process of its own, which is sent what it sees and sends what it
-    decides.
+    """A hand of the user's own that runs in a process of its own.
 
-    Of what comes only the program of its class is taken; what is decided too late acts at once,
-    and counts.
+    The site sends it views, and receives its decisions. Only messages of the program that the
+    scenario names are accepted. A decision that arrives too late acts at once, and is counted.
+
+    Args:
+        hand_site: the site of the hand, and the settings of its class.
+        boot: the boot of this process.
+        inbox: the inbox of the hand's decisions.
+        publish: publishes a view.
+        dropped: counts dropped and late messages by reason.
+        clock: the clock of this process.
     """
 
     def __init__(
         self,
-        at: HandSite,
+        hand_site: HandSite,
         boot: int,
         inbox: Inbox,
         publish: Callable[[bytes], None],
         dropped: Counter[str],
         clock: Clock,
     ) -> None:
-        super().__init__(at, None)
+        super().__init__(hand_site, None)
         self._boot = boot
         self._inbox = inbox
         self._publish = publish
         self._dropped = dropped
         self._clock = clock
-        self._asked = -1
-        self._source = at.source
+        self._asked_tick = -1
+        self._source = hand_site.source
 
     def track(self, site: Site, k: int) -> list[float]:
-        """Returns what it does in tick k, by the decisions that have come."""
-        for message in self._read():
+        """Returns the state of the hand at tick `k`, by the received decisions."""
+        for message in self._read_decisions():
             self._decide(k, message)
         return super().track(site, k)
 
-    def request_action(self, k: int, arrays: SiteArrays) -> None:
-        """Sends it what it sees."""
+    def ask(self, k: int, arrays: SiteArrays) -> None:
+        """Sends the hand the view of tick `k`."""
         view = self.view(k, arrays)
-        seen = _list_numbers(view) | {
-            "peers": [PeerSeen(**_list_numbers(one)) for one in view.peers]
-        }
-        self._publish(encode(HandViewMessage(site=self._site, boot=self._boot, **seen)))
-        self._asked = k
+        fields = _list_numbers(view)
+        fields["peers"] = [PeerSeen(**_list_numbers(peer)) for peer in view.peers]
+        self._publish(encode(HandViewMessage(site=self._site, boot=self._boot, **fields)))
+        self._asked_tick = k
 
     def wait_for_first(
         self, stopped: Callable[[], bool], give_up_ns: int, say: Callable[[str], None]
     ) -> bool:
-        """Waits until its program is there; False if `stopped` comes first.
+        """Waits for the hand's program; returns False if `stopped` returns True first.
 
         Raises:
-            SessionError: it did not come in time.
+            SessionError: the program did not announce itself before `give_up_ns`.
         """
         say(f"waits for its hand {self._code}: trilat hand {self._site} --scenario FILE")
         while not stopped():
-            if any(self._read()):
+            if any(self._read_decisions()):
                 return True
             if self._clock.monotonic_ns() > give_up_ns:
                 raise SessionError(f"{self._site} waited in vain for its hand {self._code}")
             self._clock.sleep_until(self._clock.monotonic_ns() + POLL_NS)
         return False
 
-    def _read(self) -> Iterator[HandMessage]:
+    def _read_decisions(self) -> Iterator[HandMessage]:
         return _read_messages(self._inbox, self._site, self._dropped, self._source)
 
     def _decide(self, k: int, message: HandMessage) -> None:
-        asked = message.n * self.hand.period_ticks
-        # that it is here may come after the first question, and decides nothing
-        is_here = message.n == 0 and not message.grip
-        if self.failure or is_here or asked > self._asked:
+        """Applies a decision at tick `k`; the message names the tick whose view it answers."""
+        asked_tick = message.n * self.hand.period_ticks
+        # The announcement of the program may arrive after the first view; it decides nothing.
+        is_announcement = message.n == 0 and not message.grip
+        if self.failure or is_announcement or asked_tick > self._asked_tick:
             return
-        self._dropped.update(["hand: late"] * (asked + self.hand.delay_ticks < k))
+        if asked_tick + self.hand.delay_ticks < k:
+            self._dropped["hand: late"] += 1
+        goal = (message.target or message.force) if message.grip else None
         try:
-            self.hand.accept_decision(
-                asked, (message.target or message.force) if message.grip else None
-            )
+            self.hand.accept_decision(asked_tick, goal)
         except ValueError as error:
             self.fail(k, str(error))
 
 
 def _list_numbers(view: Any) -> dict[str, Any]:
+    """Returns the fields of a view by name, with arrays as lists."""
     return {
-        k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in view._asdict().items()
+        name: value.tolist() if isinstance(value, np.ndarray) else value
+        for name, value in view._asdict().items()
     }

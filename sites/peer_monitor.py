@@ -1,9 +1,11 @@
-"""Presence of the other members during a run: joins, leaves, and the end events of sites and
-recorders.
+"""Presence of the other members during a run: joins, departures, and the end events of members.
 
-Invariant: of sites, only the boots that the session began with count, and under the rule
-`glide` those that were admitted since: another start of a site is admitted once the token of
-the one before is gone, or its end was heard. A recorder may join at any time.
+Invariant:
+    - Of each site, only the boot counts with which the session began. Under the rule `glide`,
+      boots that were admitted since then count as well.
+    - Another boot of a site is admitted once the token of the previous one is gone, or its end
+      event was received.
+    - A recorder may join at any time.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,23 +15,33 @@ from trilat_net.net.bus import Bus, Inbox
 from trilat_net.net.membership import EventPublisher, read_messages
 from trilat_net.net.messages import Event
 
-MEET_AGAIN_NS = 1_000_000_000
-"""A site that is heard longer after its token went is there: a reconnection may report that
-late.
+RETURN_NS = 1_000_000_000
+"""A site that is heard for longer than this after its token was lost counts as present.
+
+After a reconnection its new token may be reported late.
 """
 
 
 class PeerMonitor:
-    """The other members, as one site sees them; with `admits` it lets sites come back.
+    """The other members of a session, as one site sees them.
+
+    Args:
+        bus: the bus of the site.
+        session: the session's name.
+        site: the name of this site.
+        peers: the names of its peers.
+        admits: whether sites may leave and rejoin.
 
     Attributes:
-        boots: the members of the session and their boots.
+        boots: the boots of the session's members, by name.
+        recorders: boots of the recorders that are present.
         stored: boots of the recorders that have stored all messages of this site.
-        ended_by: text of the event with which a member ended the run for all; "" while none
-            has.
-        ended_member: that member.
-        away: the sites that have left, by name: when, ns since the epoch, and a sentence.
-        admitted: what sites said that were admitted and that the loop has still to take in.
+        ended_by: text of the event with which a member ended the run for all, else "".
+        ended_member: the name of that member.
+        departed: the sites that have left, by name: the time, ns since the epoch, and a
+            sentence.
+        admitted: join events of admitted sites that the loop has not applied yet.
+        changed: True once a peer has published a change.
     """
 
     def __init__(
@@ -38,8 +50,9 @@ class PeerMonitor:
         self.boots: Mapping[str, int] = {}
         self.recorders: set[str] = set()
         self.stored: set[str] = set()
-        self.ended_by = self.ended_member = ""
-        self.away: dict[str, tuple[int, str]] = {}
+        self.ended_by = ""
+        self.ended_member = ""
+        self.departed: dict[str, tuple[int, str]] = {}
         self.admitted: list[Event] = []
         self.changed = False
         self._site = site
@@ -54,62 +67,69 @@ class PeerMonitor:
         self._alive: set[tuple[str, str]] = set()
         self._ended: set[int] = set()
         self._refused: set[int] = set()
-        self._firsts: dict[int, int] = {}  # of the starts that it admitted, by boot
+        self._first_ticks: dict[int, int] = {}  # the first ticks of the admitted boots
 
     @property
     def all_stored(self) -> bool:
-        """True if there is a recorder that has stored all, and none is present that has not."""
+        """True if a recorder has stored everything, and no present recorder lacks anything."""
         return bool(self.stored) and self.recorders <= self.stored
 
     def watch(self, publisher: EventPublisher, t_ns: int) -> None:
-        """Takes events and presence; publishes who comes, and who is lost without an end event."""
-        coming = [
-            event
-            for inbox in self._events.values()
-            for event in self._read(inbox, publisher, t_ns)
-        ]
+        """Reads events and presence; publishes who joins, and who is lost without an end event.
+
+        Args:
+            publisher: publishes this site's events.
+            t_ns: the present time, ns since the epoch.
+        """
+        joining: list[Event] = []
+        for inbox in self._events.values():
+            joining += self._read_peer_events(inbox, publisher, t_ns)
         for parts, alive in topics.read_presence(self._presence):
-            known = str(self.boots.get(parts.member)) == parts.boot
-            if parts.member == topics.RECORDER:
-                (self.recorders.add if alive else self.recorders.discard)(parts.boot)
-                if alive and not known:  # in the middle, or again after another one died
-                    publisher.publish(
-                        "back", "a recorder has come", about=parts.member, t_ns=t_ns
-                    )
-            elif parts.member in self._events:
-                (self._alive.add if alive else self._alive.discard)((parts.member, parts.boot))
-            if self.boots.get(parts.member) in self._ended:
-                continue
-            if known and alive:
-                self.away.pop(parts.member, None)
-            elif not alive and (known or parts.member == topics.RECORDER):
-                publisher.publish(
-                    "lost", f"{parts.member} is gone", about=parts.member, t_ns=t_ns
-                )
-                if self._admits and parts.member in self._events:
-                    self.away[parts.member] = (
-                        t_ns,
-                        f"{parts.member} is gone since t = {t_ns * 1e-9:.1f} s",
-                    )
-        for event in coming:
-            self._consider(publisher, event, t_ns)
+            self._update_presence(parts.member, parts.boot, publisher, t_ns, alive=alive)
+        for event in joining:
+            self._decide_on_join(publisher, event, t_ns)
 
-    def meet_again(self, member: str, t_ns: int) -> None:
-        """Takes a site that is heard for present, if its token went some time ago and it has
-        not ended.
+    def _update_presence(
+        self, member: str, boot: str, publisher: EventPublisher, t_ns: int, *, alive: bool
+    ) -> None:
+        is_member = str(self.boots.get(member)) == boot
+        is_recorder = member == topics.RECORDER
+        is_site = member in self._events
+        if is_recorder:
+            (self.recorders.add if alive else self.recorders.discard)(boot)
+            if alive and not is_member:  # a recorder joins late, or replaces one that died
+                publisher.publish("back", "a recorder has come", about=member, t_ns=t_ns)
+        elif is_site:
+            (self._alive.add if alive else self._alive.discard)((member, boot))
+        if self.boots.get(member) in self._ended:
+            return
+        if is_member and alive:
+            self.departed.pop(member, None)
+        elif not alive and (is_member or is_recorder):
+            publisher.publish("lost", f"{member} is gone", about=member, t_ns=t_ns)
+            if self._admits and is_site:
+                sentence = f"{member} is gone since t = {t_ns * 1e-9:.1f} s"
+                self.departed[member] = (t_ns, sentence)
+
+    def mark_present(self, member: str, t_ns: int) -> None:
+        """Marks a site that is heard as present, if its token was lost some time ago.
+
+        A site whose end event was received stays departed.
         """
-        since_ns, _ = self.away.get(member, (t_ns, ""))
-        if t_ns - since_ns > MEET_AGAIN_NS and self.boots.get(member) not in self._ended:
-            del self.away[member]
+        since_ns, _ = self.departed.get(member, (t_ns, ""))
+        if t_ns - since_ns > RETURN_NS and self.boots.get(member) not in self._ended:
+            del self.departed[member]
 
-    def _read(self, inbox: Inbox, publisher: EventPublisher, t_ns: int) -> Iterator[Event]:
-        """Takes a peer's events; yields those of starts that come.
+    def _read_peer_events(
+        self, inbox: Inbox, publisher: EventPublisher, t_ns: int
+    ) -> Iterator[Event]:
+        """Reads a peer's events, and yields the join events of new boots.
 
-        Of what it admitted in the place of this site the last counts: before came starts that
-        died joining.
+        If the peer has admitted several boots of this site, the last one counts: the earlier
+        ones died while they joined.
         """
-        own = publisher.info.boot
-        in_place = own
+        own_boot = publisher.info.boot
+        admitted_boot = own_boot
         for event in read_messages(inbox, Event):
             if event.kind == "coming" and self._admits:
                 yield event
@@ -123,56 +143,60 @@ class PeerMonitor:
             elif event.kind == "end":
                 self._ended.add(event.boot)
                 if event.about and self._admits:
-                    self.away[event.member] = t_ns, event.text
+                    self.departed[event.member] = t_ns, event.text
                     publisher.publish(
                         "left", event.text, about=event.member, t_ns=t_ns, ticks=event.ticks
                     )
             elif event.kind == "admit" and event.about == self._site:
-                in_place = event.boots.get(self._site, own)
-        if in_place != own and self.boots.get(self._site) == own:
+                admitted_boot = event.boots.get(self._site, own_boot)
+        if admitted_boot != own_boot and self.boots.get(self._site) == own_boot:
             self.ended_by = f"another start of {self._site} has taken its place"
             self.ended_member = self._site
 
-    def _consider(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
+    def _decide_on_join(self, publisher: EventPublisher, event: Event, t_ns: int) -> None:
+        """Admits a new boot of a site, or refuses it while the previous one is alive."""
         member = event.member
-        before = self.boots.get(event.member)
-        if event.boots.get(member) != event.boot or self._firsts.get(event.boot) == event.ticks:
+        previous_boot = self.boots.get(member)
+        is_repeated = self._first_ticks.get(event.boot) == event.ticks
+        if event.boots.get(member) != event.boot or is_repeated:
             return
-        if before not in (event.boot, *self._ended) and (member, str(before)) in self._alive:
+        is_replaced = previous_boot not in (event.boot, *self._ended)
+        if is_replaced and (member, str(previous_boot)) in self._alive:
             if event.boot not in self._refused:
                 self._refused.add(event.boot)
-                text = f"{member} is there already; another start of it must wait until that is gone"
-                self._answer(
-                    kind="refused", text=text, publisher=publisher, event=event, t_ns=t_ns
+                text = (
+                    f"{member} is there already; "
+                    "another start of it must wait until that is gone"
                 )
+                self._publish_decision("refused", text, publisher, event=event, t_ns=t_ns)
             return
         self.boots = {**self.boots, member: event.boot}
-        self.away.pop(member, None)
+        self.departed.pop(member, None)
         self.admitted.append(event)
-        self._firsts[event.boot] = event.ticks
+        self._first_ticks[event.boot] = event.ticks
         publisher.update(boots=self.boots)
-        self._answer(
-            kind="admit",
-            text=f"{member} may join from its tick {event.ticks} on",
-            publisher=publisher,
-            event=event,
-            t_ns=t_ns,
-        )
+        text = f"{member} may join from its tick {event.ticks} on"
+        self._publish_decision("admit", text, publisher, event=event, t_ns=t_ns)
 
-    def _answer(
+    def _publish_decision(
         self, kind: str, text: str, publisher: EventPublisher, event: Event, t_ns: int
     ) -> None:
-        boots = {**self.boots, event.member: event.boot}
-        about = {
-            "about": event.member,
-            "boots": boots,
-            "attempt": event.attempt,
-            "ticks": event.ticks,
-        }
-        publisher.publish(kind, text, t_ns=t_ns, **about)
+        publisher.publish(
+            kind,
+            text,
+            t_ns=t_ns,
+            about=event.member,
+            boots={**self.boots, event.member: event.boot},
+            attempt=event.attempt,
+            ticks=event.ticks,
+        )
 
     def read_stored(self, ticks: int) -> bool:
-        """Takes the recorders' events; True if one has just stored all `ticks` of this site."""
+        """Reads the recorders' events; returns True if a recorder has just stored all messages.
+
+        Args:
+            ticks: the number of ticks of this site.
+        """
         before = len(self.stored)
         for event in read_messages(self._recorder_events, Event):
             if event.kind == "stored" and event.about == self._site and event.ticks >= ticks:

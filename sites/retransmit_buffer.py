@@ -1,7 +1,8 @@
-"""Retransmission buffer of a site: recently published messages, for recorders that missed them.
+"""Retransmission buffer of a site: recent messages, for recorders that missed them.
 
-Invariant (L6): bounded in memory, a minute of every channel, and in time, one chunk per
-request. The loop answers in the slack of its ticks.
+Invariant (L6):
+    - The memory is bounded: it holds at most a minute of every channel.
+    - The time is bounded: each query is answered with one chunk, in the slack of a tick.
 """
 
 from array import array
@@ -16,9 +17,9 @@ from trilat_net.net.topics import STATS_PER_SECOND, count_messages, skipped_numb
 
 KEPT_S = 60
 RECORDS_KEPT = 120_000
-"""Capacity in records: a minute up to 2 kHz, less above."""
+"""Capacity in records: a minute at rates up to 2 kHz, less at higher rates."""
 RECORD_BYTES = 640
-"""Largest mean size of a record of two joints at which a minute of them is kept."""
+"""Mean size up to which a minute of records fits, for an arm of two joints."""
 FLOAT_BYTES = 9
 STATISTICS_BYTES = 4_096
 EVENTS_KEPT = 4_096
@@ -26,64 +27,77 @@ EVENTS_BYTES = 4_000_000
 
 
 class ChannelBuffer:
-    """The last messages of one channel; their numbers count from 0. `size_bytes` holds any one
-    message.
+    """The last messages of one channel, numbered from 0 on.
 
-    The memory is allocated at the start: nothing is allocated while the loop runs.
+    The memory is a ring that is allocated at the start: nothing is allocated while the loop
+    runs.
+
+    Args:
+        capacity: the largest number of messages.
+        size_bytes: the size of the memory; any single message must fit.
+
+    Attributes:
+        next_number: the number of the next message.
+        oldest: the number of the oldest message that is kept.
     """
 
     def __init__(self, capacity: int, size_bytes: int) -> None:
-        self.made = self.oldest = 0
+        self.next_number = 0
+        self.oldest = 0
         self._capacity = capacity
         self._size = size_bytes
-        self._bytes = bytearray().ljust(size_bytes, b"\xff")  # touched, so that the pages exist
+        # Every byte is written once, so that the operating system maps all pages now.
+        self._bytes = bytearray().ljust(size_bytes, b"\xff")
         self._starts = array("q", bytes(8 * capacity))
         self._lengths = array("q", bytes(8 * capacity))
-        self._head = (
-            0  # bytes written since the start, with those skipped at the end of the memory
-        )
+        # Bytes written since the start, and those skipped at the end of the memory.
+        self._head = 0
 
-    def begin_at(self, number: int) -> None:
-        """Lets the first message have a number, before there is any."""
-        self.made = self.oldest = number
+    def start_at(self, number: int) -> None:
+        """Sets the number of the first message; the buffer must be empty."""
+        self.next_number = number
+        self.oldest = number
 
-    def keep(self, payload: bytes) -> None:
-        """Adds the next message; drops the oldest ones to make room."""
+    def store(self, payload: bytes) -> None:
+        """Adds the next message, and drops the oldest ones to make room."""
         length = len(payload)
-        at = self._head % self._size
-        if at + length > self._size:  # a message is contiguous
-            self._head += self._size - at
-            at = 0
-        self._bytes[at : at + length] = payload
-        slot = self.made % self._capacity
+        offset = self._head % self._size
+        if offset + length > self._size:  # a message must be contiguous
+            self._head += self._size - offset
+            offset = 0
+        self._bytes[offset : offset + length] = payload
+        slot = self.next_number % self._capacity
         self._starts[slot] = self._head
         self._lengths[slot] = length
         self._head += length
-        self.made += 1
-        self.oldest = max(self.oldest, self.made - self._capacity)
+        self.next_number += 1
+        self.oldest = max(self.oldest, self.next_number - self._capacity)
         while self._starts[self.oldest % self._capacity] < self._head - self._size:
             self.oldest += 1
 
     def skip(self, count: int) -> None:
-        """Adds numbers of messages that are never made: an empty one stands for each."""
+        """Adds `count` empty messages for numbers that the site never publishes."""
         for _ in range(count):
-            self.keep(b"")
+            self.store(b"")
 
-    def chunk(self, first: int, last: int) -> tuple[int, list[bytes]]:
-        """Returns the number of the first message and the messages of one answer, of those that
-        are kept.
+    def read_chunk(self, first: int, last: int) -> tuple[int, list[bytes]]:
+        """Returns the kept messages from `first` to `last`, as many as one reply can hold.
+
+        Returns:
+            The number of the first returned message, and the messages.
         """
         first = max(first, self.oldest)
+        end = min(last + 1, self.next_number, first + BACKFILL_MESSAGES)
         payloads: list[bytes] = []
         size = 0
-        for number in range(first, min(last + 1, self.made, first + BACKFILL_MESSAGES)):
+        for number in range(first, end):
             slot = number % self._capacity
-            at = self._starts[slot] % self._size
+            offset = self._starts[slot] % self._size
             length = self._lengths[slot]
             size += length
             if payloads and size > BACKFILL_BYTES:
                 break
-            payloads.append(bytes(self._bytes[at : at + length]))
+            payloads.append(bytes(self._bytes[offset : offset + length]))
         return first, payloads
 
 
@@ -103,30 +117,29 @@ class RetransmitBuffer:
             topics.EVENT: ChannelBuffer(EVENTS_KEPT, EVENTS_BYTES),
         }
 
-    def begin_at(self, tick: int) -> None:
-        """Lets tick be the first one of the site."""
-        self.channels[topics.STATE].begin_at(tick)
-        self.channels[topics.LINK].begin_at(
-            count_messages(topics.LINK, tick, self._site.rate_hz)
-        )
+    def start_at(self, tick: int) -> None:
+        """Sets the first tick of the site."""
+        link_number = count_messages(topics.LINK, tick, self._site.rate_hz)
+        self.channels[topics.STATE].start_at(tick)
+        self.channels[topics.LINK].start_at(link_number)
 
     def skip(self, first: int, next_tick: int) -> None:
-        """Adds the numbers of what a site never publishes that makes no ticks from one on, up
-        to another.
-        """
+        """Adds empty messages for the skipped ticks `first` to `next_tick` - 1."""
         self.channels[topics.STATE].skip(next_tick - first)
-        ticks = next_tick, next_tick - first
-        number, first_skipped = skipped_numbers(topics.LINK, *ticks, self._site.rate_hz)
+        number, first_skipped = skipped_numbers(
+            topics.LINK, next_tick, next_tick - first, self._site.rate_hz
+        )
         self.channels[topics.LINK].skip(max(0, number - first_skipped))
 
     def answer_query(self) -> bool:
-        """Answers the oldest query; False without one."""
+        """Answers the oldest query; returns False if there is none."""
         query = self._queries.poll()
         if query is None:
             return False
-        answer_backfill(query, self._site.name, self._boot, self._find)
+        answer_backfill(query, self._site.name, self._boot, self._find_messages)
         return True
 
-    def _find(self, wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
+    def _find_messages(self, wanted: BackfillRequest) -> tuple[int, list[bytes], int]:
         buffer = self.channels[wanted.channel]
-        return *buffer.chunk(wanted.first, wanted.last), buffer.made
+        first, payloads = buffer.read_chunk(wanted.first, wanted.last)
+        return first, payloads, buffer.next_number

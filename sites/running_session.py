@@ -179,7 +179,11 @@ class RunningSession:
                     )
                 reach = scenario.arms[site].reach
                 led = DeviceHand(
-                    hand=held, device=device, how=live.device, clock=self._clock, reach=reach
+                    hand=held,
+                    device=device,
+                    settings=live.device,
+                    clock=self._clock,
+                    reach=reach,
                 )
                 led.run(stopped, lambda text: say(f"{site}: {text}"))
                 say(f"{site}: {led.describe()}")
@@ -581,14 +585,14 @@ def open_hand(
         raise UsageError(
             f"nobody can take hold of {site}: the scenario has no operator of kind 'live' there{others}"
         )
-    place = scenario.arms[site].end_effector if live.mode != "joint" else tuple
+    compute_pose = tuple if live.mode == "joint" else scenario.arms[site].end_effector
     return Hand(
         bus=bus,
         clock=clock,
         session=session,
         site=site,
         operator=live.actor,
-        place=place,
+        compute_pose=compute_pose,
         source=source,
         repeats=repeats,
     )

@@ -1,7 +1,8 @@
 """The parts of a site that live from its start to its end, and its options.
 
-Invariant: once made, every subscription of the site is declared and its step is compiled, so a
-site that declares itself alive is ready for its session.
+Invariant:
+    - When `SiteParts` has been created, every subscription of the site is declared and its step
+      is compiled. A site that announces itself is therefore ready for its session.
 """
 
 from collections.abc import Callable
@@ -52,13 +53,20 @@ from .site_loop import StateBlock, make_sample_readers, may_hold_samples
 
 @dataclass(frozen=True, slots=True)
 class SiteOptions:
-    """How a site takes part in a session.
+    """How a site joins a session, and how long it waits.
 
     Attributes:
-        stay_s: how long to stay afterwards until the recorder has left, at most, s.
-        without: sites without which the session begins; they may join it while it runs.
-        leave_timeout_s: how long to go on after a site has left that does not come back, s;
-            None: to the end.
+        session: the session's name.
+        connection: the endpoints and keys.
+        join_timeout_s: longest wait for the session to begin, s.
+        needs_recorder: whether the session begins only when a recorder is present.
+        cpu: the processor that the loop is bound to; None for any.
+        stay_s: longest time to stay after the run until the recorder has left, s.
+        clock_offset_s: offset added to this site's clock, s, to emulate another machine.
+        clock_drift_ppm: drift added to this site's clock, parts per million.
+        without: sites that the session does not wait for; they may join the running session.
+        leave_timeout_s: how long to continue after a peer has left and not returned, s; None
+            stands for the end of the run.
     """
 
     session: str
@@ -74,7 +82,15 @@ class SiteOptions:
 
 
 class SiteParts:
-    """One site's parts; those that its scenario does not ask for are None."""
+    """All parts of one site. Parts that the scenario does not ask for are None.
+
+    Attributes:
+        arm: the external arm.
+        switch: the dead-man switch of that arm.
+        plant: the user's own plant.
+        hand: the live hand at the site's arm.
+        step: the site's step, under the watchdog if the law is a user's own.
+    """
 
     def __init__(
         self,
@@ -96,172 +112,189 @@ class SiteParts:
         self.setup = scenario.setup(name)
         self.site = Site(self.setup)
         self.boot = new_boot()
-        peers = self.site.peers
-        session = options.session
         self.stats = LoopStats(self.site, self.boot)
         self.watchdog, self.step = watch_law(scenario, self.site, clock)
+        readers = make_sample_readers(self.setup)
         self.rings = [
-            bus.stamped_inbox(
-                topics.key(session, link.peer, topics.SAMPLE), clock.monotonic_ns, read
-            )
-            for link, read in zip(
-                self.setup.links, make_sample_readers(self.setup), strict=True
-            )
+            bus.stamped_inbox(self._key(topics.SAMPLE, link.peer), clock.monotonic_ns, reader)
+            for link, reader in zip(self.setup.links, readers, strict=True)
         ]
         self.arm: ExternalArm | None = None
         self.switch: DeadManSwitch | None = None
-        self._meet_outside_arm()
+        self._connect_outside_arm()
         self.plant: PlantPlayer | None = None
         if isinstance(plant := scenario.sites[name].plant, OwnPlant):
-            watch = self._watch(f"the plant {plant.code}", self.site.rate_hz)
-            self.plant = PlantPlayer(scenario, name, plant, watch)
+            run_plant = self._watch_code(f"the plant {plant.code}", self.site.rate_hz)
+            self.plant = PlantPlayer(scenario, name, plant, run_plant)
         self.hand: HandServer | HandPlayer | None = None
-        self._meet_hand()
-        queries = bus.query_inbox(topics.key(session, name, topics.PAST))
-        self.buffer = RetransmitBuffer(self.site, self.boot, queries)
-        self.publish_sample = bus.publisher(topics.key(session, name, topics.SAMPLE))
-        # a site that is killed loses no record
-        single = self.arm is not None or scenario.sites_may_return
-        send_states, send_links = map(self._keeping_publisher, (topics.STATE, topics.LINK))
-        self.states = StateBlock(
-            self.site, self.boot, send_states, scenario.names.index(name), single=single
+        self._connect_hand()
+        past_queries = bus.query_inbox(self._key(topics.PAST))
+        self.buffer = RetransmitBuffer(self.site, self.boot, past_queries)
+        self._make_publishers()
+        self.monitor = PeerMonitor(
+            bus, options.session, name, self.site.peers, admits=scenario.sites_may_return
         )
-        self.states.holds_samples = not single and may_hold_samples(scenario, name)
-        self.publish_link: Callable[[bytes], None] = lambda payload: send_links([payload])
-        self.monitor = PeerMonitor(bus, session, name, peers, admits=scenario.sites_may_return)
         self._next_tick = -1
-        asked, stops = (
-            bus.query_inbox(topics.key(session, name, one)) for one in (topics.SET, topics.STOP)
+        self.changes = ChangeServer(
+            scenario=scenario,
+            site=name,
+            queries=bus.query_inbox(self._key(topics.SET)),
+            mode=lambda: self.site.mode,
+            held=lambda: self.switch is None or self.switch.held,
+            stops=bus.query_inbox(self._key(topics.STOP)),
         )
-        inputs = (lambda: self.site.mode), (lambda: self.switch is None or self.switch.held)
-        self.changes = ChangeServer(scenario, name, asked, *inputs, stops)
         warm_up(scenario, name, clock)
 
-    def _watch(self, name: str, rate_hz: int) -> Callable[..., Any]:
-        """Returns what calls code of one's own under the watchdog; one that is too slow raises."""
+    def _key(self, channel: str, member: str = "") -> str:
+        """Returns the key of a channel of this site, or of another member of the session."""
+        return topics.key(self.options.session, member or self.name, channel)
+
+    def _make_publishers(self) -> None:
+        scenario = self.scenario
+        self.publish_sample = self.bus.publisher(self._key(topics.SAMPLE))
+        send_states = self._make_storing_publisher(topics.STATE)
+        send_links = self._make_storing_publisher(topics.LINK)
+        self.publish_link: Callable[[bytes], None] = lambda payload: send_links([payload])
+        # Each record is sent with its tick, so that a site that is killed loses no record.
+        sends_every_tick = self.arm is not None or scenario.sites_may_return
+        self.states = StateBlock(
+            site=self.site,
+            boot=self.boot,
+            send=send_states,
+            turn=scenario.names.index(self.name),
+            single=sends_every_tick,
+        )
+        self.states.holds_samples = not sends_every_tick and may_hold_samples(
+            scenario, self.name
+        )
+
+    def _watch_code(self, name: str, rate_hz: int) -> Callable[..., Any]:
+        """Returns a function that calls the user's code under the watchdog.
+
+        The call raises TimeoutError if the code is too slow.
+        """
         code = WatchedCode(name, rate_hz, lambda _, problem: TimeoutError(problem), self.clock)
         self.watchdog.codes.append(code)
         return code.run
 
-    def _meet_hand(self) -> None:
+    def _connect_hand(self) -> None:
+        """Creates the live hand of the site, if the scenario has one.
+
+        A class of the user's own runs in this process (`HandPlayer`) or in its own
+        (`RemoteHand`); otherwise people and programs hold the arm (`HandServer`).
+        """
         name = self.name
-        bus = self.bus
-        session = self.options.session
-        live = self.scenario.sites[name].find_live_hand()
-        at = find_own_hand(self.scenario, name)
-        if live is None:
+        live_hand = self.scenario.sites[name].find_live_hand()
+        if live_hand is None:
             return
-        if at is not None and not at.has_separate_process:
-            watch = self._watch(f"the hand {at.program}", at.rate_hz)
-            self.hand = HandPlayer(at, make_hand_program(at), watch)
+        own_hand = find_own_hand(self.scenario, name)
+        if own_hand is not None and not own_hand.has_separate_process:
+            run_hand = self._watch_code(f"the hand {own_hand.program}", own_hand.rate_hz)
+            self.hand = HandPlayer(own_hand, make_hand_program(own_hand), run_hand)
             return
-        inbox = bus.inbox(topics.key(session, name, topics.HAND), MESSAGES_KEPT)
-        dropped = self.stats.dropped
-        if at is not None:
-            publish = bus.publisher(topics.key(session, name, topics.VIEW))
+        inbox = self.bus.inbox(self._key(topics.HAND), MESSAGES_KEPT)
+        if own_hand is not None:
             self.hand = RemoteHand(
-                at=at,
+                hand_site=own_hand,
                 boot=self.boot,
                 inbox=inbox,
-                publish=publish,
-                dropped=dropped,
+                publish=self.bus.publisher(self._key(topics.VIEW)),
+                dropped=self.stats.dropped,
                 clock=self.clock,
             )
             return
         self.hand = HandServer(
             site=self.site,
-            hand=live,
+            hand=live_hand,
             arm=self.scenario.arms[name],
             inbox=inbox,
-            dropped=dropped,
+            dropped=self.stats.dropped,
             limits=self.scenario.motion_limits(name),
         )
 
-    def _meet_outside_arm(self) -> None:
+    def _connect_outside_arm(self) -> None:
+        """Creates the external arm and the dead-man switch, if the scenario has them."""
         name = self.name
-        session = self.options.session
-        dropped = self.stats.dropped
-        measured, enable = (
-            topics.key(session, name, one) for one in (topics.MEASURED, topics.ENABLE)
-        )
+        read_clock = self.clock.monotonic_ns
         if name in self.scenario.outside:
-            ring = self.bus.stamped_inbox(
-                measured, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT
-            )
+            key = self._key(topics.MEASURED)
             connection = self.options.connection
-            # its own, or a router
-            reached = connection.reach(connection.listen or connection.connect or ())
-            place = " at ".join([measured, *map(str, reached[:1])])
+            # The arm reaches the site at an endpoint of its own, else through a router.
+            endpoints = connection.reach(connection.listen or connection.connect or ())
             self.arm = ExternalArm(
-                site=self.site, ring=ring, clock=self.clock, dropped=dropped, place=place
+                site=self.site,
+                ring=self.bus.stamped_inbox(key, read_clock, bytes, MEASUREMENTS_KEPT),
+                clock=self.clock,
+                dropped=self.stats.dropped,
+                address=" at ".join([key, *map(str, endpoints[:1])]),
             )
         if self.scenario.sites[name].arm.dead_man:
             ring = self.bus.stamped_inbox(
-                enable, self.clock.monotonic_ns, bytes, MEASUREMENTS_KEPT
+                self._key(topics.ENABLE), read_clock, bytes, MEASUREMENTS_KEPT
             )
-            self.switch = DeadManSwitch(name, ring, self.clock, dropped)
+            self.switch = DeadManSwitch(name, ring, self.clock, self.stats.dropped)
 
-    def _keeping_publisher(self, channel: str) -> Callable[[list[bytes]], None]:
-        keep = self.buffer.channels[channel].keep
-        publish = self.bus.publisher(topics.key(self.options.session, self.name, channel))
+    def _make_storing_publisher(self, channel: str) -> Callable[[list[bytes]], None]:
+        """Returns a function that stores messages for retransmission and publishes them."""
+        store = self.buffer.channels[channel].store
+        publish = self.bus.publisher(self._key(channel))
 
-        def keep_and_publish(payloads: list[bytes]) -> None:
+        def store_and_publish(payloads: list[bytes]) -> None:
             for payload in payloads:
-                keep(payload)
+                store(payload)
             for block in join_states(payloads):
                 publish(block)
 
-        return keep_and_publish
+        return store_and_publish
 
-    def take_changes(self, k: int) -> list[CoreChange]:
-        """Returns what the site takes in at tick k: requests, and what it finds out about its
-        own arm.
+    def pop_changes(self, k: int) -> list[CoreChange]:
+        """Returns the changes that the site applies at tick `k`.
+
+        They are the accepted requests, and what the site observes about its own arm: skipped
+        ticks, silence, a released dead-man switch.
         """
-        changes = list(self.changes.take(k))
+        changes = list(self.changes.pop_changes(k))
         if self.arm is None:
             return changes
-        # it may join a running session
+        # A site that joins a running session starts at a later tick, and has skipped none.
         skipped = k - self._next_tick if self._next_tick >= 0 else 0
         self._next_tick = k + 1
+        mode = self.site.mode
         if skipped:
             self.buffer.skip(k - skipped, k)
-        mode = self.site.mode
-        orders: list[tuple[SiteOrder, int]] = [
-            ("overrun", skipped),
-            (self.arm.take_order(mode), 0),
-        ]
+            changes.append(self._make_order_change(k, "overrun", skipped))
+        orders: list[SiteOrder] = [self.arm.pop_order(mode)]
         if self.switch is not None:
-            orders.append((self.switch.take_order(mode, self.site.life_reason), 0))
-        for order, ticks in orders:
-            if ticks or (order and order != "overrun"):
-                t_ns = tick_ns(k, self.site.rate_hz)
-                change = make_site_order(
-                    scenario=self.scenario,
-                    site=self.name,
-                    order=order,
-                    from_ns=t_ns,
-                    ticks=ticks,
-                )
-                changes.append(to_core_change(self.scenario, change))
+            orders.append(self.switch.pop_order(mode, self.site.life_reason))
+        changes += [self._make_order_change(k, order) for order in orders if order]
         return changes
+
+    def _make_order_change(self, k: int, order: SiteOrder, skipped: int = 0) -> CoreChange:
+        change = make_site_order(
+            scenario=self.scenario,
+            site=self.name,
+            order=order,
+            from_ns=tick_ns(k, self.site.rate_hz),
+            ticks=skipped,
+        )
+        return to_core_change(self.scenario, change)
 
 
 WARM_UP_TICKS = 200
 
 
 def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
-    """Steps a throw-away site, so that all code of a tick is compiled and in memory; it leaves
-    no trace.
+    """Steps a throw-away site, so that all code of a tick is compiled and in memory.
 
     Raises:
-        LawFailed: a user law fails already with every arm at rest where it starts.
+        LawFailed: the user's law fails even with every arm at rest at its start.
     """
     setup = scenario.setup(name)
     site = Site(setup)
     watchdog, step = watch_law(scenario, site, clock or SystemClock())
     try:
         with watchdog:
-            _warm(setup, site, step)
+            _run_warm_up(setup, site, step)
     except LawFailed as failed:
         problem = (
             f"{failed.problem}; this was the rehearsal, with every arm at rest where it starts"
@@ -272,7 +305,10 @@ def warm_up(scenario: Scenario, name: str, clock: Clock | None = None) -> None:
 def watch_law(
     scenario: Scenario, site: Site, clock: Clock
 ) -> tuple[CodeWatchdog, Callable[[TickInput], TickRecord]]:
-    """Returns what watches a site's law, if that is a user's, and the step of the site."""
+    """Returns a watchdog for the site's law, and the step of the site.
+
+    The watchdog watches nothing if the law is not a user's own.
+    """
     law = scenario.sites[site.name].control
     if not isinstance(law, ImportedLaw):
         return CodeWatchdog(), site.step
@@ -284,9 +320,9 @@ def watch_law(
     return CodeWatchdog(code), lambda tick: code.run(tick.k, lambda: site.step(tick))
 
 
-def _warm(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:
-    site.start_at(first_tick_at(0, site.rate_hz))
-    site.release_tick(0, 0)  # as a site does that joins late
+def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:
+    site.begin_at(first_tick_at(0, site.rate_hz))
+    site.release_tick(0, 0)  # as when a site joins late
     estimator = OffsetEstimator()
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None
     for k in range(WARM_UP_TICKS):

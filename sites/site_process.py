@@ -1,8 +1,10 @@
 """One site as one process: it joins a session, runs, and leaves.
 
-Invariant: a site declares itself alive only when its subscriptions are declared and its step is
-compiled. Until the epoch its arm is braked; at the end it stays until every recorder present
-has all messages that it can have, or for some seconds.
+Invariant:
+    - A site announces itself only when its subscriptions are declared and its step is compiled.
+    - The arm is braked until the epoch.
+    - After its last tick, the site stays until every recorder present has all messages of this
+      site, or until a time limit.
 """
 
 import signal
@@ -54,21 +56,22 @@ from .site_loop import PeerInbox, run_loop
 from .site_parts import SiteOptions, SiteParts
 
 POLL_NS = 5_000_000
-NOBODY = -1
-"""No start of a peer that is not there yet."""
-STATUS_TICKS_S = 5
-"""Between two lines that say how a site does, s."""
+NO_BOOT = -1
+"""The boot of a peer that is not present yet."""
+STATUS_PERIOD_S = 5
+"""Time between two status lines, s."""
 LINGER_NS = 10 * NS_PER_S
-"""Longest wait after the last query of a recorder. One whose process was frozen, or whose
-connection broke, needs seconds to connect again: that takes the lease of Zenoh, 5 s, and one
-attempt after that.
+"""Longest wait after the last query of a recorder.
+
+A recorder whose process was suspended, or whose connection broke, needs seconds to connect
+again: the lease of Zenoh, 5 s, and one attempt after that.
 """
-TELL_NS = NS_PER_S
-"""A wait of this length is announced to the user."""
+ANNOUNCE_AFTER_NS = NS_PER_S
+"""A longer wait is announced to the user."""
 LEAVE_TIMEOUT_NS = 2 * NS_PER_S
-"""Wait after a recorder that has everything is gone: its process ends."""
+"""Wait after the last recorder has left with everything; its process is ending."""
 QUERIED_NS = NS_PER_S
-"""A recorder that has sent a query within this time is present, whatever its token says."""
+"""A recorder whose last query is younger counts as present, even without a liveliness token."""
 
 
 def run_site(
@@ -76,39 +79,41 @@ def run_site(
 ) -> int:
     """Runs one site of a scenario from its start to its end.
 
+    Args:
+        scenario: the scenario of the session.
+        name: the site's name.
+        options: how the site joins the session.
+        say: prints a line for the user.
+
     Returns:
-        The exit code: 0, or 128 and the number of the signal that ended it.
+        The exit code: 0, or 128 plus the number of the signal that ended the site.
 
     Raises:
         SessionError: the session could not begin.
         UsageError: an endpoint cannot be used.
-        ScenarioError: its user law cannot be made, or is not the one that the scenario names;
-            or an arm outside of the program lacks limits.
-        RunFailed: the run diverged, its user law failed, or its arm fell silent.
+        ScenarioError: the user's law cannot be imported or differs from the scenario's, or an
+            external arm lacks limits.
+        RunFailed: the run diverged, the user's law failed, or the arm fell silent.
     """
     check_outside_arms(scenario)
-    # one that returns to a session has less time to go: see `join_session`
+    # A site that rejoins a session needs its keys for less time: see `join_session`.
     if not scenario.sites_may_return:
         options.connection.require_keys_until(scenario.duration_s)
     share_threads()
     with Interrupt() as interrupt:
         clock = make_system_clock(options.clock_offset_s, options.clock_drift_ppm)
 
-        def named(text: str) -> None:
-            say(f"{name}: {text}")
-
-        timeout_s = options.join_timeout_s
         bus = open_bus(
             connection=options.connection,
             clock=clock,
             stopped=interrupt.is_requested,
-            timeout_s=timeout_s,
-            say=named,
+            timeout_s=options.join_timeout_s,
+            say=lambda text: say(f"{name}: {text}"),
         )
         if bus is None:
             return interrupt.exit_code
         with closing(bus), LinePrinter(say) as printer:
-            with interrupt.raising():  # it may compile for minutes
+            with interrupt.raising():  # compilation may take minutes
                 parts = SiteParts(
                     scenario=scenario,
                     name=name,
@@ -119,92 +124,115 @@ def run_site(
                     say=printer.put,
                 )
             if options.connection.listen:
-                parts.say(f"others connect to {', '.join(map(str, options.connection.listen))}")
-            return take_part(parts)
+                endpoints = ", ".join(map(str, options.connection.listen))
+                parts.say(f"others connect to {endpoints}")
+            return join_and_run(parts)
 
 
-def take_part(parts: SiteParts) -> int:
-    """Joins a session, runs and leaves; returns the exit code.
+def join_and_run(parts: SiteParts) -> int:
+    """Joins a session, runs and leaves.
+
+    Returns:
+        The exit code of the process.
 
     Raises:
         SessionError: the session could not begin.
-        RunFailed: the run ended badly.
+        RunFailed: the run failed.
     """
-    give_up_ns = parts.clock.monotonic_ns() + int(parts.options.join_timeout_s * 1e9)
-    waits = parts.interrupt.is_requested, give_up_ns, parts.say
-    for awaited in (parts.arm, parts.hand):
-        if isinstance(awaited, ExternalArm | RemoteHand) and not awaited.wait_for_first(*waits):
+    timeout_ns = int(parts.options.join_timeout_s * 1e9)
+    give_up_ns = parts.clock.monotonic_ns() + timeout_ns
+    stopped = parts.interrupt.is_requested
+    for device in (parts.arm, parts.hand):
+        if not isinstance(device, ExternalArm | RemoteHand):
+            continue
+        if not device.wait_for_first(stopped, give_up_ns, parts.say):
             return parts.interrupt.exit_code
     running = join_session(parts, give_up_ns)
     if running is None:
         return parts.interrupt.exit_code
     running.run()
-    return running.leave()
+    return running.leave_session()
 
 
 def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
-    """Declares a site alive, and waits for the others and the epoch; None if a signal comes
-    first.
+    """Announces the site, and waits for the other members and the epoch.
+
+    Args:
+        parts: the parts of the site.
+        give_up_ns: when to give up, on this process's monotonic clock.
+
+    Returns:
+        The running site; None if a signal ended the wait.
 
     Raises:
         SessionError: the session did not begin in time, or this site cannot be part of it.
     """
     scenario = parts.scenario
     options = parts.options
-    needs = {"needs_recorder": options.needs_recorder}
-    info = describe_member(parts.name, parts.boot, parts.clock, scenario.text, **needs)
-    late = LateSites(scenario.sites_may_return, options.without, parts.site.rate_hz)
-    keep = parts.buffer.channels[topics.EVENT].keep
-    publisher = EventPublisher(parts.bus, options.session, info, keep)
+    info = describe_member(
+        parts.name,
+        parts.boot,
+        parts.clock,
+        scenario.text,
+        needs_recorder=options.needs_recorder,
+    )
+    store_event = parts.buffer.channels[topics.EVENT].store
+    publisher = EventPublisher(parts.bus, options.session, info, store_event)
     joining = SessionJoin(
         bus=parts.bus,
         clock=parts.clock,
         session=options.session,
         publisher=publisher,
         sites=scenario.names,
-        late=late,
+        late=LateSites(scenario.sites_may_return, options.without, parts.site.rate_hz),
     )
     membership = joining.membership
     pinger = joining.pinger
     parts.say(f"waiting for {', '.join(membership.list_missing()) or 'the epoch'}")
-    begins = 0
+    first_tick = 0
     while not parts.interrupt.is_requested():
         epoch = joining.poll()
         if epoch is not None:
             since_ns = parts.clock.monotonic_ns() - epoch.mono_ns
             options.connection.require_keys_until(scenario.duration_s - since_ns / NS_PER_S)
             return RunningSite(parts, publisher, pinger, epoch)
-        if joining.announced_first_tick != begins:
-            begins = joining.announced_first_tick
-            parts.site.start_at(begins)  # it takes 0.1 s for every hour that the session runs
+        if joining.coming_at != first_tick:
+            first_tick = joining.coming_at
+            # Prepared here, since it takes 0.1 s for every hour of the running session.
+            parts.site.begin_at(first_tick)
         now_ns = parts.clock.monotonic_ns()
         if now_ns > give_up_ns:
-            missing = membership.list_missing()
-            reason = (
-                f"{', '.join(missing)} never came"
-                if missing
-                else "the others came, but no epoch"
-            )
-            reason = joining.reason or reason
-            for member, problem in membership.unreadable.items():
-                reason += f"; the answer of {member} cannot be read: {problem}"
-            waited = f"{parts.name} waited {options.join_timeout_s:g} s in session {options.session!r}"
-            raise SessionError(f"{waited}: {reason}")
+            raise _describe_failed_join(parts, joining)
         parts.clock.sleep_until(now_ns + pinger.pause_ns(POLL_NS))
     return None
+
+
+def _describe_failed_join(parts: SiteParts, joining: SessionJoin) -> SessionError:
+    options = parts.options
+    missing = joining.membership.list_missing()
+    reason = joining.reason
+    if not reason and missing:
+        reason = f"{', '.join(missing)} never came"
+    elif not reason:
+        reason = "the others came, but no epoch"
+    for member, problem in joining.membership.unreadable.items():
+        reason += f"; the answer of {member} cannot be read: {problem}"
+    waited_s = f"{options.join_timeout_s:g} s"
+    return SessionError(
+        f"{parts.name} waited {waited_s} in session {options.session!r}: {reason}"
+    )
 
 
 class RunningSite:
     """A site between the epoch and its last tick.
 
-    The loop calls `use_slack` after a block of records, and again after the next tick if it
-    returns true, in a quarter of a period.
+    The loop calls `use_slack` after a block of records, if a quarter of a period is left. If
+    that returns True, the loop calls it again after the next tick.
     """
 
     def __init__(
         self, parts: SiteParts, publisher: EventPublisher, pinger: Pinger, epoch: Epoch
     ) -> None:
-        scenario = parts.scenario
         site = parts.site
         self._parts = parts
         self._publisher = publisher
@@ -213,41 +241,27 @@ class RunningSite:
         self._mode = Mode.RUN
         self._skipped = list[str]()
         self._output: TickRecord | None = None
-        self._status_s = self._told_s = 0
-        self._given_up = False
-        self._held_s = -1
-        self._came_ns = tick_ns(epoch.first, site.rate_hz)
+        self._status_s = 0
+        self._waiting_s = 0
+        self._has_given_up = False
+        self._alarm_s = -1
+        self._rejoined_ns = tick_ns(epoch.first, site.rate_hz)
         self.publish_sample = parts.publish_sample
         self.publish_link = parts.publish_link
         self.use_slack = parts.buffer.answer_query
         parts.monitor.boots = epoch.boots
-        boots = [epoch.boots.get(peer, NOBODY) for peer in site.peers]
-        peers = [
-            PeerClock(
-                name=peer,
-                epoch_ns=epoch.epochs.get(peer, epoch.mono_ns),
-                index_at_peer=scenario.peers(peer).index(parts.name),
-                estimate=pinger.estimate(boot),
-                estimator=pinger.estimator(boot),
-            )
-            for peer, boot in zip(site.peers, boots, strict=True)
-        ]
-        site.start_at(epoch.first)
-        parts.buffer.begin_at(epoch.first)
-        own = {peer.name for peer in peers if peer.is_own and peer.name in epoch.boots}
-        self._here = [name for name in scenario.names if name == parts.name or name in own]
-        rate_hz = max(scenario.sites[name].rate_hz for name in self._here)
-        turn_ns = find_turn_ns(self._here.index(parts.name), len(self._here), rate_hz)
-        self._timing = SiteTiming(
-            epoch_ns=epoch.mono_ns,
-            rate_hz=site.rate_hz,
-            peers=peers,
-            leader=scenario.names[0],
-            turn_ns=turn_ns,
-        )
+        site.begin_at(epoch.first)
+        parts.buffer.start_at(epoch.first)
+        self._timing = self._make_timing(pinger)
         self._clock_texts = describe_clocks(pinger, epoch.boots, epoch.mono_ns)
-        heard = (parts.rings, boots, self._timing.monitors, parts.stats.dropped)
-        self._inbox = PeerInbox(parts.setup.links, *heard, tick_ns(epoch.first, site.rate_hz))
+        self._inbox = PeerInbox(
+            links=parts.setup.links,
+            rings=parts.rings,
+            boots=[epoch.boots.get(peer, NO_BOOT) for peer in site.peers],
+            monitors=self._timing.monitors,
+            dropped=parts.stats.dropped,
+            from_ns=tick_ns(epoch.first, site.rate_hz),
+        )
         publisher.update(
             running=True,
             epoch_mono_ns=epoch.mono_ns,
@@ -255,59 +269,103 @@ class RunningSite:
             boots=epoch.boots,
         )
 
+    def _make_timing(self, pinger: Pinger) -> SiteTiming:
+        """Returns the timing of the site, with its turn among the sites of this machine.
+
+        Sites with the same clock run on the same machine.
+        """
+        parts = self._parts
+        epoch = self._epoch
+        scenario = parts.scenario
+        peers = []
+        for peer in parts.site.peers:
+            boot = epoch.boots.get(peer, NO_BOOT)
+            peers.append(
+                PeerClock(
+                    name=peer,
+                    epoch_ns=epoch.epochs.get(peer, epoch.mono_ns),
+                    index_at_peer=scenario.peers(peer).index(parts.name),
+                    estimate=pinger.estimate(boot),
+                    estimator=pinger.estimator(boot),
+                )
+            )
+        local_names = {peer.name for peer in peers if peer.is_own and peer.name in epoch.boots}
+        local_names.add(parts.name)
+        self._local_sites = [name for name in scenario.names if name in local_names]
+        turn = self._local_sites.index(parts.name)
+        rate_hz = max(scenario.sites[name].rate_hz for name in self._local_sites)
+        return SiteTiming(
+            epoch_ns=epoch.mono_ns,
+            rate_hz=parts.site.rate_hz,
+            peers=peers,
+            leader=scenario.names[0],
+            turn_ns=find_turn_ns(turn, len(self._local_sites), rate_hz),
+        )
+
     def run(self) -> None:
-        """Runs every tick, or until the run ends."""
+        """Runs all ticks, or until the run ends early."""
         parts = self._parts
         parts.states.holds_samples &= all(meter.peer.is_own for meter in self._timing.monitors)
         self._publish_setup()
-        order = encode(ChangeRequest(order="stop", source="the operator"))
-        name = parts.name
-        here = (
+        known_site = make_site_known(
             parts.options.session,
-            name,
+            parts.name,
             parts.scenario.names,
             parts.boot,
             parts.options.connection,
+            encode(ChangeRequest(order="stop", source="the operator")),
         )
-        with make_site_known(*here, order), parts.watchdog:
-            ticks = parts.scenario.ticks(name)
-            timed = (ticks, parts.clock, self._inbox, self._timing, parts.stats)
-            last = (parts.states, self, self._epoch.first)
+        with known_site, parts.watchdog:
             self._output = run_loop(
-                parts.site, parts.boot, *timed, *last, catches_up=parts.arm is None
+                site=parts.site,
+                boot=parts.boot,
+                ticks=parts.scenario.ticks(parts.name),
+                clock=parts.clock,
+                inbox=self._inbox,
+                timing=self._timing,
+                stats=parts.stats,
+                states=parts.states,
+                io=self,
+                first=self._epoch.first,
+                catches_up=parts.arm is None,
             )
         output = self._output
         self._ticks = 0 if output is None else output.tick + 1
         self._t_ns = -1 if output is None else output.t_ns
         if output is not None:
-            self._tell_skipped(output.tick, output.t_ns)
+            self._publish_skipped(output.tick, output.t_ns)
 
     def _publish_setup(self) -> None:
+        """Publishes the settings of the process, the clocks, and how the arm stands."""
         parts = self._parts
         texts = self._clock_texts
-        obtained = realtime.prepare(parts.options.cpu, len(self._here))
+        obtained = realtime.prepare(parts.options.cpu, len(self._local_sites))
         obtained["turn"] = f"{self._timing.turn_ns // 1000} us after the grid"
+        settings = [f"{key}: {value}" for key, value in obtained.items()]
         self._publisher.publish(
             "setup",
-            ", ".join([*(f"{key}: {value}" for key, value in obtained.items()), *texts]),
+            ", ".join([*settings, *texts]),
             epoch_mono_ns=self._epoch.mono_ns,
             clock=parts.clock.identity(),
         )
         begins = "the session begins"
         if first := self._epoch.first:
-            begins = f"joins the running session at t = {tick_ns(first, parts.site.rate_hz) * 1e-9:.3f} s"
-            text = f"{parts.name} {begins}"
-            about = {"boots": self._epoch.boots, "ticks": first}
+            t_ns = tick_ns(first, parts.site.rate_hz)
+            begins = f"joins the running session at t = {t_ns * 1e-9:.3f} s"
             self._publisher.publish(
-                "join", text, t_ns=tick_ns(first, parts.site.rate_hz), **about
+                "join",
+                f"{parts.name} {begins}",
+                t_ns=t_ns,
+                boots=self._epoch.boots,
+                ticks=first,
             )
         parts.say(f"{begins}; {obtained['scheduling']}, memory {obtained['memory']}")
         self._publish_clocks(self._timing.list_initial_notices(), 0)
-        if parts.arm is not None and (
-            text := parts.arm.bind(parts.scenario.sites[parts.name].q0_rad)
-        ):
-            self._publisher.publish("arm", f"{parts.name}: {text}")
-            texts = [*texts, text]
+        if parts.arm is not None:
+            warning = parts.arm.bind(parts.scenario.sites[parts.name].q0_rad)
+            if warning:
+                self._publisher.publish("arm", f"{parts.name}: {warning}")
+                texts = [*texts, warning]
         for text in texts:
             parts.say(text)
 
@@ -316,31 +374,30 @@ class RunningSite:
             self._publisher.publish(**notice, t_ns=t_ns)
 
     def should_stop(self) -> bool:
-        """True if the run ends before its next tick."""
+        """Returns True if the run ends before its next tick."""
         parts = self._parts
         for input_ in (parts.arm, parts.switch):
             if input_ is not None:
                 input_.poll()
         ended = self._failure or parts.monitor.ended_by or parts.changes.stopped
-        return bool(ended) or parts.interrupt.is_requested() or self._given_up
+        return bool(ended) or parts.interrupt.is_requested() or self._has_given_up
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord | None:
-        """Steps the site; None if its law failed, which ends the run."""
+        """Steps the site; returns None if its law or plant failed, which ends the run."""
         parts = self._parts
         measured = None if parts.arm is None else parts.arm.newest
         hand = () if parts.hand is None else parts.hand.track(parts.site, k)
         try:
             if parts.plant is not None:
                 measured = parts.plant.state
-            self._output = parts.step(
-                TickInput(
-                    k=k,
-                    arrivals=arrivals,
-                    commands=parts.take_changes(k),
-                    measured=measured,
-                    hand=hand,
-                )
+            inputs = TickInput(
+                k=k,
+                arrivals=arrivals,
+                commands=parts.pop_changes(k),
+                measured=measured,
+                hand=hand,
             )
+            self._output = parts.step(inputs)
             if parts.plant is not None:
                 parts.plant.move(k, self._output.tau)
         except CodeFailed as failed:
@@ -348,175 +405,198 @@ class RunningSite:
             return None
         return self._output
 
-    def attend(self, k: int, t_ns: int) -> None:
-        """Answers queries, follows the leader's grid, publishes news: ten times a second, after
-        statistics.
+    def run_housekeeping(self, k: int, t_ns: int) -> None:
+        """Replies to queries, follows the leader's grid, and publishes news.
 
-        These are of tick k, whose nominal time is given.
+        The loop calls it ten times a second, after the statistics of tick `k` at its nominal
+        time `t_ns`, ns since the epoch.
         """
-        grid_ns = self._timing.schedule.due_ns(k + 1) - tick_ns(k + 1, self._parts.site.rate_hz)
+        parts = self._parts
+        nominal_ns = tick_ns(k + 1, parts.site.rate_hz)
+        grid_ns = self._timing.schedule.due_ns(k + 1) - nominal_ns
         self._publisher.update(ticks=k + 1, grid_ns=grid_ns)
         self._publisher.answer_queries()
         self._publish_clocks(
-            self._timing.update_clocks(k + 1, self._parts.clock.monotonic_ns()), t_ns
+            self._timing.update_clocks(k + 1, parts.clock.monotonic_ns()), t_ns
         )
         self._watch_members(t_ns)
-        self._come_again(t_ns)
-        if (hand := self._parts.hand) is not None:
-            for _, text in hand.news:
-                self._parts.say(text.partition(": ")[2])
-            self._tell("hand", hand.news)
-        self._tell("mark", self._parts.changes.marks)
-        self._tell_skipped(k, t_ns)
-        self._tell_waiting(k, t_ns)
-        if self._output is not None and t_ns // NS_PER_S >= self._status_s + STATUS_TICKS_S:
-            self._status_s = t_ns // NS_PER_S
-            self._parts.say(self._describe_status(self._output))
+        self._rejoin(t_ns)
+        if parts.hand is not None:
+            for _, text in parts.hand.news:
+                parts.say(text.partition(": ")[2])
+            self._publish_news("hand", parts.hand.news)
+        self._publish_news("mark", parts.changes.marks)
+        self._publish_skipped(k, t_ns)
+        self._publish_waiting(k, t_ns)
+        second = t_ns // NS_PER_S
+        if self._output is not None and second >= self._status_s + STATUS_PERIOD_S:
+            self._status_s = second
+            parts.say(self._describe_status(self._output))
 
-    def _tell(self, kind: str, news: list[tuple[int, str]]) -> None:
+    def _publish_news(self, kind: str, news: list[tuple[int, str]]) -> None:
+        """Publishes and removes all news, which are pairs of a tick and a text."""
+        rate_hz = self._parts.site.rate_hz
         for tick, text in news:
-            self._publisher.publish(
-                kind, text, t_ns=tick_ns(tick, self._parts.site.rate_hz), ticks=tick
-            )
+            self._publisher.publish(kind, text, t_ns=tick_ns(tick, rate_hz), ticks=tick)
         news.clear()
 
-    def _tell_skipped(self, k: int, t_ns: int) -> None:
+    def _publish_skipped(self, k: int, t_ns: int) -> None:
         if self._skipped:
             ticks = " ".join(self._skipped)
             self._skipped = []
             text = f"{self._parts.name} did not make ticks {ticks}"
             self._publisher.publish("overrun", text, t_ns=t_ns, ticks=k + 1, command=ticks)
 
-    def _tell_waiting(self, k: int, t_ns: int) -> None:
-        """Publishes once a second that the site does not go to its peers because they are too
-        far away.
-        """
+    def _publish_waiting(self, k: int, t_ns: int) -> None:
+        """Publishes once a second that the site is too far from its peers to approach them."""
         output = self._output
-        holds = output is not None and output.mode in (Mode.WAITING, Mode.HOLD)
-        if (
-            output is None
-            or not holds
-            or self._parts.setup.on_stale.action is not StaleAction.GLIDE
-        ):
+        if output is None or output.mode not in (Mode.WAITING, Mode.HOLD):
             return
-        if (
-            find_life_reason(output) is LifeReason.ALIGN_LIMIT
-            and t_ns // NS_PER_S > self._told_s
-        ):
-            self._told_s = t_ns // NS_PER_S
+        if self._parts.setup.on_stale.action is not StaleAction.GLIDE:
+            return
+        second = t_ns // NS_PER_S
+        if find_life_reason(output) is LifeReason.ALIGN_LIMIT and second > self._waiting_s:
+            self._waiting_s = second
             text = describe_mode(self._parts.name, output, glides=True)
             self._publisher.publish("waiting", text, t_ns=t_ns, ticks=k)
             self._parts.say(text)
 
     def _watch_members(self, t_ns: int) -> None:
+        """Follows who leaves and who joins, and admits the peers that join."""
         parts = self._parts
-        monitor = self._parts.monitor
+        monitor = parts.monitor
         monitor.watch(self._publisher, t_ns)
-        if monitor.changed:  # 100 ms ago at most: no sample so far is due sooner than before
+        if monitor.changed:
+            # A change holds from 100 ms after its request, so no earlier sample was due sooner.
             parts.states.holds_samples = False
-        for meter in self._timing.monitors if monitor.away else ():
-            if meter.is_receiving(parts.clock.monotonic_ns()):
-                monitor.meet_again(meter.peer.name, t_ns)
+        if monitor.departed:
+            for meter in self._timing.monitors:
+                if meter.is_receiving(parts.clock.monotonic_ns()):
+                    monitor.mark_present(meter.peer.name, t_ns)
         for event in monitor.admitted:
-            index = parts.site.peers.index(event.member)
-            rate_hz = parts.scenario.sites[event.member].rate_hz
-            bound_ns = None if event.clock == parts.clock.identity() else event.bound_ns
-            joins = (tick_ns(event.ticks, rate_hz), event.epoch_mono_ns, bound_ns)
-            self._tell_last(index, event, t_ns)
-            self._publish_clocks(self._timing.admit(index, *joins), t_ns)
-            self._inbox.admit(index, event.boot, event.ticks)
-            parts.say(f"{event.member} joins at t = {joins[0] * 1e-9:.3f} s")
+            self._admit_peer(event, t_ns)
         monitor.admitted.clear()
         patience_s = parts.options.leave_timeout_s
-        since_ns = min((since_ns for since_ns, _ in monitor.away.values()), default=t_ns)
-        self._given_up = patience_s is not None and t_ns - since_ns > patience_s * NS_PER_S
+        if patience_s is None:
+            self._has_given_up = False
+        else:
+            since_ns = min((left_ns for left_ns, _ in monitor.departed.values()), default=t_ns)
+            self._has_given_up = t_ns - since_ns > patience_s * NS_PER_S
 
-    def _come_again(self, t_ns: int) -> None:
-        """Says once a second that this site has come, while a peer that was cut off then
-        ignores it.
+    def _admit_peer(self, event: Event, t_ns: int) -> None:
+        """Accepts samples of a peer's new boot from the tick on that its event names."""
+        parts = self._parts
+        index = parts.site.peers.index(event.member)
+        join_ns = tick_ns(event.ticks, parts.scenario.sites[event.member].rate_hz)
+        has_same_clock = event.clock == parts.clock.identity()
+        bound_ns = None if has_same_clock else event.bound_ns
+        self._publish_last_heard(index, event, t_ns)
+        notices = self._timing.admit(index, join_ns, event.epoch_mono_ns, bound_ns)
+        self._publish_clocks(notices, t_ns)
+        self._inbox.admit(index, event.boot, event.ticks)
+        parts.say(f"{event.member} joins at t = {join_ns * 1e-9:.3f} s")
+
+    def _rejoin(self, t_ns: int) -> None:
+        """Announces this site's join again, once a second, while a heard peer ignores the site.
+
+        A peer whose connection was broken at the time of the join has not received that event.
         """
         coming = self._epoch.coming
         now_ns = self._parts.clock.monotonic_ns()
-        if coming is None or t_ns < self._came_ns + NS_PER_S:
+        if coming is None or t_ns < self._rejoined_ns + NS_PER_S:
             return
+        meters = self._timing.monitors
         if any(
             meter.is_receiving(now_ns) and meter.is_acknowledged(now_ns) is None
-            for meter in self._timing.monitors
+            for meter in meters
         ):
-            self._came_ns = t_ns
-            self._publisher.publish(
-                **{**asdict(coming), "t_ns": t_ns, "n": self._publisher.published}
-            )
+            self._rejoined_ns = t_ns
+            fields = {**asdict(coming), "t_ns": t_ns, "n": self._publisher.published}
+            self._publisher.publish(**fields)
 
-    def _tell_last(self, index: int, coming: Event, t_ns: int) -> None:
-        """Publishes how far the start of a peer was heard that ends now: it may not have been
-        able to.
+    def _publish_last_heard(self, index: int, coming: Event, t_ns: int) -> None:
+        """Publishes the last tick that was received of a peer's previous boot.
+
+        That boot may have ended without an event of its own.
         """
-        newest = self._inbox.newest_before(index, coming.boot)
-        if newest is not None:
-            text = f"of the start of {coming.member} before came samples up to tick {newest}"
-            about = {
-                "about": coming.member,
-                "boots": {coming.member: coming.boot},
-                "ticks": newest + 1,
-            }
-            self._publisher.publish("last", text, t_ns=t_ns, **about)
+        tick = self._inbox.find_last_tick_of(index, coming.boot)
+        if tick is None:
+            return
+        self._publisher.publish(
+            "last",
+            f"the previous start of {coming.member} was heard up to tick {tick}",
+            t_ns=t_ns,
+            about=coming.member,
+            boots={coming.member: coming.boot},
+            ticks=tick + 1,
+        )
 
     def _describe_status(self, output: TickRecord) -> str:
-        shared = output.shared()[0]
-        own, desired = (np.array([vector]) for vector in (shared, output.q_des))
-        axes = self._parts.scenario.arms[self._parts.name].axes
-        apart = np.abs(
-            compute_task_errors(own, desired, axes) if output.x else own - desired
-        ).max()
-        unit = "m or rad" if output.x else "rad"
+        """Returns a line with the time, the mode, the error, the torque and the problems."""
+        parts = self._parts
+        position = np.array([output.shared()[0]])
+        desired = np.array([output.q_des])
+        if output.x:
+            unit = "m or rad"
+            error = compute_task_errors(position, desired, parts.scenario.arms[parts.name].axes)
+        else:
+            unit = "rad"
+            error = position - desired
+        largest_error = np.abs(error).max()
         torque_nm = max(map(abs, output.tau))
-        stats = self._parts.stats
-        dropped = sum(stats.dropped.values())
+        dropped = sum(parts.stats.dropped.values())
         return (
-            f"t = {output.t_ns / NS_PER_S:.0f} s, {MODE_WORDS[output.mode]}, |e| {apart:.3g} {unit}, torque "
-            f"{torque_nm:.3g} N m, {count_nouns(stats.overruns, 'tick')} late, "
+            f"t = {output.t_ns / NS_PER_S:.0f} s, {MODE_WORDS[output.mode]}, "
+            f"|e| {largest_error:.3g} {unit}, torque {torque_nm:.3g} N m, "
+            f"{count_nouns(parts.stats.overruns, 'tick')} late, "
             f"{count_nouns(dropped, 'message')} dropped"
         )
 
-    def report(self, output: TickRecord) -> None:
-        """Tells of a tick that took a command in, or at which the mode changed."""
-        name = self._parts.name
-        at = {"t_ns": output.t_ns, "ticks": output.tick}
-        if skipped := count_skipped_ticks(output.cmd):  # told together, in `attend`
+    def report_tick(self, output: TickRecord) -> None:
+        """Publishes the changes that a tick has applied, and a change of the mode."""
+        parts = self._parts
+        # Skipped ticks are collected here, and published together by `run_housekeeping`.
+        if skipped := count_skipped_ticks(output.cmd):
             self._skipped.append(f"{output.tick - skipped}-{output.tick - 1}")
         for change in output.cmd:
-            if not count_skipped_ticks([change]):
-                source = self._parts.changes.sources.pop(change, "")
-                sentence = describe_change(msgspec.json.decode(change, type=Change), source)
-                self._publisher.publish("change", sentence, command=change, **at)
-                self._parts.say(sentence)
+            if count_skipped_ticks([change]):
+                continue
+            source = parts.changes.sources.pop(change, "")
+            sentence = describe_change(msgspec.json.decode(change, type=Change), source)
+            self._publisher.publish(
+                "change", sentence, command=change, t_ns=output.t_ns, ticks=output.tick
+            )
+            parts.say(sentence)
         if output.mode is not self._mode:
             self._mode = output.mode
-            glides = self._parts.setup.on_stale.action is StaleAction.GLIDE
-            failure = self._parts.site.law_failure
-            text = describe_mode(name, output, glides=glides, law_failure=failure)
-            self._publisher.publish("mode", text, **at)
+            text = describe_mode(
+                parts.name,
+                output,
+                glides=parts.setup.on_stale.action is StaleAction.GLIDE,
+                law_failure=parts.site.law_failure,
+            )
+            self._publisher.publish("mode", text, t_ns=output.t_ns, ticks=output.tick)
             self._raise_alarm(output)
 
     def _raise_alarm(self, output: TickRecord) -> None:
-        """Says that the arm is stopped, or at most once a second that it holds; why, and what
-        to do.
+        """Prints an alarm with its reason and a remedy.
+
+        An arm that is stopped always raises one; an arm that holds at most one a second.
         """
         parts = self._parts
         mode = output.mode
-        rule = self._parts.setup.on_stale
-        second = output.t_ns // NS_PER_S
-        if mode is Mode.HOLD and second <= self._held_s:
-            return
-        self._held_s = second if mode is Mode.HOLD else self._held_s
+        rule = parts.setup.on_stale
+        if mode is Mode.HOLD:
+            second = output.t_ns // NS_PER_S
+            if second <= self._alarm_s:
+                return
+            self._alarm_s = second
         if rule.action is not StaleAction.GLIDE:
             return
-        says_lost = rule.degrades and mode is Mode.RETURN
-        lost = (
-            parts.site.layout.list_lost_peers(output.mem, parts.site.peers) if says_lost else ()
-        )
-        shown = (
+        lost: Sequence[str] = ()
+        if rule.degrades and mode is Mode.RETURN:
+            lost = parts.site.layout.find_lost(output.mem, parts.site.peers)
+        alarm = find_alarm(
             parts.options.session,
             parts.name,
             MODE_WORDS[mode],
@@ -524,69 +604,73 @@ class RunningSite:
             len(output.q_des),
             lost,
         )
-        if (alarm := find_alarm(*shown)) is not None:
+        if alarm is not None:
             parts.say(f"*** {alarm}")
 
-    def leave(self) -> int:
+    def leave_session(self) -> int:
         """Publishes the end, waits for the recorders, and returns the exit code.
 
         Raises:
-            RunFailed: the run ended badly, here or at a peer; as `PeerLeft`, without a peer.
+            PeerLeft: a peer left before the end and did not return.
+            RunFailed: the run failed, at this site or at a peer.
         """
         parts = self._parts
-        interrupt = self._parts.interrupt
+        interrupt = parts.interrupt
+        monitor = parts.monitor
+        self._publish_end()
+        # Signals that arrive later end the wait for the recorders, and do not change the code.
+        code = interrupt.exit_code if interrupt.is_requested() else 0
+        monitor.watch(self._publisher, self._t_ns)
+        if topics.RECORDER in monitor.boots or monitor.recorders:
+            self._await_recorders()
+        count_executed_ticks = count_nouns(self._ticks, "tick")
+        counts = parts.stats.dropped.items()
+        dropped = ", ".join(f"{count} {reason}" for reason, count in counts)
+        parts.say(
+            f"{count_executed_ticks}, {parts.stats.overruns} of them late by a period or more"
+            + (f"; dropped: {dropped}" if dropped else "")
+        )
+        if self._failure is not None:
+            raise self._failure
+        if monitor.ended_by:
+            raise RunFailed(f"{parts.name} ended because {monitor.ended_by}")
+        if not code and self._departures:
+            raise PeerLeft(
+                f"{parts.name} made {count_executed_ticks}; {self._departures}, and did not come back"
+            )
+        return code
+
+    def _publish_end(self) -> None:
+        """Publishes the failure, the law's hiccups and the end, with their causes."""
+        parts = self._parts
         output = self._output
         kind = "failed"
         if output is not None and output.mode is Mode.DIVERGED:
             kind = "diverged"
             self._failure = RunFailed(describe_divergence(parts.name, output))
         if self._failure is not None:
-            self._publish(kind, str(self._failure))
-        for hiccups in filter(None, (code.describe_hiccups() for code in parts.watchdog.codes)):
-            self._publish("law", hiccups)
-            parts.say(hiccups)
-        about, why = self._find_cause()
+            self._publish_end_event(kind, str(self._failure))
+        for code in parts.watchdog.codes:
+            if hiccups := code.describe_hiccups():
+                self._publish_end_event("law", hiccups)
+                parts.say(hiccups)
+        about, cause = self._find_cause()
         if unheard := [
             meter.peer.name for meter in self._timing.monitors if meter.is_unacknowledged
         ]:
-            why += f"; {', '.join(unheard)} did not hear it at the end"
-        self._publish(
-            "end", f"{parts.name} made {count_nouns(self._ticks, 'tick')}{why}", about=about
-        )
-        code = (
-            interrupt.exit_code if interrupt.is_requested() else 0
-        )  # later signals end the wait
-        parts.monitor.watch(self._publisher, self._t_ns)
-        if topics.RECORDER in parts.monitor.boots or parts.monitor.recorders:
-            self._await_recorders()
-        dropped = ", ".join(
-            f"{count} {reason}" for reason, count in parts.stats.dropped.items()
-        )
-        parts.say(
-            f"{count_nouns(self._ticks, 'tick')}, {parts.stats.overruns} of them late by a period or more"
-            + (f"; dropped: {dropped}" if dropped else "")
-        )
-        if self._failure is not None:
-            raise self._failure
-        if parts.monitor.ended_by:
-            raise RunFailed(f"{parts.name} ended because {parts.monitor.ended_by}")
-        if not code and self._away:
-            raise PeerLeft(
-                f"{parts.name} made {count_nouns(self._ticks, 'tick')}; {self._away}, and did not come back"
-            )
-        return code
+            cause += f"; {', '.join(unheard)} did not hear it at the end"
+        text = f"{parts.name} made {count_nouns(self._ticks, 'tick')}{cause}"
+        self._publish_end_event("end", text, about=about)
 
     @property
-    def _away(self) -> str:
-        """What sites that have left said of it, "" if all are there."""
-        return "; ".join(text for _, text in self._parts.monitor.away.values())
+    def _departures(self) -> str:
+        """The sentences about the sites that have left, "" if all are present."""
+        return "; ".join(text for _, text in self._parts.monitor.departed.values())
 
     def _find_cause(self) -> tuple[str, str]:
-        """Returns whose end it was if the run ends before its time, and why, to be put behind a
-        sentence.
-        """
+        """Returns which member ended the run early, and the end of a sentence that says why."""
         parts = self._parts
-        monitor = self._parts.monitor
+        monitor = parts.monitor
         if self._failure is not None:
             return parts.name, f": {self._failure}"
         if monitor.ended_by:
@@ -597,21 +681,20 @@ class RunningSite:
             return "", ""
         if parts.interrupt.is_requested():
             return parts.name, f", ended by {signal.Signals(parts.interrupt.number).name}"
-        return next(iter(monitor.away), ""), f": {self._away}"
+        return next(iter(monitor.departed), ""), f": {self._departures}"
 
-    def _publish(self, kind: str, text: str, about: str = "") -> None:
+    def _publish_end_event(self, kind: str, text: str, about: str = "") -> None:
         self._publisher.publish(kind, text, t_ns=self._t_ns, ticks=self._ticks, about=about)
 
     def _await_recorders(self) -> None:
-        """Waits until every recorder present has stored all, then for `stay_s` until they are
-        gone.
+        """Waits until every recorder has stored everything, then `stay_s` for them to leave.
 
         A signal does not shorten the first wait, since records that are not stored are lost
         with this process; a second signal ends it.
         """
         parts = self._parts
-        clock = self._parts.clock
-        monitor = self._parts.monitor
+        clock = parts.clock
+        monitor = parts.monitor
         begun_ns = clock.monotonic_ns()
         give_up_ns = begun_ns + LINGER_NS
         queried_ns = 0
@@ -623,23 +706,21 @@ class RunningSite:
             self._publisher.answer_queries()
             monitor.watch(self._publisher, self._t_ns)
             is_gone = not monitor.recorders and clock.monotonic_ns() - queried_ns > QUERIED_NS
-            if is_gone and monitor.stored:  # one that has not stored all may come back
+            if is_gone and monitor.stored:  # a recorder that lacks messages may come back
                 give_up_ns = min(give_up_ns, clock.monotonic_ns() + LEAVE_TIMEOUT_NS)
             if monitor.read_stored(self._ticks) and monitor.all_stored:
                 give_up_ns = clock.monotonic_ns() + int(parts.options.stay_s * 1e9)
-            if (
-                not (is_announced or monitor.all_stored)
-                and clock.monotonic_ns() - begun_ns > TELL_NS
-            ):
+            waited_ns = clock.monotonic_ns() - begun_ns
+            if not is_announced and not monitor.all_stored and waited_ns > ANNOUNCE_AFTER_NS:
                 is_announced = True
                 parts.say(
-                    f"keeps its last records until the recorder has them, {LINGER_NS // NS_PER_S} s at most; "
-                    "Ctrl-C a second time ends it at once"
+                    "keeps its last records until the recorder has them, "
+                    f"{LINGER_NS // NS_PER_S} s at most; Ctrl-C a second time ends it at once"
                 )
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
 
     def _may_leave(self) -> bool:
-        """True if the user insists, or wants the end and every recorder present has stored all."""
+        """Returns True if the user insists, or ended the run and the recorders have it all."""
         interrupt = self._parts.interrupt
         return interrupt.is_repeated() or (
             self._parts.monitor.all_stored and interrupt.is_requested()

@@ -50,7 +50,7 @@ class Answering:
     def _answer(self) -> None:
         while not self._done.wait(0.002):
             self._publisher.answer_queries()
-            self._changes.take(100)
+            self._changes.pop_changes(100)
 
     def close(self) -> None:
         self._done.set()

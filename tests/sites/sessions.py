@@ -12,7 +12,7 @@ from recorder.record_process import Recorder
 from sites import realtime
 from sites.running_session import RunningSession
 from sites.site_parts import SiteOptions, SiteParts
-from sites.site_process import take_part
+from sites.site_process import join_and_run
 from tests.net.local_bus import LocalNetwork
 from trilat_net.errors import LogRefused, RunFailed, SessionError
 from trilat_net.execution import virtual
@@ -113,7 +113,7 @@ class Session:
         own = self._own(name, clock)
         bus = self.join(name)
         try:
-            return take_part(
+            return join_and_run(
                 SiteParts(self.scenario, name, options, bus, own, interrupt, self.said.append)
             )
         finally:

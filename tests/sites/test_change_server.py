@@ -41,7 +41,7 @@ class Asked:
 
     def ask(self, k: int, key: str = KEY, **order: Any) -> tuple[list[CoreChange], ChangeReply]:
         replies = self.send(encode(ChangeRequest(**order)), key)
-        taken = list(self.changes.take(k))
+        taken = list(self.changes.pop_changes(k))
         answer = replies.poll()
         assert answer is not None
         return taken, decode(answer[1], ChangeReply)
@@ -134,7 +134,7 @@ def obey(batches: list[list[str]]) -> tuple[list[bool], Mode]:
     for k in range(20):
         batch = batches[k] if k < len(batches) else ()
         replies += [asked.send(encode(ChangeRequest(order=order))) for order in batch]
-        mode = site.step(TickInput(k, commands=list(asked.changes.take(k)))).mode
+        mode = site.step(TickInput(k, commands=list(asked.changes.pop_changes(k)))).mode
     answers = [answer for reply in replies if (answer := reply.poll())]
     assert len(answers) == len(replies)
     return [decode(answer[1], ChangeReply).accepted for answer in answers], mode
@@ -155,7 +155,7 @@ def test_a_client_of_another_version_is_refused_with_both_versions() -> None:
 def test_what_is_no_order_is_answered_and_harmless() -> None:
     asked = Asked()
     replies = [asked.send(payload) for payload in (b"", b"\xc1", b"x" * 70_000)]
-    assert asked.changes.take(0) == []
+    assert asked.changes.pop_changes(0) == []
     assert all(
         (answer := r.poll()) and not decode(answer[1], ChangeReply).accepted for r in replies
     )

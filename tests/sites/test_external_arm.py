@@ -305,17 +305,17 @@ class Switch:
 def test_a_switch_is_held_until_let_go_or_silent() -> None:
     one = Switch()
     switch, clock, ring, hear = one.switch, one.clock, one.ring, one.hear
-    assert switch.take_order(Mode.RUN, LifeReason.START) == "released"
-    assert switch.take_order(Mode.FAULT, LifeReason.START) == ""
+    assert switch.pop_order(Mode.RUN, LifeReason.START) == "released"
+    assert switch.pop_order(Mode.FAULT, LifeReason.START) == ""
     assert not hear(1, 0, site="m")
     assert hear(1, 5)
-    assert switch.take_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
-    assert switch.take_order(Mode.STOPPED, LifeReason.STOP) == ""  # that ends by an order alone
+    assert switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+    assert switch.pop_order(Mode.STOPPED, LifeReason.STOP) == ""  # that ends by an order alone
     assert hear(2, 0, held=False)  # of one that does not hold it
     clock.sleep_until(clock.monotonic_ns() + SWITCH_SILENCE_NS)
     assert switch.held
     assert not hear(1, 5, after_ns=1)  # said before
-    assert switch.take_order(Mode.STOPPED, LifeReason.RELEASED) == ""
+    assert switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == ""
     assert hear(1, 6)
     assert not hear(1, 7, held=False)
     assert hear(2, 1)
@@ -330,14 +330,14 @@ def test_of_two_that_hold_switch_whoever_lets_go_stops_arm(first: int) -> None:
     one, other = Switch(), 3 - first
     assert one.hear(1, 0)
     assert one.hear(2, 0)
-    assert one.switch.take_order(Mode.RUN, LifeReason.ALIGNED) == ""
+    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == ""
     assert not one.hear(first, 1, held=False)
     assert not one.hear(other, 1)  # it still holds
-    assert one.switch.take_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
     assert not one.hear(other, 2)
     assert not one.hear(other, 3, held=False)
     assert one.hear(other, 4)
-    assert one.switch.take_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+    assert one.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
 
 
 def test_of_two_that_hold_switch_silence_of_one_stops_arm() -> None:
@@ -347,14 +347,14 @@ def test_of_two_that_hold_switch_silence_of_one_stops_arm() -> None:
     for n in range(4):
         assert one.hear(2, n, after_ns=SWITCH_SILENCE_NS // 4)
     assert not one.hear(2, 4, after_ns=1)
-    assert one.switch.take_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
     assert not one.hear(2, 5)
     assert not one.hear(2, 6, held=False)
     assert one.hear(2, 7)
     assert not one.hear(2, 8, held=False)
     assert one.hear(2, 9)
-    assert one.switch.take_order(Mode.RUN, LifeReason.ALIGNED) == "released"
-    assert one.switch.take_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
+    assert one.switch.pop_order(Mode.RUN, LifeReason.ALIGNED) == "released"
+    assert one.switch.pop_order(Mode.STOPPED, LifeReason.RELEASED) == "held"
 
 
 def test_many_idle_switch_programs_forget_nobody_who_holds() -> None:
@@ -494,7 +494,7 @@ def test_the_newest_counts_in_whatever_order_they_come(order: list[int], bound: 
         heard.hear(measurement(n=n + 1, q=[n / 1000, 0.0]))
         assert heard.arm.newest.q[0] == max(order[: order.index(n) + 1]) / 1000
     records = sum(n > max(order[:i], default=-1) for i, n in enumerate(order))
-    assert heard.arm.taken == 1 + records
+    assert heard.arm.accepted == 1 + records
     assert heard.dropped["old measurement"] == 8 - records
 
 
@@ -503,7 +503,7 @@ def test_a_flood_of_measurements_is_bounded_and_counted() -> None:
     heard.hear(measurement(n=0))
     heard.arm.bind((0.5, 0.25))
     heard.hear(measurement(n=1), *(measurement(n=n) for n in range(2, 502)))
-    assert heard.arm.taken == 1 + MEASUREMENTS_KEPT
+    assert heard.arm.accepted == 1 + MEASUREMENTS_KEPT
     heard.hear(measurement(n=510))
     assert heard.dropped["missing measurement"] == 8
 
@@ -525,18 +525,18 @@ def test_silence_is_what_the_site_itself_could_have_heard() -> None:
     heard.arm.bind((0.5, 0.25))
     heard.clock.sleep_until(60 * A_SECOND)
     heard.hear()
-    orders = [heard.arm.take_order(Mode.RUN)]
+    orders = [heard.arm.pop_order(Mode.RUN)]
     for _ in range(SILENCE_LIMIT_NS // PERIOD_NS + 1):
         heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
         heard.hear()
-        orders.append(heard.arm.take_order(Mode.HOLD if "arm_silent" in orders else Mode.RUN))
+        orders.append(heard.arm.pop_order(Mode.HOLD if "arm_silent" in orders else Mode.RUN))
     # the sleep counts as 20 ms: no longer is it known that nothing came
     assert orders.index("arm_silent") == (HELD_SILENCE_NS - 20_000_000) // PERIOD_NS + 1
     assert orders.index("arm_lost") == (SILENCE_LIMIT_NS - 20_000_000) // PERIOD_NS + 1
-    assert heard.arm.take_order(Mode.FAULT) == ""
-    assert heard.arm.take_order(Mode.WAITING) == "arm_lost"  # reset too early
+    assert heard.arm.pop_order(Mode.FAULT) == ""
+    assert heard.arm.pop_order(Mode.WAITING) == "arm_lost"  # reset too early
     heard.hear(measurement(boot=9, n=0))  # its program was started anew
-    assert heard.arm.take_order(Mode.FAULT) == ""
+    assert heard.arm.pop_order(Mode.FAULT) == ""
     assert heard.arm.newest.q == [0.5, 0.25]
 
 
@@ -547,12 +547,12 @@ def test_a_short_silence_is_over_with_the_next_measurement() -> None:
     for _ in range(40):
         heard.clock.sleep_until(heard.clock.monotonic_ns() + PERIOD_NS)
         heard.hear()
-    assert heard.arm.take_order(Mode.RUN) == "arm_silent"
+    assert heard.arm.pop_order(Mode.RUN) == "arm_silent"
     heard.hear(measurement(boot=9, n=1))
-    assert heard.arm.take_order(Mode.HOLD) == ""
+    assert heard.arm.pop_order(Mode.HOLD) == ""
     heard.hear(measurement(n=1))
-    assert heard.arm.take_order(Mode.HOLD) == "arm_back"
-    assert heard.arm.take_order(Mode.RETURN) == ""
+    assert heard.arm.pop_order(Mode.HOLD) == "arm_back"
+    assert heard.arm.pop_order(Mode.RETURN) == ""
 
 
 def test_an_encoder_glitch_is_no_measurement_repeated_it_is_silence() -> None:

@@ -77,10 +77,10 @@ class Alone:
     def publish_link(self, payload: bytes) -> None:
         self.links.append(decode(payload, LinkStats))
 
-    def attend(self, k: int, t_ns: int) -> None:
+    def run_housekeeping(self, k: int, t_ns: int) -> None:
         self.slack.append((k, t_ns))
 
-    def report(self, output: TickRecord) -> None: ...
+    def report_tick(self, output: TickRecord) -> None: ...
 
     def use_slack(self) -> None: ...
 

@@ -61,10 +61,10 @@ def test_a_ring_tells_what_it_still_has_in_chunks(
     ring = ChannelBuffer(capacity, size_bytes)
     payloads = [str(n).encode()[-size:].zfill(size) for n, size in enumerate(sizes)]
     for payload in payloads:
-        ring.keep(payload)
+        ring.store(payload)
     last, told, at = first + length - 1, [], first
     while True:
-        begun, chunk = ring.chunk(at, last)
+        begun, chunk = ring.read_chunk(at, last)
         assert begun == max(at, ring.oldest)
         assert len(chunk) <= BACKFILL_MESSAGES
         assert sum(map(len, chunk)) <= BACKFILL_BYTES
@@ -72,7 +72,7 @@ def test_a_ring_tells_what_it_still_has_in_chunks(
             break
         told += [(begun + n, payload) for n, payload in enumerate(chunk)]
         at = begun + len(chunk)
-    left = range(max(first, ring.oldest), min(last + 1, ring.made))
+    left = range(max(first, ring.oldest), min(last + 1, ring.next_number))
     assert told == [(n, payloads[n]) for n in left]
 
 
@@ -83,8 +83,8 @@ def test_a_ring_forgets_no_more_than_it_must(
     """What is left fills the memory, but for the piece of a message at its end, or the places."""
     ring = ChannelBuffer(capacity, size_bytes)
     for size in sizes:
-        ring.keep(b"x" * size)
-    left = ring.made - ring.oldest
+        ring.store(b"x" * size)
+    left = ring.next_number - ring.oldest
     assert left <= capacity
     assert sum(sizes[ring.oldest :]) <= size_bytes
     if ring.oldest and left < capacity:
@@ -95,7 +95,7 @@ def test_every_channel_is_told_apart() -> None:
     desk = Desk()
     for n, ring in enumerate(desk.history.channels.values()):
         for m in range(n + 2):
-            ring.keep(b"%d %d" % (n, m))
+            ring.store(b"%d %d" % (n, m))
     for n, channel in enumerate(desk.history.channels):
         past = desk.told(channel, 1, 9)
         assert (past.member, past.boot, past.channel) == ("m1", BOOT, channel)
@@ -107,11 +107,11 @@ def test_memory_holds_a_minute_and_no_more() -> None:
     rings = Desk(1000).history.channels
     for ring, capacity in zip(rings.values(), (60_000, 10 * KEPT_S, EVENTS_KEPT), strict=True):
         for _ in range(capacity + 5):
-            ring.keep(b"x" * 600)
+            ring.store(b"x" * 600)
         assert ring.oldest == 5
     fast = Desk(20_000).history.channels[topics.STATE]
     for _ in range(RECORDS_KEPT + 1):
-        fast.keep(b"x" * 600)
+        fast.store(b"x" * 600)
     assert fast.oldest == 1
 
 
@@ -119,7 +119,7 @@ def test_the_largest_messages_fit_an_answer() -> None:
     """One message is always told, however large it is."""
     desk = Desk()
     for _ in range(3):
-        desk.history.channels[topics.EVENT].keep(b"x" * MAX_BYTES)
+        desk.history.channels[topics.EVENT].store(b"x" * MAX_BYTES)
     assert [len(payload) for payload in desk.told(topics.EVENT, 0, 9).payloads] == [MAX_BYTES]
 
 

@@ -1,8 +1,9 @@
-"""Clients of a site: for programs of an external arm, of its dead-man switch, and of a hand.
+"""Clients of a site: the programs of an external arm, of its dead-man switch, and of a hand.
 
-An external arm (`plant = "external"` in the scenario) sends its position as often as it likes.
-The torque to apply is in the record that the site publishes at every tick, so the arm receives
-exactly what the log holds.
+An external arm (`plant = "external"`) measures its joints and applies the torque that its site
+computes. `ArmClient` connects the arm's program to that site, `SwitchClient` connects its
+dead-man switch, and `Hand` connects a person or a program that holds an arm. The program of an
+arm looks like this:
 
     with ArmClient.connected("two_sites", "s", ["tcp/127.0.0.1:10241"]) as client:
         while not client.over:
@@ -12,13 +13,16 @@ exactly what the log holds.
             robot.wait()
 
 Invariant:
-    - Without a valid torque, `torque` returns None and the arm must brake.
-    - Records of another boot of the site are ignored: a client follows the boot that it saw
-      first. Records older than the newest one, or too far ahead of it, are ignored, too.
-    - Payloads that cannot be decoded come from strangers, and change nothing.
-    - A live hand sends messages also at rest: a thread repeats its last message. If the hand's
-      process hangs or ends, the messages stop, and the site releases the arm.
-    - The state of the arm and the force that a hand feels are those of the site's records.
+    - The arm may send measurements at any rate. The torque that it applies is read from the
+      record which the site publishes at every tick, so it equals the torque in the log.
+    - `ArmClient.torque` returns None if there is no valid torque; the arm must then brake.
+    - The client follows the boot of the site that it saw first: records of other boots are
+      ignored, and so are records that are older than the newest one or more than `AHEAD_NS`
+      too far ahead.
+    - Messages that cannot be decoded come from a stranger and are ignored.
+    - A thread repeats a resting hand's last message, so the site keeps receiving messages while
+      the program lives. If the program dies or hangs, the site releases the arm.
+    - The force on the arm, and the force that a hand feels, follow from the site's records.
 """
 
 import math
@@ -43,43 +47,31 @@ from .wire import decode, encode, split_states
 from .zenoh_config import OPERATOR
 
 FRESH_NS = 100_000_000
-"""Age, in ns, from which on a record is out of date: the site is late, or gone."""
+"""Largest age of a usable record; the site of an older record is late or gone."""
 AHEAD_NS = 1_000_000_000
-"""Largest time, in ns, by which nominal time may run ahead of the clock between two records."""
+"""Largest excess of the time between two records over the time between their arrivals."""
 BRAKE_NS = 100_000_000
-"""Time after a fault, or after the release of the dead-man switch, until the brakes must hold.
-
-The unit is ns.
-"""
+"""Time after a fault, or after the release of a dead-man switch, until the brakes must hold."""
 HEARTBEAT_S = SILENCE_NS / 4e9
-"""Time between two messages of a hand at rest, in s."""
-_MOTIONS = {
+"""Period at which the last message of a resting hand is repeated."""
+_ACTIONS = {
     TorqueKind.LIVE_TIP: "move",
     TorqueKind.LIVE_JOINT: "turn",
     TorqueKind.LIVE_FORCE: "push",
 }
-"""The method of `Hand` that serves each kind of live hand."""
-_STEP_S = 1e-6
-"""Step of the numerical derivative of the arm's position, in s."""
+_DERIVATIVE_STEP_S = 1e-6
+"""Step of the numerical derivative of the arm's pose, in s."""
 
 
 R = TypeVar("R", bound=Request)
 
 
 class SiteSender:
-    """Sender of numbered messages to a site, under one of the site's keys.
-
-    Args:
-        bus: connection of the sending program.
-        clock: clock of the sending program.
-        session: name of the session.
-        site: name of the site.
-        channel: last part of the key.
-        boot: random number of the sending program's start.
+    """Sends numbered messages to one channel of a site.
 
     Attributes:
-        boot: random number of the sending program's start.
-        number: number of the newest message; -1 before the first.
+        boot: the number that identifies this start of the sending program.
+        number: the number of the newest message; -1 before the first.
     """
 
     def __init__(
@@ -92,34 +84,36 @@ class SiteSender:
         self._publish = bus.publisher(topics.key(session, site, channel))
 
     def send(self, kind: type[R], **fields: object) -> R:
-        """Sends a message with the next number, and returns the message."""
-        common_fields = {
-            "site": self._site,
-            "boot": self.boot,
-            "n": self.number + 1,
-            "sent_ns": self._clock.monotonic_ns(),
-        }
-        message = kind(**(common_fields | fields))  # type: ignore[arg-type]
+        """Sends the next message and returns it.
+
+        Args:
+            kind: the class of the message.
+            fields: its fields other than the site, the boot and the number; they may replace
+                the time stamp `sent_ns`.
+        """
+        header = {"site": self._site, "boot": self.boot, "n": self.number + 1}
+        stamp = {"sent_ns": self._clock.monotonic_ns()}
+        message = kind(**(header | stamp | fields))  # type: ignore[arg-type]
         self.number += 1
         self.repeat(message)
         return message
 
     def repeat(self, message: R) -> None:
-        """Sends a message again."""
+        """Sends a message again, with its number unchanged."""
         self._publish(encode(message))
 
 
 class SiteClient:
-    """Connection of a program to one site; a context manager, which closes the connection."""
+    """The connection of a program to one site; a context manager that closes the connection."""
 
     def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
         self._bus = bus
         self._clock = clock
         self._site = site
         self._record: State | None = None
-        self._record_arrival_ns = 0
+        self._received_ns = 0
         self._was_present = False
-        self._is_gone = False
+        self._is_over = False
         self._records = bus.stamped_inbox(
             topics.key(session, site, topics.STATE), clock.monotonic_ns, bytes, 64
         )
@@ -140,59 +134,65 @@ class SiteClient:
 
     @property
     def fresh(self) -> bool:
-        """True if the newest record is up to date.
+        """True if the newest record is at most `FRESH_NS` old and the run goes on.
 
-        False before the first tick, after the run, and if the record is older than FRESH_NS.
+        It is False before the first tick, after the run, and once the run has diverged.
         """
         record = self.record
-        if record is None or self._is_gone or record.mode == "diverged":
+        if record is None or self._is_over or record.mode == "diverged":
             return False
-        return self._clock.monotonic_ns() - self._record_arrival_ns <= FRESH_NS
+        return self._clock.monotonic_ns() - self._received_ns <= FRESH_NS
 
     @property
     def over(self) -> bool:
         """True once the site's run has ended, or the site is gone."""
         self._read_messages()
-        return self._is_gone
+        return self._is_over
 
-    def _follows_last(self, record: State, arrived_ns: int) -> bool:
-        """True if a record is a plausible successor of the newest record."""
+    def _is_next_record(self, record: State, received_ns: int) -> bool:
         last = self._record
         if last is None:
             return True
-        if record.boot != last.boot or record.tick <= last.tick or record.t_ns <= last.t_ns:
-            return False
-        passed_ns = arrived_ns - self._record_arrival_ns
-        return record.t_ns - last.t_ns <= passed_ns + AHEAD_NS
+        is_newer = (
+            record.boot == last.boot and record.tick > last.tick and record.t_ns > last.t_ns
+        )
+        elapsed_ns = received_ns - self._received_ns
+        return is_newer and record.t_ns - last.t_ns <= elapsed_ns + AHEAD_NS
 
     def _read_messages(self) -> None:
         while (message := self._records.poll()) is not None:
-            block, arrived_ns = message
+            block, received_ns = message
             try:
-                # Of a block of records only the last one is of interest.
+                # A block holds the records of several ticks; only the last one matters here.
                 (payload,) = deque(split_states(block), maxlen=1)
                 record = decode(payload, State)
             except WireError:
-                continue  # a payload of a stranger
-            if self._follows_last(record, arrived_ns):
+                continue  # sent by a stranger
+            if self._is_next_record(record, received_ns):
                 self._record = record
-                self._record_arrival_ns = arrived_ns
+                self._received_ns = received_ns
         for event in read_messages(self._events, Event):
-            is_followed = self._record is not None and event.boot == self._record.boot
-            if event.kind == "end" and is_followed:
-                self._is_gone = True
-        for _, is_alive in topics.read_presence(self._presence):
-            self._was_present = self._was_present or is_alive
-            self._is_gone = self._is_gone or (self._was_present and not is_alive)
+            if (
+                event.kind == "end"
+                and self._record is not None
+                and event.boot == self._record.boot
+            ):
+                self._is_over = True
+        for _, alive in topics.read_presence(self._presence):
+            self._was_present = self._was_present or alive
+            self._is_over = self._is_over or (self._was_present and not alive)
 
 
 class OutsideClient(SiteClient):
-    """Connection of a program that sends messages to a site; a context manager."""
+    """The connection of a program that sends messages to one channel of a site.
+
+    It is a context manager that closes the connection.
+    """
 
     channel = ""
-    """Last part of the key under which the program sends."""
+    """The last part of the key under which the program publishes."""
     member = ""
-    """Member whose certificate keys the program uses; "" for those of its site."""
+    """The member whose keys the program uses; "" stands for the site."""
 
     def __init__(self, bus: Bus, clock: Clock, session: str, site: str) -> None:
         super().__init__(bus, clock, session, site)
@@ -209,14 +209,14 @@ class OutsideClient(SiteClient):
     def connected(
         cls, session: str, site: str, connect: Sequence[str], keys: str | Path | None = None
     ) -> Self:
-        """Returns a client that reaches a site over Zenoh.
+        """Returns a client that is connected to a site over Zenoh.
 
         Args:
-            session: name of the session, by default the scenario's name.
-            site: name of the arm's site.
-            connect: endpoints of the site, as the site prints them while it waits for its arm.
-            keys: folder of certificate keys, as in --keys: an arm uses the keys of its site, a
-                switch those of the operator.
+            session: the session's name, by default the scenario's.
+            site: the site of the arm.
+            connect: the site's endpoints, as the site prints them when it waits for its arm.
+            keys: the folder of keys, as for --keys. An arm uses the keys of its site, a switch
+                uses those of the operator.
 
         Raises:
             UsageError: an endpoint cannot be used.
@@ -227,10 +227,10 @@ class OutsideClient(SiteClient):
 
 
 class SwitchClient(OutsideClient):
-    """Dead-man switch of an arm: its program reports whether somebody holds the switch.
+    """The dead-man switch of an arm; its program reports whether somebody holds the switch.
 
-    >>> endpoints = ["tcp/127.0.0.1:10241"]
-    >>> with tn.SwitchClient.connected("two_sites", "s", endpoints) as switch:  # doctest: +SKIP
+    >>> place = ["tcp/127.0.0.1:10241"]
+    >>> with tn.SwitchClient.connected("two_sites", "s", place) as switch:  # doctest: +SKIP
     ...     while not switch.over:
     ...         switch.send(held=button.is_pressed())  # at least every 100 ms
     ...         time.sleep(0.02)
@@ -240,15 +240,17 @@ class SwitchClient(OutsideClient):
     member = OPERATOR
 
     def send(self, *, held: bool) -> None:
-        """Reports whether somebody holds the switch."""
+        """Sends whether somebody holds the switch."""
         self._sender.send(ArmEnable, held=held)
 
 
 class ArmClient(OutsideClient):
-    """Connection of an arm to its site; a context manager, which closes the connection.
+    """The connection of an arm to its site; a context manager that closes the connection.
 
-    >>> endpoints = ["tcp/127.0.0.1:10241"]
-    >>> with tn.ArmClient.connected("two_sites", "s", endpoints) as client:  # doctest: +SKIP
+    `record` is the newest record of the site.
+
+    >>> place = ["tcp/127.0.0.1:10241"]
+    >>> with tn.ArmClient.connected("two_sites", "s", place) as client:  # doctest: +SKIP
     ...     client.send(robot.q, robot.qd)
     ...     tau = client.torque()
     """
@@ -267,49 +269,48 @@ class ArmClient(OutsideClient):
         Args:
             q: joint angles, rad.
             qd: joint velocities, rad/s.
-            tau_x: torque of operator and environment, N m per joint, if the arm measures it.
-                The sign is that of the paper: the torque ON the arm is the negative.
-            stamp_ns: time of the measurement, in ns on the arm's own clock; None for the
-                present, on this program's monotonic clock.
+            tau_x: torque of operator and environment, N m per joint, if the arm measures it. In
+                the paper's sign: the torque ON the arm is the negative of `tau_x`.
+            stamp_ns: time of the measurement, ns on any monotonic clock of the arm; by default
+                the present time of this program's monotonic clock.
 
         Raises:
-            ValueError: tau_x has another length than q, or is not finite.
+            ValueError: `tau_x` is not as long as `q`, or a number is not finite.
         """
-        fields: dict[str, object] = {
-            "q": [*map(float, q)],
-            "qd": [*map(float, qd)],
-            "tau_x": [*map(float, tau_x)],
-        }
-        if stamp_ns is not None:
-            fields["sent_ns"] = stamp_ns
-        self._sender.send(ArmMeasurement, **fields)
+        vectors = {"q": q, "qd": qd, "tau_x": tau_x}
+        numbers = {name: [*map(float, vector)] for name, vector in vectors.items()}
+        stamp = {} if stamp_ns is None else {"sent_ns": stamp_ns}
+        self._sender.send(ArmMeasurement, **numbers, **stamp)
 
     def torque(self) -> tuple[float, ...] | None:
         """Returns the torque to apply now, N m per joint; None if the arm must brake.
 
-        The arm must brake before the first tick, after the run, while the newest record is
-        older than `FRESH_NS`, and from `BRAKE_NS` after a fault or the release of the dead-man
-        switch on. Until then, the torque brings the arm to rest.
+        The arm must brake:
+            - before the first tick and after the run,
+            - if the newest record is older than `FRESH_NS`,
+            - `BRAKE_NS` after a fault, or after the release of the dead-man switch. Until then
+              the torque brings the arm to rest.
         """
         record = self.record
         if record is None or not self.fresh:
             return None
+        # `mem` begins with the held pose and the time at which a fault or a stop began.
         shared = len(record.q_des)
-        # The memory of a site at rest holds the start of the rest and its reason.
+        begun_ns = record.mem[shared : shared + 1]
         reason = record.mem[2 * shared + 1 : 2 * shared + 2]
         is_released = record.mode == "stopped" and reason == [LifeReason.RELEASED]
-        if record.mode == "fault" or is_released:
-            rest_since_ns = record.mem[shared : shared + 1]
-            if not rest_since_ns or record.t_ns - rest_since_ns[0] >= BRAKE_NS:
-                return None
-        return tuple(record.tau)
+        if record.mode != "fault" and not is_released:
+            return tuple(record.tau)
+        if begun_ns and record.t_ns - begun_ns[0] < BRAKE_NS:
+            return tuple(record.tau)
+        return None
 
 
 def make_hand_sender(bus: Bus, clock: Clock, session: str, site: str) -> SiteSender:
     """Returns a sender of a hand's messages to a site.
 
-    The sender's boot is at least 1, because 0 stands for nobody, and below 2^32, so that a
-    record, which holds floating-point numbers, can hold the boot exactly.
+    Its boot lies in 1 ... 2^32 - 1: records store it as a float, and 0 means that nobody holds
+    the arm.
     """
     return SiteSender(
         bus=bus,
@@ -322,19 +323,15 @@ def make_hand_sender(bus: Bus, clock: Clock, session: str, site: str) -> SiteSen
 
 
 class Hand(SiteClient):
-    """A hand at the arm of one site; a context manager, which releases the arm on exit.
+    """The hand of a person or a program at one arm; a context manager that releases the arm.
 
     Args:
-        bus: connection of the program.
-        clock: clock of the program.
-        session: name of the session.
-        site: name of the site.
-        operator: the live hand of the scenario, as the core represents it.
-        place: returns the position of the arm for joint angles (rad), in the coordinates of
-            the target.
-        source: name of the person or program, for people.
-        repeats: True if a thread repeats the last message. Without the thread, a program that
-            hangs releases the arm.
+        operator: the live hand of the scenario, as the kernel has it.
+        compute_pose: returns the arm's pose for given joint angles, in the coordinates of the
+            hand's target: of the end effector in m, or the joints in rad.
+        source: a name of the holder, for events.
+        repeats: whether a thread repeats the last message. Without the thread, the site
+            releases the arm if the program hangs.
     """
 
     def __init__(
@@ -344,27 +341,24 @@ class Hand(SiteClient):
         session: str,
         site: str,
         operator: TorqueSource,
-        place: Callable[[Sequence[float]], Sequence[float]],
+        compute_pose: Callable[[Sequence[float]], Sequence[float]],
         source: str = "",
         *,
         repeats: bool = True,
     ) -> None:
         super().__init__(bus, clock, session, site)
         self._operator = operator
-        self._compute_position = place
+        self._compute_pose = compute_pose
         self._source = source
         self._sender = make_hand_sender(bus, clock, session, site)
         self._message: HandMessage | None = None
         self._lock = threading.Lock()
         self._ended = threading.Event()
         if repeats:
-            threading.Thread(target=self._repeat_message, daemon=True).start()
+            threading.Thread(target=self._repeat_messages, daemon=True).start()
 
     def __exit__(self, *_: object) -> None:
-        """Releases the arm, and waits until a record of the site says so.
-
-        The connection stays open, because it belongs to the caller.
-        """
+        """Releases the arm and waits until the site confirms it; leaves the bus open."""
         try:
             self.release()
             deadline_ns = self._clock.monotonic_ns() + 2 * GRIP_NS
@@ -374,26 +368,26 @@ class Hand(SiteClient):
             self._ended.set()
 
     def move(self, *place_m: float) -> int:
-        """Grips the arm if necessary, and moves the target of the end effector.
+        """Moves the target of the end effector to x, y (in space also z), m.
 
-        Args:
-            *place_m: coordinates x, y, and in space z, of the target, in m.
+        The first call takes hold of the arm.
 
         Returns:
-            The number of the message, which `State.hand` contains from the first record on
-            that follows the message.
+            The number of the message. The `hand` of each record names the number of the message
+            that the record follows.
 
         Raises:
-            UsageError: the hand of this site does not move a target, or a number is not finite.
+            UsageError: the hand of this site is not moved in this way, or a number is not
+                finite.
         """
         return self._send("move", place_m)
 
     def turn(self, *angles_rad: float) -> int:
-        """Like `move`, for a hand at the joints: sets a target angle for each joint, in rad."""
+        """Moves the target angles of the joints, rad; otherwise like `move`."""
         return self._send("turn", angles_rad)
 
     def push(self, *force_n: float) -> int:
-        """Like `move`, for a hand that pushes: sets the force ON the end effector, in N."""
+        """Sets the force ON the end effector, N; otherwise like `move`."""
         return self._send("push", force_n)
 
     def release(self) -> None:
@@ -412,16 +406,18 @@ class Hand(SiteClient):
 
     @property
     def number(self) -> int:
-        """Number of this hand's newest message that the newest record follows.
+        """The number of this hand's newest message that the newest record follows.
 
-        The number is -1 if this hand does not hold the arm.
+        It is -1 if this hand does not hold the arm.
         """
         hand = self.in_force
-        return -1 if hand is None or hand.source != self._sender.boot else hand.number
+        if hand is None or hand.source != self._sender.boot:
+            return -1
+        return hand.number
 
     @property
     def in_force(self) -> HandInForce | None:
-        """State of the hand that holds the arm, by the newest record; None before the first."""
+        """The state of the holder's hand in the newest record; None before the first record."""
         record = self.record
         if record is None or not record.hand:
             return None
@@ -429,81 +425,70 @@ class Hand(SiteClient):
 
     @property
     def pose(self) -> tuple[float, ...]:
-        """Position of the arm by the newest record.
+        """The pose of the arm in the newest record.
 
-        Coordinates of the end effector in m, or joint angles in rad for a hand that turns.
+        It is the position of the end effector in m; for `turn` the joint angles in rad.
         """
-        record = self._need_record()
-        return tuple(map(float, self._compute_position(record.q)))
+        record = self._wait_for_record()
+        return tuple(map(float, self._compute_pose(record.q)))
 
     @property
     def force(self) -> tuple[float, ...]:
-        """Force ON the arm of the hand that holds the arm, by the newest record.
+        """The force of the holder ON the arm in the newest record, N; for `turn` torques, N m.
 
-        The unit is N, or N m for a hand that turns. With the target x_t of the hand and its
-        velocity v_t, and the position x and velocity v of the arm, a hand that moves or turns
-        pulls by K (x_t - x) + B (v_t - v), limited in size, times the grip. The operator feels
-        the negative of this force.
+        A hand with a target pulls with F = K (target - pose) + B (target rate - pose rate),
+        limited in size and scaled by the grip. The operator feels the negative of this force.
         """
-        record = self._need_record()
+        record = self._wait_for_record()
         operator = self._operator
         hand = HandInForce.read(record.hand)
         pull = list(hand.target)
         if operator.kind is not TorqueKind.LIVE_FORCE:
-            position = self._compute_position(record.q)
-            velocity = self._compute_velocity(record)
+            pose = self._compute_pose(record.q)
+            pose_rate = self._compute_pose_rate(record)
+            terms = zip(
+                operator.K, operator.B, hand.target, hand.rate, pose, pose_rate, strict=True
+            )
             pull = [
-                K * (x_target - x) + B * (v_target - v)
-                for K, B, x_target, v_target, x, v in zip(
-                    operator.K,
-                    operator.B,
-                    hand.target,
-                    hand.rate,
-                    position,
-                    velocity,
-                    strict=True,
-                )
+                K * (target - position) + B * (target_rate - rate)
+                for K, B, target, target_rate, position, rate in terms
             ]
         size = math.hypot(*pull)
         share = hand.grip * (operator.limit / size if size > operator.limit else 1.0)
         return tuple(share * component for component in pull)
 
-    def _compute_velocity(self, record: State) -> list[float]:
-        """Returns the velocity of the arm's position, by central differences."""
-        q_ahead = [q + _STEP_S * qd for q, qd in zip(record.q, record.qd, strict=True)]
-        q_behind = [q - _STEP_S * qd for q, qd in zip(record.q, record.qd, strict=True)]
-        ahead = self._compute_position(q_ahead)
-        behind = self._compute_position(q_behind)
-        return [(a - b) / (2.0 * _STEP_S) for a, b in zip(ahead, behind, strict=True)]
+    def _compute_pose_rate(self, record: State) -> list[float]:
+        """Returns the rate of the pose by a central difference along the joint velocities."""
+        step_s = _DERIVATIVE_STEP_S
+        joints = list(zip(record.q, record.qd, strict=True))
+        pose_after = self._compute_pose([q + step_s * qd for q, qd in joints])
+        pose_before = self._compute_pose([q - step_s * qd for q, qd in joints])
+        pairs = zip(pose_after, pose_before, strict=True)
+        return [(after - before) / (2.0 * step_s) for after, before in pairs]
 
-    def _need_record(self) -> State:
-        """Returns the newest record, and waits for the first one.
-
-        Raises:
-            UsageError: the run has ended without a record.
-        """
+    def _wait_for_record(self) -> State:
         while (record := self.record) is None:
             if self.over:
                 raise UsageError(f"the run of {self._site} has ended: there is no record")
             self._clock.sleep_until(self._clock.monotonic_ns() + 1_000_000)
         return record
 
-    def _send(self, motion: str, numbers: Sequence[float]) -> int:
-        possible_motion = _MOTIONS[self._operator.kind]
-        if motion != possible_motion:
+    def _send(self, action: str, numbers: Sequence[float]) -> int:
+        allowed = _ACTIONS[self._operator.kind]
+        if action != allowed:
             raise UsageError(
-                f"the hand of {self._site} can {possible_motion}, not {motion}: "
+                f"the hand of {self._site} can {allowed}, not {action}: "
                 "see its mode in the scenario"
             )
         goal = [float(number) for number in numbers]
         if not all(map(math.isfinite, goal)):
-            raise UsageError(f"a hand can {motion} to finite numbers, not to {goal}")
-        field = "force" if motion == "push" else "target"
+            raise UsageError(f"a hand can {allowed} to finite numbers, not to {goal}")
+        key = "force" if allowed == "push" else "target"
         with self._lock:
-            self._message = self._sender.send(HandMessage, source=self._source, **{field: goal})
+            self._message = self._sender.send(HandMessage, source=self._source, **{key: goal})
             return self._sender.number
 
-    def _repeat_message(self) -> None:
+    def _repeat_messages(self) -> None:
         while not self._ended.wait(HEARTBEAT_S):
             with self._lock:
                 if self._message is not None:

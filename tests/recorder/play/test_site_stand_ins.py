@@ -64,10 +64,10 @@ def test_where_nothing_is_missing_it_answers_as_a_site(
     """Messages of 2 bytes, and of 1800, of which fewer fit an answer."""
     ring = ChannelBuffer(200, 400_000)
     for number in range(count):
-        ring.keep(number.to_bytes(2, "big") * size)
+        ring.store(number.to_bytes(2, "big") * size)
     memory = remembered(list(range(count)), count, size)
     told = memory.find_messages(CHANNEL, first, first + more)
-    assert told == ring.chunk(first, first + more)
+    assert told == ring.read_chunk(first, first + more)
     assert sum(map(len, told[1])) <= BACKFILL_BYTES
 
 
