@@ -1,13 +1,15 @@
-"""Deadline budget and watchdog of code of a user's own: a law, a hand, a plant.
+"""Deadline budget and watchdog of a user's own code: a law, a hand, a plant.
 
-Invariant: the watchdog judges the code's own computing time, never the machine's lateness, and
-enters no number of the run. A single hiccup is only counted; code that is too slow, or does not
-return, fails in order.
+The code may use `SHARE` of the period at which it is called. Time beyond that adds to its
+overtime, which faster calls pay back; code whose overtime exceeds `OVERTIME_LIMIT_NS` is too
+slow. One call counts for at most `HICCUP_NS`, so that no single call fails. If the machine has
+preempted the thread, the thread's computing time counts instead of the elapsed time.
 
-It may use `SHARE` of the period at which it is called. Time beyond that adds to its overtime,
-which faster calls pay back; code that owes `MOST_NS` is too slow. One call counts for at most
-`HICCUP_NS`, so that no single call fails. If the machine preempted the thread, the thread's
-computing time counts instead of the elapsed time.
+Invariant:
+    - The watchdog judges the code's own computing time, never the lateness of the machine.
+    - It enters no number of the run.
+    - A single slow call is only counted. Code that is too slow, or does not return, fails and
+      is reported.
 """
 
 import signal
@@ -29,19 +31,21 @@ except ImportError:  # not on this platform: elapsed time counts
 
 T = TypeVar("T")
 SHARE = 0.75
-MOST_NS = 500_000_000
+OVERTIME_LIMIT_NS = 500_000_000
 HICCUP_NS = 50_000_000
 CHECK_S = 1.0
 CHECKS = 3
 FIRST_CHECKS = 61
-"""Code in the same call at so many checks in a row, one every `CHECK_S`, hangs; the second is
-of its first tick, in which it may compile.
+"""Code hangs if it is in the same call at `CHECKS` checks in a row, one every `CHECK_S`.
+
+In its first tick, in which it may compile, the limit is `FIRST_CHECKS`.
 """
 
 
 def read_thread_usage() -> tuple[int, int]:
-    """Returns this thread's computing time, ns, and its involuntary switches; (0, -1) if
-    unknown.
+    """Returns this thread's computing time, ns, and its involuntary context switches.
+
+    Returns (0, -1) if they are unknown.
     """
     if _THREAD is None:
         return 0, -1
@@ -50,14 +54,19 @@ def read_thread_usage() -> tuple[int, int]:
 
 
 class WatchedCode:
-    """Code of a user's own, called `rate_hz` times a second.
+    """A user's own code, called `rate_hz` times a second.
 
     Args:
-        name: of it, as in "the law mylaw:MyLaw".
-        fail: makes the error that is raised, of a tick and a problem.
+        name: the name of the code, as in "the law mylaw:MyLaw".
+        rate_hz: how often the code is called, 1/s.
+        fail: returns the error to raise, from a tick and a problem.
+        clock: the clock of this process.
+        usage: returns the thread's computing time and context switches.
 
     Attributes:
-        hiccups: number of calls that took longer than a period.
+        hiccups: the number of calls that took longer than a period.
+        longest_ns: the duration of the longest call.
+        longest_tick: the tick of that call.
     """
 
     def __init__(
@@ -68,59 +77,67 @@ class WatchedCode:
         clock: Clock,
         usage: Callable[[], tuple[int, int]] = read_thread_usage,
     ) -> None:
-        self.hiccups = self.longest_ns = 0
+        self.hiccups = 0
+        self.longest_ns = 0
         self.longest_tick = -1
         self._name = name
         self._fail = fail
         self._clock = clock
         self._usage = usage
         self._period_ns = NS_PER_S // rate_hz
-        self._owed_ns = self._sum_ns = self._count = self._checks = 0
-        self._running = self._first = -1  # the ticks of the call under way and of the first one
-        self._checked = -1  # how many calls there were before the one checked last
+        self._owed_ns = 0
+        self._total_ns = 0
+        self._calls = 0
+        self._same_call_checks = 0
+        self._running_tick = -1  # the tick of the running call
+        self._first_tick = -1
+        self._checked_count = -1  # the number of finished calls at the last check
 
     def run(self, k: int, call: Callable[[], T]) -> T:
-        """Returns what a call gives at a tick.
+        """Returns the result of a call at tick `k`.
 
         Raises:
-            Exception: of `fail`, if it is too slow; and what the call raises.
+            Exception: the error of `fail` if the code is too slow; otherwise what the call
+                raises.
         """
         computed_ns, switches = self._usage()
-        began_ns = self._clock.monotonic_ns()
-        self._running = k
-        self._first = k if self._first < 0 else self._first
+        begun_ns = self._clock.monotonic_ns()
+        self._running_tick = k
+        self._first_tick = k if self._first_tick < 0 else self._first_tick
         try:
             result = call()
         finally:
-            self._running = -1
-        took_ns = self._clock.monotonic_ns() - began_ns
-        if took_ns > SHARE * self._period_ns:  # else the reason does not matter
+            self._running_tick = -1
+        elapsed_ns = self._clock.monotonic_ns() - begun_ns
+        if elapsed_ns > SHARE * self._period_ns:
+            # The thread was preempted if it was switched involuntarily.
             computed_after_ns, switches_after = self._usage()
             if switches_after != switches:
-                took_ns = min(took_ns, computed_after_ns - computed_ns)
-        self._account(k, took_ns)
+                elapsed_ns = min(elapsed_ns, computed_after_ns - computed_ns)
+        self._count_call(k, elapsed_ns)
         return result
 
-    def _account(self, k: int, took_ns: int) -> None:
-        self.hiccups += took_ns > self._period_ns
-        self._sum_ns += took_ns
-        self._count += 1
-        if took_ns > self.longest_ns:
-            self.longest_ns = took_ns
+    def _count_call(self, k: int, elapsed_ns: int) -> None:
+        """Counts a call and its overtime; raises an error if the code is too slow."""
+        self.hiccups += elapsed_ns > self._period_ns
+        self._total_ns += elapsed_ns
+        self._calls += 1
+        if elapsed_ns > self.longest_ns:
+            self.longest_ns = elapsed_ns
             self.longest_tick = k
-        self._owed_ns += min(took_ns, HICCUP_NS) - int(SHARE * self._period_ns)
+        self._owed_ns += min(elapsed_ns, HICCUP_NS) - int(SHARE * self._period_ns)
         self._owed_ns = max(self._owed_ns, 0)
-        if self._owed_ns > MOST_NS:
-            mean_ms = self._sum_ns / self._count * 1e-6
+        if self._owed_ns > OVERTIME_LIMIT_NS:
+            mean_ms = self._total_ns / self._calls * 1e-6
             period_ms = self._period_ns * 1e-6
             problem = (
-                f"it is too slow: {mean_ms:.3g} ms a call, of {period_ms:.3g} ms between two of them it may "
-                f"take {SHARE:.0%}; make it faster, or lower rate_hz"
+                f"it is too slow: {mean_ms:.3g} ms a call, of {period_ms:.3g} ms between two "
+                f"of them it may take {SHARE:.0%}; make it faster, or lower rate_hz"
             )
             raise self._fail(k, problem)
 
     def describe_hiccups(self) -> str:
-        """Returns a sentence about the calls that were late for the next one; "" without any."""
+        """Returns a sentence about the calls that took longer than a period, else ""."""
         if not self.hiccups:
             return ""
         return (
@@ -130,30 +147,35 @@ class WatchedCode:
         )
 
     def check(self) -> None:
-        """Stops code that is in the same call as at the checks before; a process that slept had
-        none.
+        """Interrupts user code that is still in the call seen at the previous checks.
+
+        Checks missed while the process was suspended do not count.
 
         Raises:
-            Exception: of `fail`, out of the code.
+            Exception: the error of `fail`, out of the user's code.
         """
-        running = self._running
-        self._checks = self._checks + 1 if running >= 0 and self._count == self._checked else 0
-        self._checked = self._count if running >= 0 else -1
-        most = (FIRST_CHECKS if running == self._first else CHECKS) - 1
-        if self._checks >= most:
-            raise self._fail(running, f"it did not come back within {most * CHECK_S:g} s")
+        tick = self._running_tick
+        is_same_call = tick >= 0 and self._calls == self._checked_count
+        self._same_call_checks = self._same_call_checks + 1 if is_same_call else 0
+        self._checked_count = self._calls if tick >= 0 else -1
+        limit = (FIRST_CHECKS if tick == self._first_tick else CHECKS) - 1
+        if self._same_call_checks >= limit:
+            raise self._fail(tick, f"it did not come back within {limit * CHECK_S:g} s")
 
 
 class CodeWatchdog:
-    """A context within which code that hangs is stopped."""
+    """A context manager within which user code that hangs is interrupted.
+
+    It uses SIGALRM, so it works in the main thread only.
+    """
 
     def __init__(self, *codes: WatchedCode) -> None:
         self.codes = list(codes)
         self._handler_before: Any = None
 
     def __enter__(self) -> "CodeWatchdog":
-        alone = threading.current_thread() is threading.main_thread()
-        if self.codes and alone and hasattr(signal, "setitimer"):
+        is_main_thread = threading.current_thread() is threading.main_thread()
+        if self.codes and is_main_thread and hasattr(signal, "setitimer"):
             self._handler_before = signal.signal(signal.SIGALRM, self._check)
             signal.setitimer(signal.ITIMER_REAL, CHECK_S, CHECK_S)
         return self

@@ -1,13 +1,14 @@
-"""A whole session on one machine: starts every site and the recorder as processes, monitors and
-ends them.
+"""A whole session on one machine: starts all sites and the recorder, watches and ends them.
 
-They are copies of one process, the starter, which has loaded everything: a copy begins in a
-tenth of the time that an interpreter takes. What is copied has no connection, no thread of its
-own and no code of the user's.
+The processes are copies of one process, the starter, which has loaded everything: a copy starts
+in a tenth of the time that an interpreter takes. The copied process has no connection, no
+threads of its own and no user's code.
 
-Invariant: in every case the recorder ends last and no child is left on return, nor if this
-process is killed; if the starter is, all are asked to end. The children have process sessions
-of their own, so that Ctrl-C reaches them through this process, in that order.
+Invariant:
+    - The recorder always ends last, and no child process is left on return, even if this
+      process is killed. If the starter is killed, all processes are asked to end.
+    - The children have process sessions of their own, so that Ctrl-C reaches them through this
+      process, in that order.
 """
 
 import os
@@ -53,26 +54,30 @@ from .site_parts import warm_up
 
 POLL_NS = 100_000_000
 START_S = 10
-"""Time for a site to start, s, where many share a few processors."""
+"""Time for a site to start, s, if many of them share a few processors."""
 JOIN_S = 60
+"""Longest wait of the sites for each other and for the recorder, s."""
 WAIT_S = 600
-"""For so long sites wait for each other and for the recorder, s; the second where people begin
-a session.
-"""
+"""The same wait if people begin the session, s."""
 END_TIMEOUT_NS = 45 * NS_PER_S
-"""Time for a child to end after its signal; then it is killed. A site waits 10 s for the
-recorder, and as long again after every question of one that was behind.
+"""Time for a child to end after its signal; then it is killed.
+
+A site waits 10 s for the recorder, and as long again after each query of a recorder that lacks
+messages.
 """
 RECORDER_NS = 2 * NS_PER_S
-"""Time for the recorder to write what is under way, once all sites have ended."""
+"""Time for the recorder to write the last messages after all sites have ended."""
 
 
 @dataclass(slots=True)
 class SessionResult:
-    """How a session ended: what failed, in order, the number of the signal that ended it, or 0;
-    and a code.
+    """How a session ended.
 
-    The exit code is that of a run that failed, or of a disk that took no more.
+    Attributes:
+        log: the path of the log.
+        problems: what failed, in order.
+        interrupted: the number of the signal that ended the session, or 0.
+        exit_code: the code of a failed run, or of a disk that refused the log.
     """
 
     log: Path
@@ -82,7 +87,14 @@ class SessionResult:
 
 
 class SessionProcess:
-    """A process of a session: its number once it has begun, its exit code once it has ended."""
+    """A process of a session.
+
+    Attributes:
+        name: the name of the process, such as that of its site.
+        output: the file with everything that the process prints.
+        pid: its process number; None before it has started.
+        code: its exit code; None before it has ended.
+    """
 
     def __init__(self, starter: "ProcessStarter", name: str, output: Path) -> None:
         self.name = name
@@ -93,90 +105,104 @@ class SessionProcess:
         self._signalled = False
 
     def end(self, number: int) -> None:
-        """Sends it a signal, unless it has ended."""
+        """Sends the process a signal, unless it has ended."""
         if self.code is None:
             self._signalled = True
             self._starter.signal(self, number)
 
     def problem(self) -> str | None:
-        """Describes how the process failed; None if it did not."""
+        """Describes how the process failed; returns None if it did not fail."""
         code = self.code
         if self._signalled and self.pid is None:
-            return None  # the signal met the starter: an interpreter that still starts ends with any code
-        if code in (0, None) or (
-            self._signalled and code in (128 + signal.SIGINT, -signal.SIGINT)
-        ):
-            return None  # a process that ends anyway has no handler any more
+            # The signal met an interpreter that was still starting; it may end with any code.
+            return None
+        if code in (0, None):
+            return None
+        if self._signalled and code in (128 + signal.SIGINT, -signal.SIGINT):
+            return None  # a process that is ending anyway has no signal handler any more
         if code is not None and code < 0:
             return f"{self.name} was killed by {signal.Signals(-code).name}"
         lines = self.output.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        last = lines[-1].removeprefix("error: ") if lines else "it printed nothing"
-        return f"{self.name} ended with code {code}: {last}"
+        last_line = lines[-1].removeprefix("error: ") if lines else "it printed nothing"
+        return f"{self.name} ended with code {code}: {last_line}"
 
 
 class ProcessStarter:
-    """Starts the processes of a scenario's session on this machine; what each prints is kept in
-    a folder.
+    """Starts the processes of a session on this machine, and keeps their output in a folder.
+
+    Args:
+        scenario_file: the scenario of the session.
+        folder: the folder for the outputs.
     """
 
     def __init__(self, scenario_file: Path, folder: Path) -> None:
         self._folder = folder
         self._output = folder / "starter.txt"
         self._processes: dict[str, SessionProcess] = {}
-        self._orders, theirs = Pipe()
-        with theirs, create_file(self._output) as sink:
+        self._pipe, child_end = Pipe()
+        with child_end, create_file(self._output) as sink:
             # see `run_starter`
-            words = [
+            arguments = [
                 "start-processes",
-                str(theirs.fileno()),
+                str(child_end.fileno()),
                 str(scenario_file),
             ]
             self._starter = subprocess.Popen(
-                [sys.executable, "-m", "trilat_net", *words],
+                [sys.executable, "-m", "trilat_net", *arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=sink,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                pass_fds=[theirs.fileno()],
+                pass_fds=[child_end.fileno()],
             )
 
-    def start(self, name: str, words: Sequence[str]) -> SessionProcess:
-        """Starts a command, given by its words, as a process of a name that no other has."""
-        started = SessionProcess(self, name, self._folder / f"{name}.txt")
-        create_file(started.output).close()  # here, where a disk that refuses it is told of
-        self._processes[name] = started
-        self._order(name, [*words], 0, started.output)
-        return started
+    def start(self, name: str, arguments: Sequence[str]) -> SessionProcess:
+        """Starts a command as a process.
+
+        Args:
+            name: a name that no other process has.
+            arguments: the command and its arguments, without `trilat`.
+        """
+        process = SessionProcess(self, name, self._folder / f"{name}.txt")
+        create_file(process.output).close()  # here, where a full disk is reported to the user
+        self._processes[name] = process
+        self._send_order(name, [*arguments], 0, process.output)
+        return process
 
     def signal(self, process: SessionProcess, number: int) -> None:
-        """Sends a process a signal; one that has not begun never will."""
-        self._order(process.name, [], number, process.output)
-        self._starter.send_signal(signal.SIGINT)  # which it ignores from its first order on
+        """Sends a process a signal; a process that has not started yet will not start."""
+        self._send_order(process.name, [], number, process.output)
+        # Interrupts a starter that still imports; it blocks the signal before its first order.
+        self._starter.send_signal(signal.SIGINT)
 
-    def _order(self, *order: Any) -> None:
-        with suppress(OSError):  # the starter has failed, which `poll` finds
-            self._orders.send(order)
+    def _send_order(self, name: str, arguments: list[str], number: int, output: Path) -> None:
+        with suppress(OSError):  # the starter has failed, which `poll` reports
+            self._pipe.send((name, arguments, number, output))
 
     def poll(self) -> None:
-        """Takes note of what has begun and ended."""
+        """Updates the processes by the starter's reports of starts and ends.
+
+        If the starter has failed, all of its processes are asked to end.
+        """
         try:
-            while self._orders.poll():
-                name, pid, code = self._orders.recv()
+            while self._pipe.poll():
+                name, pid, code = self._pipe.recv()
                 self._processes[name].pid = pid
                 self._processes[name].code = code
         except (EOFError, OSError):
             code = self._starter.wait()
-            for left in self._processes.values():
-                if left.code is None:
-                    left.code = code
-                    left.output = self._output
-                    if left.pid is not None:
-                        with suppress(ProcessLookupError):
-                            os.kill(left.pid, signal.SIGINT)
+            for process in self._processes.values():
+                if process.code is not None:
+                    continue
+                process.code = code
+                process.output = self._output
+                if process.pid is not None:
+                    with suppress(ProcessLookupError):
+                        os.kill(process.pid, signal.SIGINT)
 
     def close(self) -> None:
-        """Ends the starter, after all that it has started."""
-        self._orders.close()
+        """Ends the starter; all processes that it has started have ended by then."""
+        self._pipe.close()
         self._starter.send_signal(signal.SIGINT)
         self._starter.wait()
 
@@ -184,8 +210,10 @@ class ProcessStarter:
 SessionAttendant = Callable[
     [str, Sequence[str], Callable[[str], None]], AbstractContextManager[Callable[[], bool]]
 ]
-"""Given a session's name, the endpoints of its sites and what tells people, a context that
-lasts as long as the session; what it yields returns true once the session is to end.
+"""A function of a session's name, its endpoints, and a function that prints a line.
+
+It returns a context that lasts as long as the session. The context yields a function that
+returns True once the session is to end.
 """
 
 
@@ -196,13 +224,21 @@ def run_demo(
     attend: SessionAttendant | None = None,
     begins: Callable[[], bool] | None = None,
 ) -> SessionResult:
-    """Runs a session of all sites and a recorder, by the scenario's name, as single sites do.
+    """Runs a session of all sites and a recorder, under the scenario's name.
 
-    Its log is valid whenever the session began. Given `begins`, the sites wait for the recorder
-    until it returns true, at most `WAIT_S`; so the session begins a second or two after that.
+    Args:
+        scenario: the scenario.
+        folder: the folder of the log and of the processes' outputs.
+        console: the terminal for the user.
+        attend: observes the session and may end it.
+        begins: returns True once the session may begin; the sites wait for the recorder until
+            then, at most `WAIT_S`. The session begins a second or two later.
+
+    Returns:
+        How the session ended. The log is valid whenever the session has begun.
 
     Raises:
-        ScenarioError: an arm outside of the program lacks limits.
+        ScenarioError: an external arm lacks limits.
     """
     check_outside_arms(scenario)
     result = SessionResult(folder / "run.mcap")
@@ -228,10 +264,10 @@ def run_demo(
         recorder: list[SessionProcess] = []
         display.say(f"others connect to {', '.join(endpoints)}")
         for name in scenario.outside:
-            place = f"{topics.key(session, name, topics.MEASURED)} at {endpoints[scenario.names.index(name)]}"
-            display.say(
-                f"{name} waits for its arm on {place}; see {find_page('external-arm.md')}"
-            )
+            key = topics.key(session, name, topics.MEASURED)
+            endpoint = endpoints[scenario.names.index(name)]
+            page = find_page("external-arm.md")
+            display.say(f"{name} waits for its arm on {key} at {endpoint}; see {page}")
         attending = (
             nullcontext(lambda: False)
             if attend is None
@@ -270,10 +306,13 @@ def run_demo(
 
 
 def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Interrupt) -> None:
-    """Compiles what a scenario's arms need, if it may not be cached; a signal interrupts it."""
+    """Compiles the code that a scenario's arms need, unless it is cached.
+
+    A signal interrupts the compilation.
+    """
     layouts = {arm.counts: name for name, arm in scenario.arms.items()}
     chains = any(arm.chain is not None for arm in scenario.arms.values())
-    # what is cached may be of arms with other numbers of joints
+    # The cached code may be for chains with another number of joints.
     if chains or not is_core_cached():
         compiling_notice.report = say
         with interrupt.raising():
@@ -284,6 +323,11 @@ def compile_core(scenario: Scenario, say: Callable[[str], None], interrupt: Inte
 def _start(
     scenario: Scenario, folder: Path, reserved: ExitStack, endpoints: list[str], wait_s: int
 ) -> tuple[ProcessStarter, list[SessionProcess], Callable[[], SessionProcess]]:
+    """Starts all sites and hands.
+
+    Returns:
+        The starter, the processes, and a function that starts the recorder.
+    """
     file = folder / "scenario.toml"
     log = folder / "run.mcap"
     output = folder / "processes"
@@ -292,43 +336,28 @@ def _start(
     log.unlink(missing_ok=True)  # of an earlier run, in a folder that may be replaced
     starter = reserved.enter_context(closing(ProcessStarter(file, output)))
     session = scenario.name
+    common = ["--scenario", str(file), "--session", session]
     connect = [["--connect", endpoint] for endpoint in endpoints]
     patience = ["--join-timeout", str(max(wait_s, START_S * len(endpoints)))]
-    sites = [
-        starter.start(
-            name,
-            [
-                *(
-                    "site",
-                    name,
-                    "--scenario",
-                    str(file),
-                    "--session",
-                    session,
-                    "--listen",
-                    endpoints[n],
-                ),
-                *chain(*connect[:n]),
-                *("--needs-recorder", *patience),
-            ],
-        )
-        for n, name in enumerate(scenario.names)
-    ]
+    processes = []
     for n, name in enumerate(scenario.names):
-        at = find_own_hand(scenario, name)
-        if at is not None and at.has_separate_process:
-            words = ["hand", name, "--scenario", str(file), "--session", session]
-            sites.append(starter.start(f"hand-{name}", [*words, *connect[n], *patience]))
-    arguments = ["record", "--session", session, *chain(*connect), "-o", str(log)]
-    return (
-        starter,
-        sites,
-        lambda: starter.start(topics.RECORDER, [*arguments, *patience, "--force"]),
-    )
+        arguments = ["site", name, *common, "--listen", endpoints[n]]
+        arguments += [*chain(*connect[:n]), "--needs-recorder", *patience]
+        processes.append(starter.start(name, arguments))
+    for n, name in enumerate(scenario.names):
+        own_hand = find_own_hand(scenario, name)
+        if own_hand is not None and own_hand.has_separate_process:
+            arguments = ["hand", name, *common, *connect[n], *patience]
+            processes.append(starter.start(f"hand-{name}", arguments))
+    record = ["record", "--session", session, *chain(*connect), "-o", str(log)]
+    record += [*patience, "--force"]
+    return starter, processes, lambda: starter.start(topics.RECORDER, record)
 
 
 def _is_over(children: list[SessionProcess], result: SessionResult) -> bool:
-    result.problems += [problem for child in children if (problem := child.problem())]
+    """Adds the problems of ended processes to the result; True if the session is over."""
+    problems = [child.problem() for child in children]
+    result.problems += [problem for problem in problems if problem]
     return bool(result.problems) or all(child.code == 0 for child in children)
 
 
@@ -340,28 +369,37 @@ def _end_all(
     interrupt: Interrupt,
     say: Callable[[str], None],
 ) -> None:
-    """Ends the sites, then the recorder, which by then has all their messages.
+    """Ends the sites, then the recorder, which has all their messages by then.
 
-    A second signal of the user's reaches all of them, and ends them at once.
+    A second signal of the user reaches all of them, and ends them at once.
     """
-    tell = partial(
+    announce = partial(
         say,
         "the sites keep their last records until the recorder has them, 10 s at most; "
         "Ctrl-C a second time ends it at once",
     )
     _end_group(
-        starter=starter, group=sites, clock=clock, insists=interrupt.is_repeated, tell=tell
+        starter=starter,
+        group=sites,
+        clock=clock,
+        ends_now=interrupt.is_repeated,
+        announce=announce,
     )
-    sites_left_ns = clock.monotonic_ns()
+    sites_ended_ns = clock.monotonic_ns()
 
-    def may_insist() -> bool:
-        """True once the recorder has had its time: without sites there is nothing that it could
-        ask for.
+    def must_end_now() -> bool:
+        """True if the user insists, or the recorder's time is over.
+
+        After the end of the sites there are no more messages for the recorder to request.
         """
-        return interrupt.is_repeated() or clock.monotonic_ns() - sites_left_ns > RECORDER_NS
+        return interrupt.is_repeated() or clock.monotonic_ns() - sites_ended_ns > RECORDER_NS
 
     _end_group(
-        starter=starter, group=recorder, clock=clock, insists=may_insist, tell=lambda: None
+        starter=starter,
+        group=recorder,
+        clock=clock,
+        ends_now=must_end_now,
+        announce=lambda: None,
     )
 
 
@@ -369,25 +407,32 @@ def _end_group(
     starter: ProcessStarter,
     group: list[SessionProcess],
     clock: Clock,
-    insists: Callable[[], bool],
-    tell: Callable[[], None],
+    ends_now: Callable[[], bool],
+    announce: Callable[[], None],
 ) -> None:
-    """Ends processes in order, at once when `insists` returns True; `tell` says why it takes
-    long.
+    """Ends processes in order, and waits for them.
+
+    Args:
+        starter: the starter of the processes.
+        group: the processes.
+        clock: the clock of this process.
+        ends_now: returns True to end the processes at once, by a second signal.
+        announce: tells the user why the wait takes long.
     """
     for process in group:
         process.end(signal.SIGINT)
     begun_ns = clock.monotonic_ns()
-    is_told = has_insisted = False
+    is_announced = False
+    is_repeated = False
     while any(process.code is None for process in group):
         waited_ns = clock.monotonic_ns() - begun_ns
-        if insists() and not has_insisted:
-            has_insisted = True
+        if ends_now() and not is_repeated:
+            is_repeated = True
             for process in group:
                 process.end(signal.SIGINT)
-        if waited_ns > NS_PER_S and not is_told:
-            is_told = True
-            tell()
+        if waited_ns > NS_PER_S and not is_announced:
+            is_announced = True
+            announce()
         if waited_ns > END_TIMEOUT_NS:
             for process in group:
                 process.end(signal.SIGKILL)
@@ -396,50 +441,59 @@ def _end_group(
 
 
 def run_starter(number: int, scenario_file: str) -> list[str] | None:
-    """Starts and signals processes as ordered until nobody is there; in each process it returns
-    its words.
+    """Starts and signals processes on request, until the requesting process is gone.
+
+    It returns in each started process, with the command and arguments of that process, and in
+    the starter itself with None.
+
+    Args:
+        number: the file descriptor of the pipe to the requesting process.
+        scenario_file: the scenario of the session.
     """
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     scenario = load_scenario(scenario_file)
-    # code of the user's is loaded where it runs, and nowhere else
+    # A user's own code is imported only in the process that runs it.
     if not list_imported_code([scenario]):
         for name in {arm.counts: name for name, arm in scenario.arms.items()}.values():
             warm_up(scenario, name)
     freeze_gc()
-    # Blocked and not ignored: a copy would lose the signal that meets it before it has a handler.
+    # Blocked, not ignored: a copy would lose a signal that arrives before it has a handler.
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    return _Starter(Connection(number)).serve()
+    return _StarterProcess(Connection(number)).serve()
 
 
-class _Starter:
-    def __init__(self, orders: Connection) -> None:
-        self._orders = orders
+class _StarterProcess:
+    """The starter's loop, and the processes that it has started."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self._pipe = pipe
         self._running: dict[str, int] = {}
 
     def serve(self) -> list[str] | None:
-        words: list[str]
+        """Executes orders; returns the arguments in a started process, None in the starter."""
+        arguments: list[str]
         while True:
             self._report_ends()
             try:
-                if not self._orders.poll(POLL_NS / 10 / NS_PER_S):
+                if not self._pipe.poll(POLL_NS / 10 / NS_PER_S):
                     continue
-                name, words, number, output = self._orders.recv()
+                name, arguments, number, output = self._pipe.recv()
             except (EOFError, OSError):
                 self._end_all()
                 return None
             if not number and self._fork(name):
-                _become(words, output)
-                return words
+                _become_process(arguments, output)
+                return arguments
             if number and name in self._running:
                 os.kill(self._running[name], number)
 
     def _fork(self, name: str) -> bool:
-        """Copies this process; true in the copy."""
+        """Copies this process; returns True in the copy."""
         if pid := os.fork():
             self._running[name] = pid
             self._report(name, pid, None)
             return False
-        self._orders.close()
+        self._pipe.close()
         return True
 
     def _report_ends(self) -> None:
@@ -449,9 +503,9 @@ class _Starter:
                 del self._running[name]
                 self._report(name, pid, os.waitstatus_to_exitcode(status))
 
-    def _report(self, *news: Any) -> None:
-        with suppress(OSError):  # whoever asked is gone, as the next look at its orders finds
-            self._orders.send(news)
+    def _report(self, name: str, pid: int, code: int | None) -> None:
+        with suppress(OSError):  # the requesting process is gone, which `serve` notices next
+            self._pipe.send((name, pid, code))
 
     def _end_all(self) -> None:
         recorder = (
@@ -464,8 +518,8 @@ class _Starter:
                 os.waitpid(pid, 0)
 
 
-def _become(words: list[str], output: Path) -> None:
-    """Makes a copy what a shell would have started: its name, session, output and signals."""
+def _become_process(arguments: list[str], output: Path) -> None:
+    """Gives a copy the name, process session, output and signals of a process of a shell."""
     os.setsid()
     sink = os.open(output, os.O_WRONLY | os.O_NOFOLLOW)
     for stream in (sys.stdout, sys.stderr):
@@ -473,7 +527,7 @@ def _become(words: list[str], output: Path) -> None:
     os.close(sink)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    setproctitle(" ".join(["trilat", *words]))
+    setproctitle(" ".join(["trilat", *arguments]))
 
 
 def run(
@@ -486,9 +540,9 @@ def run(
     force: bool = False,
     quiet: bool = True,
 ) -> Log:
-    """Runs a scenario live, a process per site and a recorder over Zenoh, and returns its log.
+    """Runs a scenario live, with a process per site and a recorder, and returns its log.
 
-    The command is `trilat demo`, which reports on the log too: `tn.report(log)`.
+    The command is `trilat demo`, which also reports on the log: `tn.report(log)`.
 
     >>> log = tn.run("two_sites", duration_s=2)
     >>> tn.verify(log).passed
@@ -501,12 +555,13 @@ def run(
         duration_s: the duration of the run, s; by default the scenario's.
         seed: the seed; by default the scenario's.
         out: folder of the log; by default the next free runs/NAME-N.
-        force: whether it may hold something already.
-        quiet: whether nothing is printed while it runs.
+        force: whether the folder may contain files already.
+        quiet: whether nothing is printed during the run.
 
     Raises:
         ScenarioError: the scenario or an override is not valid.
-        RunFailed: a process failed, or the run was interrupted; it says what the log holds.
+        RunFailed: a process failed, or the run was interrupted; the message says whether there
+            is a log.
     """
     chosen = load_scenario(scenario, set, duration_s=duration_s, seed=seed)
     folder = make_results_folder(None if out is None else Path(out), chosen.name, force=force)

@@ -1,9 +1,12 @@
-"""A hand of one's own in a process of its own: what `trilat hand` runs.
+"""A hand of the user's own in a process of its own: what `trilat hand` runs.
 
-Invariant: it sees what the site sends it, and nothing else of the session; each decision names
-the tick by whose view it was made, so that the site lets it act a fixed time after that. Views
-that are too old to act in time are skipped. If its class fails, it lets go and ends; if it is
-killed, the site notices the silence.
+Invariant:
+    - The hand sees the views that the site sends, and nothing else of the session.
+    - Each decision names the tick of its view, so that the site applies it a fixed time after
+      that tick.
+    - Views that are too old to act in time are skipped.
+    - If the hand's class fails, the hand releases the arm and the process ends. If the process
+      is killed, the site notices the silence.
 """
 
 from collections import deque
@@ -31,83 +34,92 @@ from trilat_net.scenario.operators.program_hand import (
 )
 
 POLL_NS = 500_000
-HERE_NS = 100_000_000
-"""Until the first view it says so often that it is there."""
+ANNOUNCE_PERIOD_NS = 100_000_000
+"""Period at which the hand announces itself before it has received its first view."""
 VIEWS_KEPT = 64
 
 
 class HandProcess(SiteClient):
-    """A program at the arm of a site.
+    """A user's own hand at the arm of a site.
+
+    Args:
+        hand_site: the site of the hand, and the settings of its class.
+        program: the hand.
+        bus: the bus to the session.
+        clock: the clock of this process.
+        session: the session's name.
 
     Attributes:
-        asked: number of views that it was asked by.
-        skipped: number of views that it had no time for.
+        asked: the number of views that the hand has decided on.
+        skipped: the number of views that were too old.
     """
 
     def __init__(
-        self, at: HandSite, program: HandProgram, bus: Bus, clock: Clock, session: str
+        self, hand_site: HandSite, program: HandProgram, bus: Bus, clock: Clock, session: str
     ) -> None:
-        super().__init__(bus, clock, session, at.name)
-        self.asked = self.skipped = 0
+        super().__init__(bus, clock, session, hand_site.name)
+        self.asked = 0
+        self.skipped = 0
         self._program = program
-        self._code = at.source
-        self._pushes = at.spec.mode == "force"
-        self._every = at.scenario.sites[at.name].rate_hz // at.rate_hz
-        self._sender = make_hand_sender(bus, clock, session, at.name)
-        self._views = bus.inbox(topics.key(session, at.name, topics.VIEW), VIEWS_KEPT)
-        self._here_ns = 0
-        self._waiting = deque[HandViewMessage]()
-        self._most = max(1, int(at.delay_s * at.rate_hz))
+        self._code = hand_site.source
+        self._pushes = hand_site.spec.mode == "force"
+        self._every = hand_site.scenario.sites[hand_site.name].rate_hz // hand_site.rate_hz
+        self._sender = make_hand_sender(bus, clock, session, hand_site.name)
+        self._views = bus.inbox(topics.key(session, hand_site.name, topics.VIEW), VIEWS_KEPT)
+        self._announced_ns = 0
+        self._waiting_views = deque[HandViewMessage]()
+        self._max_waiting = max(1, int(hand_site.delay_s * hand_site.rate_hz))
 
     def serve(self) -> None:
-        """Decides by the next view, if one has come; says before the first that it is there.
+        """Decides on the next view, if there is one; before the first view, announces the hand.
 
         Raises:
-            RunFailed: its class failed; it has let go.
+            RunFailed: the hand's class failed; the arm has been released.
         """
-        views = self._waiting
+        views = self._waiting_views
         views.extend(read_messages(self._views, HandViewMessage))
-        while len(views) > self._most:
+        while len(views) > self._max_waiting:
             self.skipped += 1
             views.popleft()
+        due_ns = self._announced_ns + ANNOUNCE_PERIOD_NS
         if views:
             self._decide(views.popleft())
-        elif not self.asked and self._clock.monotonic_ns() > self._here_ns + HERE_NS:
-            self._here_ns = self._clock.monotonic_ns()
+        elif not self.asked and self._clock.monotonic_ns() > due_ns:
+            self._announced_ns = self._clock.monotonic_ns()
             self._send(0, None)
 
     def _decide(self, message: HandViewMessage) -> None:
         self.asked += 1
         try:
             goal = self._program.act(read_view(message))
-            numbers = None if goal is None else [float(one) for one in goal]
-        except (Exception, SystemExit) as error:  # the user's code
+            numbers = None if goal is None else [float(number) for number in goal]
+        except (Exception, SystemExit) as error:  # whatever the user's code raises
             self._send(message.k, None)
-            problem = (
-                f"failed at tick {message.k}: {type(error).__name__}: {error}; it has let go"
-            )
+            class_name = self._code.split()[0]
             raise RunFailed(
-                f"the hand {self._code.split()[0]} of {message.site} {problem}"
+                f"the hand {class_name} of {message.site} failed at tick {message.k}: "
+                f"{type(error).__name__}: {error}; it has let go"
             ) from error
         self._send(message.k, numbers)
 
     def _send(self, k: int, goal: list[float] | None) -> None:
-        does = {"force" if self._pushes else "target": goal or [], "grip": goal is not None}
-        self._sender.send(HandMessage, source=self._code, n=k // self._every, **does)
+        """Sends the decision on the view of tick `k`; None releases the arm."""
+        fields = {"force" if self._pushes else "target": goal or [], "grip": goal is not None}
+        self._sender.send(HandMessage, source=self._code, n=k // self._every, **fields)
 
 
 def read_view(message: HandViewMessage) -> HandView:
-    """Returns what a hand sees, as its class is given it."""
+    """Returns the view of a message, with lists as arrays."""
 
-    def read(one: Any, names: tuple[str, ...]) -> Any:
-        values = ((name, getattr(one, name)) for name in names if name != "peers")
+    def read_fields(source: Any, names: tuple[str, ...]) -> Any:
+        values = {name: getattr(source, name) for name in names if name != "peers"}
         return {
             name: np.array(value) if isinstance(value, list) else value
-            for name, value in values
+            for name, value in values.items()
         }
 
-    peers = tuple(PeerView(**read(peer, PeerView._fields)) for peer in message.peers)
-    return HandView(**read(message, HandView._fields), peers=peers)
+    peers = tuple(PeerView(**read_fields(peer, PeerView._fields)) for peer in message.peers)
+    return HandView(**read_fields(message, HandView._fields), peers=peers)
 
 
 def run_hand(
@@ -121,18 +133,27 @@ def run_hand(
 ) -> None:
     """Runs the hand of a site until its session ends.
 
+    Args:
+        scenario: the scenario of the session.
+        name: the site of the hand.
+        session: the session's name.
+        connection: the endpoints and keys.
+        interrupt: the signals of this process.
+        say: prints a line for the user.
+        timeout_s: longest wait for the first view, s.
+
     Raises:
-        UsageError: the site has no hand of one's own, or not in a process of its own.
-        SessionError: the site does not ask in time.
-        RunFailed: its class failed.
+        UsageError: the site has no hand of the user's own in a separate process.
+        SessionError: the site does not send a view in time.
+        RunFailed: the hand's class failed.
     """
-    at = find_own_hand(scenario, name)
-    if at is None or not at.has_separate_process:
+    hand_site = find_own_hand(scenario, name)
+    if hand_site is None or not hand_site.has_separate_process:
         problem = "has no hand of kind 'own' with process = true"
         raise UsageError(
             f"{name} {problem}: its site runs such a hand itself, or there is none"
         )
-    program = make_hand_program(at)
+    program = make_hand_program(hand_site)
     clock = SystemClock()
     stopped = interrupt.is_requested
     give_up_ns = clock.monotonic_ns() + int(timeout_s * 1e9)
@@ -141,13 +162,15 @@ def run_hand(
     )
     if bus is None:
         return
-    with HandProcess(at=at, program=program, bus=bus, clock=clock, session=session) as hand:
-        say(f"{name}: its hand {at.program} is there")
+    with HandProcess(
+        hand_site=hand_site, program=program, bus=bus, clock=clock, session=session
+    ) as hand:
+        say(f"{name}: its hand {hand_site.program} is there")
         while not (stopped() or hand.over):
             hand.serve()
             if not hand.asked and clock.monotonic_ns() > give_up_ns:
                 raise SessionError(
-                    f"{name} did not ask its hand {at.program} within {timeout_s:g} s"
+                    f"{name} did not ask its hand {hand_site.program} within {timeout_s:g} s"
                 )
             clock.sleep_until(clock.monotonic_ns() + POLL_NS)
         say(

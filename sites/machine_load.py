@@ -1,7 +1,8 @@
-"""Load of this machine before a session begins on it: whether its processors have time left.
+"""Load of this machine before a session begins: whether its processors have time left.
 
-Invariant: a measurement changes nothing and takes a fifth of a second; where the system does
-not tell how busy it is, nothing is said.
+Invariant:
+    - A measurement changes nothing and takes 0.2 s.
+    - There is no warning if the operating system does not report its load.
 """
 
 from contextlib import suppress
@@ -15,17 +16,18 @@ from trilat_net.net.clock import Clock
 MEASURED_NS = 200_000_000
 """Time over which the load is measured."""
 BUSY_SHARE = 0.8
-"""A machine that is busy for this share of the time has none left for a recorder, which has no
-priority.
-"""
+"""Share of busy time above which a recorder, which has no priority, may get too little."""
 _STATISTICS = Path("/proc/stat")
 _IDLE_COLUMNS = slice(3, 5)  # idle, and waiting for a disk
-_TIME_COLUMNS = slice(0, 8)  # guests are counted in the time of users already
+_TIME_COLUMNS = slice(0, 8)  # without guests, whose time the column "user" includes
 
 
 class ProcessorTimes(NamedTuple):
-    """Time that all processors have spent since the machine was started, in ticks of the
-    system.
+    """Time that all processors have spent since the start of the machine, in system ticks.
+
+    Attributes:
+        idle: the time without work.
+        total: all time.
     """
 
     idle: int
@@ -39,9 +41,7 @@ class ProcessorTimes(NamedTuple):
 
 
 def measure_busy_share(clock: Clock) -> float | None:
-    """Returns the share of time for which the machine's processors are busy, 0 to 1; None if
-    unknown.
-    """
+    """Returns the share of time in which the processors are busy, 0 to 1; None if unknown."""
     with suppress(OSError, ValueError, IndexError):
         before = ProcessorTimes.parse(_STATISTICS.read_text(encoding="ascii"))
         clock.sleep_until(clock.monotonic_ns() + MEASURED_NS)
@@ -52,19 +52,18 @@ def measure_busy_share(clock: Clock) -> float | None:
 
 
 def describe_load(busy_share: float | None) -> str:
-    """Returns a warning about a busy machine, with what to do; "" if it has time left or does
-    not tell.
+    """Returns a warning about a busy machine, with a remedy.
+
+    Returns "" if the machine has time left, or if its load is unknown.
     """
     if busy_share is None or busy_share < BUSY_SHARE:
         return ""
     cores = process.count_cores()
-    processors = (
-        f"{count_nouns(cores, 'processor is', 'processors are')}"
-        if cores > 1
-        else "one processor is"
-    )
+    processors = "one processor is"
+    if cores > 1:
+        processors = count_nouns(cores, "processor is", "processors are")
     return (
-        f"this machine's {processors} {busy_share:.0%} busy with other programs, so that ticks may be "
-        "late and the recorder may miss records: end those programs, or lower the rate, as in "
-        "--set rate_hz=200"
+        f"this machine's {processors} {busy_share:.0%} busy with other programs, "
+        "so that ticks may be late and the recorder may miss records: "
+        "end those programs, or lower the rate, as in --set rate_hz=200"
     )

@@ -1,7 +1,7 @@
-"""A session in a terminal, a row for each site: what `trilat demo` and `trilat watch` show.
+"""The view of a session in a terminal: `trilat demo` and `trilat watch` show a row per site.
 
-A terminal shows a table that is refreshed; other outputs get the same rows as lines every two
-seconds.
+A terminal shows a table that is refreshed; other outputs receive the same rows as lines every
+two seconds.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,14 +30,14 @@ HEADS = ("site", "time", "mode", "angles", "|e|", "torque", AGES, "held", "late"
 NUMBERS = frozenset(("time", "|e|", "torque", "late", "overruns"))
 TABLE_NS = NS_PER_S // 4
 LINES_NS = 2 * NS_PER_S
-"""Between two updates of a table, and of lines."""
+"""Time between two updates of the table, and between two updates of the lines."""
 LOUD_EVENTS = frozenset(
     ("lost", "left", "join", "unheard", "heard", "diverged", "failed", "refused", "clock fault")
 )
-"""Kinds of events that a person who watches should read."""
+"""Kinds of events that are printed for the person who watches."""
 
 SiteRow = Mapping[str, str]
-"""A site's row, by `HEADS`."""
+"""The texts of a site's row, by the names in `HEADS`."""
 
 
 def describe_site(
@@ -49,73 +49,82 @@ def describe_site(
     ended: bool = False,
     silent_s: float = 0.0,
 ) -> SiteRow:
-    """Returns the row of a site by its newest record and statistics, as far as there are any.
+    """Returns the row of a site, from its newest record and statistics.
 
     Args:
-        scenario: of the session.
+        scenario: the scenario of the session.
         name: the site.
-        record: its newest record; None before the first.
-        stats: its newest statistics; None before the first.
-        ended: true once the site has said that it ends.
-        silent_s: for how long it was not heard, s; 0.0 if it was heard lately.
+        record: the newest record; None before the first.
+        stats: the newest statistics; None before the first.
+        ended: whether the site has published its end.
+        silent_s: the time since the site was heard, s; 0.0 if that was a moment ago.
     """
     row = dict.fromkeys(HEADS, "") | {"site": name, "mode": "braked"}
     if stats is not None:
-        aged = stats.age_us.items()
+        ages = [
+            f"{peer} {age_us / 1000:.0f} ms" if age_us >= 0 else f"{peer} none"
+            for peer, age_us in stats.age_us.items()
+        ]
         row |= {
             "time": f"{stats.t_ns / NS_PER_S:.1f} s",
             "mode": stats.mode,
-            AGES: ", ".join(
-                f"{peer} {age / 1000:.0f} ms" if age >= 0 else f"{peer} none"
-                for peer, age in aged
-            ),
+            AGES: ", ".join(ages),
             "late": f"{stats.late_max_us} us",
             "overruns": f"{stats.overruns}",
         }
     if record is not None:
-        own, desired = (np.array([v]) for v in (record.x or record.q, record.q_des))
-        e = (
-            compute_task_errors(own, desired, scenario.arms[name].axes)
-            if record.x
-            else own - desired
-        )
-        hand = HandInForce.read(record.hand) if record.hand else None
-        row |= {
-            "time": f"{record.t_ns / NS_PER_S:.1f} s",
-            "mode": record.mode,
-            "angles": describe_angles(record.q),
-            "|e|": f"{np.linalg.norm(e):.4f} {'m' if record.x else 'rad'}",
-            "torque": f"{max(map(abs, record.tau)):.2f} N m",
-            "held": ""
-            if hand is None
-            else "yes"
-            if hand.source
-            else "fades"
-            if hand.grip
-            else "free",
-        }
+        row |= _describe_record(scenario, name, record)
     if ended:
         return row | {"mode": "ended"}
     return row | {"mode": f"silent {silent_s:.0f} s"} if silent_s > 0.0 else row
 
 
+def _describe_record(scenario: Scenario, name: str, record: State) -> SiteRow:
+    """Returns the texts of a row that follow from a record."""
+    position = np.array([record.x or record.q])
+    desired = np.array([record.q_des])
+    if record.x:
+        unit = "m"
+        error = compute_task_errors(position, desired, scenario.arms[name].axes)
+    else:
+        unit = "rad"
+        error = position - desired
+    hand = HandInForce.read(record.hand) if record.hand else None
+    return {
+        "time": f"{record.t_ns / NS_PER_S:.1f} s",
+        "mode": record.mode,
+        "angles": describe_angles(record.q),
+        "|e|": f"{np.linalg.norm(error):.4f} {unit}",
+        "torque": f"{max(map(abs, record.tau)):.2f} N m",
+        "held": _describe_hold(hand),
+    }
+
+
+def _describe_hold(hand: HandInForce | None) -> str:
+    if hand is None:
+        return ""
+    if hand.source:
+        return "yes"
+    return "fades" if hand.grip else "free"
+
+
 def describe_angles(q: Sequence[float]) -> str:
-    """Returns joint angles as a row has them."""
+    """Returns the text of joint angles, rad."""
     return " ".join(f"{angle:+.3f}" for angle in q) + " rad"
 
 
 def describe_row(row: SiteRow) -> str:
-    """Returns a site in a line of text."""
-    words = {"|e|": "|e|", "torque": "torque", "age": AGES, "hand": "held", "late": "late"}
+    """Returns a site's row as a line of text."""
+    keys = {"|e|": "|e|", "torque": "torque", "age": AGES, "hand": "held", "late": "late"}
     parts = [f"{row['site']} {row['time']} {row['mode']}".strip(), row["angles"]]
-    return "; ".join(
-        [*parts, *(f"{word} {row[key]}" for word, key in words.items() if row[key])]
-    )
+    parts += [f"{word} {row[key]}" for word, key in keys.items() if row[key]]
+    return "; ".join(parts)
 
 
 def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
-    """Returns a block for each alarm: red, or yellow of a site that holds and goes on by
-    itself.
+    """Returns a panel for each alarm of a site.
+
+    A panel is red if the arm is stopped or in fault, and yellow if it continues by itself.
     """
     blocks = []
     for name, alarm in alarms:
@@ -129,13 +138,13 @@ def frame_alarms(alarms: Sequence[tuple[str, LifeAlarm]]) -> list[Panel]:
 
 
 class SessionDisplay:
-    """Shows rows of sites in a terminal; a context, which restores it."""
+    """Shows the rows of all sites; a context manager that restores the terminal."""
 
     def __init__(self, console: Console, clock: Clock) -> None:
         self._console = console
         self._clock = clock
         self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
-        self._shown_ns = clock.monotonic_ns()
+        self._updated_ns = clock.monotonic_ns()
         self._title = ""
 
     def __enter__(self) -> "SessionDisplay":
@@ -147,8 +156,8 @@ class SessionDisplay:
 
     @property
     def due(self) -> bool:
-        """True if what it shows is old."""
-        return self._clock.monotonic_ns() - self._shown_ns >= (
+        """True if it is time for the next update."""
+        return self._clock.monotonic_ns() - self._updated_ns >= (
             TABLE_NS if self._live else LINES_NS
         )
 
@@ -159,17 +168,14 @@ class SessionDisplay:
     def show(
         self, title: str, rows: Sequence[SiteRow], alarms: Sequence[tuple[str, LifeAlarm]] = ()
     ) -> None:
-        """Shows all sites, under what nobody may overlook."""
-        self._shown_ns = self._clock.monotonic_ns()
+        """Shows the rows of all sites, with the alarms above them."""
+        self._updated_ns = self._clock.monotonic_ns()
         if self._live is None:
-            shouted = [f"*** {name} {alarm}" for name, alarm in alarms]
-            titled = [title] if title != self._title else []
+            alarm_lines = [f"*** {name} {alarm}" for name, alarm in alarms]
+            title_lines = [title] if title != self._title else []
             self._title = title
-            for line in [
-                *titled,
-                *shouted,
-                *(describe_row(row) for row in rows if row["time"]),
-            ]:
+            row_lines = [describe_row(row) for row in rows if row["time"]]
+            for line in [*title_lines, *alarm_lines, *row_lines]:
                 self.say(line)
             return
         table = Table(title=escape(title), title_justify="left")
@@ -177,12 +183,13 @@ class SessionDisplay:
             table.add_column(head, justify="right" if head in NUMBERS else "left")
         for row in rows:
             table.add_row(*map(escape, row.values()))
-        self._live.start()  # not before: what ends at a signal until then could not restore the terminal
+        # Started only here: a signal before the first update would not restore the terminal.
+        self._live.start()
         self._live.update(Group(*frame_alarms(alarms), table), refresh=True)
 
 
 class SessionMonitor:
-    """What the sites of a session that is started here say of themselves, on a display."""
+    """Receives the messages of the sites, and shows them on a display."""
 
     def __init__(
         self, bus: Bus, session: str, scenario: Scenario, display: SessionDisplay
@@ -199,7 +206,7 @@ class SessionMonitor:
         }
 
     def poll(self) -> None:
-        """Takes the messages that have arrived, and shows them when that is due."""
+        """Receives the messages that have arrived, and updates the display if that is due."""
         scenario = self._scenario
         for stats in read_messages(self._links, LinkStats):
             if stats.site in self._states:
@@ -211,8 +218,8 @@ class SessionMonitor:
             for record in read_records(states, scenario.layout(name)):
                 self.records[name] = record
         if self._display.due:
-            known = [
-                (name, self.records.get(name), self.latest.get(name)) for name in scenario.names
+            rows = [
+                describe_site(scenario, name, self.records.get(name), self.latest.get(name))
+                for name in scenario.names
             ]
-            rows = [describe_site(scenario, *one) for one in known]
             self._display.show(f"{scenario.name}, {scenario.duration_s:g} s", rows)

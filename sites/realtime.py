@@ -1,8 +1,11 @@
-"""Real-time settings of a process: affinity, timer slack, locked memory, scheduling, garbage
-collector.
+"""Real-time settings of a process, such as its priority and its locked memory.
 
-Invariant: a step that fails warns and the site goes on. A loop without privileges runs as well
-as it can, and its log records the settings obtained.
+The settings are processor affinity, timer slack, memory, scheduling and garbage collection.
+
+Invariant:
+    - A setting that fails is reported, and the site continues.
+    - A loop without privileges runs as well as it can, and its log records the settings that it
+      obtained.
 """
 
 import ctypes
@@ -18,8 +21,9 @@ from trilat_net.errors import count_nouns
 FIFO_PRIORITY = 50
 NICE = -10
 SITES_PER_PROCESSOR = 2
-"""More loops with priority would keep Zenoh and recorders from running, and connections would
-be lost.
+"""Largest number of loops with priority on one processor.
+
+With more, Zenoh and the recorder would get too little time, and connections would be lost.
 """
 
 _PR_SET_TIMERSLACK = 29
@@ -29,23 +33,25 @@ _MCL_ONFAULT = 4
 
 
 def prepare(cpu: int | None, sites: int = 1) -> dict[str, str]:
-    """Requests every setting that helps a loop; returns what was obtained, by name.
+    """Requests every setting that helps a loop, and returns the obtained ones by name.
 
     Args:
-        cpu: the processor that it is bound to, if any.
-        sites: how many sites of the session run on this machine.
+        cpu: the processor to bind the process to; None for any.
+        sites: the number of sites of the session on this machine.
     """
     cpus = os.cpu_count() or 1
-    shared = f"normal ({count_nouns(sites, 'site shares', 'sites share')} {count_nouns(cpus, 'processor')})"
+    has_room = sites <= SITES_PER_PROCESSOR * cpus
+
+    def describe_shared() -> str:
+        shares = count_nouns(sites, "site shares", "sites share")
+        return f"normal ({shares} {count_nouns(cpus, 'processor')})"
+
+    memory_flags = _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT
     steps: dict[str, Callable[[], str]] = {
         "affinity": lambda: _set_affinity(cpu),
         "timer_slack": lambda: _call_libc("1 ns", "prctl", _PR_SET_TIMERSLACK, 1),
-        "memory": lambda: _call_libc(
-            "locked", "mlockall", _MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT
-        ),
-        "scheduling": _set_scheduling
-        if sites <= SITES_PER_PROCESSOR * cpus
-        else lambda: shared,
+        "memory": lambda: _call_libc("locked", "mlockall", memory_flags),
+        "scheduling": _set_scheduling if has_room else describe_shared,
         "collector": _stop_collector,
     }
     obtained = {}
@@ -92,8 +98,9 @@ def _set_scheduling() -> str:
 
 
 def _set_threads(change: Callable[[int], None]) -> None:
-    """Changes this thread and all others: one that waits for a processor may hold the
-    interpreter.
+    """Applies a change to this thread and then to all threads of the process.
+
+    Another thread that waits for a processor may hold the interpreter lock.
     """
     change(0)
     tasks = Path("/proc/self/task")

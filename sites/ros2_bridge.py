@@ -1,12 +1,17 @@
-"""The bridge of a session to the graph of ROS 2: orders as services, and topics that are hands
-and robots.
+"""The bridge between a session and the graph of ROS 2.
 
-Invariant: ROS never sits in a loop. What comes from it enters only as a hand's message, which
-the site limits, fades and records, or as a measurement of an external arm, so that a log is
-verified without ROS. A topic that two publishers share moves nothing; a target that falls
-silent for 200 ms lets go. A robot without a valid torque gets what is safe for it, never mere
-silence. Nothing that comes from ROS ends the bridge: it is refused, counted by its reason, and
-the first of each reason is said.
+Orders are services; topics of ROS can be hands and robots.
+
+Invariant:
+    - ROS never sits in a control loop. Its messages enter only as those of a hand, which the
+      site limits, fades and records, or as measurements of an external arm. A log is therefore
+      verified without ROS.
+    - A topic with two publishers moves nothing. A target that falls silent for 200 ms releases
+      the arm.
+    - A robot without a valid torque receives its safe command repeatedly; it never just
+      receives nothing.
+    - No message of ROS ends the bridge: it is refused and counted by reason, and the first
+      refusal of each reason is printed.
 """
 
 import math
@@ -33,44 +38,54 @@ from trilat_net.net.zenoh_bus import RouterSilent
 from trilat_net.net.zenoh_config import BRIDGE
 from trilat_net.scenario import Scenario, parse_embedded
 
-from .ros2_topics import RELIABLE, Ends, SiteTopics
+from .ros2_topics import RELIABLE, BridgeEnds, SiteTopics
 from .running_session import RunningSession, open_hand
 
 POLL_NS = 1_000_000
-"""Least time between two looks at what has come."""
-LOOK_NS = 200_000_000
-"""Between two looks for what is not there yet, or not any more."""
+"""Smallest time between two polls of the session's messages."""
+LOOK_PERIOD_NS = 200_000_000
+"""Time between two checks of the connection to the router."""
 SILENCE_NS = 200_000_000
-"""A target that nobody repeats for so long lets the arm go."""
-RIVAL_NS = NS_PER_S
-"""A publisher that was heard within this time has not gone."""
-SAFE_NS = 10_000_000
-"""Between two commands that say to a robot what is safe."""
-DRIVE_S = 0.001
-ASK_S = 0.05
-"""Between two looks for a torque; for shares that are wanted."""
+"""Time after which a target that is not repeated releases the arm."""
+SENDER_TIMEOUT_NS = NS_PER_S
+"""A publisher counts as present for this long after its last message."""
+SAFE_PERIOD_NS = 10_000_000
+"""Time between two safe commands to a robot."""
+DRIVE_PERIOD_S = 0.001
+"""Time between two checks for a new torque."""
+REQUEST_PERIOD_S = 0.05
+"""Time between two checks for newly requested shares."""
 TRIGGER = "std_srvs/srv/Trigger"
 
 
-class OneSender:
-    """Of several publishers that send on one topic none counts, until all but one are gone."""
+class SingleSender:
+    """Accepts the messages of a topic only while the topic has a single publisher."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._gid = b""
-        self._heard_ns = self._mixed_ns = clock.monotonic_ns() - RIVAL_NS
+        self._received_ns = clock.monotonic_ns() - SENDER_TIMEOUT_NS
+        self._mixed_ns = self._received_ns
 
     def admit(self, gid: bytes) -> int:
-        """Returns how long nothing had come before a message, ns; ValueError: two publishers
-        send.
+        """Accepts a message of a publisher.
+
+        Args:
+            gid: the identity of the publisher.
+
+        Returns:
+            The time since the previous message, ns.
+
+        Raises:
+            ValueError: two publishers send.
         """
         now_ns = self._clock.monotonic_ns()
-        silent_ns = now_ns - self._heard_ns
-        if self._gid not in (b"", gid) and silent_ns < RIVAL_NS:
+        silent_ns = now_ns - self._received_ns
+        if self._gid not in (b"", gid) and silent_ns < SENDER_TIMEOUT_NS:
             self._mixed_ns = now_ns
         self._gid = gid
-        self._heard_ns = now_ns
-        if now_ns - self._mixed_ns < RIVAL_NS:
+        self._received_ns = now_ns
+        if now_ns - self._mixed_ns < SENDER_TIMEOUT_NS:
             raise ValueError(
                 "has two publishers: neither moves the arm until the other is gone"
             )
@@ -78,61 +93,70 @@ class OneSender:
 
 
 class TargetTopic:
-    """A topic of ROS that holds an arm as a hand: `target_pose`, `target_joint` or
-    `target_wrench`.
+    """A topic of ROS that holds an arm: `target_pose`, `target_joint` or `target_wrench`.
 
-    `read` returns the goal of a message, or raises ValueError, and `act` gives it to the hand.
+    Args:
+        hand: the hand at the arm.
+        read: returns the goal of a message; raises ValueError.
+        apply: sends a goal to the site by the hand.
+        clock: the clock of this process.
     """
 
     def __init__(
         self,
         hand: Hand,
         read: Callable[[bytes], Sequence[float]],
-        act: Callable[..., int],
+        apply: Callable[..., int],
         clock: Clock,
     ) -> None:
         self.hand = hand
         self._read = read
-        self._act = act
+        self._apply = apply
         self._clock = clock
-        self._sender = OneSender(clock)
+        self._sender = SingleSender(clock)
         self._lock = threading.Lock()
-        self._held_ns: int | None = None
+        self._received_ns: int | None = None
 
-    def take(self, data: bytes, attachment: Attachment) -> None:
-        """Takes a message, in a thread of Zenoh's; raises ValueError or TrilatError if that
-        cannot be.
+    def receive(self, data: bytes, attachment: Attachment) -> None:
+        """Applies a message; called in a thread of Zenoh.
+
+        Raises:
+            ValueError: the message cannot be read, or there are two publishers.
+            TrilatError: the hand refuses the goal.
         """
         with self._lock:
             try:
                 self._sender.admit(attachment.gid)
             except ValueError:
-                self._let_go()
+                self._release_hand()
                 raise
-            self._act(*self._read(data))
-            self._held_ns = self._clock.monotonic_ns()
+            self._apply(*self._read(data))
+            self._received_ns = self._clock.monotonic_ns()
 
     def watch(self) -> None:
-        """Lets go where nobody has repeated the target."""
+        """Releases the arm if nobody has repeated the target for `SILENCE_NS`."""
         with self._lock:
-            if (
-                self._held_ns is not None
-                and self._clock.monotonic_ns() - self._held_ns > SILENCE_NS
-            ):
-                self._let_go()
+            if self._received_ns is None:
+                return
+            if self._clock.monotonic_ns() - self._received_ns > SILENCE_NS:
+                self._release_hand()
 
-    def _let_go(self) -> None:
-        if self._held_ns is not None:
-            self._held_ns = None
+    def _release_hand(self) -> None:
+        if self._received_ns is not None:
+            self._received_ns = None
             self.hand.release()
 
 
 class DominanceTopic:
-    """A topic of ROS that sets the shares of a site in its peers, `set_dominance`; the newest
-    message wins.
+    """A topic of ROS that sets the shares of a site in its peers, `set_dominance`.
 
-    One that only repeats what was asked for, without a pause of a second, asks for nothing. Its
-    numbers are in the order of `peers`; `change` asks the site, and waits until it agrees.
+    The newest message wins. Messages that repeat the last request are ignored, unless nothing
+    has arrived for a second.
+
+    Args:
+        peers: the peers, in the order of a message's numbers.
+        change: requests shares from the site, and waits until it accepts.
+        clock: the clock of this process.
     """
 
     def __init__(
@@ -140,149 +164,176 @@ class DominanceTopic:
     ) -> None:
         self._peers = peers
         self._change = change
-        self._sender = OneSender(clock)
-        self._wanted: dict[str, float] | None = None
-        self._asked: dict[str, float] | None = None
+        self._sender = SingleSender(clock)
+        self._requested: dict[str, float] | None = None
+        self._sent_request: dict[str, float] | None = None
 
-    def take(self, data: bytes, attachment: Attachment) -> None:
-        """Takes a message, in a thread of Zenoh's; raises ValueError if that cannot be."""
+    def receive(self, data: bytes, attachment: Attachment) -> None:
+        """Stores the shares of a message; called in a thread of Zenoh.
+
+        Raises:
+            ValueError: the message cannot be read, or there are two publishers.
+        """
         shares = _check_finite(cdr.read_float_array(data))
         if len(shares) != len(self._peers):
-            raise ValueError(
-                f"has {count_nouns(len(shares), 'number')}; the peers are {', '.join(self._peers)}"
-            )
-        if self._sender.admit(attachment.gid) > RIVAL_NS:
-            self._asked = None
-        self._wanted = dict(zip(self._peers, shares, strict=True))
+            size = count_nouns(len(shares), "number")
+            raise ValueError(f"has {size}; the peers are {', '.join(self._peers)}")
+        if self._sender.admit(attachment.gid) > SENDER_TIMEOUT_NS:
+            self._sent_request = None
+        self._requested = dict(zip(self._peers, shares, strict=True))
 
-    def ask(self) -> None:
-        """Asks the site for what is wanted, if that is new; raises TrilatError if it refuses."""
-        wanted = self._wanted
-        if wanted is not None and wanted != self._asked:
-            self._asked = wanted
-            self._change(wanted)
+    def send_request(self) -> None:
+        """Requests the stored shares from the site, if they are new.
+
+        Raises:
+            TrilatError: the site refuses the shares.
+        """
+        requested = self._requested
+        if requested is not None and requested != self._sent_request:
+            self._sent_request = requested
+            self._change(requested)
 
 
 class RobotArm:
-    """A robot of ROS that is the arm of a site: the site gets its joint states, it gets the
-    site's torque.
+    """A robot of ROS that is the external arm of a site.
 
-    It is the program of an external arm, see `ArmClient`. Where that has to brake, the robot's
-    controller gets again and again what is safe for it. Of each joint, in the scenario's order,
-    `joints` has the names by which the robot may call it; `make` returns a client of whatever
-    start of the site. Until it is `armed` the robot gets nothing but what is safe.
+    The site receives the robot's joint states, and the robot receives the site's torque, as
+    with `ArmClient`. If the arm must brake, the robot's controller receives its safe command
+    repeatedly.
+
+    Args:
+        make_client: returns a client of the site's present boot.
+        joints: the names by which the robot may call each joint, in the scenario's order.
+        robot: the settings of the robot.
+        commands: the publisher of the robot's commands.
+        clock: the clock of this process.
+
+    Attributes:
+        armed: False as long as the robot must receive safe commands only.
 
     Raises:
-        UsageError: the controller has not one number for each joint.
+        UsageError: the settings do not have one number for each joint.
     """
 
     def __init__(
         self,
-        make: Callable[[], ArmClient],
+        make_client: Callable[[], ArmClient],
         joints: Sequence[Sequence[str]],
         robot: RobotTable,
         commands: TopicPublisher,
         clock: Clock,
     ) -> None:
         self.armed = False
-        self._make = make
-        self._client = make()
+        self._make_client = make_client
+        self._client = make_client()
         self._joints = joints
-        order = robot.controller or [called[0] for called in joints]
-        self._order = [n for name in order for n, called in enumerate(joints) if name in called]
+        controller = robot.controller or [names[0] for names in joints]
+        self._joint_order = [
+            index for name in controller for index, names in enumerate(joints) if name in names
+        ]
         self._safe = robot.safe or [0.0] * len(joints)
-        whole = sorted(self._order) == list(range(len(joints))) and len(order) == len(joints)
-        if (
-            not whole
-            or len(self._safe) != len(joints)
-            or not all(map(math.isfinite, self._safe))
-        ):
-            named = ", ".join(called[0] for called in joints)
+        count = len(joints)
+        is_complete = (
+            sorted(self._joint_order) == list(range(count)) and len(controller) == count
+        )
+        is_safe_valid = len(self._safe) == count and all(map(math.isfinite, self._safe))
+        if not is_complete or not is_safe_valid:
+            known = ", ".join(names[0] for names in joints)
             raise UsageError(
-                f"--names: `controller` and `safe` have one of each joint: {named}"
+                f"--names: `controller` and `safe` have one of each joint: {known}"
             )
-        self._pack = cdr.make_float_array_packer((" ".join(order), len(order)))
+        self._pack = cdr.make_float_array_packer((" ".join(controller), len(controller)))
         self._commands = commands
         self._clock = clock
-        self._sender = OneSender(clock)
+        self._sender = SingleSender(clock)
         self._lock = threading.Lock()
-        self._sent: tuple[int, int] | None = (
-            None  # boot and tick of the record whose torque went out last
-        )
-        self._safe_ns = clock.monotonic_ns() - SAFE_NS
+        # Boot and tick of the record whose torque was published last.
+        self._sent_tick: tuple[int, int] | None = None
+        self._safe_ns = clock.monotonic_ns() - SAFE_PERIOD_NS
 
-    def take(self, data: bytes, attachment: Attachment) -> None:
-        """Takes a message, in a thread of Zenoh's, unless it is of another robot; ValueError:
-        it is none.
+    def receive(self, data: bytes, attachment: Attachment) -> None:
+        """Sends the site the joint states of a message; called in a thread of Zenoh.
+
+        A message of another robot, which has none of the joints, is ignored.
+
+        Raises:
+            ValueError: the message cannot be read, or there are two publishers.
         """
-        found = cdr.read_joint_state(data)
-        if found.names and not any(
-            name in found.names for called in self._joints for name in called
-        ):
+        state = cdr.read_joint_state(data)
+        known_names = {name for names in self._joints for name in names}
+        if state.names and known_names.isdisjoint(state.names):
             return
-        at = find_joint_places(self._joints, found)
-        if len(found.velocity) != len(found.position):
-            raise ValueError(
-                f"has {count_nouns(len(found.position), 'position')} and "
-                f"{count_nouns(len(found.velocity), 'velocity')}"
-            )
-        q, qd = (
-            _check_finite([row[n] for n in at]) for row in (found.position, found.velocity)
-        )
+        indices = find_joint_indices(self._joints, state)
+        if len(state.velocity) != len(state.position):
+            positions = count_nouns(len(state.position), "position")
+            velocities = count_nouns(len(state.velocity), "velocity")
+            raise ValueError(f"has {positions} and {velocities}")
+        q = _check_finite([state.position[index] for index in indices])
+        qd = _check_finite([state.velocity[index] for index in indices])
         with self._lock:
             self._sender.admit(attachment.gid)
-            self._client.send(q, qd, stamp_ns=found.stamp_ns)
+            self._client.send(q, qd, stamp_ns=state.stamp_ns)
 
-    def drive(self) -> None:
-        """Publishes the torque of the newest record, once, or what is safe."""
-        if self._client.over:  # the site may come again
+    def send_command(self) -> None:
+        """Publishes the torque of the newest record once, or the safe command."""
+        if self._client.over:  # the site may rejoin with another boot
             with self._lock:
-                self._client = self._make()
+                self._client = self._make_client()
         record = self._client.record
-        torque = self._client.torque()  # of that record, or a newer one
+        torque = self._client.torque()  # of that record, or of a newer one
         if (
             not self.armed
             or torque is None
             or record is None
-            or len(torque) != len(self._order)
+            or len(torque) != len(self._joint_order)
         ):
-            if self._clock.monotonic_ns() - self._safe_ns >= SAFE_NS:
-                self.brake()
-        elif self._sent != (record.boot, record.tick):
-            self._sent = record.boot, record.tick
-            self._commands.put(self._pack(*(torque[n] for n in self._order)))
+            if self._clock.monotonic_ns() - self._safe_ns >= SAFE_PERIOD_NS:
+                self.send_safe_command()
+        elif self._sent_tick != (record.boot, record.tick):
+            self._sent_tick = (record.boot, record.tick)
+            self._commands.put(self._pack(*(torque[index] for index in self._joint_order)))
 
-    def brake(self) -> None:
-        """Publishes what is safe."""
+    def send_safe_command(self) -> None:
+        """Publishes the safe command."""
         self._safe_ns = self._clock.monotonic_ns()
         self._commands.put(self._pack(*self._safe))
 
 
-def find_joint_places(names: Sequence[Sequence[str]], found: cdr.RosJoints) -> list[int]:
-    """Returns where joints, of some names each, stand in a message; ValueError: one is not
-    there once.
+def find_joint_indices(joints: Sequence[Sequence[str]], state: cdr.RosJoints) -> list[int]:
+    """Returns the index of each joint in a message.
+
+    Args:
+        joints: the names that each joint may have.
+        state: the message.
+
+    Raises:
+        ValueError: a joint is missing, or appears twice.
     """
-    if len(found.names) != len(found.position):
-        raise ValueError(
-            f"has {count_nouns(len(found.names), 'name')} and {count_nouns(len(found.position), 'position')}"
-        )
-    at = {name: n for n, name in enumerate(found.names)}
-    lacking = [called[0] for called in names if not at.keys() & set(called)]
-    if lacking:
-        raise ValueError(
-            f"lacks {', '.join(lacking)}; it has {', '.join(found.names[:9]) or 'no names'}"
-        )
-    if twice := [name for called in names for name in called if found.names.count(name) > 1]:
-        raise ValueError(f"has {twice[0]} twice")
-    return [next(at[name] for name in called if name in at) for called in names]
+    if len(state.names) != len(state.position):
+        name_count = count_nouns(len(state.names), "name")
+        position_count = count_nouns(len(state.position), "position")
+        raise ValueError(f"has {name_count} and {position_count}")
+    indices = {name: index for index, name in enumerate(state.names)}
+    missing = [names[0] for names in joints if not indices.keys() & set(names)]
+    if missing:
+        present = ", ".join(state.names[:9]) or "no names"
+        raise ValueError(f"lacks {', '.join(missing)}; it has {present}")
+    for names in joints:
+        for name in names:
+            if state.names.count(name) > 1:
+                raise ValueError(f"has {name} twice")
+    return [next(indices[name] for name in names if name in indices) for names in joints]
 
 
-def read_joint_target(names: Sequence[Sequence[str]], data: bytes) -> list[float]:
-    """Returns the angles of a `JointState` in an arm's order; ValueError: it lacks one, or is
-    none.
+def read_joint_target(joints: Sequence[Sequence[str]], data: bytes) -> list[float]:
+    """Returns the angles of a `JointState` in the order of an arm's joints, rad.
+
+    Raises:
+        ValueError: the message cannot be read, or lacks a joint.
     """
-    found = cdr.read_joint_state(data)
-    return _check_finite([found.position[n] for n in find_joint_places(names, found)])
+    state = cdr.read_joint_state(data)
+    indices = find_joint_indices(joints, state)
+    return _check_finite([state.position[index] for index in indices])
 
 
 def _check_finite(numbers: Sequence[float]) -> list[float]:
@@ -291,39 +342,51 @@ def _check_finite(numbers: Sequence[float]) -> list[float]:
     return list(numbers)
 
 
-def read_place_target(frame: str, axes: int, count: int, data: bytes) -> list[float]:
-    """Returns the place of a `PoseStamped` (7 numbers) or the force of a `WrenchStamped` (6),
-    by the axes.
+def read_vector_target(frame: str, axes: int, count: int, data: bytes) -> list[float]:
+    """Returns the position of a `PoseStamped`, m, or the force of a `WrenchStamped`, N.
+
+    Args:
+        frame: the frame in which the arm expects the vector.
+        axes: the number of coordinates to return.
+        count: how many numbers the message has: 7 of a pose, 6 of a wrench.
+        data: the message.
 
     Raises:
-        ValueError: it cannot be read, is in another frame than this or none, or a number is not
-            finite.
+        ValueError: the message cannot be read, is in another frame, or has a number that is
+            not finite.
     """
-    found, numbers = cdr.read_frame_vectors(data, count)
-    if found not in ("", frame):
-        raise ValueError(f"is in the frame {found[:80]!r}, and here it is {frame!r}")
+    message_frame, numbers = cdr.read_frame_vectors(data, count)
+    if message_frame not in ("", frame):
+        raise ValueError(f"is in the frame {message_frame[:80]!r}, and here it is {frame!r}")
     return _check_finite(numbers[:axes])
 
 
 class Bridge:
-    """The bridge of a session that runs; its topics and services are there from now on.
+    """The bridge of a running session; its topics and services exist from its creation on.
 
-    By their topics, `targets` are what holds an arm, and `dominance` what changes who leads.
+    Args:
+        ends: the graph and the session.
+        scenario: the scenario of the session.
+        epoch_unix_ns: the session's epoch in Unix time.
+
+    Attributes:
+        targets: the topics that hold an arm, by name.
+        dominance: the topics that set the shares of a site, by name.
     """
 
-    def __init__(self, ends: Ends, scenario: Scenario, epoch_unix_ns: int) -> None:
-        graph, bus, clock, session, _ = self._ends = ends
-        self._records, self._events, self._links = (
-            bus.inbox(topics.key(session, "*", channel), 4096)
-            for channel in (topics.STATE, topics.EVENT, topics.LINK)
-        )
+    def __init__(self, ends: BridgeEnds, scenario: Scenario, epoch_unix_ns: int) -> None:
+        graph, bus, clock, session, _ = ends
+        self._ends = ends
+        self._records = bus.inbox(topics.key(session, "*", topics.STATE), 4096)
+        self._events = bus.inbox(topics.key(session, "*", topics.EVENT), 4096)
+        self._links = bus.inbox(topics.key(session, "*", topics.LINK), 4096)
         self._presence = bus.presence(topics.presence_key(session, "*"))
         self._present = set[topics.KeyParts]()
-        self._met = False
+        self._has_met_site = False
         self._epoch_unix_ns = epoch_unix_ns
-        frames, self._diagnostics = (
-            graph.publisher(topic, COMMON_TOPICS[topic].kind, RELIABLE)
-            for topic in (FRAMES, DIAGNOSTICS)
+        frames = graph.publisher(FRAMES, COMMON_TOPICS[FRAMES].kind, RELIABLE)
+        self._diagnostics = graph.publisher(
+            DIAGNOSTICS, COMMON_TOPICS[DIAGNOSTICS].kind, RELIABLE
         )
         self._lines = {
             name: graph.publisher(f"{session}/{name}", channel.kind, RELIABLE)
@@ -342,13 +405,13 @@ class Bridge:
         running = RunningSession(session, Connection(), bus)
         self.targets = dict[str, TargetTopic]()
         self.dominance = dict[str, DominanceTopic]()
-        for name, shown in self._sites.items():
+        for name, site_topics in self._sites.items():
             for event in list_past_events(bus, clock, session, name):
-                shown.shares.take(event.command)
+                site_topics.shares.add_change(event.command)
             topic = ends.topic(name, "set_dominance")
             change = partial(running.set_dominance, name)
             self.dominance[topic] = DominanceTopic(scenario.peers(name), change, clock)
-            graph.subscribe(topic, cdr.FLOAT64_ARRAY, self.dominance[topic].take)
+            graph.subscribe(topic, cdr.FLOAT64_ARRAY, self.dominance[topic].receive)
         for name in scenario.open_hands:
             hand = open_hand(
                 bus=bus,
@@ -358,39 +421,46 @@ class Bridge:
                 scenario=scenario,
                 source="ros2",
             )
-            last, kind, read, act = describe_target(
-                scenario, name, hand, self._sites[name].frame
-            )
-            topic = ends.topic(name, last)
-            self.targets[topic] = TargetTopic(hand, read, act, clock)
-            graph.subscribe(topic, kind, self.targets[topic].take)
+            frame = self._sites[name].frame
+            topic_name, kind, read, apply = describe_target(scenario, name, hand, frame)
+            topic = ends.topic(name, topic_name)
+            self.targets[topic] = TargetTopic(hand, read, apply, clock)
+            graph.subscribe(topic, kind, self.targets[topic].receive)
         serve_orders(graph, running, scenario.names)
 
     def run(
         self, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
     ) -> bool:
-        """Shows the session at a rate, the newest record each time, until it ends or `stopped`.
+        """Publishes the session until it ends or `stopped` returns True.
 
-        Returns True if another session has begun under its name.
+        Args:
+            rate_hz: the rate at which the newest records are published, 1/s.
+            stopped: returns True to end the call.
+            say: prints a line for the user.
+
+        Returns:
+            True if another session has begun under the same name.
         """
         clock = self._ends.clock
-        connected = True
-        wake_ns = looked_ns = diagnosed_ns = clock.monotonic_ns()
+        is_connected = True
+        now_ns = clock.monotonic_ns()
+        wake_ns = now_ns
+        checked_ns = now_ns
+        diagnosed_ns = now_ns
         poll_ns = max(POLL_NS, int(NS_PER_S / (5.0 * rate_hz)))
-        while not (stopped() or (self._met and not self._present)):
-            if self._show(rate_hz):
+        while not (stopped() or (self._has_met_site and not self._present)):
+            if self._publish_messages(rate_hz):
                 return True
             for target in self.targets.values():
                 target.watch()
             now_ns = clock.monotonic_ns()
-            if now_ns - looked_ns > LOOK_NS:
-                looked_ns = now_ns
-                before = connected
-                connected = self._ends.graph.connected
-                if connected != before:
-                    say(
-                        f"the router of ROS {'is back' if connected else 'is gone: waiting for it'}"
-                    )
+            if now_ns - checked_ns > LOOK_PERIOD_NS:
+                checked_ns = now_ns
+                was_connected = is_connected
+                is_connected = self._ends.graph.connected
+                if is_connected != was_connected:
+                    state = "is back" if is_connected else "is gone: waiting for it"
+                    say(f"the router of ROS {state}")
             if now_ns - diagnosed_ns > NS_PER_S:
                 diagnosed_ns = now_ns
                 self._diagnose()
@@ -398,20 +468,21 @@ class Bridge:
             clock.sleep_until(wake_ns)
         return False
 
-    def _show(self, rate_hz: float) -> bool:
-        """Shows what has come; returns whether another session has begun under the name of this
-        one.
+    def _publish_messages(self, rate_hz: float) -> bool:
+        """Publishes the messages that have arrived from the session.
+
+        Returns:
+            True if another session has begun under the same name.
         """
         for record in read_records(self._records):
             if record.site in self._sites:
                 self._sites[record.site].show(record, rate_hz)
-        anew = False
+        has_new_epoch = False
         for event in read_messages(self._events, Event):
-            anew = anew or (
-                event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns
-            )
+            if event.kind == "epoch" and event.epoch_unix_ns != self._epoch_unix_ns:
+                has_new_epoch = True
             if event.member in self._sites:
-                self._sites[event.member].shares.take(event.command)
+                self._sites[event.member].shares.add_change(event.command)
             for name, data in pack_event(event, self._ends.clock.unix_ns()):
                 self._lines[name].put(data)
         for stats in read_messages(self._links, LinkStats):
@@ -420,22 +491,26 @@ class Bridge:
         for parts, alive in topics.read_presence(self._presence):
             if parts.member in self._sites:
                 (self._present.add if alive else self._present.discard)(parts)
-                self._met = True
-        return anew
+                self._has_met_site = True
+        return has_new_epoch
 
     def _diagnose(self) -> None:
-        records = [shown.newest for shown in self._sites.values() if shown.newest is not None]
+        """Publishes the diagnostics of all sites, if somebody listens."""
+        newest = [site_topics.newest for site_topics in self._sites.values()]
+        records = [record for record in newest if record is not None]
         if self._diagnostics.has_subscribers:
-            self._diagnostics.put(
-                pack_session_diagnostics(self._ends.session, self._epoch_unix_ns, records)
-            )
+            data = pack_session_diagnostics(self._ends.session, self._epoch_unix_ns, records)
+            self._diagnostics.put(data)
 
 
 def describe_target(
     scenario: Scenario, site: str, hand: Hand, frame: str
 ) -> tuple[str, str, Callable[[bytes], Sequence[float]], Callable[..., int]]:
-    """Returns how the live hand of a site is moved, in a frame: topic, type, what reads it,
-    what it does.
+    """Returns how the live hand of a site is moved by a topic.
+
+    Returns:
+        The topic's name and type, a function that reads the goal of a message, and the method
+        of the hand that sends the goal.
     """
     live = scenario.sites[site].find_live_hand(is_open=True)
     assert live is not None
@@ -444,27 +519,24 @@ def describe_target(
         read = partial(read_joint_target, list_joint_names(scenario, site))
         return "target_joint", cdr.JOINT_STATE, read, hand.turn
     if live.mode == "force":
-        return (
-            "target_wrench",
-            cdr.WRENCH,
-            partial(read_place_target, frame, axes, 6),
-            hand.push,
-        )
-    return "target_pose", cdr.POSE, partial(read_place_target, frame, axes, 7), hand.move
+        read = partial(read_vector_target, frame, axes, 6)
+        return "target_wrench", cdr.WRENCH, read, hand.push
+    read = partial(read_vector_target, frame, axes, 7)
+    return "target_pose", cdr.POSE, read, hand.move
 
 
 def list_joint_names(scenario: Scenario, site: str) -> list[tuple[str, ...]]:
-    """Returns the names of each joint of a site: the one that its topics show, and that of the
-    scenario.
-    """
-    pairs = zip(
-        Ros2SiteChannels(scenario, site).joints, scenario.arms[site].joint_names, strict=True
-    )
+    """Returns the names of each joint of a site: that of its topics, and the scenario's."""
+    topic_names = Ros2SiteChannels(scenario, site).joints
+    pairs = zip(topic_names, scenario.arms[site].joint_names, strict=True)
     return [tuple(dict.fromkeys(pair)) for pair in pairs]
 
 
 def serve_orders(graph: Ros2Graph, running: RunningSession, sites: Sequence[str]) -> None:
-    """Offers the services of a session: `/<session>/stop`, `/<session>/<site>/stop`, ..."""
+    """Offers the orders of a session as services.
+
+    Their names are `/<session>/stop`, `/<session>/<site>/stop` and so on.
+    """
 
     def serve(order: Callable[..., list[str]], *site: str) -> None:
         name = "/".join([running.name, *site, order.__name__])
@@ -485,13 +557,14 @@ def _answer(order: Callable[..., list[str]], *sites: str) -> bytes:
 
 
 @contextmanager
-def _repeated(
-    period_s: float, act: Callable[[], None], last: Callable[[], None] = lambda: None
+def _repeat_in_thread(
+    period_s: float, act: Callable[[], None], finish: Callable[[], None] = lambda: None
 ) -> Iterator[None]:
-    over = threading.Event()
+    """Calls `act` every `period_s` in a thread, and `finish` after the thread has ended."""
+    is_over = threading.Event()
 
     def repeat() -> None:
-        while not over.wait(period_s):
+        while not is_over.wait(period_s):
             act()
 
     thread = threading.Thread(target=repeat, daemon=True)
@@ -499,9 +572,9 @@ def _repeated(
     try:
         yield
     finally:
-        over.set()
+        is_over.set()
         thread.join()
-        last()
+        finish()
 
 
 def serve_ros2(
@@ -513,51 +586,62 @@ def serve_ros2(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> None:
-    """Joins a session to the graph of ROS 2 until it ends, or `stopped`; waits for a router and
-    for it.
+    """Publishes a session in the graph of ROS 2 until it ends or `stopped` returns True.
 
-    `timeout_s` is the longest wait for the first site or its router.
+    It waits for a router of ROS and for the session.
+
+    Args:
+        running: the session.
+        open_graph: connects to the graph of ROS 2.
+        rate_hz: the rate at which records are published, 1/s.
+        table: the names of the topics, and the robots.
+        stopped: returns True to end the call.
+        say: prints a line for the user.
+        timeout_s: longest wait for the first site or its router, s.
 
     Raises:
-        UsageError: no router, or what the table says of a robot does not fit the session.
+        UsageError: there is no router, or the settings of a robot do not fit the session.
     """
     clock = SystemClock()
     with running.reach(BRIDGE, timeout_s) as bus:
-        began_anew = True
-        told = False
-        while began_anew and not stopped():
+        has_new_epoch = True
+        is_announced = False
+        while has_new_epoch and not stopped():
             try:
                 graph = open_graph(Refusals(say))
             except RouterSilent as silent:
-                if not told:
+                if not is_announced:
                     say(f"{silent}: waiting for it")
-                told = True
-                clock.sleep_until(clock.monotonic_ns() + LOOK_NS)
+                is_announced = True
+                clock.sleep_until(clock.monotonic_ns() + LOOK_PERIOD_NS)
                 continue
             with graph:
-                ends = Ends(
+                ends = BridgeEnds(
                     graph=graph, bus=bus, clock=clock, session=running.name, table=table
                 )
-                began_anew = show_session(ends, rate_hz, stopped, say)
+                has_new_epoch = show_session(ends, rate_hz, stopped, say)
 
 
 def show_session(
-    ends: Ends, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
+    ends: BridgeEnds, rate_hz: float, stopped: Callable[[], bool], say: Callable[[str], None]
 ) -> bool:
-    """Shows a session until it ends or `stopped`; waits for it to begin, which the arms of
-    robots let it.
+    """Waits for a session, and publishes it until it ends or `stopped` returns True.
 
-    Returns True if another one has begun under its name.
+    The robots are connected before, because the session begins only with their arms.
+
+    Returns:
+        True if another session has begun under the same name.
     """
     with ExitStack() as stack:
         robots: dict[str, RobotArm] = {}
         for site, robot in ends.table.robots.items():
-            if robot.joints:  # as it can begin before any site answers
+            if robot.joints:  # such a robot can start before any site replies
                 robots[site] = stack.enter_context(open_robot(ends, site, robot))
         say(f"waiting for session {ends.session!r} to begin")
-        if (met := await_site(ends, stopped, running=False)) is None:
+        info = await_site(ends, stopped, running=False)
+        if info is None:
             return False
-        scenario = parse_embedded(met.scenario, ends.session)
+        scenario = parse_embedded(info.scenario, ends.session)
         refuse_other_robots(ends.table, scenario)
         for site in scenario.outside:
             if site not in robots:
@@ -565,57 +649,72 @@ def show_session(
                 names = list_joint_names(scenario, site)
                 robots[site] = stack.enter_context(open_robot(ends, site, robot, names))
             robots[site].armed = True
-        if (begun := await_site(ends, stopped, running=True)) is None:
+        running_info = await_site(ends, stopped, running=True)
+        if running_info is None:
             return False
-        bridge = Bridge(ends, scenario, begun.epoch_unix_ns)
+        bridge = Bridge(ends, scenario, running_info.epoch_unix_ns)
         for target in bridge.targets.values():
             stack.enter_context(target.hand)
-        for topic, shares in bridge.dominance.items():
-            stack.enter_context(_repeated(ASK_S, ends.graph.refusals.guard(topic, shares.ask)))
-        held = [f"; /{topic} holds an arm" for topic in bridge.targets]
-        held += [
-            f"; /{ends.topic(site, 'robot_states')} measures the arm of {site}"
-            for site in robots
-        ]
+        for topic, dominance in bridge.dominance.items():
+            send_request = ends.graph.refusals.guard(topic, dominance.send_request)
+            stack.enter_context(_repeat_in_thread(REQUEST_PERIOD_S, send_request))
+        inputs = [f"; /{topic} holds an arm" for topic in bridge.targets]
+        for site in robots:
+            topic = ends.topic(site, "robot_states")
+            inputs.append(f"; /{topic} measures the arm of {site}")
         say(
-            f"session {ends.session} is in the graph of ROS 2: /{ends.session}/...{''.join(held)}"
+            f"session {ends.session} is in the graph of ROS 2: "
+            f"/{ends.session}/...{''.join(inputs)}"
         )
         return bridge.run(rate_hz, stopped, say)
 
 
 @contextmanager
 def open_robot(
-    ends: Ends, site: str, robot: RobotTable, joints: Sequence[Sequence[str]] = ()
+    ends: BridgeEnds, site: str, robot: RobotTable, joints: Sequence[Sequence[str]] = ()
 ) -> Iterator[RobotArm]:
-    """Yields the robot of a site, which is heard and driven meanwhile, and brakes at the end."""
+    """Yields the robot of a site, which is received and commanded meanwhile.
+
+    At the end, the robot receives its safe command.
+    """
     commands = ends.graph.publisher(
         ends.topic(site, "robot_commands"), cdr.FLOAT64_ARRAY, RELIABLE
     )
-    make = partial(ArmClient, ends.bus, ends.clock, ends.session, site)
+    make_client = partial(ArmClient, ends.bus, ends.clock, ends.session, site)
     names = joints or [(name,) for name in robot.joints]
-    arm = RobotArm(make=make, joints=names, robot=robot, commands=commands, clock=ends.clock)
-    ends.graph.subscribe(ends.topic(site, "robot_states"), cdr.JOINT_STATE, arm.take)
-    with _repeated(DRIVE_S, arm.drive, arm.brake):
+    arm = RobotArm(
+        make_client=make_client, joints=names, robot=robot, commands=commands, clock=ends.clock
+    )
+    ends.graph.subscribe(ends.topic(site, "robot_states"), cdr.JOINT_STATE, arm.receive)
+    with _repeat_in_thread(DRIVE_PERIOD_S, arm.send_command, arm.send_safe_command):
         yield arm
 
 
 def refuse_other_robots(table: TopicTable, scenario: Scenario) -> None:
-    """Raises UsageError if the table has the robot of a site without an external arm."""
+    """Checks that each robot of the table belongs to a site with an external arm.
+
+    Raises:
+        UsageError: a robot belongs to another site.
+    """
     for site, robot in table.robots.items():
-        if site not in scenario.outside and (
-            robot != RobotTable() or site not in scenario.names
-        ):
-            able = ", ".join(scenario.outside) or "none"
+        has_settings = robot != RobotTable() or site not in scenario.names
+        if site not in scenario.outside and has_settings:
+            outside = ", ".join(scenario.outside) or "none"
             raise UsageError(
-                f"--names: sites.{site}: there is no external arm; sites with one: {able}"
+                f"--names: sites.{site}: there is no external arm; sites with one: {outside}"
             )
 
 
-def await_site(ends: Ends, stopped: Callable[[], bool], *, running: bool) -> Info | None:
-    """Returns what a site answers, of a session that is to be running or not; None if
-    `stopped`.
+def await_site(ends: BridgeEnds, stopped: Callable[[], bool], *, running: bool) -> Info | None:
+    """Waits for the reply of a site; returns None if `stopped` returns True first.
+
+    Args:
+        ends: the graph and the session.
+        stopped: returns True to end the wait.
+        running: whether to wait for a site that runs.
     """
-    answers = find_members(ends.bus, ends.clock, ends.session, stopped=stopped, timeout_s=None)
-    return next(
-        (info for info in answers if info.scenario and (info.running or not running)), None
-    )
+    replies = find_members(ends.bus, ends.clock, ends.session, stopped=stopped, timeout_s=None)
+    for info in replies:
+        if info.scenario and (info.running or not running):
+            return info
+    return None

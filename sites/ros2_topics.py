@@ -1,7 +1,9 @@
-"""What a session shows in the graph of ROS 2: the topics of its sites.
+"""The topics of a session's sites in the graph of ROS 2.
 
-Invariant: a message is made only while somebody listens. Names are those of `topic_names`,
-messages those of `published`, which a bag has as well.
+Invariant:
+    - A message is packed only while somebody listens to its topic.
+    - The topics are named by `topic_names`, and their messages packed by `published`, as in a
+      bag.
 """
 
 from typing import NamedTuple
@@ -21,9 +23,15 @@ RELIABLE = QualityOfService()
 LATCHED = QualityOfService(latched=True, depth=1)
 
 
-class Ends(NamedTuple):
-    """Both ends of the bridge: the graph of ROS, and a session by its bus, its name and its
-    topics.
+class BridgeEnds(NamedTuple):
+    """Both ends of the bridge: the graph of ROS, and the session.
+
+    Attributes:
+        graph: the graph of ROS 2.
+        bus: the bus to the session.
+        clock: the clock of this process.
+        session: the session's name.
+        table: the names of the topics.
     """
 
     graph: Ros2Graph
@@ -38,15 +46,24 @@ class Ends(NamedTuple):
 
 
 class SiteTopics:
-    """What one site shows, under `/<session>/<site>`, and by `frames` of `/tf`; stamps count
-    from the epoch.
+    """The topics of one site under `/<session>/<site>`, and its part of `/tf`.
 
-    Its end effector is in `frame`; `newest` is the record that was shown last.
+    Args:
+        ends: the graph and the session.
+        scenario: the scenario of the session.
+        site: the name of the site.
+        epoch_unix_ns: the session's epoch in Unix time; the stamps count from there.
+        frames: the publisher of `/tf`.
+
+    Attributes:
+        frame: the frame of the site's end effector.
+        shares: the shares of the site in its peers.
+        newest: the record that was published last.
     """
 
     def __init__(
         self,
-        ends: Ends,
+        ends: BridgeEnds,
         scenario: Scenario,
         site: str,
         epoch_unix_ns: int,
@@ -56,12 +73,11 @@ class SiteTopics:
         self._frames = frames
         self.frame = self._messages.frame
         self.shares = ShareHistory(scenario, site)
-        self._publishers = {
-            name: ends.graph.publisher(
-                ends.topic(site, name), channel.kind, LATCHED if channel.latched else RELIABLE
-            )
-            for name, channel in self._messages.topics.items()
-        }
+        self._publishers = {}
+        for name, channel in self._messages.topics.items():
+            quality = LATCHED if channel.latched else RELIABLE
+            topic = ends.topic(site, name)
+            self._publishers[name] = ends.graph.publisher(topic, channel.kind, quality)
         self._publishers["robot_description"].put(self._messages.description)
         self.newest: State | None = None
 
@@ -69,26 +85,26 @@ class SiteTopics:
         return self._publishers[topic].has_subscribers
 
     def show(self, record: State, rate_hz: float) -> None:
-        """Publishes a record, as far as somebody listens, if it is the first of its time at a
-        rate.
+        """Publishes a record on the topics with listeners, at most `rate_hz` records a second.
 
-        None is shown after a later one.
+        Records older than the newest published one of the same boot are ignored.
         """
-        last = self.newest
-        times = [int(one.t_ns * rate_hz) // NS_PER_S for one in (record, last or record)]
-        if last is not None and record.boot == last.boot and times[0] <= times[1]:
-            return
+        newest = self.newest
+        if newest is not None and record.boot == newest.boot:
+            period = int(record.t_ns * rate_hz) // NS_PER_S
+            newest_period = int(newest.t_ns * rate_hz) // NS_PER_S
+            if period <= newest_period:
+                return
         self.newest = record
-        for topic, data in self._messages.pack_record(
-            record, self.shares.at(record.t_ns), self._is_heard
-        ):
+        shares = self.shares.advance_to(record.t_ns)
+        for topic, data in self._messages.pack_record(record, shares, self._is_heard):
             self._publishers[topic].put(data)
         if self._frames.has_subscribers:
             for data in self._messages.pack_frames(record):
                 self._frames.put(data)
 
     def show_statistics(self, stats: LinkStats) -> None:
-        """Publishes statistics of the site, as far as somebody listens."""
+        """Publishes statistics of the site on the topics with listeners."""
         for topic, data in self._messages.pack_statistics(stats):
             if self._is_heard(topic):
                 self._publishers[topic].put(data)

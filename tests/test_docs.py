@@ -235,7 +235,12 @@ STATED: list[tuple[str, str, float, float]] = [
     ("network.md", "follow a line to 1 ppm", 1, offset.WANDER / 1e3),
     ("own-controller.md", "at most 1024 numbers", 1024, user_law.MAX_LAW_MEMORY),
     ("own-controller.md", "three quarters of the period", 0.75, code_watchdog.SHARE),
-    ("own-controller.md", "at half a second of overtime", 0.5, code_watchdog.MOST_NS / 1e9),
+    (
+        "own-controller.md",
+        "at half a second of overtime",
+        0.5,
+        code_watchdog.OVERTIME_LIMIT_NS / 1e9,
+    ),
     ("own-controller.md", "for 50 ms at most", 50, code_watchdog.HICCUP_NS / 1e6),
     ("ports.md", "a circle of 0.001 1/s", 0.001, port_response.ZERO_ROOT_RADIUS_PER_S),
     ("recording.md", "it flushes every 65 ms", 65, record_process.FLUSH_NS / 1e6),

@@ -1,9 +1,11 @@
-"""Devices in somebody's hand: where they are, how they move, their buttons, and the force that
-they render.
+"""Devices in a person's hand: their position, velocity and buttons, and their force.
 
-Invariant: a device is one class, found by its file in this folder, and nothing else lists them.
-All speak of whoever holds them: x to the right, y ahead, z up; m, m/s, N. Their buttons are
-"a", "b", "c", from the first.
+Invariant:
+    - A device is one class, which is found by its file in this folder; nothing else lists the
+      devices.
+    - All devices use the coordinates of the person who holds them: x to the right, y ahead, z
+      up; units m, m/s, N.
+    - Buttons are named "a", "b", "c" from the first on.
 """
 
 from collections.abc import Mapping
@@ -17,11 +19,15 @@ Vector = tuple[float, float, float]
 
 
 class DeviceState(NamedTuple):
-    """What a device measures: its place, of which only changes count, its velocity, and what is
-    pressed.
+    """The measured state of a device.
 
     >>> tn.DeviceState((0.0, -0.12, 0.15), (0.0, 0.0, 0.0), {"a": True}).buttons["a"]
     True
+
+    Attributes:
+        position_m: its position, m, in a frame with any origin: only changes are used.
+        velocity_m_s: its velocity, m/s.
+        buttons: whether each button is pressed, by its name.
     """
 
     position_m: Vector
@@ -30,8 +36,9 @@ class DeviceState(NamedTuple):
 
 
 class Device(Protocol):
-    """A device, read `rate_hz` times a second; a context, which is entered again after each
-    loss of it.
+    """A device that is read `rate_hz` times a second.
+
+    It is a context manager that is entered again after each loss of the connection.
 
     >>> tn.session("play").lead("m1", MyDevice())  # doctest: +SKIP
     """
@@ -39,34 +46,38 @@ class Device(Protocol):
     rate_hz: ClassVar[int]
 
     def __enter__(self) -> Self:
-        """Connects to it; an `OSError` says that it is not there."""
+        """Connects to the device; raises OSError if the device is not present."""
 
     def __exit__(self, *_: object) -> None:
-        """Takes its force away, and lets it go."""
+        """Ends the device's force, and closes the connection."""
 
     def read(self) -> DeviceState:
-        """Returns its newest state; an `OSError` says that it is silent or gone."""
+        """Returns the newest state; raises OSError if the device is silent or gone."""
 
     def render(self, force_n: Vector) -> None:
-        """Lets whoever holds it feel a force, N."""
+        """Renders a force to the person who holds the device, N."""
 
 
 def open_device(text: str) -> Device:
-    """Returns the device of a text such as "spacemouse" or
-    "haply_inverse3=ws://127.0.0.1:10001".
+    """Returns the device that a text such as "spacemouse" names.
+
+    Args:
+        text: the name of the device and, after "=", its address, as in
+            "haply_inverse3=ws://127.0.0.1:10001".
 
     Raises:
         UsageError: there is no such device.
     """
     name, _, address = text.partition("=")
-    known = sorted(found.name for found in iter_modules(__path__))
+    known = sorted(module_info.name for module_info in iter_modules(__path__))
     if name not in known:
         raise UsageError(
             f"--device is one of {', '.join(known)}, with its =ADDRESS if need be, not {text!r}"
         )
     module = import_module(f"{__name__}.{name}")
-    kind = next(
-        one for word, one in vars(module).items() if word.lower() == name.replace("_", "")
+    class_name = name.replace("_", "")
+    device_class = next(
+        member for word, member in vars(module).items() if word.lower() == class_name
     )
-    made: Device = kind(*([address] if address else []))
-    return made
+    device: Device = device_class(address) if address else device_class()
+    return device

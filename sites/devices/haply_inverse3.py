@@ -1,9 +1,12 @@
-"""Haply's Inverse3, by the JSON of its service: one state for each message sent, so ours is the
-cadence.
+"""Haply's Inverse3, by the JSON messages of its service.
 
-Invariant: each state is answered by one message with a force, a zero one at rest, which keeps
-the connection alive. A message that cannot be read is a state that is nowhere, and moves
-nothing.
+The service replies to each message with one state, so this program sets the rate.
+
+Invariant:
+    - Each state is answered by one message with a force, also a zero force at rest, which keeps
+      the connection alive.
+    - A message that cannot be parsed becomes a state whose position is not finite; such a state
+      moves nothing.
 """
 
 import math
@@ -20,9 +23,8 @@ from trilat_net.net.host_names import check_hosts
 from . import DeviceState, Vector
 
 SILENCE_S = 0.15
-"""A service that is silent for so long is given up, before the site lets go of a silent hand.
-"""
-_NOWHERE = (math.nan, math.nan, math.nan)
+"""Silence after which the service is given up, before the site releases a silent hand."""
+_NO_POSITION = (math.nan, math.nan, math.nan)
 _UNREADABLE = (
     LookupError,
     TypeError,
@@ -31,7 +33,7 @@ _UNREADABLE = (
     OverflowError,
     msgspec.MsgspecError,
 )
-_PLAIN: dict[str, Any] = {
+_CONNECT_OPTIONS: dict[str, Any] = {
     "compression": None,
     "proxy": None,
     "ping_interval": None,
@@ -40,13 +42,13 @@ _PLAIN: dict[str, Any] = {
 
 
 class HaplyInverse3:
-    """An Inverse3 of Haply and its wireless grip, by the maker's service (version 3).
+    """An Inverse3 of Haply with its wireless grip, by the maker's service (version 3).
 
     >>> tn.lead("play", "m1", tn.HaplyInverse3("ws://127.0.0.1:10001"))  # doctest: +SKIP
 
     Args:
-        address: of the service; "#values" at its end sends forces by that key, as older
-            versions take them, and not by `vector`.
+        address: the address of the service. "#values" at its end sends forces under the key
+            `values`, as older versions of the service expect, instead of `vector`.
     """
 
     rate_hz: ClassVar[int] = 1000
@@ -56,24 +58,24 @@ class HaplyInverse3:
         self._force_key = key or "vector"
         self._open = ExitStack()
         self._socket: ClientConnection | None = None
-        self._first: dict[str, Any] = {}
+        self._configuration: dict[str, Any] = {}
         self._id = ""
-        self._was_there = False
+        self._was_connected = False
 
     def __enter__(self) -> Self:
-        if not self._was_there:
-            # a misspelt name never answers; one that did may be away for a while
+        if not self._was_connected:
+            # Only before the first connection: a known service may be away for a while.
             check_hosts([self._address])
         try:
             self._socket = self._open.enter_context(
-                connect(self._address, open_timeout=2.0, **_PLAIN)
+                connect(self._address, open_timeout=2.0, **_CONNECT_OPTIONS)
             )
         except (OSError, ValueError, WebSocketException) as error:
             raise ConnectionError(
                 f"no service of an Inverse3 at {self._address}: {error}"
             ) from None
-        self._was_there = True
-        self._first = {"session": {"configure": {"profile": {"name": "trilat-net"}}}}
+        self._was_connected = True
+        self._configuration = {"session": {"configure": {"profile": {"name": "trilat-net"}}}}
         self._id = ""
         return self
 
@@ -83,8 +85,8 @@ class HaplyInverse3:
         self._open.close()
 
     def read(self) -> DeviceState:
-        """Returns the state that the service sends next."""
-        assert self._socket is not None  # it is entered
+        """Returns the next state that the service sends."""
+        assert self._socket is not None  # the context has been entered
         try:
             message = msgspec.json.decode(self._socket.recv(SILENCE_S))
             if not message.get("inverse3"):
@@ -97,7 +99,9 @@ class HaplyInverse3:
             ]
             buttons = {name: bool(pressed) for grip in grips for name, pressed in grip.items()}
             return DeviceState(
-                _read(state["cursor_position"]), _read(state["cursor_velocity"]), buttons
+                _parse_vector(state["cursor_position"]),
+                _parse_vector(state["cursor_velocity"]),
+                buttons,
             )
         except TimeoutError:
             raise TimeoutError(f"the service at {self._address} is silent") from None
@@ -106,24 +110,24 @@ class HaplyInverse3:
                 f"the service at {self._address} has closed the connection"
             ) from None
         except _UNREADABLE:
-            return DeviceState(_NOWHERE, _NOWHERE, {})
+            return DeviceState(_NO_POSITION, _NO_POSITION, {})
 
     def render(self, force_n: Vector) -> None:
-        """Sends a force, which asks for the next state."""
+        """Sends a force, N; the message also requests the next state."""
         if self._socket is None or not self._id:
             return
         force = {self._force_key: dict(zip("xyz", force_n, strict=True))}
         command = {"device_id": self._id, "commands": {"set_cursor_force": force}}
         try:
             self._socket.send(
-                msgspec.json.encode(self._first | {"inverse3": [command]}), text=True
+                msgspec.json.encode(self._configuration | {"inverse3": [command]}), text=True
             )
         except WebSocketException:
             raise ConnectionError(
                 f"the service at {self._address} has closed the connection"
             ) from None
-        self._first = {}
+        self._configuration = {}
 
 
-def _read(point: dict[str, float]) -> Vector:
+def _parse_vector(point: dict[str, float]) -> Vector:
     return float(point["x"]), float(point["y"]), float(point["z"])

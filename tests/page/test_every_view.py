@@ -55,7 +55,7 @@ def give_orders(orders: Mapping[float, str], bus: Bus, clock: Clock) -> None:
     begun_ns = clock.monotonic_ns()
     for at_s, order in orders.items():
         clock.sleep_until(begun_ns + int(at_s * 1e9))
-        reached(bus, clock).order(["s"], order)
+        reached(bus, clock).send_order(["s"], order)
 
 
 def record(scenario: Scenario, user: str, orders: Mapping[float, str] = {}) -> Views:

@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 import trilat_net as tn
-from sites.ros2_topics import Ends, SiteTopics
+from sites.ros2_topics import BridgeEnds, SiteTopics
 from tests.turning import (
     ALLOWED,
     CASE,
@@ -227,7 +227,7 @@ class Graph:
 
 def list_live_topics(log: Log, motions: dict[str, Motion], _folder: Path) -> Iterator[Series]:
     graph = Graph()
-    ends: Any = Ends(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
+    ends: Any = BridgeEnds(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
     for site in motions:
         shown = SiteTopics(ends, log.scenario, site, 0, graph.published["tf"])  # type: ignore[arg-type]
         for record in log[site].states:

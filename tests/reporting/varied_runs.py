@@ -80,7 +80,7 @@ def run_session(scenario: Scenario, orders: tuple[tuple[float, str], ...] = ()) 
             begun_ns = clock.monotonic_ns()
             for at_s, order in orders:
                 clock.sleep_until(begun_ns + int(at_s * 1e9))
-                reached(bus, clock).order(["s"], order)
+                reached(bus, clock).send_order(["s"], order)
 
         if orders:
             session.stranger(give_orders)

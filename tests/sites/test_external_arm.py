@@ -257,7 +257,8 @@ def test_an_arm_moves_only_while_its_switch_is_held(tmp_path: Path) -> None:
             switch.send(held=False)
             clock.sleep_until(clock.monotonic_ns() + 20_000_000)
             told.extend(
-                (one.accepted, one.text) for one in reached(bus, clock).order(["s"], "enable")
+                (one.accepted, one.text)
+                for one in reached(bus, clock).send_order(["s"], "enable")
             )
 
     session.stranger(hold, at_ns=A_SECOND)

@@ -20,18 +20,18 @@ from scipy.spatial.transform import Rotation
 
 import trilat_net
 from sites.ros2_bridge import (
-    RIVAL_NS,
-    SAFE_NS,
+    SAFE_PERIOD_NS,
+    SENDER_TIMEOUT_NS,
     SILENCE_NS,
     DominanceTopic,
     RobotArm,
     TargetTopic,
     read_joint_target,
-    read_place_target,
+    read_vector_target,
     refuse_other_robots,
     show_session,
 )
-from sites.ros2_topics import Ends, SiteTopics
+from sites.ros2_topics import BridgeEnds, SiteTopics
 from sites.running_session import ShareHistory
 from tests.log.standard_files import made
 from tests.net.local_bus import LocalNetwork
@@ -85,11 +85,11 @@ class Desk:
         self.refusals = Refusals(self.said.append)
         self.topic = TargetTopic(
             self.arm,  # type: ignore[arg-type]
-            lambda data: read_place_target("m1/base", 2, 7, data),
+            lambda data: read_vector_target("m1/base", 2, 7, data),
             self.arm.move,
             self.clock,
         )
-        self.take = self.refusals.guard("play/m1/target_pose", self.topic.take)
+        self.take = self.refusals.guard("play/m1/target_pose", self.topic.receive)
 
     def hears(
         self, x: float, sender: Attachment = FIRST, after_ns: int = 0, frame: str = "m1/base"
@@ -312,7 +312,7 @@ def test_the_pose_of_the_tip_is_in_the_transforms(name: str) -> None:
     log = trilat_net.simulate(name, {"duration_s": 0.3})
     for site in log.sites:
         graph = Listener()
-        ends: Any = Ends(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
+        ends: Any = BridgeEnds(graph, None, None, "t", read_topic_table("crisp"))  # type: ignore[arg-type]
         shown = SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
         shown.show(log[site].states[-1], 1000.0)
         messages = [
@@ -360,7 +360,9 @@ def test_shares_are_asked_for_once_and_refusals_are_said() -> None:
 
     refusals, clock = Refusals(said.append), ManualClock()
     topic = DominanceTopic(["m1", "m2"], change, clock)
-    take, ask = (refusals.guard("t/s/set_dominance", act) for act in (topic.take, topic.ask))
+    take, ask = (
+        refusals.guard("t/s/set_dominance", act) for act in (topic.receive, topic.send_request)
+    )
     for data in (
         shares(0.9, 0.1),
         shares(0.9, 0.1),
@@ -380,7 +382,7 @@ def test_shares_are_asked_for_once_and_refusals_are_said() -> None:
         "refused: t/s/set_dominance is not plain CDR, little-endian",
     ]
     # whoever asks for the same later may have been overruled meanwhile
-    clock.sleep_until(2 * RIVAL_NS)
+    clock.sleep_until(2 * SENDER_TIMEOUT_NS)
     take(shares(0.5, 0.1), FIRST)
     ask()
     assert asked[2:] == [{"m1": 0.5, "m2": 0.1}]
@@ -396,15 +398,17 @@ def test_shares_are_those_that_the_certificate_sees(
     history, ramps = ShareHistory(scenario, "s"), []
     for start, lasts, share in changes:
         to, at_s, ramp_s = {"m1": share, "m2": 1.0 - share}, start / 10.0, lasts / 10.0
-        history.take(json.dumps({"at_s": at_s, "dominance": "s", "to": to, "ramp_s": ramp_s}))
-        history.take("{}")
+        history.add_change(
+            json.dumps({"at_s": at_s, "dominance": "s", "to": to, "ramp_s": ramp_s})
+        )
+        history.add_change("{}")
         ramps.append(scenario.ramp("s", to, round(at_s * 1e9), ramp_s))
     if len({ramp.start_ns for ramp in ramps}) == len(ramps):
         t_s = np.arange(100) / 10.0
         first, scripted = list_scripted_ramps(scenario, "s")
         planned = evaluate_ramps(first, [*scripted, *ramps], t_s, 0.0).alpha
         np.testing.assert_allclose(
-            [history.at(round(t * 1e9)) for t in t_s], planned, atol=1e-9
+            [history.advance_to(round(t * 1e9)) for t in t_s], planned, atol=1e-9
         )
 
 
@@ -412,9 +416,11 @@ def test_shares_that_change_ten_times_a_second_are_shown() -> None:
     history = ShareHistory(load_scenario("paper"), "s")
     for n in range(3_600):
         to = {"m1": 0.25, "m2": 0.75} if n % 2 else {"m1": 0.75, "m2": 0.25}
-        history.take(json.dumps({"at_s": n / 10.0, "dominance": "s", "to": to, "ramp_s": 1.0}))
-        assert sum(history.at(n * 10**8)) == pytest.approx(1.0)
-    assert history.at(370 * 10**9) == (0.25, 0.75)
+        history.add_change(
+            json.dumps({"at_s": n / 10.0, "dominance": "s", "to": to, "ramp_s": 1.0})
+        )
+        assert sum(history.advance_to(n * 10**8)) == pytest.approx(1.0)
+    assert history.advance_to(370 * 10**9) == (0.25, 0.75)
 
 
 class Robot:
@@ -435,7 +441,7 @@ class Robot:
             self.clock,
         )
         self.arm.armed = True
-        self.take = self.refusals.guard("joint_states", self.arm.take)
+        self.take = self.refusals.guard("joint_states", self.arm.receive)
 
     def says(
         self,
@@ -462,7 +468,7 @@ class Robot:
     def driven(self, after_ns: int = 0) -> list[list[float]]:
         self.clock.sleep_until(self.clock.monotonic_ns() + after_ns)
         self.commands.clear()
-        self.arm.drive()
+        self.arm.send_command()
         got = [
             ROS.deserialize_cdr(data, "std_msgs/msg/Float64MultiArray")
             for data in self.commands
@@ -512,7 +518,7 @@ def test_two_robots_on_one_topic_measure_nothing() -> None:
     robot.says(*pose, sender=SECOND)
     robot.says(*pose)
     assert len(robot.measured()) == 1
-    robot.clock.sleep_until(robot.clock.monotonic_ns() + RIVAL_NS)
+    robot.clock.sleep_until(robot.clock.monotonic_ns() + SENDER_TIMEOUT_NS)
     robot.says(*pose)
     assert len(robot.measured()) == 1
     assert robot.said == [
@@ -528,8 +534,8 @@ def test_whatever_asks_for_shares_or_angles_is_taken_or_counted(data: bytes) -> 
         list[list[float]](),
     )
     shares_ = DominanceTopic(["m1"], asked.append, ManualClock())
-    refusals.guard("a", shares_.take)(data, FIRST)
-    shares_.ask()
+    refusals.guard("a", shares_.receive)(data, FIRST)
+    shares_.send_request()
     refusals.guard("b", lambda: turned.append(read_joint_target(NAMES, data)))()
     assert len(asked) + len(turned) + refusals.counts.total() == 2
     assert all(
@@ -560,15 +566,15 @@ def test_a_robot_gets_each_torque_once_in_its_own_order() -> None:
 def test_a_robot_without_a_torque_gets_the_safe_command() -> None:
     robot, safe = Robot(), [[0.5, -0.5]]
     assert robot.driven() == safe  # the site has made no tick
-    assert robot.driven(SAFE_NS - 1) == []
+    assert robot.driven(SAFE_PERIOD_NS - 1) == []
     robot.ticks(0, 3.0, 4.0)
-    assert robot.driven(SAFE_NS) == [[4.0, 3.0]]
+    assert robot.driven(SAFE_PERIOD_NS) == [[4.0, 3.0]]
     assert robot.driven(FRESH_NS + 1) == safe  # it is silent
     robot.ticks(200, 3.0, 4.0, mode=Mode.FAULT, since_ns=50 * 10**6)
-    assert robot.driven(SAFE_NS) == safe  # its arm has come to rest
+    assert robot.driven(SAFE_PERIOD_NS) == safe  # its arm has come to rest
     robot.ticks(201, 3.0, 4.0)
     robot.arm.armed = False
-    assert robot.driven(SAFE_NS) == safe
+    assert robot.driven(SAFE_PERIOD_NS) == safe
 
 
 @pytest.mark.parametrize(
@@ -603,7 +609,7 @@ class Sites:
             for channel in (topics.STATE, topics.EVENT)
         )
         self.graph, self.anew, self.said = Listener(), list[bool](), list[str]()
-        self._ends: Any = Ends(
+        self._ends: Any = BridgeEnds(
             self.graph, network.join(), SystemClock(), session, read_topic_table("crisp")
         )  # type: ignore[arg-type]
 
@@ -716,7 +722,7 @@ def test_bags_of_other_scenarios_have_no_topic_of_their_own(
     log = trilat_net.simulate(name, {"duration_s": 0.02})
     trilat_net.export(log, "ros2", tmp_path / "bag.mcap", names=naming)
     graph, table = Listener(), read_topic_table(naming)
-    ends: Any = Ends(graph, None, None, name, table)  # type: ignore[arg-type]
+    ends: Any = BridgeEnds(graph, None, None, name, table)  # type: ignore[arg-type]
     for site in log.sites:
         SiteTopics(ends, log.scenario, site, 0, graph.came["tf"])  # type: ignore[arg-type]
     planned = list_topics(log.scenario, name, table)

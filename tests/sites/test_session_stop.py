@@ -76,7 +76,7 @@ def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> Non
         for name, sites in (("stop", ["s"]), ("reset", ["s"]), ("enable", [])):
             clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
             said.extend(
-                (one.accepted, one.text) for one in reached(bus, clock).order(sites, name)
+                (one.accepted, one.text) for one in reached(bus, clock).send_order(sites, name)
             )
 
     raised: list[tuple[str, LifeAlarm]] = []
@@ -154,7 +154,9 @@ def test_an_arm_without_glide_is_told_how_it_ends(tmp_path: Path) -> None:
     def order(bus: Bus, clock: RelayClock) -> None:
         clock.sleep_until(clock.monotonic_ns() + 1_200_000_000)
         said.extend(
-            one.text for one in reached(bus, clock).order(["s"], "stop") if not one.accepted
+            one.text
+            for one in reached(bus, clock).send_order(["s"], "stop")
+            if not one.accepted
         )
 
     session.stranger(order)
