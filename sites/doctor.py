@@ -1,9 +1,11 @@
-"""What stands in the way of a session on this machine: keys, links, clock, rights, rate and
-room.
+"""Checks what stands in the way of a session on this machine.
 
-Invariant: nothing is changed and nothing is sent but what a member sends that connects; a
-finding says what was found, and, unless it is well, what to do. Rights and rate are those that
-a process of its own got.
+The checks are of keys, links, clocks, rights, tick rate, disk and processors.
+
+Invariant:
+    - Nothing is changed, and nothing is sent except the messages of a member that connects.
+    - A finding says what was found and, if there is a problem, what to do.
+    - Rights and rates are measured in a process of their own.
 """
 
 import json
@@ -57,29 +59,32 @@ from .site_parts import warm_up
 
 FindingState = Literal["ok", "warn", "fail"]
 CONNECT_S = 2.0
-LEAST_BYTES = 100 << 20
-FEW_BYTES = 2 << 30
-"""Free room with which a recording is likely to end early, and room for an hour and a half of
-three sites.
-"""
-STEADY_NS = 100_000_000
-STEP_NS = 1_000_000
-BOUND_US = 1_000
-"""How long the clocks are compared, by how much they may part meanwhile, and an offset's
-largest bound.
-"""
+MIN_FREE_BYTES = 100 << 20
+"""Free space below which a recording is likely to end early."""
+LOW_FREE_BYTES = 2 << 30
+"""Free space below which there is a warning: 90 minutes of three sites."""
+CLOCK_TEST_NS = 100_000_000
+"""Duration of the comparison of the clocks."""
+MAX_CLOCK_STEP_NS = 1_000_000
+"""Largest change of the difference of the clocks in that time."""
+MAX_BOUND_US = 1_000
+"""Largest error bound of a clock offset without a warning."""
 PINGS = 20
 RATES_HZ = (1000, 500, 200, 100)
 REHEARSAL_S = 1.0
-HELD_PERIODS = 0.5
-HELD_SHARE = 0.99
-"""A rate is held if this share of its ticks begins in this part of a period, from when each is
-due.
-"""
+MAX_LATE_PERIODS = 0.5
+MIN_PUNCTUAL_SHARE = 0.99
+"""A rate is held if this share of ticks begins at most `MAX_LATE_PERIODS` after it is due."""
 
 
 class DoctorFinding(NamedTuple):
-    """One finding: what was looked at, how it is, and a sentence."""
+    """The result of one check.
+
+    Attributes:
+        check: the subject of the check.
+        state: "ok", "warn" or "fail".
+        text: a sentence about the result.
+    """
 
     check: str
     state: FindingState
@@ -95,12 +100,12 @@ def examine_machine(
     *,
     insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Yields all findings, one after the other, by the arguments of `doctor`."""
-    owned = yield from examine_keys(keys)
-    yield from examine_links(connection, keys, owned, insecure=insecure)
+    """Yields all findings, one after the other; `doctor` explains the arguments."""
+    member_keys = yield from examine_keys(keys)
+    yield from examine_links(connection, keys, member_keys, insecure=insecure)
     yield from examine_clock(clock)
     if session is not None:
-        safe = secure_connection(connection, owned, insecure=insecure)
+        safe = secure_connection(connection, member_keys, insecure=insecure)
         yield from examine_offsets(safe, clock, session)
     yield examine_system()
     yield from examine_rights()
@@ -109,8 +114,10 @@ def examine_machine(
 
 
 def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKeys | None]:
-    """Yields whose keys they are, until when they hold, and if others can get at them; returns
-    good ones.
+    """Yields whether the keys are valid, until when, and whether others can read them.
+
+    Returns:
+        The keys; None if there are none, or if they cannot be used.
     """
     if folder is None:
         yield DoctorFinding(
@@ -118,15 +125,13 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
         )
         return None
     try:
-        owned = read_member_keys(folder)
+        member_keys = read_member_keys(folder)
     except UsageError as error:
         yield DoctorFinding("keys", "fail", str(error))
         return None
-    left = owned.ends - datetime.now(UTC)
-    text = (
-        f"{owned.member} of {', '.join(owned.members)}, until {owned.ends:%Y-%m-%d %H:%M} UTC"
-    )
-    if left < ENDS_SOON:
+    names = ", ".join(member_keys.members)
+    text = f"{member_keys.member} of {names}, until {member_keys.ends:%Y-%m-%d %H:%M} UTC"
+    if member_keys.ends - datetime.now(UTC) < ENDS_SOON:
         yield DoctorFinding("keys", "warn", f"{text}: soon; renew them with trilat keys renew")
     else:
         yield DoctorFinding("keys", "ok", text)
@@ -138,103 +143,107 @@ def examine_keys(folder: Path | None) -> Generator[DoctorFinding, None, MemberKe
     if authority.exists():
         text = f"{authority} lies here too: with it anybody makes keys; keep it elsewhere"
         yield DoctorFinding("keys", "warn", text)
-    return owned
+    return member_keys
 
 
 def examine_links(
-    connection: Connection, folder: Path | None, owned: MemberKeys | None, *, insecure: bool
+    connection: Connection,
+    folder: Path | None,
+    member_keys: MemberKeys | None,
+    *,
+    insecure: bool,
 ) -> Iterator[DoctorFinding]:
-    """Yields whether endpoints can be listened at and reached, and whether links are encrypted."""
+    """Yields whether each endpoint can be listened at or reached, and is encrypted."""
     try:
-        safe = secure_connection(connection, owned, insecure=insecure)
+        safe = secure_connection(connection, member_keys, insecure=insecure)
     except UsageError as error:
         yield DoctorFinding("links", "fail", str(error))
         return
-    sides = [(place, True) for place in find_endpoint_addresses(safe.reach(safe.listen))]
-    sides += [
-        (place, False) for place in find_endpoint_addresses(safe.reach(safe.connect or ()))
-    ]
-    for place, listens in sides:
-        if not listens and place.startswith("quic/"):
-            yield _examine_quic(place, owned)
-        elif (address := _split_address(place)) is None:
-            yield DoctorFinding(
-                "links", "warn", f"{place} was not tried: not an address of TCP or QUIC"
-            )
-        elif listens:
-            yield _examine_listening(place, address)
+    for endpoint in find_endpoint_addresses(safe.reach(safe.listen)):
+        if (address := _split_address(endpoint)) is None:
+            yield _describe_untried(endpoint)
         else:
-            yield _examine_reaching(place, address, folder if owned else None)
+            yield _examine_listening(endpoint, address)
+    for endpoint in find_endpoint_addresses(safe.reach(safe.connect or ())):
+        if endpoint.startswith("quic/"):
+            yield _examine_quic(endpoint, member_keys)
+        elif (address := _split_address(endpoint)) is None:
+            yield _describe_untried(endpoint)
+        else:
+            yield _examine_reaching(endpoint, address, folder if member_keys else None)
     if not safe.listen and not safe.connect:
         yield DoctorFinding(
             "links", "ok", "no endpoints given: --listen and --connect are tried if given"
         )
 
 
-def _examine_listening(place: str, address: tuple[str, int]) -> DoctorFinding:
+def _describe_untried(endpoint: str) -> DoctorFinding:
+    text = f"{endpoint} was not tried: not an address of TCP or QUIC"
+    return DoctorFinding("links", "warn", text)
+
+
+def _examine_listening(endpoint: str, address: tuple[str, int]) -> DoctorFinding:
+    """Returns whether this machine can listen at an endpoint."""
+    is_quic = endpoint.startswith("quic/")
+    family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
+    kind = socket.SOCK_DGRAM if is_quic else socket.SOCK_STREAM
     try:
-        family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
-        quic = place.startswith("quic/")
-        with socket.socket(family, socket.SOCK_DGRAM if quic else socket.SOCK_STREAM) as probe:
-            if not quic:  # two sockets of UDP at one port would both be let
+        with socket.socket(family, kind) as probe:
+            if not is_quic:  # with this option, two sockets of UDP could share the port
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
-            if not quic:
+            if not is_quic:
                 probe.listen(1)
     except OSError as error:
-        return DoctorFinding(
-            "links", "fail", f"cannot listen at {place}: {error.strerror or error}"
-        )
-    if place.startswith(ENCRYPTED) or is_loopback(place):
-        return DoctorFinding("links", "ok", f"can listen at {place}")
-    return DoctorFinding(
-        "links", "warn", f"{place} would listen unencrypted, to anybody who reaches it"
-    )
+        text = f"cannot listen at {endpoint}: {error.strerror or error}"
+        return DoctorFinding("links", "fail", text)
+    if endpoint.startswith(ENCRYPTED) or is_loopback(endpoint):
+        return DoctorFinding("links", "ok", f"can listen at {endpoint}")
+    text = f"{endpoint} would listen unencrypted, to anybody who reaches it"
+    return DoctorFinding("links", "warn", text)
 
 
 def _examine_reaching(
-    place: str, address: tuple[str, int], folder: Path | None
+    endpoint: str, address: tuple[str, int], folder: Path | None
 ) -> DoctorFinding:
+    """Returns whether a member answers at an endpoint of TCP or TLS."""
     try:
         with socket.create_connection(address, CONNECT_S) as link:
-            if not place.startswith("tls/"):
-                state: FindingState = "ok" if is_loopback(place) else "warn"
-                return DoctorFinding("links", state, f"{place} answers, unencrypted")
-            with _tls_context(folder).wrap_socket(link, server_hostname=address[0]) as safe:
-                proved = (
-                    "with a certificate of the same authority"
-                    if folder
-                    else "whose authority is unknown"
-                )
-                return DoctorFinding(
-                    "links", "ok", f"{place} answers over {safe.version()}, {proved}"
-                )
+            if not endpoint.startswith("tls/"):
+                state: FindingState = "ok" if is_loopback(endpoint) else "warn"
+                return DoctorFinding("links", state, f"{endpoint} answers, unencrypted")
+            context = _tls_context(folder)
+            with context.wrap_socket(link, server_hostname=address[0]) as safe:
+                authority = "whose authority is unknown"
+                if folder:
+                    authority = "with a certificate of the same authority"
+                text = f"{endpoint} answers over {safe.version()}, {authority}"
+                return DoctorFinding("links", "ok", text)
     except ssl.SSLError as error:
-        why = getattr(error, "verify_message", "") or error.reason or str(error)
-        return DoctorFinding(
-            "links", "fail", f"{place} answers, but not as a member with these keys: {why}"
-        )
+        reason = getattr(error, "verify_message", "") or error.reason or str(error)
+        text = f"{endpoint} answers, but not as a member with these keys: {reason}"
+        return DoctorFinding("links", "fail", text)
     except OSError as error:
-        return DoctorFinding(
-            "links", "fail", f"{place} cannot be reached: {error.strerror or error}"
-        )
+        text = f"{endpoint} cannot be reached: {error.strerror or error}"
+        return DoctorFinding("links", "fail", text)
 
 
-def _examine_quic(place: str, owned: MemberKeys | None) -> DoctorFinding:
-    """Returns whether a member answers over QUIC: there is no way to try that but to connect as
-    a member.
+def _examine_quic(endpoint: str, member_keys: MemberKeys | None) -> DoctorFinding:
+    """Returns whether a member answers over QUIC.
+
+    The only way to find out is to connect as a member.
     """
-    if owned is None:
+    if member_keys is None:
         return DoctorFinding(
-            "links", "warn", f"{place} was not tried: QUIC asks for the keys of a member"
+            "links", "warn", f"{endpoint} was not tried: QUIC asks for the keys of a member"
         )
     try:
-        with closing(ZenohBus([], [place], "client", owned.settings)):
-            text = f"{place} answers over QUIC, with a certificate of the same authority"
+        with closing(ZenohBus([], [endpoint], "client", member_keys.settings)):
+            text = f"{endpoint} answers over QUIC, with a certificate of the same authority"
             return DoctorFinding("links", "ok", text)
     except (RouterSilent, UsageError) as error:
         return DoctorFinding(
-            "links", "fail", f"{place} does not answer a member with these keys: {error}"
+            "links", "fail", f"{endpoint} does not answer a member with these keys: {error}"
         )
 
 
@@ -249,42 +258,45 @@ def _tls_context(folder: Path | None) -> ssl.SSLContext:
     return context
 
 
-def _split_address(place: str) -> tuple[str, int] | None:
-    found = re.fullmatch(r"(?:tcp|tls|quic)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?", place)
-    return (found[1].strip("[]"), int(found[2])) if found and int(found[2]) < 1 << 16 else None
+def _split_address(endpoint: str) -> tuple[str, int] | None:
+    """Returns host and port of an endpoint; None if it has no such address."""
+    pattern = r"(?:tcp|tls|quic)/(\[[^\]]+\]|[^:/]+):(\d{1,5})(?:[?#].*)?"
+    match = re.fullmatch(pattern, endpoint)
+    if match is None or int(match[2]) >= 1 << 16:
+        return None
+    return match[1].strip("[]"), int(match[2])
 
 
 def examine_clock(clock: Clock) -> Iterator[DoctorFinding]:
-    """Yields whether this machine's clocks are steady."""
-    begun = clock.monotonic_ns()
-    wall = clock.unix_ns()
-    before = begun
-    backwards = 0
-    coarsest_ns = 0
-    while before - begun < STEADY_NS:
-        now = clock.monotonic_ns()
-        backwards += now < before
-        coarsest_ns = max(coarsest_ns, now - before)
-        before = now
-    apart_ns = abs(clock.unix_ns() - wall - (clock.monotonic_ns() - begun))
-    if backwards:
-        yield DoctorFinding(
-            "clock",
-            "fail",
-            f"the monotonic clock went back {count_nouns(backwards, 'time')} in 0.1 s",
-        )
-    elif apart_ns > STEP_NS:
-        text = f"the wall clock stepped by {apart_ns / 1e6:.1f} ms in 0.1 s; that distorts no record"
-        yield DoctorFinding("clock", "warn", text)
+    """Yields whether the clocks of this machine are steady."""
+    begun_ns = clock.monotonic_ns()
+    wall_ns = clock.unix_ns()
+    previous_ns = begun_ns
+    backward_steps = 0
+    longest_gap_ns = 0
+    while previous_ns - begun_ns < CLOCK_TEST_NS:
+        now_ns = clock.monotonic_ns()
+        backward_steps += now_ns < previous_ns
+        longest_gap_ns = max(longest_gap_ns, now_ns - previous_ns)
+        previous_ns = now_ns
+    step_ns = abs(clock.unix_ns() - wall_ns - (clock.monotonic_ns() - begun_ns))
+    if backward_steps:
+        times = count_nouns(backward_steps, "time")
+        text = f"the monotonic clock went back {times} in 0.1 s"
+        yield DoctorFinding("clock", "fail", text)
+    elif step_ns > MAX_CLOCK_STEP_NS:
+        step = f"the wall clock stepped by {step_ns / 1e6:.1f} ms in 0.1 s"
+        yield DoctorFinding("clock", "warn", f"{step}; that distorts no record")
     else:
-        longest = f"largest pause of a loop that never sleeps {coarsest_ns / 1e6:.1f} ms"
-        yield DoctorFinding("clock", "ok", f"steady; {longest}")
+        longest_ms = longest_gap_ns / 1e6
+        text = f"steady; largest pause of a loop that never sleeps {longest_ms:.1f} ms"
+        yield DoctorFinding("clock", "ok", text)
 
 
 def examine_offsets(
     connection: Connection, clock: Clock, session: str
 ) -> Iterator[DoctorFinding]:
-    """Yields how far the clocks of a session's members are ahead, and how well that is known."""
+    """Yields the clock offset of each member of a session, and its error bound."""
     try:
         ping = ping_session(
             connection=connection,
@@ -297,49 +309,56 @@ def examine_offsets(
     except (RunFailed, SessionError, UsageError) as error:
         yield DoctorFinding("clock", "fail", str(error))
         return
-    for facts in ping.members if ping else ():
-        if facts["same_clock"]:
-            yield DoctorFinding("clock", "ok", f"{facts['member']} has the same clock")
-        elif "offset_ns" not in facts:
-            yield DoctorFinding("clock", "warn", f"{facts['member']} answered too few pings")
+    for row in ping.members if ping else ():
+        member = row["member"]
+        if row["same_clock"]:
+            yield DoctorFinding("clock", "ok", f"{member} has the same clock")
+        elif "offset_ns" not in row:
+            yield DoctorFinding("clock", "warn", f"{member} answered too few pings")
         else:
-            offset_s = facts["offset_ns"] / 1e9
-            bound_us = facts["bound_us"]
-            text = f"{facts['member']} is {offset_s:+.6f} s, known to {bound_us:.0f} us"
-            yield DoctorFinding("clock", "ok" if bound_us <= BOUND_US else "warn", text)
+            offset_s = row["offset_ns"] / 1e9
+            bound_us = row["bound_us"]
+            text = f"{member} is {offset_s:+.6f} s, known to {bound_us:.0f} us"
+            yield DoctorFinding("clock", "ok" if bound_us <= MAX_BOUND_US else "warn", text)
 
 
-def _ask_process(code: str) -> Any:
-    """Returns what a process of its own prints last, as JSON; None if it fails."""
-    done = subprocess.run(
+def _run_in_process(code: str) -> Any:
+    """Runs Python code in a new process.
+
+    Returns:
+        The JSON value of the last printed line; None if the process fails.
+    """
+    completed = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=False
     )
-    return None if done.returncode else json.loads(done.stdout.splitlines()[-1])
+    if completed.returncode:
+        return None
+    return json.loads(completed.stdout.splitlines()[-1])
 
 
-_RIGHTS = "import json; from sites.realtime import prepare; print(json.dumps(prepare(None)))"
+_RIGHTS_CODE = (
+    "import json; from sites.realtime import prepare; print(json.dumps(prepare(None)))"
+)
 
 
 def examine_rights() -> Iterator[DoctorFinding]:
-    """Yields which real-time settings a site would get."""
-    obtained: dict[str, str] | None = _ask_process(_RIGHTS)
+    """Yields which real-time settings a site obtains."""
+    obtained: dict[str, str] | None = _run_in_process(_RIGHTS_CODE)
     if obtained is None:
         yield DoctorFinding("rights", "warn", "could not be tried")
         return
-    good = {"scheduling": "SCHED_FIFO", "memory": "locked", "timer_slack": "1 ns"}
-    for name, start in good.items():
-        got = obtained[name].startswith(start)
-        help_ = (
-            ""
-            if got
-            else "; ticks will be late by milliseconds under load: see compose.realtime.yaml"
-        )
-        text = f"{name.replace('_', ' ')}: {obtained[name]}{help_}"
-        yield DoctorFinding("rights", "ok" if got else "warn", text)
+    wanted = {"scheduling": "SCHED_FIFO", "memory": "locked", "timer_slack": "1 ns"}
+    remedy = "ticks will be late by milliseconds under load: see compose.realtime.yaml"
+    for name, prefix in wanted.items():
+        text = f"{name.replace('_', ' ')}: {obtained[name]}"
+        if obtained[name].startswith(prefix):
+            yield DoctorFinding("rights", "ok", text)
+        else:
+            yield DoctorFinding("rights", "warn", f"{text}; {remedy}")
 
 
 def examine_system() -> DoctorFinding:
-    """Returns which half of the program is promised on this system."""
+    """Returns which parts of the program are supported on this operating system."""
     name = {"Darwin": "macOS"}.get(platform.system(), platform.system())
     if name == "Linux":
         return DoctorFinding(
@@ -352,42 +371,49 @@ def examine_system() -> DoctorFinding:
 
 
 class Rehearsal(LoopStats):
-    """The live loop of a site alone: all that it does in a tick but for the network."""
+    """The live loop of a single site, with everything that a tick does except the network.
+
+    Args:
+        scenario: the scenario.
+        name: the name of the site.
+    """
 
     def __init__(self, scenario: Scenario, name: str) -> None:
-        self._stepped = Site(scenario.setup(name))
+        self._site = Site(scenario.setup(name))
         self._ticks = scenario.ticks(name)
-        super().__init__(self._stepped, 1)
+        super().__init__(self._site, 1)
         self._late_us: list[int] = []
 
     def run(self, clock: Clock) -> list[int]:
-        """Makes its ticks in real time; returns how late each began, us."""
+        """Runs all ticks in real time; returns the lateness of each, us."""
         inbox = PeerInbox(links=(), rings=(), boots=(), monitors=(), dropped=self.dropped)
-        timing = SiteTiming(
-            clock.monotonic_ns() + NS_PER_S // 10, self._stepped.rate_hz, (), ""
+        epoch_ns = clock.monotonic_ns() + NS_PER_S // 10
+        timing = SiteTiming(epoch_ns, self._site.rate_hz, (), "")
+        site_io: Any = self
+        run_loop(
+            site=self._site,
+            boot=1,
+            ticks=self._ticks,
+            clock=clock,
+            inbox=inbox,
+            timing=timing,
+            stats=self,
+            states=StateBlock(self._site, 1, lambda _: None),
+            io=site_io,
         )
-        timed: Any = (
-            clock,
-            inbox,
-            timing,
-            self,
-            StateBlock(self._stepped, 1, lambda _: None),
-            self,
-        )
-        run_loop(self._stepped, 1, self._ticks, *timed)
         return self._late_us
 
     def count_tick(self, late_us: int, busy_us: int, skipped: int = 0) -> None:
-        """Counts one tick, and keeps its lateness."""
+        """Counts a tick, and keeps its lateness."""
         super().count_tick(late_us, busy_us, skipped)
         self._late_us.append(late_us)
 
     def step(self, k: int, arrivals: Sequence[Arrival]) -> TickRecord:
         """Steps the site."""
-        return self._stepped.step(TickInput(k, arrivals))
+        return self._site.step(TickInput(k, arrivals))
 
     def run_housekeeping(self, *_: object) -> bool:
-        """Drops what a site would send and tell; nobody asks anything, or ends it."""
+        """Does nothing; False means that the run goes on."""
         return False
 
     publish_sample = run_housekeeping
@@ -398,95 +424,103 @@ class Rehearsal(LoopStats):
 
 
 def rehearse_rates(clock: Clock) -> list[tuple[int, int, int]]:
-    """Runs a site at one rate after the other until one is held, or none.
+    """Runs a site at decreasing rates until a rate is held.
 
-    Returns for each its rate, Hz, the lateness within which `HELD_SHARE` of its ticks began,
-    and the largest.
+    Returns:
+        For each rate: the rate, Hz; the lateness that `MIN_PUNCTUAL_SHARE` of its ticks did
+        not exceed, us; and the largest lateness, us.
     """
-    found: list[tuple[int, int, int]] = []
+    results: list[tuple[int, int, int]] = []
     for rate_hz in RATES_HZ:
-        if not found or not is_held(*found[-1][:2]):
-            scenario = load_scenario("free", {"rate_hz": rate_hz, "duration_s": REHEARSAL_S})
-            warm_up(scenario, "s", clock)
-            late_us = sorted(Rehearsal(scenario, "s").run(clock))
-            found.append((rate_hz, late_us[int(HELD_SHARE * len(late_us))], late_us[-1]))
-    return found
+        if results and is_held(results[-1][0], results[-1][1]):
+            break
+        scenario = load_scenario("free", {"rate_hz": rate_hz, "duration_s": REHEARSAL_S})
+        warm_up(scenario, "s", clock)
+        late_us = sorted(Rehearsal(scenario, "s").run(clock))
+        quantile_us = late_us[int(MIN_PUNCTUAL_SHARE * len(late_us))]
+        results.append((rate_hz, quantile_us, late_us[-1]))
+    return results
 
 
 def is_held(rate_hz: int, late_us: int) -> bool:
-    """True if a lateness is within `HELD_PERIODS` of a rate."""
-    return late_us <= HELD_PERIODS * 1e6 / rate_hz
+    """True if a lateness is at most `MAX_LATE_PERIODS` of the period of a rate."""
+    return late_us <= MAX_LATE_PERIODS * 1e6 / rate_hz
 
 
-_RATES = (
+_RATES_CODE = (
     "import json; from sites import doctor, realtime; realtime.prepare(None); "
     "print(json.dumps(doctor.rehearse_rates(doctor.SystemClock())))"
 )
 
 
 def examine_rate() -> DoctorFinding:
-    """Returns the highest tick rate that a site alone holds here and now, measured for a second
-    each.
-    """
+    """Returns the highest tick rate that a single site holds now, measured for 1 s each."""
     if not is_core_cached():
         return DoctorFinding(
             "rate", "warn", "not measured: the core is not yet compiled, see below"
         )
-    found: list[tuple[int, int, int]] | None = _ask_process(_RATES)
-    if found is None:
+    results: list[tuple[int, int, int]] | None = _run_in_process(_RATES_CODE)
+    if results is None:
         return DoctorFinding("rate", "warn", "could not be measured")
-    *missed, (rate_hz, late_us, largest_us) = found
-    within = f"{HELD_SHARE:.0%} of the ticks began within {late_us / 1e3:.2f} ms of their time"
-    text = f"{within}, all within {largest_us / 1e3:.1f} ms"
+    *missed, (rate_hz, late_us, largest_us) = results
+    share = f"{MIN_PUNCTUAL_SHARE:.0%}"
+    text = (
+        f"{share} of the ticks began within {late_us / 1e3:.2f} ms of their time, "
+        f"all within {largest_us / 1e3:.1f} ms"
+    )
     if not is_held(rate_hz, late_us):
         text = f"a site alone holds not even {rate_hz} Hz: {text}; end other programs"
         return DoctorFinding("rate", "fail", text)
-    text = (
-        f"a site alone holds {rate_hz} Hz: {text} ({HELD_SHARE:.0%} must within half a period)"
-    )
+    text = f"a site alone holds {rate_hz} Hz: {text} ({share} must within half a period)"
     if missed:
-        text += f"; at {missed[-1][0]} Hz within {missed[-1][1] / 1e3:.2f} ms: lower rate_hz"
+        missed_hz, missed_us, _ = missed[-1]
+        text += f"; at {missed_hz} Hz within {missed_us / 1e3:.2f} ms: lower rate_hz"
     return DoctorFinding("rate", "warn" if missed else "ok", text)
 
 
 def examine_room(folder: Path) -> Iterator[DoctorFinding]:
-    """Yields free disk, processors and their load, and whether the core is compiled."""
-    place = next(
-        path for path in (folder.absolute(), *folder.absolute().parents) if path.is_dir()
-    )
-    free = shutil.disk_usage(place).free
-    state: FindingState = "fail" if free < LEAST_BYTES else "warn" if free < FEW_BYTES else "ok"
-    if not os.access(place, os.W_OK):
-        yield DoctorFinding("disk", "fail", f"{place} cannot be written to")
-    yield DoctorFinding("disk", state, f"{free / 1e9:.1f} GB are free in {place}")
+    """Yields the free disk space, the load, and whether the kernel is compiled."""
+    candidates = (folder.absolute(), *folder.absolute().parents)
+    existing = next(path for path in candidates if path.is_dir())
+    free = shutil.disk_usage(existing).free
+    state: FindingState = "ok"
+    if free < MIN_FREE_BYTES:
+        state = "fail"
+    elif free < LOW_FREE_BYTES:
+        state = "warn"
+    if not os.access(existing, os.W_OK):
+        yield DoctorFinding("disk", "fail", f"{existing} cannot be written to")
+    yield DoctorFinding("disk", state, f"{free / 1e9:.1f} GB are free in {existing}")
     cores = process.count_cores()
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     text = f"{count_nouns(cores, 'processor')}, of which {load:.1f} are busy"
     warning = describe_load(measure_busy_share(SystemClock()))
+    if warning:
+        text = f"{text}; {warning}"
     is_short = cores < 2 or load >= cores or bool(warning)
-    yield DoctorFinding(
-        "processors", "warn" if is_short else "ok", f"{text}; {warning}" if warning else text
-    )
-    cached = is_core_cached()
-    late = "not yet compiled: the first session here begins half a minute later"
-    yield DoctorFinding("core", "ok" if cached else "warn", "compiled" if cached else late)
+    yield DoctorFinding("processors", "warn" if is_short else "ok", text)
+    if is_core_cached():
+        yield DoctorFinding("core", "ok", "compiled")
+    else:
+        text = "not yet compiled: the first session here begins half a minute later"
+        yield DoctorFinding("core", "warn", text)
 
 
 @dataclass(frozen=True, repr=False)
 class DoctorReport(Result):
-    """What stands in the way of a session on this machine, and what does not."""
+    """All findings about this machine."""
 
     findings: list[DoctorFinding]
 
     def headline(self) -> str:
-        """Returns how many findings warn or fail."""
+        """Returns the numbers of findings that fail, warn and are ok."""
         states = [finding.state for finding in self.findings]
         return (
             f"{states.count('fail')} fail, {states.count('warn')} warn, {states.count('ok')} ok"
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns plain values, with the findings as of `trilat doctor --json`."""
+        """Returns plain values, as `trilat doctor --json` prints them."""
         return {"findings": self.to_rows()}
 
     def to_rows(self) -> list[dict[str, Any]]:
@@ -504,8 +538,7 @@ def doctor(
     folder: str | Path = "runs",
     insecure: bool = False,
 ) -> DoctorReport:
-    """Examines keys, links, clocks, rights, disk and processors; the command is `trilat
-    doctor`.
+    """Examines keys, links, clocks, rights, disk and processors; as `trilat doctor`.
 
     >>> "clock" in {finding.check for finding in tn.doctor().findings}
     True
@@ -514,22 +547,20 @@ def doctor(
         listen: endpoints to listen at.
         connect: endpoints to connect to.
         router: endpoints of routers.
-        keys: folder of a member's keys.
-        session: a session whose members are asked for their clocks.
-        folder: where results would go.
+        keys: the folder of a member's keys.
+        session: a session whose members' clocks are compared.
+        folder: where results would be stored.
         insecure: whether everybody on the network is trusted.
 
     Raises:
         UsageError: an endpoint or the keys cannot be used.
     """
-    connection = resolve_member_connection(listen, connect, router)
-    place = None if keys is None else Path(keys)
-    found = examine_machine(
-        connection=connection,
-        keys=place,
+    findings = examine_machine(
+        connection=resolve_member_connection(listen, connect, router),
+        keys=None if keys is None else Path(keys),
         folder=Path(folder),
         session=session,
         clock=SystemClock(),
         insecure=insecure,
     )
-    return DoctorReport(list(found))
+    return DoctorReport(list(findings))

@@ -1,9 +1,12 @@
-"""The benchmark of a network: round trips by size, rate and transport, against what a scenario
-bears.
+"""The benchmark of a network: round trips by size, rate and transport.
 
-Invariant: it is no part of any session. Its payloads go as samples go, by the same keys' roles,
-priority and settings, in a session of its own name; the far end sends each back at once. It
-lasts as long as it was told.
+The results are judged against the delay and the loss that a scenario tolerates.
+
+Invariant:
+    - The benchmark is part of no session. Its payloads travel like samples, with the same
+      roles, priority and settings, in a session of its own name.
+    - The far end sends each payload back at once.
+    - The benchmark takes as long as requested.
 """
 
 import math
@@ -45,41 +48,42 @@ from trilat_net.scenario.delay_models.kernel_delays import ConstantDelay
 SESSION = "benchmark"
 NEAR = "near"
 FAR = "far"
-"""Names of the ends that have no keys."""
+"""Names of the near and far ends without keys."""
 PROTOCOLS = ("tcp", "tls", "quic")
-SIZES = (1, 4, 16)
-"""Of a payload, in samples of the scenario."""
-RATES = (0.1, 1.0)
-"""In the scenario's rate."""
+SIZE_FACTORS = (1, 4, 16)
+"""Sizes of the payloads, in samples of the scenario."""
+RATE_SHARES = (0.1, 1.0)
+"""Rates of the payloads, as shares of the scenario's rate."""
 DEFAULT_S = 24.0
-"""All cases together, s: with three transports 18 of 1.33 s each."""
+"""Duration of all cases together, s: with three transports 18 cases of 1.33 s each."""
 CONNECT_NS = 20_000_000_000
 """Longest wait for the far end."""
 MAX_LOST = 1e-3
-"""The largest share of samples lost that is good enough."""
+"""Largest tolerable share of lost samples."""
 _RETRY_NS = 50_000_000
-_STRAGGLE_NS = 500_000_000
+_LAST_REPLY_NS = 500_000_000
 _HEADER = struct.Struct("<QQqB")
-"""Who measures, number of the sample, time of its departure, ns; 1 in an answer."""
+"""Identity of the measuring end, number of the sample, its time of sending in ns; 1 in a reply.
+"""
 
 
-def _read(payload: bytes) -> tuple[int, ...] | None:
+def _parse_header(payload: bytes) -> tuple[int, ...] | None:
     return _HEADER.unpack_from(payload) if len(payload) >= _HEADER.size else None
 
 
 def answer_benchmarks(bus: Bus, member: str) -> None:
-    """Sends back what benchmarks send, until the bus is closed."""
+    """Sends back the payloads of benchmarks until the bus is closed."""
     put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
 
     def answer(_: str, payload: bytes) -> None:
-        if (header := _read(payload)) is not None and not header[-1]:
+        if (header := _parse_header(payload)) is not None and not header[-1]:
             put(_HEADER.pack(*header[:-1], 1) + payload[_HEADER.size :])
 
     bus.tap(topics.key(SESSION, "*", topics.SAMPLE), answer)
 
 
 class NearEnd:
-    """The end that measures."""
+    """The end that measures round trips."""
 
     def __init__(self, bus: Bus, clock: Clock, member: str) -> None:
         self._clock = clock
@@ -88,7 +92,7 @@ class NearEnd:
         self._put = bus.publisher(topics.key(SESSION, member, topics.SAMPLE))
         key = topics.key(SESSION, "*", topics.SAMPLE)
         self._inbox: StampedInbox[tuple[int, ...] | None] = bus.stamped_inbox(
-            key, clock.monotonic_ns, _read
+            key, clock.monotonic_ns, _parse_header
         )
 
     def _send(self, size_bytes: int) -> None:
@@ -96,36 +100,41 @@ class NearEnd:
         self._number += 1
         self._put(sample.ljust(size_bytes, b"\0"))
 
-    def _answers(self) -> Iterator[tuple[int, int]]:
+    def _read_replies(self) -> Iterator[tuple[int, int]]:
+        """Yields the number and the round-trip time, ns, of each reply that has arrived."""
         while (entry := self._inbox.poll()) is not None:
             header, arrived_ns = entry
             if header is not None:
-                owner, number, sent_ns, answer = header
-                if answer and owner == self._owner:
+                owner, number, sent_ns, is_reply = header
+                if is_reply and owner == self._owner:
                     yield number, arrived_ns - sent_ns
 
-    def meet(self) -> bool:
-        """Returns True if the far end answers in time."""
+    def wait_for_far_end(self) -> bool:
+        """Returns True once the far end replies; False if it does not reply in time."""
         clock = self._clock
         until_ns = clock.monotonic_ns() + CONNECT_NS
         while clock.monotonic_ns() < until_ns:
             self._send(_HEADER.size)
             clock.sleep_until(clock.monotonic_ns() + _RETRY_NS)
-            if any(self._answers()):
+            if any(self._read_replies()):
                 return True
         return False
 
     def measure(self, size_bytes: int, rate_hz: float, duration_s: float) -> Array:
-        """Returns the round trips of samples sent at a rate, s; NaN for those that did not come
-        back.
+        """Returns the round-trip times of samples, s; NaN for samples without a reply.
+
+        Args:
+            size_bytes: the size of a sample.
+            rate_hz: the rate at which samples are sent, 1/s.
+            duration_s: how long samples are sent, s; at least 10 samples are sent.
         """
         count = max(10, round(rate_hz * duration_s))
         clock = self._clock
         trips_s = np.full(count, np.nan)
         first = self._number
 
-        def take() -> int:
-            for number, trip_ns in self._answers():
+        def count_missing() -> int:
+            for number, trip_ns in self._read_replies():
                 if number >= first:
                     trips_s[number - first] = trip_ns / 1e9
             return int(np.isnan(trips_s).sum())
@@ -135,9 +144,9 @@ class NearEnd:
             clock.sleep_until(begun_ns + round(n * 1e9 / rate_hz))
             self._send(size_bytes)
             if n % 1000 == 0:
-                take()
-        until_ns = clock.monotonic_ns() + _STRAGGLE_NS
-        while take() and clock.monotonic_ns() < until_ns:
+                count_missing()
+        until_ns = clock.monotonic_ns() + _LAST_REPLY_NS
+        while count_missing() and clock.monotonic_ns() < until_ns:
             clock.sleep_until(clock.monotonic_ns() + 5_000_000)
         return trips_s
 
@@ -145,19 +154,25 @@ class NearEnd:
 def _open(
     endpoint: str, keys: MemberKeys | None, *, listens: bool, insecure: bool
 ) -> tuple[ZenohBus, str]:
-    encrypted = endpoint.startswith(ENCRYPTED)
-    if encrypted and keys is None:
+    """Returns a bus at an endpoint, and the name of the member that it belongs to."""
+    is_encrypted = endpoint.startswith(ENCRYPTED)
+    if is_encrypted and keys is None:
         raise UsageError(
             f"{endpoint}: an encrypted endpoint takes keys: give --keys DIR of a site"
         )
-    if encrypted and keys is not None and keys.member in (*ROLES, ROUTER):
+    if is_encrypted and keys is not None and keys.member in (*ROLES, ROUTER):
         raise UsageError(
             f"--keys: a benchmark goes as samples go, so it takes a site's, not {keys.member}'s"
         )
-    used = keys if encrypted else None
-    at_end = Connection(listen=[endpoint]) if listens else Connection(connect=[endpoint])
-    bus = secure_connection(at_end, used, insecure=insecure).open()
-    return bus, used.member if used else FAR if listens else NEAR
+    used_keys = keys if is_encrypted else None
+    if listens:
+        connection = Connection(listen=[endpoint])
+        name = FAR
+    else:
+        connection = Connection(connect=[endpoint])
+        name = NEAR
+    bus = secure_connection(connection, used_keys, insecure=insecure).open()
+    return bus, used_keys.member if used_keys else name
 
 
 def run_far_end(
@@ -169,7 +184,15 @@ def run_far_end(
     insecure: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Answers benchmarks at endpoints until `stopped`, or for some time; says when it begins.
+    """Replies to benchmarks at some endpoints.
+
+    Args:
+        endpoints: the endpoints to listen at.
+        keys: the folder of a site's keys, for encrypted endpoints.
+        stopped: returns True to end the call.
+        duration_s: the longest duration, s.
+        insecure: whether everybody on the network is trusted.
+        say: prints a line for the user.
 
     Raises:
         UsageError: an endpoint or the keys cannot be used.
@@ -187,48 +210,48 @@ def run_far_end(
 
 
 @contextmanager
-def _own_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
-    """Yields endpoints of a far end on this machine, of all transports, and the keys of the
-    near one.
+def _run_local_far_end(duration_s: float) -> Iterator[tuple[list[str], Path]]:
+    """Runs a far end of all transports on this machine.
+
+    It yields the endpoints, and the folder of the near end's keys.
     """
     with tempfile.TemporaryDirectory() as folder:
-        near, far = create_keys(Path(folder) / "keys", [NEAR, FAR], days=1)
+        near_keys, far_keys = create_keys(Path(folder) / "keys", [NEAR, FAR], days=1)
         free = find_free_endpoints(len(PROTOCOLS))
         endpoints = [
-            place.replace("tcp", kind) for kind, place in zip(PROTOCOLS, free, strict=True)
+            endpoint.replace("tcp", protocol)
+            for protocol, endpoint in zip(PROTOCOLS, free, strict=True)
         ]
-        words = [
-            "ping",
-            "--keys",
-            str(far),
-            "--seconds",
-            str(math.ceil(duration_s + 2 * CONNECT_NS / 1e9)),
-        ]
-        words += [word for place in endpoints for word in ("--answer", place)]
+        seconds = math.ceil(duration_s + 2 * CONNECT_NS / 1e9)
+        arguments = ["ping", "--keys", str(far_keys), "--seconds", str(seconds)]
+        for endpoint in endpoints:
+            arguments += ["--answer", endpoint]
         child = subprocess.Popen(
-            [sys.executable, "-m", "trilat_net", *words],
+            [sys.executable, "-m", "trilat_net", *arguments],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
         try:
-            yield endpoints, near
+            yield endpoints, near_keys
         finally:
             child.terminate()
             child.wait()
 
 
 class ScenarioNeeds(NamedTuple):
-    """What a scenario asks of a network.
+    """The requirements of a scenario on its network.
 
     Attributes:
-        sample_bytes: of a sample of its largest arm.
-        playout_ms: the least play-out of its links.
-        held_ms: for how long every link holds its samples at least, by play-out or a constant
-            delay.
-        in_use_ms: the age of samples in use that its own links make; None if theory does not
-            know.
-        stable_ms: the common delays for which its loop is stable; None if theory does not know.
-        words: that in words, or why theory does not know.
+        sample_bytes: the size of a sample of the largest arm.
+        rate_hz: the largest rate of a site, 1/s.
+        playout_ms: the smallest play-out delay of its links.
+        held_ms: the shortest time for which any link holds its samples, by play-out or a
+            constant delay.
+        in_use_ms: the age of samples in use that the scenario's links cause; None if theory
+            cannot tell.
+        stable_ms: the intervals of the common delay for which the loop is stable; None if
+            theory cannot tell.
+        words: a sentence about these intervals, or the reason why theory cannot tell.
     """
 
     sample_bytes: int
@@ -241,8 +264,45 @@ class ScenarioNeeds(NamedTuple):
 
 
 def find_needs(scenario: Scenario) -> ScenarioNeeds:
-    """Returns what a scenario asks of a network; takes as long as `trilat linear`."""
+    """Returns the requirements of a scenario; takes as long as `trilat linear`."""
     links = list(scenario.links.values())
+    held_ms = [
+        max(link.playout_ms, link.delay_ms if isinstance(link, ConstantDelay) else 0.0)
+        for link in links
+    ]
+    rates_hz = [site.rate_hz for site in scenario.sites.values()]
+    # The links of a measured network are replaced by one of 1 ms: their delay is the result.
+    overrides = ["link.model=constant", "link.delay_ms=1"] if scenario.measured else []
+    in_use_ms: float | None = None
+    stable_ms: list[list[float]] | None = None
+    try:
+        require_libraries("scipy")
+        # Imported here because the far end does not need SciPy.
+        from trilat_net.theory.linear_analysis import analyse_linear_loop
+
+        loop = analyse_linear_loop(load_scenario(scenario, overrides))
+    except (ScenarioError, RunFailed, UsageError) as error:
+        description = f"theory does not know its delay margin: {error}"
+    else:
+        description = loop.margin.description
+        stable_ms = [
+            [1e3 * interval.low_s, 1e3 * interval.high_s] for interval in loop.margin.intervals
+        ]
+        if not overrides:
+            in_use_ms = 1e3 * float(loop.conditions.age_s.max())
+    return ScenarioNeeds(
+        sample_bytes=_measure_sample(scenario),
+        rate_hz=max(rates_hz),
+        playout_ms=min((link.playout_ms for link in links), default=0.0),
+        held_ms=min(held_ms, default=0.0),
+        in_use_ms=in_use_ms,
+        stable_ms=stable_ms,
+        words=description,
+    )
+
+
+def _measure_sample(scenario: Scenario) -> int:
+    """Returns the size of a sample of the scenario's largest arm, in bytes."""
     shared = max(arm.counts.shared for arm in scenario.arms.values())
     vectors = {name: [0.5] * shared for name in ("q", "qd", "tau_x")}
     sample = PeerSample(
@@ -254,77 +314,57 @@ def find_needs(scenario: Scenario) -> ScenarioNeeds:
         echo=[[n, 100_000, 2**60] for n in range(len(scenario.names) - 1)],
         **vectors,
     )
-    held = [
-        max(one.playout_ms, one.delay_ms if isinstance(one, ConstantDelay) else 0.0)
-        for one in links
-    ]
-    rates = [site.rate_hz for site in scenario.sites.values()]
-    instead = ["link.model=constant", "link.delay_ms=1"] if scenario.measured else []
-    try:
-        require_libraries("scipy")
-        # SciPy: no need of a far end
-        from trilat_net.theory.linear_analysis import (
-            analyse_linear_loop,
-        )
-
-        found = analyse_linear_loop(load_scenario(scenario, instead))
-    except (ScenarioError, RunFailed, UsageError) as error:
-        theory: tuple[Any, ...] = (
-            None,
-            None,
-            f"theory does not know its delay margin: {error}",
-        )
-    else:
-        stable = [[1e3 * one.low_s, 1e3 * one.high_s] for one in found.margin.intervals]
-        own = None if instead else 1e3 * float(found.conditions.age_s.max())
-        theory = (own, stable, found.margin.description)
-    playout_ms = min((one.playout_ms for one in links), default=0.0)
-    return ScenarioNeeds(
-        len(msgspec.msgpack.encode(sample)),
-        max(rates),
-        playout_ms,
-        min(held, default=0.0),
-        *theory,
-    )
+    return len(msgspec.msgpack.encode(sample))
 
 
 def judge_network(needs: ScenarioNeeds, row: Mapping[str, Any]) -> dict[str, Any]:
-    """Judges if a network is good enough, by its row at the scenario's own size and rate.
+    """Returns whether a network is good enough for a scenario.
 
-    A sample is in use from its receiver's first tick after it came and was due (L2): the
-    network counts with its p99, a play-out and the scenario's own delay hide what is shorter.
+    A sample is in use from the receiver's first tick after the sample has arrived and is due
+    (L2). The network therefore counts with its p99 delay; a play-out delay and the scenario's
+    own delay hide shorter ones.
+
+    Args:
+        needs: the requirements of the scenario.
+        row: the measurement at the scenario's own size and rate.
     """
-    facts = {
+    fields = {
         "transport": row["transport"],
         "good": False,
         "lost_share": row["lost"] / row["sent"],
     }
     times = row["one_way_us"]
     if times is None:
-        nothing = dict.fromkeys(("p99_ms", "age_ms", "spare_ms", "playout_ms"))
-        return {**facts, "hidden": False, **nothing}
+        unknown = dict.fromkeys(("p99_ms", "age_ms", "spare_ms", "playout_ms"))
+        return {**fields, "hidden": False, **unknown}
     period_ms = 1e3 / needs.rate_hz
     p99_ms = times["p99"] / 1e3
     ticks = max(1, math.ceil(max(p99_ms, needs.held_ms) / period_ms - 1e-9))
     age_ms = max(period_ms * ticks, needs.in_use_ms or 0.0)
-    hidden = p99_ms <= needs.held_ms
-    within = [high for low, high in needs.stable_ms or [] if low <= age_ms <= high]
-    bears = hidden if needs.stable_ms is None else bool(within)
+    is_hidden = p99_ms <= needs.held_ms
+    limits_ms = [high for low, high in needs.stable_ms or [] if low <= age_ms <= high]
+    is_tolerated = is_hidden if needs.stable_ms is None else bool(limits_ms)
     return {
-        **facts,
-        "good": bears and facts["lost_share"] <= MAX_LOST,
-        "hidden": hidden,
+        **fields,
+        "good": is_tolerated and fields["lost_share"] <= MAX_LOST,
+        "hidden": is_hidden,
         "p99_ms": p99_ms,
         "age_ms": age_ms,
-        "spare_ms": within[0] - age_ms if within else None,
+        "spare_ms": limits_ms[0] - age_ms if limits_ms else None,
         "playout_ms": math.ceil(times["max"] / 1e3),
     }
 
 
 @dataclass(frozen=True, repr=False)
 class NetworkBenchmark(Result):
-    """A network as it was measured, and whether it is good enough for a scenario, per
-    transport.
+    """A measured network, and whether each transport is good enough for a scenario.
+
+    Attributes:
+        scenario: the name of the scenario.
+        duration_s: the duration of all cases together, s.
+        needs: the requirements of the scenario.
+        rows: a row per size, rate and transport.
+        judged: a verdict per transport.
     """
 
     scenario: str
@@ -335,14 +375,15 @@ class NetworkBenchmark(Result):
 
     @property
     def good(self) -> bool:
-        """True if it is good enough over every transport."""
-        return all(one["good"] for one in self.judged)
+        """True if every transport is good enough."""
+        return all(verdict["good"] for verdict in self.judged)
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat ping --benchmark --json`."""
-        facts = {"scenario": self.scenario, "duration_s": self.duration_s, "good": self.good}
         return {
-            **facts,
+            "scenario": self.scenario,
+            "duration_s": self.duration_s,
+            "good": self.good,
             "needs": self.needs._asdict(),
             "transports": self.judged,
             "rows": self.rows,
@@ -350,12 +391,13 @@ class NetworkBenchmark(Result):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per size, rate and transport; times in us."""
-        flat = []
+        flat_rows = []
         for row in self.rows:
             times = row["one_way_us"] or dict.fromkeys(("p50", "p99", "max"))
-            rest = {key: one for key, one in row.items() if key != "one_way_us"}
-            flat.append({**rest, **{f"{name}_us": one for name, one in times.items()}})
-        return flat
+            flat = {key: value for key, value in row.items() if key != "one_way_us"}
+            flat |= {f"{name}_us": value for name, value in times.items()}
+            flat_rows.append(flat)
+        return flat_rows
 
 
 def ping_benchmark(
@@ -366,8 +408,7 @@ def ping_benchmark(
     connect: Sequence[str] | None = None,
     keys: str | Path | None = None,
 ) -> NetworkBenchmark:
-    """Measures a network by size, rate and transport against a scenario; as `trilat ping
-    --benchmark`.
+    """Measures a network against a scenario's requirements; as `trilat ping --benchmark`.
 
     >>> found = tn.ping_benchmark("p_d_margin", duration_s=2)
     >>> [row["transport"] for row in found.to_dict()["transports"]]
@@ -377,63 +418,68 @@ def ping_benchmark(
         scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
             scenario.
         set: overrides, as in `{"link.model": "measured"}`.
-        duration_s: how long all cases take together, s.
-        connect: endpoints at which `trilat ping --answer` runs; by default one on this machine,
-            over TCP, TLS and QUIC.
-        keys: folder of a site's keys, for encrypted endpoints.
+        duration_s: the duration of all cases together, s.
+        connect: endpoints at which `trilat ping --answer` runs; by default a far end on this
+            machine, over TCP, TLS and QUIC.
+        keys: the folder of a site's keys, for encrypted endpoints.
 
     Raises:
         ScenarioError: the scenario is not valid.
         UsageError: an endpoint or the keys cannot be used.
-        RunFailed: nobody answers at an endpoint.
+        RunFailed: nobody replies at an endpoint.
     """
     chosen = load_scenario(scenario, set)
     needs = find_needs(chosen)
     with ExitStack() as stack:
         if not connect:
-            connect, keys = stack.enter_context(_own_far_end(duration_s))
-        known = None if keys is None else read_member_keys(keys)
-        share_s = duration_s / (len(connect) * len(SIZES) * len(RATES))
-        rows = [
-            row for place in connect for row in _measure_endpoint(place, known, needs, share_s)
-        ]
-    own = [
-        row
+            connect, keys = stack.enter_context(_run_local_far_end(duration_s))
+        member_keys = None if keys is None else read_member_keys(keys)
+        case_s = duration_s / (len(connect) * len(SIZE_FACTORS) * len(RATE_SHARES))
+        rows: list[dict[str, Any]] = []
+        for endpoint in connect:
+            rows += _measure_endpoint(endpoint, member_keys, needs, case_s)
+    scenario_case = (needs.sample_bytes, needs.rate_hz)
+    verdicts = [
+        judge_network(needs, row)
         for row in rows
-        if (row["bytes"], row["rate_hz"]) == (needs.sample_bytes, needs.rate_hz)
+        if (row["bytes"], row["rate_hz"]) == scenario_case
     ]
-    judged = [judge_network(needs, row) for row in own]
-    return NetworkBenchmark(chosen.name, duration_s, needs, rows, judged)
+    return NetworkBenchmark(chosen.name, duration_s, needs, rows, verdicts)
 
 
 def _measure_endpoint(
-    endpoint: str, keys: MemberKeys | None, needs: ScenarioNeeds, share_s: float
+    endpoint: str, keys: MemberKeys | None, needs: ScenarioNeeds, case_s: float
 ) -> Iterator[dict[str, Any]]:
+    """Yields a row per size and rate, each measured for `case_s`."""
+    protocol = endpoint.partition("/")[0]
     bus, member = _open(endpoint, keys, listens=False, insecure=False)
     with closing(bus):
         near = NearEnd(bus, SystemClock(), member)
-        if not near.meet():
+        if not near.wait_for_far_end():
+            port = endpoint.rpartition(":")[2]
             raise RunFailed(
                 f"nobody answers at {endpoint} within {CONNECT_NS // 10**9} s: start there "
-                f"trilat ping --answer {endpoint.partition('/')[0]}/0.0.0.0:{endpoint.rpartition(':')[2]}, "
+                f"trilat ping --answer {protocol}/0.0.0.0:{port}, "
                 "over tls or quic with --keys of another site"
             )
-        for times, part in product(SIZES, RATES):
-            size_bytes = times * needs.sample_bytes
-            rate_hz = part * needs.rate_hz
-            trips_s = near.measure(size_bytes, rate_hz, share_s)
-            came_us = trips_s[np.isfinite(trips_s)] / 2 * 1e6  # half a round trip
-            p50, p99 = np.percentile(came_us, (50, 99)) if len(came_us) else (0.0, 0.0)
-            most = {
-                "p50": float(p50),
-                "p99": float(p99),
-                "max": float(came_us.max(initial=0.0)),
-            }
+        for size_factor, rate_share in product(SIZE_FACTORS, RATE_SHARES):
+            size_bytes = size_factor * needs.sample_bytes
+            rate_hz = rate_share * needs.rate_hz
+            trips_s = near.measure(size_bytes, rate_hz, case_s)
             yield {
-                "transport": endpoint.partition("/")[0],
+                "transport": protocol,
                 "bytes": size_bytes,
                 "rate_hz": rate_hz,
                 "sent": len(trips_s),
                 "lost": int(np.isnan(trips_s).sum()),
-                "one_way_us": most if len(came_us) else None,
+                "one_way_us": _summarise_trips(trips_s),
             }
+
+
+def _summarise_trips(trips_s: Array) -> dict[str, float] | None:
+    """Returns quantiles of the one-way times, us, half a round trip each; None without any."""
+    one_way_us = trips_s[np.isfinite(trips_s)] / 2 * 1e6
+    if not len(one_way_us):
+        return None
+    p50, p99 = np.percentile(one_way_us, (50, 99))
+    return {"p50": float(p50), "p99": float(p99), "max": float(one_way_us.max(initial=0.0))}

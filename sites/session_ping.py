@@ -1,8 +1,8 @@
-"""Ping client: round trips to every member of a session, the links of its sites; delays of a
-topic of ROS 2.
+"""Measures the round trips to all members of a session, its links, and delays of ROS 2 topics.
 
-Invariant: read-only. It announces no token in a session, which neither waits for it nor sees
-it.
+Invariant:
+    - The client only reads. It announces no token, so the session neither waits for it nor
+      sees it.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,16 +28,20 @@ from trilat_net.results import Result
 from trilat_net.scenario import parse_embedded
 
 POLL_NS = 1_000_000
-GATHER_NS = 600_000_000
-"""Time to find members after the first one."""
+GATHERING_NS = 600_000_000
+"""Time for further members to reply after the first one."""
 PATIENCE_NS = 3_000_000_000
-"""Time to wait for the last answers beyond their due time."""
+"""Additional time for the last replies after they are due."""
 
 
 @dataclass(frozen=True, repr=False)
 class PingReport(Result):
-    """Round trips and clock offsets to every member of a session, and its links as its sites
-    measure them.
+    """Round trips and clock offsets to the members of a session, and its links.
+
+    Attributes:
+        session: the session's name.
+        members: a row per member, with the round trips and the offset of its clock.
+        links: a row per link, as the receiving site measures it.
     """
 
     session: str
@@ -50,8 +54,13 @@ class PingReport(Result):
 
 
 class SessionPing:
-    """One measurement of a session, of `count` round trips to each member; call `poll` until
-    `over`.
+    """One measurement of a session; call `poll` until `is_over`.
+
+    Args:
+        bus: a bus that reaches the session.
+        clock: the clock of this process.
+        session: the session's name.
+        count: the number of round trips to each member.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, count: int) -> None:
@@ -59,14 +68,14 @@ class SessionPing:
         self.links: dict[str, LinkStats] = {}
         self._clock = clock
         self._session = session
-        self._count = count
+        self._trips_per_member = count
         self._members = MemberQuery(bus, clock, session)
         self._stats = bus.inbox(topics.key(session, "*", topics.LINK), 256)
         self.pinger = Pinger(bus, clock, session, count)
         self._first_ns: int | None = None
 
     def poll(self) -> None:
-        """Takes the answers that have arrived, and asks again."""
+        """Receives the replies that have arrived, and sends the next queries."""
         for info in self._members.poll():
             self.infos[info.member] = info
             self._first_ns = self._first_ns or self._clock.monotonic_ns()
@@ -78,19 +87,23 @@ class SessionPing:
     def _boots(self) -> set[int]:
         return {info.boot for info in self.infos.values()}
 
-    def over(self, timeout_ns: int, begun_ns: int) -> bool:
-        """True once every member has answered, or has had the time to."""
+    def is_over(self, timeout_ns: int, begun_ns: int) -> bool:
+        """Returns True once every member has replied, or has had the time to.
+
+        Args:
+            timeout_ns: the longest wait for the first reply.
+            begun_ns: the start of the measurement on this process's clock.
+        """
         now_ns = self._clock.monotonic_ns()
         if self._first_ns is None:
             return now_ns - begun_ns > timeout_ns
-        passed_ns = now_ns - self._first_ns
-        enough_ns = GATHER_NS + self._count * PING_PACE_NS + PATIENCE_NS
-        return passed_ns > GATHER_NS and (
-            self.pinger.knows_clocks(self._boots) or passed_ns > enough_ns
-        )
+        elapsed_ns = now_ns - self._first_ns
+        limit_ns = GATHERING_NS + self._trips_per_member * PING_PACE_NS + PATIENCE_NS
+        is_complete = self.pinger.knows_clocks(self._boots) or elapsed_ns > limit_ns
+        return elapsed_ns > GATHERING_NS and is_complete
 
     def report(self) -> PingReport:
-        """Returns what it found."""
+        """Returns the results of the measurement."""
         members = [self._describe(info) for _, info in sorted(self.infos.items())]
         links = [
             {
@@ -108,33 +121,37 @@ class SessionPing:
         return PingReport(self._session, members, links)
 
     def _describe(self, info: Info) -> dict[str, Any]:
+        """Returns the row of a member."""
         trips = self.pinger.trips.get(info.boot)
-        shared = info.clock == self._clock.identity()
+        has_same_clock = info.clock == self._clock.identity()
         rtts_ns = tuple(trips.rtts_ns) if trips else ()
-        facts: dict[str, Any] = {
+        fields: dict[str, Any] = {
             "member": info.member,
             "host": info.host,
             "running": info.running,
             "ticks": info.ticks,
             "answers": len(rtts_ns),
-            "same_clock": shared,
+            "same_clock": has_same_clock,
         }
         if rtts_ns:
-            steps = [abs(b - a) for a, b in pairwise(rtts_ns)]
-            ordered = sorted(rtts_ns)
-            facts["rtt_us"] = {
-                "min": ordered[0] / 1000,
-                "p50": ordered[len(ordered) // 2] / 1000,
-                "p99": ordered[min(len(ordered) - 1, len(ordered) * 99 // 100)] / 1000,
+            steps_ns = [abs(following - rtt) for rtt, following in pairwise(rtts_ns)]
+            ordered_ns = sorted(rtts_ns)
+            count = len(ordered_ns)
+            fields["rtt_us"] = {
+                "min": ordered_ns[0] / 1000,
+                "p50": ordered_ns[count // 2] / 1000,
+                "p99": ordered_ns[min(count - 1, count * 99 // 100)] / 1000,
             }
-            facts["jitter_us"] = sum(steps) / max(1, len(steps)) / 1000
-        estimate = exact_offset(0) if shared else trips.latest if trips else None
+            fields["jitter_us"] = sum(steps_ns) / max(1, len(steps_ns)) / 1000
+        estimate = trips.latest if trips else None
+        if has_same_clock:
+            estimate = exact_offset(0)
         if estimate is not None:
-            facts["offset_ns"] = estimate.offset_ns
-            facts["bound_us"] = (
+            fields["offset_ns"] = estimate.offset_ns
+            fields["bound_us"] = (
                 estimate.error_bound_ns(estimate.local_ns, estimate.offset_ns) / 1000
             )
-        return facts
+        return fields
 
 
 def ping_session(
@@ -145,28 +162,39 @@ def ping_session(
     timeout_s: float,
     stopped: Callable[[], bool],
 ) -> PingReport | None:
-    """Measures a session once; None if `stopped`. It waits for the first answer for
-    `timeout_s`.
+    """Measures a session once.
+
+    Args:
+        connection: the endpoints and keys.
+        clock: the clock of this process.
+        session: the session's name.
+        count: the number of round trips to each member.
+        timeout_s: longest wait for the first reply, s.
+        stopped: returns True to end the measurement.
+
+    Returns:
+        The results; None if `stopped` has returned True.
 
     Raises:
-        RunFailed: no member answered.
+        RunFailed: no member replied.
     """
 
-    def site_names(text: str) -> tuple[str, ...]:
+    def read_site_names(text: str) -> tuple[str, ...]:
         try:
             return parse_embedded(text, session).names
-        # of another version: the first site's endpoint is all that is known
         except ScenarioError:
+            # A scenario of another version: only the first site's endpoint is known.
             return ()
 
-    there = connection, clock, session, site_names
     try:
-        with connect_to_session(*there, stopped=stopped, timeout_s=timeout_s) as bus:
+        with connect_to_session(
+            connection, clock, session, read_site_names, stopped=stopped, timeout_s=timeout_s
+        ) as bus:
             if bus is None:
                 return None
             ping = SessionPing(bus, clock, session, count)
             begun_ns = clock.monotonic_ns()
-            while not ping.over(int(timeout_s * 1e9), begun_ns):
+            while not ping.is_over(int(timeout_s * 1e9), begun_ns):
                 if stopped():
                     return None
                 ping.poll()
@@ -174,20 +202,26 @@ def ping_session(
     except SessionError as error:
         raise RunFailed(str(error)) from None
     if not ping.infos:
-        places = ", ".join(map(str, connection.connect or [default_endpoint(session, 0)]))
+        endpoints = connection.connect or [default_endpoint(session, 0)]
         raise RunFailed(
-            f"no member of session {session!r} answered at {places} within {timeout_s:g} s; is that its "
-            "name, and has it not ended? name other endpoints with --connect"
+            f"no member of session {session!r} answered at {', '.join(map(str, endpoints))} "
+            f"within {timeout_s:g} s; is that its name, and has it not ended? "
+            "name other endpoints with --connect"
         )
     return ping.report()
 
 
 @dataclass(frozen=True, repr=False)
 class TopicDelays(Result):
-    """How long messages of a topic of ROS 2 were on their way, for each publisher of it.
+    """The delays of the messages of a ROS 2 topic, for each of its publishers.
 
-    From the time of sending in the attachment of each to its arrival here: it contains the
-    offset between the clocks of the two machines.
+    A delay is the time from the sending time stamp of a message to its arrival here. It
+    contains the offset between the clocks of the two machines.
+
+    Attributes:
+        topic: the name of the topic.
+        lasted_s: the duration of the measurement, s.
+        publishers: a row per publisher.
     """
 
     topic: str
@@ -202,49 +236,56 @@ class TopicDelays(Result):
 def ping_topic(
     graph: Ros2Graph, clock: Clock, topic: str, lasts_s: float, stopped: Callable[[], bool]
 ) -> TopicDelays:
-    """Listens to a topic of ROS 2 for some time, or until `stopped`.
+    """Measures the delays of a ROS 2 topic for `lasts_s`, or until `stopped` returns True.
 
     Raises:
-        RunFailed: nobody published anything.
+        RunFailed: nobody has published on the topic.
     """
-    heard: dict[bytes, list[tuple[int, int]]] = {}
+    samples: dict[bytes, list[tuple[int, int]]] = {}
     types: dict[bytes, str] = {}
 
-    def take(kind: str, attachment: Attachment) -> None:
-        late_ns = clock.unix_ns() - attachment.sent_unix_ns
+    def receive(kind: str, attachment: Attachment) -> None:
+        delay_ns = clock.unix_ns() - attachment.sent_unix_ns
         types[attachment.gid] = kind
-        heard.setdefault(attachment.gid, []).append((attachment.number, late_ns))
+        samples.setdefault(attachment.gid, []).append((attachment.number, delay_ns))
 
-    graph.tap(topic, take)
+    graph.tap(topic, receive)
     begun_ns = clock.monotonic_ns()
     while not stopped() and clock.monotonic_ns() - begun_ns < lasts_s * NS_PER_S:
         clock.sleep_until(clock.monotonic_ns() + 10 * POLL_NS)
     lasted_s = (clock.monotonic_ns() - begun_ns) / NS_PER_S
-    if not heard:
+    if not samples:
         raise RunFailed(
-            f"nobody published on /{topic} in {lasted_s:.3g} s: see ros2 topic list, and --domain"
+            f"nobody published on /{topic} in {lasted_s:.3g} s: "
+            "see ros2 topic list, and --domain"
         )
-    publishers = [
-        {
-            "gid": gid.hex(),
-            "type": types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_"),
-        }
-        | _describe_delays(list(came), lasted_s)
-        for gid, came in list(heard.items())
-    ]
+    publishers = []
+    for gid, publisher_samples in list(samples.items()):
+        # From the name of the type in DDS, as in "std_msgs::msg::dds_::Bool_".
+        kind = types[gid].replace("::dds_::", "/").replace("::", "/").removesuffix("_")
+        delays = _describe_delays(list(publisher_samples), lasted_s)
+        publishers.append({"gid": gid.hex(), "type": kind} | delays)
     return TopicDelays(topic, lasted_s, publishers)
 
 
-def _describe_delays(came: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:
-    """Returns what is known of one publisher; a number that is missing between others was lost."""
-    numbers = {number for number, _ in came}
-    late_us = np.array([late_ns for _, late_ns in came]) / 1e3
-    counts, edges_us = np.histogram(late_us, bins=20)
-    quantiles = {"min": 0.0, "p50": 50.0, "p99": 99.0, "max": 100.0}
+def _describe_delays(samples: Sequence[tuple[int, int]], lasted_s: float) -> dict[str, Any]:
+    """Returns the row of a publisher.
+
+    Args:
+        samples: the number and the delay, ns, of each received message. A number that is
+            missing between others was lost.
+        lasted_s: the duration of the measurement, s.
+    """
+    numbers = {number for number, _ in samples}
+    delays_us = np.array([delay_ns for _, delay_ns in samples]) / 1e3
+    counts, edges_us = np.histogram(delays_us, bins=20)
+    percents = {"min": 0.0, "p50": 50.0, "p99": 99.0, "max": 100.0}
     return {
-        "messages": len(came),
+        "messages": len(samples),
         "lost": max(numbers) - min(numbers) + 1 - len(numbers),
-        "rate_hz": len(came) / lasted_s,
-        "delay_us": {name: float(np.percentile(late_us, at)) for name, at in quantiles.items()},
+        "rate_hz": len(samples) / lasted_s,
+        "delay_us": {
+            name: float(np.percentile(delays_us, percent)) for name, percent in percents.items()
+        },
         "histogram": {"edges_us": edges_us.tolist(), "counts": counts.tolist()},
     }

@@ -59,7 +59,7 @@ def test_round_trips_are_those_of_the_network(trip_ms: float) -> None:
 
     def run(clock):
         near = NearEnd(network.join(), clock, "near")
-        met = near.meet()
+        met = near.wait_for_far_end()
         begun_ns = clock.monotonic_ns()
         trips_s = near.measure(500, 1000, 0.2)
         return met, trips_s, clock.monotonic_ns() - begun_ns
@@ -76,7 +76,7 @@ def test_round_trips_are_those_of_the_network(trip_ms: float) -> None:
 
 def test_nobody_there_is_said() -> None:
     relay, network = Relay(), LocalNetwork()
-    relay.add("near", lambda clock: NearEnd(network.join(), clock, "near").meet())
+    relay.add("near", lambda clock: NearEnd(network.join(), clock, "near").wait_for_far_end())
     assert relay.run()["near"] is False
 
 

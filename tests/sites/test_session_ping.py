@@ -2,7 +2,7 @@
 
 import pytest
 
-from sites.session_ping import GATHER_NS, ping_topic
+from sites.session_ping import GATHERING_NS, ping_topic
 from tests.json_outline import is_documented
 from tests.net.manual_clock import ManualClock
 from tests.net.parties import SESSION, Member, Party, told
@@ -85,13 +85,13 @@ def test_it_waits_a_little_for_the_others() -> None:
     party.start("m")
     visit = Visit(party, count=5)
     member: Member | None = None
-    while not visit.probe.over(S, visit.begun_ns):
+    while not visit.probe.is_over(S, visit.begun_ns):
         visit.probe.poll()
         for present in (party.members["m"], member):
             if present is not None:
                 present.poll()
         party.clock.sleep_until(party.clock.monotonic_ns() + 2_000_000)
-        if member is None and party.clock.monotonic_ns() - visit.begun_ns > GATHER_NS // 3:
+        if member is None and party.clock.monotonic_ns() - visit.begun_ns > GATHERING_NS // 3:
             member = party.member("s")
     assert {facts["member"] for facts in visit.probe.report().members} == {"m", "s"}
 

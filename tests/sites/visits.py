@@ -23,7 +23,7 @@ class Visit:
 
     def look(self, timeout_ns: int = S) -> SessionPing:
         for n in range(2_000_000_000):
-            if self.probe.over(timeout_ns, self.begun_ns):
+            if self.probe.is_over(timeout_ns, self.begun_ns):
                 break
             self.probe.poll()
             if n % 10 == 0:
