@@ -1,11 +1,12 @@
-"""The closed loop linearised about its equilibrium: roots, delay margin, stability edges,
-haptic ports.
+"""Linear analysis of the closed loop: roots, delay margin, stability edges, haptic ports.
 
-Invariant: the equations are written anew in plain NumPy and share nothing with the core's
-leaves, so that roots and runs check each other; the simulation only supplies the pose at which
-a run settles.
+The loop is linearised about its equilibrium. Definitions, equations and sources are in
+docs/linear.md and docs/ports.md.
 
-Definitions, equations and sources are in docs/linear.md and docs/ports.md.
+Invariant:
+    - The equations are written a second time in plain NumPy and share nothing with the compiled
+      core, so that roots and runs check each other.
+    - The simulation only supplies the pose at which a run comes to rest.
 """
 
 from .equilibrium import find_equilibrium

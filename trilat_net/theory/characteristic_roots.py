@@ -372,7 +372,7 @@ def count_zero_roots(pencil: Pencil) -> tuple[int, int]:
 def refine_roots(
     pencil: Pencil, candidates: Complex, names: Sequence[str], wanted: int
 ) -> tuple[list[CharacteristicRoot], int]:
-    """Returns the rightmost `wanted` roots near some guesses, and the number of failed guesses.
+    """Returns the rightmost `wanted` roots near some guesses, and the count of failures.
 
     Two more roots than wanted are refined, because Newton's method may change their order; the
     remaining guesses are skipped.

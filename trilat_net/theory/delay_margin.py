@@ -1,4 +1,4 @@
-"""The delay margin: the common delays of all links for which the continuous loop is stable.
+"""The delay margin: common delays of all links for which the continuous loop is stable.
 
 With one delay T on all links the loop has a root at j w where det(I - exp(-j w T) G(j w)) = 0.
 Here G(j w) consists of the delayed rows of (j w I - A)^-1 A_d. So G has an eigenvalue of

@@ -1,9 +1,11 @@
-"""Equilibria of the loop: at the end of a run, nearest to a pose, or predicted by the linear
-loop.
+"""Equilibria of the loop: at the end of a run, nearest to a pose, or predicted.
 
-Invariant: the result solves the equations to 1e-10, or a note says that it does not. Equilibria
-are not isolated (any pose that the sites agree on may be one), so each is the nearest to a
-stated pose. The simulation supplies starting values only.
+Equilibria are not isolated: any pose on which the sites agree may be an equilibrium. Every
+result is therefore the equilibrium nearest to a stated pose. The simulation supplies starting
+values only.
+
+Invariant:
+    - The result solves the equations to 1e-10, or a note states that it does not.
 """
 
 from collections.abc import Iterator, Sequence
@@ -35,9 +37,9 @@ from .site_dynamics import (
 from .textbook_arm import SINGULAR
 
 MAX_PROLONGATION = 8.0
-"""A run that is not at rest goes on for up to this multiple of its duration."""
+"""A run that is not at rest is extended up to this multiple of its duration."""
 _MAX_RUN_TICKS = 4_000_000
-"""Limit of a prolonged run, in ticks of all sites together."""
+"""Limit of an extended run, in ticks of all sites together."""
 
 MAX_EQUILIBRIUM_RESIDUAL = 1e-10
 """The largest residual of an equilibrium."""
@@ -45,35 +47,42 @@ _NEWTON_RESIDUAL = 1e-11
 """A residual below this is rounding, rad/s^2."""
 _GAUSS_NEWTON_STEPS = 60
 _MAX_STEP = 0.3
+"""Largest change of a state in one Gauss-Newton step, rad or units of the estimate."""
 _MAX_HALVINGS = 20
 _SETTLING_TICKS = 20_000
+"""Ticks that the memory of an imported law has to become constant."""
 _FLAT = 1e-8
-"""A singular value this small, relative to the largest, belongs to a direction of further
-equilibria.
+"""A singular value this small, relative to the largest, counts as zero.
+
+Its direction leads to further equilibria.
 """
 
 
 def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
-    """Returns the experiment prolonged: forces present at its end stay, but for those that
-    swing.
+    """Returns the experiment with a longer duration, s, in which nothing new begins.
 
-    Nothing new begins.
+    Hands and environments that are present at the original end stay; chirps and multisines are
+    removed.
     """
     end_s = scenario.duration_s
 
-    def prolong(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
-        return tuple(
-            msgspec.structs.replace(actor, end_s=1e9)
-            if getattr(actor, "end_s", 0.0) > end_s and hasattr(actor, "stiffness_nm_rad")
-            else actor
-            for actor in actors
-            if getattr(actor, "start_s", 0.0) <= end_s
-            and not isinstance(actor, Chirp | Multisine)
-        )
+    def extend_actors(actors: tuple[msgspec.Struct, ...]) -> tuple[msgspec.Struct, ...]:
+        extended = []
+        for actor in actors:
+            if getattr(actor, "start_s", 0.0) > end_s or isinstance(actor, Chirp | Multisine):
+                continue
+            is_present = getattr(actor, "end_s", 0.0) > end_s
+            if is_present and hasattr(actor, "stiffness_nm_rad"):
+                extended.append(msgspec.structs.replace(actor, end_s=1e9))
+            else:
+                extended.append(actor)
+        return tuple(extended)
 
     sites = {
         name: msgspec.structs.replace(
-            spec, hands=prolong(spec.hands), environment=prolong(spec.environment)
+            spec,
+            hands=extend_actors(spec.hands),
+            environment=extend_actors(spec.environment),
         )
         for name, spec in scenario.sites.items()
     }
@@ -84,142 +93,168 @@ def extend_scenario(scenario: Scenario, duration_s: float) -> Scenario:
 
 
 def compute_equilibrium_residual(conditions: OperatingConditions, rest: Equilibrium) -> Array:
-    """Returns the accelerations and rates of estimates at a pose, in the order of the loop's
-    states.
+    """Returns the rates at a pose in the order of the loop's states, shape (states,).
 
-    The derivatives of the angles are zero.
+    They are zero for the angles, and the accelerations and the rates of the estimates.
     """
-    x = linear_loop.gather_site_arguments(conditions, rest)
+    arguments = linear_loop.gather_site_arguments(conditions, rest)
     states = [
-        np.concatenate([np.zeros_like(one.qdd), one.qdd, one.estimate])
-        for one in conditions.evaluate_rates(x)
+        np.concatenate([np.zeros_like(rates.qdd), rates.qdd, rates.estimate])
+        for rates in conditions.evaluate_rates(arguments)
     ]
     return _select_loop_states(conditions, states)
 
 
 def _select_loop_states(conditions: OperatingConditions, states: Sequence[Array]) -> Array:
+    """Returns the states in the loop of all sites in one vector."""
     masks = linear_loop.mask_loop_states(conditions)
-    return np.concatenate([own[mask] for own, mask in zip(states, masks, strict=True)])
+    return np.concatenate(
+        [site_states[mask] for site_states, mask in zip(states, masks, strict=True)]
+    )
 
 
 @limit_blas_threads()
 def find_nearest_equilibrium(conditions: OperatingConditions, rest: Equilibrium) -> Equilibrium:
-    """Returns the equilibrium nearest to a pose: Gauss-Newton steps of least norm from there.
+    """Returns the equilibrium nearest to a pose, by Gauss-Newton steps of least norm.
 
     Raises:
         ScenarioError: a site in task space is in a singular pose.
     """
     _refuse_singular_poses(conditions, rest)
-    if conditions.has_forms:  # what such a law remembers is not in a pose
+    if conditions.has_forms:
+        # the memory of such a law supplies the holding torque, and a pose does not contain it
         return rest._replace(residual=0.0)
     residual = compute_equilibrium_residual(conditions, rest)
     for _ in range(_GAUSS_NEWTON_STEPS):
         if np.abs(residual).max() <= _NEWTON_RESIDUAL:
             break
-        loop = linear_loop.linearise_loop(conditions, rest, all_estimates=True)
-        effects = np.hstack([loop.A, *(term.A for term in loop.delayed)])
-        # velocities are zero, and what nothing moves (an estimate without a gain, at an end of its box) stays
-        speeds = [name.rpartition(".")[2].startswith("qd") for name in loop.names]
-        free = np.flatnonzero(effects.any(axis=1) & ~np.array(speeds))
-        step = np.zeros(len(loop.names))
-        step[free] = np.linalg.lstsq(loop.static_matrix[:, free], -residual, rcond=_FLAT)[0]
+        step = _compute_gauss_newton_step(conditions, rest, residual)
         share = _MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP)
-        for _ in range(_MAX_HALVINGS):  # touching a wall changes the next step
-            tried = _shift_equilibrium(conditions, rest, share * step)
-            after = compute_equilibrium_residual(conditions, tried)
-            if np.linalg.norm(after) < np.linalg.norm(residual):
+        # a shorter step if the residual does not fall, as when a wall is touched
+        for _ in range(_MAX_HALVINGS):
+            candidate = _shift_equilibrium(conditions, rest, share * step)
+            candidate_residual = compute_equilibrium_residual(conditions, candidate)
+            if np.linalg.norm(candidate_residual) < np.linalg.norm(residual):
                 break
             share *= 0.5
         else:
             break
-        rest = tried
-        residual = after
+        rest = candidate
+        residual = candidate_residual
     return rest._replace(residual=float(np.abs(residual).max()))
+
+
+def _compute_gauss_newton_step(
+    conditions: OperatingConditions, rest: Equilibrium, residual: Array
+) -> Array:
+    """Returns the least-squares step of the loop's states, of least norm, shape (states,).
+
+    Velocities stay zero, and so do states that nothing moves: an estimate without a gain, or at
+    an end of its box.
+    """
+    loop = linear_loop.linearise_loop(conditions, rest, all_estimates=True)
+    effects = np.hstack([loop.A, *(term.A for term in loop.delayed)])
+    is_speed = [name.rpartition(".")[2].startswith("qd") for name in loop.names]
+    free = np.flatnonzero(effects.any(axis=1) & ~np.array(is_speed))
+    step = np.zeros(len(loop.names))
+    step[free] = np.linalg.lstsq(loop.static_matrix[:, free], -residual, rcond=_FLAT)[0]
+    return step
 
 
 def _shift_equilibrium(
     conditions: OperatingConditions, rest: Equilibrium, step: Array
 ) -> Equilibrium:
-    """Returns an equilibrium shifted by a deviation of the loop's states; velocities do not
-    count.
-    """
+    """Returns an equilibrium shifted by a step of the loop's states; velocities are ignored."""
     masks = linear_loop.mask_loop_states(conditions)
-    parts = np.split(step, np.cumsum([np.count_nonzero(mask) for mask in masks])[:-1])
+    bounds = np.cumsum([np.count_nonzero(mask) for mask in masks])[:-1]
+    site_steps = np.split(step, bounds)
     q = np.array(rest.q)
     theta_hat = np.array(rest.theta_hat)
-    for n, (site, mask, part) in enumerate(zip(conditions.sites, masks, parts, strict=True)):
-        at = lay_out_arguments(site)
-        states = np.zeros(len(mask))
-        states[mask] = part
-        q[n, : at.joints] += states[at.q]
-        theta_hat[n, : at.parameters] += states[at.estimate]
+    for n, site in enumerate(conditions.sites):
+        layout = lay_out_arguments(site)
+        states = np.zeros(len(masks[n]))
+        states[masks[n]] = site_steps[n]
+        q[n, : layout.joints] += states[layout.q]
+        theta_hat[n, : layout.parameters] += states[layout.estimate]
     return rest._replace(q=q, theta_hat=theta_hat)
 
 
 def pad_rows(rows: Sequence[Sequence[float] | Array]) -> Array:
-    """Returns vectors of several lengths as the rows of one array, the shorter ones followed by
-    zeros.
-    """
+    """Returns vectors of different lengths as rows of one array, padded with zeros."""
     padded = np.zeros((len(rows), max(map(len, rows))))
-    for own, row in zip(padded, rows, strict=True):
-        own[: len(row)] = row
+    for padded_row, row in zip(padded, rows, strict=True):
+        padded_row[: len(row)] = row
     return padded
 
 
 def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -> None:
-    for site, x in zip(
-        conditions.sites, linear_loop.gather_site_arguments(conditions, rest), strict=True
-    ):
+    """Raises ScenarioError if a site in task space is in a singular pose."""
+    arguments = linear_loop.gather_site_arguments(conditions, rest)
+    for site, x in zip(conditions.sites, arguments, strict=True):
         arm = place_arm(site, x[lay_out_arguments(site).q])
         if not follow_peers(site, arm, x).least > SINGULAR:
             raise ScenarioError(
-                "rests in a singular pose, where the inverse of its Jacobian, and so the loop, has no "
-                "derivative: end it elsewhere, or follow fewer axes",
+                "rests in a singular pose, where the inverse of its Jacobian, and so the loop, "
+                "has no derivative: end it elsewhere, or follow fewer axes",
                 path=f"sites.{site.name}.task.axes",
             )
 
 
 def predict_from_start(conditions: OperatingConditions, scenario: Scenario) -> Equilibrium:
-    """Returns the equilibrium that the linear loop reaches from the start poses if its other
-    modes decay.
+    """Returns the equilibrium that the loop reaches from the start poses.
 
-    A loop with roots at zero keeps part of its history: with null vectors W' S = 0 and S V = 0
-    of S = A + sum_k A_k, and D = I + sum_k T_k A_k, it is V (W' D V)^-1 W' (x(0) + sum_k A_k
-    int_{-T_k}^0 x). Hale and Verduyn Lunel, "Introduction to Functional Differential Equations"
-    (1993), chapter 7.
+    The prediction assumes that every mode decays except those at zero. A loop with roots at
+    zero keeps part of its history: with null vectors W' S = 0 and S V = 0 of
+    S = A + sum_k A_k, and D = I + sum_k T_k A_k, it is
+
+        V (W' D V)^-1 W' (x(0) + sum_k A_k int_{-T_k}^0 x)
+
+    Hale and Verduyn Lunel, "Introduction to Functional Differential Equations" (1993),
+    chapter 7.
     """
     q = pad_rows([spec.q0_rad for spec in scenario.sites.values()])
     start = Equilibrium(q, _complete_estimates(conditions), "", 0.0)
-    # ten estimates a link lead steps from afar astray; about a shared pose they are true
+    # from afar, steps of a chain's ten estimates per link diverge; about the mean pose the
+    # estimates are true
     layout = conditions.sites[0].layout
-    alike = layout.chain and not layout.task
-    about = start._replace(q=np.tile(q.mean(axis=0), (len(q), 1))) if alike else start
-    rest = find_nearest_equilibrium(conditions, about)
+    first_guess = start
+    if layout.chain and not layout.task:
+        first_guess = start._replace(q=np.tile(q.mean(axis=0), (len(q), 1)))
+    rest = find_nearest_equilibrium(conditions, first_guess)
     if conditions.has_forms:
         return rest._replace(how="the start poses")
     for _ in range(3):
-        moved = []
-        for site, dq, d_theta in zip(
-            conditions.sites, start.q - rest.q, start.theta_hat - rest.theta_hat, strict=True
-        ):
-            at = lay_out_arguments(site)
-            moved.append(
-                np.concatenate([dq[: at.joints], np.zeros(at.joints), d_theta[: at.parameters]])
-            )
-        deviation = _select_loop_states(conditions, moved)
+        deviation = _compute_deviation(conditions, start, rest)
         loop = linear_loop.linearise_loop(conditions, rest, all_estimates=True)
-        kept = _project_on_zero_roots(loop, deviation)
-        if kept is None:
+        remaining = _project_on_zero_roots(loop, deviation)
+        if remaining is None:
             break
-        rest = find_nearest_equilibrium(conditions, _shift_equilibrium(conditions, rest, kept))
+        shifted = _shift_equilibrium(conditions, rest, remaining)
+        rest = find_nearest_equilibrium(conditions, shifted)
     return rest._replace(
-        how="predicted from the start poses: what the linear loop keeps of its start"
+        how="predicted from the start poses: the part of the start that the linear loop keeps"
     )
 
 
+def _compute_deviation(
+    conditions: OperatingConditions, start: Equilibrium, rest: Equilibrium
+) -> Array:
+    """Returns the deviation of a start at rest from an equilibrium, shape (states,)."""
+    q_deviation = start.q - rest.q
+    estimate_deviation = start.theta_hat - rest.theta_hat
+    states = []
+    for n, site in enumerate(conditions.sites):
+        layout = lay_out_arguments(site)
+        q = q_deviation[n, : layout.joints]
+        estimate = estimate_deviation[n, : layout.parameters]
+        states.append(np.concatenate([q, np.zeros(layout.joints), estimate]))
+    return _select_loop_states(conditions, states)
+
+
 def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Array | None:
-    """Returns the part of a constant deviation that stays; None if roots at zero have too few
-    vectors.
+    """Returns the part of a constant deviation that remains for ever, shape (states,).
+
+    None: the roots at zero have too few vectors.
     """
     left, values, right = np.linalg.svd(loop.static_matrix)
     count = int(np.sum(values <= _FLAT * values[0]))
@@ -235,24 +270,28 @@ def _project_on_zero_roots(loop: linear_loop.LinearLoop, deviation: Array) -> Ar
 
 
 def find_equilibrium(scenario: Scenario, pose: tuple[float, ...] | None = None) -> Equilibrium:
-    """Returns the equilibrium of a scenario: at the end of a run, or at a pose, rad, with true
-    estimates.
+    """Returns the equilibrium of a scenario at the end of a run, or at a pose.
+
+    Args:
+        scenario: the experiment.
+        pose: shared pose of all sites: an angle per joint in rad, or in task space the pose of
+            the end effectors. Estimates are then the true parameters. None: the end of a run.
 
     Raises:
         ScenarioError: the scenario has no linear loop, or no equilibrium near the end of its
             run.
-        UsageError: the pose is not a finite angle for every joint.
+        UsageError: the pose does not consist of as many finite numbers as expected.
     """
     conditions = derive_operating_conditions(scenario)
-    rest = (
-        _find_at_run_end(scenario, conditions) if pose is None else _take_pose(pose, conditions)
-    )
+    if pose is None:
+        rest = _find_at_run_end(scenario, conditions)
+    else:
+        rest = _build_at_pose(pose, conditions)
     return rest._replace(notes=tuple(_describe_limits(conditions, rest)))
 
 
 def predict_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Returns the equilibrium that the linear loop predicts from the start poses, without a
-    run.
+    """Returns the equilibrium that the linear loop predicts from the start poses.
 
     Raises:
         ScenarioError: the scenario has no linear loop, or no equilibrium there.
@@ -262,29 +301,28 @@ def predict_equilibrium(scenario: Scenario) -> Equilibrium:
 
 
 def follow_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
-    """Returns the equilibrium of a scenario nearest to that of another one; the same if it
-    still is one.
+    """Returns the equilibrium of a scenario nearest to the equilibrium of another scenario.
+
+    It is `rest` itself, with completed estimates, if that is an equilibrium here too.
 
     Raises:
         ScenarioError: the scenario has no linear loop, or no equilibrium there.
     """
     conditions = derive_operating_conditions(scenario)
     start = rest._replace(theta_hat=_complete_estimates(conditions, rest.theta_hat))
-    if (
-        conditions.has_forms
-        or float(np.abs(compute_equilibrium_residual(conditions, start)).max())
-        <= MAX_EQUILIBRIUM_RESIDUAL
-    ):
+    if conditions.has_forms:
+        return start
+    residual = compute_equilibrium_residual(conditions, start)
+    if float(np.abs(residual).max()) <= MAX_EQUILIBRIUM_RESIDUAL:
         return start
     return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
 
 
 def choose_equilibrium(scenario: Scenario) -> Equilibrium:
-    """Returns the equilibrium of a scenario: predicted if any shared pose is one, else the end
-    of a run.
+    """Returns the equilibrium of a scenario: predicted where possible, else the end of a run.
 
-    Any shared pose is an equilibrium if no site has estimates and no operator or environment
-    acts.
+    Prediction is possible if any shared pose is an equilibrium: no site has estimates, and no
+    operator or environment acts.
 
     Raises:
         ScenarioError: the scenario has no linear loop, or no equilibrium there.
@@ -294,7 +332,8 @@ def choose_equilibrium(scenario: Scenario) -> Equilibrium:
         return find_equilibrium(scenario)
     if all(site.gains.law is Law.KNOWN for site in sites):
         return predict_equilibrium(scenario)
-    with suppress(ScenarioError):  # a law of one's own need not carry gravity
+    # an imported law need not compensate gravity, so that the prediction may fail
+    with suppress(ScenarioError):
         return predict_equilibrium(scenario)
     return find_equilibrium(scenario)
 
@@ -302,30 +341,32 @@ def choose_equilibrium(scenario: Scenario) -> Equilibrium:
 def _complete_estimates(
     conditions: OperatingConditions, theta_hat: Array | None = None
 ) -> Array:
-    """Returns estimates, the truth if none are given; of laws that learn nothing, the law's
-    parameters.
+    """Returns the estimates of all sites, shape (N, P), padded with zeros.
 
-    Of a law of one's own it is the memory, by default that at the beginning.
+    Args:
+        conditions: the numbers of the loop.
+        theta_hat: known estimates, shape (N, P). None: the true parameters, and for an imported
+            law its initial memory. Laws that learn nothing have their assumed parameters.
     """
     rows = []
     for n, site in enumerate(conditions.sites):
-        given = None if theta_hat is None else theta_hat[n]
+        known = None if theta_hat is None else theta_hat[n]
         if isinstance(site.law_factory, NumericLaw):
-            rows.append(site.law_factory.complete_memory(given))
+            rows.append(site.law_factory.complete_memory(known))
         elif has_estimate(site):
-            rows.append(site.theta if given is None else given[: len(site.theta)])
+            rows.append(site.theta if known is None else known[: len(site.theta)])
         else:
             rows.append(np.broadcast_to(site.gains.known, site.theta.shape))
     return pad_rows(rows)
 
 
-def _settle_memories(
+def _iterate_memories(
     conditions: OperatingConditions, rest: Equilibrium, ticks: int
 ) -> Equilibrium:
+    """Returns a pose with the memories that imported laws have after some ticks there."""
     theta_hat = rest.theta_hat.copy()
-    for n, (site, x) in enumerate(
-        zip(conditions.sites, linear_loop.gather_site_arguments(conditions, rest), strict=True)
-    ):
+    arguments = linear_loop.gather_site_arguments(conditions, rest)
+    for n, (site, x) in enumerate(zip(conditions.sites, arguments, strict=True)):
         if isinstance(site.law_factory, NumericLaw):
             theta_hat[n, : len(site.law_factory.memory)] = site.law_factory.iterate_memory(
                 x, ticks
@@ -333,49 +374,65 @@ def _settle_memories(
     return rest._replace(theta_hat=theta_hat)
 
 
-def _take_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equilibrium:
-    at = lay_out_arguments(conditions.sites[0])
+def _build_at_pose(pose: tuple[float, ...], conditions: OperatingConditions) -> Equilibrium:
+    """Returns the pose that the user requests, with true estimates and its residual.
+
+    Raises:
+        ScenarioError: an end effector does not reach the pose, or the pose is singular.
+        UsageError: the pose does not consist of as many finite numbers as expected.
+    """
+    layout = lay_out_arguments(conditions.sites[0])
     task = conditions.sites[0].layout.task
-    if len(pose) != at.coordinates or not np.isfinite(pose).all():
-        count = "two" if at.coordinates == 2 else str(at.coordinates)
-        numbers = f"{count_nouns(count, 'angle')} in rad" + (
-            ", one per joint" if at.coordinates != 2 else ""
-        )
-        if task:
-            numbers = f"a place in m{' and a rotation vector in rad' * (at.coordinates > 3)} of the end effectors"
+    if len(pose) != layout.coordinates or not np.isfinite(pose).all():
+        example = f"--pose 0.1,0.3{',...' * (layout.coordinates > 2)}"
         raise UsageError(
-            f"--pose is {numbers}, as in --pose 0.1,0.3{',...' * (at.coordinates > 2)}, not {pose}"
+            f"--pose is {_describe_pose(layout.coordinates, task=bool(task))}, "
+            f"as in {example}, not {pose}"
         )
     target = np.array(pose, dtype=np.float64)
     q = [reach_pose(site, target) if task else target for site in conditions.sites]
     rest = Equilibrium(
-        pad_rows(q),
-        _complete_estimates(conditions),
-        "the pose that was asked for, with theta_hat = theta",
-        0.0,
+        q=pad_rows(q),
+        theta_hat=_complete_estimates(conditions),
+        how="the requested pose, with theta_hat = theta",
+        residual=0.0,
     )
     _refuse_singular_poses(conditions, rest)
     if conditions.has_forms:
         return rest
-    rest = _settle_memories(conditions, rest, _SETTLING_TICKS)
-    return rest._replace(
-        residual=float(np.abs(compute_equilibrium_residual(conditions, rest)).max())
-    )
+    rest = _iterate_memories(conditions, rest, _SETTLING_TICKS)
+    residual = compute_equilibrium_residual(conditions, rest)
+    return rest._replace(residual=float(np.abs(residual).max()))
+
+
+def _describe_pose(coordinates: int, *, task: bool) -> str:
+    """Returns the numbers of which a pose consists, for an error message."""
+    if task:
+        rotation = " and a rotation vector in rad" if coordinates > 3 else ""
+        return f"a position in m{rotation} of the end effectors"
+    if coordinates == 2:
+        return f"{count_nouns('two', 'angle')} in rad"
+    return f"{count_nouns(str(coordinates), 'angle')} in rad, one per joint"
 
 
 def reach_pose(site: SiteSetup, pose: Array) -> Array:
-    """Returns the angles, nearest to the start pose, at which a site's end effector is at a
-    shared pose.
+    """Returns the joint angles at which a site's end effector has a pose, rad, shape (n,).
+
+    They are found by Gauss-Newton steps from the start pose, and nearest to it.
+
+    Args:
+        site: setup of a site that follows in task space.
+        pose: the shared pose, shape (m,).
 
     Raises:
-        ScenarioError: it cannot be there along the axes that the site follows.
+        ScenarioError: the end effector does not reach the pose along the followed axes.
     """
-    at = lay_out_arguments(site)
+    layout = lay_out_arguments(site)
     q = np.array(site.q0, dtype=np.float64)
     for _ in range(_GAUSS_NEWTON_STEPS):
-        x = np.zeros(at.arguments)
-        x[at.q] = q
-        x[at.q_des] = pose
+        x = np.zeros(layout.arguments)
+        x[layout.q] = q
+        x[layout.q_des] = pose
         following = follow_peers(site, place_arm(site, q), x)
         if np.abs(following.e).max() <= _NEWTON_RESIDUAL:
             return q
@@ -383,91 +440,100 @@ def reach_pose(site: SiteSetup, pose: Array) -> Array:
         step = np.linalg.lstsq(following.J, -following.e, rcond=_FLAT)[0]
         q = q + step * (_MAX_STEP / max(float(np.abs(step).max()), _MAX_STEP))
     raise ScenarioError(
-        f"its end effector does not reach the pose: {np.abs(following.e).max():.2g} m or rad are left",
+        "its end effector does not reach the pose: "
+        f"{np.abs(following.e).max():.2g} m or rad remain",
         path=f"sites.{site.name}.q0_rad",
     )
 
 
 def find_mean_pose(scenario: Scenario) -> tuple[float, ...]:
-    """Returns the mean of what sites share of their start poses: angles, or their end
-    effectors' poses.
-    """
+    """Returns the mean of the poses that the sites share at the start, shape (m,)."""
     conditions = derive_operating_conditions(scenario)
     count = len(conditions.sites)
     q = pad_rows([site.q0 for site in conditions.sites])
-    alike = conditions._replace(alpha=np.full((count, count), 1.0 / count))
-    return tuple(linear_loop.compute_references(alike, Equilibrium(q, q, "", 0.0))[0].tolist())
+    equal_shares = conditions._replace(alpha=np.full((count, count), 1.0 / count))
+    references = linear_loop.compute_references(equal_shares, Equilibrium(q, q, "", 0.0))
+    return tuple(references[0].tolist())
 
 
 def _find_at_run_end(scenario: Scenario, conditions: OperatingConditions) -> Equilibrium:
-    """Runs a scenario until it is at rest, for at most `MAX_PROLONGATION` times its duration."""
+    """Returns the equilibrium nearest to the end of a run.
+
+    The run is extended until the arms rest, up to `MAX_PROLONGATION` times its duration. If it
+    diverges, the equilibrium is predicted from the start poses.
+    """
     ticks = sum(map(scenario.ticks, scenario.names))
-    most_s = scenario.duration_s * max(1.0, min(MAX_PROLONGATION, _MAX_RUN_TICKS / ticks))
+    extension = max(1.0, min(MAX_PROLONGATION, _MAX_RUN_TICKS / ticks))
+    most_s = scenario.duration_s * extension
     run = FusedRun(extend_scenario(scenario, most_s))
     until_s = scenario.duration_s
     while True:
-        states = run.run_and_sample(until_s)
+        mean_states = run.run_and_sample(until_s)
         speed_rad_s = max(float(values[-BUCKETS_PER_S:, 1].max()) for values in run.maxima)
-        if (
-            run.diverged_s is not None
-            or speed_rad_s < EQUILIBRIUM_SPEED_RAD_S
-            or 2.0 * until_s > most_s
-        ):
+        is_at_rest = speed_rad_s < EQUILIBRIUM_SPEED_RAD_S
+        if run.diverged_s is not None or is_at_rest or 2.0 * until_s > most_s:
             break
         until_s *= 2.0
     if run.diverged_s is not None:
         rest = predict_from_start(conditions, scenario)
         how = f"the run diverges at {run.ran_s:.4g} s; {rest.how}"
         return _require_equilibrium(scenario, rest._replace(how=how))
-    if speed_rad_s < EQUILIBRIUM_SPEED_RAD_S:
+    if is_at_rest:
         q = run.q
         theta_hat = run.theta_hat
-        how = f"the run is at rest at {run.ran_s:.4g} s (slower than {EQUILIBRIUM_SPEED_RAD_S:g} rad/s)"
+        how = (
+            f"the run is at rest at {run.ran_s:.4g} s "
+            f"(slower than {EQUILIBRIUM_SPEED_RAD_S:g} rad/s)"
+        )
     else:
-        q, theta_hat = (values.mean(axis=0) for values in states)
-        how = f"the run still moves at {run.ran_s:.4g} s ({speed_rad_s:.2g} rad/s): the equilibrium nearest "
-        how += "to the mean of its last quarter"
+        q, theta_hat = (values.mean(axis=0) for values in mean_states)
+        how = (
+            f"the run still moves at {run.ran_s:.4g} s ({speed_rad_s:.2g} rad/s): "
+            "the equilibrium nearest to the mean of its last quarter"
+        )
     laws = scenario.controls
-    # of such a law the estimate is its memory
     if any(isinstance(law, ImportedLaw) for law in laws):
+        # the memory of an imported law takes the position of its estimate
         rows = zip(laws, theta_hat, run.memories, strict=True)
         theta_hat = pad_rows(
-            [own if isinstance(law, ImportedLaw) else row for law, row, own in rows]
+            [memory if isinstance(law, ImportedLaw) else row for law, row, memory in rows]
         )
     start = Equilibrium(q, _complete_estimates(conditions, theta_hat), how, 0.0)
-    start = _settle_memories(conditions, start, 1)
+    start = _iterate_memories(conditions, start, 1)
     return _require_equilibrium(scenario, find_nearest_equilibrium(conditions, start))
 
 
 def _require_equilibrium(scenario: Scenario, rest: Equilibrium) -> Equilibrium:
+    """Returns an equilibrium, or raises ScenarioError if its residual is too large."""
     if not rest.residual <= MAX_EQUILIBRIUM_RESIDUAL:
         raise ScenarioError(
-            f"the loop has no equilibrium near the end of its run (residual {rest.residual:.2g} rad/s^2); "
-            "give a pose, as in --pose 0.1,0.3",
+            "the loop has no equilibrium near the end of its run "
+            f"(residual {rest.residual:.2g} rad/s^2); give a pose, as in --pose 0.1,0.3",
             source=scenario.name,
         )
     return rest
 
 
 def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iterator[str]:
+    """Yields remarks on conditions under which the linear loop misses an effect."""
     if rest.residual > MAX_EQUILIBRIUM_RESIDUAL:
         yield (
-            f"the pose is no equilibrium: accelerations or rates of {rest.residual:.2g} remain, and the "
-            "roots are those of equations frozen at it"
+            "the pose is no equilibrium: accelerations or rates of "
+            f"{rest.residual:.2g} remain, and the roots are those of equations frozen at it"
         )
-    x = linear_loop.gather_site_arguments(conditions, rest)
-    for site, own in zip(conditions.sites, x, strict=True):
-        least = (
-            follow_peers(site, place_arm(site, own[lay_out_arguments(site).q]), own).least
-            ** 0.5
-        )
+    arguments = linear_loop.gather_site_arguments(conditions, rest)
+    for site, x in zip(conditions.sites, arguments, strict=True):
+        arm = place_arm(site, x[lay_out_arguments(site).q])
+        least = follow_peers(site, arm, x).least ** 0.5
         task = None if site.chain is None else site.chain.task
         if task is not None and least < task.singular_value:
             yield (
-                f"{site.name} rests near a singular pose (bound of its least singular value {least:.3g}, "
-                f"damped below {task.singular_value:g}): the damping is part of the loop, and J J+ is not 1"
+                f"{site.name} rests near a singular pose (bound of its least singular value "
+                f"{least:.3g}, damped below {task.singular_value:g}): the damping is part of "
+                "the loop, and J J+ is not 1"
             )
-    for site, own, rates in zip(conditions.sites, x, conditions.evaluate_rates(x), strict=True):
+    all_rates = conditions.evaluate_rates(arguments)
+    for site, x, rates in zip(conditions.sites, arguments, all_rates, strict=True):
         torques_nm = np.abs(rates.tau)
         limits_nm = np.broadcast_to(site.tau_limit_nm, rates.tau.shape)
         if (torques_nm >= limits_nm).any():
@@ -476,4 +542,4 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
                 f"{site.name} needs {torques_nm[worst]:.4g} N m at rest, and its clamp is "
                 f"{limits_nm[worst]:g}: the clamp is left out"
             )
-        yield from describe_switching_points(site, own)
+        yield from describe_switching_points(site, x)

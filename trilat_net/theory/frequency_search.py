@@ -1,8 +1,11 @@
-"""Adaptive frequency grids, the minima of curves over frequency, and the bands below a level.
+"""Adaptive frequency grids, minima of curves over frequency, and bands below a level.
 
-Invariant: values on a grid are evidence and no proof. A grid is refined where the response
-changes by more than a tenth, and about every minimum until the deepest changes by less than 1
-%; features narrower than its steps stay hidden.
+A grid is refined where the response changes by more than a tenth between two points, and about
+every minimum until the deepest changes by less than 1 %.
+
+Invariant:
+    - Values on a grid are evidence and no proof: features narrower than the grid's steps stay
+      hidden.
 """
 
 from collections.abc import Callable
@@ -23,13 +26,18 @@ HIGH_HZ = 100.0
 """The default band."""
 
 _PER_DECADE = 40
+"""Points per decade."""
 _PER_TURN = 16
-"""Points for one turn of the phase of a round trip."""
+"""Points per turn of the phase of a round trip."""
 _MAX_POINTS = 6000
 _CHANGE = 0.1
+"""Largest relative change of the response between two points."""
 _CLOSEST = 1e-6
+"""Smallest relative distance of two points."""
 _ROUNDS = 20
+"""Largest number of refinements."""
 _SETTLED = 0.01
+"""A minimum is resolved if its neighbours lie above it by at most this share of its depth."""
 
 
 class FrequencyBand(NamedTuple):
@@ -40,12 +48,12 @@ class FrequencyBand(NamedTuple):
 
 
 class Minima(NamedTuple):
-    """A curve with resolved minima.
+    """A curve over frequency with resolved minima.
 
     Attributes:
-        w_rad_s: frequencies, shape (F,).
-        values: shape (F,).
-        below: the bands in which it lies below its level.
+        w_rad_s: frequencies, shape (F,), rad/s.
+        values: values of the curve, shape (F,).
+        below: the bands in which the curve lies below its level.
     """
 
     w_rad_s: Array
@@ -64,10 +72,15 @@ class Minima(NamedTuple):
 
 
 def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array:
-    """Returns frequencies, rad/s, even on a logarithmic axis and close enough for the phase of
-    a delay.
+    """Returns frequencies that resolve the phase of a delay, rad/s, shape (F,).
 
-    A round trip over the longest delay, T, turns the phase once in pi / T rad/s.
+    They are even on a logarithmic axis, and above some frequency also on a linear axis: a round
+    trip over the longest delay T turns the phase once in pi / T rad/s.
+
+    Args:
+        low_hz: lower end of the band, Hz.
+        high_hz: upper end of the band, Hz.
+        delay_s: the longest delay T, s.
     """
     low = 2.0 * np.pi * low_hz
     high = 2.0 * np.pi * high_hz
@@ -80,8 +93,9 @@ def build_frequency_grid(low_hz: float, high_hz: float, delay_s: float) -> Array
 
 
 def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
-    """Returns the frequency up to which the grid has at least four points in a turn of a round
-    trip, Hz.
+    """Returns the frequency up to which the grid resolves the phase of a delay, Hz.
+
+    Up to there it has at least four points per turn of a round trip.
     """
     step_hz = (high_hz - low_hz) / _MAX_POINTS
     if 8.0 * step_hz * delay_s <= 1.0:
@@ -90,44 +104,54 @@ def find_resolved_hz(low_hz: float, high_hz: float, delay_s: float) -> float:
 
 
 def refine_frequencies(response: PortResponse, w_rad_s: Array) -> Array:
-    """Returns frequencies between which the response changes by at most a tenth, within a limit
-    of points.
+    """Returns a grid on which the response changes by at most a tenth from point to point.
 
-    At a pole on the axis refinement stops when two points differ by a millionth.
+    The number of points is limited. At a pole on the axis refinement stops when two points
+    differ by a millionth.
+
+    Args:
+        response: the response.
+        w_rad_s: first frequencies, rising, shape (F,), rad/s.
     """
 
-    def find_wide(Y: Complex) -> NDArray[np.bool_]:
+    def find_large_changes(Y: Complex) -> NDArray[np.bool_]:
         size = np.linalg.norm(Y, axis=(1, 2))
+        larger_size = np.maximum(np.maximum(size[1:], size[:-1]), 1e-300)
         change = np.linalg.norm(np.diff(Y, axis=0), axis=(1, 2))
-        wide: NDArray[np.bool_] = change > _CHANGE * np.maximum(
-            np.maximum(size[1:], size[:-1]), 1e-300
-        )
-        return wide
+        is_large: NDArray[np.bool_] = change > _CHANGE * larger_size
+        return is_large
 
-    return _refine(response, w_rad_s, find_wide)[0]
+    return _refine(response, w_rad_s, find_large_changes)[0]
 
 
 def _refine(
     function: Callable[[Array], NDArray[Any]],
     w_rad_s: Array,
-    find_wide: Callable[[NDArray[Any]], NDArray[np.bool_]],
+    find_coarse: Callable[[NDArray[Any]], NDArray[np.bool_]],
 ) -> tuple[Array, NDArray[Any]]:
+    """Returns a refined grid and the function's values on it.
+
+    Args:
+        function: values, shape (F, ...), by frequencies, shape (F,).
+        w_rad_s: first frequencies, rising, shape (F,).
+        find_coarse: returns the steps of the grid to be halved, shape (F - 1,), by the values.
+    """
     values = function(w_rad_s)
     for _ in range(_ROUNDS):
-        wide = find_wide(values) & (w_rad_s[1:] > w_rad_s[:-1] * (1.0 + _CLOSEST))
-        if not wide.any() or len(w_rad_s) > 2 * _MAX_POINTS:
+        coarse = find_coarse(values) & (w_rad_s[1:] > w_rad_s[:-1] * (1.0 + _CLOSEST))
+        if not coarse.any() or len(w_rad_s) > 2 * _MAX_POINTS:
             break
-        between = np.sqrt(w_rad_s[:-1] * w_rad_s[1:])[wide]
-        place = np.flatnonzero(wide) + 1
-        w_rad_s = np.insert(w_rad_s, place, between)
-        values = np.insert(values, place, function(between), axis=0)
+        middles = np.sqrt(w_rad_s[:-1] * w_rad_s[1:])[coarse]
+        indices = np.flatnonzero(coarse) + 1
+        w_rad_s = np.insert(w_rad_s, indices, middles)
+        values = np.insert(values, indices, function(middles), axis=0)
     return w_rad_s, values
 
 
 def cache_response(response: PortResponse, w_rad_s: Array) -> PortResponse:
-    """Returns the same response, computed only once for this very array of frequencies."""
-    known = response(w_rad_s)
-    return lambda w: known if w is w_rad_s else response(w)
+    """Returns the same response, which is computed only once for this array of frequencies."""
+    cached = response(w_rad_s)
+    return lambda w: cached if w is w_rad_s else response(w)
 
 
 def find_minima(
@@ -136,59 +160,77 @@ def find_minima(
     level: float = 0.0,
     tolerance: FrequencyCurve | None = None,
 ) -> Minima:
-    """Returns the curve with its minima resolved, and the bands below a level, from first
-    frequencies on.
+    """Returns a curve with its minima resolved, and the bands in which it is below a level.
 
-    `tolerance` is the least depth below the level, and of a minimum below its neighbours; None:
-    zero.
+    Args:
+        curve: the curve.
+        w_rad_s: first frequencies, rising, shape (F,), rad/s.
+        level: the level.
+        tolerance: rounding error of the curve. The curve must be below the level by more than
+            that, and a minimum below its neighbours. None: zero.
     """
-    allowed = tolerance or (lambda w: np.zeros(len(w)))
-    w_rad_s, both = _refine(
-        lambda w: np.stack([curve(w), allowed(w)], axis=1), w_rad_s, _find_steps_at_minima
-    )
-    values, rounding = both.T
+    rounding_error = tolerance or (lambda w: np.zeros(len(w)))
+
+    def evaluate(w: Array) -> Array:
+        return np.stack([curve(w), rounding_error(w)], axis=1)
+
+    w_rad_s, refined = _refine(evaluate, w_rad_s, _find_steps_at_minima)
+    values, rounding = refined.T
     below = _find_bands_below(
-        lambda w: curve(w) + allowed(w), w_rad_s, values + rounding, level
+        lambda w: curve(w) + rounding_error(w), w_rad_s, values + rounding, level
     )
     return Minima(w_rad_s, values, below)
 
 
 def _find_steps_at_minima(curve_and_rounding: Array) -> NDArray[np.bool_]:
-    """Returns the steps at minima that are not settled: a neighbour is more than 1 % above
-    them.
+    """Returns the steps of a grid at minima that are not resolved yet, shape (F - 1,).
 
-    1 % of their depth, or of that of the deepest if that is more; and more than rounding.
+    A minimum is not resolved if a neighbour lies above it by more than rounding, and by more
+    than 1 % of its own depth or of the deepest minimum's, whichever is larger.
+
+    Args:
+        curve_and_rounding: values of the curve and their rounding errors, shape (F, 2).
     """
     values, rounding = curve_and_rounding.T
     middle = values[1:-1]
-    rise = np.maximum(values[:-2], values[2:]) - values[1:-1]
-    low = (middle <= values[:-2]) & (middle <= values[2:])
-    low &= rise > np.maximum(
-        _SETTLED * np.maximum(np.abs(middle), abs(values.min())), rounding[1:-1]
-    )
-    minimum = np.r_[False, low, False]
-    steps: NDArray[np.bool_] = minimum[1:] | minimum[:-1]
+    left = values[:-2]
+    right = values[2:]
+    rise = np.maximum(left, right) - middle
+    is_minimum = (middle <= left) & (middle <= right)
+    limit = _SETTLED * np.maximum(np.abs(middle), abs(values.min()))
+    is_minimum &= rise > np.maximum(limit, rounding[1:-1])
+    at_points = np.r_[False, is_minimum, False]
+    steps: NDArray[np.bool_] = at_points[1:] | at_points[:-1]
     return steps
 
 
 def _find_bands_below(
     curve: FrequencyCurve, w_rad_s: Array, values: Array, level: float
 ) -> tuple[FrequencyBand, ...]:
-    """Returns the bands below a level; all edges are found by bisection together."""
-    below = values < level
-    turns = np.flatnonzero(below[1:] != below[:-1])
-    low = w_rad_s[turns]
-    high = w_rad_s[turns + 1]
-    was = below[turns]
-    for _ in range(30 if len(turns) else 0):
+    """Returns the bands in which a curve is below a level; bisection finds all edges together.
+
+    Args:
+        curve: the curve.
+        w_rad_s: frequencies, rising, shape (F,), rad/s.
+        values: values of the curve, shape (F,).
+        level: the level.
+    """
+    is_below = values < level
+    edge_steps = np.flatnonzero(is_below[1:] != is_below[:-1])
+    low = w_rad_s[edge_steps]
+    high = w_rad_s[edge_steps + 1]
+    is_low_below = is_below[edge_steps]
+    for _ in range(30 if len(edge_steps) else 0):
         middle = np.sqrt(low * high)
-        same = (curve(middle) < level) == was
-        low = np.where(same, middle, low)
-        high = np.where(same, high, middle)
+        is_like_low = (curve(middle) < level) == is_low_below
+        low = np.where(is_like_low, middle, low)
+        high = np.where(is_like_low, high, middle)
     edges = np.sqrt(low * high).tolist()
-    if below[0]:
+    if is_below[0]:
         edges.insert(0, float(w_rad_s[0]))
-    if below[-1]:
+    if is_below[-1]:
         edges.append(float(w_rad_s[-1]))
     hz = [edge / (2.0 * np.pi) for edge in edges]
-    return tuple(FrequencyBand(a, b) for a, b in zip(hz[::2], hz[1::2], strict=True))
+    return tuple(
+        FrequencyBand(from_hz, to_hz) for from_hz, to_hz in zip(hz[::2], hz[1::2], strict=True)
+    )

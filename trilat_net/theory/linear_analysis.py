@@ -1,14 +1,14 @@
-"""Linear analysis of a scenario, or where a run ended: equilibrium, roots, delay margin,
-verdict, JSON.
+"""Linear analysis of a scenario, or of a run's end: equilibrium, roots, margin, verdict.
 
-Invariant: the verdict is that of the sampled loop, at any tick rates and delays; of the
-continuous loop where a law is linearised in continuous time alone. It holds for small motions
-about the equilibrium only.
+At the end of a recorded run, the roots are those at the log's own end pose and estimates, under
+the conditions at its end. Where delays are drawn or measured, the roots are computed over the
+very samples that the last quarter of the records has in use. Mean ages serve for laws that are
+linearised in continuous time only. Only twins are executed.
 
-Where a recorded run ended the roots are those at the log's own end pose and estimates, under
-the conditions at its end. Where delays are drawn or measured they are those over the very
-samples that the last quarter of the records has in use; mean ages serve for laws that are
-linearised in continuous time alone. Only twins are executed.
+Invariant:
+    - The verdict is that of the sampled loop, at any tick rates and delays. It is that of the
+      continuous loop if a law is linearised in continuous time only.
+    - The verdict holds for small motions about the equilibrium only.
 """
 
 import math
@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -52,7 +52,7 @@ from .port_passivity import HandMatrices
 DEFAULT_ROOTS = 6
 MAX_ROOTS = 60
 SAMPLED_ROOT_DIFFERENCE = 0.01
-"""Continuous and sampled roots that differ by more, relative to abs(s), are both reported."""
+"""Continuous and sampled roots that differ by more than this share of abs(s) are both shown."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -63,13 +63,13 @@ class LinearAnalysis(Result):
         scenario: the experiment.
         conditions: the numbers of the loop: dominance factors, ages, actors in force.
         rest: the equilibrium.
-        loop: the linear loop there.
+        loop: the loop linearised at the equilibrium.
         continuous: roots of the delay-differential equation.
         sampled: roots of the sampled loop; None if a law is linearised in continuous time
-            alone.
+            only.
         margin: the common delays for which the continuous loop is stable.
-        scans: where stability changes along keys, of `analyse_linear_loop`.
-        ports: the haptic ports of the operators, likewise; None if nobody asked.
+        scans: edges of stability along the requested keys.
+        ports: analysis of the operators' haptic ports; None if it was not requested.
     """
 
     scenario: Scenario
@@ -84,9 +84,7 @@ class LinearAnalysis(Result):
 
     @property
     def end_effectors(self) -> tuple[Array, ...]:
-        """What each site shares of its pose at the equilibrium in task space; nothing in joint
-        space.
-        """
+        """The pose that each site shares at the equilibrium; empty arrays in joint space."""
         sites = self.conditions.sites
         if not sites[0].layout.task:
             return (np.zeros(0),) * len(sites)
@@ -99,7 +97,7 @@ class LinearAnalysis(Result):
 
     @property
     def verdict(self) -> str:
-        """stable, unstable, or at the edge: of small motions about the equilibrium."""
+        """Stability of small motions: "stable", "unstable" or "at the edge"."""
         return self.decisive.verdict
 
     @property
@@ -107,18 +105,17 @@ class LinearAnalysis(Result):
         """Remarks on conditions, equilibrium and roots."""
         notes = [*self.conditions.notes, *self.rest.notes]
         if self.sampled is not None and self.sampled.verdict != self.continuous.verdict:
-            decides = (
-                "the tick rate decides"
-                if self.sampled.span_s is None
-                else "ticks and delays decide"
-            )
+            decides = "ticks and delays decide"
+            if self.sampled.span_s is None:
+                decides = "the tick rate decides"
             notes.append(
                 f"the continuous loop is {self.continuous.verdict}, the sampled loop is "
                 f"{self.sampled.verdict}: {decides}"
             )
         if self.decisive.drifting:
             notes.append(
-                f"{self.decisive.drifting} of the roots at zero only drift: their modes keep their speed"
+                f"{self.decisive.drifting} of the roots at zero only drift: "
+                "their modes keep their speed"
             )
         if lacks_detailed_balance(self.scenario):
             notes.append(IRREVERSIBLE_SHARES)
@@ -130,71 +127,88 @@ class LinearAnalysis(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat linear --json`."""
-        names = self.scenario.names
-        conditions = self.conditions
-        rest = self.rest
-        layouts = [site.layout for site in conditions.sites]
-        learns = [not isinstance(site.law_factory, NumericLaw) for site in conditions.sites]
-        q = [own[: layout.joints].tolist() for own, layout in zip(rest.q, layouts, strict=True)]
-        theta_hat = [
-            own[: layout.parameters * one].tolist()
-            for own, layout, one in zip(rest.theta_hat, layouts, learns, strict=True)
-        ]
-        poses = dict(zip(names, (pose.tolist() for pose in self.end_effectors), strict=True))
         return {
             "scenario": self.scenario.name,
             "scenario_sha256": self.scenario.sha256,
             "verdict": self.verdict,
-            "rest": {
-                "how": rest.how,
-                "residual": rest.residual,
-                "q_rad": dict(zip(names, q, strict=True)),
-                "theta_hat": dict(zip(names, theta_hat, strict=True)),
-                **({"x": poses} if layouts[0].task else {}),
-            },
-            "delay_in_use_ms": {
-                f"{names[j]}->{names[i]}": 1e3 * float(conditions.age_s[i, j])
-                for i, j in zip(*np.nonzero(conditions.alpha), strict=True)
-            },
+            "rest": self._rest_to_json(),
+            "delay_in_use_ms": self._delays_to_json(),
             "continuous": _spectrum_to_json(self.continuous),
             "as_computed": None if self.sampled is None else _spectrum_to_json(self.sampled),
             "margin": {
                 "words": self.margin.description,
                 "stable": [
-                    {"from_s": one.low_s, "to_s": one.high_s} for one in self.margin.intervals
+                    {"from_s": interval.low_s, "to_s": interval.high_s}
+                    for interval in self.margin.intervals
                 ],
                 "crossings": [
                     {
-                        "delay_s": one.delay_s,
-                        "omega_rad_s": one.omega_rad_s,
-                        "pairs_to_the_right": one.pairs,
+                        "delay_s": crossing.delay_s,
+                        "omega_rad_s": crossing.omega_rad_s,
+                        "pairs_to_the_right": crossing.pairs,
                     }
-                    for one in self.margin.crossings
+                    for crossing in self.margin.crossings
                 ],
             },
             "notes": list(self.notes),
             "ports": None if self.ports is None else ports_to_json(self.ports),
-            "edges": {scan.key: [one._asdict() for one in scan.edges] for scan in self.scans},
+            "edges": {scan.key: [edge._asdict() for edge in scan.edges] for scan in self.scans},
+        }
+
+    def _rest_to_json(self) -> dict[str, Any]:
+        """Returns the equilibrium as plain values, without padding."""
+        rest = self.rest
+        q = {}
+        theta_hat = {}
+        for n, site in enumerate(self.conditions.sites):
+            q[site.name] = rest.q[n][: site.layout.joints].tolist()
+            # the memory of an imported law is no estimate
+            is_imported = isinstance(site.law_factory, NumericLaw)
+            parameters = 0 if is_imported else site.layout.parameters
+            theta_hat[site.name] = rest.theta_hat[n][:parameters].tolist()
+        values: dict[str, Any] = {
+            "how": rest.how,
+            "residual": rest.residual,
+            "q_rad": q,
+            "theta_hat": theta_hat,
+        }
+        if self.conditions.sites[0].layout.task:
+            poses = [pose.tolist() for pose in self.end_effectors]
+            values["x"] = dict(zip(self.scenario.names, poses, strict=True))
+        return values
+
+    def _delays_to_json(self) -> dict[str, float]:
+        """Returns the age of the samples in use, ms, by link."""
+        conditions = self.conditions
+        names = self.scenario.names
+        return {
+            f"{names[j]}->{names[i]}": 1e3 * float(conditions.age_s[i, j])
+            for i, j in zip(*np.nonzero(conditions.alpha), strict=True)
         }
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per root: of the continuous loop, and as computed tick by tick."""
         spectra = {"continuous": self.continuous, "as computed": self.sampled}
-        return [
-            {"loop": loop, **root, "states": ", ".join(root["states"])}
-            for loop, spectrum in spectra.items()
-            if spectrum is not None
-            for root in _spectrum_to_json(spectrum)["roots"]
-        ]
+        rows: list[dict[str, Any]] = []
+        for loop, spectrum in spectra.items():
+            if spectrum is None:
+                continue
+            roots = _spectrum_to_json(spectrum)["roots"]
+            rows += [
+                {"loop": loop, **root, "states": ", ".join(root["states"])} for root in roots
+            ]
+        return rows
 
     def find_sampled_root(self, root: CharacteristicRoot) -> CharacteristicRoot | None:
-        """Returns the sampled root nearest to a continuous one; None if they differ by 1 % or
-        less.
+        """Returns the sampled root nearest to a continuous root, if they differ by over 1 %.
+
+        None: they differ by less, or there is no sampled root.
         """
         if self.sampled is None or not self.sampled.roots:
             return None
-        near = min(self.sampled.roots, key=lambda one: abs(one.s - root.s))
-        return near if abs(near.s - root.s) > SAMPLED_ROOT_DIFFERENCE * abs(root.s) else None
+        nearest = min(self.sampled.roots, key=lambda sampled: abs(sampled.s - root.s))
+        difference = abs(nearest.s - root.s)
+        return nearest if difference > SAMPLED_ROOT_DIFFERENCE * abs(root.s) else None
 
 
 def analyse_linear_loop(
@@ -207,11 +221,16 @@ def analyse_linear_loop(
     ports: bool = False,
     hands: Sequence[HandMatrices] = (),
 ) -> LinearAnalysis:
-    """Returns the linear analysis of a scenario; its arguments are those of
-    `trilat_net.linear`.
+    """Returns the linear analysis of a scenario, see `trilat_net.linear`.
 
-    `pose` is that of all sites, rad; of the measured operators, `hands`, any may hold any
-    master.
+    Args:
+        source: a scenario, its file, or the name of a shipped scenario.
+        overrides: changed keys of the scenario.
+        pose: shared pose of all sites, rad; None: the end of a run.
+        roots: number of roots.
+        over: ranges of keys along which edges of stability are searched, as "control.d=0.1:3".
+        ports: analyse the operators' haptic ports.
+        hands: measured operators, any of whom may hold any master.
 
     Raises:
         ScenarioError: the scenario is not valid, or has no linear loop.
@@ -224,28 +243,25 @@ def analyse_linear_loop(
     conditions = derive_operating_conditions(scenario)
     rest = find_equilibrium(scenario, pose)
     loop = linearise_loop(conditions, rest)
-    continuous = compute_delay_spectrum(loop, roots)
-    sampled = compute_sampled_spectrum(conditions, rest, roots)
-    found = LinearAnalysis(
-        scenario, conditions, rest, loop, continuous, sampled, find_delay_margin(loop)
+    analysis = LinearAnalysis(
+        scenario=scenario,
+        conditions=conditions,
+        rest=rest,
+        loop=loop,
+        continuous=compute_delay_spectrum(loop, roots),
+        sampled=compute_sampled_spectrum(conditions, rest, roots),
+        margin=find_delay_margin(loop),
     )
-    scans = tuple(
-        EdgeScan(
-            key,
-            low,
-            high,
-            tuple(
-                iterate_linear_edges(scenario=scenario, key=key, low=low, high=high, rest=rest)
-            ),
-        )
-        for key, low, high in ranges
-    )
-    return replace(
-        found, scans=scans, ports=analyse_ports(scenario, rest, hands=hands) if ports else None
-    )
+    scans = []
+    for key, low, high in ranges:
+        edges = iterate_linear_edges(scenario, key, low=low, high=high, rest=rest)
+        scans.append(EdgeScan(key, low, high, tuple(edges)))
+    port_analysis = analyse_ports(scenario, rest, hands=hands) if ports else None
+    return replace(analysis, scans=tuple(scans), ports=port_analysis)
 
 
 def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
+    """Returns a spectrum as plain values."""
     return {
         "verdict": spectrum.verdict,
         "roots": [
@@ -268,136 +284,183 @@ def _spectrum_to_json(spectrum: Spectrum) -> dict[str, Any]:
 
 
 _ROOTS = 2
-"""Roots that are looked for: the rightmost ones."""
+"""Number of rightmost roots that are computed at the end of a run."""
 
 
 def certify_run(
     log: Log, *, min_coverage: float = MIN_COVERAGE, own_laws: bool = False, twins: int = TWINS
 ) -> Certificate:
-    """Returns the certificate of a log, with the roots of the loop where the run ended, and so
-    many twins.
+    """Returns the certificate of a log, with the roots of the loop at the end of the run.
 
-    See `certify`.
+    Args:
+        log: the log.
+        min_coverage: least share of records that a site must have, see `certify`.
+        own_laws: the code of imported laws may be executed.
+        twins: number of twins that are executed; 0: none.
 
     Raises:
-        LogError: a record cannot be read, or names a change that is none.
+        LogError: a record cannot be read, or names a change that does not exist.
     """
-    found = certify(log, min_coverage=min_coverage, own_laws=own_laws)
-    growth = measure_twins(log, found.end, twins, own_laws=own_laws) if twins else None
-    return replace(found, roots=find_end_pose_roots(log), twins=growth)
+    certificate = certify(log, min_coverage=min_coverage, own_laws=own_laws)
+    growth = None
+    if twins:
+        growth = measure_twins(log, certificate.end, twins, own_laws=own_laws)
+    return replace(certificate, roots=find_end_pose_roots(log), twins=growth)
 
 
 def find_end_pose_roots(log: Log) -> EndPoseRoots:
-    """Returns the roots of the loop where a run ended, or why there are none."""
-    parts = [log[site] for site in log.sites]
-    if not all(map(len, parts)):
-        return _no_roots("a site has no records")
-    if any(part.mode[-1] == "diverged" for part in parts):
-        return _no_roots("the run diverged")
+    """Returns the roots of the loop at the end of a run, or the reason why there are none."""
+    site_logs = [log[site] for site in log.sites]
+    if not all(map(len, site_logs)):
+        return _explain_no_roots("a site has no records")
+    if any(site_log.mode[-1] == "diverged" for site_log in site_logs):
+        return _explain_no_roots("the run diverged")
     if any(log.changes(site) for site in log.sites):
-        return _no_roots("commands changed the loop while it ran")
-    scenario, uses, mean_s = _fix_delays(log)
+        return _explain_no_roots("commands changed the loop while it ran")
+    fixed = _fix_delays(log)
     try:
-        conditions = derive_operating_conditions(scenario, own_laws=False)
-        for at, age_s in mean_s.items():
-            conditions.age_s[at] = age_s
-        q, theta_hat = _choose_state(scenario, parts)
-        rest = follow_equilibrium(
-            scenario, Equilibrium(q, theta_hat, "the end of the log", 0.0)
-        )
+        conditions = derive_operating_conditions(fixed.scenario, own_laws=False)
+        for pair, age_s in fixed.mean_age_s.items():
+            conditions.age_s[pair] = age_s
+        q, theta_hat = _choose_end_state(fixed.scenario, site_logs)
+        end = Equilibrium(q, theta_hat, "the end of the log", 0.0)
+        rest = follow_equilibrium(fixed.scenario, end)
     except ScenarioError as error:
-        return _no_roots(error.problem)
-    sampled = compute_sampled_spectrum(conditions, rest, _ROOTS, uses)
-    decisive = sampled or compute_delay_spectrum(linearise_loop(conditions, rest), _ROOTS)
-    root = decisive.rightmost
-    verdict = decisive.verdict
-    about = decisive.basis
-    if sampled is None:  # a law in continuous time, whose ticks are left out
-        about = ", in continuous time" + ", of the mean ages" * bool(
-            conditions.varying or mean_s
+        return _explain_no_roots(error.problem)
+    sampled = compute_sampled_spectrum(conditions, rest, _ROOTS, fixed.uses)
+    if sampled is not None:
+        return _describe_end_pose_roots(
+            sampled, sampled.basis, exact=sampled.deviation_per_s is None
         )
-    exact = sampled is not None and sampled.deviation_per_s is None
+    continuous = compute_delay_spectrum(linearise_loop(conditions, rest), _ROOTS)
+    basis = ", in continuous time"
+    if conditions.varying or fixed.mean_age_s:
+        basis += ", of the mean ages"
+    return _describe_end_pose_roots(continuous, basis, exact=False)
+
+
+def _describe_end_pose_roots(spectrum: Spectrum, basis: str, *, exact: bool) -> EndPoseRoots:
+    """Returns the rightmost root and the verdict, as the certificate states them.
+
+    Args:
+        spectrum: the roots at the end pose.
+        basis: a phrase that states over which ticks the roots are computed.
+        exact: no delay is averaged or assumed to repeat.
+    """
+    root = spectrum.rightmost
+    verdict = spectrum.verdict
     if root is None:
         return EndPoseRoots(verdict, None, exact, f"this rest: {verdict}, without roots")
     omega = f" at {abs(root.s.imag):.4g} rad/s" if root.s.imag else ""
-    drift = f"{decisive.drifting} of its motions keep their speed, the others " * bool(
-        decisive.drifting
-    )
-    text = f"this rest: {verdict}, {drift}{root.s.real:+.3g} /s{omega}{about}"
+    drift = ""
+    if spectrum.drifting:
+        drift = f"{spectrum.drifting} of its motions keep their speed, the others "
+    text = f"this rest: {verdict}, {drift}{root.s.real:+.3g} /s{omega}{basis}"
     return EndPoseRoots(verdict, root.s.real, exact, text)
 
 
-def _fix_delays(log: Log) -> tuple[Scenario, SamplesInUse | None, dict[tuple[int, int], float]]:
-    """Returns the scenario that a log ran, with constant delays where its records alone know
-    them.
+class _FixedDelays(NamedTuple):
+    """A recorded scenario in which every delay is known.
 
-    And if there are such links the samples in use in its last quarter, a missing tick's being
-    those before, and per (receiver, sender) of such a link their mean age, s.
+    Attributes:
+        scenario: the scenario up to the end of the records. A link whose delays only the
+            records know has its constant mean delay.
+        uses: the samples in use in the last quarter of the run; None if the scenario determines
+            all delays, or if no sample was received on some link.
+        mean_age_s: mean age of the samples on links with unknown delays, s, by (receiver,
+            sender).
     """
-    known = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
-    unknown = [
-        one.random or one.measured or one.points is not None for one in known.links.values()
-    ]
-    if not any(unknown):
-        return known, None, {}
-    sites = [log[name] for name in known.names]
-    links = dict(known.links)
+
+    scenario: Scenario
+    uses: SamplesInUse | None
+    mean_age_s: dict[tuple[int, int], float]
+
+
+def _fix_delays(log: Log) -> _FixedDelays:
+    """Returns the scenario of a log with the delays that the records show.
+
+    A tick without a record uses the samples of the tick before.
+    """
+    scenario = msgspec.structs.replace(log.scenario, duration_s=recorded_end_s(log))
+    has_unknown_delay = {
+        name: link.random or link.measured or link.points is not None
+        for name, link in scenario.links.items()
+    }
+    if not any(has_unknown_delay.values()):
+        return _FixedDelays(scenario, None, {})
+    sites = [log[name] for name in scenario.names]
+    links = dict(scenario.links)
     common_hz = math.gcd(*(site.rate_hz for site in sites))
+    # start and end of the last quarter, in ticks of the common rate
     end = max(1, min(int(site.tick[-1]) * common_hz // site.rate_hz for site in sites))
     start = max(3 * end // 4, end - round(DRAWN_SPAN_S * common_hz))
     used = {}
-    mean_s = {}
-    for (i, own), (j, peer) in permutations(enumerate(sites), 2):
-        ticks = np.arange(start * own.rate_hz // common_hz, end * own.rate_hz // common_hz)
-        rows = np.maximum(np.searchsorted(own.tick, ticks, side="right") - 1, 0)
-        samples = own.used[peer.name][rows]
-        name = f"{peer.name}->{own.name}"
-        if samples.min() < 0:  # of a peer that never sent, or not yet
-            return known, None, {}
+    mean_age_s = {}
+    for (i, site), (j, peer) in permutations(enumerate(sites), 2):
+        first_tick = start * site.rate_hz // common_hz
+        end_tick = end * site.rate_hz // common_hz
+        ticks = np.arange(first_tick, end_tick)
+        rows = np.maximum(np.searchsorted(site.tick, ticks, side="right") - 1, 0)
+        samples = site.used[peer.name][rows]
+        if samples.min() < 0:
+            # the peer never sent a sample, or not yet
+            return _FixedDelays(scenario, None, {})
         used[i, j] = samples - start * peer.rate_hz // common_hz
-        if unknown[[*links].index(name)]:
-            mean_s[i, j] = float((ticks / own.rate_hz - samples / peer.rate_hz).mean())
-            links[name] = ConstantDelay(delay_ms=1e3 * mean_s[i, j])
-    fixed = msgspec.structs.replace(known, links=links)
-    return fixed, SamplesInUse((end - start) / common_hz, used), mean_s
+        name = f"{peer.name}->{site.name}"
+        if has_unknown_delay[name]:
+            ages_s = ticks / site.rate_hz - samples / peer.rate_hz
+            mean_age_s[i, j] = float(ages_s.mean())
+            links[name] = ConstantDelay(delay_ms=1e3 * mean_age_s[i, j])
+    uses = SamplesInUse((end - start) / common_hz, used)
+    return _FixedDelays(msgspec.structs.replace(scenario, links=links), uses, mean_age_s)
 
 
-def _no_roots(why: str) -> EndPoseRoots:
-    return EndPoseRoots("", None, False, f"this rest: no roots: {why}")
+def _explain_no_roots(reason: str) -> EndPoseRoots:
+    """Returns a result without roots, and the reason."""
+    return EndPoseRoots("", None, False, f"this rest: no roots: {reason}")
 
 
-def _choose_state(scenario: Scenario, parts: Sequence[SiteLog]) -> tuple[Array, Array]:
-    """Returns angles and estimates of all sites: at the end of those at rest, else the last
-    quarter's mean.
+def _choose_end_state(scenario: Scenario, site_logs: Sequence[SiteLog]) -> tuple[Array, Array]:
+    """Returns the angles and the estimates of all sites at the end of a run.
 
-    Of arms that chatter at a sampled wall, it is the state of the last quarter that is deepest
-    in it.
+    They are the last record of a site at rest, and otherwise the mean of the last quarter. If
+    arms chatter at a sampled wall, it is the state in the last quarter that is deepest in it.
+
+    Returns:
+        Angles, shape (N, n), rad, and estimates, shape (N, P).
     """
-    count = min(map(len, parts))
+    count = min(map(len, site_logs))
     rows = slice(3 * count // 4, count)
-    together = all(np.array_equal(part.t_s[rows], parts[0].t_s[rows]) for part in parts)
-    if together and not all(map(_rests, parts)):
-        joints = max(part.q.shape[1] for part in parts)
-        q = np.stack(
-            [np.pad(part.q[rows], ((0, 0), (0, joints - part.q.shape[1]))) for part in parts],
-            axis=1,
-        )
+    first_times = site_logs[0].t_s[rows]
+    have_same_times = all(
+        np.array_equal(site_log.t_s[rows], first_times) for site_log in site_logs
+    )
+    if have_same_times and not all(map(_is_at_rest, site_logs)):
+        joints = max(site_log.q.shape[1] for site_log in site_logs)
+        padded = []
+        for site_log in site_logs:
+            missing_joints = joints - site_log.q.shape[1]
+            padded.append(np.pad(site_log.q[rows], ((0, 0), (0, missing_joints))))
+        q = np.stack(padded, axis=1)
         deepest = find_deepest_contact(scenario, q)
         if deepest is not None:
-            return q[deepest], pad_rows([part.theta_hat[rows][deepest] for part in parts])
-    ends = [(_end_of(part, part.q), _end_of(part, part.theta_hat)) for part in parts]
-    return pad_rows([q for q, _ in ends]), pad_rows([theta_hat for _, theta_hat in ends])
+            estimates = [site_log.theta_hat[rows][deepest] for site_log in site_logs]
+            return q[deepest], pad_rows(estimates)
+    angles = [_find_end_value(site_log, site_log.q) for site_log in site_logs]
+    estimates = [_find_end_value(site_log, site_log.theta_hat) for site_log in site_logs]
+    return pad_rows(angles), pad_rows(estimates)
 
 
-def _rests(part: SiteLog) -> bool:
-    t_s = part.t_s
-    return float(np.abs(part.qd[t_s > t_s[-1] - 1.0]).max()) <= SETTLED_SPEED_RAD_S
+def _is_at_rest(site_log: SiteLog) -> bool:
+    """True if no joint moved faster than `SETTLED_SPEED_RAD_S` in the last second."""
+    t_s = site_log.t_s
+    last_second = site_log.qd[t_s > t_s[-1] - 1.0]
+    return float(np.abs(last_second).max()) <= SETTLED_SPEED_RAD_S
 
 
-def _end_of(part: SiteLog, values: Array) -> Array:
-    """Returns a signal at the last record of an arm at rest, else its mean over the last
-    quarter.
-    """
-    return np.asarray(
-        values[-1] if _rests(part) else values[part.t_s >= 0.75 * part.t_s[-1]].mean(axis=0)
-    )
+def _find_end_value(site_log: SiteLog, values: Array) -> Array:
+    """Returns a signal's last value if the arm is at rest, else its last quarter's mean."""
+    if _is_at_rest(site_log):
+        return np.asarray(values[-1])
+    last_quarter = values[site_log.t_s >= 0.75 * site_log.t_s[-1]]
+    return np.asarray(last_quarter.mean(axis=0))

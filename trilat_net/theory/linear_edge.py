@@ -1,8 +1,11 @@
-"""Values of a scenario's key at which the linear loop changes between stable and unstable.
+"""Values of a scenario's key at which the linear loop becomes stable or unstable.
 
-Invariant: a scan brackets each edge, and Brent's method on the rightmost root's real part
-closes it: of the sampled loop for the scheme `digital` and for sampled actors, of the
-continuous loop otherwise. The equilibrium is found once and followed along the key.
+A scan brackets each edge, and Brent's method finds the zero of the rightmost root's real part.
+The loop is the sampled one for the scheme `digital` and for sampled actors, and the continuous
+one otherwise.
+
+Invariant:
+    - The equilibrium is found once and followed along the key.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,62 +34,79 @@ from .site_dynamics import place_arm
 
 EDGE_SCAN_POINTS = 24
 EDGE_TOLERANCE = 1e-6
+"""Tolerance of an edge, relative to the key's value."""
 _LOGARITHMIC = 20.0
-"""A range with a larger ratio of its ends is scanned in equal steps of the logarithm."""
+"""A range whose ends have a larger ratio is scanned in equal steps of the logarithm."""
 _LEAST_PER_S = -1e3
-"""The real part that stands for that of a loop in which nothing moves, 1/s."""
+"""Least real part in Brent's method, 1/s; it replaces -infinity for a loop without roots."""
 _INTEGER_KEYS = ("rate_hz", "seed")
 
 ASSUMED_EQUILIBRIUM_REMARK = (
-    "the linear analysis of a law that learns is about the mean start pose, with true estimates: the "
-    "equilibrium of a run depends on its whole history"
+    "the linear analysis of a law that learns is about the mean start pose, with true "
+    "estimates: the equilibrium of a run depends on its whole history"
 )
 
 
 def find_rightmost_root(
     conditions: OperatingConditions, rest: Equilibrium, *, sampled: bool
 ) -> CharacteristicRoot | None:
-    """Returns the rightmost root about an equilibrium; None if there are only those at zero.
+    """Returns the rightmost root about an equilibrium; None if all roots are zero.
 
-    It is of the sampled loop if asked for, and unless a law is linearised in continuous time
-    alone.
+    Args:
+        conditions: the numbers of the loop.
+        rest: the equilibrium.
+        sampled: analyse the sampled loop. The continuous one is analysed all the same if a law
+            is linearised in continuous time only.
     """
     spectrum = compute_sampled_spectrum(conditions, rest, 1) if sampled else None
-    return (spectrum or compute_delay_spectrum(linearise_loop(conditions, rest), 1)).rightmost
+    if spectrum is None:
+        spectrum = compute_delay_spectrum(linearise_loop(conditions, rest), 1)
+    return spectrum.rightmost
 
 
 def find_deepest_contact(scenario: Scenario, q: Array) -> int | None:
-    """Returns which of some states, shape (K, N, n), rad, is deepest in a sampled wall; None if
-    none is.
+    """Returns the index of the state that is deepest in a sampled wall; None: no contact.
+
+    Args:
+        scenario: the experiment.
+        q: joint angles of all sites in K states, shape (K, N, n), rad.
     """
     depth_m = np.full(len(q), -np.inf)
     for n, name in enumerate(scenario.names):
         site = scenario.setup(name)
+        joint_angles = q[:, n, : site.layout.joints].T
         for wall in site.actors:
             if wall.kind is TorqueKind.WALL and wall.sampled:
-                at = place_arm(site, q[:, n, : site.layout.joints].T).end_effector_position()
-                depth_m = np.maximum(depth_m, (np.array(wall.a) - at.T) @ np.array(wall.b))
+                tip = place_arm(site, joint_angles).end_effector_position()
+                wall_depth_m = (np.array(wall.a) - tip.T) @ np.array(wall.b)
+                depth_m = np.maximum(depth_m, wall_depth_m)
     deepest = int(depth_m.argmax())
     return deepest if depth_m[deepest] > 0.0 else None
 
 
 def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float:
-    """Returns how fast small motions grow in contact with sampled walls, 1/s; NaN if none is
-    pressed.
+    """Returns the growth rate of small motions in contact with sampled walls, 1/s.
 
-    That is the real part of the sampled loop's rightmost root at the rest next to the state, of
-    those given, that is deepest in a wall: angles, shape (K, N, n), rad, and estimates, shape
-    (K, N, P). Chatter leaves the wall in between, and its mean may be no contact.
+    It is the real part of the sampled loop's rightmost root, at the equilibrium nearest to the
+    state that is deepest in a wall. Arms that chatter leave the wall again and again, so that
+    the mean of their states may have no contact.
+
+    Args:
+        scenario: the experiment.
+        q: joint angles of all sites in K states, shape (K, N, n), rad.
+        theta_hat: estimates of all sites in these states, shape (K, N, P).
+
+    Returns:
+        The growth rate; -infinity if nothing moves; NaN without contact or a linear loop.
     """
     deepest = find_deepest_contact(scenario, q)
     if deepest is None:
         return np.nan
     try:
-        # the memory of such a law is not given
+        # refuses imported laws, because their memory is not among the arguments
         derive_operating_conditions(scenario, own_laws=False)
-        rest = follow_equilibrium(
-            scenario, Equilibrium(q[deepest], theta_hat[deepest], "", 0.0)
-        )
+        state = Equilibrium(q[deepest], theta_hat[deepest], "", 0.0)
+        rest = follow_equilibrium(scenario, state)
         root = find_rightmost_root(derive_operating_conditions(scenario), rest, sampled=True)
     except ScenarioError:
         return np.nan
@@ -94,13 +114,13 @@ def find_contact_growth(scenario: Scenario, q: Array, theta_hat: Array) -> float
 
 
 class LinearEdge(NamedTuple):
-    """A value at which a loop changes between stable and unstable.
+    """A value at which a loop becomes stable or unstable.
 
     Attributes:
         key: the scenario's key.
-        value: its value there, in its own unit.
+        value: the key's value at the edge, in its own unit.
         omega_rad_s: the frequency of the root that crosses, rad/s.
-        stable_above: True if it is stable above and unstable below.
+        stable_above: True if the loop is stable above the value and unstable below.
     """
 
     key: str
@@ -119,10 +139,10 @@ class EdgeScan(NamedTuple):
 
 
 def parse_edge_range(text: str) -> tuple[str, float, float]:
-    """Returns key and ends of a text such as control.d=0.1:3.
+    """Returns the key and the ends of a range such as "control.d=0.1:3".
 
     Raises:
-        UsageError: it names none.
+        UsageError: the text is not a range.
     """
     key, _, ends = text.partition("=")
     low, colon, high = ends.partition(":")
@@ -146,11 +166,17 @@ def iterate_linear_edges(
     points: int = EDGE_SCAN_POINTS,
     sampled: bool | None = None,
 ) -> Iterator[LinearEdge]:
-    """Yields all edges that a scan of a key such as "control.d" finds, by rising value.
+    """Yields all edges that a scan of a key finds, by rising value.
 
-    The equilibrium `rest` is that of the scenario, if known; it is followed along the key. The
-    loop is the sampled one if asked for, by default if the scheme is `digital`, or an actor in
-    force is sampled.
+    Args:
+        scenario: the experiment.
+        key: the scenario's key, as "control.d".
+        low: lower end of the range.
+        high: upper end of the range.
+        rest: the equilibrium of the scenario, if known; it is followed along the key.
+        points: number of values that the scan evaluates.
+        sampled: analyse the sampled loop. None: only for the scheme `digital`, or if an actor
+            in force is sampled.
 
     Raises:
         ScenarioError: a value is not valid for that key, or the scenario has no linear loop.
@@ -160,75 +186,98 @@ def iterate_linear_edges(
         raise UsageError(
             f"{key} is scanned from a value to a larger one, not {low:g} to {high:g}"
         )
-    rate = _GrowthRate(scenario, key, rest, sampled)
-    spaced = np.geomspace if low > 0.0 and high / low > _LOGARITHMIC else np.linspace
-    values = spaced(low, high, points)
-    before: tuple[float, float] | None = None
-    for value in np.unique(np.round(values)) if rate.integer else values:
-        now = (float(value), rate.at(float(value)))
-        if before is not None and (before[1] > 0.0) != (now[1] > 0.0):
-            yield rate.close_edge(before, now)
-        before = now
+    growth = _GrowthRate(scenario, key, rest, sampled)
+    is_logarithmic = low > 0.0 and high / low > _LOGARITHMIC
+    values = (np.geomspace if is_logarithmic else np.linspace)(low, high, points)
+    if growth.takes_integers:
+        values = np.unique(np.round(values))
+    previous: _GrowthPoint | None = None
+    for value in values.tolist():
+        point = _GrowthPoint(value, growth.evaluate(value))
+        if previous is not None and previous.is_unstable != point.is_unstable:
+            yield growth.close_edge(previous, point)
+        previous = point
+
+
+class _GrowthPoint(NamedTuple):
+    """A value of a key and the real part of the rightmost root there, 1/s."""
+
+    value: float
+    growth_per_s: float
+
+    @property
+    def is_unstable(self) -> bool:
+        """True if the rightmost root is to the right of the axis."""
+        return self.growth_per_s > 0.0
 
 
 class _GrowthRate:
-    """The real part of the rightmost root over the values of a key, 1/s.
+    """The real part of the rightmost root as a function of a key's value.
 
     Attributes:
-        integer: True if the key takes whole numbers.
+        takes_integers: True if the key takes whole numbers.
     """
 
     def __init__(
         self, scenario: Scenario, key: str, rest: Equilibrium | None, sampled: bool | None
     ) -> None:
-        self.integer = key.rpartition(".")[2] in _INTEGER_KEYS
+        self.takes_integers = key.rpartition(".")[2] in _INTEGER_KEYS
         self._scenario = scenario
         self._key = key
         self._sampled = sampled
         self._rest = rest or choose_equilibrium(scenario)
         self._root: CharacteristicRoot | None = None
 
-    def at(self, value: float) -> float:
-        """Returns the real part at a value; -infinity if there are only roots at zero."""
-        scenario = load_scenario(
-            self._scenario, {self._key: round(value) if self.integer else value}
-        )
+    def evaluate(self, value: float) -> float:
+        """Returns the real part at a value, 1/s; -infinity if all roots are zero."""
+        typed_value = round(value) if self.takes_integers else value
+        scenario = load_scenario(self._scenario, {self._key: typed_value})
         conditions = derive_operating_conditions(scenario)
         self._rest = follow_equilibrium(scenario, self._rest)
-        sampled = conditions.needs_sampled_loop if self._sampled is None else self._sampled
+        sampled = self._sampled
+        if sampled is None:
+            sampled = conditions.needs_sampled_loop
         self._root = find_rightmost_root(conditions, self._rest, sampled=sampled)
         return -np.inf if self._root is None else self._root.s.real
 
-    def close_edge(self, left: tuple[float, float], right: tuple[float, float]) -> LinearEdge:
-        (low, at_low) = left
-        (high, _) = right
-        if self.integer:
+    def close_edge(self, left: _GrowthPoint, right: _GrowthPoint) -> LinearEdge:
+        """Returns the edge between two values of which exactly one is unstable.
+
+        Raises:
+            ScenarioError: a value in between has no linear loop.
+            ValueError: the ends, evaluated again, are both stable or both unstable.
+        """
+        low = left.value
+        high = right.value
+        if self.takes_integers:
             while high - low > 1.0:
                 middle = float((low + high) // 2.0)
-                low, high = (
-                    (middle, high)
-                    if (self.at(middle) > 0.0) == (at_low > 0.0)
-                    else (low, middle)
-                )
+                if (self.evaluate(middle) > 0.0) == left.is_unstable:
+                    low = middle
+                else:
+                    high = middle
         else:
-            reach = 0.25 * EDGE_TOLERANCE * max(abs(low), abs(high))
-            low = high = float(
-                brentq(lambda value: max(self.at(value), _LEAST_PER_S), low, high, xtol=reach)
-            )
-        self.at(high)
+            tolerance = 0.25 * EDGE_TOLERANCE * max(abs(low), abs(high))
+            edge = brentq(self._evaluate_finite, low, high, xtol=tolerance)
+            low = high = float(edge)
+        self.evaluate(high)
         omega = 0.0 if self._root is None else self._root.s.imag
-        return LinearEdge(self._key, 0.5 * (low + high), omega, at_low > 0.0)
+        return LinearEdge(self._key, 0.5 * (low + high), omega, left.is_unstable)
+
+    def _evaluate_finite(self, value: float) -> float:
+        """Returns the real part at a value, at least `_LEAST_PER_S`."""
+        return max(self.evaluate(value), _LEAST_PER_S)
 
 
 class GrowthColumn(NamedTuple):
-    """How fast a loop grows over the values of a key.
+    """The growth rate of a loop over the values of a key.
 
     Attributes:
-        growth_per_s: per value the real part of the rightmost root; NaN if there is no linear
+        growth_per_s: real part of the rightmost root at each value; NaN if there is no linear
             loop, and -infinity if nothing moves.
-        edges: by the place of the value below it, each value at which the loop becomes stable
-            or unstable.
-        remarks: what is to be known of it, each once.
+        edges: values at which the loop becomes stable or unstable, by the index of the next
+            smaller value.
+        remarks: remarks on the analysis, without repetition.
     """
 
     growth_per_s: list[float]
@@ -239,66 +288,77 @@ class GrowthColumn(NamedTuple):
 def compute_growth_column(
     scenarios: Sequence[Scenario], key: str, values: Sequence[float]
 ) -> GrowthColumn:
-    """Returns the growth of scenarios that differ in a key alone, by its rising values.
+    """Returns the growth rates of scenarios that differ in one key only.
 
-    The equilibrium is followed from one scenario to the next. An edge is missing where that
-    next to it is none of the values in between.
+    The equilibrium is followed from one scenario to the next. An edge is missing if a value
+    between its neighbours is not valid for the key.
+
+    Args:
+        scenarios: the experiments, by rising value of the key.
+        key: the scenario's key.
+        values: the key's values.
     """
     rest: Equilibrium | None = None
-    found = GrowthColumn([], {}, [])
+    column = GrowthColumn([], {}, [])
     for n, scenario in enumerate(scenarios):
         try:
             rest, remark = _assume_equilibrium(scenario, rest)
             conditions = derive_operating_conditions(scenario)
             root = find_rightmost_root(conditions, rest, sampled=conditions.needs_sampled_loop)
-            found.growth_per_s.append(-np.inf if root is None else root.s.real)
-            before, now = found.growth_per_s[-2:] if n else [np.nan, np.nan]
-            if np.isfinite([before, now]).all() and (before > 0.0) != (now > 0.0):
-                with suppress(ScenarioError, ValueError):  # of both ends the same sign
-                    ends = (values[n - 1], before), (values[n], now)
-                    found.edges[n - 1] = (
-                        _GrowthRate(scenario, key, rest, None).close_edge(*ends).value
-                    )
+            column.growth_per_s.append(-np.inf if root is None else root.s.real)
+            if n > 0:
+                left = _GrowthPoint(values[n - 1], column.growth_per_s[-2])
+                right = _GrowthPoint(values[n], column.growth_per_s[-1])
+                is_finite = np.isfinite([left.growth_per_s, right.growth_per_s]).all()
+                if is_finite and left.is_unstable != right.is_unstable:
+                    # evaluated again from one equilibrium, both ends may have the same sign
+                    with suppress(ScenarioError, ValueError):
+                        edge = _GrowthRate(scenario, key, rest, None).close_edge(left, right)
+                        column.edges[n - 1] = edge.value
         except ScenarioError as error:
             remark = f"no linear analysis: {error.problem}"
-            found.growth_per_s.append(float("nan"))
-        if remark and remark not in found.remarks:
-            found.remarks.append(remark)
-    return found
+            column.growth_per_s.append(float("nan"))
+        if remark and remark not in column.remarks:
+            column.remarks.append(remark)
+    return column
 
 
 def find_root_crossings(
     scenario: Scenario, key: str, low: float, high: float
 ) -> tuple[tuple[float, ...], str]:
-    """Returns the values of a key at which the rightmost root crosses the axis, rising, and a
-    remark or "".
+    """Returns the values of a key at which the rightmost root crosses the axis, and a remark.
 
-    There are no values if the scenario has no linear loop; its own value of the key gives the
-    equilibrium.
+    Args:
+        scenario: the experiment; its own value of the key gives the equilibrium.
+        key: the scenario's key.
+        low: lower end of the range.
+        high: upper end of the range.
+
+    Returns:
+        The values, rising, and a remark or "". There are no values without a linear loop.
     """
     try:
         rest, remark = _assume_equilibrium(scenario, None)
-        return tuple(
-            one.value
-            for one in iterate_linear_edges(
-                scenario=scenario, key=key, low=low, high=high, rest=rest
-            )
-        ), remark
+        edges = iterate_linear_edges(scenario, key, low=low, high=high, rest=rest)
+        return tuple(edge.value for edge in edges), remark
     except ScenarioError as error:
         return (), f"no linear analysis: {error.problem}"
 
 
 def _assume_equilibrium(
-    scenario: Scenario, before: Equilibrium | None
+    scenario: Scenario, previous: Equilibrium | None
 ) -> tuple[Equilibrium, str]:
-    """Returns an equilibrium without a run if possible: at the mean start pose, or near that
-    before.
+    """Returns an equilibrium, without a run if possible, and a remark or "".
+
+    Adaptive sites without actors have the mean start pose as their equilibrium. Otherwise it is
+    the one next to the previous equilibrium.
     """
     sites = derive_operating_conditions(scenario).sites
-    if any(site.gains.law is Law.ADAPTIVE for site in sites) and not any(
-        site.actors for site in sites
-    ):
-        return find_equilibrium(scenario, find_mean_pose(scenario)), ASSUMED_EQUILIBRIUM_REMARK
-    return choose_equilibrium(scenario) if before is None else follow_equilibrium(
-        scenario, before
-    ), ""
+    is_adaptive = any(site.gains.law is Law.ADAPTIVE for site in sites)
+    has_actors = any(site.actors for site in sites)
+    if is_adaptive and not has_actors:
+        rest = find_equilibrium(scenario, find_mean_pose(scenario))
+        return rest, ASSUMED_EQUILIBRIUM_REMARK
+    if previous is None:
+        return choose_equilibrium(scenario), ""
+    return follow_equilibrium(scenario, previous), ""

@@ -105,6 +105,7 @@ class NumericLaw:
 
     @property
     def _memory_slice(self) -> slice:
+        """The slice of the memory in the arguments."""
         start = 2 * self._layout.joints
         return slice(start, start + len(self.memory))
 

@@ -1,4 +1,4 @@
-"""The operating point of the linear loop: conditions at the end of a run, and the equilibrium.
+"""The operating point of the linear loop: the conditions at the end of a run.
 
 A link has an effective delay: the age of its samples at the ticks that use them. With a
 constant delay T and equal tick rates 1 / h it is max(1, ceil(T / h)) ticks. In all other cases

@@ -1,16 +1,17 @@
-"""Port analysis of a scenario's teleoperator: passivity, absolute stability, transparency, also
-as JSON.
-
-Invariant: operators and environments are off, and their torque at the equilibrium stays as a
-constant, so that a held pose can be analysed too. An unstable loop has no steady oscillations:
-nothing but its instability counts. Every result holds for the analysed band.
+"""Port analysis of a teleoperator: passivity, absolute stability and transparency.
 
 Sites that follow in task space have ports at their end effectors, along the followed axes: the
 same loop in other coordinates. With J the Jacobian of a site's followed axes at rest and N a
-basis of the joint motions that leave them alone, x = J q and z = N' q stand in place of q, so
-that a force F on the end effector is the torque J' F and its velocity is x'. A port is numbered
-as its coordinate, 1 to 3 a place, 4 to 6 turns, and its position's state is called "q" with
-that number, as a joint's is.
+basis of the joint motions that leave them unchanged, x = J q and z = N' q replace q. A force F
+on the end effector is the torque J' F, and its velocity is x'. A port has the number of its
+coordinate: 1 to 3 for the position, 4 to 6 for rotations. The state of its position is called
+"q" with that number, as for a joint.
+
+Invariant:
+    - Operators and environments are removed, and their torque at the equilibrium stays as a
+      constant, so that a held pose can be analysed too.
+    - An unstable loop has no steady oscillations: only its instability counts.
+    - Every result holds for the analysed band.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,7 +34,7 @@ from ..results import finite_or_none
 from ..scenario import Scenario
 from ..scenario.arms import TASK_AXES
 from . import frequency_search, port_response
-from .characteristic_roots import compute_delay_spectrum
+from .characteristic_roots import Complex, compute_delay_spectrum
 from .linear_loop import LinearLoop, gather_site_arguments, linearise_loop
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .port_passivity import (
@@ -54,12 +55,14 @@ from .site_dynamics import follow_peers, lay_out_arguments, place_arm
 def freeze_external_torques(
     conditions: OperatingConditions, rest: Equilibrium
 ) -> OperatingConditions:
-    """Returns the conditions with the torque of operators and environments constant as at the
-    equilibrium.
+    """Returns conditions in which the torque of operators and environments is constant.
+
+    Its value is that at the equilibrium.
     """
-    x = gather_site_arguments(conditions, rest)
+    arguments = gather_site_arguments(conditions, rest)
     sites = []
-    for site, rates in zip(conditions.sites, conditions.evaluate_rates(x), strict=True):
+    all_rates = conditions.evaluate_rates(arguments)
+    for site, rates in zip(conditions.sites, all_rates, strict=True):
         torque = tuple((rates.external + rates.held).tolist())
         constant = (TorqueSource(TorqueKind.RECORDED, a=torque),) if any(torque) else ()
         sites.append(site._replace(actors=constant))
@@ -67,53 +70,51 @@ def freeze_external_torques(
 
 
 def linearise_teleoperator(conditions: OperatingConditions, rest: Equilibrium) -> LinearLoop:
-    """Returns the loop at whose ports operators and environments act, without them."""
+    """Returns the loop without the operators and environments that act at its ports."""
     frozen = freeze_external_torques(conditions, rest)
-    return use_end_effector_ports(frozen, rest, linearise_loop(frozen, rest))
+    return move_ports_to_end_effectors(frozen, rest, linearise_loop(frozen, rest))
 
 
 def build_proof_output(
     conditions: OperatingConditions, loop: LinearLoop
 ) -> port_response.LoopOutput | None:
-    """Returns the output r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)), Eq. (6),
-    (9), (10).
+    """Returns the output of the paper's passivity proof, or None if there is no proof.
 
-    In task space it is J r, with places in q's stead. None if a site has another law than the
-    paper's, which has no r, and where orientations are followed, or axes that a peer leaves
-    free: there is no proof.
+    The output is r_i = qd_i + Lambda (q_i - sum_j alpha_ij q_j(t - T_ij)), Eq. (6), (9), (10).
+    In task space it is J r, with positions in place of q. There is no proof for laws other than
+    the paper's, which have no r, for orientations, and for axes that a peer does not follow.
     """
-    if any(
-        site.gains.law is not Law.ADAPTIVE or site.gains.absolute for site in conditions.sites
-    ):
+    sites = conditions.sites
+    if any(site.gains.law is not Law.ADAPTIVE or site.gains.absolute for site in sites):
         return None
-    if conditions.sites[0].layout.task and conditions.sites[0].layout.shared > POSITION:
+    if sites[0].layout.task and sites[0].layout.shared > POSITION:
         return None
     C = loop.C.copy()
     delays_s = conditions.age_s[conditions.alpha != 0.0]
     delayed = {float(delay_s): np.zeros_like(loop.C) for delay_s in delays_s}
-    for i, site in enumerate(conditions.sites):
+    for i, site in enumerate(sites):
         Lambda = np.broadcast_to(site.gains.Lambda, site.layout.shared)
-        for row, joint in zip(
-            port_response.find_site_ports(loop, site.name),
-            list_followed_axes(site),
-            strict=True,
-        ):
-            C[row, loop.names.index(f"{site.name}.q{joint}")] += Lambda[joint - 1]
+        ports = port_response.find_site_ports(loop, site.name)
+        for port, joint in zip(ports, list_followed_axes(site), strict=True):
+            C[port, loop.names.index(f"{site.name}.q{joint}")] += Lambda[joint - 1]
             for j in np.flatnonzero(conditions.alpha[i]):
-                if joint not in list_followed_axes(conditions.sites[j]):
+                if joint not in list_followed_axes(sites[j]):
                     continue
-                angle = loop.names.index(f"{conditions.sites[j].name}.q{joint}")
+                position = loop.names.index(f"{sites[j].name}.q{joint}")
                 factor = Lambda[joint - 1] * conditions.alpha[i, j]
-                delayed[float(conditions.age_s[i, j])][row, angle] -= factor
+                delayed[float(conditions.age_s[i, j])][port, position] -= factor
     return port_response.LoopOutput(C, tuple(sorted(delayed.items())))
 
 
 def compute_proof_weights(conditions: OperatingConditions) -> Array:
-    """Returns beta_i = pi_i / c_i of the corrected proof (docs/errata.md), sum N, shape (N,)."""
+    """Returns beta_i = pi_i / c_i of the corrected proof in docs/errata.md, shape (N,).
+
+    The weights sum to N.
+    """
     Kd = np.full((len(conditions.sites), conditions.sites[0].layout.shared), np.nan)
-    for own, site in zip(Kd, conditions.sites, strict=True):
+    for site_Kd, site in zip(Kd, conditions.sites, strict=True):
         followed = [n - 1 for n in list_followed_axes(site)]
-        own[followed] = np.broadcast_to(site.gains.Kd, own.shape)[followed]
+        site_Kd[followed] = np.broadcast_to(site.gains.Kd, site_Kd.shape)[followed]
     return compute_lyapunov_weights(conditions.alpha, Kd).beta
 
 
@@ -121,10 +122,11 @@ class TwoPort(NamedTuple):
     """Llewellyn's criterion for one joint of two sites.
 
     Attributes:
-        sites: the two.
-        joint: the joint, or coordinate of the task, from 1 on; no operator is at the others.
-        clamped: the third site if it is clamped; "" if it is free, or there is none.
-        minima: the parameter over frequency, and the bands where it is below 1.
+        sites: the two sites.
+        joint: number of the joint, or coordinate of the task, from 1 on; no operator is at the
+            others.
+        clamped: the third site if it is clamped; "" if it is free, or there is no third site.
+        minima: Llewellyn's parameter over frequency, and the bands where it is below 1.
     """
 
     sites: tuple[str, str]
@@ -134,29 +136,28 @@ class TwoPort(NamedTuple):
 
 
 class PortAnalysis(NamedTuple):
-    """The ports of a teleoperator, operators and environments off.
+    """The ports of a teleoperator without operators and environments.
 
     Attributes:
         scenario: the teleoperator.
         band_hz: the analysed band, Hz.
-        resolved_hz: the frequency up to which the grid follows the phase of the delays, Hz.
-        verdict: of its roots: "stable", "unstable" or "at the edge".
+        resolved_hz: the frequency up to which the grid resolves the phase of the delays, Hz.
+        verdict: verdict of the loop's roots: "stable", "unstable" or "at the edge".
         pole: the pole of the admittance at zero frequency.
         velocity: passivity at all ports with respect to qd.
-        joints: the same for each joint alone, no operator at the others.
+        joints: the same for each joint alone, with no operator at the others.
         proof: passivity with respect to r = qd + Lambda e; None if the law has no r.
-        beta: the weights of the sites in that, shape (N,), sum N.
-        estimates_true: True if all estimates at the equilibrium are true; otherwise the proof
+        beta: the weights of the sites in `proof`, shape (N,), sum N.
+        estimates_true: True if all estimates at the equilibrium are true. Otherwise the proof
             counts the energy that they store, which a linear loop cannot show.
-        absolute: the least eigenvalue under the best weights; stable with any passive operators
-            where it is not negative.
+        absolute: the least eigenvalue under the best weights; the loop is stable with any
+            passive operators if it is not negative.
         two_ports: Llewellyn's criterion for every pair of sites.
-        transparency: at each site, with one other site free and clamped.
-        clamped_verdict: of the roots with that other site clamped.
-        axes: names of the ports' numbers in task space, whose ports are forces along them; {}:
-            joints.
-        measured: with measured hands at the masters, see `check_against_hands`; None if there
-            are none.
+        transparency: transparency at each site, with one other site free and clamped.
+        clamped_verdict: verdict of the roots with that other site clamped.
+        axes: in task space the name of each port number's axis; {} in joint space.
+        measured: result with measured hands at the masters, see `check_against_hands`; None if
+            no hand was measured.
     """
 
     scenario: Scenario
@@ -178,12 +179,12 @@ class PortAnalysis(NamedTuple):
 
     @property
     def sites(self) -> tuple[str, ...]:
-        """Of the ports."""
+        """Names of the sites."""
         return self.scenario.names
 
     @property
     def kind(self) -> str:
-        """What a port belongs to: a joint, or an axis of the task."""
+        """The kind of a port: "joint", or "axis" in task space."""
         return "axis" if self.axes else "joint"
 
     @property
@@ -192,18 +193,19 @@ class PortAnalysis(NamedTuple):
         return "xd" if self.axes else "qd"
 
     def name_port(self, number: int) -> str:
-        """Returns the name of the ports of a number: "joint 2", or "axis y" of a task."""
+        """Returns the name of the ports with a number: "joint 2", or "axis y" in task space."""
         return f"{self.kind} {self.axes.get(number, number)}"
 
     def impedance_unit(self, number: int = 0) -> str:
-        """Returns the unit of an impedance at the ports of a number; 0: at all of them."""
-        turns = not self.axes or max(self.axes) > POSITION
-        units = {
-            "N s/m" if self.axes and port <= POSITION else "N m s/rad"
-            for port in [number]
-            if port
-        }
-        return " and ".join(units or (["N s/m"] if self.axes else []) + ["N m s/rad"] * turns)
+        """Returns the unit of an impedance at the ports with a number; 0: at all ports."""
+        linear = "N s/m"
+        angular = "N m s/rad"
+        if not self.axes:
+            return angular
+        if number:
+            return linear if number <= POSITION else angular
+        has_rotations = max(self.axes) > POSITION
+        return f"{linear} and {angular}" if has_rotations else linear
 
 
 def analyse_ports(
@@ -213,14 +215,19 @@ def analyse_ports(
     band_hz: tuple[float, float] = (frequency_search.LOW_HZ, frequency_search.HIGH_HZ),
     hands: Sequence[HandMatrices] = (),
 ) -> PortAnalysis:
-    """Returns the analysis of a scenario's ports at an equilibrium, over a band, Hz.
+    """Returns the analysis of a scenario's ports at an equilibrium, over a band.
 
-    The site `of` is free and clamped for the others' transparency; None: the slave, or the last
-    site. Of `hands` any may hold any master.
+    Args:
+        scenario: the teleoperator.
+        rest: the equilibrium.
+        of: the site that is free and clamped for the others' transparency; None: the slave, or
+            the last site.
+        band_hz: lower and upper end of the band, Hz.
+        hands: measured hands, any of which may hold any master.
 
     Raises:
         ScenarioError: the scenario has no linear loop.
-        UsageError: no site of that name, or an empty band.
+        UsageError: there is no site of that name, or the band is empty.
     """
     low, high = band_hz
     if not 0.0 < low < high:
@@ -229,131 +236,170 @@ def analyse_ports(
         )
     conditions = derive_operating_conditions(scenario)
     loop = linearise_teleoperator(conditions, rest)
-    of = of or scenario.slave
+    other_site = of or scenario.slave
     sites = port_response.list_port_sites(loop)
     delay_s = port_response.find_longest_delay_s(loop)
+    grid = frequency_search.build_frequency_grid(low, high, delay_s)
     Y = port_response.build_admittance(loop)
-    w_rad_s = frequency_search.refine_frequencies(
-        Y, frequency_search.build_frequency_grid(*band_hz, delay_s)
-    )
+    w_rad_s = frequency_search.refine_frequencies(Y, grid)
     Y = frequency_search.cache_response(Y, w_rad_s)
+    joints = {
+        joint: check_passivity(port_response.select_ports(Y, ports), w_rad_s)
+        for joint, ports in port_response.group_ports_by_joint(loop).items()
+    }
+    transparency: list[Transparency] = []
+    for site in sites:
+        if site != other_site:
+            transparency += measure_transparency(loop, site, other_site)
+    clamped_loop = port_response.clamp_site(loop, other_site)
+    held_hands = _locate_hands(scenario, conditions, rest=rest, loop=loop, hands=hands)
     return PortAnalysis(
         scenario=scenario,
         band_hz=band_hz,
-        resolved_hz=frequency_search.find_resolved_hz(*band_hz, delay_s),
+        resolved_hz=frequency_search.find_resolved_hz(low, high, delay_s),
         verdict=compute_delay_spectrum(loop, 1).verdict,
         pole=port_response.find_pole_at_zero(loop),
         velocity=check_passivity(Y, w_rad_s),
-        joints={
-            joint: check_passivity(port_response.select_ports(Y, places), w_rad_s)
-            for joint, places in port_response.group_ports_by_joint(loop).items()
-        },
+        joints=joints,
         proof=_check_proof(conditions, loop, w_rad_s),
         beta=compute_proof_weights(conditions),
-        estimates_true=all(
-            site.gains.law is Law.USER or np.allclose(own[: len(site.theta)], site.theta)
-            for own, site in zip(rest.theta_hat, conditions.sites, strict=True)
-        ),
-        absolute=frequency_search.find_minima(
-            lambda w: find_best_weights(Y(w), _find_owners(loop)).margin,
-            w_rad_s,
-            tolerance=lambda w: np.full(len(w), EIGENVALUE_ROUNDING),
-        ),
+        estimates_true=_are_estimates_true(conditions, rest),
+        absolute=_check_absolute_stability(loop, Y, w_rad_s),
         two_ports=_check_two_ports(loop, Y, w_rad_s),
-        transparency=tuple(
-            one for site in sites if site != of for one in measure_transparency(loop, site, of)
-        ),
-        clamped_verdict=compute_delay_spectrum(port_response.clamp_site(loop, of), 1).verdict,
+        transparency=tuple(transparency),
+        clamped_verdict=compute_delay_spectrum(clamped_loop, 1).verdict,
         axes=name_ports(conditions),
         measured=check_against_hands(
-            Y,
-            w_rad_s,
-            *_place_hands(
-                scenario=scenario, conditions=conditions, rest=rest, loop=loop, hands=hands
-            ),
+            Y, w_rad_s, held=held_hands.hands, places=held_hands.places
         ),
     )
 
 
-def _place_hands(
+def _are_estimates_true(conditions: OperatingConditions, rest: Equilibrium) -> bool:
+    """True if every estimate at the equilibrium is the true parameter."""
+    for theta_hat, site in zip(rest.theta_hat, conditions.sites, strict=True):
+        if site.gains.law is Law.USER:
+            continue
+        if not np.allclose(theta_hat[: len(site.theta)], site.theta):
+            return False
+    return True
+
+
+def _check_absolute_stability(
+    loop: LinearLoop, Y: port_response.PortResponse, w_rad_s: Array
+) -> frequency_search.Minima:
+    """Returns the margin of absolute stability over frequency, with the best weights."""
+    owners = _find_owners(loop)
+    return frequency_search.find_minima(
+        lambda w: find_best_weights(Y(w), owners).margin,
+        w_rad_s,
+        tolerance=lambda w: np.full(len(w), EIGENVALUE_ROUNDING),
+    )
+
+
+class _HeldHands(NamedTuple):
+    """The masters' end effectors and the hands that may hold them.
+
+    Attributes:
+        hands: for each master the hands of which any may hold.
+        places: for each master the matrix from the velocities at all ports to that of its end
+            effector, shape (n, p).
+    """
+
+    hands: list[Sequence[HandMatrices]]
+    places: list[Array]
+
+
+def _locate_hands(
     scenario: Scenario,
     conditions: OperatingConditions,
+    *,
     rest: Equilibrium,
     loop: LinearLoop,
     hands: Sequence[HandMatrices],
-) -> tuple[list[Sequence[HandMatrices]], list[Array]]:
-    """Returns the hands at each master, and its end effector's velocity by those at the ports."""
+) -> _HeldHands:
+    """Returns the masters' end effectors and the hands that may hold them.
+
+    Raises:
+        UsageError: a hand moves along other axes than an end effector.
+    """
     places: list[Array] = []
-    for site, own in zip(conditions.sites, rest.q, strict=True):
+    for site, site_q in zip(conditions.sites, rest.q, strict=True):
         if not hands or scenario.sites[site.name].role != "master":
             continue
-        q = own[np.newaxis, : site.layout.joints]
+        q = site_q[np.newaxis, : site.layout.joints]
         ports = port_response.find_site_ports(loop, site.name)
         J = build_arm_rows(scenario, site.name).place_end_effector(q, np.zeros_like(q)).J[0]
-        if any(len(one.B) != len(J) for one in hands):
+        if any(len(hand.B) != len(J) for hand in hands):
             raise UsageError(
                 f"{site.name}: its end effector moves along {count_nouns(len(J), 'axis')}, "
-                "a hand along others"
+                "and a hand along another number"
             )
         place = np.zeros((len(J), len(loop.inputs)))
-        if site.layout.task:  # its ports are axes
-            for n, port in zip(list_followed_axes(site), ports, strict=True):
-                if n <= len(J):
-                    place[n - 1, port] = 1.0
+        if site.layout.task:
+            # the ports are axes already
+            for axis, port in zip(list_followed_axes(site), ports, strict=True):
+                if axis <= len(J):
+                    place[axis - 1, port] = 1.0
         else:
             place[:, ports] = J
         places.append(place)
-    return [hands] * len(places), places
+    return _HeldHands([hands] * len(places), places)
 
 
 def _find_owners(loop: LinearLoop) -> NDArray[np.int64]:
+    """Returns the index of the site of each port, shape (p,)."""
     sites = port_response.list_port_sites(loop)
-    return np.array(
-        [sites.index(port_response.parse_port_site(port)) for port in loop.inputs],
-        dtype=np.int64,
-    )
+    owners = [sites.index(port_response.parse_port_site(port)) for port in loop.inputs]
+    return np.array(owners, dtype=np.int64)
 
 
 def _check_proof(
     conditions: OperatingConditions, loop: LinearLoop, w_rad_s: Array
 ) -> Passivity | None:
+    """Returns passivity with respect to r under the proof's weights; None: no proof."""
     output = build_proof_output(conditions, loop)
     beta = compute_proof_weights(conditions)[_find_owners(loop)]
     if output is None or not (beta > 0.0).all():
         return None
-    return check_passivity(
-        lambda w: port_response.evaluate_transfer(
-            loop, port_response.to_imaginary_axis(w), output
-        ),
-        w_rad_s,
-        beta,
-    )
+
+    def evaluate(w: Array) -> Complex:
+        s = port_response.to_imaginary_axis(w)
+        return port_response.evaluate_transfer(loop, s, output)
+
+    return check_passivity(evaluate, w_rad_s, beta)
 
 
 def _check_two_ports(
     loop: LinearLoop, Y: port_response.PortResponse, w_rad_s: Array
 ) -> tuple[TwoPort, ...]:
+    """Returns Llewellyn's criterion for each joint that both sites of a pair have.
+
+    With three sites, the third is once free and once clamped.
+    """
     two_ports = []
-    for pair in combinations(port_response.list_port_sites(loop), 2):
-        others = [site for site in port_response.list_port_sites(loop) if site not in pair]
-        for clamped in ("", *others) if len(others) == 1 else ("",):
-            fixed = port_response.find_site_ports(loop, clamped) if clamped else []
-            for joint, places in port_response.group_ports_by_joint(loop).items():
+    sites = port_response.list_port_sites(loop)
+    for pair in combinations(sites, 2):
+        others = [site for site in sites if site not in pair]
+        clamped_sites = ["", *others] if len(others) == 1 else [""]
+        for clamped in clamped_sites:
+            clamped_ports = port_response.find_site_ports(loop, clamped) if clamped else []
+            for joint, ports in port_response.group_ports_by_joint(loop).items():
                 keep = [
                     port
-                    for port in places
+                    for port in ports
                     if port_response.parse_port_site(loop.inputs[port]) in pair
                 ]
                 if len(keep) == len(pair):
-                    two_ports.append(
-                        TwoPort(pair, joint, clamped, _check_llewellyn(Y, keep, fixed, w_rad_s))
-                    )
+                    minima = _check_llewellyn(Y, keep, clamped_ports, w_rad_s)
+                    two_ports.append(TwoPort(pair, joint, clamped, minima))
     return tuple(two_ports)
 
 
 def _check_llewellyn(
     Y: port_response.PortResponse, keep: list[int], clamped: list[int], w_rad_s: Array
 ) -> frequency_search.Minima:
+    """Returns Llewellyn's parameter of two ports, with other ports clamped."""
     return frequency_search.find_minima(
         lambda w: llewellyn_parameter(clamp_ports(Y(w), keep, clamped)),
         w_rad_s,
@@ -364,6 +410,7 @@ def _check_llewellyn(
 
 def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
     """Returns a port analysis as plain values; infinite numbers are None."""
+    measured = ports.measured
     return {
         "sites": list(ports.sites),
         "band_hz": list(ports.band_hz),
@@ -372,133 +419,138 @@ def ports_to_json(ports: PortAnalysis) -> dict[str, Any]:
         "pole_at_zero": {"order": ports.pole.order, "passive": ports.pole.passive},
         "passive_qd": _passivity_to_json(ports.velocity),
         "passive_qd_of_joint": {
-            ports.axes.get(joint, str(joint)): _passivity_to_json(one)
-            for joint, one in ports.joints.items()
+            ports.axes.get(joint, str(joint)): _passivity_to_json(passivity)
+            for joint, passivity in ports.joints.items()
         },
         "passive_r": None if ports.proof is None else _passivity_to_json(ports.proof),
         "beta": ports.beta.tolist(),
         "estimates_true": ports.estimates_true,
         "absolute": _minima_to_json(ports.absolute),
-        "measured_operators": None
-        if ports.measured is None
-        else _minima_to_json(ports.measured),
+        "measured_operators": None if measured is None else _minima_to_json(measured),
         "llewellyn": [
             {
-                "sites": list(one.sites),
-                "joint": ports.axes.get(one.joint, one.joint),
-                "clamped": one.clamped,
+                "sites": list(two_port.sites),
+                "joint": ports.axes.get(two_port.joint, two_port.joint),
+                "clamped": two_port.clamped,
+                **_minima_to_json(two_port.minima),
             }
-            | _minima_to_json(one.minima)
-            for one in ports.two_ports
+            for two_port in ports.two_ports
         ],
         "roots_clamped": ports.clamped_verdict,
         "felt": [
-            _transparency_to_json(one) | {"joint": ports.axes.get(one.joint, one.joint)}
-            for one in ports.transparency
+            {
+                **_transparency_to_json(transparency),
+                "joint": ports.axes.get(transparency.joint, transparency.joint),
+            }
+            for transparency in ports.transparency
         ],
     }
 
 
-def _passivity_to_json(one: Passivity) -> dict[str, Any]:
+def _passivity_to_json(passivity: Passivity) -> dict[str, Any]:
+    """Returns a passivity as plain values."""
     return {
-        **_minima_to_json(one.minima),
-        "lacking_nm_s_rad": finite_or_none(one.lacking_nm_s_rad),
+        **_minima_to_json(passivity.minima),
+        "lacking_nm_s_rad": finite_or_none(passivity.lacking_nm_s_rad),
     }
 
 
-def _minima_to_json(one: frequency_search.Minima) -> dict[str, Any]:
+def _minima_to_json(minima: frequency_search.Minima) -> dict[str, Any]:
+    """Returns the least value of a curve and the bands in which it fails, as plain values."""
     return {
-        "holds": not one.below,
-        "least": one.least,
-        "least_hz": one.least_hz,
-        "fails_hz": [list(band) for band in one.below],
+        "holds": not minima.below,
+        "least": minima.least,
+        "least_hz": minima.least_hz,
+        "fails_hz": [list(band) for band in minima.below],
     }
 
 
-def _transparency_to_json(one: Transparency) -> dict[str, Any]:
-    free, clamped = one.interpolate_magnitudes(QUOTED_AT_HZ)
+def _transparency_to_json(transparency: Transparency) -> dict[str, Any]:
+    """Returns a transparency as plain values."""
+    free, clamped = transparency.interpolate_magnitudes(QUOTED_AT_HZ)
     return {
-        "at": one.operator_site,
-        "of": one.other_site,
-        "joint": one.joint,
+        "at": transparency.operator_site,
+        "of": transparency.other_site,
+        "joint": transparency.joint,
         "free_at_1_hz_nm_s_rad": free,
         "clamped_at_1_hz_nm_s_rad": clamped,
-        "band_hz": list(one.band_hz),
-        "softest_nm_s_rad": one.softest_nm_s_rad,
-        "stiffest_nm_s_rad": one.stiffest_nm_s_rad,
-        "width_db": one.ratio_db,
-        "ratio_db": one.ratio_db,
-        "difference_nm_s_rad": one.difference_nm_s_rad,
+        "band_hz": list(transparency.band_hz),
+        "softest_nm_s_rad": transparency.softest_nm_s_rad,
+        "stiffest_nm_s_rad": transparency.stiffest_nm_s_rad,
+        "width_db": transparency.ratio_db,
+        "ratio_db": transparency.ratio_db,
+        "difference_nm_s_rad": transparency.difference_nm_s_rad,
     }
 
 
 def list_followed_axes(site: SiteSetup) -> list[int]:
-    """Returns the coordinates that a site follows, from 1 on: of joint space all joints."""
+    """Returns the coordinates that a site follows, from 1 on; in joint space all joints."""
     if site.chain is None or site.chain.task is None:
         return list(range(1, site.layout.joints + 1))
-    return [n for n, on in enumerate(site.chain.task.axes, 1) if on]
+    return [n for n, is_followed in enumerate(site.chain.task.axes, 1) if is_followed]
 
 
 def name_ports(conditions: OperatingConditions) -> dict[int, str]:
-    """Returns what the ports of each number are called: the axes of a task, or {} for the
-    joints.
-    """
+    """Returns the name of each port number's axis in task space; {} in joint space."""
     if not conditions.sites[0].layout.task:
         return {}
     followed = sorted({n for site in conditions.sites for n in list_followed_axes(site)})
     return {n: TASK_AXES[n - 1] for n in followed}
 
 
-def use_end_effector_ports(
+def move_ports_to_end_effectors(
     conditions: OperatingConditions, rest: Equilibrium, loop: LinearLoop
 ) -> LinearLoop:
-    """Returns a loop with ports at the end effectors, if its sites follow with them; else the
-    loop.
+    """Returns a loop with ports at the end effectors; in joint space the same loop.
+
+    The states change to T X with a block T = (J; N') for the positions and the velocities of
+    each site, and the ports to J.
     """
     if not conditions.sites[0].layout.task:
         return loop
-    blocks = []
-    inverses = []
+    state_blocks = []
+    inverse_blocks = []
+    port_blocks = []
     names = []
-    ports = []
-    for site, x in zip(conditions.sites, gather_site_arguments(conditions, rest), strict=True):
-        at = lay_out_arguments(site)
+    inputs = []
+    outputs = []
+    arguments = gather_site_arguments(conditions, rest)
+    for site, x in zip(conditions.sites, arguments, strict=True):
+        layout = lay_out_arguments(site)
         followed = list_followed_axes(site)
-        whole = follow_peers(site, place_arm(site, x[at.q]), x).J
-        assert whole is not None
-        J: Array = whole[[n - 1 for n in followed]]
-        free = null_space(J)
-        T = np.vstack([J, free.T])
-        inverse = np.hstack([np.linalg.pinv(J), free])
-        estimates = [name for name in loop.names if name.startswith(f"{site.name}.")][
-            2 * at.joints :
-        ]
-        rest_of_site = np.eye(len(estimates))
-        blocks.append(block_diag(T, T, rest_of_site))
-        inverses.append(block_diag(inverse, inverse, rest_of_site))
-        free_names = [f"free{n + 1}" for n in range(free.shape[1])]
-        for kind, slow in (("q", ""), ("qd", "d")):
-            names += [f"{site.name}.{kind}{n}" for n in followed]
-            names += [f"{site.name}.{name}{slow}" for name in free_names]
+        full_J = follow_peers(site, place_arm(site, x[layout.q]), x).J
+        assert full_J is not None
+        J: Array = full_J[[n - 1 for n in followed]]
+        N = null_space(J)
+        T = np.vstack([J, N.T])
+        T_inverse = np.hstack([np.linalg.pinv(J), N])
+        site_states = [name for name in loop.names if name.startswith(f"{site.name}.")]
+        estimates = site_states[2 * layout.joints :]
+        unchanged = np.eye(len(estimates))
+        state_blocks.append(block_diag(T, T, unchanged))
+        inverse_blocks.append(block_diag(T_inverse, T_inverse, unchanged))
+        port_blocks.append(J)
+        free_names = [f"free{n + 1}" for n in range(N.shape[1])]
+        names += [f"{site.name}.q{n}" for n in followed]
+        names += [f"{site.name}.{name}" for name in free_names]
+        names += [f"{site.name}.qd{n}" for n in followed]
+        names += [f"{site.name}.{name}d" for name in free_names]
         names += estimates
-        ports.append(J)
-    change = block_diag(*blocks)
-    back = block_diag(*inverses)
-    J = block_diag(*ports)
-    numbers = [(site.name, n) for site in conditions.sites for n in list_followed_axes(site)]
-    inputs, outputs = (
-        tuple(f"{site}.{kind}{n}" for site, n in numbers) for kind in ("tau", "qd")
-    )
+        inputs += [f"{site.name}.tau{n}" for n in followed]
+        outputs += [f"{site.name}.qd{n}" for n in followed]
+    new_by_old = block_diag(*state_blocks)
+    old_by_new = block_diag(*inverse_blocks)
+    J = block_diag(*port_blocks)
     delayed = tuple(
-        term._replace(A=change @ term.A @ back, B=change @ term.B @ J.T)
+        term._replace(A=new_by_old @ term.A @ old_by_new, B=new_by_old @ term.B @ J.T)
         for term in loop.delayed
     )
     return loop._replace(
         names=tuple(names),
-        inputs=inputs,
-        outputs=outputs,
-        A=change @ loop.A @ back,
-        B=change @ loop.B @ J.T,
-        C=J @ loop.C @ back,
+        inputs=tuple(inputs),
+        outputs=tuple(outputs),
+        A=new_by_old @ loop.A @ old_by_new,
+        B=new_by_old @ loop.B @ J.T,
+        C=J @ loop.C @ old_by_new,
         delayed=delayed,
     )

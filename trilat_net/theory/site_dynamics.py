@@ -145,7 +145,7 @@ def follow_peers(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers) -> F
 
 
 def compute_shared_pose(site: SiteSetup, q: Numbers) -> Numbers:
-    """Returns the pose that a site shares with its peers: joint angles or an end effector pose.
+    """Returns the pose that a site shares: joint angles, or the pose of its end effector.
 
     Args:
         site: setup of the site.
