@@ -18,7 +18,7 @@ def test_a_protocol_becomes_a_table(tmp_path: Path) -> None:
     shorten(tmp_path / "reaching.toml")
     told = trilat("experiment", "run", "reaching.toml", "--jobs", "1", cwd=tmp_path).succeeds()
     folder = "runs/experiment-reaching-001"
-    assert f"4 trials, into {folder}; it goes on after Ctrl-C by" in told
+    assert f"4 trials, into {folder}; after Ctrl-C, continue with" in told
     assert "reaching: 4 of 4 trials" in told
     again = json.loads(trilat("experiment", "run", folder, "--json", cwd=tmp_path).out)
     assert (again["done"], again["conditions"]) == (4, ["no_delay", "delay_300"])

@@ -89,9 +89,9 @@ def test_bad_input_is_2_before_anything_runs(words: tuple[str, ...], folder: Pat
 
 
 def test_without_arguments_every_shipped_scenario_that_expects_something_is_meant() -> None:
-    from trilat_net.cli.studies import _batch
+    from trilat_net.cli.studies import _list_trials
 
-    named = [trial.source for trial in _batch([], [1, 2], [], live=False)]
+    named = [trial.source for trial in _list_trials([], [1, 2], [], live=False)]
     assert set(named) == {
         name for name in list_shipped() if load_scenario(name).expect.has_expectations
     }

@@ -65,7 +65,7 @@ def test_ctrl_c_during_run_ends_all_and_finishes_file(stage: Stage) -> None:
     assert log.complete
     assert {event.member for event in log.events if event.kind == "end"} == {"m", "s"}
     assert verify(log).passed
-    assert "run.mcap holds what there was" in running.text()
+    assert "run.mcap holds the records so far" in running.text()
 
 
 @pytest.mark.parametrize(

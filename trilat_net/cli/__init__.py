@@ -1,8 +1,10 @@
 """The `trilat` command: registers all commands and maps errors to exit codes.
 
-Invariant: a command parses, calls one function of the library and prints. It exits 0 on
-success, 1 on a failed run or comparison, 2 on bad input, 4 when a law of a log may not run, 5
-when a disk takes no more, 128 + n when signal n ended it; an error is one sentence.
+Invariant:
+    - A command parses its options, calls one function of the library and prints the result.
+    - The exit code is 0 on success, 1 for a failed run or comparison, 2 for bad input, 4 if a
+      law of a log may not run, 5 if a disk is full, and 128 + n if signal n ended the command.
+    - An error is printed as one sentence.
 """
 
 import errno
@@ -26,28 +28,27 @@ from .options import flag
 
 
 class _Commands(TyperGroup):
-    """The group of all commands; Ctrl-C ends any of them with 130, not with the framework's 1.
+    """The group of all commands; Ctrl-C ends any of them with exit code 130.
 
-    Its exception gets lost where Python raises it inside a `__del__`; `Interrupt` remembers the
-    signal.
+    The framework alone would exit with 1. KeyboardInterrupt is lost if Python raises it inside
+    a `__del__`, so that `Interrupt` remembers the signal.
     """
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Returns the names of all commands as the help has them."""
-        place = {name: n for n, name in enumerate(_FIRST)}
-        return sorted(super().list_commands(ctx), key=lambda name: place.get(name, len(place)))
+        """Returns the names of all commands in the order of the help."""
+        rank = {name: n for n, name in enumerate(_FIRST_COMMANDS)}
+        return sorted(super().list_commands(ctx), key=lambda name: rank.get(name, len(rank)))
 
     def invoke(self, ctx: Any) -> Any:
-        """Runs a command."""
+        """Runs a command; Ctrl-C ends it with the exit code of the signal."""
         with Interrupt() as interrupt:
             try:
                 with interrupt.raising():
                     return super().invoke(ctx)
             except KeyboardInterrupt:
                 err.print("interrupted")
-                raise typer.Exit(
-                    interrupt.exit_code if interrupt.is_requested() else 130
-                ) from None
+                exit_code = interrupt.exit_code if interrupt.is_requested() else 130
+                raise typer.Exit(exit_code) from None
 
 
 app = typer.Typer(
@@ -56,13 +57,14 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Dual-user teleoperation over a real network, in virtual time, and again from the log.",
-    epilog="Begin with: trilat demo paper",
+    help="Dual-user teleoperation over a network, in virtual time, and again from the log.",
+    epilog="Start with: trilat demo paper",
 )
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(is_requested: bool) -> None:
+    """Prints the version and exits, if it is requested."""
+    if is_requested:
         print_line(f"trilat-net {find_version()}")
         raise typer.Exit
 
@@ -76,74 +78,96 @@ def _main(
         ),
     ] = False,
 ) -> None:
-    pass
+    """Declares the options of `trilat` itself."""
 
 
-_FIRST = (
-    "demo", "live", "site", "hand", "record", "ping", "watch", "stop", "enable", "reset", "doctor", "router",
-    "ros2", "sim", "verify", "certify", "twin", "metrics", "compare", "figure", "report", "replay",
-    "rerun", "log", "test", "sweep", "bench", "linear", "tune",
+_FIRST_COMMANDS = (
+    "demo", "live", "site", "hand", "record", "ping", "watch", "stop", "enable", "reset",
+    "doctor", "router", "ros2", "sim", "verify", "certify", "twin", "metrics", "compare",
+    "figure", "report", "replay", "rerun", "log", "test", "sweep", "bench", "linear", "tune",
 )  # fmt: skip
-"""The order of the help; others follow."""
+"""The first commands of the help, in their order; the others follow."""
 _GROUPS: dict[str, dict[str, Any]] = {
     "log": {"help": "Inspects, checks, signs, recovers, exports or views a log."},
-    "scenario": {"help": "The shipped scenarios and your own."},
-    "new": {"help": "A control law, a hand or a plant of your own, with its test."},
-    "identify": {"help": "Finds what holds an arm."},
-    "trace": {"help": "Imports delays that other programs measured."},
-    "experiment": {"help": "Experiments with participants, from a protocol to its table."},
-    "set": {"callback": options.spread(sessions.set_command)},
-    "keys": {"help": "Keys that authenticate members of a session, and sign logs."},
+    "scenario": {"help": "Lists, shows, checks and creates scenarios."},
+    "new": {"help": "Creates a control law, a hand or a plant of your own, with a test."},
+    "identify": {"help": "Identifies the hand that holds an arm."},
+    "trace": {"help": "Imports delays that another program measured."},
+    "experiment": {
+        "help": "Runs experiments with participants, from the protocol to the tables."
+    },
+    "set": {"callback": options.expand_option_tuples(sessions.set_command)},
+    "keys": {"help": "Creates keys that authenticate members of a session or sign logs."},
 }
-_WITHIN = {"set": "--session paper "}
-"""What examples of a group have before the name of a command."""
+_GROUP_OPTIONS = {"set": "--session paper "}
+"""Options of a group that its examples need before the name of the command."""
 
 
-def _add_command(group: typer.Typer, words: str, run: Any) -> None:
-    epilog = "\n\n".join(f"Example: trilat {words} {one}".rstrip() for one in run.examples)
+def _add_command(group: typer.Typer, command_line: str, run: Any) -> None:
+    """Adds a command to a group.
+
+    Args:
+        group: the group.
+        command_line: the command as in its examples, as "log info".
+        run: the function of the command, see `options.command`.
+    """
+    examples = [
+        f"Example: trilat {command_line} {example}".rstrip() for example in run.examples
+    ]
     text = run.__doc__ or "(Its help is left out by python -OO: start it as python -O.)"
-    paragraphs = inspect.cleandoc(text).split("\n\n")  # else lines break where the source's do
-    text = "\n\n".join(" ".join(lines.split()) for lines in paragraphs)
-    group.command(words.split()[-1], help=text, epilog=epilog)(options.spread(run))
+    # joined into one line per paragraph, because the help keeps line breaks
+    paragraphs = inspect.cleandoc(text).split("\n\n")
+    text = "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
+    name = command_line.split()[-1]
+    declare = group.command(name, help=text, epilog="\n\n".join(examples))
+    declare(options.expand_option_tuples(run))
 
 
 def _add_commands() -> None:
-    """Adds the commands of every file of this folder: `log_info_command` is `trilat log info`."""
-    groups = {name: typer.Typer(no_args_is_help=True, **more) for name, more in _GROUPS.items()}
+    """Adds the commands of this folder's files: `log_info_command` is `trilat log info`."""
+    groups = {
+        name: typer.Typer(no_args_is_help=True, **settings)
+        for name, settings in _GROUPS.items()
+    }
     for file in pkgutil.iter_modules(__path__):
-        for name, run in vars(import_module(f"{__name__}.{file.name}")).items():
-            if hasattr(run, "examples"):
-                words = name.removesuffix("_command").replace("_", "-")
-                first, _, rest = words.partition("-")
-                if first in groups:
-                    _add_command(groups[first], f"{first} {_WITHIN.get(first, '')}{rest}", run)
-                else:
-                    _add_command(app, words, run)
+        module = import_module(f"{__name__}.{file.name}")
+        for function_name, run in vars(module).items():
+            if not hasattr(run, "examples"):
+                continue
+            command = function_name.removesuffix("_command").replace("_", "-")
+            first, _, rest = command.partition("-")
+            if first in groups:
+                group_options = _GROUP_OPTIONS.get(first, "")
+                _add_command(groups[first], f"{first} {group_options}{rest}", run)
+            else:
+                _add_command(app, command, run)
     for name, group in groups.items():
         app.add_typer(group, name=name)
 
 
 _add_commands()
 
-_TOO_LITTLE = "there is too little memory: 3 GiB of addresses suffice (ulimit -v), and 1 GiB of memory itself"
-_WITHOUT_MEMORY = (
+_TOO_LITTLE_MEMORY = (
+    "there is too little memory: 3 GiB of addresses suffice (ulimit -v), "
+    "and 1 GiB of memory itself"
+)
+_MEMORY_ERRORS = (
     "failed to map segment",
     "libllvmlite",
     "start new thread",
     "allocate memory",
 )
-"""What Python, Numba and threads say who get none."""
+"""Texts in errors of Python, Numba and threads that could not allocate memory."""
 
 
 def _run() -> None:
-    """Runs `trilat`; a library that `trilat-net-core` does without, and that is missing, is
-    named.
-    """
+    """Runs `trilat`; the error for a library that `trilat-net-core` lacks says so."""
     try:
         app()
     except ModuleNotFoundError as error:
-        if (name := (error.name or "").partition(".")[0]) in STUDY_LIBRARIES:
-            require_libraries(name)
+        library = (error.name or "").partition(".")[0]
+        if library in STUDY_LIBRARIES:
+            require_libraries(library)
         raise
 
 
@@ -158,23 +182,34 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     except (MemoryError, ImportError, RuntimeError, OSError) as error:
-        if isinstance(error, MemoryError) or any(
-            text in str(error) for text in _WITHOUT_MEMORY
-        ):
-            sys.stderr.write(f"error: {_TOO_LITTLE}\n")  # to lay it out takes memory, too
-            sys.exit(1)
-        if not isinstance(error, OSError):  # else a full disk, a folder that vanished
-            raise
-        # a name, or without one a closed pipe
-        refused = os.name == "nt" and error.errno == errno.EINVAL
-        if isinstance(error, BrokenPipeError) or (refused and not error.filename):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            sys.exit(0)
-        print_error(
-            f"{f'{error.filename}: ' if error.filename else ''}{error.strerror or error}"
-        )
-        bad_name = refused or error.errno == errno.ENAMETOOLONG
-        sys.exit(LogRefused.exit_code if error.errno in DISK_ERRNOS else 2 if bad_name else 1)
+        sys.exit(_report_system_error(error))
     finally:
         TrilatError.in_command = False
-        gc.freeze()  # at exit, Python need not traverse every record
+        gc.freeze()  # so that Python does not traverse every record at exit
+
+
+def _report_system_error(error: Exception) -> int:
+    """Prints an error of the operating system and returns the exit code.
+
+    Raises:
+        Exception: the error itself, if it is a bug of the program.
+    """
+    lacks_memory = any(text in str(error) for text in _MEMORY_ERRORS)
+    if isinstance(error, MemoryError) or lacks_memory:
+        # written directly: laying the text out needs memory, too
+        sys.stderr.write(f"error: {_TOO_LITTLE_MEMORY}\n")
+        return 1
+    # an OSError is a full disk or a vanished folder; other errors are bugs
+    if not isinstance(error, OSError):
+        raise error
+    # Windows reports a refused name and a closed pipe by the same error
+    is_invalid = os.name == "nt" and error.errno == errno.EINVAL
+    if isinstance(error, BrokenPipeError) or (is_invalid and not error.filename):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    prefix = f"{error.filename}: " if error.filename else ""
+    print_error(f"{prefix}{error.strerror or error}")
+    if error.errno in DISK_ERRNOS:
+        return LogRefused.exit_code
+    is_bad_name = is_invalid or error.errno == errno.ENAMETOOLONG
+    return 2 if is_bad_name else 1

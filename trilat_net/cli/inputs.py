@@ -1,4 +1,4 @@
-"""What a run is made of: scenarios, control laws of one's own, measured delays, keys."""
+"""Commands for the inputs of a run: scenarios, user-written code, measured delays, keys."""
 
 import sys
 from pathlib import Path
@@ -19,19 +19,24 @@ def scenario_list_command(as_json: options.JsonOption = False) -> None:
     """Lists the shipped scenarios."""
     from ..scenario import list_shipped, load_scenario
 
-    chosen = [(name, load_scenario(name)) for name in list_shipped()]
+    scenarios = {name: load_scenario(name) for name in list_shipped()}
     if as_json:
         facts = [
-            {"name": name, "sites": one.names, "duration_s": one.duration_s, "title": one.title}
-            for name, one in chosen
+            {
+                "name": name,
+                "sites": scenario.names,
+                "duration_s": scenario.duration_s,
+                "title": scenario.title,
+            }
+            for name, scenario in scenarios.items()
         ]
         return terminal.print_json(facts)
     rows = [
-        (name, str(len(one.names)), f"{one.duration_s:g} s", one.title) for name, one in chosen
+        (name, str(len(scenario.names)), f"{scenario.duration_s:g} s", scenario.title)
+        for name, scenario in scenarios.items()
     ]
-    return terminal.print_table(
-        TextTable(("name", "sites", "time", "what it is"), rows, align="lrrl")
-    )
+    columns = ("name", "sites", "time", "what it is")
+    return terminal.print_table(TextTable(columns, rows, align="lrrl"))
 
 
 @options.command("paper --set control.Kd=5")
@@ -41,7 +46,7 @@ def scenario_show_command(
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
 ) -> None:
-    """Prints the resolved text of a scenario: every value of every site and link."""
+    """Prints a scenario in full: every value of every site and link."""
     from ..scenario.describe import list_arm_notes
 
     scenario = options.load_chosen_scenario(name, overrides, duration, seed)
@@ -56,7 +61,7 @@ def scenario_check_command(
     overrides: options.SetOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Checks a scenario, and prints what follows from it."""
+    """Checks a scenario, and prints what its values imply."""
     from ..scenario.describe import describe_scenario
     from ..scenario.validate import check_outside_arms
 
@@ -75,25 +80,33 @@ def scenario_new_command(
     file: Annotated[Path, typer.Argument(help="File to write.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a commented template, with the unit of every key."""
+    """Writes a scenario template with comments and the unit of every key."""
     from ..scenario import read_template
 
     write_whole(file, read_template(), force=force)
     terminal.print_text(f"{file}: a template; check it with: trilat scenario check {file}")
 
 
-def _tell_skeleton(kind: str, written: list[Path], key: str, then: str) -> None:
-    """Prints what was written, and how to run it."""
+def _print_skeleton(kind: str, written: list[Path], key: str, check: str) -> None:
+    """Prints the files of a new law, hand or plant, and the commands that run it.
+
+    Args:
+        kind: "law", "hand" or "plant".
+        written: the file and its test.
+        key: override of the scenario that uses the class, with {} for the class.
+        check: the command that examines the log of the run.
+    """
     from ..scenario.skeletons import name_skeleton_class
 
     file, test = written
     code = f"{file.stem}:{name_skeleton_class(file.stem, kind)}"
-    there = "" if file.parent == Path() else f"cd {file.parent}, and "
+    change_folder = "" if file.parent == Path() else f"cd {file.parent}, and "
     terminal.print_text(
-        f"{file}: a {kind} that works; {test.name}: its test. Change the {kind}, {there}run"
+        f"{file}: a {kind} that works; {test.name}: its test. "
+        f"Change the {kind}, {change_folder}run"
     )
     terminal.print_text(f"  trilat sim paper --set {key.format(code)} -o {file.stem}.mcap")
-    terminal.print_texts([f"  trilat {then} {file.stem}.mcap", f"  pytest {test.name}"])
+    terminal.print_texts([f"  trilat {check} {file.stem}.mcap", f"  pytest {test.name}"])
 
 
 @options.command("mylaw.py")
@@ -101,10 +114,10 @@ def new_law_command(
     file: Annotated[Path, typer.Argument(help="File to write, as in mylaw.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a control law of your own, working and with comments, and its test."""
+    """Writes a working control law with comments, for you to change, and its test."""
     from ..scenario.skeletons import new_law
 
-    _tell_skeleton("law", new_law(file, force=force), "control.law={}", "certify")
+    _print_skeleton("law", new_law(file, force=force), "control.law={}", "certify")
 
 
 @options.command("myhand.py")
@@ -112,11 +125,11 @@ def new_hand_command(
     file: Annotated[Path, typer.Argument(help="File to write, as in myhand.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a hand of your own, a program that acts as a user, and its test."""
+    """Writes a working hand, a program that acts as a user, for you to change, and its test."""
     from ..scenario.skeletons import new_hand
 
     key = """'sites.m2.hands=[{{kind="own", class="{}"}}]'"""
-    _tell_skeleton("hand", new_hand(file, force=force), key, "report")
+    _print_skeleton("hand", new_hand(file, force=force), key, "report")
 
 
 @options.command("myplant.py")
@@ -124,10 +137,10 @@ def new_plant_command(
     file: Annotated[Path, typer.Argument(help="File to write, as in myplant.py.")],
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a plant of your own, which moves an arm in the place of the program, and its test."""
+    """Writes a working plant, your own model of an arm, for you to change, and its test."""
     from ..scenario.skeletons import new_plant
 
-    _tell_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify")
+    _print_skeleton("plant", new_plant(file, force=force), "sites.s.plant={}", "verify")
 
 
 @options.command("irtt run.json.gz", "csv drive.txt --way half -o drive.csv")
@@ -138,32 +151,35 @@ def trace_import_command(
         Path | None, value("--out -o", "CSV", "Default: FILE as -trace.csv, here.")
     ] = None,
     way: Annotated[str, value("--way", "half|send|receive|whole")] = "",
-    column: Annotated[str, value("--column", "NAME", "Column of the delays in a table.")] = "",
+    column: Annotated[
+        str, value("--column", "NAME", "Column of a table with the delays.")
+    ] = "",
     every_s: Annotated[
         float, value("--every", "S", "Interval of a ping without times, s.")
     ] = 1.0,
     as_json: options.JsonOption = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Makes a trace for links from what another program measured, and prints statistics of the
-    network.
+    """Converts delays that another program measured into a trace for links.
+
+    Prints statistics of the network as well.
 
     Options:
         file: JSON of irtt, lines of ping or fping, or a table with a header.
-        way: Half a round trip, one way of irtt (send or receive), or delays as they are.
-            Default: half of a round trip, a one-way delay as it is.
+        way: Half a round trip, one direction of irtt (send or receive), or delays as they are.
+            Default: half a round trip; one-way delays as they are.
     """
     from ..scenario.delay_traces import import_trace
 
-    place = out if out is not None else Path(f"{file.name.split('.')[0]}-trace.csv")
-    refuse_existing(place, force=force)
-    found = import_trace(file, form, way=way, column=column, every_s=every_s)
-    write_whole(place, found.write_rows())
+    path = out if out is not None else Path(f"{file.name.split('.')[0]}-trace.csv")
+    refuse_existing(path, force=force)
+    trace = import_trace(file, form, way=way, column=column, every_s=every_s)
+    write_whole(path, trace.write_rows())
     if as_json:
-        terminal.print_json({**found.to_dict(), "file": str(place)})
+        terminal.print_json({**trace.to_dict(), "file": str(path)})
         return
-    terminal.print_line(found.summary())
-    terminal.print_line(f"{place}: use it with --set link.model=trace --set link.file={place}")
+    terminal.print_line(trace.summary())
+    terminal.print_line(f"{path}: use it with --set link.model=trace --set link.file={path}")
 
 
 @options.command("keys m1 m2 s recorder operator --host 192.0.2.1")
@@ -175,13 +191,12 @@ def keys_new_command(
         int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")
     ] = 30,
 ) -> None:
-    """Makes keys: a private certificate authority, and for each member a folder for its machine
-    alone.
+    """Creates keys: a certificate authority, and a folder of keys for each member.
 
-    Bring each folder to its machine by a channel that you trust, and give it as --keys. Members
-    without keys, or with keys of another authority, cannot connect; a member can send only
-    under its own name. Keep the folder `authority` where no member runs: `trilat keys renew`
-    needs it before the keys end.
+    Bring each folder to its member's machine by a channel that you trust, and pass it with
+    --keys. Members without keys, or with keys of another authority, cannot connect; a member
+    can send only under its own name. Keep the folder `authority` on a machine where no member
+    runs: `trilat keys renew` needs it before the keys expire.
 
     Options:
         members: The sites; and recorder, operator, router, bridge if there are any.
@@ -189,49 +204,49 @@ def keys_new_command(
     """
     from ..net.member_keys import create_keys
 
-    made = create_keys(folder, members, hosts or (), days)
-    for one in made:
-        terminal.print_line(f"{one}: for {one.name}")
+    folders = create_keys(folder, members, hosts or (), days)
+    for member_folder in folders:
+        terminal.print_line(f"{member_folder}: for {member_folder.name}")
+    first = folders[0]
     terminal.print_line(
-        f"they are valid for {count_nouns(days, 'day')}; use them as in: trilat site "
-        f"{made[0].name} --keys {made[0]} ..."
+        f"they are valid for {count_nouns(days, 'day')}; use them as in: "
+        f"trilat site {first.name} --keys {first} ..."
     )
 
 
 @options.command("keys", "keys m1 recorder --days 90")
 def keys_renew_command(
     folder: Annotated[
-        Path, typer.Argument(help="Folder that trilat keys new has made.", metavar="DIR")
+        Path, typer.Argument(help="Folder that trilat keys new created.", metavar="DIR")
     ],
     members: Annotated[list[str] | None, typer.Argument(metavar="[MEMBER]...")] = None,
     days: Annotated[
         int, typer.Option("--days", min=1, max=3650, help="Validity of the certificates.")
     ] = 30,
 ) -> None:
-    """Renews the certificates of members, by the authority in the folder; their private keys
-    stay.
+    """Renews the certificates of members; their private keys stay the same.
 
-    Bring the files authority.pem, certificate.pem and members.json of each folder to its
-    machine again, and start the member anew before its next session: a running one keeps its
-    old certificate.
+    The authority in the folder signs the new certificates. Bring the files authority.pem,
+    certificate.pem and members.json of each folder to its machine again, and restart the member
+    before its next session: a running member keeps its old certificate.
 
     Options:
-        members: Default: all members whose folders are there.
+        members: Default: all members with a folder.
     """
     from ..net.member_keys import renew_keys
 
-    for one in renew_keys(folder, members or (), days):
-        terminal.print_line(f"{one}: valid for {count_nouns(days, 'day')} from now")
+    for member_folder in renew_keys(folder, members or (), days):
+        terminal.print_line(f"{member_folder}: valid for {count_nouns(days, 'day')} from now")
 
 
 @options.command("lab")
 def keys_pair_command(
-    name: Annotated[Path, typer.Argument(help="Makes NAME.key and NAME.pub.", metavar="NAME")],
+    name: Annotated[Path, typer.Argument(help="Writes NAME.key and NAME.pub.", metavar="NAME")],
 ) -> None:
-    """Makes a pair of Ed25519 keys, to sign logs and to check signatures.
+    """Creates a pair of Ed25519 keys, to sign logs and to check signatures.
 
-    Keep NAME.key private. Give NAME.pub, by a channel that they trust, to those who check your
-    logs.
+    Keep NAME.key private. Give NAME.pub, by a channel that they trust, to everybody who checks
+    your logs.
     """
     from ..log.log_signature import create_signing_keys
 
@@ -245,9 +260,7 @@ def keys_info_command(
     folder: Annotated[Path, typer.Argument(help="Folder of one member's keys.", metavar="DIR")],
     as_json: options.JsonOption = False,
 ) -> None:
-    """Shows whose keys these are, until when they are valid, and the Zenoh settings that follow
-    from them.
-    """
+    """Shows the member and the expiry of keys, and the Zenoh settings that they imply."""
     from ..net.member_keys import read_member_keys
 
     keys = read_member_keys(folder)

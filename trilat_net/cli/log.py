@@ -1,4 +1,8 @@
-"""`trilat log`: info, check, sign, recover, export, view. None of them executes the log."""
+"""`trilat log`: info, check, sign, recover, export, view.
+
+Invariant:
+    - No command of this file executes a log.
+"""
 
 from contextlib import nullcontext
 from pathlib import Path
@@ -20,65 +24,66 @@ def log_info_command(files: options.LogsArgument, as_json: options.JsonOption = 
     from ..analysis.file_overview import info
 
     with terminal.progress_bar(f"reading {files[0]}") as progress:
-        found = info(*files, progress=progress)
-    terminal.print_result(found, as_json=as_json)
-    for path in () if as_json else files:
-        terminal.warn_if_unfinished(path)
+        overview = info(*files, progress=progress)
+    terminal.print_result(overview, as_json=as_json)
+    if not as_json:
+        for path in files:
+            terminal.warn_if_unfinished(path)
 
 
 @options.command("run.mcap", "run.mcap --key lab.pub")
 def log_check_command(
     files: options.LogsArgument,
     key: Annotated[
-        Path | None, options.value("--key", "PUB", "Also check FILE.sig, by this public key.")
+        Path | None, options.value("--key", "PUB", "Also check FILE.sig with this public key.")
     ] = None,
     as_json: options.JsonOption = False,
 ) -> None:
     """Checks that a log is well-formed, complete and consistent; executes nothing.
 
-    Exit code 0: sound; 1: not sound; 2: no such file. Of files of other programs only the
+    Exit code 0: sound; 1: not sound; 2: no such file. For files of other programs only the
     structure is checked.
     """
     from ..log.session_check import check_file
 
     with terminal.progress_bar(f"checking {files[0]}") as progress:
-        found = check_file(*files, progress=progress)
+        check = check_file(*files, progress=progress)
     if key is not None:
         from ..log.log_signature import check_signatures
 
         with terminal.progress_bar(f"checking the signature of {files[0]}") as progress:
-            found.findings.append(check_signatures(files, key, progress))
-    terminal.print_result(found, as_json=as_json)
+            check.findings.append(check_signatures(files, key, progress))
+    terminal.print_result(check, as_json=as_json)
     if not as_json:
-        if not found.ours:
+        if not check.ours:
             terminal.print_note("this is no log of trilat-net: only its structure was checked")
         for path in files:
             terminal.warn_if_unfinished(path)
-    raise typer.Exit(found.exit_code)
+    raise typer.Exit(check.exit_code)
 
 
 @options.command("run.mcap --key lab.key")
 def log_sign_command(
     file: options.LogArgument,
     key: Annotated[
-        Path, options.value("--key", "KEY", "Private key, made by trilat keys pair.")
+        Path, options.value("--key", "KEY", "Private key, created by trilat keys pair.")
     ],
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Signs a finished log with Ed25519: writes FILE.sig, and leaves FILE as it is.
+    """Signs a finished log with Ed25519: writes FILE.sig, and does not change FILE.
 
-    The signature covers the digest chain: all messages and everything that describes them. The
-    owner of the public key checks it with: trilat log check FILE --key PUB
+    The signature covers the digest chain: all messages and everything that describes them.
+    Check it with the public key: trilat log check FILE --key PUB
     """
     from ..log.log_signature import sign_log
 
     with terminal.progress_bar(f"reading {file}") as progress:
-        made = sign_log(file, key, force=force, progress=progress)
+        signature = sign_log(file, key, force=force, progress=progress)
     if as_json:
-        terminal.print_json({"file": file.as_posix(), "signature": made.as_posix()})
+        terminal.print_json({"file": file.as_posix(), "signature": signature.as_posix()})
     else:
-        terminal.print_text(f"{made}: signs {file}")
+        terminal.print_text(f"{signature}: signs {file}")
 
 
 @options.command("run.mcap.active")
@@ -93,9 +98,9 @@ def log_recover_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Recovers a torn or damaged log into a new, whole file; the original is not changed.
+    """Recovers a torn or damaged log into a new, complete file; the original is not changed.
 
-    Works on every MCAP file. Exit code 0: nothing was lost; 3: something was lost, and is
+    Works with every MCAP file. Exit code 0: nothing was lost; 3: something was lost, and is
     listed; 1: nothing could be recovered.
     """
     from ..log.recover import recover
@@ -122,33 +127,36 @@ def log_export_command(
     Options:
         form: ros2: an MCAP file of standard messages at full rate; parquet, csv: a folder with
             a file per site and kind; npz, mat: one file with an array per column; lerobot: a
-            dataset of LeRobot, an episode for each log of the files and folders that are given.
-        settings: Setting of a form, repeatable: of lerobot fps=30, program=m2 (a user that is a
-            program); of ros2 names=crtk (or a file of names).
-        actions: Actions of lerobot as its plugin takes them: places of end effectors, or angles
-            of joints. Default: what sites share.
+            dataset of LeRobot, with an episode for each log in FILE.
+        settings: Setting of a format, repeatable: for lerobot fps=30, program=m2 (a user that
+            is a program); for ros2 names=crtk (or a file of names).
+        actions: Actions of lerobot as its plugin accepts them: positions of end effectors, or
+            angles of joints. Default: the pose that sites share.
         output: File or folder; default: next to FILE, named after it.
     """
     from ..log.log_reader import open_logs
     from ..reporting.export import Exporter
 
-    given = {key: value for key, _, value in (one.partition("=") for one in settings or [])}
-    given |= {"actions": actions} if actions else {}
-    exporter = Exporter(form, output, force=force, log=files[0], settings=given)
+    pairs = [text.partition("=") for text in settings or []]
+    format_settings = {key: value for key, _, value in pairs}
+    if actions:
+        format_settings["actions"] = actions
+    exporter = Exporter(form, output, force=force, log=files[0], settings=format_settings)
     with terminal.progress_bar(f"reading {files[0]}") as progress:
         logs = open_logs(*files, progress=progress)
     for log in logs:
         terminal.warn_of_damage(log)
     with terminal.progress_bar(f"writing {exporter.path}") as progress:
-        told = exporter.export(*logs, progress=progress)
+        summary = exporter.export(*logs, progress=progress)
     records = {site: sum(len(log[site]) for log in logs) for site in logs[0].sites}
-    told = told or f"{count_nouns(sum(records.values()), 'record')} of {', '.join(records)}"
+    if not summary:
+        summary = f"{count_nouns(sum(records.values()), 'record')} of {', '.join(records)}"
     if as_json:
         terminal.print_json(
             {"file": exporter.path.as_posix(), "format": form, "records": records}
         )
     else:
-        terminal.print_text(f"{exporter.path}: {told}")
+        terminal.print_text(f"{exporter.path}: {summary}")
 
 
 @options.command("run.mcap")
@@ -168,9 +176,9 @@ def log_view_command(
 ) -> None:
     """Opens a log in Rerun: a column per site, a name for every curve.
 
-    If a log lacks the standard channels (--views off), was not finished or has parts, they are
-    first made in a temporary file. Where Rerun is not installed, the log's page opens in a
-    browser instead.
+    If a log lacks the standard channels (--views off), was not finished or has parts, a
+    temporary file with these channels is written first. If Rerun is not installed, the log's
+    page opens in a browser instead.
     """
     from importlib.util import find_spec
 
@@ -192,7 +200,7 @@ def log_view_command(
 
 
 def _open_page(files: list[Path]) -> None:
-    """Opens the page of a log, which is made as by `trilat report` where there is none yet."""
+    """Opens the page of a log; writes it first, as `trilat report` does, if it is missing."""
     import webbrowser
     from contextlib import suppress
 

@@ -1,6 +1,4 @@
-"""Processes that take part in a session: a site, the recorder, a log that is played again, a
-router.
-"""
+"""Commands for the processes of a session: site, hand, recorder, replay, router, ROS 2."""
 
 import math
 import os
@@ -55,7 +53,7 @@ def site_command(
     seed: options.SeedOption = None,
     overrides: options.SetOption = None,
 ) -> None:
-    """Runs one site as one process: for separate terminals or machines.
+    """Runs one site as one process, for separate terminals or machines.
 
     Without endpoints, the sites of a session find each other on this machine: each listens at a
     loopback port derived from session and site, and connects to the sites that precede it in
@@ -64,10 +62,10 @@ def site_command(
     Options:
         name: Name of the site in the scenario.
         scenario: Name of a shipped scenario, or path of a TOML file.
-        stay: At the end, wait until the recorder has left, at most this long, s.
+        stay: At the end, wait at most this long until the recorder has left, s.
         without: Option of the first site: begin without SITE, which may join later; repeatable.
-        leave_timeout: Under glide: time to go on without a site that has left, s; default: to
-            the end.
+        leave_timeout: Under glide: time to continue without a site that has left, s; default:
+            to the end.
     """
     from sites.site_parts import SiteOptions
     from sites.site_process import run_site
@@ -78,10 +76,11 @@ def site_command(
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     find_site(chosen, name)
     identity = options.check_session_name(session or chosen.name)
-    places = default_endpoints(identity, chosen.names, encrypted=ways.keys is not None)
-    before = chosen.names[: chosen.names.index(name)]
-    connection = ways.resolve([places[name]], [places[peer] for peer in before]).require(name)
-    how = SiteOptions(
+    endpoints = default_endpoints(identity, chosen.names, encrypted=ways.keys is not None)
+    earlier_sites = chosen.names[: chosen.names.index(name)]
+    earlier_endpoints = [endpoints[site] for site in earlier_sites]
+    connection = ways.resolve([endpoints[name]], earlier_endpoints).require(name)
+    site_options = SiteOptions(
         session=identity,
         connection=connection,
         join_timeout_s=join_timeout,
@@ -93,7 +92,7 @@ def site_command(
         without=_check_without(chosen, name, without or []),
         leave_timeout_s=leave_timeout,
     )
-    raise typer.Exit(run_site(chosen, name, how, terminal.print_line))
+    raise typer.Exit(run_site(chosen, name, site_options, terminal.print_line))
 
 
 @options.command("m2 --scenario my_run.toml", "m1 --session play --device haply_inverse3")
@@ -116,24 +115,23 @@ def hand_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Runs a hand at a site: a class of your own in a process of its own, or a device that you
-    hold.
+    """Runs a hand at a site: your own class in a separate process, or a device that you hold.
 
-    The class (kind = "own", process = true) sees what the site sees, and decides; the site lets
-    each decision act after the hand's delay_ms. A device (kind = "live") leads the arm of a
+    The class (kind = "own", process = true) reads the state of the site and decides; the site
+    applies each decision after the hand's delay_ms. A device (kind = "live") leads the arm of a
     session that runs already.
 
     Options:
         name: Name of the site in the scenario.
-        scenario: Of a class: the scenario that the site runs: a shipped name, or path of a TOML
-            file.
-        device: haply_inverse3 or spacemouse; the scenario of the session says how it leads the
-            arm.
+        scenario: For a class: the scenario that the site runs: a shipped name, or path of a
+            TOML file.
+        device: haply_inverse3 or spacemouse; the scenario of the session defines how it leads
+            the arm.
     """
     if device is not None:
-        if extra := {"--scenario", "--duration", "--seed", "--set"} & set(
-            options.given_options(context)
-        ):
+        scenario_options = {"--scenario", "--duration", "--seed", "--set"}
+        extra = scenario_options & set(options.list_used_options(context))
+        if extra:
             raise UsageError(
                 f"--device leads an arm of a session that runs: leave out {min(extra)}"
             )
@@ -152,11 +150,10 @@ def hand_command(
 
     chosen = options.load_chosen_scenario(scenario, overrides, duration, seed)
     identity = options.check_session_name(session or chosen.name)
-    places = default_endpoints(identity, chosen.names, encrypted=reach.keys is not None)
+    endpoints = default_endpoints(identity, chosen.names, encrypted=reach.keys is not None)
     find_site(chosen, name)
-    connection = (
-        options.MemberOptions(None, *reach).resolve((), [places[name]]).require(OPERATOR)
-    )
+    member = options.MemberOptions(None, *reach)
+    connection = member.resolve((), [endpoints[name]]).require(OPERATOR)
     with Interrupt() as interrupt:
         run_hand(
             scenario=chosen,
@@ -175,29 +172,49 @@ def hand_command(
 def _lead_by_device(
     device: str, name: str, session: str | None, reach: options.Reach, timeout_s: float
 ) -> None:
+    """Leads an arm of a running session by a device, until the session ends or Ctrl-C.
+
+    Args:
+        device: name of the device, and its address if needed.
+        name: name of the site.
+        session: name of the session.
+        reach: the options by which the command reaches the session.
+        timeout_s: longest wait for the site, s.
+    """
     from sites.devices import open_device
     from sites.running_session import RunningSession
 
     running = RunningSession(options.check_session_name(session or ""), reach.resolve())
-    opened = open_device(device)
-    say = terminal.print_line
+    opened_device = open_device(device)
     with Interrupt() as interrupt:
-        running.lead(name, opened, stopped=interrupt.is_requested, say=say, timeout_s=timeout_s)
+        running.lead(
+            name,
+            opened_device,
+            stopped=interrupt.is_requested,
+            say=terminal.print_line,
+            timeout_s=timeout_s,
+        )
     if interrupt.is_requested():
         raise typer.Exit(interrupt.exit_code)
 
 
 def _check_without(scenario: "Scenario", name: str, without: list[str]) -> tuple[str, ...]:
+    """Returns the sites without which a session may begin.
+
+    Raises:
+        UsageError: the site is not the first, or sites cannot join later.
+    """
     from ..scenario import find_site
 
-    for late in without:
-        find_site(scenario, late)
-        if name != scenario.names[0] or late == name:
+    first_site = scenario.names[0]
+    for late_site in without:
+        find_site(scenario, late_site)
+        if name != first_site or late_site == name:
             raise UsageError(
-                f"--without is an option of {scenario.names[0]}, the first site, and names other sites"
+                f"--without is an option of {first_site}, the first site, and names other sites"
             )
         if not scenario.sites_may_return:
-            raise UsageError('--without asks for on_stale.action = "glide" at every site')
+            raise UsageError('--without needs on_stale.action = "glide" at every site')
     return tuple(without)
 
 
@@ -225,14 +242,14 @@ def record_command(
 ) -> None:
     """Records a session into an MCAP log, from its epoch to its end or to Ctrl-C.
 
-    Without endpoints it asks the first site, at its loopback port, for the others. Parts are
-    named FILE-001.mcap and so on. The name of a file ends in .active until the file is
-    finished.
+    Without endpoints the recorder asks the first site, at its loopback port, for the others.
+    Parts are named FILE-001.mcap and so on. The name of a file ends in .active until the file
+    is finished.
 
     Options:
         output: Default: SESSION.mcap; with --conclude run.mcap in the next free folder.
         join_timeout: Longest wait for the session to begin, s; default: no limit.
-        concluded: Afterwards verify the log, and write a report into its folder.
+        concluded: Verify the log at the end, and write a report into its folder.
         include: Record only these channels, as in '**/m1/**'; repeatable.
         exclude: Leave these channels out, as in '**/link'; repeatable.
         split_size: Split the log into parts of at most this size, MiB.
@@ -251,7 +268,7 @@ def record_command(
     options.check_session_name(session)
     connection = ways.resolve().require(RECORDER)
     path = _choose_path(output, session, concluded=concluded)
-    place = LogStorage(
+    storage = LogStorage(
         path,
         force=force,
         durable=durable,
@@ -261,7 +278,7 @@ def record_command(
         choice=parse_channel_filter(include or [], exclude or []),
         views_hz=parse_viz_rate(views),
     )
-    place.first()  # refuses a taken name before anything waits
+    storage.first()  # refuses an existing file before the recorder waits for the session
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{path}: cannot be written: {path.parent} is not a writable folder")
     page = path.parent / "report.html"
@@ -270,33 +287,35 @@ def record_command(
     clock = make_system_clock(clock_offset, clock_drift)
 
     def warn_of_load() -> None:
-        if warning := describe_load(measure_busy_share(clock)):
+        warning = describe_load(measure_busy_share(clock))
+        if warning:
             terminal.print_note(warning)
 
-    then = (
-        (lambda: _conclude(list(find_parts(path).values()), png=png))
-        if concluded
-        else lambda: None
-    )
+    def conclude() -> None:
+        if concluded:
+            _conclude(list(find_parts(path).values()), png=png)
+
     try:
         code = record_session(
             session=session,
-            storage=place,
+            storage=storage,
             connection=connection,
             join_timeout_s=join_timeout,
             clock=clock,
             say=terminal.print_line,
-            afterwards=then,
+            afterwards=conclude,
             warn=warn_of_load,
         )
     finally:
         if concluded and output is None:
+            # removes the folder if nothing was written into it
             with suppress(OSError):
-                path.parent.rmdir()  # nothing came into it
+                path.parent.rmdir()
     raise typer.Exit(code)
 
 
 def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
+    """Returns the path of the log of a session; creates the folder of a report."""
     from ..files import make_folder, make_results_folder, require_libraries
 
     if not concluded:
@@ -309,15 +328,20 @@ def _choose_path(output: Path | None, session: str, *, concluded: bool) -> Path:
 
 
 def _conclude(parts: list[Path], *, png: bool) -> None:
+    """Verifies a log and writes its report.
+
+    Raises:
+        CodeWithheld: code from outside was not executed, so that not all was judged.
+        RunFailed: the log failed a check, or the session ended by a failure.
+    """
     log, conclusion = terminal.conclude_files(parts, parts[0].parent, png=png)
     if conclusion.exit_code == CodeWithheld.exit_code:
         raise CodeWithheld(f"{parts[0]}: not all was judged: it needs trilat verify --law FILE")
     if not conclusion.passed:
         raise RunFailed(f"{parts[0]}: failed a check")
-    if ended := next(
-        (event for event in log.events if event.kind in ("diverged", "failed")), None
-    ):
-        raise RunFailed(f"{parts[0]}: {ended.text}")
+    for event in log.events:
+        if event.kind in ("diverged", "failed"):
+            raise RunFailed(f"{parts[0]}: {event.text}")
 
 
 @options.command("run.mcap --rate 2 --start 5")
@@ -347,25 +371,25 @@ def replay_command(
     insecure: options.InsecureOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Publishes a log over Zenoh with its original timing, as a session of its own.
+    """Publishes a log over Zenoh with its original timing, as a separate session.
 
-    To recorders, viewers and `trilat ping` it looks like a running session: it answers for the
-    sites of the log, and its messages are theirs, byte for byte. Without endpoints it listens
-    where the session's first site would.
+    For recorders, viewers and `trilat ping` the replay is like a running session: it replies
+    for the sites of the log, and its messages are theirs, byte for byte. Without endpoints it
+    listens at the port of the session's first site.
 
     Options:
-        files: An MCAP log, or the parts of one in their order.
+        files: An MCAP log, or all parts of a log in their order.
         rate: Speed relative to the recording, or max: as fast as possible.
         start: Start of the part to play, s since tick 0.
         duration: Duration of the part to play, s, instead of --stop.
-        include: Play only these channels, as in '**/m1/*'; repeatable. Default: all of the
-            sites.
+        include: Play only these channels, as in '**/m1/*'; repeatable. Default: all channels of
+            the sites.
         exclude: Leave these channels out, as in '**/link'; repeatable.
         prefix: Name the session WORD-NAME; with '' NAME, as recorded.
-        time: Play messages at their times of sending, or of arrival.
+        time: Play messages at the times at which they were sent, or logged.
         low_cpu: Sleep until every deadline, which is about 0.1 ms less exact.
-        preload: Largest log held in memory; another process reads a larger one during the
-            replay.
+        preload: Largest log that is held in memory; a separate process reads larger logs during
+            the replay.
     """
     from recorder.play.play_process import PlayOptions, play_log
     from recorder.play.player import parse_rate
@@ -385,10 +409,9 @@ def replay_command(
     )
     speed = parse_rate(rate)
     with terminal.progress_bar(f"reading {files[0]}") as progress:
-        facts, block = preload_messages(files, selection, preload << 20, progress)
-    name = options.check_session_name(
-        session or (f"{prefix}-{facts.session}" if prefix else facts.session)
-    )
+        header, block = preload_messages(files, selection, preload << 20, progress)
+    prefixed_name = f"{prefix}-{header.session}" if prefix else header.session
+    name = options.check_session_name(session or prefixed_name)
     ways = options.MemberOptions(
         listen=listen,
         connect=connect,
@@ -398,27 +421,26 @@ def replay_command(
         insecure=insecure,
     )
     connection = ways.resolve([default_endpoint(name, 0)], [])
-    play = PlayOptions(
+    play_options = PlayOptions(
         session=name, rate=speed, loop=loop, low_cpu=low_cpu, needs_recorder=needs_recorder
     )
-    tell = partial(
-        (terminal.err if as_json else terminal.out).print, markup=False, soft_wrap=True
-    )
-    _announce_playback(facts, name, speed, tell)
-    reported = set(facts.torn)  # playing may add to them
-    _warn_torn(facts.torn)
+    console = terminal.err if as_json else terminal.out
+    print_line = partial(console.print, markup=False, soft_wrap=True)
+    _announce_playback(header, name, speed, print_line)
+    reported = set(header.torn)  # a copy: more torn files may be met during the replay
+    _warn_torn(header.torn)
     clock = SystemClock()
     with Interrupt() as interrupt:
         outcome = play_log(
-            loaded=(facts, block),
+            loaded=(header, block),
             paths=files,
             selection=selection,
-            options=play,
+            options=play_options,
             connection=connection,
             clock=clock,
             stopped=interrupt.is_requested,
-            say=tell,
-            show=_line(clock),
+            say=print_line,
+            show=_make_progress_line(clock),
         )
     if outcome is None:
         raise typer.Exit(interrupt.exit_code)
@@ -426,7 +448,7 @@ def replay_command(
         terminal.print_json({"session": name, **_describe_playback(outcome, speed)})
     else:
         _show_playback(outcome)
-    _warn_of(outcome, reported)
+    _warn_about_playback(outcome, reported)
     if interrupt.is_requested():
         terminal.err.print("interrupted")
         raise typer.Exit(interrupt.exit_code)
@@ -435,29 +457,36 @@ def replay_command(
 
 
 def _announce_playback(
-    facts: "SessionHeader", name: str, rate: float, tell: Callable[[str], None]
+    header: "SessionHeader", name: str, rate: float, print_line: Callable[[str], None]
 ) -> None:
+    """Prints the session that a replay opens, its speed, and the version of its messages."""
     from ..net.messages import VERSION
 
     speed = "as fast as possible" if math.isinf(rate) else f"at {rate:g} times its speed"
-    tell(f"playing {', '.join(facts.boots)} as session {name}, {speed}; Ctrl-C ends it")
-    if facts.version != VERSION:
-        tell(
-            f"note: these messages are of schema version {facts.version}: recorders and sites of today take "
-            f"{VERSION} and count others as dropped; any other Zenoh subscriber gets them"
+    sites = ", ".join(header.boots)
+    print_line(f"playing {sites} as session {name}, {speed}; Ctrl-C ends it")
+    if header.version != VERSION:
+        print_line(
+            f"note: these messages are of schema version {header.version}: recorders and sites "
+            f"of today accept {VERSION} and count others as dropped; any other Zenoh "
+            "subscriber receives them"
         )
 
 
-def _line(clock: Clock) -> Callable[["PlayProgress"], None]:
-    before: list[tuple[int, int]] = []
+def _make_progress_line(clock: Clock) -> Callable[["PlayProgress"], None]:
+    """Returns a function that shows the progress of a replay in one line of the terminal."""
+    previous: list[tuple[int, int]] = []
 
     def show(progress: "PlayProgress") -> None:
-        now = (clock.monotonic_ns(), progress.position_ns)
-        then = before.pop() if before else now
-        before.append(now)
-        rate = (now[1] - then[1]) / (now[0] - then[0]) if now[0] > then[0] else 0.0
+        now_ns = clock.monotonic_ns()
+        position_ns = progress.position_ns
+        last_now_ns, last_position_ns = previous.pop() if previous else (now_ns, position_ns)
+        previous.append((now_ns, position_ns))
+        rate = 0.0
+        if now_ns > last_now_ns:
+            rate = (position_ns - last_position_ns) / (now_ns - last_now_ns)
         text = (
-            f"{progress.position_ns / 1e9:8.1f} s   x{rate:.2f}   "
+            f"{position_ns / 1e9:8.1f} s   x{rate:.2f}   "
             f"{count_nouns(progress.published, 'message')}   "
             f"latest {progress.late_max_us / 1e3:.2f} ms late"
         )
@@ -468,16 +497,18 @@ def _line(clock: Clock) -> Callable[["PlayProgress"], None]:
 
 
 def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any]:
-    late = outcome.lateness
+    """Returns the outcome of a replay as plain values."""
+    lateness = outcome.lateness
+    late_us = None
+    if lateness is not None:
+        late_us = {"p50": lateness.p50_us, "p99": lateness.p99_us, "max": lateness.max_us}
     return {
         "messages": outcome.counts,
         "published": sum(outcome.counts.values()),
         "rounds": outcome.rounds,
         "rate": None if math.isinf(rate) else rate,
         "took_s": round(outcome.took_s, 6),
-        "late_us": None
-        if late is None
-        else {"p50": late.p50_us, "p99": late.p99_us, "max": late.max_us},
+        "late_us": late_us,
         "held_s": round(outcome.held_s, 3),
         "cut": outcome.cut,
         "strays": outcome.strays,
@@ -489,52 +520,61 @@ def _describe_playback(outcome: "PlaybackSummary", rate: float) -> dict[str, Any
 
 
 def _show_playback(outcome: "PlaybackSummary") -> None:
+    """Prints the messages of each channel, the duration and the lateness of a replay."""
     if terminal.err.is_interactive:
         terminal.err.file.write("\r" + " " * 72 + "\r")
     rows = [(topic, str(count)) for topic, count in sorted(outcome.counts.items())]
     terminal.print_table(TextTable(("channel", "messages"), rows, align="lr"))
+    messages = count_nouns(sum(outcome.counts.values()), "message")
+    text = f"{messages} in {outcome.took_s:.2f} s"
+    if outcome.rounds > 1:
+        text += f", {count_nouns(outcome.rounds, 'round')}"
     late = outcome.lateness
-    total = f"{count_nouns(sum(outcome.counts.values()), 'message')} in {outcome.took_s:.2f} s"
-    rounds = f", {count_nouns(outcome.rounds, 'round')}" if outcome.rounds > 1 else ""
-    how = (
-        f"; late by p50 {late.p50_us} us, p99 {late.p99_us} us, max {late.max_us} us"
-        if late
-        else ""
-    )
-    held = (
-        f"; waited {outcome.held_s:.2f} s for slow subscribers" if outcome.held_s > 0.1 else ""
-    )
-    dropped = "" if outcome.cut else "; none dropped"
-    terminal.print_text(f"{total}{rounds}{how}{held}{dropped}")
+    if late:
+        text += f"; late by p50 {late.p50_us} us, p99 {late.p99_us} us, max {late.max_us} us"
+    if outcome.held_s > 0.1:
+        text += f"; waited {outcome.held_s:.2f} s for slow subscribers"
+    if not outcome.cut:
+        text += "; none dropped"
+    terminal.print_text(text)
     if outcome.recorders:
-        has = "has everything" if outcome.stored else "has not confirmed that it has everything"
-        given = (
-            f"; {count_nouns(outcome.refilled, 'message')} that it had missed were sent again"
-            if outcome.refilled
-            else ""
-        )
-        terminal.print_text(f"the recorder {has}{given}")
+        stored = "has not confirmed that it has everything"
+        if outcome.stored:
+            stored = "has everything"
+        resent = ""
+        if outcome.refilled:
+            missed = count_nouns(outcome.refilled, "message")
+            resent = f"; {missed} that it had missed were sent again"
+        terminal.print_text(f"the recorder {stored}{resent}")
 
 
 def _warn_torn(torn: dict[Path, str]) -> None:
+    """Warns of files of a log that were not finished."""
     for path, text in torn.items():
         terminal.print_note(
-            f"{path}: {text}; the whole part is played; make it whole with: trilat log recover {path}"
+            f"{path}: {text}; the intact part is played; "
+            f"make the file whole with: trilat log recover {path}"
         )
 
 
-def _warn_of(outcome: "PlaybackSummary", reported: set[Path]) -> None:
+def _warn_about_playback(outcome: "PlaybackSummary", reported: set[Path]) -> None:
+    """Warns of torn files, of subscribers that were cut off, and of late messages.
+
+    Args:
+        outcome: the outcome of the replay.
+        reported: torn files of which the user has been warned already.
+    """
     _warn_torn({path: text for path, text in outcome.torn.items() if path not in reported})
     if outcome.cut:
         terminal.print_error(
-            "a subscriber took nothing for 5 s and was cut off, "
+            "a subscriber received nothing for 5 s and was cut off, "
             f"{count_nouns(outcome.cut, 'time')}: it lacks the messages "
             "that were played then"
         )
     if outcome.strays:
         terminal.print_error(
             f"{count_nouns(outcome.strays, 'message lies', 'messages lie')} more than a "
-            "minute from their place in the file, and were "
+            "minute from their position in the file, and were "
             "played late; with a larger --preload they are played in order"
         )
 
@@ -550,7 +590,8 @@ def router_command(
         value(
             "--listen",
             "EP",
-            f"Endpoint to listen at; repeatable; default: with --keys {ANY_ADDRESS}, else {LOOPBACK}.",
+            "Endpoint to listen at; repeatable; "
+            f"default: with --keys {ANY_ADDRESS}, else {LOOPBACK}.",
         ),
     ] = None,
     connect: options.ConnectOption = None,
@@ -561,15 +602,15 @@ def router_command(
         float | None,
         seconds(
             "--until-idle",
-            "End once all members have been gone for this long, s; default: never.",
+            "End after all members have been absent for this long, s; default: never.",
         ),
     ] = None,
 ) -> None:
     """Connects sites that cannot reach each other directly, for example behind NAT.
 
-    Sites and the recorder name it with --router and start in any order. It runs until Ctrl-C; a
-    session continues when the router is restarted. Routers that --connect to each other act as
-    one.
+    Sites and the recorder name the router with --router and start in any order. The router runs
+    until Ctrl-C; a session continues when it is restarted. Routers that --connect to each other
+    act as one router.
     """
     from ..net.connection import (
         open_bus,
@@ -581,19 +622,21 @@ def router_command(
     from ..net.zenoh_config import ROUTER
 
     file = None if zenoh_config is None else read_zenoh_file(zenoh_config)
-    places = [LOOPBACK if keys is None else ANY_ADDRESS]
-    named = resolve_member_connection(
+    default_listen = [LOOPBACK if keys is None else ANY_ADDRESS]
+    open_connection = resolve_member_connection(
         listen=listen,
         connect=connect,
         routers=None,
         file=file,
-        listen_else=places,
+        listen_else=default_listen,
         connect_else=(),
         routes=True,
     )
-    connection = secure_connection(named, keys, insecure=insecure).require(ROUTER)
-    if text := connection.describe_end():
-        terminal.print_note(text)
+    secured = secure_connection(open_connection, keys, insecure=insecure)
+    connection = secured.require(ROUTER)
+    expiry = connection.describe_end()
+    if expiry:
+        terminal.print_note(expiry)
     clock = SystemClock()
     with Interrupt() as interrupt:
         bus = open_bus(
@@ -606,20 +649,20 @@ def router_command(
         if bus is None:
             raise typer.Exit(interrupt.exit_code)
         with closing(bus):
-            _say_of_router(
-                f"listening at {', '.join(map(str, connection.listen))}; Ctrl-C ends it"
-            )
+            endpoints = ", ".join(map(str, connection.listen))
+            _print_router_line(f"listening at {endpoints}; Ctrl-C ends it")
             run_router(
                 bus=bus,
                 clock=clock,
                 stopped=interrupt.is_requested,
-                say=_say_of_router,
+                say=_print_router_line,
                 until_idle_s=until_idle,
             )
         raise typer.Exit(interrupt.exit_code if interrupt.is_requested() else 0)
 
 
-def _say_of_router(text: str) -> None:
+def _print_router_line(text: str) -> None:
+    """Prints a line of the router."""
     terminal.print_line(f"router: {text}")
 
 
@@ -637,16 +680,16 @@ def ros2_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Shows a session to ROS 2; its programs hold arms, and its robots are external arms.
+    """Bridges a session to ROS 2, whose programs can hold arms and whose robots can be arms.
 
-    ROS needs RMW_IMPLEMENTATION=rmw_zenoh_cpp and its router; nothing of ROS is needed here.
-    The bridge waits for the router, and ends with the session. docs/ros2.md has all topics and
-    services.
+    ROS needs RMW_IMPLEMENTATION=rmw_zenoh_cpp and its router; nothing of ROS is needed on this
+    machine. The bridge waits for the router, and ends with the session. docs/ros2.md has all
+    topics and services.
 
     Options:
-        distro: Distribution of ROS 2 whose form is written.
-        rate: Messages a second of each topic.
-        names: Names of topics, or a TOML file of them and of robots.
+        distro: Distribution of ROS 2 whose message format is written.
+        rate: Rate of each topic, Hz.
+        names: Names of topics: crisp, crtk, or a TOML file of topics and robots.
     """
     from sites.ros2_bridge import serve_ros2
     from sites.running_session import RunningSession
@@ -661,7 +704,7 @@ def ros2_command(
         raise UsageError(f"--ros-distro is one of {', '.join(DISTROS)}, not {distro!r}")
     name = check_ros_name(options.check_session_name(session), "session")
     table = read_topic_table(names)
-    check_hosts(ros or ())  # before a session is looked for: the bridge waits for its router
+    check_hosts(ros or ())  # before the search for the session: the bridge waits for its router
     running = RunningSession(name, reach.resolve(operates=False).require(BRIDGE))
 
     def open_graph(refusals: Refusals) -> Ros2Graph:

@@ -1,6 +1,4 @@
-"""Options that several commands share, alone or together, and the scenario, connection or log
-they mean.
-"""
+"""Options that several commands share, and the scenario, connection or log that they name."""
 
 import inspect
 import re
@@ -25,55 +23,68 @@ Runs = TypeVar("Runs", bound=Callable[..., None])
 
 
 def check_range(
-    low: float, high: float, what: str
+    low: float, high: float, noun: str
 ) -> Callable[[typer.CallbackParam, float | None], Any]:
-    """Returns a check of an option that refuses a number out of a range; `what` names such
-    numbers.
+    """Returns a callback of an option that refuses a number out of a range.
+
+    Args:
+        low: the smallest number.
+        high: the largest number.
+        noun: what the number is, for the error message, as "a share".
     """
 
     def check(param: typer.CallbackParam, value: float | None) -> float | None:
         if value is not None and not low <= value <= high:
             raise UsageError(
-                f"{param.opts[0]} is {what} from {low:.7g} to {high:.7g}, not {value:g}"
+                f"{param.opts[0]} is {noun} from {low:.7g} to {high:.7g}, not {value:g}"
             )
         return value
 
     return check
 
 
-def value(names: str, metavar: str, text: str = "", **more: Any) -> Any:
-    """Returns an option that takes a value, with its help; several names are separated by
-    spaces.
+def value(names: str, metavar: str, text: str = "", **settings: Any) -> Any:
+    """Returns an option that takes a value.
+
+    Args:
+        names: names of the option, separated by spaces, as "-o --out".
+        metavar: placeholder of the value in the help.
+        text: the help.
+        settings: further arguments of `typer.Option`.
     """
-    return typer.Option(*names.split(), metavar=metavar, help=text, **more)
+    return typer.Option(*names.split(), metavar=metavar, help=text, **settings)
 
 
-def flag(names: str, text: str = "", **more: Any) -> Any:
+def flag(names: str, text: str = "", **settings: Any) -> Any:
     """Returns an option without a value, with its help."""
-    return typer.Option(names, help=text, **more)
+    return typer.Option(names, help=text, **settings)
 
 
 def seconds(name: str, text: str = "") -> Any:
-    """Returns an option that takes a waiting time, s, with its help."""
+    """Returns an option that takes a waiting time in s, with its help."""
     return value(name, "S", text, callback=check_range(0.0, 86_400.0, "a number of seconds"))
 
 
-_TOLD = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
-"""An entry of a docstring's section `Options`, after `inspect.cleandoc`."""
+_OPTION_ENTRY = re.compile(r"^    (\w+): (.+(?:\n {8}.+)*)", re.MULTILINE)
+"""An entry in the section `Options` of a docstring after `inspect.cleandoc`."""
 
 
 def command(*examples: str) -> Callable[[Runs], Runs]:
-    """Declares a command of the program, with the arguments of its examples.
+    """Returns a decorator that declares a command of the program.
 
-    An option whose help does not fit into its line has it in the section `Options` of the
-    docstring.
+    The help of an option that does not fit into its line is in the section `Options` of the
+    function's docstring.
+
+    Args:
+        examples: arguments of the examples in the help.
     """
 
     def declare(run: Runs) -> Runs:
         run.examples = examples  # type: ignore[attr-defined]
-        head, _, told = (inspect.getdoc(run) or "").partition("\n\nOptions:\n")
+        docstring = inspect.getdoc(run) or ""
+        head, _, option_entries = docstring.partition("\n\nOptions:\n")
         run.__doc__ = head or None
-        for name, text in _TOLD.findall(told):
+        for name, text in _OPTION_ENTRY.findall(option_entries):
             run.__annotations__[name].__metadata__[0].help = " ".join(text.split())
         return run
 
@@ -81,38 +92,35 @@ def command(*examples: str) -> Callable[[Runs], Runs]:
 
 
 def complete_scenarios(incomplete: str) -> list[str]:
-    """Returns what a shell completes to a scenario: shipped names, and TOML files and folders
-    here.
-    """
+    """Returns the scenarios that a shell may complete: shipped names and TOML files here."""
     shipped = (entry.name.removesuffix(".toml") for entry in _SCENARIOS.iterdir())
     names = [name for name in shipped if "." not in name and not name.startswith("_")]
     folder = Path(incomplete).parent if "/" in incomplete else Path()
-    here = [str(path) for path in folder.glob("*.toml")] if folder.is_dir() else []
-    return sorted(name for name in [*names, *here] if name.startswith(incomplete))
+    files = [str(path) for path in folder.glob("*.toml")] if folder.is_dir() else []
+    return sorted(name for name in [*names, *files] if name.startswith(incomplete))
 
 
 def complete_figures(incomplete: str) -> list[str]:
-    """Returns what a shell completes to the name of a figure."""
+    """Returns the figures that a shell may complete."""
     from ..reporting.figures.registry import FIGURES
 
     return [name for name in FIGURES if name.startswith(incomplete)]
 
 
 def complete_sites(context: typer.Context, incomplete: str) -> list[str]:
-    """Returns what a shell completes to a site: those of the scenario or the log that was named
-    before.
-    """
+    """Returns the sites that a shell may complete: those of the named scenario or log."""
     from ..log.log_reader import open_log
     from ..scenario import load_scenario
 
     files = context.params.get("files") or []
-    # before an option without its value they are not parsed
+    # arguments before an option without a value are not parsed yet
     if "files" in context.params and not files:
-        files = [Path(word) for word in context.args]
+        files = [Path(argument) for argument in context.args]
     try:
-        names = (
-            open_log(*files).sites if files else load_scenario(context.params["scenario"]).names
-        )
+        if files:
+            names = open_log(*files).sites
+        else:
+            names = load_scenario(context.params["scenario"]).names
     except (TrilatError, KeyError, TypeError):
         return []
     return [name for name in names if name.startswith(incomplete)]
@@ -149,8 +157,8 @@ RouterOption = Annotated[
     value(
         "--router",
         "EP",
-        "Endpoint of a router to use instead, as in tcp/192.0.2.1:7447; repeatable: the first one that "
-        "answers is used.",
+        "Endpoint of a router to use instead, as in tcp/192.0.2.1:7447; repeatable: "
+        "the first router that answers is used.",
     ),
 ]
 ZenohConfigOption = Annotated[
@@ -166,13 +174,17 @@ InsecureOption = Annotated[
 
 
 MOST_LETTERS = 80
-"""Of a session's name; a scenario's has 64 at most."""
+"""Largest length of a session's name; that of a scenario's name is 64."""
 
 
 def check_session_name(name: str) -> str:
-    """Refuses a session name that cannot be part of a key."""
+    """Returns a session's name, or refuses it if it cannot be part of a Zenoh key.
+
+    Raises:
+        UsageError: the name is too long or has other characters.
+    """
     if len(name) > MOST_LETTERS or not re.fullmatch("[A-Za-z0-9_.-]+", name):
-        # others look alike
+        # letters of other alphabets may look the same
         letters = "" if name.isascii() else "; its letters are a to z and A to Z"
         raise UsageError(
             f"a session's name is at most {MOST_LETTERS} letters, digits, _, - and ., "
@@ -196,7 +208,7 @@ ClockDriftOption = Annotated[
     value(
         "--clock-drift-ppm",
         "PPM",
-        "For tests: use a clock that runs faster than the machine's by this, ppm.",
+        "For tests: use a clock that is faster than the machine's by this share, ppm.",
         callback=check_range(-200.0, 200.0, "a number"),
     ),
 ]
@@ -217,7 +229,7 @@ JobsOption = Annotated[
 
 LogArgument = Annotated[Path, typer.Argument(help="An MCAP log.", metavar="FILE")]
 LogsArgument = Annotated[
-    list[Path], typer.Argument(help="An MCAP log, or all the parts of one.", metavar="FILE...")
+    list[Path], typer.Argument(help="An MCAP log, or all parts of a log.", metavar="FILE...")
 ]
 ROS_ROUTER = "tcp/127.0.0.1:7447"
 RosRouterOption = Annotated[
@@ -235,18 +247,18 @@ MinCoverageOption = Annotated[
     value(
         "--min-coverage",
         "SHARE",
-        "Least share of every site's ticks that must be judged for a pass.",
+        "Least share of each site's ticks that must be judged for a pass.",
         callback=check_range(0.0, 1.0, "a share"),
     ),
 ]
 MIN_COVERAGE = 0.999
-"""As in `log.accounting`, which takes long to import."""
+"""The same as in `log.accounting`, whose import takes long."""
 OnOption = Annotated[
     str | None,
     value(
         "--on",
         "tcp://HOST:PORT",
-        "Run on the workers of this Dask scheduler instead of processes of this machine.",
+        "Run on the workers of this Dask scheduler instead of on this machine.",
     ),
 ]
 PngOption = Annotated[bool, flag("--png", "Write every figure as a PNG file too.")]
@@ -267,19 +279,26 @@ def check_picture(path: Path | None, *, force: bool) -> None:
         raise UsageError(f"{path}: there is no folder {path.parent}")
 
 
-def print_drawn(
-    found: "Result", picture: Path | None, figure: str, shown: Any, *, as_json: bool
+def print_and_draw(
+    result: "Result", picture: Path | None, figure: str, drawn: Any, *, as_json: bool
 ) -> None:
-    """Prints a result; if asked for, writes the figure of what is shown, as
-    "twin_differences:draw_twins".
+    """Prints a result, and writes a figure of it if a path is given.
+
+    Args:
+        result: the result.
+        picture: path of the figure; None: no figure.
+        figure: module and function that draw the figure, as "twin_differences:draw_twins".
+        drawn: argument of that function.
+        as_json: print the result as JSON.
     """
     if picture is not None:
         from ..reporting.style import REPORT_DPI, write_figure
 
-        module, _, name = figure.partition(":")
-        draw = getattr(import_module(f"trilat_net.reporting.figures.{module}"), name)
-        write_figure(draw(shown), picture, REPORT_DPI)
-    terminal.print_result(found, as_json=as_json)
+        module_name, _, function_name = figure.partition(":")
+        module = import_module(f"trilat_net.reporting.figures.{module_name}")
+        draw = getattr(module, function_name)
+        write_figure(draw(drawn), picture, REPORT_DPI)
+    terminal.print_result(result, as_json=as_json)
     if picture is not None and not as_json:
         terminal.print_paths([picture])
 
@@ -295,25 +314,28 @@ def load_chosen_scenario(
 
 def list_overrides(overrides: list[str] | None, duration: float | None) -> list[str]:
     """Returns the overrides of --set and --duration, in this order."""
-    return [*(overrides or []), *([] if duration is None else [f"duration_s={duration!r}"])]
+    texts = list(overrides or [])
+    if duration is not None:
+        texts.append(f"duration_s={duration!r}")
+    return texts
 
 
 def split_names(text: str | None) -> list[str]:
-    """Returns the names of a text such as adaptive,p_d; none for None."""
+    """Returns the names of a text such as adaptive,p_d; an empty list for None."""
     return [] if text is None else [name.strip() for name in text.split(",")]
 
 
-def given_options(context: typer.Context) -> list[str]:
-    """Returns the options and arguments that were given, by the first name of each, as they are
-    declared.
+def list_used_options(context: typer.Context) -> list[str]:
+    """Returns the options and arguments on the command line, in the order of declaration.
+
+    An option appears by its first name.
     """
-    sources = (
-        (param, context.get_parameter_source(param.name or ""))
-        for param in context.command.params
-    )
-    return [
-        param.opts[0] for param, source in sources if source and source.name == "COMMANDLINE"
-    ]
+    used = []
+    for param in context.command.params:
+        source = context.get_parameter_source(param.name or "")
+        if source and source.name == "COMMANDLINE":
+            used.append(param.opts[0])
+    return used
 
 
 class MemberOptions(NamedTuple):
@@ -329,13 +351,24 @@ class MemberOptions(NamedTuple):
     def find_endpoints(
         self, listen_else: Sequence[str] = (), connect_else: Sequence[str] | None = None
     ) -> "Connection":
-        """Returns where it listens and what it connects to, by default these; without its keys."""
+        """Returns the endpoints of the process, without its keys.
+
+        Args:
+            listen_else: endpoints to listen at if the options name none.
+            connect_else: endpoints to connect to if the options name none.
+        """
         from ..net.connection import resolve_member_connection
         from ..net.zenoh_bus import read_zenoh_file
 
         file = None if self.zenoh_config is None else read_zenoh_file(self.zenoh_config)
-        ways = self.listen, self.connect, self.router, file
-        return resolve_member_connection(*ways, listen_else, connect_else)
+        return resolve_member_connection(
+            listen=self.listen,
+            connect=self.connect,
+            routers=self.router,
+            file=file,
+            listen_else=listen_else,
+            connect_else=connect_else,
+        )
 
     def resolve(
         self,
@@ -344,9 +377,12 @@ class MemberOptions(NamedTuple):
         *,
         stops: bool = False,
     ) -> "Connection":
-        """Returns how it takes part, by default at these endpoints; with its keys.
+        """Returns the connection of the process, with its keys.
 
-        With `stops` it serves to stop arms alone, for which keys that have ended may do.
+        Args:
+            listen_else: endpoints to listen at if the options name none.
+            connect_else: endpoints to connect to if the options name none.
+            stops: the connection only stops arms, so that expired keys are accepted.
         """
         from ..net.connection import secure_connection
 
@@ -357,13 +393,15 @@ class MemberOptions(NamedTuple):
 
             keys = read_member_keys(keys, stops=True)
         secured = secure_connection(connection, keys, insecure=self.insecure)
-        if not stops and (text := secured.describe_end()):  # who stops an arm reads no notes
-            terminal.print_note(text)
+        expiry = secured.describe_end()
+        # somebody who stops an arm does not read notes
+        if expiry and not stops:
+            terminal.print_note(expiry)
         return secured
 
 
 class Reach(NamedTuple):
-    """The options by which a command reaches a session of which it is no member."""
+    """The options by which a command that is not a member reaches a session."""
 
     connect: ConnectOption = None
     router: RouterOption = None
@@ -374,8 +412,8 @@ class Reach(NamedTuple):
         """Returns the connection.
 
         Args:
-            operates: whether the keys must be the operator's.
-            stops: whether it serves to stop arms alone, for which keys that have ended may do.
+            operates: the keys must be the operator's.
+            stops: the connection only stops arms, so that expired keys are accepted.
         """
         from ..net.zenoh_config import OPERATOR
 
@@ -384,25 +422,31 @@ class Reach(NamedTuple):
 
 
 class LawFiles(NamedTuple):
-    """The options that let files run as the laws that a log names."""
+    """The options that allow files to run as the laws that a log names."""
 
     law: Annotated[
         list[Path] | None,
-        value("--law", "FILE", "Let this file run as a law that the log names; repeatable."),
+        value("--law", "FILE", "Allow this file to run as a law of the log; repeatable."),
     ] = None
     other_version: Annotated[
-        bool, flag("--other-version", "Take the --law FILE though it is not the one that ran.")
+        bool,
+        flag("--other-version", "Accept a --law FILE that differs from the file that ran."),
     ] = False
     remember: Annotated[
         bool,
         flag(
             "--remember",
-            "Let the --law FILE run for other logs that name its hash and the same settings, too.",
+            "Also allow the --law FILE for other logs with its hash and the same settings.",
         ),
     ] = False
 
     def open(self, *files: Path, runs_them: bool = True) -> "Log":
-        """Returns a log; warns of code from outside that its execution runs, or may not run."""
+        """Returns a log, with a warning about code from outside.
+
+        Args:
+            files: the log, or its parts.
+            runs_them: the command executes the laws of the log, so that a warning is due.
+        """
         allowed: dict[str, Any] = {**self._asdict(), "law": self.law or ()}
         log = terminal.open_with_progress(*files, **allowed)
         if runs_them:
@@ -411,7 +455,7 @@ class LawFiles(NamedTuple):
 
 
 class RunOptions(NamedTuple):
-    """The options of a run that is live on this machine, and of its results."""
+    """The options of a live run on this machine, and of its results."""
 
     duration: DurationOption = None
     folder: Annotated[
@@ -424,9 +468,14 @@ class RunOptions(NamedTuple):
     as_json: JsonOption = False
 
     def load(self, source: str, longest_s: float | None = None) -> "Scenario":
-        """Returns the scenario of the run, which lasts so long unless told otherwise, s."""
-        lasts_s = longest_s if self.duration is None else self.duration
-        return load_chosen_scenario(source, self.overrides, lasts_s, self.seed)
+        """Returns the scenario of the run.
+
+        Args:
+            source: a shipped name, or the path of a TOML file.
+            longest_s: duration of the run if --duration is not given, s; None: the scenario's.
+        """
+        duration_s = longest_s if self.duration is None else self.duration
+        return load_chosen_scenario(source, self.overrides, duration_s, self.seed)
 
 
 class PageServing(NamedTuple):
@@ -437,7 +486,7 @@ class PageServing(NamedTuple):
         value(
             "--host",
             "ADDRESS",
-            "Address of the page; beyond loopback with --tls or --insecure.",
+            "Address of the page; beyond loopback it needs --tls or --insecure.",
         ),
     ] = "127.0.0.1"
     port: Annotated[
@@ -450,33 +499,41 @@ class PageServing(NamedTuple):
         bool, flag("--browser/--no-browser", "Open a browser if there is one.")
     ] = True
     tls: Annotated[
-        Path | None, value("--tls", "DIR", "Encrypt by a member's keys in this folder.")
+        Path | None, value("--tls", "DIR", "Encrypt with the keys of a member in this folder.")
     ] = None
 
 
-_TUPLES = (MemberOptions, Reach, LawFiles, RunOptions, PageServing)
+_OPTION_TUPLES = (MemberOptions, Reach, LawFiles, RunOptions, PageServing)
 
 
-def spread(run: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a command with an option for every field of its parameters that are tuples of
-    options.
+def expand_option_tuples(run: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns a command with one option for each field of its option tuples.
+
+    Args:
+        run: function of the command, whose parameters may be tuples of options such as `Reach`.
     """
-    given = inspect.signature(run).parameters
-    kinds = {n: p.annotation for n, p in given.items() if p.annotation in _TUPLES}
-    parameters = [
-        inner.replace(kind=inspect.Parameter.KEYWORD_ONLY)
-        for name, outer in given.items()
-        for inner in (
-            inspect.signature(kinds[name]).parameters.values() if name in kinds else [outer]
-        )
-    ]
+    declared = inspect.signature(run).parameters
+    tuples = {
+        name: parameter.annotation
+        for name, parameter in declared.items()
+        if parameter.annotation in _OPTION_TUPLES
+    }
+    parameters = []
+    for name, parameter in declared.items():
+        fields = [parameter]
+        if name in tuples:
+            fields = list(inspect.signature(tuples[name]).parameters.values())
+        parameters += [field.replace(kind=inspect.Parameter.KEYWORD_ONLY) for field in fields]
 
     @wraps(run)
-    def gather(**values: Any) -> Any:
-        for name, kind in kinds.items():
-            values[name] = kind(*map(values.pop, kind._fields))
-        return run(**values)
+    def run_with_tuples(**arguments: Any) -> Any:
+        for name, option_tuple in tuples.items():
+            values = [arguments.pop(field) for field in option_tuple._fields]
+            arguments[name] = option_tuple(*values)
+        return run(**arguments)
 
-    vars(gather)["__signature__"] = inspect.Signature(parameters)
-    gather.__annotations__ = {one.name: one.annotation for one in parameters}
-    return gather
+    vars(run_with_tuples)["__signature__"] = inspect.Signature(parameters)
+    run_with_tuples.__annotations__ = {
+        parameter.name: parameter.annotation for parameter in parameters
+    }
+    return run_with_tuples

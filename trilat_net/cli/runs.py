@@ -1,6 +1,4 @@
-"""Runs: a scenario in virtual time, and a log executed again, judged, measured, changed or
-drawn.
-"""
+"""Commands that run a scenario in virtual time, or judge, measure, draw or rerun a log."""
 
 from dataclasses import replace
 from enum import StrEnum
@@ -42,7 +40,7 @@ def sim_command(
     path = output if output is not None else Path(f"{chosen.name}.mcap")
     views_hz = parse_viz_rate(views)
     with Interrupt(compiles=True) as interrupt:
-        within = record_virtual(
+        stayed_in_limits = record_virtual(
             chosen, path, force=force, stopped=interrupt.is_requested, views_hz=views_hz
         )
     if interrupt.is_requested():
@@ -56,15 +54,13 @@ def sim_command(
         terminal.print_json(open_log(path).to_dict())
     else:
         terminal.print_text(f"{path}: {chosen.duration_s:g} s of {', '.join(chosen.names)}")
-    if not within:
-        chains = any(spec.arm.urdf for spec in chosen.sites.values())
+    if not stayed_in_limits:
+        remedy = ""
+        if any(spec.arm.urdf for spec in chosen.sites.values()):
+            remedy = "; a urdf states such limits, and limits.qd_limit_rad_s replaces them"
         terminal.print_error(
-            f"{path}: the run diverged: a joint passed its qd_limit_rad_s, and the run ended there"
-            + (
-                "; a urdf states such limits, and limits.qd_limit_rad_s others"
-                if chains
-                else ""
-            )
+            f"{path}: the run diverged: a joint exceeded its qd_limit_rad_s, "
+            f"and the run ended there{remedy}"
         )
         raise typer.Exit(1)
 
@@ -81,14 +77,14 @@ def verify_command(
 ) -> None:
     """Executes every site again from a log and compares every computed field of every record.
 
-    Exit code 0: all agrees, the log is as it was made, and enough of every site was judged. 1:
-    something differs, was changed, or is missing. 2: no log. 4: a site's law is code from
-    outside that may not run without --law; all else agrees.
+    Exit code 0: everything agrees, the log was not changed, and enough of every site was
+    judged. 1: something differs, was changed, or is missing. 2: no log. 4: a site's law is code
+    from outside that may not run without --law; everything else agrees.
 
     Options:
         virtual: Compare with virtual time too, with and without the log's arrivals.
-        resume_every: Start sites afresh from the records every N ticks: shows what a law knows
-            besides.
+        resume_every: Restart sites from the records every N ticks, which reveals state of a law
+            that the records lack.
     """
     from ..execution.log_checks import run_log_checks
 
@@ -106,7 +102,7 @@ def verify_command(
 
 
 Accepted = StrEnum("Accepted", ["BOUNDED", "OPEN"])
-"""What `--accept` lets pass besides a stable run."""
+"""Results that `--accept` lets pass, besides a stable run."""
 
 
 @options.command("run.mcap")
@@ -116,26 +112,26 @@ def certify_command(
         list[Accepted] | None,
         typer.Option(
             "--accept",
-            help="Also exit 0 for a bounded oscillation, or an open judgement; repeatable.",
+            help="Also exit 0 for a bounded oscillation or an open verdict; repeatable.",
         ),
     ] = None,
     min_coverage: options.MinCoverageOption = options.MIN_COVERAGE,
     own_laws: Annotated[
         bool,
-        flag("--own-laws", "Run code of imported laws for the energies that they declare."),
+        flag("--own-laws", "Run the code of imported laws for the energies that they declare."),
     ] = False,
     twins: Annotated[
-        int, value("--twins", "N", "Twins that get a small push; 0: none.", min=0, max=99)
+        int, value("--twins", "N", "Number of twins with a small push.", min=0, max=99)
     ] = 8,
     *,
     laws: options.LawFiles,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Judges a run: stable, not stable or open; V and its energy balance, premises, roots at
-    the end pose.
+    """Judges a run: stable, not stable or open.
 
-    Executes the run again beside twins that get a small push, and no code of imported laws
-    without --law or --own-laws. docs/certificate.md defines every word and every key of the
+    Prints V and its energy balance, the premises of the proof, and the roots at the end pose.
+    Executes the run again together with twins that get a small push; runs code of imported laws
+    only with --law or --own-laws. docs/certificate.md defines every term and every key of the
     JSON.
 
     Exit code 0: stable. 1: not stable (bounded oscillation, drifting, growing, diverged) or
@@ -145,25 +141,25 @@ def certify_command(
 
     own_laws = own_laws or bool(laws.law)
     log = laws.open(*files, runs_them=own_laws)
-    found = certify_run(log, min_coverage=min_coverage, own_laws=own_laws, twins=twins)
-    terminal.print_result(found, as_json=as_json)
-    if not found.accepts(accept or ()):
+    certificate = certify_run(log, min_coverage=min_coverage, own_laws=own_laws, twins=twins)
+    terminal.print_result(certificate, as_json=as_json)
+    if not certificate.accepts(accept or ()):
         raise typer.Exit(1)
 
 
-_PUSHED = (
-    "Push a twin: m1.q1=1e-6 (rad), m1.qd1, m1.theta1, all of m1.q or of q; repeatable, a twin each. "
-    "Default: as certify does."
+_PUSH_HELP = (
+    "Push a twin: m1.q1=1e-6 (rad), m1.qd1, m1.theta1, all of m1.q or of q; repeatable, "
+    "one twin each. Default: the pushes of certify."
 )
 
 
 @options.command("run.mcap --at 12 --push m1.q1=1e-6 -o twin.png", "run.mcap --delta 1e-9:1e-3")
 def twin_command(
     files: options.LogsArgument,
-    at_s: Annotated[float, value("--at", "S", "The instant of the push, s.")] = 0.0,
+    at_s: Annotated[float, value("--at", "S", "Time of the push, s.")] = 0.0,
     push: Annotated[
         list[str] | None,
-        value("--push", "WHAT=SIZE", _PUSHED, autocompletion=options.complete_sites),
+        value("--push", "STATE=SIZE", _PUSH_HELP, autocompletion=options.complete_sites),
     ] = None,
     delta: Annotated[
         str,
@@ -177,19 +173,20 @@ def twin_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Executes a run again, beside twins that get a small push at an instant: it dies away, or
-    it grows.
+    """Executes a run again together with twins that get a small push, and shows its growth.
 
-    Nothing of the difference is a model: the twins get the arrivals, delays, hands and changes
-    of the run (docs/certificate.md, "Twins"). Exit code 0 for any growth.
+    The difference between run and twin is simulated in full, without a linear model: the twins
+    get the arrivals, delays, hands and changes of the run (docs/certificate.md, "Twins"). Exit
+    code 0 for any growth.
     """
     from ..analysis.twin_growth import twin
 
     options.check_picture(picture, force=force)
     log = laws.open(*files)
-    found = twin(log, at_s, push or (), delta)
-
-    options.print_drawn(found, picture, "twin_differences:draw_twins", found, as_json=as_json)
+    growth = twin(log, at_s, push or (), delta)
+    options.print_and_draw(
+        growth, picture, "twin_differences:draw_twins", growth, as_json=as_json
+    )
 
 
 @options.command("run.mcap --site m1 --json > m1.json")
@@ -197,30 +194,28 @@ def identify_hand_command(
     file: options.LogsArgument,
     site: Annotated[
         str,
-        value("--site", "SITE", "Whose arm it holds.", autocompletion=options.complete_sites),
+        value("--site", "SITE", "Site of the held arm.", autocompletion=options.complete_sites),
     ] = "m1",
     as_json: options.JsonOption = False,
 ) -> None:
-    """Finds mass, damping and stiffness of the hand at an arm, from a run in which sines move
-    that arm.
+    """Identifies mass, damping and stiffness of the hand at an arm that sines move.
 
-    The scenario has an operator of kind "multisine" at any site (docs/ports.md, "Measured
-    operators"). What is found, as JSON, is what `trilat linear --operators` takes.
+    The scenario of the run has an operator of kind "multisine" at any site (docs/ports.md,
+    "Measured operators"). `trilat linear --operators` reads the JSON of the result.
     """
     from ..studies.hand_impedance import identify_hand
 
-    terminal.print_result(
-        identify_hand(terminal.open_with_progress(*file), site), as_json=as_json
-    )
+    log = terminal.open_with_progress(*file)
+    terminal.print_result(identify_hand(log, site), as_json=as_json)
 
 
 @options.command("run.mcap")
 def metrics_command(file: options.LogsArgument, as_json: options.JsonOption = False) -> None:
-    """Measures a run: tracking, effort, energies, force sharing, impedance, walls, learning,
-    network.
+    """Measures a run by all metrics that apply to it.
 
-    Sites, links and walls are columns. A dash is a missing number; if the run could have one,
-    the reason is given below the table. docs/metrics.md has every formula.
+    They cover tracking, effort, energies, force sharing, impedance, walls, learning and the
+    network. Sites, links and walls are columns. A dash is a missing number; if the run could
+    have it, the reason is given below the table. docs/metrics.md has every formula.
     """
     from ..analysis.metrics.log_metrics import compute_log_metrics
 
@@ -249,8 +244,9 @@ def figure_command(
     as_json: Annotated[bool, flag("--json", "Print the list or the paths as JSON.")] = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Draws figures of a log for a paper: vectors, type 8 pt, fonts embedded, the same bytes
-    every time.
+    """Draws figures of a log for a paper, as vectors with embedded fonts of 8 pt.
+
+    The same log gives the same bytes every time.
 
     Options:
         names: Names of figures, see --list; default: all that FILE has.
@@ -264,30 +260,28 @@ def figure_command(
     from ..files import refuse_link
     from ..reporting.figures.registry import write_figures, write_overlay
 
-    place = folder
-    # nobody has named the folder: who sent the log may have planted a link there
-    if place is None:
-        place = file.with_name(f"{file.stem}-figures")
-        refuse_link(place)
+    out = folder
+    if out is None:
+        # the sender of the log may have planted a link at the default path
+        out = file.with_name(f"{file.stem}-figures")
+        refuse_link(out)
     kinds = [kind.strip().lower() for kind in formats.split(",") if kind.strip()]
     if not kinds:
         raise UsageError("--format names no format, as in --format pdf,png")
-    shape: dict[str, Any] = {"width_in": width_in, "formats": kinds, "force": force}
+    settings: dict[str, Any] = {"width_in": width_in, "formats": kinds, "force": force}
     if others:
         if names:
             raise UsageError(
                 "--with draws the figure overlay, and no other: leave the names out"
             )
-        logs = {
-            file.stem: log,
-            **{one.stem: terminal.open_with_progress(one) for one in others},
-        }
+        logs = {file.stem: log}
+        logs |= {path.stem: terminal.open_with_progress(path) for path in others}
         if len(logs) <= len(others):
-            raise UsageError("logs that are drawn over one another need names of their own")
-        paths = write_overlay(logs, place, **shape)
+            raise UsageError("logs that are drawn over one another need different file names")
+        paths = write_overlay(logs, out, **settings)
     else:
         with terminal.progress_bar("drawing") as progress:
-            paths = write_figures(log, place, names or (), progress=progress, **shape)
+            paths = write_figures(log, out, names or (), progress=progress, **settings)
     if as_json:
         terminal.print_json([path.as_posix() for path in paths])
         return
@@ -295,22 +289,23 @@ def figure_command(
 
 
 def _list_figures(log: "Log", *, as_json: bool) -> None:
+    """Prints all figures, and why a log lacks some of them."""
     from ..reporting.figures.registry import FIGURES
 
-    absent = {name: plate.absent(log) for name, plate in FIGURES.items()}
+    reasons = {name: plate.absent(log) for name, plate in FIGURES.items()}
     if as_json:
         rows = [
-            {"name": n, "about": FIGURES[n].about, "absent": why or None}
-            for n, why in absent.items()
+            {"name": name, "about": FIGURES[name].about, "absent": reason or None}
+            for name, reason in reasons.items()
         ]
         terminal.print_json(rows)
         return
-    drawable = [(name, FIGURES[name].about) for name, why in absent.items() if not why]
+    drawable = [(name, FIGURES[name].about) for name, reason in reasons.items() if not reason]
     terminal.print_table(TextTable(("figure", "shows"), drawable))
-    for name, why in absent.items():
-        if why:
+    for name, reason in reasons.items():
+        if reason:
             terminal.out.print(
-                f"[dim]{name}: nothing to show: {escape(why)}[/dim]", soft_wrap=True
+                f"[dim]{name}: nothing to show: {escape(reason)}[/dim]", soft_wrap=True
             )
 
 
@@ -327,13 +322,13 @@ def report_command(
     png: options.PngOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Writes the page and the summary of a log, with --png its figures as well."""
+    """Writes the page and the summary of a log, and with --png its figures."""
     from ..files import make_results_folder, refuse_link
     from ..reporting.conclude import conclude
 
-    log = laws.open(*files)  # before its folder is made
-    # nobody has named the folder: who sent the log may have planted a link there
+    log = laws.open(*files)  # before its folder is created
     if folder is None:
+        # the sender of the log may have planted a link at the default path
         folder = files[0].with_suffix("")
         refuse_link(folder)
     results = make_results_folder(folder, "", force=force)
@@ -367,8 +362,7 @@ def rerun_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Executes sites of a log again with changed settings, and compares the result with the
-    log.
+    """Executes sites of a log again with changed settings, and compares the results.
 
     Without --closed-loop the other sites stay as recorded and do not react.
     """
@@ -382,17 +376,17 @@ def rerun_command(
         refuse_existing(output, force=force, unfinished=active_path(output))
     log = laws.open(*files)
     with terminal.progress_bar("executing") as progress:
-        again = rerun(
+        result = rerun(
             log, replace or [], overrides or [], closed_loop=closed_loop, progress=progress
         )
     if output is not None:
-        again.save(output, force=force)
+        result.save(output, force=force)
     if as_json:
-        terminal.print_json({**again.to_dict(), "file": str(output) if output else None})
+        terminal.print_json({**result.to_dict(), "file": str(output) if output else None})
     else:
-        terminal.print_result(again)
+        terminal.print_result(result)
         terminal.print_paths([output] if output else [])
-    if again.diverged or again.broken:
+    if result.diverged or result.broken:
         raise typer.Exit(1)
 
 
@@ -405,63 +399,71 @@ def linear_command(
     overrides: options.SetOption = None,
     pose: Annotated[
         str | None,
-        value(
-            "--pose", "Q1,Q2,...", "Pose of all sites, rad, true theta; default: a run's end."
-        ),
+        value("--pose", "Q1,Q2,...", "Pose of all sites, rad; default: the end of a run."),
     ] = None,
     roots: Annotated[int, value("--roots", "N", "Number of roots to print.")] = 6,
     over: Annotated[
         list[str] | None,
-        value("--over", "KEY=LOW:HIGH", "Find where stability changes; repeatable."),
+        value("--over", "KEY=LOW:HIGH", "Find edges of stability along a key; repeatable."),
     ] = None,
     ports: Annotated[
-        bool, flag("--ports/--no-ports", "Print what operators feel, and passivity.")
+        bool,
+        flag("--ports/--no-ports", "Analyse passivity and the impedances that operators feel."),
     ] = True,
     operators: Annotated[
         list[Path] | None,
         value(
-            "--operators", "FILE", "A measured operator, of `identify hand --json`; repeatable."
+            "--operators",
+            "FILE",
+            "A measured operator, from `trilat identify hand --json`; repeatable.",
         ),
     ] = None,
     picture: Annotated[
         Path | None, value("--figure", "FILE", "Draw a figure: .png, .svg or .pdf.")
     ] = None,
-    what: Annotated[
+    drawn: Annotated[
         LinearFigure,
         typer.Option("--draw", help="What to draw: roots, impedances, or passivity."),
     ] = LinearFigure.ROOTS,
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Linearises the loop about its equilibrium: stability of small motions, and the operators'
-    impedances.
+    """Linearises the loop about its equilibrium, and analyses the stability of small motions.
 
-    With delays: roots, delay margin, edges of stability (docs/linear.md); then, with operators
-    and environments off, passivity, Llewellyn's criterion, and impedance (docs/ports.md). Exit
-    code 0 for any verdict.
+    Computes roots, delay margin and edges of stability with delays (docs/linear.md). Without
+    operators and environments it computes passivity, Llewellyn's criterion and the impedances
+    that operators feel (docs/ports.md). Exit code 0 for any verdict.
     """
     options.check_picture(picture, force=force)
     from ..studies.hand_impedance import read_hands
     from ..theory.linear_analysis import analyse_linear_loop
 
-    wanted = ports or (picture is not None and what is not LinearFigure.ROOTS)
-    found = analyse_linear_loop(
+    draws_ports = picture is not None and drawn is not LinearFigure.ROOTS
+    analysis = analyse_linear_loop(
         scenario,
         overrides or [],
-        pose=_pose(pose),
+        pose=_parse_pose(pose),
         roots=roots,
         over=over or [],
-        ports=wanted,
+        ports=ports or draws_ports,
         hands=read_hands(operators or []),
     )
-    shown = found if ports or as_json else replace(found, ports=None)
-    name, of = (
-        ("root_map", found) if what is LinearFigure.ROOTS else (f"port_{what}", found.ports)
-    )
-    options.print_drawn(shown, picture, f"linear_figures:draw_{name}", of, as_json=as_json)
+    printed = analysis if ports or as_json else replace(analysis, ports=None)
+    if drawn is LinearFigure.ROOTS:
+        figure = "linear_figures:draw_root_map"
+        argument: Any = analysis
+    else:
+        figure = f"linear_figures:draw_port_{drawn}"
+        argument = analysis.ports
+    options.print_and_draw(printed, picture, figure, argument, as_json=as_json)
 
 
-def _pose(text: str | None) -> tuple[float, ...] | None:
+def _parse_pose(text: str | None) -> tuple[float, ...] | None:
+    """Returns the angles of a text such as "0.1,0.3"; None for None.
+
+    Raises:
+        UsageError: a part of the text is not a number.
+    """
     if text is None:
         return None
     try:

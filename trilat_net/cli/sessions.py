@@ -1,6 +1,4 @@
-"""Sessions: begun on this machine, shown, measured, changed, stopped; and whether one can run
-here.
-"""
+"""Commands that start, show, measure, change or stop sessions, or check this machine."""
 
 import re
 from contextlib import suppress
@@ -29,16 +27,15 @@ if TYPE_CHECKING:
 def demo_command(
     scenario: options.ScenarioArgument = "paper", *, run: options.RunOptions
 ) -> None:
-    """Runs a scenario live over Zenoh, a process per site and a recorder; then verifies and
-    reports.
+    """Runs a scenario live over Zenoh, then verifies its log and writes a report.
+
+    Each site and the recorder is a process of its own.
     """
     run_and_report(run.load(scenario), run)
 
 
-def _describe_kept(path: Path) -> str:
-    """Returns what the log of a session that was interrupted holds and lacks; "" if it cannot
-    be read.
-    """
+def _describe_log(path: Path) -> str:
+    """Returns the contents of an interrupted session's log; "" if it cannot be read."""
     from ..errors import LogError
     from ..log.log_reader import open_log
 
@@ -50,8 +47,15 @@ def _describe_kept(path: Path) -> str:
 def run_and_report(
     chosen: "Scenario", run: options.RunOptions, page: "PageAttendant | None" = None
 ) -> None:
-    """Runs a scenario live, then verifies and reports; a page may end it as planned, and gets
-    the report.
+    """Runs a scenario live, then verifies its log and writes a report.
+
+    Args:
+        chosen: the scenario.
+        run: the options of the run.
+        page: page that shows the session, may end it, and links to the report; None: no page.
+
+    Raises:
+        typer.Exit: the session was interrupted or had problems, or the log failed a check.
     """
     from sites.demo_session import run_demo
 
@@ -66,16 +70,14 @@ def run_and_report(
         outcome = run_demo(chosen, results, terminal.out, page.attend if page else None)
     for problem in outcome.problems:
         terminal.print_error(problem)
-    there = outcome.log.exists()
-    if outcome.interrupted and not (page and there):
-        kept = (
-            f"; {outcome.log} holds what there was{_describe_kept(outcome.log)}"
-            if there
-            else ""
-        )
-        terminal.err.print(f"interrupted{kept}", markup=False, soft_wrap=True)
+    has_log = outcome.log.exists()
+    if outcome.interrupted and not (page and has_log):
+        contents = ""
+        if has_log:
+            contents = f"; {outcome.log} holds the records so far{_describe_log(outcome.log)}"
+        terminal.err.print(f"interrupted{contents}", markup=False, soft_wrap=True)
         raise typer.Exit(128 + outcome.interrupted)
-    if not there:
+    if not has_log:
         raise typer.Exit(outcome.exit_code)
     _, conclusion = terminal.conclude_files(
         [outcome.log], results, as_json=run.as_json, png=run.png
@@ -96,10 +98,10 @@ def live_command(
     serving: options.PageServing,
     run: options.RunOptions,
 ) -> None:
-    """Runs a scenario live, with a page on which to watch it and take hold of the arms.
+    """Runs a scenario live, with a page on which to watch it and to lead the arms.
 
-    The page's button or Ctrl-C ends the session; then its log is verified and reported. With
-    --session the page shows a session that already runs, and leaves it running.
+    The page's button or Ctrl-C ends the session; then its log is verified and a report is
+    written. With --session the page shows a session that already runs, and leaves it running.
 
     Options:
         session: Show this running session instead of starting one.
@@ -112,19 +114,11 @@ def live_command(
     page = PageOptions(*serving)
     page.check()
     if session is not None:
-        alone = {
-            "--duration",
-            "--out",
-            "--seed",
-            "--set",
-            "--force",
-            "--png",
-            "--json",
-            "scenario",
-        }
-        if extra := alone & set(options.given_options(context)):
+        extra = _START_OPTIONS & set(options.list_used_options(context))
+        if extra:
             raise UsageError(
-                f"--session shows a session that runs already: leave out {', '.join(sorted(extra))}"
+                "--session shows a session that runs already: "
+                f"leave out {', '.join(sorted(extra))}"
             )
         connection = reach.resolve()
         name = options.check_session_name(session)
@@ -144,6 +138,18 @@ def live_command(
     with PageAttendant(page, clock) as attendant:
         run_and_report(run.load(scenario, LONGEST_S), run, attendant)
 
+
+_START_OPTIONS = {
+    "--duration",
+    "--out",
+    "--seed",
+    "--set",
+    "--force",
+    "--png",
+    "--json",
+    "scenario",
+}
+"""Options of `trilat live` that only concern a session that it starts."""
 
 _check_count = options.check_range(5, 10_000, "a number")
 
@@ -182,30 +188,33 @@ def ping_command(
     """Shows round trip, clock offset and jitter between here and every member of a session.
 
     The session may still wait for members. If it runs, the links that its sites measure are
-    shown too. Without endpoints it asks the first site, at its loopback port, for the others.
+    shown too. Without endpoints the command asks the first site, at its loopback port, for the
+    others.
 
-    With --benchmark it needs no session: it measures if the network is good enough for a
+    With --benchmark it needs no session: it measures whether the network is good enough for a
     scenario, by the delay margin of trilat linear. The far end is trilat ping --answer EP on
-    another machine, given as --connect EP; without one it runs here, over TCP, TLS and QUIC.
-    This takes half a minute; exit code 1 if the network is not good enough.
+    another machine, reached with --connect EP; without --connect the far end runs here, over
+    TCP, TLS and QUIC. This takes half a minute; exit code 1 if the network is not good enough.
 
     With --ros2 it needs no session either: it listens to a topic of ROS 2 over Zenoh, of any
-    type, unseen (docs/ros2.md).
+    message type (docs/ros2.md).
 
     Options:
         benchmark: Measure the network instead, by size, rate and transport, for this scenario.
-        ros2: Measure how long messages of this topic of ROS 2 take instead.
-        seconds: Duration of all cases together, s; default 24. With --answer: time until it
-            ends; with --ros2: 5.
+        ros2: Measure the delay of messages of this ROS 2 topic instead.
+        seconds: Duration of all cases together, s; default 24. With --answer: time until the
+            command ends; with --ros2: duration of the measurement, default 5.
         picture: Draw the benchmark: .png, .svg or .pdf.
-        answer: Answer benchmarks from elsewhere, at this endpoint; repeatable.
+        answer: Answer benchmarks from other machines, at this endpoint; repeatable.
     """
-    ways = {
-        "--benchmark": benchmark is not None,
-        "--ros2": ros2 is not None,
-        "--answer": bool(answer),
-    }
-    _refuse_others(context, next((way for way, chosen in ways.items() if chosen), ""))
+    mode = ""
+    if benchmark is not None:
+        mode = "--benchmark"
+    elif ros2 is not None:
+        mode = "--ros2"
+    elif answer:
+        mode = "--answer"
+    _refuse_options_of_other_modes(context, mode)
     if benchmark is not None:
         return _benchmark(
             scenario=benchmark,
@@ -219,13 +228,13 @@ def ping_command(
     if ros2 is not None:
         return _ping_topic(ros2, ros, domain, seconds or 5.0, as_json=as_json)
     if answer:
-        return _answer(answer, reach.keys, seconds, insecure=insecure)
+        return _run_far_end(answer, reach.keys, seconds, insecure=insecure)
     from sites.session_ping import ping_session
 
     connection = reach.resolve(operates=False)
     clock = make_system_clock(clock_offset, clock_drift)
     with Interrupt() as interrupt:
-        found = ping_session(
+        measurement = ping_session(
             connection=connection,
             clock=clock,
             session=options.check_session_name(session),
@@ -233,36 +242,60 @@ def ping_command(
             timeout_s=timeout,
             stopped=interrupt.is_requested,
         )
-        if found is None:
+        if measurement is None:
             raise typer.Exit(interrupt.exit_code)
-    terminal.print_result(found, as_json=as_json)
-    if not any(member["answers"] for member in found.members):
+    terminal.print_result(measurement, as_json=as_json)
+    if not any(member["answers"] for member in measurement.members):
         raise typer.Exit(1)
     return None
 
 
-_OF_BENCHMARK = {
-    "--benchmark",
+_MODE_OPTIONS = {
+    "--benchmark": {
+        "--benchmark",
+        "--set",
+        "--seconds",
+        "--figure",
+        "--force",
+        "--connect",
+        "--keys",
+        "--json",
+    },
+    "--answer": {"--answer", "--seconds", "--keys", "--insecure"},
+    "--ros2": {"--ros2", "--ros", "--domain", "--seconds", "--json"},
+}
+"""All options that each mode of `trilat ping` accepts."""
+_OPTIONS_WITH_MODE = {
     "--set",
     "--seconds",
     "--figure",
     "--force",
-    "--connect",
-    "--keys",
-    "--json",
+    "--insecure",
+    "--ros",
+    "--domain",
 }
-_OF_ANSWER = {"--answer", "--seconds", "--keys", "--insecure"}
-_OF_ROS2 = {"--ros2", "--ros", "--domain", "--seconds", "--json"}
+"""Options of `trilat ping` that need one of its modes."""
 
 
-def _refuse_others(context: typer.Context, way: str) -> None:
-    given = set(options.given_options(context))
-    own = {"--benchmark": _OF_BENCHMARK, "--answer": _OF_ANSWER, "--ros2": _OF_ROS2}.get(way)
-    alone = {"--set", "--seconds", "--figure", "--force", "--insecure", "--ros", "--domain"}
-    if other := sorted(given & alone if own is None else given - own):
-        raise UsageError(
-            f"{other[0]}: {f'not with {way}' if way else 'only with --benchmark, --answer or --ros2'}"
-        )
+def _refuse_options_of_other_modes(context: typer.Context, mode: str) -> None:
+    """Refuses options that do not belong to a mode of `trilat ping`.
+
+    Args:
+        context: the command line.
+        mode: the option that selects the mode; "": a session is measured.
+
+    Raises:
+        UsageError: an option belongs to another mode.
+    """
+    used = set(options.list_used_options(context))
+    if mode:
+        refused = sorted(used - _MODE_OPTIONS[mode])
+        reason = f"not with {mode}"
+    else:
+        refused = sorted(used & _OPTIONS_WITH_MODE)
+        reason = "only with --benchmark, --answer or --ros2"
+    if refused:
+        raise UsageError(f"{refused[0]}: {reason}")
 
 
 def _benchmark(
@@ -275,28 +308,27 @@ def _benchmark(
     force: bool,
     as_json: bool,
 ) -> None:
+    """Measures whether the network is good enough for a scenario, and prints the result."""
     options.check_picture(picture, force=force)
     from sites.network_benchmark import DEFAULT_S, ping_benchmark
 
-    found = ping_benchmark(
+    result = ping_benchmark(
         scenario,
         overrides or [],
         duration_s=seconds or DEFAULT_S,
         connect=reach.connect,
         keys=reach.keys,
     )
-
-    shown = found.to_dict()
-    options.print_drawn(
-        found, picture, "linear_figures:draw_network_delays", shown, as_json=as_json
-    )
-    if not found.good:
+    figure = "linear_figures:draw_network_delays"
+    options.print_and_draw(result, picture, figure, result.to_dict(), as_json=as_json)
+    if not result.good:
         raise typer.Exit(1)
 
 
 def _ping_topic(
     topic: str, routers: list[str] | None, domain: int, lasts_s: float, *, as_json: bool
 ) -> None:
+    """Measures the delay of a ROS 2 topic's messages, and prints the result."""
     from sites.session_ping import ping_topic
 
     from ..net.ros2_graph import Refusals, Ros2Graph
@@ -313,28 +345,32 @@ def _ping_topic(
         domain=domain,
     )
     with graph, Interrupt() as interrupt:
-        found = ping_topic(
+        measurement = ping_topic(
             graph=graph,
             clock=clock,
             topic=name,
             lasts_s=lasts_s,
             stopped=interrupt.is_requested,
         )
-    terminal.print_result(found, as_json=as_json)
+    terminal.print_result(measurement, as_json=as_json)
 
 
-def _answer(
+def _run_far_end(
     endpoints: list[str], keys: Path | None, seconds: float | None, *, insecure: bool
 ) -> None:
+    """Answers benchmarks from other machines, for a time in s or until Ctrl-C."""
     from math import inf
 
     from sites.network_benchmark import run_far_end
 
     with Interrupt() as interrupt:
-        stopped = interrupt.is_requested
-        last_s = seconds or inf
         run_far_end(
-            endpoints, keys, stopped, last_s, insecure=insecure, say=terminal.print_line
+            endpoints,
+            keys,
+            interrupt.is_requested,
+            seconds or inf,
+            insecure=insecure,
+            say=terminal.print_line,
         )
     if interrupt.is_requested():
         raise typer.Exit(interrupt.exit_code)
@@ -345,17 +381,16 @@ def watch_command(
     session: Annotated[str, value("--session", "ID", "Session to watch.")],
     *,
     as_site: Annotated[
-        str, value("--as", "SITE", "Show what this site's user is shown, and nothing else.")
+        str, value("--as", "SITE", "Show only the view of this site's user.")
     ] = "",
     reach: options.Reach,
     timeout: options.AnswerOption = 10.0,
 ) -> None:
-    """Shows a running session in a terminal, with a line per site, until the session ends or
-    Ctrl-C.
+    """Shows a running session in a terminal, until the session ends or Ctrl-C.
 
-    Each line has angles, |e|, torque, mode, the age of each peer's sample and who holds the
-    arm. The line above has V. Without endpoints it asks the first site, at its loopback port,
-    for the others.
+    Each site has a line with angles, |e|, torque, mode, the age of each peer's sample and the
+    holder of the arm. The line above has V. Without endpoints the command asks the first site,
+    at its loopback port, for the others.
     """
     from live.terminal_watch import show_in_terminal, watch_session
 
@@ -380,7 +415,14 @@ SitesArgument = Annotated[
 ]
 
 
-def _find(session: str, reach: options.Reach, *, stops: bool = False) -> "RunningSession":
+def _connect(session: str, reach: options.Reach, *, stops: bool = False) -> "RunningSession":
+    """Returns the connection to a running session.
+
+    Args:
+        session: name of the session.
+        reach: the options by which the command reaches the session.
+        stops: the command only stops arms, so that expired keys are accepted.
+    """
     from sites.running_session import RunningSession
 
     connection = reach.resolve(operates=False, stops=stops)
@@ -397,44 +439,50 @@ def stop_command(
     *,
     reach: options.Reach,
 ) -> None:
-    """Stops arms at once while the session goes on: they come to rest where they are.
+    """Stops arms at once while the session continues: the arms come to rest where they are.
 
     They stay stopped until `trilat enable`. With --end all sites end their run at the same time
-    instead. Without endpoints it asks sites on this machine at once where their files say that
-    they are, else the first site, at its loopback port, for the others.
+    instead. Without endpoints the command asks the sites on this machine at the addresses in
+    their files, or else the first site, at its loopback port, for the others.
     """
     if end and sites:
         raise UsageError("--end ends the whole session: name no site")
-    running = _find(session, reach, stops=not end)
-    terminal.print_texts(running.end() if end else running.stop(*(sites or ())))
+    running = _connect(session, reach, stops=not end)
+    replies = running.end() if end else running.stop(*(sites or ()))
+    terminal.print_texts(replies)
 
 
 @options.command("--session paper s")
 def enable_command(
     session: SessionOption, sites: SitesArgument = None, *, reach: options.Reach
 ) -> None:
-    """Lets stopped arms follow again: they wait for their peers and align with them."""
-    terminal.print_texts(_find(session, reach).enable(*(sites or ())))
+    """Enables stopped arms: they wait for their peers, align with them and follow again."""
+    terminal.print_texts(_connect(session, reach).enable(*(sites or ())))
 
 
 @options.command("--session paper s")
 def reset_command(
     session: SessionOption,
-    sites: Annotated[list[str], typer.Argument(metavar="SITE...", help="The sites in fault.")],
+    sites: Annotated[list[str], typer.Argument(metavar="SITE...", help="Sites with a fault.")],
     *,
     reach: options.Reach,
 ) -> None:
-    """Ends the fault of sites unless its cause persists: they wait for their peers and align
-    with them.
+    """Clears the fault of sites unless its cause persists.
+
+    The sites then wait for their peers and align with them.
     """
-    terminal.print_texts(_find(session, reach).reset(*sites))
+    terminal.print_texts(_connect(session, reach).reset(*sites))
 
 
 _UNITS = {"us": 1e-3, "ms": 1.0, "s": 1e3}
 
 
 def parse_milliseconds(text: str) -> float:
-    """Returns a time with its unit, as in 350ms or 0.35s, in ms."""
+    """Returns a time in ms, from a text with a unit such as 350ms or 0.35s.
+
+    Raises:
+        UsageError: the text is not a number with a unit.
+    """
     match = re.fullmatch(r"([-+.\deE]+?)\s*(us|ms|s)", text.strip())
     try:
         if match:
@@ -445,7 +493,11 @@ def parse_milliseconds(text: str) -> float:
 
 
 def parse_share(text: str) -> float:
-    """Returns a share, as in 5% or 0.05."""
+    """Returns a share, from a text such as 5% or 0.05.
+
+    Raises:
+        UsageError: the text is not a number or a percentage.
+    """
     number = text.strip().removesuffix("%")
     try:
         return float(number) / (100.0 if number != text.strip() else 1.0)
@@ -456,12 +508,21 @@ def parse_share(text: str) -> float:
 
 
 def parse_pairs(texts: list[str], example: str) -> dict[str, Any]:
-    """Returns KEY=VALUE texts as a table; a value is TOML or a bare word."""
+    """Returns KEY=VALUE texts as a table; a value is TOML or a bare word.
+
+    Args:
+        texts: the texts.
+        example: an example for the error message.
+
+    Raises:
+        UsageError: a text is not of that form.
+    """
     from ..scenario.override import split_assignment
 
     pairs = []
     for text in texts:
-        if (pair := split_assignment(text)) is None:
+        pair = split_assignment(text)
+        if pair is None:
             raise UsageError(f"a change reads KEY=VALUE, as in {example}, not {text!r}")
         pairs.append(pair)
     return dict(pairs)
@@ -477,7 +538,7 @@ def set_command(
 ) -> None:
     """Changes a link, or a row of the dominance matrix, while a session runs.
 
-    Without endpoints it asks the first site, at its loopback port, for the others.
+    Without endpoints the command asks the first site, at its loopback port, for the others.
     """
     name = None if session is None else options.check_session_name(session)
     context.obj = name, reach.resolve()
@@ -499,7 +560,7 @@ def set_link_command(
         value("--to", "KEY=VALUE", "Any key of a link, as in model=gamma; repeatable."),
     ] = None,
 ) -> None:
-    """Changes the given keys of a directed link; a model or a preset replaces all of them."""
+    """Changes keys of a directed link; a model or a preset replaces all keys."""
     table = parse_pairs(to or [], "deviation_ms=20")
     if preset is not None:
         table["preset"] = preset
@@ -529,28 +590,29 @@ def set_dominance_command(
         str, typer.Option("--ramp", help="Duration of the change, as in 2s.")
     ] = "1s",
 ) -> None:
-    """Changes one row of the dominance matrix along a linear ramp; it sums to 1 throughout."""
-    table = {
-        peer: parse_share(str(value)) for peer, value in parse_pairs(shares, "m1=0.9").items()
-    }
-    _send_change(
-        context,
-        site,
-        {"dominance": site, "to": table, "ramp_s": parse_milliseconds(ramp) / 1e3},
-    )
+    """Changes one row of the dominance matrix along a linear ramp; its sum stays 1."""
+    pairs = parse_pairs(shares, "m1=0.9")
+    table = {peer: parse_share(str(share)) for peer, share in pairs.items()}
+    ramp_s = parse_milliseconds(ramp) / 1e3
+    _send_change(context, site, {"dominance": site, "to": table, "ramp_s": ramp_s})
 
 
-def _send_change(context: typer.Context, site: str, order: dict[str, Any]) -> None:
+def _send_change(context: typer.Context, site: str, change: dict[str, Any]) -> None:
+    """Requests a change from a site of the running session, and prints its reply.
+
+    Raises:
+        UsageError: the session is not named, or the site refuses the change.
+    """
     from sites.running_session import RunningSession
 
     from ..fields import check_finite
     from ..net.requests import ChangeRequest
 
     session, connection = context.obj
-    check_finite(order, "")  # a message holds no others
+    check_finite(change, "")  # messages cannot hold infinite numbers
     if session is None:
         raise UsageError("the session is missing: trilat set --session ID ...")
-    reply = RunningSession(session, connection).change(site, ChangeRequest(**order))
+    reply = RunningSession(session, connection).change(site, ChangeRequest(**change))
     if not reply.accepted:
         raise UsageError(f"refused: {reply.text}")
     terminal.print_text(reply.text)
@@ -562,18 +624,15 @@ def doctor_command(
     ways: options.MemberOptions,
     session: Annotated[
         str | None,
-        value("--session", "ID", "Also ask the members of this session for their clocks."),
+        value("--session", "ID", "Also check the clocks of this session's members."),
     ] = None,
-    folder: Annotated[Path, value("--out -o", "DIR", "Folder where results would go.")] = Path(
-        "runs"
-    ),
+    folder: Annotated[Path, value("--out -o", "DIR", "Folder for results.")] = Path("runs"),
     as_json: options.JsonOption = False,
 ) -> None:
-    """Checks keys, endpoints, clocks, real-time rights, disk and processors: one line per
-    finding.
+    """Checks keys, endpoints, clocks, real-time rights, disk and processors of this machine.
 
-    Give it the options that a site, recorder or router on this machine would get. Exit code 1
-    if a check fails.
+    Use the options of the site, recorder or router that shall run here. Exit code 1 if a check
+    fails.
     """
     from sites.doctor import examine_machine
 

@@ -1,8 +1,8 @@
-"""Studies of some runs: scenarios with what they [expect], logs side by side, laws, experiments
-with people.
+"""Commands that study several runs: tests, comparisons, tuning, benchmarks, experiments.
 
-Invariant: numbers are printed and nothing is ranked. A suite that is interrupted goes on by the
-same command.
+Invariant:
+    - Numbers are printed, and nothing is ranked.
+    - The same command continues an interrupted suite.
 """
 
 import os
@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -50,7 +50,7 @@ def test_command(
         bool,
         flag(
             "--live/--virtual",
-            "Run live over a network, one after the other, or in virtual time.",
+            "Run live over a network, in sequence, or in virtual time.",
         ),
     ] = False,
     seeds: Annotated[
@@ -65,8 +65,9 @@ def test_command(
     overrides: options.SetOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    r"""Runs scenarios and checks their \[expect]: margins, and commands that repeat what
-    failed.
+    r"""Runs scenarios, checks their \[expect], and prints margins.
+
+    For each failure it prints the command that repeats the run.
     """
     from ..files import write_whole
     from ..studies.executor import check_workers
@@ -77,10 +78,10 @@ def test_command(
     check_workers(jobs, on)
     if junit is not None and (junit.is_dir() or not os.access(junit.parent, os.W_OK)):
         raise UsageError(f"{junit}: cannot be written")
-    batch = _batch(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
+    trials = _list_trials(scenarios or [], parse_seeds(seeds), overrides or [], live=live)
     began_unix_ns = SystemClock().unix_ns()
     with terminal.lines_aside(as_json):
-        report = _run_live(batch) if live else _run_virtual(batch, jobs, on)
+        report = _run_live(trials) if live else _run_virtual(trials, jobs, on)
     terminal.print_result(report, as_json=as_json)
     if junit is not None:
         write_whole(junit, encode_junit_xml(report, began_unix_ns, platform.node()))
@@ -89,15 +90,16 @@ def test_command(
 
 
 def parse_seeds(text: str | None) -> list[int]:
-    """Returns the seeds that a text such as 1..20 or 1,5,9 or 1..3,8 names; none for None.
+    """Returns the seeds of a text such as 1..20 or 1,5,9 or 1..3,8; an empty list for None.
 
     Raises:
-        UsageError: it names none, or too many.
+        UsageError: the text is not of that form, or names too many seeds.
     """
     seeds: list[int] = []
     for part in [] if text is None else text.split(","):
         match = re.fullmatch(r"\s*([0-9]{1,18})(?:\.\.([0-9]{1,18}))?\s*", part)
-        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        first = int(match[1]) if match else 1
+        last = int(match[2] or match[1]) if match else 0
         if last < first:
             raise UsageError(f"--seeds reads 1..20 or 1,5,9, not {text!r}")
         if len(seeds) + last - first >= MAX_SEEDS:
@@ -106,55 +108,67 @@ def parse_seeds(text: str | None) -> list[int]:
     return seeds
 
 
-def _batch(
+def _list_trials(
     sources: list[str], seeds: list[int], overrides: list[str], *, live: bool
 ) -> "list[Trial]":
-    """Returns all trials; without sources, of every shipped scenario that expects something."""
+    """Returns all trials; without sources, those of each shipped scenario with expectations."""
     from ..scenario import list_shipped, load_scenario
     from ..studies.trials import trials
 
-    chosen = sources or [
-        name for name in list_shipped() if load_scenario(name).expect.has_expectations
-    ]
+    if not sources:
+        sources = [
+            name for name in list_shipped() if load_scenario(name).expect.has_expectations
+        ]
     return [
         trial
-        for source in dict.fromkeys(chosen)
+        for source in dict.fromkeys(sources)
         for trial in trials(source, seeds, overrides, live=live)
     ]
 
 
-def _run_virtual(batch: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
+def _run_virtual(trials: "list[Trial]", jobs: int | None, on: str | None) -> "TrialReport":
+    """Runs trials in virtual time, and shows their progress."""
     from ..studies.trials import run_trials
 
-    to_do = Counter(trial.source for trial in batch)
+    remaining = Counter(trial.source for trial in trials)
     with terminal.progress_bar("runs") as show:
 
-        def done(result: "TrialResult") -> None:
+        def report_done(result: "TrialResult") -> None:
             source = result.trial.source
-            to_do[source] -= 1
-            show(len(batch) - to_do.total(), len(batch))
-            if not to_do[source] and not terminal.out.is_terminal:
+            remaining[source] -= 1
+            show(len(trials) - remaining.total(), len(trials))
+            if not remaining[source] and not terminal.out.is_terminal:
                 terminal.print_text(f"{source}: ran")
 
-        return run_trials(batch, jobs, done, on)
+        return run_trials(trials, jobs, report_done, on)
 
 
-def _run_live(batch: "list[Trial]") -> "TrialReport":
+def _run_live(trials: "list[Trial]") -> "TrialReport":
+    """Runs trials live, one after the other."""
     from ..studies.trials import TrialReport, evaluate_live_log
 
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
     results = []
-    for trial in batch:
+    for trial in trials:
         began_ns = clock.monotonic_ns()
-        outcome = run_apart(trial.scenario, str(trial), f"test-{trial}")
+        outcome = run_in_own_folder(trial.scenario, str(trial), f"test-{trial}")
         wall_s = (clock.monotonic_ns() - began_ns) * 1e-9
         results.append(evaluate_live_log(trial, outcome.log, outcome.problems, wall_s))
     return TrialReport(results, (clock.monotonic_ns() - start_ns) * 1e-9)
 
 
-def run_apart(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
-    """Runs a scenario live, into a folder of its own; ends the command if that is interrupted."""
+def run_in_own_folder(scenario: "Scenario", label: str, folder_name: str) -> "SessionResult":
+    """Runs a scenario live, with its results in a new folder.
+
+    Args:
+        scenario: the scenario.
+        label: label of the printed line.
+        folder_name: name of the folder, to which a number is added.
+
+    Raises:
+        typer.Exit: the session was interrupted.
+    """
     from sites.demo_session import run_demo
 
     from ..files import make_results_folder
@@ -168,21 +182,20 @@ def run_apart(scenario: "Scenario", label: str, folder_name: str) -> "SessionRes
     return outcome
 
 
-_LINES = 10
-"""Lines of progress, where no terminal shows a bar."""
+_PROGRESS_LINES = 10
+"""Number of lines of progress, if the output is no terminal."""
 
 
 @contextmanager
 def show_progress(
     label: str, print_line: Callable[[str], None], items: str = "runs"
 ) -> Iterator[Callable[[int, int], None]]:
-    """Yields a function to call with (done, total): it shows a bar, or lines where there is no
-    terminal.
+    """Yields a function of (done, total) that shows progress: as a bar, or as lines elsewhere.
 
     Args:
-        label: what a bar is called.
-        print_line: prints a line.
-        items: what is counted, in the plural.
+        label: label of the bar.
+        print_line: function that prints a line.
+        items: noun of the counted items, in the plural.
     """
     if terminal.err.is_interactive:
         with terminal.progress_bar(label) as show:
@@ -195,22 +208,25 @@ def show_progress(
     first = 0
     printed = 0
 
-    def line(done: int, total: int) -> None:
+    def show_line(done: int, total: int) -> None:
         nonlocal began_ns, first, printed
-        if began_ns < 0:  # the start of processes takes seconds and is not counted
+        if began_ns < 0:
+            # the start of the processes takes seconds and does not count
             began_ns = clock.monotonic_ns()
             first = done
-        if done in (total, first) or done * _LINES // total <= printed:
+        lines = done * _PROGRESS_LINES // total
+        if done in (total, first) or lines <= printed:
             return
-        printed = done * _LINES // total
-        left_s = (clock.monotonic_ns() - began_ns) * 1e-9 / (done - first) * (total - done)
+        printed = lines
+        elapsed_s = (clock.monotonic_ns() - began_ns) * 1e-9
+        left_s = elapsed_s / (done - first) * (total - done)
         print_line(f"  {done} of {total} {items}, about {format_wall_time(left_s)} left")
 
-    yield line
+    yield show_line
 
 
 def _run_tuning(
-    asked: "TuningPlan",
+    plan: "TuningPlan",
     folder: Path | None,
     jobs: int | None,
     on: str | None,
@@ -218,29 +234,40 @@ def _run_tuning(
     force: bool,
     as_json: bool,
 ) -> None:
+    """Tunes control laws, prints the comparison and writes its files.
+
+    Args:
+        plan: the laws and the procedure.
+        folder: folder of the results; None: the next free one.
+        jobs: number of processes.
+        on: address of a Dask scheduler.
+        force: replace existing files.
+        as_json: print the result as JSON.
+    """
     from ..files import make_results_folder
     from ..studies.executor import count_workers
     from ..studies.sweep.sweep_run import format_wall_time
     from ..studies.tuning.tuning_report import describe_procedure, write_tuning
 
     workers = count_workers(jobs, on)
-    chosen = make_results_folder(folder, f"tune-{asked.base.scenario.name}", force=force)
+    name = plan.base.scenario.name
+    results_folder = make_results_folder(folder, f"tune-{name}", force=force)
     if not as_json:
-        laws = ", ".join(space.law for space in asked.spaces)
-        terminal.print_text(f"{asked.base.scenario.name}, laws {laws}; the same for all:")
-        terminal.print_texts(f"  {line}" for line in describe_procedure(asked))
+        laws = ", ".join(space.law for space in plan.spaces)
+        terminal.print_text(f"{name}, laws {laws}; the same for all:")
+        terminal.print_texts(f"  {line}" for line in describe_procedure(plan))
         cores = count_nouns(workers, "core")
-        duration = format_wall_time(asked.estimate_s(workers))
+        duration = format_wall_time(plan.estimate_s(workers))
         terminal.print_text(
-            f"{count_nouns(asked.runs, 'run')} on {cores}: about {duration} at the present "
+            f"{count_nouns(plan.runs, 'run')} on {cores}: about {duration} at the present "
             "speed of this machine"
         )
     with terminal.progress_bar("searching") as progress:
-        found = asked.run(jobs, progress, on)
-    paths = write_tuning(found, chosen)
+        comparison = plan.run(jobs, progress, on)
+    paths = write_tuning(comparison, results_folder)
     if not as_json:
         terminal.out.print()
-    terminal.print_result(found, as_json=as_json)
+    terminal.print_result(comparison, as_json=as_json)
     terminal.print_paths([] if as_json else paths)
 
 
@@ -266,10 +293,10 @@ def compare_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Compares logs and the differences of their experiments; or control laws, all tuned by one
-    procedure.
+    """Compares logs and the differences of their experiments, or tuned control laws.
 
-    Ranks nothing: arms that hang, or that no operator moves, also have small errors.
+    One procedure tunes all laws. Nothing is ranked: arms that hang freely, or that no operator
+    moves, also have small errors.
 
     Options:
         files: Two or more MCAP logs.
@@ -277,13 +304,13 @@ def compare_command(
         law: Control laws; default: adaptive,adaptive_box,p_d,pd_d. Others: adaptive_robust,
             known, p_f, wave, tdpa, tanks, four_channel, six_channel, saturated_pd, authority,
             impedance, smith, and your own, as in mylaws:Law.
-        seeds: Seeds of the scenario that each candidate is the mean of.
+        seeds: Number of seeds of the scenario over which each candidate is averaged.
         objective: The objective besides effort.
-        gravity: Gravity that all laws assume, in % of the truth.
+        gravity: Gravity that all laws assume, in % of the true gravity.
         output: Folder of the results; default: the next free runs/tune-...
     """
     if tune is None:
-        for name in options.given_options(context):
+        for name in options.list_used_options(context):
             if name not in ("files", "--json"):
                 raise UsageError(
                     f"{name} belongs to --tune SCENARIO; logs are compared as they are"
@@ -294,10 +321,10 @@ def compare_command(
         terminal.print_result(compare(*logs), as_json=as_json)
         return
     if files:
-        raise UsageError("--tune makes its own runs: leave the logs out, or --tune")
+        raise UsageError("--tune makes its own runs: leave out the logs, or --tune")
     from ..studies.tuning import plan_tuning
 
-    asked = plan_tuning(
+    plan = plan_tuning(
         tune,
         options.list_overrides(overrides, duration),
         laws=options.split_names(law),
@@ -307,7 +334,7 @@ def compare_command(
         gravity_percent=gravity,
         seeds=seeds,
     )
-    _run_tuning(asked, output, jobs, on, force=force, as_json=as_json)
+    _run_tuning(plan, output, jobs, on, force=force, as_json=as_json)
 
 
 @options.command(
@@ -321,11 +348,11 @@ def tune_command(
         str, value("--tip", "LINK", "End link; default: the only one without a child.")
     ] = "",
     sites: Annotated[
-        int, value("--sites", "2|3", "How many such arms follow one another.")
+        int, value("--sites", "2|3", "Number of arms that follow one another.")
     ] = 2,
     rate: Annotated[int, value("--rate", "HZ", "Tick rate.")] = 1000,
     margin: Annotated[
-        float, value("--margin", "FACTOR", "By how much K is below the edge.")
+        float, value("--margin", "FACTOR", "Factor by which K is below the edge.")
     ] = 2.0,
     damping: Annotated[float, value("--damping", "RATIO", "Damping ratio of an arm.")] = 0.7,
     quantile: Annotated[float, value("--quantile", "SHARE")] = 1.0,
@@ -338,81 +365,112 @@ def tune_command(
     force: options.ForceOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Finds the largest gains that an arm bears over a delay, with a margin, and confirms them
-    by runs.
+    """Finds the largest gains for an arm over a delay, and confirms them by runs.
 
-    Such arms follow one another over links of that delay both ways (docs/arms.md). The last
-    line is one to paste into a scenario. Exit code 0: all runs do as the linear loop predicts.
-    1: one does not.
+    The gains keep a margin to the edge of stability. Two or three such arms follow one another
+    over links of that delay in both directions (docs/arms.md). Paste the last line into a
+    scenario. Exit code 0: all runs behave as the linear loop predicts. 1: a run does not.
 
     Options:
-        delay: One way; the delays of a log, of a running session, or of a table t_s,delay_ms.
-        quantile: Of delays that vary, the one that a constant delay stands for; 1: the largest.
+        delay: One-way delay; or the delays of a log, a running session, or a table
+            t_s,delay_ms.
+        quantile: Quantile of varying delays that is used as the constant delay; 1: the largest.
     """
     options.check_picture(picture, force=force)
     from ..studies.arm_gains import tune_arm
 
-    loop: dict[str, Any] = {"set": overrides or (), "tip": tip, "sites": sites, "rate_hz": rate}
-    wanted: dict[str, Any] = {"margin": margin, "damping": damping, "quantile": quantile}
-    there = _measure_delay(delay, reach)
+    delay_text = _measure_delay(delay, reach)
     with terminal.progress_bar("edge and runs") as show:
-        found = tune_arm(
-            arm, there, law, **loop, **wanted, curve=picture is not None, progress=show
+        gains = tune_arm(
+            arm,
+            delay_text,
+            law,
+            set=overrides or (),
+            tip=tip,
+            sites=sites,
+            rate_hz=rate,
+            margin=margin,
+            damping=damping,
+            quantile=quantile,
+            curve=picture is not None,
+            progress=show,
         )
-    options.print_drawn(
-        found, picture, "linear_figures:draw_arm_gains", found.to_dict(), as_json=as_json
-    )
-    if not found.agree:
+    figure = "linear_figures:draw_arm_gains"
+    options.print_and_draw(gains, picture, figure, gains.to_dict(), as_json=as_json)
+    if not gains.agree:
         raise typer.Exit(1)
 
 
 def _measure_delay(text: str, reach: options.Reach) -> str:
-    """Returns a delay; of a running session that of its slowest link, or half of its longest
-    round trip.
+    """Returns the text of a delay, measured if it names a running session.
+
+    For a session it is the delay of the slowest link, or half of the longest round trip if no
+    link is measured.
     """
     name = text.removeprefix("measured:")
     if name == text or name.endswith(".mcap"):
         return text
     from sites.session_ping import ping_session
 
-    there = reach.resolve(operates=False), SystemClock(), options.check_session_name(name)
-    found = ping_session(*there, 50, 3.0, lambda: False)
-    assert found is not None  # nothing stops it
-    trips_us = [0.5 * one["rtt_us"]["p99"] for one in found.members if one["answers"]]
-    delays_us = [max(link["delay_us"], link["delay_max_us"]) for link in found.links]
-    return f"{max(delays_us or trips_us or [0.0]):.0f}us"
+    measurement = ping_session(
+        connection=reach.resolve(operates=False),
+        clock=SystemClock(),
+        session=options.check_session_name(name),
+        count=50,
+        timeout_s=3.0,
+        stopped=lambda: False,
+    )
+    assert measurement is not None  # nothing stops the measurement
+    half_trips_us = [
+        0.5 * member["rtt_us"]["p99"] for member in measurement.members if member["answers"]
+    ]
+    delays_us = [max(link["delay_us"], link["delay_max_us"]) for link in measurement.links]
+    return f"{max(delays_us or half_trips_us or [0.0]):.0f}us"
 
 
-def _tune(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:
+def _tune_bench(laws: list[str], study: str, jobs: int | None, on: str | None) -> None:
+    """Tunes the laws of a study of the benchmark, and stores their gains with the suite.
+
+    Args:
+        laws: names of the laws; empty: all laws of the study.
+        study: name of the study.
+        jobs: number of processes.
+        on: address of a Dask scheduler.
+
+    Raises:
+        UsageError: a law is not part of the study.
+    """
     from ..studies.bench.bench_plan import GAINS_FILE, STUDIES, tune_laws, write_gains
 
-    asked = STUDIES[study].laws
-    unknown = [
-        law for law in laws if law not in {law for known in asked.values() for law in known}
-    ]
+    laws_by_form = STUDIES[study].laws
+    all_laws = {law for form_laws in laws_by_form.values() for law in form_laws}
+    unknown = [law for law in laws if law not in all_laws]
     if unknown:
-        raise UsageError(f"--law: {unknown[0]} is none of the study {study}")
-    wanted = {
-        form: [law for law in known if law in laws or not laws] for form, known in asked.items()
-    }
+        raise UsageError(f"--law: {unknown[0]} is no law of the study {study}")
+    chosen = {}
+    for form, form_laws in laws_by_form.items():
+        chosen_laws = [law for law in form_laws if law in laws or not laws]
+        if chosen_laws:
+            chosen[form] = chosen_laws
     with show_progress("tuning", terminal.print_note) as progress:
-        found = tune_laws(
-            {form: kept for form, kept in wanted.items() if kept}, jobs, on, progress
-        )
-    write_gains(found)
+        gains = tune_laws(chosen, jobs, on, progress)
+    write_gains(gains)
     terminal.print_paths([GAINS_FILE])
 
 
-def _run(
+def _run_bench(
     folder: "BenchFolder", jobs: int | None, on: str | None, *, confirm: bool
 ) -> "BenchResults":
+    """Runs the benchmark in its folder; on Ctrl-C, says how to continue."""
     from ..studies.bench import run_bench
 
     try:
         with show_progress("running", terminal.print_note) as progress:
             return run_bench(folder, jobs, on, progress, confirm=confirm)
     except KeyboardInterrupt:
-        terminal.print_note(f"what is done is kept in {folder.path}; the same command goes on")
+        terminal.print_note(
+            f"finished runs are kept in {folder.path}; the same command continues"
+        )
         raise
 
 
@@ -438,17 +496,16 @@ def bench_command(
     on: options.OnOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs control laws on the same tasks over the same links: stability, energy, errors,
-    effort, stiffness.
+    """Runs control laws on the same tasks over the same links, and tabulates the results.
 
-    One procedure tuned the gains of every law. Finished runs are kept: the same command
-    continues.
+    The tables show stability, energy, errors, effort and stiffness. One procedure tuned the
+    gains of every law. Finished runs are kept: the same command continues.
 
     Options:
         link: Other links, as in rtt68-loss10,4g.
-        cell: Print the commands that make logs of a cell.
+        cell: Print the commands that write logs of a cell.
         tune: Tune the laws again, and store their gains with the suite.
-        confirm: Run what is not stable for 100 s: it is refuted or confirmed.
+        confirm: Run unstable cells again for 100 s, which refutes or confirms the verdict.
         output: Folder; continues a suite in it. Default: runs/bench-STUDY.
     """
     from ..studies.bench import plan_bench, prepare_bench_folder
@@ -458,35 +515,42 @@ def bench_command(
     from ..studies.study_folder import format_command
 
     check_workers(jobs, on)
-    chosen = "small" if small else study
-    lists = [options.split_names(one) for one in (task, law, link)]
+    chosen_study = "small" if small else study
+    laws = options.split_names(law)
     if tune:
-        _tune(lists[1], chosen, jobs, on)
+        _tune_bench(laws, chosen_study, jobs, on)
         return
-    plan = plan_bench(chosen, tasks=lists[0], laws=lists[1], links=lists[2], seeds=seeds)
+    plan = plan_bench(
+        chosen_study,
+        tasks=options.split_names(task),
+        laws=laws,
+        links=options.split_names(link),
+        seeds=seeds,
+    )
     if cell is not None:
-        for one in plan.cell(cell).seeds:
-            log = f"{cell.replace('/', '-')}-{one}.mcap"
-            terminal.print_line(f"{plan.cell(cell).build(one).command} -o {log}")
+        for seed in plan.cell(cell).seeds:
+            log = f"{cell.replace('/', '-')}-{seed}.mcap"
+            terminal.print_line(f"{plan.cell(cell).build(seed).command} -o {log}")
         return
-    stale = find_stale({str(one.tuned): one.tuned for one in plan.cells}.values())
+    tuned_gains = {str(planned.tuned): planned.tuned for planned in plan.cells}
+    stale = find_stale(tuned_gains.values())
     if stale:
         terminal.print_note(
             f"tuned for another text of law or task, see --tune: {', '.join(stale)}"
         )
     folder = prepare_bench_folder(plan, output)
-    terminal.print_note(
-        f"{count_nouns(len(plan.cells), 'cell')}, {count_nouns(plan.runs, 'run')}, into {folder.path}"
-    )
-    results = _run(folder, jobs, on, confirm=confirm)
-    given = {"--task": task, "--law": law, "--link": link, "--seeds": seeds}
-    words = [
-        word for key, value in given.items() if value is not None for word in (key, str(value))
-    ]
-    words += ["--confirm"] if confirm else []
-    paths = write_bench(
-        results, folder.path, format_command("bench", "--study", chosen, *words)
-    )
+    cells = count_nouns(len(plan.cells), "cell")
+    runs = count_nouns(plan.runs, "run")
+    terminal.print_note(f"{cells}, {runs}, into {folder.path}")
+    results = _run_bench(folder, jobs, on, confirm=confirm)
+    arguments = ["--study", chosen_study]
+    filters = {"--task": task, "--law": law, "--link": link, "--seeds": seeds}
+    for name, filter_value in filters.items():
+        if filter_value is not None:
+            arguments += [name, str(filter_value)]
+    if confirm:
+        arguments.append("--confirm")
+    paths = write_bench(results, folder.path, format_command("bench", *arguments))
     terminal.print_result(results, as_json=as_json)
     terminal.print_paths([] if as_json else paths)
 
@@ -498,10 +562,12 @@ FolderArgument = Annotated[Path, typer.Argument(help="Folder of an experiment.",
 @options.command("reaching.toml", "two-people.toml --pair")
 def experiment_new_command(
     file: ProtocolArgument,
-    pair: Annotated[bool, flag("--pair", "For two people, who hold a master each.")] = False,
+    pair: Annotated[
+        bool, flag("--pair", "For two people, each of whom holds a master.")
+    ] = False,
     force: options.ForceOption = False,
 ) -> None:
-    """Writes a protocol with comments, which runs as it is."""
+    """Writes a commented protocol that runs without changes."""
     from ..studies.experiment.experiment_run import new_experiment
 
     new_experiment(file, pair=pair, force=force)
@@ -512,7 +578,7 @@ def experiment_new_command(
 def experiment_check_command(
     file: ProtocolArgument, as_json: options.JsonOption = False
 ) -> None:
-    """Prints the plan of a protocol, or everything that is wrong with it."""
+    """Prints the plan of a protocol, or everything that is wrong with the protocol."""
     from ..studies.experiment.experiment_run import check_experiment
 
     terminal.print_result(check_experiment(file), as_json=as_json)
@@ -521,7 +587,7 @@ def experiment_check_command(
 @options.command("reaching.toml", "two-people.toml --live", "runs/experiment-reaching-001")
 def experiment_run_command(
     file: Annotated[
-        Path, typer.Argument(help="A protocol, or the folder of one that goes on.")
+        Path, typer.Argument(help="A protocol, or the folder of an experiment to continue.")
     ],
     out: Annotated[
         Path | None, value("--out -o", "DIR", "Default: runs/experiment-NAME-N.")
@@ -533,38 +599,36 @@ def experiment_run_command(
     on: options.OnOption = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs an experiment: with synthetic participants in virtual time, or with people.
+    """Runs an experiment with synthetic participants in virtual time, or with people.
 
-    Each trial leaves a verified log. With --live it prints a link for the experimenter and one
-    for each user; trials begin once all users are ready on their pages. The page's button or
-    Ctrl-C ends it for now.
+    Each trial leaves a verified log. With --live the command prints a link for the experimenter
+    and one for each user; trials begin once all users are ready on their pages. The page's
+    button or Ctrl-C pauses the experiment.
     """
     from live.page_server import PageOptions
 
     from ..studies.experiment.experiment_run import begin_experiment, open_experiment
 
     page = PageOptions(*serving)
-    code = 0
     if live:
         page.check()
-    begun = open_experiment(file) if file.is_dir() else begin_experiment(file, out)
+    experiment = open_experiment(file) if file.is_dir() else begin_experiment(file, out)
+    exit_code = 0
     with terminal.lines_aside(as_json):
-        terminal.print_text(
-            f"{count_nouns(len(begun.plan.trials), 'trial')}, into {begun.folder}; it goes on after Ctrl-C by"
-        )
-        terminal.print_text(
-            f"  trilat experiment run {begun.folder}{' --live' if live else ''}"
-        )
+        trials = count_nouns(len(experiment.plan.trials), "trial")
+        terminal.print_text(f"{trials}, into {experiment.folder}; after Ctrl-C, continue with")
+        live_option = " --live" if live else ""
+        terminal.print_text(f"  trilat experiment run {experiment.folder}{live_option}")
         if live:
             from live.experiment_sessions import run_with_people
 
-            code = run_with_people(begun, page, terminal.print_line)
+            exit_code = run_with_people(experiment, page, terminal.print_line)
         else:
             with show_progress("trials", terminal.print_text) as show:
-                begun.run(jobs, show, on)
-    terminal.print_result(begun, as_json=as_json)
-    if code:
-        raise typer.Exit(code)
+                experiment.run(jobs, show, on)
+    terminal.print_result(experiment, as_json=as_json)
+    if exit_code:
+        raise typer.Exit(exit_code)
 
 
 @options.command("runs/experiment-reaching-001")
@@ -576,7 +640,7 @@ def experiment_analyse_command(
     exclude: Annotated[
         list[str] | None,
         value(
-            "--exclude", "WHO=WHY", "Leave out a participant or pair, and say why; repeatable."
+            "--exclude", "WHO=REASON", "Leave out a participant or pair, and why; repeatable."
         ),
     ] = None,
     as_json: options.JsonOption = False,
@@ -584,10 +648,13 @@ def experiment_analyse_command(
     """Compares the conditions of an experiment: tables, figures, a paragraph for a paper."""
     from ..studies.experiment.experiment_analysis import analyse_experiment
 
-    left_out = dict(entry.partition("=")[::2] for entry in exclude or [])
-    found = analyse_experiment(folder, out, exclude=left_out)
-    terminal.print_result(found, as_json=as_json)
-    terminal.print_paths([] if as_json else found.paths)
+    excluded = {}
+    for text in exclude or []:
+        participant, _, reason = text.partition("=")
+        excluded[participant] = reason
+    analysis = analyse_experiment(folder, out, exclude=excluded)
+    terminal.print_result(analysis, as_json=as_json)
+    terminal.print_paths([] if as_json else analysis.paths)
 
 
 @options.command("0.8 --participants 16")
@@ -596,31 +663,31 @@ def experiment_power_command(
         float, typer.Argument(help="Cohen's d_z of a paired comparison.", min=0.01, max=10.0)
     ],
     participants: Annotated[
-        int | None, value("--participants", "N", "How many there are.", min=2)
+        int | None, value("--participants", "N", "Number of participants.", min=2)
     ] = None,
-    seed: Annotated[int, value("--seed", "S", "Of the experiments that are drawn.")] = 1,
+    seed: Annotated[int, value("--seed", "S", "Seed of the drawn experiments.")] = 1,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Tells how many participants it takes to find an effect, by theory and by drawn
-    experiments.
+    """Computes how many participants are needed to find an effect.
+
+    The power is computed by theory and from drawn experiments.
     """
     from ..studies.experiment.experiment_analysis import compute_experiment_power
 
-    terminal.print_result(
-        compute_experiment_power(effect, participants, seed=seed), as_json=as_json
-    )
+    power = compute_experiment_power(effect, participants, seed=seed)
+    terminal.print_result(power, as_json=as_json)
 
 
 @options.command("runs/experiment-reaching-001")
 def experiment_status_command(
     folder: FolderArgument, as_json: options.JsonOption = False
 ) -> None:
-    """Prints how far an experiment is, and whether its logs are those that its trials wrote."""
+    """Prints the progress of an experiment, and checks that its logs were not changed."""
     from ..studies.experiment.experiment_run import list_log_problems, open_experiment
 
-    found = open_experiment(folder)
-    problems = list(list_log_problems(found))
-    terminal.print_result(found, as_json=as_json)
+    experiment = open_experiment(folder)
+    problems = list(list_log_problems(experiment))
+    terminal.print_result(experiment, as_json=as_json)
     for problem in problems:
         terminal.err.print(problem, markup=False, highlight=False)
     if problems:

@@ -1,14 +1,14 @@
-"""`trilat sweep`: runs a scenario over a grid of its keys, maps stability, finds edges,
-confirms cells live.
+"""`trilat sweep`: runs a scenario over a grid of its keys, maps stability and finds edges.
 
-Invariant: everything printed is in the result files too, except live runs, which have logs. A
-sweep that is interrupted prints the command that resumes it.
+Invariant:
+    - Everything printed is also in the result files, except live runs, which have logs.
+    - An interrupted sweep prints the command that resumes it.
 """
 
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,7 +17,7 @@ from ..process import join_arguments
 from ..reporting import terminal_output as terminal
 from . import options
 from .options import flag, value
-from .studies import parse_seeds, run_apart, show_progress
+from .studies import parse_seeds, run_in_own_folder, show_progress
 
 if TYPE_CHECKING:
     from ..scenario import Scenario
@@ -31,146 +31,184 @@ if TYPE_CHECKING:
 _option = partial(typer.Option, rich_help_panel="Maps and edges")
 
 
-def _check_modes(given: Sequence[str]) -> Sequence[str]:
-    chosen = [name for name in ("--map", "--margin", "--confirm", "--cell") if name in given]
-    if len(chosen) > 1:
-        raise UsageError(f"{' and '.join(chosen)} exclude each other: give one at a time")
-    if "--width" in given and "--map" not in given:
-        raise UsageError("--width is of a map: use it with --map")
-    if "--tolerance" in given and "--margin" not in given:
-        raise UsageError("--tolerance is of an edge: use it with --margin")
+def _check_modes(used_options: Sequence[str]) -> None:
+    """Refuses options that exclude each other.
+
+    Raises:
+        UsageError: two options exclude each other, or an option lacks the one that it belongs
+            to.
+    """
+    modes = [
+        name for name in ("--map", "--margin", "--confirm", "--cell") if name in used_options
+    ]
+    if len(modes) > 1:
+        raise UsageError(f"{' and '.join(modes)} exclude each other: give one at a time")
+    if "--width" in used_options and "--map" not in used_options:
+        raise UsageError("--width belongs to a map: use it with --map")
+    if "--tolerance" in used_options and "--margin" not in used_options:
+        raise UsageError("--tolerance belongs to an edge: use it with --margin")
     for name in ("--judge", "--metric"):
-        if name in given and "--margin" in given:
-            raise UsageError(f"{name} is of a sweep and its map: leave --margin out")
-    return given
+        if name in used_options and "--margin" in used_options:
+            raise UsageError(f"{name} belongs to a sweep and its map: leave --margin out")
 
 
 def _draw_map(
     results: "SweepResults", folder: Path, width: float | None, jobs: int | None, on: str | None
 ) -> None:
+    """Draws the stability map of a sweep with the lines of theory, and prints its remarks.
+
+    Args:
+        results: the finished sweep.
+        folder: folder of the files.
+        width: width of the map, in; None: one column of a paper.
+        jobs: number of processes.
+        on: address of a Dask scheduler.
+    """
     from ..reporting.appearance import COLUMN_IN, make_print_size
     from ..studies.sweep.fixed_gains import FAIR_COMPARISON
     from ..studies.sweep.map_page import write_map
     from ..studies.sweep.stability_map import build_stability_map
     from ..studies.sweep.sweep_plan import build_sweep_command
 
-    form = make_print_size(COLUMN_IN if width is None else width)
-    words = [] if width is None else ["--width", f"{width:g}"]
-    command = build_sweep_command(results.plan, "--map", *words)
+    size = make_print_size(COLUMN_IN if width is None else width)
+    width_option = [] if width is None else ["--width", f"{width:g}"]
+    command = build_sweep_command(results.plan, "--map", *width_option)
     terminal.print_text("map: the lines of theory ...")
     with show_progress(
         "linear analysis", terminal.print_text, "columns of the map"
     ) as progress:
-        made = build_stability_map(results, (command,), jobs, progress, on=on)
-    terminal.print_texts(f"note: {line}" for line in made.remarks)
+        stability_map = build_stability_map(results, (command,), jobs, progress, on=on)
+    terminal.print_texts(f"note: {remark}" for remark in stability_map.remarks)
     terminal.print_text("map: drawing ...")
-    paths = write_map(made, folder, form.width_in)
-    terminal.print_texts(f"not swept: {text}" for text in made.fixed)
+    paths = write_map(stability_map, folder, size.width_in)
+    terminal.print_texts(f"not swept: {text}" for text in stability_map.fixed)
     terminal.print_text(FAIR_COMPARISON)
     terminal.print_paths(paths)
 
 
 def _search_margins(
-    asked: "SweepPlan",
-    within: "SearchRange",
+    plan: "SweepPlan",
+    search_range: "SearchRange",
     folder: Path | None,
+    *,
     jobs: int | None,
     on: str | None,
-    *,
     as_json: bool,
 ) -> None:
-    """Searches edges along one key, prints them with theory, and writes margin.json and
-    margin.md.
+    """Searches edges along one key, prints them with theory, and writes the result files.
 
-    The last axis of the plan is the two ends of the range.
+    Args:
+        plan: the sweep; its last axis is the two ends of the range.
+        search_range: the range.
+        folder: folder of margin.json and margin.md; None: the next free one.
+        jobs: number of processes.
+        on: address of a Dask scheduler.
+        as_json: print the result as JSON.
     """
     from ..files import make_results_folder
     from ..studies.sweep.margin_search import SweepMargins, search_margins
 
-    chosen = make_results_folder(folder, f"margin-{asked.base.name}", force=None)
+    results_folder = make_results_folder(folder, f"margin-{plan.base.name}", force=None)
     with (
         terminal.lines_aside(as_json),
         show_progress("searching", terminal.print_text, "places") as progress,
     ):
-        found = SweepMargins(
-            asked,
-            within,
-            search_margins(plan=asked, within=within, jobs=jobs, progress=progress, on=on),
+        edges = search_margins(
+            plan=plan, within=search_range, jobs=jobs, progress=progress, on=on
         )
-    paths = found.write(chosen)
+        margins = SweepMargins(plan, search_range, edges)
+    paths = margins.write(results_folder)
     if not as_json:
         terminal.out.print()
-    terminal.print_result(found, as_json=as_json)
+    terminal.print_result(margins, as_json=as_json)
     terminal.print_paths([] if as_json else paths)
 
 
 def _confirm_cells(results: "SweepResults", count: int) -> None:
+    """Runs cells next to the edges live, and prints whether their verdicts agree.
+
+    Args:
+        results: the finished sweep.
+        count: number of cells on each side of the edges.
+
+    Raises:
+        typer.Exit: a verdict differs.
+    """
     from ..studies.sweep.live_confirmation import (
         choose_cells_near_edges,
         confirm_cell,
         tabulate_confirmations,
     )
 
-    keys = [one.key for one in results.plan.axes]
+    keys = [axis.key for axis in results.plan.axes]
     rows = choose_cells_near_edges(results.rows, keys, count)
     name = f"confirm-{results.plan.base.name}"
 
     def run(scenario: "Scenario", cell: str) -> "tuple[Path, Sequence[str]]":
-        outcome = run_apart(scenario, cell, f"{name}-{cell}")
+        outcome = run_in_own_folder(scenario, cell, f"{name}-{cell}")
         return outcome.log, outcome.problems
 
-    found = [confirm_cell(row, run) for row in rows]
+    confirmations = [confirm_cell(row, run) for row in rows]
     terminal.out.print()
-    terminal.print_table(tabulate_confirmations(found, keys))
-    same = sum(one.same for one in found)
-    terminal.out.print(f"{same} of {len(found)} verdicts are the same")
-    if same < len(found):
+    terminal.print_table(tabulate_confirmations(confirmations, keys))
+    same = sum(confirmation.same for confirmation in confirmations)
+    terminal.out.print(f"{same} of {len(confirmations)} verdicts are the same")
+    if same < len(confirmations):
         raise typer.Exit(1)
 
 
 def _run_sweep(
-    asked: "SweepPlan | None", path: Path | None, jobs: int | None, on: str | None, *, yes: bool
+    new_plan: "SweepPlan | None",
+    path: Path | None,
+    jobs: int | None,
+    on: str | None,
+    *,
+    yes: bool,
 ) -> "FinishedSweep":
-    """Runs a sweep, or what is left of the one in a folder, and prints its summary.
+    """Runs a sweep, or the remaining runs of the sweep in a folder, and prints its summary.
 
-    One that is too large is refused before it has a folder.
+    A sweep that is too large is refused before its folder is created.
+
+    Args:
+        new_plan: the sweep; None: that of the folder.
+        path: folder of a sweep to continue, or of a new one; None: the next free folder.
+        jobs: number of processes.
+        on: address of a Dask scheduler.
+        yes: run a sweep even if it is too large.
     """
     from ..studies.executor import count_workers
     from ..studies.sweep import sweep_results, sweep_run
 
-    begun = None
-    plan = asked
+    existing_folder = None
+    plan = new_plan
     done = []
     if path is not None and (plan is None or (path / sweep_results.PLAN_FILE).exists()):
-        begun = sweep_run.open_sweep_folder(path, plan)
-        plan = begun.plan
-        done = begun.read_done()
+        existing_folder = sweep_run.open_sweep_folder(path, plan)
+        plan = existing_folder.plan
+        done = existing_folder.read_done()
     assert plan is not None
     terminal.print_texts(sweep_results.describe_sweep_plan(plan))
-    if begun is not None:
+    if existing_folder is not None:
         terminal.print_text(f"  {count_nouns(len(done), 'run is', 'runs are')} done already")
     workers = count_workers(jobs, on)
-    expected = sweep_run.estimate_sweep(plan, done, workers)
+    estimate = sweep_run.estimate_sweep(plan, done, workers)
     if not yes:
-        sweep_run.refuse_oversized_sweep(plan, expected, workers)
-    folder = begun or sweep_run.prepare_sweep_folder(plan, path)
-    if expected.seconds:
-        about = sweep_run.format_wall_time(expected.seconds)
-        terminal.print_text(f"  about {about}, by some of its cells; into {folder.path}")
-    swept = _run_in_folder(folder, jobs, on, expected)
-    if not (expected.entries or swept.runs):
+        sweep_run.refuse_oversized_sweep(plan, estimate, workers)
+    folder = existing_folder or sweep_run.prepare_sweep_folder(plan, path)
+    if estimate.seconds:
+        duration = sweep_run.format_wall_time(estimate.seconds)
+        terminal.print_text(f"  about {duration}, by some of its cells; into {folder.path}")
+    finished = _run_in_folder(folder, jobs, on, estimate)
+    if not (estimate.entries or finished.runs):
         terminal.out.print("nothing was left to run")
-    speed = [sweep_run.describe_sweep_speed(swept)] if swept.runs else []
-    _print_results(
-        swept.results,
-        [*speed, f"results: {folder.path / sweep_results.RESULTS_FILE}"],
-        folder.path,
-    )
-    return swept
+    remarks = [sweep_run.describe_sweep_speed(finished)] if finished.runs else []
+    remarks.append(f"results: {folder.path / sweep_results.RESULTS_FILE}")
+    _print_results(finished.results, remarks, folder.path)
+    return finished
 
 
 def _run_in_folder(
-    folder: "SweepFolder", jobs: int | None, on: str | None, expected: "DurationEstimate"
+    folder: "SweepFolder", jobs: int | None, on: str | None, estimate: "DurationEstimate"
 ) -> "FinishedSweep":
     """Runs a sweep in its folder; on Ctrl-C, prints the command that resumes it."""
     from ..studies.sweep import run_sweep
@@ -178,37 +216,37 @@ def _run_in_folder(
     try:
         with show_progress("sweeping", terminal.print_text) as progress:
             return run_sweep(
-                folder=folder, jobs=jobs, progress=progress, known=expected.entries, on=on
+                folder=folder, jobs=jobs, progress=progress, known=estimate.entries, on=on
             )
     except KeyboardInterrupt:
         resume = join_arguments(["trilat", "sweep", "--resume", str(folder.path)])
-        kept = (
-            f"{count_nouns(len(folder.read_done()), 'run is', 'runs are')} done and "
-            f"kept; go on with: {resume}"
+        done = count_nouns(len(folder.read_done()), "run is", "runs are")
+        terminal.err.print(
+            f"{done} done and kept; continue with: {resume}", markup=False, soft_wrap=True
         )
-        terminal.err.print(kept, markup=False, soft_wrap=True)
         raise
 
 
-def _print_results(results: "SweepResults", more: list[str], path: Path) -> None:
+def _print_results(results: "SweepResults", remarks: list[str], path: Path) -> None:
+    """Prints the summary of a sweep, remarks, and the next commands."""
     from ..studies.sweep.sweep_results import list_next_commands, summarize_sweep
 
-    terminal.print_texts(
-        [*summarize_sweep(results), *more, *(f"  {line}" for line in list_next_commands(path))]
-    )
+    terminal.print_texts(summarize_sweep(results))
+    terminal.print_texts(remarks)
+    terminal.print_texts(f"  {command}" for command in list_next_commands(path))
 
 
 def _print_cell_commands(path: Path, number: int, *, as_json: bool) -> None:
+    """Prints the commands that write logs of a cell, or its rows as JSON."""
     from ..studies.sweep import read_results
     from ..studies.sweep.sweep_results import build_reproduce_command
 
     results = read_results(path)
     if as_json:
         return terminal.print_json([dict(row) for row in results.of_cell(number)])
+    folder = path if path.is_dir() else path.parent
     for row in results.of_cell(number):
-        command, note = build_reproduce_command(
-            results, row, path if path.is_dir() else path.parent
-        )
+        command, note = build_reproduce_command(results, row, folder)
         if note:
             terminal.print_note(note)
         terminal.print_line(command)
@@ -251,24 +289,23 @@ def sweep_command(
     confirm: Annotated[int | None, _option("--confirm", metavar="K", min=1)] = None,
     as_json: options.JsonOption = False,
 ) -> None:
-    """Runs a scenario over a grid of its keys, in virtual time on all cores, and classifies
-    stability.
+    """Runs a scenario over a grid of its keys in virtual time, and classifies stability.
 
-    Finished runs are kept, however the sweep ends: --resume, or the same command with the same
-    -o, continues.
+    All cores are used. Finished runs are kept, however the sweep ends: --resume, or the same
+    command with the same -o, continues the sweep.
 
     Options:
         scenario: Name of a shipped scenario, or path of a TOML file; or path of the results of
             a sweep.
         over: An axis, as in link.delay_ms=0:1600:50 or link.order=newest,in_order; repeatable.
-        seeds: How many seeds, or a list, as in 1..20; default: one.
+        seeds: Number of seeds, or a list, as in 1..20; default: one.
         law: Sweep laws as well; default: the scenario's.
         longest: Longest run of an undecided cell, s; default: eight times the duration.
         judge: What a map shows: classes, or growth exponents of pushed twins, for which short
             runs suffice.
-        metric: Measure this of every run besides (docs/metrics.md); repeatable.
+        metric: Measure this metric of every run as well (docs/metrics.md); repeatable.
         output: Folder of the results; a sweep in it is continued. Default: runs/sweep-NAME-N.
-        cell: With results: print the commands that make logs of a cell.
+        cell: With results: print the commands that write logs of a cell.
         width: Width of the map, in; default: one column.
         margin: Search the edge of stability along a key instead, at every point of the grid.
         tolerance: Width of an edge relative to its value.
@@ -277,23 +314,22 @@ def sweep_command(
     from ..studies.sweep import plan_sweep
     from ..studies.sweep.margin_search import format_range_axis, parse_search_range
 
-    given = _check_modes(options.given_options(context))
+    used_options = options.list_used_options(context)
+    _check_modes(used_options)
     results = Path(scenario) if scenario is not None and _is_results(scenario) else None
     draw = partial(_draw_map, width=width, jobs=jobs, on=on)
     if cell is not None or resume is not None or results is not None:
-        _refuse_beside_results(given)
+        _refuse_plan_options(used_options)
     elif confirm is not None:
-        raise UsageError("--confirm is of results: trilat sweep FOLDER --confirm 5")
+        raise UsageError("--confirm belongs to results: trilat sweep FOLDER --confirm 5")
     if resume is not None:
         if scenario is not None or cell is not None:
-            raise UsageError(
-                "--resume goes on with the sweep of its folder: leave the rest out"
-            )
+            raise UsageError("--resume continues the sweep of its folder: leave the rest out")
         with terminal.lines_aside(as_json):
-            swept = _run_sweep(None, resume, jobs, on, yes=yes)
+            finished = _run_sweep(None, resume, jobs, on, yes=yes)
     elif cell is not None:
         if scenario is None:
-            raise UsageError("--cell is of results: trilat sweep FOLDER --cell N")
+            raise UsageError("--cell belongs to results: trilat sweep FOLDER --cell N")
         return _print_cell_commands(Path(scenario), cell, as_json=as_json)
     elif results is not None:
         return _show_results(results, confirm, draw if mapped else None, as_json=as_json)
@@ -302,25 +338,32 @@ def sweep_command(
             "name a scenario and what to sweep, as in: --over link.delay_ms=0:1600:50"
         )
     else:
-        within = None if margin is None else parse_search_range(margin, tolerance)
-        axes = [*(over or []), *([] if within is None else [format_range_axis(within)])]
-        laws = options.split_names(law)
-        texts = options.list_overrides(overrides, duration)
-        more: dict[str, Any] = {"longest_s": longest, "judge": judge, "metrics": metric or ()}
-        asked = plan_sweep(
-            scenario, texts, over=axes, seeds=parse_seed_count(seeds), laws=laws, **more
+        axes = list(over or [])
+        search_range = None
+        if margin is not None:
+            search_range = parse_search_range(margin, tolerance)
+            axes.append(format_range_axis(search_range))
+        plan = plan_sweep(
+            scenario,
+            options.list_overrides(overrides, duration),
+            over=axes,
+            seeds=parse_seed_count(seeds),
+            laws=options.split_names(law),
+            longest_s=longest,
+            judge=judge,
+            metrics=metric or (),
         )
-        if within is not None:
+        if search_range is not None:
             return _search_margins(
-                asked=asked, within=within, folder=output, jobs=jobs, on=on, as_json=as_json
+                plan, search_range, output, jobs=jobs, on=on, as_json=as_json
             )
         with terminal.lines_aside(as_json):
-            swept = _run_sweep(asked, output, jobs, on, yes=yes)
+            finished = _run_sweep(plan, output, jobs, on, yes=yes)
     if mapped:
         with terminal.lines_aside(as_json):
-            draw(swept.results, swept.folder.path)
+            draw(finished.results, finished.folder.path)
     if as_json:
-        terminal.print_json(swept.results.to_dict())
+        terminal.print_json(finished.results.to_dict())
     return None
 
 
@@ -331,6 +374,14 @@ def _show_results(
     *,
     as_json: bool,
 ) -> None:
+    """Confirms cells of a finished sweep, draws its map, or prints its summary.
+
+    Args:
+        path: the results.
+        confirm: number of cells on each side of the edges to run live; None: none.
+        draw: function that draws the map; None: no map.
+        as_json: print the results as JSON.
+    """
     from ..studies.sweep.sweep_results import describe_sweep_plan, read_results
 
     results = read_results(path)
@@ -346,7 +397,7 @@ def _show_results(
         terminal.print_json(results.to_dict())
 
 
-_OF_A_PLAN = (
+_PLAN_OPTIONS = (
     "--over",
     "--seeds",
     "--law",
@@ -357,19 +408,22 @@ _OF_A_PLAN = (
     "--set",
     "--duration",
 )
+"""Options that define a sweep, and that its results fix."""
 
 
-def _refuse_beside_results(given: Sequence[str]) -> None:
-    for name in _OF_A_PLAN:
-        if name in given:
-            raise UsageError(f"{name} is of the sweep already: leave it out")
-    if "--margin" in given:
-        raise UsageError("--margin is of a scenario, and searches anew: name that")
+def _refuse_plan_options(used_options: Sequence[str]) -> None:
+    """Refuses options that define a sweep, if its results are given."""
+    for name in _PLAN_OPTIONS:
+        if name in used_options:
+            raise UsageError(f"{name} belongs to the sweep already: leave it out")
+    if "--margin" in used_options:
+        raise UsageError("--margin starts a new search in a scenario: name the scenario")
 
 
 def parse_seed_count(text: str | None) -> int | list[int]:
-    """Returns the number of seeds of a text such as 10, or the seeds of 1..20, 1,5,9 or 7,; 1
-    for None.
+    """Returns the number of seeds of a text such as 10, or the seeds of 1..20, 1,5,9 or 7,.
+
+    It is 1 for None.
     """
     if text is None:
         return 1
@@ -383,6 +437,6 @@ def _is_results(source: str) -> bool:
     from ..scenario import list_shipped
     from ..studies.sweep.sweep_results import PLAN_FILE
 
-    return source not in list_shipped() and (
-        source.endswith(".csv") or (Path(source) / PLAN_FILE).exists()
-    )
+    if source in list_shipped():
+        return False
+    return source.endswith(".csv") or (Path(source) / PLAN_FILE).exists()

@@ -311,7 +311,7 @@ class _TickRun(NamedTuple):
 
     site: int
     first: int
-    count: int
+    ticks: int
 
 
 class _SpanPart(NamedTuple):
@@ -465,10 +465,10 @@ class _SpanMap:
         now = run.first + self._rows[i] - 1
         P = self._P[i]
         state = tracks[i][now]
-        next_states = tracks[i][now + 1 : now + 1 + run.count]
+        next_states = tracks[i][now + 1 : now + 1 + run.ticks]
         next_states[:] = 0.0
         for peer, rows, effect in self._peer_effects[i]:
-            samples = tracks[peer][rows[run.first : run.first + run.count]]
+            samples = tracks[peer][rows[run.first : run.first + run.ticks]]
             next_states += effect @ samples
         for next_state in next_states:
             next_state += P @ state

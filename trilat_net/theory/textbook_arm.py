@@ -395,7 +395,8 @@ def _find_quaternion(R: Numbers) -> Numbers:
     largest = sizes.argmax(axis=0)[np.newaxis, np.newaxis]
     quaternion = np.take_along_axis(products, largest, axis=0)[0]
     quaternion = quaternion / np.sqrt(np.sum(quaternion * quaternion, axis=0))
-    return np.where(quaternion[0].real < 0.0, -quaternion, quaternion)
+    with_positive_w: Numbers = np.where(quaternion[0].real < 0.0, -quaternion, quaternion)
+    return with_positive_w
 
 
 def relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:

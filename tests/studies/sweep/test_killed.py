@@ -82,7 +82,7 @@ def test_killed_interrupted_and_resumed_it_comes_to_the_same_bytes(tmp_path: Pat
     kept = len(keys(parts / JOURNAL_FILE))
     assert code == 130
     assert err.splitlines() == [
-        f"{kept} runs are done and kept; go on with: trilat sweep --resume parts",
+        f"{kept} runs are done and kept; continue with: trilat sweep --resume parts",
         "interrupted",
     ]
     assert done + 10 <= kept < RUNS
