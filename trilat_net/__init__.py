@@ -6,9 +6,9 @@
     log["m1"].t_s, log["m1"].q
     tn.certify(log)
 
-One `Site.step` and three drivers: live over a network, in virtual time, and again from a log.
-The same code gives the same numbers, bit for bit. What a function finds is an object with
-`summary()`, `to_frame()` and `to_dict()`; docs/python.md lists them all.
+One `Site.step` has three drivers: live over a network, in virtual time, and again from a log.
+The same code gives the same numbers, bit for bit. Functions return objects with `summary()`,
+`to_frame()` and `to_dict()`; docs/python.md lists them all.
 """
 
 from importlib import import_module as _import_module
@@ -97,7 +97,8 @@ _NAMES = {
     "sites.running_session": "hand session start",
     "trilat_net.analysis.file_overview": "info",
     "trilat_net.analysis.twin_growth": "twin",
-    "trilat_net.api": "bench certify export linear margin metrics report simulate sweep tune verify view",
+    "trilat_net.api": "bench certify export linear margin metrics report simulate sweep tune "
+    "verify view",
     "trilat_net.core.compiled_law": "compiled",
     "trilat_net.core.own_hand": "HandContext HandView",
     "trilat_net.core.user_law": "LawContext LawInput",
@@ -117,37 +118,39 @@ _NAMES = {
     "trilat_net.scenario.simulated_arm": "SimulatedArm",
     "trilat_net.scenario.skeletons": "new_hand new_law new_plant",
     "trilat_net.studies.arm_gains": "tune_arm",
-    "trilat_net.studies.experiment.experiment_analysis": "analyse_experiment compute_experiment_power",
-    "trilat_net.studies.experiment.experiment_run": "check_experiment new_experiment open_experiment "
-    "run_experiment",
+    "trilat_net.studies.experiment.experiment_analysis": "analyse_experiment "
+    "compute_experiment_power",
+    "trilat_net.studies.experiment.experiment_run": "check_experiment new_experiment "
+    "open_experiment run_experiment",
     "trilat_net.studies.gym_environment": "make_env",
     "trilat_net.studies.hand_impedance": "identify_hand",
     "trilat_net.studies.log_comparison": "compare",
     "trilat_net.studies.trials": "check trials",
 }
-"""By module what is offered of it."""
+"""The public names of each module."""
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 __all__ = sorted(["__version__", *_MODULES])
 
 
 def __getattr__(name: str) -> _Any:
-    """Imports the parts on first use: `trilat --help` needs none of them, and Numba takes a
-    second.
+    """Imports a name's module on first use.
+
+    `trilat --help` needs none of them, and Numba takes a second to import.
     """
     if name == "__version__":
         from .files import find_version
 
         return find_version()
     if name in _MODULES:
-        return _import_part(name)
+        return _import_name(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-def _import_part(name: str) -> _Any:
-    """Returns what is offered by this name; if a package is missing, a stand-in that says so
-    when called.
+def _import_name(name: str) -> _Any:
+    """Returns the object of a public name; if a package is missing, a function that says so.
 
-    Programs look for names (`hasattr`, `dir`, completion) without the wish to use them.
+    An error would be wrong here: programs look names up (`hasattr`, `dir`, completion) without
+    using them.
     """
     from .errors import UsageError
 
@@ -161,13 +164,14 @@ def _import_part(name: str) -> _Any:
             raise
         from .files import STUDY_LIBRARIES
 
-        in_core = "which trilat-net-core does without: pip install trilat-net"
-        remedy = in_core if package in STUDY_LIBRARIES else "which is not installed"
+        remedy = "which is not installed"
+        if package in STUDY_LIBRARIES:
+            remedy = "which trilat-net-core does without: pip install trilat-net"
         return _make_stand_in(name, f"this needs {package}, {remedy}")
 
 
 def _make_stand_in(name: str, problem: str) -> _Any:
-    """Returns a function that stands for one whose package is missing."""
+    """Returns a function that raises UsageError, in place of one whose package is missing."""
     from .errors import UsageError
 
     def stand_in(*_args: _Any, **_settings: _Any) -> _Any:

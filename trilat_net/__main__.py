@@ -1,8 +1,11 @@
-"""Entry point of `trilat` and `python -m trilat_net`; who stops arms does not wait for other
-commands.
+"""Entry point of `trilat` and `python -m trilat_net`.
 
-Invariant: what is printed into a file or pipe is UTF-8 with the line ends of POSIX on every
-system, like any text that is written; a terminal that lacks a letter shows its number.
+`trilat stop` runs before the other commands are loaded, so that arms stop without delay.
+
+Invariant:
+    - Text that is printed into a file or pipe is UTF-8 with POSIX line ends on every system, as
+      in all files that are written.
+    - A terminal that lacks a character shows its number.
 """
 
 import atexit
@@ -15,7 +18,7 @@ from contextlib import suppress
 
 def main() -> None:
     """Runs `trilat`."""
-    # with Python's own thresholds a ninth of the start is spent there
+    # with Python's default thresholds, collections take a ninth of the start
     gc.set_threshold(100_000, 20, 20)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -23,43 +26,54 @@ def main() -> None:
                 stream.reconfigure(encoding="utf-8", newline="\n")
             stream.reconfigure(errors="backslashreplace")
     code: int | None = None
-    atexit.register(lambda: _leave(code))  # first, so that it is called last
+    # registered first, and therefore called last
+    atexit.register(lambda: _exit_before_zenoh(code))
     try:
         _run()
-    except SystemExit as ended:
-        code = ended.code if isinstance(ended.code, int) else int(ended.code is not None)
+    except SystemExit as exit_request:
+        code = int(exit_request.code is not None)
+        if isinstance(exit_request.code, int):
+            code = exit_request.code
         raise
 
 
 def _run() -> None:
+    """Runs the command of the command line; starters of processes load their modules first."""
     if sys.argv[1:2] == ["stop"]:
         if sys.platform == "linux":
-            with suppress(OSError):  # before the other programs of a busy machine, if it may
+            # ahead of other programs on a busy machine, if permitted
+            with suppress(OSError):
                 os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
         from .net.known_sites import stop_at_once
 
-        left = stop_at_once(sys.argv[2:])
-        if isinstance(left, int):
-            sys.exit(left)
-        sys.argv[2:] = left
+        remaining_arguments = stop_at_once(sys.argv[2:])
+        if isinstance(remaining_arguments, int):
+            sys.exit(remaining_arguments)
+        sys.argv[2:] = remaining_arguments
     from .cli import main as run
 
     match sys.argv[1:]:
         case ["start-processes", number, scenario_file] if number.isdecimal():
-            from recorder import record_process  # noqa: F401 - loaded once, not in each process that is started
+            # loaded once here, instead of in each process that is forked
+            from recorder import record_process  # noqa: F401
             from sites import site_process  # noqa: F401
             from sites.demo_session import run_starter
 
-            if (words := run_starter(int(number), scenario_file)) is None:
+            arguments = run_starter(int(number), scenario_file)
+            if arguments is None:
                 return
-            sys.argv[1:] = words
+            sys.argv[1:] = arguments
     run()
 
 
-def _leave(code: int | None) -> None:
-    # whose threads abort a process without Python
+def _exit_before_zenoh(code: int | None) -> None:
+    """Exits at once if Zenoh is loaded: its threads abort a process without Python.
+
+    Args:
+        code: the exit code; None: the process ends by an exception.
+    """
     if code is not None and "zenoh" in sys.modules:
-        with suppress(OSError):  # which Python says itself
+        with suppress(OSError):  # Python reports this error itself
             sys.stdout.flush()
             os._exit(code & 0xFF)
 

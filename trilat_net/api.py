@@ -1,7 +1,10 @@
-"""The Python interface: a function per command, for logs, virtual time and studies.
+"""The Python interface: one function per command, for logs, virtual time and studies.
 
-Invariant: no logic here but joining rooms. A scenario is a name, a path, a TOML text, its
-tables or a `Scenario`; a log is a path or a `Log`. What takes a network is in `session_api`.
+A scenario is a name, a path, a TOML text, its tables or a `Scenario`; a log is a path or a
+`Log`. Functions that need a network are in the package `sites`.
+
+Invariant:
+    - These functions only convert arguments and call the packages that do the work.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,15 +38,24 @@ Axes = str | Sequence[str] | Mapping[str, Any]
 
 
 def _open(log: AnyLog) -> Log:
+    """Returns an opened log."""
     return log if isinstance(log, Log) else open_log(log)
 
 
-def _texts(overrides: Overrides, duration_s: float | None) -> list[str]:
+def _list_override_texts(overrides: Overrides, duration_s: float | None) -> list[str]:
+    """Returns overrides and a duration, s, as texts KEY=VALUE."""
     from .studies.trials import list_assignments
 
-    listed = overrides if isinstance(overrides, list | tuple) else [overrides]
-    texts = list_assignments(overrides) if isinstance(overrides, Mapping) else listed
-    return [*texts, *([] if duration_s is None else [f"duration_s={duration_s}"])]
+    texts: list[Any]
+    if isinstance(overrides, Mapping):
+        texts = list(list_assignments(overrides))
+    elif isinstance(overrides, list | tuple):
+        texts = list(overrides)
+    else:
+        texts = [overrides]
+    if duration_s is not None:
+        texts.append(f"duration_s={duration_s}")
+    return texts
 
 
 def simulate(
@@ -55,7 +67,7 @@ def simulate(
 ) -> SimulatedLog:
     """Runs a scenario in virtual time and returns its log; the command is `trilat sim`.
 
-    Of a run that diverged it warns; `log.diverged_s` says when.
+    It warns if the run diverged; `log.diverged_s` is the time of divergence.
 
     >>> log = tn.simulate("two_sites", duration_s=0.1)
     >>> log["m"].q.shape
@@ -84,30 +96,32 @@ def export(
     force: bool = False,
     **settings: Any,
 ) -> Path:
-    """Exports a log to files for other tools and returns the path; the command is `trilat log
-    export`.
+    """Exports a log to files for other tools and returns the path.
+
+    The command is `trilat log export`.
 
     >>> tn.export(tn.simulate("two_sites", duration_s=0.1), "npz", "run.npz").name
     'run.npz'
 
     Args:
-        log: the log, or its path; of lerobot also several, or a folder of them.
+        log: the log, or its path; for lerobot also several logs, or a folder of logs.
         to: ros2, parquet, csv, npz, mat or lerobot.
-        out: a file, or of parquet, csv and lerobot a folder.
-        force: whether it may replace one.
-        settings: what the format lets one choose, as `fps=30`, `program="m2"` and
-            `actions="tip"` of lerobot.
+        out: path of the file, or of the folder for parquet, csv and lerobot.
+        force: replace an existing file or folder.
+        settings: settings of the format, as `fps=30`, `program="m2"` and `actions="tip"` of
+            lerobot.
 
     Raises:
-        UsageError: there is no such format or setting, a package is missing, or the place is
-            taken.
+        UsageError: there is no such format or setting, a package is missing, or the path
+            exists.
     """
     from .reporting.export import Exporter
 
     exporter = Exporter(to, Path(out), force=force, settings=settings)
-    given = [log] if isinstance(log, str | Path | Log) else log
-    paths = [one for one in given if not isinstance(one, Log)]
-    exporter.export(*(one for one in given if isinstance(one, Log)), *open_logs(*paths))
+    all_logs = [log] if isinstance(log, str | Path | Log) else log
+    opened = [entry for entry in all_logs if isinstance(entry, Log)]
+    paths = [entry for entry in all_logs if not isinstance(entry, Log)]
+    exporter.export(*opened, *open_logs(*paths))
     return Path(out)
 
 
@@ -118,17 +132,17 @@ def verify(
     min_coverage: float = MIN_COVERAGE,
     resume_every: int = 0,
 ) -> LogCheckReport:
-    """Executes a log again and compares every computed field; the command is `trilat verify`.
+    """Executes a log again and compares all computed fields; the command is `trilat verify`.
 
     >>> tn.verify(tn.simulate("two_sites", duration_s=0.1)).passed
     True
 
     Args:
         log: the log, or its path.
-        virtual: whether to compare with virtual time too.
-        min_coverage: the least share of every site's ticks that must be judged to pass.
-        resume_every: at every tick that it divides a site starts afresh from the records, so
-            that what a law of one's own knows besides shows; 0: at none.
+        virtual: compare with virtual time too.
+        min_coverage: least share of each site's ticks that must be judged to pass.
+        resume_every: restart sites from the records every so many ticks, which reveals state
+            of a user-written law that the records lack; 0: never.
 
     Raises:
         LogError: the log cannot be read.
@@ -152,11 +166,10 @@ def certify(
 
     Args:
         log: the log, or its path.
-        min_coverage: the least share of every site's ticks that must be judged for a stable
-            run.
-        own_laws: whether code of laws from outside may run, for the energies that they declare,
-            and twins.
-        twins: how many twins of the run get a small push; 0: none.
+        min_coverage: least share of each site's ticks that must be judged for a stable run.
+        own_laws: code of imported laws may be executed, for the energies that they declare and
+            for twins.
+        twins: number of twins of the run with a small push.
 
     Raises:
         LogError: the log cannot be read.
@@ -167,8 +180,9 @@ def certify(
 
 
 def metrics(log: AnyLog) -> LogMetrics:
-    """Measures a run: tracking, effort, energies, force sharing, network; the command is
-    `trilat metrics`.
+    """Measures a run: tracking, effort, energies, force sharing, network.
+
+    The command is `trilat metrics`.
 
     >>> found = tn.metrics(tn.simulate("two_sites", duration_s=0.1))
     >>> found.sites["m"]["rms_error_rad"].value > 0.0
@@ -190,13 +204,13 @@ def report(
     True
 
     Args:
-        log: the log's path, or the log that was opened from it.
+        log: the log's path, or a log that was opened from a file.
         out: the folder; by default the file's name without .mcap.
-        force: whether the folder may hold something already.
-        png: whether every figure is written as a PNG file too.
+        force: use a folder that is not empty.
+        png: write every figure as a PNG file too.
 
     Raises:
-        UsageError: the folder holds something, or the log is in no file.
+        UsageError: the folder is not empty, or the log is not in a file.
     """
     from .reporting.conclude import conclude
 
@@ -204,7 +218,7 @@ def report(
     first = Path(opened.sources[0])
     if not first.is_file():
         raise UsageError(
-            "a report is of a log in a file: save it first, as in log.save('run.mcap')"
+            "a report needs a log in a file: save it first, as in log.save('run.mcap')"
         )
     folder = first.with_suffix("") if out is None else Path(out)
     return conclude(opened, make_results_folder(folder, "", force=force), png=png)
@@ -220,8 +234,9 @@ def linear(
     ports: bool = True,
     operators: Sequence[str | Path] = (),
 ) -> "LinearAnalysis":
-    """Linearises the loop about its equilibrium: roots, margins, ports; the command is `trilat
-    linear`.
+    """Linearises the loop about its equilibrium: roots, margins, ports.
+
+    The command is `trilat linear`.
 
     >>> tn.linear("p_d_margin", {"control.d": 0.9}, ports=False).verdict
     'unstable'
@@ -230,11 +245,12 @@ def linear(
         scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
             scenario.
         set: overrides, as in `{"control.d": 0.9}`.
-        pose: the angles of all sites, rad; by default those at which a run ends.
-        roots: how many roots.
-        over: ranges in which to find where stability changes, as in `["control.d=0.1:3"]`.
-        ports: whether to analyse the impedances that operators feel, and passivity.
-        operators: files of measured operators, of `trilat identify hand --json`.
+        pose: joint angles of all sites, rad; by default those at the end of a run.
+        roots: number of roots.
+        over: ranges of keys in which edges of stability are searched, as in
+            `["control.d=0.1:3"]`.
+        ports: analyse passivity and the impedances that operators feel.
+        operators: files of measured operators, from `trilat identify hand --json`.
 
     Raises:
         ScenarioError: the scenario is not valid, or has no linear loop.
@@ -244,14 +260,14 @@ def linear(
     from .theory.linear_analysis import analyse_linear_loop
 
     try:
-        fixed = None if pose is None else tuple(map(float, pose))
+        angles = None if pose is None else tuple(map(float, pose))
     except (TypeError, ValueError):
         raise UsageError(
-            f"a pose is of angles in rad, as in (0.1, 0.3), not {pose!r}"
+            f"a pose consists of angles in rad, as in (0.1, 0.3), not {pose!r}"
         ) from None
     return analyse_linear_loop(
         load_scenario(scenario, set),
-        pose=fixed,
+        pose=angles,
         roots=roots,
         over=over,
         ports=ports,
@@ -274,11 +290,12 @@ def sweep(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "SweepResults":
-    """Runs a scenario over a grid of its keys and classifies stability; the command is `trilat
-    sweep`.
+    """Runs a scenario over a grid of its keys and classifies stability.
 
-    >>> found = tn.sweep("p_d_margin", {"control.d": [0.3, 3.0]}, duration_s=2, out="grid",
-    jobs=1)
+    The command is `trilat sweep`.
+
+    >>> axes = {"control.d": [0.3, 3.0]}
+    >>> found = tn.sweep("p_d_margin", axes, duration_s=2, out="grid", jobs=1)
     >>> len(found.rows)
     2
 
@@ -287,34 +304,36 @@ def sweep(
             scenario.
         over: the axes, as in `{"link.delay_ms": range(0, 1601, 50)}`: lists or arrays of values
             by key; or as texts, `["link.delay_ms=0:1600:50"]`.
-        set: what is to be changed everywhere, as in `{"control.Kd": 5}`.
-        seeds: how many, or which.
-        laws: names of laws, or classes, to sweep besides.
-        duration_s: how long a cell runs at first, s.
-        longest_s: how long at most, s; by default eight times that, or just that if twins
-            judge.
-        judge: "twins" measures the growth exponent of every cell besides its verdict.
-        metrics: keys of docs/metrics.md that are measured of every run besides; columns of the
-            rows.
+        set: overrides of all cells, as in `{"control.Kd": 5}`.
+        seeds: number of seeds, or the seeds.
+        laws: names or classes of laws to sweep as well.
+        duration_s: first duration of a cell's run, s.
+        longest_s: longest duration of an undecided cell's run, s; by default eight times
+            `duration_s`, or `duration_s` if twins judge.
+        judge: "twins" measures the growth exponent of each cell in addition to its verdict.
+        metrics: keys of docs/metrics.md that are measured of each run; they become columns of
+            the rows.
         out: folder of the results; a sweep in it is continued. By default the next free
             runs/sweep-NAME-N.
-        jobs: how many processes; None for one per core.
-        on: what runs the cells instead: a Dask scheduler's address or an executor.
+        jobs: number of processes; None: one per core.
+        on: runs the cells instead of processes: a Dask scheduler's address, or an executor.
 
     Raises:
         ScenarioError: the scenario, an axis or one of its values is not valid.
-        UsageError: the folder holds something else.
+        UsageError: the folder contains something else.
     """
     from .studies.sweep import plan_sweep, prepare_sweep_folder, run_sweep
 
-    texts = _texts(set, duration_s)
-    more: dict[str, Any] = {
-        "laws": laws,
-        "longest_s": longest_s,
-        "judge": judge,
-        "metrics": metrics,
-    }
-    plan = plan_sweep(scenario, texts, over=over, seeds=seeds, **more)
+    plan = plan_sweep(
+        scenario,
+        _list_override_texts(set, duration_s),
+        over=over,
+        seeds=seeds,
+        laws=laws,
+        longest_s=longest_s,
+        judge=judge,
+        metrics=metrics,
+    )
     folder = prepare_sweep_folder(plan, None if out is None else Path(out))
     return run_sweep(folder, jobs, on=on).results
 
@@ -335,26 +354,26 @@ def margin(
     """Searches the edge of stability along a key; the command is `trilat sweep --margin`.
 
     >>> found = tn.margin("p_d_margin", "control.d=0.2:3", tolerance=0.2, duration_s=4, jobs=1)
-    >>> [one.margin.spans[0].stable_below for one in found.found]
+    >>> [search.margin.spans[0].stable_below for search in found.found]
     [False]
 
     Args:
         scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
             scenario.
         along: the key and its range, as in "control.d=0.2:3".
-        over: axes at every point of which it is searched, as in `{"link.delay_ms": [100,
-            200]}`, as `sweep`.
-        set: what is to be changed everywhere.
-        tolerance: how wide an edge may be, relative to its value.
-        seeds: how many, or which.
-        laws: names of laws, or classes, to search besides.
-        duration_s: how long a run is at first, s.
-        jobs: how many processes; None for one per core.
-        on: what runs them instead: a Dask scheduler's address or an executor.
+        over: axes of a grid at whose points the edge is searched, as in `sweep`:
+            `{"link.delay_ms": [100, 200]}`.
+        set: overrides of all runs.
+        tolerance: largest width of an edge, relative to its value.
+        seeds: number of seeds, or the seeds.
+        laws: names or classes of laws to search as well.
+        duration_s: first duration of a run, s.
+        jobs: number of processes; None: one per core.
+        on: runs the cells instead of processes: a Dask scheduler's address, or an executor.
 
     Raises:
         ScenarioError: the scenario or one of the values is not valid.
-        UsageError: the range is none.
+        UsageError: the range is not of the form KEY=LOW:HIGH.
     """
     from .studies.sweep import plan_sweep
     from .studies.sweep.margin_search import (
@@ -365,10 +384,12 @@ def margin(
     )
     from .studies.sweep.sweep_plan import list_axes
 
-    within = parse_search_range(along, tolerance)
-    axes = [*list_axes(over), format_range_axis(within)]
-    plan = plan_sweep(scenario, _texts(set, duration_s), over=axes, seeds=seeds, laws=laws)
-    return SweepMargins(plan, within, search_margins(plan, within, jobs, on=on))
+    search_range = parse_search_range(along, tolerance)
+    axes = [*list_axes(over), format_range_axis(search_range)]
+    overrides = _list_override_texts(set, duration_s)
+    plan = plan_sweep(scenario, overrides, over=axes, seeds=seeds, laws=laws)
+    edges = search_margins(plan, search_range, jobs, on=on)
+    return SweepMargins(plan, search_range, edges)
 
 
 def tune(
@@ -385,7 +406,7 @@ def tune(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "TuningResult":
-    """Compares control laws, each tuned alike; the command is `trilat compare --tune`.
+    """Compares control laws that one procedure tunes; the command is `trilat compare --tune`.
 
     >>> found = tn.tune("free", ["p_d"], budget=2, duration_s=2, jobs=1)
     >>> [law.space.law for law in found.found]
@@ -394,16 +415,17 @@ def tune(
     Args:
         scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
             scenario.
-        laws: which laws, by names or as classes; none means all that take any number of sites.
+        laws: names or classes of the laws; empty: all laws for any number of sites.
         set: overrides, as in `{"link.delay_ms": 100}`.
-        budget: candidates per law.
+        budget: number of candidates per law.
         seed: the seed of the search.
-        seeds: seeds of the scenario that each candidate is the mean of.
-        objective: error or settling, besides effort.
-        gravity_percent: gravity that all laws assume, in % of the truth.
-        duration_s: how long a run is, s.
-        jobs: how many processes; None for one per core.
-        on: what runs them instead: a Dask scheduler's address or an executor.
+        seeds: number of seeds of the scenario over which each candidate is averaged.
+        objective: "error" or "settling", in addition to effort.
+        gravity_percent: gravity that all laws assume, in % of the true gravity.
+        duration_s: duration of a run, s.
+        jobs: number of processes; None: one per core.
+        on: runs the candidates instead of processes: a Dask scheduler's address, or an
+            executor.
 
     Raises:
         ScenarioError: the scenario is not valid, or laws cannot be compared in it.
@@ -413,7 +435,7 @@ def tune(
 
     plan = plan_tuning(
         scenario,
-        _texts(set, duration_s),
+        _list_override_texts(set, duration_s),
         laws=laws,
         budget=budget,
         seed=seed,
@@ -436,27 +458,28 @@ def bench(
     jobs: int | None = None,
     on: "Workers" = None,
 ) -> "BenchResults":
-    """Runs the suite of control laws; the command is `trilat bench`, which writes tables and
-    figures as well.
+    """Runs the benchmark suite of control laws.
 
-    >>> found = tn.bench(tasks=["free"], laws=["p_d"], links=["rtt68"], seeds=1, out="suite",
-    jobs=1)
+    The command is `trilat bench`, which writes tables and figures as well.
+
+    >>> cell = {"tasks": ["free"], "laws": ["p_d"], "links": ["rtt68"]}
+    >>> found = tn.bench(**cell, seeds=1, out="suite", jobs=1)
     >>> len(found.runs)
     1
 
     Args:
         study: full, small or round-trips.
-        tasks: some tasks alone.
-        laws: some laws alone.
+        tasks: only these tasks; empty: all.
+        laws: only these laws; empty: all.
         links: other links, as in "rtt68-loss10" or "4g".
-        seeds: how many; by default the study's.
-        confirm: what is not stable runs again for 100 s, which refutes or confirms it.
-        out: folder; a suite in it goes on. By default runs/bench-STUDY.
-        jobs: how many processes; None for one per core.
-        on: what runs them instead: a Dask scheduler's address or an executor.
+        seeds: number of seeds; by default the study's.
+        confirm: run unstable cells again for 100 s, which refutes or confirms the verdict.
+        out: folder; a suite in it is continued. By default runs/bench-STUDY.
+        jobs: number of processes; None: one per core.
+        on: runs the cells instead of processes: a Dask scheduler's address, or an executor.
 
     Raises:
-        UsageError: there is no such study, task, law or link, or the folder holds something
+        UsageError: there is no such study, task, law or link, or the folder contains something
             else.
     """
     from .studies.bench import plan_bench, prepare_bench_folder, run_bench
@@ -473,8 +496,8 @@ def view(*files: str | Path, full: bool = False, save: str | Path | None = None)
 
     Args:
         files: the log, or its parts.
-        full: whether every record is shown.
-        save: a file for Rerun to write instead of opening it.
+        full: show every record instead of the decimated channels.
+        save: path of a file for Rerun to write instead of opening the viewer.
 
     Raises:
         UsageError: Rerun is not installed, or there is no display.
@@ -483,7 +506,7 @@ def view(*files: str | Path, full: bool = False, save: str | Path | None = None)
     from .reporting.rerun_viewer import ViewerOptions, open_rerun
 
     paths = [Path(file) for file in files]
-    kept = None if save is None else Path(save)
-    open_rerun(
-        paths, lambda: open_log(*paths), ViewerOptions(full=full, web=False, save=kept), print
+    viewer_options = ViewerOptions(
+        full=full, web=False, save=None if save is None else Path(save)
     )
+    open_rerun(paths, lambda: open_log(*paths), viewer_options, print)

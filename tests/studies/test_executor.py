@@ -28,7 +28,7 @@ def test_any_executor_gives_the_results_of_this_process() -> None:
         )
     assert shown == [(n, 50) for n in range(1, 51)]
     with open_worker_pool(1) as pool:
-        assert list(pool.each(abs, [-3, 2])) == [(0, 3), (1, 2)]
+        assert list(pool.iterate_results(abs, [-3, 2])) == [(0, 3), (1, 2)]
 
 
 def test_few_items_are_taken_at_time_however_many_there_are() -> None:
@@ -40,7 +40,7 @@ def test_few_items_are_taken_at_time_however_many_there_are() -> None:
             yield n
 
     with ThreadPoolExecutor(2) as threads, open_worker_pool(None, threads) as pool:
-        results = pool.each(abs, items())
+        results = pool.iterate_results(abs, items())
         seen = [next(results) for _ in range(20)]
         results.close()  # type: ignore[attr-defined]
     assert len({n for n, _ in seen}) == 20
@@ -49,18 +49,18 @@ def test_few_items_are_taken_at_time_however_many_there_are() -> None:
 
 def test_batches_fit_the_measured_time_and_shrink_at_the_end() -> None:
     feed = _Feed(range(2000), 2000, 2)
-    assert len(feed.take(idle=True)) == 1
-    feed.measure(10, 0.2)
-    assert len(feed.take(idle=False)) == 20
+    assert len(feed.pop_batch(idle=True)) == 1
+    feed.add_timing(10, 0.2)
+    assert len(feed.pop_batch(idle=False)) == 20
     sizes = []
-    while batch := feed.take(idle=False):
+    while batch := feed.pop_batch(idle=False):
         sizes.append(len(batch))
     assert sum(sizes) == 1979
     assert sizes == sorted(sizes, reverse=True)
     assert (sizes[0], sizes[-1]) == (20, 1)
     feed = _Feed(range(10), None, 2)
-    feed.measure(1, 7.0)
-    assert len(feed.take(idle=False)) == 1
+    feed.add_timing(1, 7.0)
+    assert len(feed.pop_batch(idle=False)) == 1
 
 
 def failing(n: int) -> int:
@@ -71,7 +71,7 @@ def failing(n: int) -> int:
 
 def test_an_error_comes_after_the_results_before_it() -> None:
     with ThreadPoolExecutor(1) as threads:
-        results = WorkerPool(threads, 1).each(failing, range(9))
+        results = WorkerPool(threads, 1).iterate_results(failing, range(9))
         assert [next(results) for _ in range(5)] == [(n, n) for n in range(5)]
         with pytest.raises(ValueError, match="five"):
             next(results)
@@ -114,7 +114,7 @@ def test_an_item_that_ends_every_worker_is_named() -> None:
     pool = WorkerPool(FragileExecutor(), 2, FragileExecutor, hint="; what to do")
     with pytest.raises(RunFailed, match=f"^7 ended {MAX_LOSSES} worker processes; what to do$"):
         pool.map(abs, range(30))
-    found = dict(pool.each(abs, range(30), lambda item: -item))
+    found = dict(pool.iterate_results(abs, range(30), lambda item: -item))
     assert found == {n: -7 if n == 7 else n for n in range(30)}
 
 

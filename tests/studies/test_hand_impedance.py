@@ -149,5 +149,5 @@ def test_motion_along_a_line_is_refused() -> None:
 def test_a_file_of_no_hand_is_refused(text: str, tmp_path: Path) -> None:
     file = tmp_path / "m1.json"
     file.write_text(text, encoding="utf-8")
-    with pytest.raises(UsageError, match=r"m1\.json: holds no hand"):
+    with pytest.raises(UsageError, match=r"m1\.json: contains no hand"):
         read_hands([file])

@@ -1,20 +1,23 @@
-"""The largest gains that an arm bears over a delay: the edge along a ray of gains, and runs
-that confirm it.
+"""The largest gains for an arm over a delay: an edge along a ray of gains, confirmed by runs.
 
-    K = k m,    d + Kd = 2 zeta sqrt(k) m,    m: the largest M_ii of a joint in some poses, or
-    less
+    K = k m,    d + Kd = 2 zeta sqrt(k) m
 
-Alike arms follow one another over links of that delay. The edge is the least k, over the poses,
-at which small motions of the sampled loop grow. The gains have its damping, and its stiffness
-over the margin. They keep the same margin to the sampled-data limit, where a damping that is
-held for a tick makes the lightest motion swing from tick to tick; m is less of joints that
-share one too light. For one joint at a wall such edges are known: Gil, Avello, Rubio and
+with m of each joint the largest M_ii of its inertia in some poses, or less. Two or three such
+arms follow one another over links of that delay. The edge is the least k over the poses at
+which small motions of the sampled loop grow. The gains have the damping of the edge, and its
+stiffness divided by the margin.
+
+The gains keep the same margin to the sampled-data limit, where a damping that is held for a
+tick makes the lightest motion swing from tick to tick. If a light motion is shared by several
+joints, their m is reduced. For one joint at a wall such edges are known: Gil, Avello, Rubio and
 Florez, "Stability analysis of a 1 DOF haptic interface using the Routh-Hurwitz criterion", IEEE
 Trans. Control Systems Technology 12 (2004); over delays Hulin, Preusche and Hirzinger,
 "Stability boundary for haptic rendering: influence of physical damping", IROS 2006.
 
-Invariant: a result is a function of its arguments. Friction, stops and torque limits are left
-out: friction only helps, and limits are no matter of small motions.
+Invariant:
+    - A result is a function of its arguments.
+    - Friction, stops and torque limits are left out: friction only helps, and limits do not
+      concern small motions.
 """
 
 import math
@@ -54,55 +57,58 @@ TUNED_LAWS = tuple(
     for name, law in BUILT_IN.items()
     if {"K", "d"} <= law.tune.keys() and not getattr(law, "sends", ())
 )
-"""Those with a stiffness and a damping that send nothing but their motion."""
+"""Laws with a stiffness and a damping that send nothing but their motion."""
 SHARES = (0.95, 1.1)
-"""Of the edge, at which runs show that it is one."""
+"""Shares of the edge's k at which runs confirm the edge."""
 _PUSH = 1e-6
+"""Largest initial displacement of the first arm's joints, rad or m."""
 _SMALL = 1.0
+"""Speed from which on motions are not small, rad/s."""
 _STILL = 1e-7
-"""By how much the first arm starts aside, rad or m; from which speed on motions are not small,
-rad/s; and what share of the largest speed is rounding.
-"""
+"""Share of the largest speed that counts as rounding."""
 _SITES = {2: ("m", "s"), 3: ("m1", "m2", "s")}
 _SLACK = 0.05
+"""Share of a joint's range at each end that poses avoid."""
 _HALF_TURN = math.pi
 _HALF_SLIDE_M = 0.5
-"""Share of a joint's range that poses leave at its ends, and half of the range of one without
-limits.
-"""
+"""Half of the range of a prismatic joint without limits, m."""
 _SETTLES = 4.0
+"""Time constants of its slowest motion that a run lasts at first."""
 _SHORTEST_S = 2.0
 _LONGEST_S = 400.0
+"""Bounds of that first duration, s."""
 _EXTENSIONS = 3
-"""By how many time constants of its slowest motion a run lasts at first, within which bounds,
-s; and how often it may go on for as long again.
-"""
-_TELLS = {EnvelopeTrend.GROWS: False, EnvelopeTrend.DECAYS: True}
+"""Number of durations of a run, each twice the one before."""
+_IS_STABLE = {EnvelopeTrend.GROWS: False, EnvelopeTrend.DECAYS: True}
 _NO_GAIN = 1e-6
 _CURVE_POINTS = 9
 _EDGE_TOLERANCE = 1e-4
+"""Tolerance of the edge's ln k."""
 _FITTING_STEP = 0.9
-_GONE_PER_S = -1e3
+"""Least factor by which m is reduced in one step."""
+_NO_ROOT_PER_S = -1e3
+"""Real part that stands for a loop without roots, 1/s."""
 _DELAY = re.compile(r"(\d+\.?\d*|\.\d+) ?(us|ms|s|)")
 _UNIT_MS = {"us": 1e-3, "ms": 1.0, "": 1.0, "s": 1e3}
 
 
 @dataclass(frozen=True, repr=False)
 class ArmGains(Result):
-    """The largest gains that an arm bears, with a margin; as the keys of `trilat tune --json`.
+    """The largest gains for an arm, with a margin; with the keys of `trilat tune --json`.
 
     Attributes:
-        age_ms: the constant age of samples that stands for the delay.
-        joints: of each m, the gains with their unit, and the error at which the effort limit is
-            reached.
-        edge: k, 1/s^2, of the sampled loop over the delays in use, over a constant one, in
-            continuous time (None: never), and where damping swings from tick to tick;
-            frequency, motion, pose, what bounds K.
-        runs: at the gains (share None) and at shares of the edge's k: how fast the largest
-            speed grows (None: until motions were not small), and the roots.
-        agree: whether all runs do as the roots predict, and the one at the gains decays.
-        line: the gains, to paste above the tables of a scenario.
-        curve: delays, s, and k of the edge in the same pose, if asked for.
+        arm, law, sites, rate_hz, delay, margin, damping: the arguments.
+        age_ms: the constant age of samples that stands for the delay, ms.
+        joints: for each joint m, the gains with their unit, and the error at which the effort
+            limit is reached.
+        edge: k of the sampled loop over the delays in use, over a constant delay, in continuous
+            time (None: never), and the k from which damping swings from tick to tick, 1/s^2;
+            frequency, motion, pose, and the limit that bounds K.
+        runs: runs at the gains (share None) and at shares of the edge's k, with the growth rate
+            of the largest speed (None: motions were not small) and that of the roots.
+        agree: True if all runs behave as the roots predict, and the run at the gains decays.
+        line: the gains as a line to paste above the tables of a scenario.
+        curve: pairs of a delay, s, and k of the edge in the same pose, if requested.
     """
 
     arm: str
@@ -126,122 +132,173 @@ class ArmGains(Result):
 
     def blocks(self) -> Iterator[Block]:
         """Yields the loop, a row per joint, the edge, the runs, and the line to paste."""
-        edge = self.edge
-        about = f"damping ratio {self.damping:g}, margin {self.margin:g}"
-        yield f"{self.arm}: {self.sites} such arms, {self.law}, {self.rate_hz} Hz, {self.delay}, {about}"
-        rows = [list(row.values()) for row in self.joints]
-        cells = [
-            [f"{one:.4g}" if isinstance(one, float) else one or "-" for one in row]
-            for row in rows
-        ]
-        yield TextTable([head.replace("_", " ") for head in self.joints[0]], cells, align="lr")
-        moves = f"{CharacteristicRoot(0j, 1, tuple(edge['moves'])).description}; {edge['omega_rad_s']:.4g} rad/s"
-        yield f"edge: K = {edge['k_per_s2']:.4g} /s^2 times inertia ({moves})"
-        smooth = (
-            "none" if edge["continuous_per_s2"] is None else f"{edge['continuous_per_s2']:.4g}"
+        yield (
+            f"{self.arm}: {self.sites} such arms, {self.law}, {self.rate_hz} Hz, {self.delay}, "
+            f"damping ratio {self.damping:g}, margin {self.margin:g}"
         )
-        constant = (
-            f"{edge['constant_per_s2']:.4g} with a constant delay of {self.age_ms:.4g} ms"
-        )
-        yield f"  {constant}; {smooth} in continuous time; the {edge['bound']} bounds K"
-        yield f"  damping swings from tick to tick from {edge['limit_per_s2']:.4g} on"
-        yield f"  least in the pose {', '.join(f'{q:.3g}' for q in edge['pose'])}"
+        header = [key.replace("_", " ") for key in self.joints[0]]
+        rows = [[_format_cell(value) for value in row.values()] for row in self.joints]
+        yield TextTable(header, rows, align="lr")
+        yield from self._describe_edge()
         for run in self.runs:
-            where = "these gains" if run["share"] is None else f"{run['share']:g} of the edge"
-            found = {None: "does not tell", True: "decays", False: "grows"}[run["stable"]]
-            found += f" {run['rate_per_s']:+.3g} /s" if run["rate_per_s"] else ""
-            found += f"; by its roots {run['predicted_per_s']:+.3g} /s"
             mark = MARKS["ok" if run["agrees"] else "fail"]
-            yield MarkedText(mark, f"run of {run['ran_s']:.4g} s at {where}: {found}")
+            yield MarkedText(mark, _describe_run(run))
         yield "to paste above the first table of a scenario:"
         yield self.line
 
+    def _describe_edge(self) -> Iterator[str]:
+        """Yields lines on the edge and the sampled-data limit."""
+        edge = self.edge
+        motion = CharacteristicRoot(0j, 1, tuple(edge["moves"])).description
+        yield (
+            f"edge: K = {edge['k_per_s2']:.4g} /s^2 times inertia "
+            f"({motion}; {edge['omega_rad_s']:.4g} rad/s)"
+        )
+        continuous = "none"
+        if edge["continuous_per_s2"] is not None:
+            continuous = f"{edge['continuous_per_s2']:.4g}"
+        yield (
+            f"  {edge['constant_per_s2']:.4g} with a constant delay of {self.age_ms:.4g} ms; "
+            f"{continuous} in continuous time; the {edge['bound']} bounds K"
+        )
+        yield f"  damping swings from tick to tick from {edge['limit_per_s2']:.4g} on"
+        yield f"  least in the pose {', '.join(f'{q:.3g}' for q in edge['pose'])}"
+
+
+def _format_cell(value: Any) -> str:
+    """Returns a table's cell: a number with four digits, a text, or "-"."""
+    return f"{value:.4g}" if isinstance(value, float) else value or "-"
+
+
+def _describe_run(run: Mapping[str, Any]) -> str:
+    """Returns a sentence on a run that confirms the edge or the gains."""
+    gains = "these gains" if run["share"] is None else f"{run['share']:g} of the edge"
+    result = {None: "is undecided", True: "decays", False: "grows"}[run["stable"]]
+    if run["rate_per_s"]:
+        result += f" {run['rate_per_s']:+.3g} /s"
+    predicted = f"by its roots {run['predicted_per_s']:+.3g} /s"
+    return f"run of {run['ran_s']:.4g} s at {gains}: {result}; {predicted}"
+
 
 def _read_delay(delay: str | float) -> tuple[dict[str, Any], str]:
-    """Returns the [link] of a delay, and its words; of a log the link with the longest delays."""
+    """Returns the table [link] of a delay, and its description.
+
+    For a log it is the link with the longest median delay.
+
+    Raises:
+        UsageError: the text is no delay, or the log's delays cannot be used.
+    """
     text = str(delay).strip()
-    if found := _DELAY.fullmatch(text):
-        delay_ms = float(found[1]) * _UNIT_MS[found[2]]
+    match = _DELAY.fullmatch(text)
+    if match:
+        delay_ms = float(match[1]) * _UNIT_MS[match[2]]
         return {"delay_ms": delay_ms}, f"{delay_ms:g} ms each way"
     path = Path(text.removeprefix("measured:"))
     if path.suffix not in (".csv", ".mcap"):
         raise UsageError(
-            f"--delay reads 40ms, measured:run.mcap or a table t_s,delay_ms such as run.csv, not {text!r}"
+            "--delay reads 40ms, measured:run.mcap or a table t_s,delay_ms such as run.csv, "
+            f"not {text!r}"
         )
     link = {"model": "trace", "file": str(path), "at_end": "loop"}
     if path.suffix == ".csv":
         return link, f"the delays of {path.name}"
+    medians_ms = {}
     try:
-        delays_ms = {
-            name: read_link_delays(path, name) for name in open_log(path).scenario.links
-        }
+        for name in open_log(path).scenario.links:
+            delays_ms = [delay_ms for _, delay_ms in read_link_delays(path, name)]
+            medians_ms[name] = float(np.median(delays_ms))
     except ValueError as error:
         raise UsageError(f"--delay {text}: {error}") from None
-    longest = max(
-        delays_ms, key=lambda name: float(np.median([ms for _, ms in delays_ms[name]]))
-    )
+    longest = max(medians_ms, key=lambda name: medians_ms[name])
     return {**link, "of": longest}, f"the delays of {longest} in {path.name}"
 
 
-def _set_up_loop(
-    arm: str | Path, link: Mapping[str, Any], law: str, more: Any, **at: Any
+def _build_loop(
+    arm: str | Path,
+    link: Mapping[str, Any],
+    law: str,
+    overrides: Any,
+    *,
+    sites: int,
+    tip: str,
+    rate_hz: int,
 ) -> Scenario:
-    """Returns alike arms that follow one another, without friction and with hardly any gains."""
+    """Returns a scenario of equal arms that follow one another, without friction.
+
+    Its gains are negligible, and its limits do not act on small motions.
+
+    Args:
+        arm: path of a URDF, or the name of a shipped file.
+        link: the table [link].
+        law: the control law.
+        overrides: overrides of the scenario.
+        sites: number of arms.
+        tip: the end link.
+        rate_hz: tick rate, Hz.
+
+    Raises:
+        UsageError: the law, the number of sites or an override is not valid.
+    """
     if law not in TUNED_LAWS:
         known = ", ".join(TUNED_LAWS)
         raise UsageError(
-            f"--law {law}: has no stiffness K beside a damping d of motion alone; {known} have"
+            f"--law {law}: has no stiffness K with a damping d of motion only; {known} have"
         )
-    if (sites := at.pop("sites")) not in _SITES:
+    if sites not in _SITES:
         raise UsageError(f"--sites is 2 or 3, not {sites}")
     names = _SITES[sites]
-    tip = at.pop("tip")
+    gains = {gain: _NO_GAIN for gain in ("K", "d", "Kd") if gain in BUILT_IN[law].tune}
+    share = 1.0 / (sites - 1)
     tables = {
         "name": "tune",
         "duration_s": _SHORTEST_S,
-        **at,
+        "rate_hz": rate_hz,
         "arm": {"urdf": str(arm), "tip": tip, "stops": False},
-        "control": {
-            "law": law,
-            **{one: _NO_GAIN for one in ("K", "d", "Kd") if one in BUILT_IN[law].tune},
-        },
+        "control": {"law": law, **gains},
         "limits": {"tau_limit_nm": 1e9, "qd_limit_rad_s": _SMALL},
         "link": dict(link),
-        "sites": {one: {"role": "slave" if one == "s" else "master"} for one in names},
-        "dominance": {one: {p: 1.0 / (sites - 1) for p in names if p != one} for one in names},
+        "sites": {name: {"role": "slave" if name == "s" else "master"} for name in names},
+        "dominance": {name: {peer: share for peer in names if peer != name} for name in names},
     }
-    loaded = load_scenario(tables, more)
-    if getattr(loaded.controls[0], "gravity", 1.0) != 1.0:
+    scenario = load_scenario(tables, overrides)
+    if getattr(scenario.controls[0], "gravity", 1.0) != 1.0:
         raise UsageError(
-            "--set control.gravity: only with exact gravity is every pose one of rest"
+            "--set control.gravity: only with exact gravity is every pose an equilibrium"
         )
-    smooth = {
+    without_friction = {
         name: re.sub(r"<dynamics\b[^>/]*", "<dynamics", text)
-        for name, text in loaded.urdf.items()
+        for name, text in scenario.urdf.items()
     }
-    return msgspec.structs.replace(loaded, urdf=smooth)
+    return msgspec.structs.replace(scenario, urdf=without_friction)
 
 
 def _draw_poses(scenario: Scenario, count: int, seed: int) -> Array:
-    """Returns poses within the joints' limits, shape (count, n)."""
+    """Returns random poses within the joints' limits, shape (count, n)."""
     ranges = []
-    for joint in read_arm(scenario.sites[scenario.names[0]].arm, scenario.urdf).joints:
+    model = read_arm(scenario.sites[scenario.names[0]].arm, scenario.urdf)
+    for joint in model.joints:
         half = _HALF_SLIDE_M if joint.kind == "prismatic" else _HALF_TURN
         middle = min(max(joint.lower, 0.0), joint.upper)
         ranges.append((max(joint.lower, middle - half), min(joint.upper, middle + half)))
     low, high = np.transpose(ranges)
-    shares = np.random.Generator(np.random.Philox(seed)).uniform(
-        _SLACK, 1.0 - _SLACK, (count, len(low))
-    )
+    random = np.random.Generator(np.random.Philox(seed))
+    shares = random.uniform(_SLACK, 1.0 - _SLACK, (count, len(low)))
     return np.asarray(low + (high - low) * shares)
 
 
 class _GainSearch:
-    """The loop of alike arms in some poses, for the gains of a ray.
+    """The loop of equal arms in some poses, for the gains of a ray.
+
+    Args:
+        scenario: the loop.
+        poses: the poses, shape (count, n).
+        margin: factor by which K is below the edge.
+        damping: damping ratio of the gains.
+        quantile: quantile of varying ages that stands for a constant age.
 
     Attributes:
-        conditions: of the loop; `held` with the constant age `age_s` of samples, where theirs
-            varies.
+        conditions: conditions of the loop.
+        constant_conditions: the same with the constant age `age_s` of samples, if ages vary.
         inertia: m, shape (n,).
     """
 
@@ -251,59 +308,69 @@ class _GainSearch:
         self._scenario = scenario
         self._poses = poses
         self._margin = margin
-        # at the edge, where K is larger by the margin
-        self._damping = damping = damping / math.sqrt(margin)
-        self.conditions = self.held = derive_operating_conditions(scenario)
-        self.rate_hz = self.held.sites[0].rate_hz
+        # the damping ratio at the edge, where K is larger by the margin
+        self._damping = damping / math.sqrt(margin)
+        self.conditions = derive_operating_conditions(scenario)
+        self.constant_conditions = self.conditions
+        self.rate_hz = self.conditions.sites[0].rate_hz
         if self.conditions.varying:
             used = find_samples_in_use(self.conditions).used.values()
-            ages = np.concatenate([np.arange(len(one)) - one for one in used])
-            self.held = self.delay_by(
-                float(np.quantile(ages, quantile, method="higher")) / self.rate_hz
-            )
-        self.age_s = float(self.held.age_s.max())
-        # the heaviest mass is stable up to k = (2 zeta / T)^2, where the damping shall have its margin
-        self._least = (2.0 * damping / self.age_s) ** 2
+            ages = np.concatenate([np.arange(len(samples)) - samples for samples in used])
+            age = float(np.quantile(ages, quantile, method="higher"))
+            self.constant_conditions = self.fix_age(age / self.rate_hz)
+        self.age_s = float(self.constant_conditions.age_s.max())
+        # the heaviest mass is stable up to this k, (2 zeta / T)^2; there the damping shall have
+        # its margin to the sampled-data limit
+        self._least = (2.0 * self._damping / self.age_s) ** 2
         model = scenario.arms[scenario.names[0]]
-        most = 1.0 if scenario.scheme == "second_order" else 2.0
-        self._swings_per_s = most * self.rate_hz
+        largest_factor = 1.0 if scenario.scheme == "second_order" else 2.0
+        self._swings_per_s = largest_factor * self.rate_hz
         self._M = [model.inertia(q) for q in poses]
         self.inertia: Array = np.max([np.diag(M) for M in self._M], axis=0)
-        wanted = self._swings_per_s / (2.0 * damping * math.sqrt(self._least) * margin)
-        while (found := self._find_lightest())[0] > wanted * (1.0 + _EDGE_TOLERANCE):
-            shares = found[1] / found[1].max()
-            self.inertia = self.inertia * max(wanted / found[0], _FITTING_STEP) ** shares
+        self._fit_inertia()
+
+    def _fit_inertia(self) -> None:
+        """Reduces m of the joints of the lightest motion until its damping has the margin."""
+        divisor = 2.0 * self._damping * math.sqrt(self._least) * self._margin
+        allowed = self._swings_per_s / divisor
+        ratio, participation = self._find_lightest()
+        while ratio > allowed * (1.0 + _EDGE_TOLERANCE):
+            shares = participation / participation.max()
+            self.inertia = self.inertia * max(allowed / ratio, _FITTING_STEP) ** shares
+            ratio, participation = self._find_lightest()
 
     def _find_lightest(self) -> tuple[float, Array]:
-        """Returns the largest eigenvalue of m M^-1 in a pose, and the joints' shares in that
-        motion.
-        """
+        """Returns the largest eigenvalue of m M^-1 over the poses, and the joints' shares."""
         root = np.sqrt(self.inertia)
         pairs = [np.linalg.eigh(root * np.linalg.inv(M) * root[:, np.newaxis]) for M in self._M]
         values, vectors = max(pairs, key=lambda pair: float(pair[0][-1]))
         return float(values[-1]), vectors[:, -1] ** 2
 
-    def delay_by(self, age_s: float) -> OperatingConditions:
-        """Returns the conditions with one constant age of samples."""
-        same: Array = np.where(self.conditions.age_s > 0.0, age_s, 0.0)
-        return self.conditions._replace(age_s=same, varying=False)
+    def fix_age(self, age_s: float) -> OperatingConditions:
+        """Returns the conditions with one constant age of samples, s."""
+        ages_s: Array = np.where(self.conditions.age_s > 0.0, age_s, 0.0)
+        return self.conditions._replace(age_s=ages_s, varying=False)
 
-    def at(self, k: float, softer: float = 1.0) -> Any:
-        """Returns the law at k, 1/s^2; with its stiffness divided by `softer`. Gains have four
-        digits.
+    def build_law(self, k: float, softer: float = 1.0) -> Any:
+        """Returns the law with the gains at k, rounded to four digits.
 
-        What damps has the shares of the law's defaults.
+        Damping gains have the same ratio as the law's defaults.
+
+        Args:
+            k: position on the ray of gains, 1/s^2.
+            softer: divisor of the stiffness.
         """
         law: Any = self._scenario.controls[0]
-        usual = {
+        defaults = {
             name: getattr(law.kind, name)[0] for name in ("d", "Kd") if name in law.kind.tune
         }
-        D = 2.0 * self._damping * math.sqrt(k) * self.inertia / sum(usual.values())
-        gains = {
-            "K": k / softer * self.inertia,
-            **{name: one * D for name, one in usual.items()},
+        damping = 2.0 * self._damping * math.sqrt(k) * self.inertia / sum(defaults.values())
+        gains = {"K": k / softer * self.inertia}
+        gains |= {name: default * damping for name, default in defaults.items()}
+        rounded = {
+            name: tuple(float(f"{value:.4g}") for value in values)
+            for name, values in gains.items()
         }
-        rounded = {name: tuple(float(f"{x:.4g}") for x in own) for name, own in gains.items()}
         return msgspec.structs.replace(law, **rounded)
 
     def find_root(
@@ -313,10 +380,10 @@ class _GainSearch:
         sites = tuple(site._replace(gains=law.linear_gains(site.theta)) for site in loop.sites)
         theta = np.array([site.theta for site in sites])
         rest = Equilibrium(np.tile(pose, (len(sites), 1)), theta, "a pose", 0.0)
-        found = find_rightmost_root(loop._replace(sites=sites), rest, sampled=sampled)
-        return found or CharacteristicRoot(complex(_GONE_PER_S), 1, ())
+        root = find_rightmost_root(loop._replace(sites=sites), rest, sampled=sampled)
+        return root or CharacteristicRoot(complex(_NO_ROOT_PER_S), 1, ())
 
-    def find_least(
+    def find_least_edge(
         self,
         loop: OperatingConditions,
         poses: Iterable[Array],
@@ -324,84 +391,99 @@ class _GainSearch:
         *,
         sampled: bool = True,
     ) -> tuple[float, Array]:
-        """Returns the least k at which small motions grow in a pose, and that pose; inf if in
-        none.
+        """Returns the least k at which small motions grow in a pose, and that pose.
 
-        Under delays that vary they may grow, and not, and grow again: then the first steps are
-        small.
+        k is inf if motions grow in no pose. Under varying delays motions may grow, decay and
+        grow again with rising k; therefore the first steps of the search are small.
+
+        Args:
+            loop: conditions of the loop.
+            poses: the poses.
+            start: first k of the search.
+            sampled: analyse the sampled loop.
         """
         edge = math.inf
-        worst = self._poses[0]
-        small = np.arange(15) * math.log(1.1)
+        worst_pose = self._poses[0]
         steps = np.arange(24) * math.log(2.0)
-        steps = np.append(small, math.log(4.0) + steps) if loop.varying else steps
+        if loop.varying:
+            small_steps = np.arange(15) * math.log(1.1)
+            steps = np.append(small_steps, math.log(4.0) + steps)
         for pose in poses:
 
             def growth(log_k: float, pose: Array = pose) -> float:
-                return self.find_root(
-                    self.at(math.exp(log_k)), pose, loop, sampled=sampled
-                ).s.real
+                law = self.build_law(math.exp(log_k))
+                return self.find_root(law, pose, loop, sampled=sampled).s.real
 
-            tried = (
-                math.log(start) + steps
-                if edge == math.inf
-                else [math.log(edge) - 10.0 * _EDGE_TOLERANCE]
-            )
-            high = next((one for one in tried if growth(one) > 0.0), None)
-            if high is not None:
-                low = next((one for one in high - steps[1:] if growth(one) <= 0.0), None)
-                if low is None:
-                    raise UsageError(f"--arm: no gains are stable in the pose {pose.tolist()}")
-                edge = math.exp(brentq(growth, low, high, xtol=_EDGE_TOLERANCE))
-                worst = pose
-        return edge, worst
+            candidates: Iterable[float] = math.log(start) + steps
+            if edge != math.inf:
+                # only a pose with a lower edge matters
+                candidates = [math.log(edge) - 10.0 * _EDGE_TOLERANCE]
+            high = next((log_k for log_k in candidates if growth(log_k) > 0.0), None)
+            if high is None:
+                continue
+            low = next((log_k for log_k in high - steps[1:] if growth(log_k) <= 0.0), None)
+            if low is None:
+                raise UsageError(f"--arm: no gains are stable in the pose {pose.tolist()}")
+            edge = math.exp(brentq(growth, low, high, xtol=_EDGE_TOLERANCE))
+            worst_pose = pose
+        return edge, worst_pose
 
     def find_edge(self) -> dict[str, Any]:
-        constant, pose = self.find_least(self.held, self._poses, self._least)
+        """Returns the edge and the sampled-data limit, see `ArmGains.edge`."""
+        constant, pose = self.find_least_edge(
+            self.constant_conditions, self._poses, self._least
+        )
         k = constant
         continuous = math.inf
         link = next(iter(self._scenario.links.values()))
         varies = self.conditions.varying
         delay_s = self.age_s if varies else 1e-3 * link.moments().mean_ms
-        if delay_s > 0.0:  # without a delay such a loop is passive
-            continuous, _ = self.find_least(
-                self.delay_by(delay_s), [pose], self._least, sampled=False
-            )
+        if delay_s > 0.0:  # without a delay the continuous loop is passive
+            fixed = self.fix_age(delay_s)
+            continuous, _ = self.find_least_edge(fixed, [pose], self._least, sampled=False)
         if varies:
-            k, _ = self.find_least(self.conditions, [pose], 0.5 * constant)
-        limit = (self._swings_per_s / (2.0 * self._damping * self._find_lightest()[0])) ** 2
-        root = self.find_root(self.at(k), pose, self.conditions)
-        damped = limit / self._margin**2
-        by_rate = damped < 1.001 * max(self._least, min(k, constant))
+            k, _ = self.find_least_edge(self.conditions, [pose], 0.5 * constant)
+        lightest, _ = self._find_lightest()
+        limit = (self._swings_per_s / (2.0 * self._damping * lightest)) ** 2
+        root = self.find_root(self.build_law(k), pose, self.conditions)
+        limit_with_margin = limit / self._margin**2
+        tick_rate_bounds = limit_with_margin < 1.001 * max(self._least, min(k, constant))
         return {
             "k_per_s2": k,
             "constant_per_s2": constant,
             "continuous_per_s2": finite_or_none(continuous),
             "limit_per_s2": limit,
-            "used_per_s2": min(k, constant, damped),
+            "used_per_s2": min(k, constant, limit_with_margin),
             "omega_rad_s": root.s.imag,
             "moves": list(root.states),
             "pose": pose.tolist(),
-            "bound": "tick rate" if by_rate else "delay",
+            "bound": "tick rate" if tick_rate_bounds else "delay",
         }
 
     def trace_edge(self, pose: Array) -> list[tuple[float, float]]:
-        """Returns delays about the age, s, each with k of the sampled loop at the edge in a
-        pose.
-        """
+        """Returns pairs of a delay, s, and the k of the sampled loop's edge in a pose."""
         most = max(4.0 * self.age_s * self.rate_hz, 8.0)
         ages_s = np.unique(np.round(np.geomspace(1.0, most, _CURVE_POINTS))) / self.rate_hz
-        found = [
-            self.find_least(self.delay_by(T), [pose], (2.0 * self._damping / T) ** 2)
-            for T in ages_s
-        ]
-        return [(float(T), k) for T, (k, _) in zip(ages_s, found, strict=True)]
+        curve = []
+        for age_s in ages_s:
+            start = (2.0 * self._damping / age_s) ** 2
+            k, _ = self.find_least_edge(self.fix_age(age_s), [pose], start)
+            curve.append((float(age_s), k))
+        return curve
 
     def confirm(
         self, law: Any, share: float | None, pose: Array, push: Array
     ) -> dict[str, Any]:
-        """Runs from a pose, the first arm pushed aside, until it is told whether small motions
-        decay.
+        """Runs from a pose with the first arm displaced, until motions decay or grow.
+
+        Args:
+            law: the law with its gains.
+            share: share of the edge's k, for the result; None: the tuned gains.
+            pose: the pose.
+            push: displacement of the first arm, shape (n,), rad or m.
+
+        Returns:
+            The run as in `ArmGains.runs`.
         """
         predicted_per_s = self.find_root(law, pose, self.conditions).s.real
         sites = {
@@ -411,7 +493,8 @@ class _GainSearch:
             for n, (name, spec) in enumerate(self._scenario.sites.items())
         }
         run = FusedRun(msgspec.structs.replace(self._scenario, sites=sites))
-        first_s = max(_SHORTEST_S, _SETTLES / max(abs(predicted_per_s), _SETTLES / _LONGEST_S))
+        slowest_per_s = max(abs(predicted_per_s), _SETTLES / _LONGEST_S)
+        first_s = max(_SHORTEST_S, _SETTLES / slowest_per_s)
         for end_s in (first_s * 2.0 ** np.arange(_EXTENSIONS)).tolist():
             run.advance_to(end_s)
             speed = np.max([site[:, 1] for site in run.maxima], axis=0)
@@ -419,14 +502,14 @@ class _GainSearch:
             fit = fit_envelopes(
                 t_s, speed[:, np.newaxis], _STILL * speed.max(), falls_first=True
             )[0]
-            left = run.diverged_s is not None
-            if left or fit.trend in _TELLS:
+            diverged = run.diverged_s is not None
+            if diverged or fit.trend in _IS_STABLE:
                 break
-        stable = False if left else _TELLS.get(fit.trend)
+        stable = False if diverged else _IS_STABLE.get(fit.trend)
         return {
             "share": share,
             "predicted_per_s": predicted_per_s,
-            "rate_per_s": None if left else finite_or_none(fit.rate_per_s),
+            "rate_per_s": None if diverged else finite_or_none(fit.rate_per_s),
             "ran_s": run.ran_s,
             "stable": stable,
             "agrees": stable is (predicted_per_s < 0.0),
@@ -450,29 +533,32 @@ def tune_arm(
     curve: bool = False,
     progress: Progress = ignore_progress,
 ) -> ArmGains:
-    """Returns the largest gains with which alike arms follow one another stably; as `trilat
-    tune`.
+    """Returns the largest gains with which equal arms follow one another stably.
+
+    The command is `trilat tune`.
 
     >>> found = tn.tune_arm("arm6.urdf", "40ms", poses=2)
     >>> found.agree, len(found.joints)
     (True, 6)
 
     Args:
-        arm: path of a URDF, or the name of a shipped one.
-        delay: of each link: "40ms", a number of ms, a table t_s,delay_ms, or a log, as
+        arm: path of a URDF, or the name of a shipped file.
+        delay: delay of each link: "40ms", a number of ms, a table t_s,delay_ms, or a log, as
             "measured:run.mcap".
         law: p_d, pd_d or saturated_pd.
         set: overrides of the loop, as in `{"arm.armature_kg_m2": 0.1}`.
-        tip: the end link; "": the only one that nothing hangs on.
+        tip: the end link; "": the only link without a child.
         sites: 2, or 3 with equal shares.
         rate_hz: tick rate, Hz.
-        margin: by how much K is below the edge, and the damping below its sampled-data limit.
-        damping: the damping ratio of inertia m against a peer that stands.
-        quantile: of delays that vary, the one that the edge of a constant delay is for.
-        poses: how many poses within the joints' limits are tried.
+        margin: factor by which K is below the edge, and the damping below its sampled-data
+            limit.
+        damping: damping ratio of inertia m against a peer that stands still.
+        quantile: quantile of varying delays for which the edge of a constant delay is computed.
+        poses: number of poses within the joints' limits.
         seed: seed of the poses.
-        curve: whether to find the edge over the delay too, for a figure.
-        progress: called with the steps done, and in all: the edge, and each run.
+        curve: compute the edge over the delay too, for a figure.
+        progress: called with the number of finished steps and of all steps: the edge and each
+            run.
 
     Raises:
         ScenarioError: the file, its tip or an override is not valid.
@@ -482,12 +568,13 @@ def tune_arm(
         "margin": (margin, 1.0, 100.0),
         "damping": (damping, 0.01, 10.0),
         "poses": (poses, 1, 1000),
+        "quantile": (quantile, 0.0, 1.0),
     }
-    for name, (value, low, high) in {**ranges, "quantile": (quantile, 0.0, 1.0)}.items():
+    for name, (value, low, high) in ranges.items():
         if not low <= value <= high:
             raise UsageError(f"{name} is from {low:g} to {high:g}, not {value:g}")
-    link, words = _read_delay(delay)
-    scenario = _set_up_loop(arm, link, law, set, sites=sites, tip=tip, rate_hz=rate_hz)
+    link, delay_text = _read_delay(delay)
+    scenario = _build_loop(arm, link, law, set, sites=sites, tip=tip, rate_hz=rate_hz)
     search = _GainSearch(
         scenario=scenario,
         poses=_draw_poses(scenario, poses, seed),
@@ -497,36 +584,54 @@ def tune_arm(
     )
     edge = search.find_edge()
     pose = np.array(edge["pose"])
-    found = search.at(edge["used_per_s2"], margin)
-    push = _PUSH * np.random.Generator(np.random.Philox(seed)).uniform(0.5, 1.0, len(pose))
-    tried = [(None, found), *((share, search.at(share * edge["k_per_s2"])) for share in SHARES)]
+    tuned_law = search.build_law(edge["used_per_s2"], margin)
+    random = np.random.Generator(np.random.Philox(seed))
+    push = _PUSH * random.uniform(0.5, 1.0, len(pose))
+    laws: list[tuple[float | None, Any]] = [(None, tuned_law)]
+    laws += [(share, search.build_law(share * edge["k_per_s2"])) for share in SHARES]
     runs = list[dict[str, Any]]()
-    for share, one in tried:
-        progress(1 + len(runs), 1 + len(tried))
-        runs.append(search.confirm(one, share, pose, push))
+    for share, run_law in laws:
+        progress(1 + len(runs), 1 + len(laws))
+        runs.append(search.confirm(run_law, share, pose, push))
     gains = {
-        name: list(getattr(found, name)) for name in ("K", "Kd", "d") if name in found.kind.tune
+        name: list(getattr(tuned_law, name))
+        for name in ("K", "Kd", "d")
+        if name in tuned_law.kind.tune
     }
-    cells = ", ".join(
-        f"{name} = {msgspec.json.encode(own).decode()}" for name, own in gains.items()
+    assignments = ", ".join(
+        f"{name} = {msgspec.json.encode(values).decode()}" for name, values in gains.items()
     )
+    return ArmGains(
+        arm=Path(arm).name,
+        law=law,
+        sites=sites,
+        rate_hz=search.rate_hz,
+        delay=delay_text,
+        age_ms=1e3 * search.age_s,
+        margin=margin,
+        damping=damping,
+        joints=_tabulate_joints(scenario, search.inertia, gains),
+        edge=edge,
+        runs=runs,
+        agree=runs[0]["stable"] is True and all(run["agrees"] for run in runs),
+        line=f'control = {{ law = "{law}", {assignments} }}',
+        curve=search.trace_edge(pose) if curve else [],
+    )
+
+
+def _tabulate_joints(
+    scenario: Scenario, inertia: Array, gains: Mapping[str, list[float]]
+) -> list[dict[str, Any]]:
+    """Returns a row per joint: m, the gains, their unit, and the error at the effort limit."""
     model = scenario.arms[scenario.names[0]]
-    units = map("/".join, zip(model.joint_units("N m"), model.joint_units("rad"), strict=True))
     errors = map(finite_or_none, np.divide(model.efforts, gains["K"]).tolist())
-    heads = ("joint", "inertia", *gains, "unit", "error_at_effort_limit")
-    columns = (model.joint_names, search.inertia.tolist(), *gains.values(), units, errors)
-    joints = [dict(zip(heads, row, strict=True)) for row in zip(*columns, strict=True)]
-    asked = (
-        Path(arm).name,
-        law,
-        sites,
-        search.rate_hz,
-        words,
-        1e3 * search.age_s,
-        margin,
-        damping,
-    )
-    agree = runs[0]["stable"] is True and all(run["agrees"] for run in runs)
-    line = f'control = {{ law = "{law}", {cells} }}'
-    over = search.trace_edge(pose) if curve else []
-    return ArmGains(*asked, joints, edge, runs, agree, line, over)
+    units = zip(model.joint_units("N m"), model.joint_units("rad"), strict=True)
+    columns = {
+        "joint": model.joint_names,
+        "inertia": inertia.tolist(),
+        **gains,
+        "unit": ["/".join(pair) for pair in units],
+        "error_at_effort_limit": list(errors),
+    }
+    rows = zip(*columns.values(), strict=True)
+    return [dict(zip(columns, row, strict=True)) for row in rows]

@@ -1,12 +1,14 @@
-"""The worker pool of all studies: runs a function on many items, here, in worker processes or
-on a cluster.
+"""The worker pool of all studies, which runs a function on many items.
 
-Any `concurrent.futures.Executor` does the work: loky's processes on this machine, a Dask
-cluster with `on="tcp://SCHEDULER:8786"`.
+Items run in this process, in worker processes (loky) or on a Dask cluster
+(`on="tcp://SCHEDULER:8786"`); any `concurrent.futures.Executor` can do the work.
 
-Invariant: what runs an item enters no result. The number of items in flight is bounded. An item
-whose worker died runs again, at most `MAX_LOSSES` times in all; the last times alone, so that
-the item that is named is the one that ends its workers.
+Invariant:
+    - Results do not depend on which worker runs an item.
+    - The number of items in flight is bounded.
+    - An item whose worker died runs again, at most `MAX_LOSSES` times in all. Its last attempt
+      is a batch of its own while nothing else runs, so that the item in the error message is
+      the one that kills its workers.
 """
 
 import textwrap
@@ -35,26 +37,25 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 Progress = Callable[[int, int], None]
-"""Called with the numbers of items done and in all."""
+"""Called with the number of finished items and the number of all items."""
 Workers = str | Executor | None
-"""What runs items: a Dask scheduler's address, an executor, or None for processes of this
-machine.
-"""
+"""The address of a Dask scheduler, an executor, or None for processes of this machine."""
 
 BATCH_S = 0.4
-"""The duration of a batch of items, about: at 20 ms an item its overhead is below 1 %."""
+"""Duration of a batch of items: with 20 ms per item its overhead is below 1 %."""
 CLUSTER_BATCH_S = 2.0
-"""The same on a cluster, where a batch costs its scheduler, its worker and this process some 20
-ms in all.
-"""
+"""The same on a cluster, where a batch costs scheduler, worker and this process about 20 ms."""
 MAX_BATCH = 400
+"""Largest number of items in a batch."""
 _SMALLEST = 16
-"""The last batches are no smaller than this part of a whole one."""
+"""The last batches have at least a full batch's number of items divided by this."""
 MAX_LOSSES = 3
+"""Number of losses of its worker after which an item is given up."""
 _BATCHES_PER_WORKER = 2
-"""One at work and one that waits, so that no worker is idle."""
+"""A batch in work and a waiting batch, so that no worker is idle."""
 _POLL_S = 1.0
 _MAX_NAME = 200
+"""Longest name of an item in an error message."""
 
 
 def ignore_progress(_done: int, _total: int) -> None:
@@ -62,7 +63,13 @@ def ignore_progress(_done: int, _total: int) -> None:
 
 
 class _BatchResult(NamedTuple):
-    """Results of the first items of a batch, how long they took, and the error of the next one."""
+    """Results of a batch.
+
+    Attributes:
+        results: results of the items up to the first error.
+        wall_s: duration of these items, s.
+        error: the first error; None if all items have a result.
+    """
 
     results: list[Any]
     wall_s: float
@@ -75,8 +82,13 @@ def run_batch(
     required: WorkerRequirements | None,
     allowed: CodeConsents,
 ) -> _BatchResult:
-    """Runs a function on the items of a batch, in whatever worker, in which the `allowed` laws
-    may run.
+    """Runs a function on the items of a batch, in a worker.
+
+    Args:
+        function: the function.
+        items: the items.
+        required: requirements on the worker; None: no requirements.
+        allowed: imported laws that may run.
 
     Raises:
         UsageError: this worker does not meet the requirements.
@@ -91,61 +103,92 @@ def run_batch(
         for item in items:
             try:
                 results.append(function(item))
-            except Exception as raised:  # raised again where the results are collected
-                error = raised
+            except Exception as raised:
+                error = raised  # `WorkerPool` raises it when it collects the results
                 break
     return _BatchResult(results, (clock.monotonic_ns() - began_ns) * 1e-9, error)
 
 
 class _Batch(NamedTuple):
+    """A batch in flight.
+
+    Attributes:
+        numbers: numbers of the items.
+        items: the items.
+        executor: the executor that runs them.
+    """
+
     numbers: list[int]
     items: list[Any]
     executor: Executor
 
 
 class _Feed(Generic[T]):
-    """The items that wait, and how many of them make the next batch."""
+    """The queue of items, which forms the batches.
+
+    Args:
+        items: the items.
+        count: number of items; None: unknown.
+        workers: number of workers.
+        batch_s: intended duration of a batch, s.
+    """
 
     def __init__(
         self, items: Iterable[T], count: int | None, workers: int, batch_s: float = BATCH_S
     ) -> None:
         self._new = enumerate(items)
-        self._left = count
+        self._remaining = count
         self._workers = workers
         self._batch_s = batch_s
-        self._again: deque[tuple[int, T]] = deque()
+        self._retries: deque[tuple[int, T]] = deque()
         self._suspects: deque[tuple[int, T]] = deque()
         self._losses: Counter[int] = Counter()
         self._runs = 0
         self._wall_s = 0.0
 
-    def measure(self, runs: int, wall_s: float) -> None:
+    def add_timing(self, runs: int, wall_s: float) -> None:
+        """Adds measured items to the mean duration per item, which sets the batch size.
+
+        Args:
+            runs: number of items.
+            wall_s: their duration together, s.
+        """
         self._runs = self._runs + runs
         self._wall_s = self._wall_s + wall_s
 
-    def take(self, *, idle: bool) -> list[tuple[int, T]]:
-        """Returns the next batch, [] if there is none now; items under suspicion wait until all
-        is idle.
+    def pop_batch(self, *, idle: bool) -> list[tuple[int, T]]:
+        """Returns the next batch as pairs of number and item; [] if there is none now.
+
+        Args:
+            idle: no batch is in flight. Only then does an item that may kill its worker leave
+                the queue.
         """
         if self._suspects:
             return [self._suspects.popleft()] if idle else []
-        if self._again:
-            return [self._again.popleft()]
-        size = (
-            min(MAX_BATCH, int(self._batch_s * self._runs / self._wall_s))
-            if self._wall_s > 0.0
-            else 1
-        )
-        if self._left is not None:  # small batches at the end leave no worker idle
-            share = self._left // (2 * self._workers * _BATCHES_PER_WORKER)
+        if self._retries:
+            return [self._retries.popleft()]
+        size = 1
+        if self._wall_s > 0.0:
+            size = min(MAX_BATCH, int(self._batch_s * self._runs / self._wall_s))
+        if self._remaining is not None:
+            # small batches at the end leave no worker idle
+            share = self._remaining // (2 * self._workers * _BATCHES_PER_WORKER)
             size = min(size, max(share, size // _SMALLEST))
         batch = list(islice(self._new, max(1, size)))
-        if self._left is not None:
-            self._left -= len(batch)
+        if self._remaining is not None:
+            self._remaining -= len(batch)
         return batch
 
-    def lose(self, batch: _Batch, losses: int = 1) -> list[tuple[int, T]]:
-        """Takes back the items of a lost batch; returns those that were lost too often."""
+    def return_lost(self, batch: _Batch, losses: int = 1) -> list[tuple[int, T]]:
+        """Puts the items of a lost batch back into the queue.
+
+        Args:
+            batch: the batch.
+            losses: number of losses that count for each item.
+
+        Returns:
+            The items that were lost `MAX_LOSSES` times and stay out of the queue.
+        """
         lost = []
         for number, item in zip(batch.numbers, batch.items, strict=True):
             self._losses[number] += losses
@@ -154,21 +197,21 @@ class _Feed(Generic[T]):
             elif self._losses[number] == MAX_LOSSES - 1:
                 self._suspects.append((number, item))
             else:
-                self._again.append((number, item))
+                self._retries.append((number, item))
         return lost
 
 
 class WorkerPool:
-    """Workers of a kind, for the length of a study.
+    """The workers of a study.
 
     Args:
-        executor: runs the batches; None: this process does.
-        workers: how many work at the same time.
-        restart: returns a new executor after the loss of a worker broke the old one; None:
-            there is none.
-        cluster: the cluster that the executor belongs to, and `required` what each of its
-            workers must have.
-        hint: what a message about a lost worker recommends.
+        executor: the executor of the batches; None: items run in this process.
+        workers: number of items that run at the same time.
+        restart: returns a new executor after the loss of a worker broke the old one; None: the
+            executor cannot be replaced.
+        cluster: the cluster to which the executor belongs.
+        required: requirements on each worker of the cluster.
+        hint: advice in the message about a lost worker.
     """
 
     def __init__(
@@ -188,25 +231,25 @@ class WorkerPool:
         self._hint = hint
         self.is_local = executor is None
 
-    def each(
+    def iterate_results(
         self,
         function: Callable[[T], R],
         items: Iterable[T],
         lost: Callable[[T], R] | None = None,
         count: int | None = None,
     ) -> Iterator[tuple[int, R]]:
-        """Yields the number of every item and the function's result, in the order in which they
-        end.
+        """Yields the number and the result of each item, in the order in which they end.
 
         Args:
-            function: of a module, so that another process can import it.
-            items: their `str` names them in messages.
-            lost: gives the result of an item that ended its workers; None: that is an error.
-            count: how many items there are, if known.
+            function: a function at module level, so that another process can import it.
+            items: the items; messages name them by their `str`.
+            lost: returns the result of an item that killed its workers; None: such an item is
+                an error.
+            count: number of items, if known.
 
         Raises:
-            RunFailed: an item ended its workers; or there are no workers any more.
-            UsageError: a worker has not what it must have.
+            RunFailed: an item killed its workers, or there are no workers any more.
+            UsageError: a worker does not meet the requirements.
         """
         if self._executor is None:
             for number, item in enumerate(items):
@@ -214,9 +257,8 @@ class WorkerPool:
                     result = function(item)
                 yield number, result
             return
-        feed = _Feed(
-            items, count, self.workers, BATCH_S if self._cluster is None else CLUSTER_BATCH_S
-        )
+        batch_s = BATCH_S if self._cluster is None else CLUSTER_BATCH_S
+        feed = _Feed(items, count, self.workers, batch_s)
         pending: dict[Future[_BatchResult], _Batch] = {}
         try:
             while True:
@@ -226,12 +268,13 @@ class WorkerPool:
                 ended = wait(pending, _POLL_S, FIRST_COMPLETED).done
                 if not ended and self._cluster is not None:
                     self._cluster.check_alive()
-                for future in sorted(ended, key=lambda one: pending[one].numbers):
+                for future in sorted(ended, key=lambda future: pending[future].numbers):
                     yield from self._collect(future, pending.pop(future), feed, lost)
         finally:
-            # Processes of our own end with the pool; loky stumbles over futures that are cancelled already.
-            for future in pending if self._restart is None else ():
-                future.cancel()
+            # own processes end with the pool, and loky fails on futures that are cancelled
+            if self._restart is None:
+                for future in pending:
+                    future.cancel()
 
     def map(
         self,
@@ -239,9 +282,9 @@ class WorkerPool:
         items: Sequence[T],
         progress: Progress = ignore_progress,
     ) -> list[R]:
-        """Returns the function's results in the order of the items."""
+        """Returns the function's results in the order of the items, and reports progress."""
         results: dict[int, R] = {}
-        for number, result in self.each(function, items, count=len(items)):
+        for number, result in self.iterate_results(function, items, count=len(items)):
             results[number] = result
             progress(len(results), len(items))
         return [results[number] for number in range(len(items))]
@@ -252,18 +295,20 @@ class WorkerPool:
         feed: _Feed[T],
         pending: dict[Future[_BatchResult], _Batch],
     ) -> None:
+        """Submits batches until every worker has one in work and one waiting."""
         assert self._executor is not None
         while len(pending) < self.workers * _BATCHES_PER_WORKER:
-            batch = feed.take(idle=not pending)
+            batch = feed.pop_batch(idle=not pending)
             if not batch:
                 return
-            numbers, items = map(list, zip(*batch, strict=True))
-            work: Any = (function, items, self._required, dict(allowed_code))
+            numbers = [number for number, _ in batch]
+            items = [item for _, item in batch]
+            arguments: Any = (function, items, self._required, dict(allowed_code))
             try:
-                future = self._executor.submit(run_batch, *work)
+                future = self._executor.submit(run_batch, *arguments)
             except BrokenExecutor:
-                self._replace(self._executor)
-                future = self._executor.submit(run_batch, *work)
+                self._replace_executor(self._executor)
+                future = self._executor.submit(run_batch, *arguments)
             pending[future] = _Batch(numbers, items, self._executor)
 
     def _collect(
@@ -273,28 +318,43 @@ class WorkerPool:
         feed: _Feed[T],
         lost: Callable[[T], R] | None,
     ) -> Iterator[tuple[int, R]]:
+        """Yields the results of a batch that ended, or returns its items to the queue.
+
+        Args:
+            future: the future of the batch.
+            batch: the batch.
+            feed: the queue.
+            lost: returns the result of an item that killed its workers, see `iterate_results`.
+        """
         try:
             result = future.result()
         except BrokenExecutor:
-            self._replace(batch.executor)
-            gone = feed.lose(batch)
+            self._replace_executor(batch.executor)
+            given_up = feed.return_lost(batch)
         except (Exception, CancelledError) as error:
             if self._cluster is None or not self._cluster.is_worker_loss(error):
                 raise
-            gone = feed.lose(batch, 1 if len(batch.items) > 1 else MAX_LOSSES)
+            # Dask has repeated a single item already
+            losses = 1 if len(batch.items) > 1 else MAX_LOSSES
+            given_up = feed.return_lost(batch, losses)
         else:
-            feed.measure(len(result.results), result.wall_s)
+            feed.add_timing(len(result.results), result.wall_s)
             yield from zip(batch.numbers, result.results, strict=False)
             if result.error is not None:
                 raise result.error
             return
-        for number, item in gone:
+        for number, item in given_up:
             if lost is None:
                 name = textwrap.shorten(str(item), _MAX_NAME, placeholder="...")
                 raise RunFailed(f"{name} ended {MAX_LOSSES} worker processes{self._hint}")
             yield number, lost(item)
 
-    def _replace(self, broken: Executor) -> None:
+    def _replace_executor(self, broken: Executor) -> None:
+        """Starts a new executor in place of a broken one, unless that has been done already.
+
+        Raises:
+            RunFailed: the executor cannot be replaced.
+        """
         if self._restart is None:
             raise RunFailed(f"a worker process was ended{self._hint}") from None
         if broken is self._executor:
@@ -310,19 +370,18 @@ def open_worker_pool(
     laws: Sequence[Any] = (),
     hint: str = "",
 ) -> Iterator[WorkerPool]:
-    """Yields the workers of a study; those that it starts are gone afterwards.
+    """Yields the workers of a study, and ends the processes that it started.
 
     Args:
-        jobs: how many processes of this machine; None for one per core; 1: this process.
-        on: what runs the items, if not processes of this machine.
-        most: how many items there are: more processes are not started.
-        laws: control laws of users' own that the items need: every worker must have their
-            files.
-        hint: what a message about a lost worker recommends.
+        jobs: number of processes of this machine; None: one per core; 1: this process.
+        on: runs the items instead of processes of this machine.
+        most: number of items; no more processes are started.
+        laws: imported control laws that the items need; each worker must have their files.
+        hint: advice in the message about a lost worker.
 
     Raises:
-        UsageError: the cluster cannot be reached, one of its workers is not fit, or a library
-            is missing.
+        UsageError: the cluster cannot be reached, a worker does not meet the requirements, or a
+            library is missing.
     """
     require_libraries()
     with ExitStack() as stack:
@@ -341,17 +400,17 @@ def open_worker_pool(
             yield WorkerPool(on, getattr(on, "_max_workers", count_cores()), hint=hint)
         else:
             count = jobs or count_cores()
-            count = count if most is None else min(count, most)
+            if most is not None:
+                count = min(count, most)
 
-            def start() -> Executor:
-                opened: AbstractContextManager[Executor] = worker_pool(count)
-                return stack.enter_context(opened)
+            def start_processes() -> Executor:
+                processes: AbstractContextManager[Executor] = worker_pool(count)
+                return stack.enter_context(processes)
 
-            yield (
-                WorkerPool(start(), count, start, hint=hint)
-                if count > 1
-                else WorkerPool(None, 1)
-            )
+            if count > 1:
+                yield WorkerPool(start_processes(), count, start_processes, hint=hint)
+            else:
+                yield WorkerPool(None, 1)
 
 
 def check_workers(jobs: int | None, on: Workers) -> None:
@@ -361,14 +420,18 @@ def check_workers(jobs: int | None, on: Workers) -> None:
         UsageError: both are given.
     """
     if on is not None and jobs is not None:
-        raise UsageError("--jobs is how many processes of this machine: leave it out with --on")
+        raise UsageError(
+            "--jobs is the number of processes of this machine: leave it out with --on"
+        )
 
 
 def count_workers(jobs: int | None, on: Workers = None) -> int:
-    """Returns how many items will run at the same time; on a cluster, checks its workers.
+    """Returns the number of items that will run at the same time.
+
+    The workers of a cluster are checked.
 
     Raises:
-        UsageError: the cluster cannot be reached, or one of its workers is not fit.
+        UsageError: the cluster cannot be reached, or a worker does not meet the requirements.
     """
     check_workers(jobs, on)
     if on is None:

@@ -1,14 +1,13 @@
-"""A Gymnasium environment: one user of an experiment acts, by what that user knows over the
-network.
+"""A Gymnasium environment in which one user of an experiment acts over the network.
 
 Invariant:
-- An episode is a run in virtual time and a function of the scenario, the seed and the actions;
-  saved as a log it verifies.
-- A step is a fixed number of ticks. A refused action makes no step and changes nothing.
-- Steps follow a reset and end with the episode.
-- What is observed, and when an action acts, is as of a hand of one's own (`OwnHand`), so that
-  what is trained here can hold an arm live, unchanged. Only orientations are observed as six
-  numbers, which never jump (`expand_poses`).
+    - An episode is a run in virtual time and a function of the scenario, the seed and the
+      actions; saved as a log it verifies.
+    - A step is a fixed number of ticks. A refused action makes no step and changes nothing.
+    - Steps follow a reset and end with the episode.
+    - Observations, and the time at which an action takes effect, are those of a user-written
+      hand (`OwnHand`), so that a trained policy can hold an arm live without changes. Only
+      orientations are observed as six numbers, which never jump (`expand_poses`).
 """
 
 import math
@@ -47,29 +46,30 @@ except ImportError:
 
 ENV_ID = "trilat_net/Teleoperation-v0"
 FAR = 1e6
-"""Bound of what is observed where nothing tighter is known: rad, rad/s, m, N m, s."""
+"""Bound of observed numbers without a tighter bound: rad, rad/s, m, N m, s."""
 MOST_DRAWS = {False: 1000, True: 100}
-"""Places that a task draws at most until one is within reach; of chains fewer, whose poses are
-searched.
+"""Largest number of positions that a task draws until one is within reach.
+
+It is smaller for chains (True), for which a pose is searched numerically.
 """
 
 
 class EpisodeError(UsageError, gymnasium.error.ResetNeeded):
-    """There is no episode: none has begun, or it has ended."""
+    """There is no episode in progress: it has not begun, or it has ended."""
 
 
 class Scene(NamedTuple):
-    """What is true of an episode at a step, and the user need not know.
+    """The true state of an episode at a step, which the user need not know.
 
     Attributes:
         t_s: time since the epoch, s.
         q: joint angles by site, rad, shape (n,).
-        end_effector_m: place of the end effector by site, m.
-        view: what the user sees.
-        bodies: the poses of the bodies of plants, by site and then name, as a record has them,
-            shape (7,).
-        can_reach: says of a site and a place, m, whether its end effector can be brought there.
-        draws: places that a task may draw at most until one is within reach.
+        end_effector_m: position of the end effector by site, m.
+        view: the user's view.
+        bodies: poses of the bodies of plants, by site and then name, as in a record, shape
+            (7,).
+        can_reach: returns whether a site's end effector can reach a position, m.
+        draws: largest number of positions that a task may draw until one is within reach.
     """
 
     t_s: float
@@ -77,12 +77,18 @@ class Scene(NamedTuple):
     end_effector_m: dict[str, Array]
     view: HandView
     bodies: dict[str, dict[str, Array]]
-    can_reach: Callable[[str, Array], bool] = lambda _site, _place: True
+    can_reach: Callable[[str, Array], bool] = lambda _site, _position: True
     draws: int = MOST_DRAWS[False]
 
 
 class Judgement(NamedTuple):
-    """What a task says of a step."""
+    """The judgement of a step by its task.
+
+    Attributes:
+        reward: the reward.
+        succeeded: the task is done, and the episode ends.
+        failed: the task cannot be done any more, and the episode ends.
+    """
 
     reward: float
     succeeded: bool = False
@@ -90,33 +96,31 @@ class Judgement(NamedTuple):
 
 
 class EpisodeTask(Protocol):
-    """What is to be done in an episode."""
+    """The task of an episode."""
 
     goal: Array
-    """What of it the user sees; its shape and its bounds, `bound`, never change."""
+    """The goal that the user observes; its shape never changes."""
     bound: float
+    """Bound of the goal's numbers, which never changes."""
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
-        """Draws the task of an episode."""
+        """Draws the goal of an episode."""
 
     def judge(self, scene: Scene) -> float | tuple[Any, ...]:
-        """Returns the reward of a step; or with it whether the task is done, as a `Judgement`
-        or a tuple.
-        """
+        """Returns the reward of a step, or a `Judgement`, also as a tuple."""
 
 
 class ReachTask:
-    """The slave's end effector is brought to a place that is drawn within its reach, and stays
-    there.
+    """Task to bring an end effector to a random position within its reach, and to stay there.
 
-    The reward of a step is minus the distance, m, times the step, s; and 1 once it was there
-    for `stay_s`.
+    The reward of a step is minus the distance, m, times the duration of the step, s. It is
+    larger by 1 once the end effector has stayed at the goal for `stay_s`.
 
     Args:
-        site: whose end effector.
-        radius_m: how far from its start the places lie, at most.
-        within_m: how near it has to come.
-        stay_s: for how long.
+        site: site of the end effector.
+        radius_m: largest distance of the goal from the start, m.
+        within_m: largest distance from the goal that counts as reached, m.
+        stay_s: time to stay at the goal, s.
     """
 
     def __init__(
@@ -135,55 +139,61 @@ class ReachTask:
         self._since_s = self._last_s = 0.0
 
     def begin(self, random: np.random.Generator, scene: Scene) -> None:
-        """Draws a place around the start, evenly over the part of the area that the end
-        effector can reach.
+        """Draws a goal, uniformly over the part of the sphere that the end effector reaches.
 
         Raises:
-            UsageError: none of the places that were drawn is within reach.
+            UsageError: no drawn position is within reach.
         """
         start = scene.end_effector_m[self._site]
         for _ in range(scene.draws):
-            way = random.normal(size=len(start))
+            direction = random.normal(size=len(start))
+            # the root makes the density uniform over the area or the volume
             share = random.uniform() ** (1.0 / len(start))
-            place = start + self._radius_m * share * way / np.linalg.norm(way)
-            if scene.can_reach(self._site, place):
+            position = start + self._radius_m * share * direction / np.linalg.norm(direction)
+            if scene.can_reach(self._site, position):
                 break
         else:
-            around = f"{self._radius_m:g} m around the start of {self._site}"
             raise UsageError(
                 "the task has no goal: the end effector can reach none of "
-                f"{count_nouns(scene.draws, 'place')} "
-                f"within {around}; start from another pose (sites.NAME.q0_rad), or give a task of your own"
+                f"{count_nouns(scene.draws, 'position')} "
+                f"within {self._radius_m:g} m around the start of {self._site}; "
+                "start from another pose (sites.NAME.q0_rad), or use your own task"
             )
-        self.goal = place
+        self.goal = position
         self._since_s = self._last_s = scene.t_s
 
     def judge(self, scene: Scene) -> Judgement:
-        """Returns the reward."""
-        apart_m = float(np.linalg.norm(scene.end_effector_m[self._site] - self.goal))
+        """Returns the reward of a step, and whether the goal was kept for long enough."""
+        distance_m = float(np.linalg.norm(scene.end_effector_m[self._site] - self.goal))
         step_s = scene.t_s - self._last_s
         self._last_s = scene.t_s
-        if apart_m > self._within_m:
+        if distance_m > self._within_m:
             self._since_s = scene.t_s
         done = scene.t_s - self._since_s >= self._stay_s
-        return Judgement(-apart_m * step_s + float(done), succeeded=done)
+        return Judgement(-distance_m * step_s + float(done), succeeded=done)
 
 
 class ActedHand(HandPlayer):
-    """The user's hand: at each step it does what it was told."""
+    """The user's hand, which applies the actions of an episode.
 
-    def __init__(self, at: HandSite, actions: list[Array]) -> None:
-        super().__init__(at, None)
+    Args:
+        hand_site: site and settings of the hand.
+        actions: the action of each step; the environment appends to this list.
+    """
+
+    def __init__(self, hand_site: HandSite, actions: list[Array]) -> None:
+        super().__init__(hand_site, None)
         self._actions = actions
 
-    def request_action(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - whoever acts has seen it
-        """Decides by the action of the step."""
+    def request_action(self, k: int, arrays: SiteArrays) -> None:  # noqa: ARG002 - already observed
+        """Decides as the action of the current step says."""
         self.hand.accept_decision(k, self._actions[k // self.hand.period_ticks].tolist())
 
 
 class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
-    """An experiment in which one user is trained, in steps, see docs/policies.md; also called
-    `tn.make_env`.
+    """An experiment in which one user is trained; also called `tn.make_env`.
+
+    See docs/policies.md.
 
     >>> bent = {f"sites.{name}.q0_rad": [0.4, 1.0] for name in ("m", "s")}
     >>> env = tn.make_env("two_sites", bent, user="m", duration_s=1)
@@ -195,26 +205,26 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         scenario: the name of a shipped scenario, a path, a TOML text, its tables, or a
             scenario.
         set: overrides, as in `{"link.delay_ms": 100}`.
-        user: the site whose arm is acted on.
-        mode: "tip", "joint" or "force", as of a live hand; by default the scenario's.
-        rate_hz: steps a second.
-        delay_ms: from what is seen to what is done, ms.
-        duration_s: of an episode, s; by default the scenario's.
-        task: what is to be done; by default `leads` brings its end effector to a place.
-        vary: what each episode draws, by key a list, or a pair of numbers.
-        leads: the site that works.
+        user: the site whose arm the actions move.
+        mode: "tip", "joint" or "force", as for a live hand; by default the scenario's.
+        rate_hz: number of steps per second.
+        delay_ms: time from an observation to the effect of its action, ms.
+        duration_s: duration of an episode, s; by default the scenario's.
+        task: the task; by default the site `leads` brings its end effector to a position.
+        vary: keys that each episode draws: from a list of values, or from a pair of bounds.
+        leads: the site that does the task.
         render_mode: "rgb_array": `render` returns a picture of the arms and the goal; None:
-            nothing.
-        flat: whether an observation is one array of float32 in place of a dictionary, and an
-            action float32.
+            `render` returns None.
+        flat: an observation is one array of float32 instead of a dictionary, and an action is
+            float32.
 
     Attributes:
-        observation_names: with `flat` what each number of an observation is, as in
+        observation_names: with `flat`, the name of each number of an observation, as in
             "peer_q[1][0]".
 
     Raises:
         ScenarioError: the scenario or an override is not valid.
-        UsageError: the site or the rate is none, or Gymnasium is not installed.
+        UsageError: there is no such site, the rate is not valid, or Gymnasium is missing.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 - Gymnasium's
@@ -222,7 +232,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def __init__(
         self,
         scenario: Any = "paper",
-        set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - as in all of the interface
+        set: Mapping[str, Any] | Sequence[str] = (),  # noqa: A002 - the same name in all functions
         *,
         user: str = "m2",
         mode: str = "",
@@ -254,28 +264,30 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             raise UsageError(
                 f"rate_hz must divide the tick rate of {user}, {self._base.sites[user].rate_hz}"
             )
-        self._every = self._base.sites[user].rate_hz // rate_hz
-        far = self._place(self._base).describe()
-        self._most = far.limit if far.mode == "force" else self._find_reach()
-        self._size = far.size
-        kind = np.float32 if flat else np.float64
-        self.action_space: Any = spaces.Box(-self._most, self._most, (far.size,), kind)
+        self._ticks_per_step = self._base.sites[user].rate_hz // rate_hz
+        hand = self._build_hand_site(self._base).describe()
+        self._action_limit = hand.limit if hand.mode == "force" else self._find_reach()
+        self._action_size = hand.size
+        dtype = np.float32 if flat else np.float64
+        limit = self._action_limit
+        self.action_space: Any = spaces.Box(-limit, limit, (hand.size,), dtype)
         self._begin(self._base)
-        self.task.begin(np.random.default_rng(0), self._look())
+        self.task.begin(np.random.default_rng(0), self._build_scene())
         bounds = {"alpha": 1.0, "grip": 1.0, "goal": self.task.bound}
         boxes: dict[str, Any] = {}
-        for name, one in self._observe(self._look()).items():
-            most = bounds.get(name, FAR)
-            boxes[name] = spaces.Box(-most, most, one.shape, np.float64)
-        self._of_parts = spaces.Dict(boxes)
-        self.observation_space: Any = _flatten_space(self._of_parts) if flat else self._of_parts
-        self.observation_names = _name_numbers(self._of_parts) if flat else []
+        for name, values in self._observe(self._build_scene()).items():
+            bound = bounds.get(name, FAR)
+            boxes[name] = spaces.Box(-bound, bound, values.shape, np.float64)
+        self._dict_space = spaces.Dict(boxes)
+        self.observation_space: Any = self._dict_space
+        self.observation_names: list[str] = []
+        if flat:
+            self.observation_space = _flatten_space(self._dict_space)
+            self.observation_names = _name_numbers(self._dict_space)
         self._flat = flat
 
     def _prepare(self, scenario: Scenario) -> Scenario:
-        """Returns an experiment in which the user has a live hand and no other operator holds
-        that arm.
-        """
+        """Returns an experiment in which the user's arm has a live hand only."""
         find_site(scenario, self._user)
         find_site(scenario, self._leads)
         spec = scenario.sites[self._user]
@@ -284,11 +296,14 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             hand = replace(hand, mode=self._mode)
         sites = {**scenario.sites, self._user: replace(spec, hands=(hand,))}
         drawn = {
-            key: one for key, one in scenario.drawn.items() if f"{self._user}.hands" not in key
+            key: distribution
+            for key, distribution in scenario.drawn.items()
+            if f"{self._user}.hands" not in key
         }
         return replace(scenario, sites=sites, drawn=drawn)
 
-    def _place(self, scenario: Scenario) -> HandSite:
+    def _build_hand_site(self, scenario: Scenario) -> HandSite:
+        """Returns the site and the settings of the user's hand."""
         hand = scenario.sites[self._user].find_live_hand()
         assert hand is not None
         return HandSite(
@@ -300,22 +315,24 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         )
 
     def _find_reach(self) -> float:
-        """Returns how far from its base the user's end effector gets, m; or how far joints
-        turn, rad.
+        """Returns the largest distance of the user's end effector from its base, m.
+
+        In the mode "joint" it is the largest angle of a joint, rad.
         """
         arm = self._base.arms[self._user]
         spec = self._base.sites[self._user]
-        if self._place(self._base).spec.mode == "joint":
+        if self._build_hand_site(self._base).spec.mode == "joint":
             return 2.0 * math.pi
         if arm.chain is None:
             return float(sum(arm.lengths_m))
         return 1.5 * float(np.linalg.norm(arm.end_effector(spec.q0_rad))) + 1.0
 
     def _begin(self, scenario: Scenario) -> None:
+        """Prepares the run of an episode."""
         self.scenario = scenario
         self._k = 0
         self._actions = list[Array]()
-        self._player = ActedHand(self._place(scenario), self._actions)
+        self._player = ActedHand(self._build_hand_site(scenario), self._actions)
         self._plants = make_plant_players(scenario)
         self._run = FusedRun(
             scenario, keep=1, hands={self._user: self._player}, plants=self._plants
@@ -324,7 +341,8 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         self._ticks = scenario.ticks(self._user)
         self._tick_rate_hz = scenario.sites[self._user].rate_hz
 
-    def _look(self) -> Scene:
+    def _build_scene(self) -> Scene:
+        """Returns the true state of the episode at the current step."""
         names = self.scenario.names
         arms = self.scenario.arms
         run = self._run
@@ -332,75 +350,65 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             name: row[: arms[name].counts.joints]
             for name, row in zip(names, run.q, strict=True)
         }
-        places = {
-            name: np.array(arms[name].end_effector(row.tolist())) for name, row in q.items()
+        positions = {
+            name: np.array(arms[name].end_effector(angles.tolist()))
+            for name, angles in q.items()
         }
-        view = self._player.view(self._k, run.arrays(names.index(self._user)))
-        poses = {
-            site: np.reshape(plant.state.bodies, (-1, 7))
-            for site, plant in self._plants.items()
-        }
-        bodies = {
-            site: dict(zip(self.scenario.bodies_m(site), at, strict=True))
-            for site, at in poses.items()
-        }
-        reach = partial(self._can_reach, q)
-        draws = MOST_DRAWS[arms[self._leads].chain is not None]
+        bodies = {}
+        for site, plant in self._plants.items():
+            poses = np.reshape(plant.state.bodies, (-1, 7))
+            bodies[site] = dict(zip(self.scenario.bodies_m(site), poses, strict=True))
         return Scene(
             t_s=self._k / self._tick_rate_hz,
             q=q,
-            end_effector_m=places,
-            view=view,
+            end_effector_m=positions,
+            view=self._player.view(self._k, run.arrays(names.index(self._user))),
             bodies=bodies,
-            can_reach=reach,
-            draws=draws,
+            can_reach=partial(self._can_reach, q),
+            draws=MOST_DRAWS[arms[self._leads].chain is not None],
         )
 
-    def _can_reach(self, q: Mapping[str, Array], site: str, place_m: Array) -> bool:
-        return can_reach(self.scenario.arms[site], q[site], place_m)
+    def _can_reach(self, q: Mapping[str, Array], site: str, position_m: Array) -> bool:
+        """True if a site's end effector can reach a position, m, from joint angles q."""
+        return can_reach(self.scenario.arms[site], q[site], position_m)
 
-    def _return(self, scene: Scene) -> Any:
+    def _format_observation(self, scene: Scene) -> Any:
         """Returns an observation in the form of the observation space."""
         parts = self._observe(scene)
         if not self._flat:
             return parts
-        return np.concatenate([np.ravel(parts[name]) for name in self._of_parts]).astype(
-            np.float32
-        )
+        numbers = np.concatenate([np.ravel(parts[name]) for name in self._dict_space])
+        return numbers.astype(np.float32)
 
     def _observe(self, scene: Scene) -> dict[str, Array]:
+        """Returns the parts of an observation by name."""
         view = scene.view
-        own = {
+        parts = {
             name: getattr(view, name)
             for name in ("q", "qd", "pose", "q_des", "tau_x", "target")
         }
-        peers = {
-            f"peer_{x}": np.array([getattr(one, x) for one in view.peers])
-            for x in ("q", "qd", "tau_x")
-        }
-        if self._base.arms[
-            self._user
-        ].shares_pose:  # a rotation vector jumps where it passes half a turn
-            own["q_des"], peers["peer_q"] = map(expand_poses, (own["q_des"], peers["peer_q"]))
-        alpha, age_s = zip(*((one.alpha, one.age_s) for one in view.peers), strict=True)
-        more = {
-            "alpha": np.array(alpha),
-            "age_s": np.array(age_s),
-            "grip": np.array([view.grip]),
-        }
-        return {**own, **peers, **more, "goal": np.array(self.task.goal, dtype=np.float64)}
+        for name in ("q", "qd", "tau_x"):
+            parts[f"peer_{name}"] = np.array([getattr(peer, name) for peer in view.peers])
+        if self._base.arms[self._user].shares_pose:
+            # a rotation vector jumps where it passes half a turn
+            parts["q_des"] = expand_poses(parts["q_des"])
+            parts["peer_q"] = expand_poses(parts["peer_q"])
+        parts["alpha"] = np.array([peer.alpha for peer in view.peers])
+        parts["age_s"] = np.array([peer.age_s for peer in view.peers])
+        parts["grip"] = np.array([view.grip])
+        parts["goal"] = np.array(self.task.goal, dtype=np.float64)
+        return parts
 
-    def _inform(self, scene: Scene, *, succeeded: bool) -> dict[str, Any]:
-        """Returns facts of a step; the first two by the names of gym-hil."""
+    def _describe_step(self, scene: Scene, *, succeeded: bool) -> dict[str, Any]:
+        """Returns the facts of a step; the first two have the names of gym-hil."""
         links = np.asarray(self._run.arrays(self.scenario.names.index(self._leads)).links)
-        shares = dict(
-            zip(self.scenario.peers(self._leads), links["alpha"].tolist(), strict=True)
-        )
+        peers = self.scenario.peers(self._leads)
+        shares = dict(zip(peers, links["alpha"].tolist(), strict=True))
         others = {name: share for name, share in shares.items() if name != self._user}
-        first = max(others, key=lambda name: others[name], default=self._user)
+        teacher = max(others, key=lambda name: others[name], default=self._user)
         return {
-            "is_intervention": others.get(first, 0.0) > shares.get(self._user, 0.0),
-            "teleop_action": scene.end_effector_m[first],
+            "is_intervention": others.get(teacher, 0.0) > shares.get(self._user, 0.0),
+            "teleop_action": scene.end_effector_m[teacher],
             "dominance": shares,
             "t_s": scene.t_s,
             "success": succeeded,
@@ -409,49 +417,51 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begins an episode: draws what varies, its links' randomness and its task.
+        """Begins an episode: draws the varied keys, the randomness of links and the task.
 
-        `options` are overrides of this episode alone, as in {"link.delay_ms": 200}.
+        `options` are overrides of this episode only, as in {"link.delay_ms": 200}.
 
         Raises:
-            ScenarioError: the options or what was drawn are not valid.
+            ScenarioError: the options or the drawn values are not valid.
             UsageError: the task has no goal within reach.
         """
         self._runs = False
         super().reset(seed=seed)
-        drawn = {key: _draw(self.np_random, of) for key, of in self._vary.items()}
-        drawn |= {"seed": int(self.np_random.integers(2**31)), **(options or {})}
-        self._begin(load_scenario(self._base, drawn))
-        scene = self._look()
+        overrides = {key: _draw(self.np_random, values) for key, values in self._vary.items()}
+        overrides["seed"] = int(self.np_random.integers(2**31))
+        overrides |= options or {}
+        self._begin(load_scenario(self._base, overrides))
+        scene = self._build_scene()
         self.task.begin(self.np_random, scene)
         self._runs = True
-        return self._return(scene), self._inform(scene, succeeded=False)
+        return self._format_observation(scene), self._describe_step(scene, succeeded=False)
 
     def step(self, action: Array) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Acts, and moves on by a step.
+        """Applies an action and advances the episode by one step.
 
         Raises:
-            UsageError: the action is not valid; the episode stays where it was.
+            UsageError: the action is not valid; the episode does not advance.
             EpisodeError: there is no episode, or it has ended.
         """
         checked = self._check_action(action)
         if not self._runs:
             raise EpisodeError("there is no episode, or it has ended: call reset first")
         self._actions.append(checked)
-        self._k += self._every
+        self._k += self._ticks_per_step
         try:
             self._run.step_to(tick_ns(self._k, self._tick_rate_hz) - 1)
         except ValueError as error:
             raise UsageError(f"an action: {error}") from None
-        scene = self._look()
+        scene = self._build_scene()
         diverged = self._run.diverged_s is not None
-        said = self.task.judge(scene)
-        said = Judgement(*said) if isinstance(said, tuple) else Judgement(said)
-        ended = said.succeeded or said.failed or diverged
-        truncated = self._k + self._every > self._ticks and not ended
-        self._runs = not (ended or truncated)
-        info = self._inform(scene, succeeded=said.succeeded)
-        return self._return(scene), said.reward, ended, truncated, info
+        result = self.task.judge(scene)
+        judgement = Judgement(*result) if isinstance(result, tuple) else Judgement(result)
+        terminated = judgement.succeeded or judgement.failed or diverged
+        truncated = self._k + self._ticks_per_step > self._ticks and not terminated
+        self._runs = not (terminated or truncated)
+        info = self._describe_step(scene, succeeded=judgement.succeeded)
+        observation = self._format_observation(scene)
+        return observation, judgement.reward, terminated, truncated, info
 
     def _check_action(self, action: Array) -> Array:
         """Returns an action within its bounds.
@@ -462,23 +472,21 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
         try:
             values = np.array(action, dtype=np.float64)
         except (TypeError, ValueError):
-            raise UsageError(
-                f"an action: it is {count_nouns(self._size, 'number')}, not {action!r:.80}"
-            ) from None
-        if values.shape != (self._size,):
-            found = (
-                f"{count_nouns(values.size, 'number')}"
-                if values.ndim == 1
-                else f"an array of shape {values.shape}"
-            )
-            raise UsageError(f"an action: it acts with {found}, not {self._size}")
+            size = count_nouns(self._action_size, "number")
+            raise UsageError(f"an action: it is {size}, not {action!r:.80}") from None
+        if values.shape != (self._action_size,):
+            content = f"an array of shape {values.shape}"
+            if values.ndim == 1:
+                content = count_nouns(values.size, "number")
+            raise UsageError(f"an action: it has {content}, not {self._action_size}")
         if not np.isfinite(values).all():
-            raise UsageError(f"an action: it acts with {values.tolist()}, which is not finite")
-        return np.clip(values, -self._most, self._most)
+            raise UsageError(f"an action: it has {values.tolist()}, which is not finite")
+        return np.clip(values, -self._action_limit, self._action_limit)
 
     def render(self) -> Any:
-        """Returns a picture of the arms and of the goal, shape (height, width, 3); None without
-        a mode.
+        """Returns a picture of the arms and the goal, shape (height, width, 3).
+
+        None: the environment has no render mode.
 
         Raises:
             EpisodeError: no episode has begun.
@@ -487,7 +495,7 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
             return None
         if not (self._runs or self._actions):
             raise EpisodeError("there is no episode to be drawn: call reset first")
-        # Matplotlib takes a second
+        # imported here, because the import of Matplotlib takes a second
         from ..reporting.episode_picture import (
             EpisodePicture,
             is_place,
@@ -495,54 +503,50 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
         if self._picture is None:
             self._picture = EpisodePicture(self.scenario, self._leads)
-        scene = self._look()
-        goal = (
-            self.task.goal
-            if is_place(self.task.goal, scene.end_effector_m[self._leads])
-            else None
-        )
+        scene = self._build_scene()
+        goal = None
+        if is_place(self.task.goal, scene.end_effector_m[self._leads]):
+            goal = self.task.goal
         return self._picture.draw(scene.q, scene.bodies, goal, f"t = {scene.t_s:.2f} s")
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
-        """Writes the episode so far as a log, which verifies.
+        """Writes the steps of the episode to a log and returns its path; the log verifies.
 
         Raises:
-            UsageError: there is no step yet, or the file exists.
+            UsageError: the episode has no step yet, or the file exists.
         """
         if not self._actions:
             raise UsageError("an episode has a log once it has a step")
-        player = ActedHand(self._place(self.scenario), self._actions)
-        lasted = replace(self.scenario, duration_s=self._k / self._tick_rate_hz)
-        record_virtual(lasted, Path(path), force=force, hands={self._user: player.track})
+        player = ActedHand(self._build_hand_site(self.scenario), self._actions)
+        scenario = replace(self.scenario, duration_s=self._k / self._tick_rate_hz)
+        record_virtual(scenario, Path(path), force=force, hands={self._user: player.track})
         return Path(path)
 
 
 def _flatten_space(parts: spaces.Dict) -> spaces.Box:
-    """Returns the space of all numbers of observations, one after the other, as float32."""
-    low, high = (
-        np.concatenate([np.ravel(getattr(box, end)) for box in parts.values()]).astype(
-            np.float32
-        )
-        for end in ("low", "high")
-    )
-    return spaces.Box(low, high, dtype=np.float32)
+    """Returns the space of all numbers of an observation in one array of float32."""
+    low = np.concatenate([np.ravel(box.low) for box in parts.values()])
+    high = np.concatenate([np.ravel(box.high) for box in parts.values()])
+    return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
 def _name_numbers(parts: spaces.Dict) -> list[str]:
-    """Returns what each number of a flat observation is."""
-    return [
-        name + "".join(f"[{index}]" for index in place)
-        for name, box in parts.items()
-        for place in np.ndindex(box.shape or ())
-    ]
+    """Returns the name of each number of a flat observation, as "peer_q[1][0]"."""
+    names = []
+    for part, box in parts.items():
+        names += [
+            part + "".join(f"[{index}]" for index in indices)
+            for indices in np.ndindex(box.shape or ())
+        ]
+    return names
 
 
-def _draw(random: np.random.Generator, of: Sequence[Any]) -> Any:
-    """Returns one of a list, or of a pair of numbers one between them."""
-    numbers = len(of) == 2 and all(isinstance(one, int | float) for one in of)
-    if isinstance(of, tuple) and numbers:
-        return float(random.uniform(*of))
-    return of[int(random.integers(len(of)))]
+def _draw(random: np.random.Generator, values: Sequence[Any]) -> Any:
+    """Returns a random element of a list, or a random number between a pair of bounds."""
+    are_numbers = all(isinstance(value, int | float) for value in values)
+    if isinstance(values, tuple) and len(values) == 2 and are_numbers:
+        return float(random.uniform(*values))
+    return values[int(random.integers(len(values)))]
 
 
 make_env = TeleoperationEnv

@@ -1,6 +1,8 @@
-"""Confidence intervals of 95 % over the runs of many seeds: of a share of them, and of a mean.
+"""95 % confidence intervals over the runs of many seeds: of a share, and of a mean.
 
-Invariant: an interval is a function of its numbers, and has a width unless all runs are one.
+Invariant:
+    - An interval is a function of its numbers.
+    - An interval of a mean has a width unless all numbers are equal.
 """
 
 from collections.abc import Sequence
@@ -16,7 +18,7 @@ def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
     American Statistical Association 22 (1927); recommended by Brown, Cai and DasGupta,
     "Interval estimation for a binomial proportion", Statistical Science 16 (2001).
     """
-    from scipy.stats import binomtest  # takes half a second, which most commands can do without
+    from scipy.stats import binomtest  # the import takes half a second
 
     if runs == 0:
         return 0.0, 1.0
@@ -25,8 +27,11 @@ def wilson_interval(successes: int, runs: int) -> tuple[float, float]:
 
 
 class MeanInterval(NamedTuple):
-    """The mean of the numbers of several runs, and half the width of its 95 % interval by
-    Student's t.
+    """The mean of several runs' numbers, with its 95 % interval by Student's t.
+
+    Attributes:
+        mean: the mean.
+        half: half the width of the interval.
     """
 
     mean: float
@@ -37,11 +42,11 @@ class MeanInterval(NamedTuple):
 
 
 def mean_interval(values: Sequence[float | None]) -> MeanInterval | None:
-    """Returns the mean of two numbers or more; None of fewer, or if one is missing."""
+    """Returns the mean of at least two numbers; None for fewer, or if a number is missing."""
     known = [value for value in values if value is not None]
     if len(known) < 2 or len(known) < len(values):
         return None
-    from scipy.special import stdtrit  # as above
+    from scipy.special import stdtrit  # the import takes long
 
     spread = float(np.std(known, ddof=1) / np.sqrt(len(known)))
     return MeanInterval(float(np.mean(known)), float(stdtrit(len(known) - 1, 0.975)) * spread)

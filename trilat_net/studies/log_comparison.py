@@ -1,6 +1,7 @@
-"""Logs side by side: the differences of their experiments, their metrics, and remarks on each.
+"""Comparison of logs: the differences of their experiments, their metrics, and remarks.
 
-Invariant: numbers are given and nothing is ranked.
+Invariant:
+    - Numbers are given, and nothing is ranked.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,18 +23,19 @@ from .intervals import MeanInterval, mean_interval
 from .tuning.candidate import check_final_posture
 
 _MOST_REASONS = 6
+"""Largest number of reasons for missing metrics that the text lists."""
 
 
 @dataclass(frozen=True, repr=False)
 class LogComparison(Result):
-    """Logs side by side.
+    """A comparison of logs.
 
     Attributes:
         logs: the logs.
-        metrics: a row per quantity, a column per log.
-        differences: of the experiments; none if it is one and the same.
-        means: of each row, over logs that differ in their seeds alone; () of other logs.
-        remarks: per column the judgement of the run, and what is to be known of its end.
+        metrics: the metrics, with a row per quantity and a column per log.
+        differences: differences of the experiments; empty if the experiments are the same.
+        means: mean of each row if the logs differ in their seeds only; else empty.
+        remarks: for each column the verdict on the run, and remarks on its end.
     """
 
     logs: tuple[Log, ...]
@@ -43,33 +45,34 @@ class LogComparison(Result):
     remarks: dict[str, list[str]]
 
     def headline(self) -> str:
-        """Returns what is compared."""
-        return f"{', '.join(self.metrics.columns)}: {count_nouns(len(self.metrics.rows), 'quantity')}"
+        """Returns the names of the logs and the number of quantities."""
+        quantities = count_nouns(len(self.metrics.rows), "quantity")
+        return f"{', '.join(self.metrics.columns)}: {quantities}"
 
     def blocks(self) -> Iterator[Block]:
-        """Yields the differences of the experiments, the quantities of the logs, and remarks
-        per log.
-        """
+        """Yields the differences of the experiments, the metrics, and remarks per log."""
         names = {log.scenario.name for log in self.logs}
         if len(names) > 1:
             yield f"logs of different scenarios: {', '.join(sorted(names))}"
         if self.differences:
-            rows = [(str(one), *one.values) for one in self.differences]
+            rows = [(str(difference), *difference.values) for difference in self.differences]
             yield from ("", TextTable(("differs", *self.metrics.columns), rows))
         else:
-            yield "one and the same experiment"
+            yield "the same experiment"
         yield from ("", _tabulate_quantities(self.metrics, self.means), "")
         for name, lines in self.remarks.items():
             yield from (MarkedText("[bold]note[/bold]", f"{name}: {line}") for line in lines)
-        reasons = [
-            f"{name}: no {row.quantity.name}: {entry.why}"
-            for row in self.metrics.rows
-            for name, entry in zip(self.metrics.columns, row.entries, strict=True)
-            if entry.value is None and entry.applies
-        ]
+        reasons = list(self._explain_missing_values())
         yield from reasons[:_MOST_REASONS]
         if len(reasons) > _MOST_REASONS:
             yield f"and {len(reasons) - _MOST_REASONS} more, which --json names"
+
+    def _explain_missing_values(self) -> Iterator[str]:
+        """Yields a sentence for each value that a log could have and lacks."""
+        for row in self.metrics.rows:
+            for name, entry in zip(self.metrics.columns, row.entries, strict=True):
+                if entry.value is None and entry.applies:
+                    yield f"{name}: no {row.quantity.name}: {entry.why}"
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat compare --json`."""
@@ -84,9 +87,10 @@ class LogComparison(Result):
         ]
         facts: dict[str, Any] = {
             "logs": logs,
-            "differences": [one._asdict() for one in self.differences],
+            "differences": [difference._asdict() for difference in self.differences],
+            "remarks": self.remarks,
+            **comparison_to_json(self.metrics),
         }
-        facts |= {"remarks": self.remarks, **comparison_to_json(self.metrics)}
         if self.means:
             pairs = zip(self.metrics.rows, self.means, strict=True)
             facts["means"] = {row.quantity.key: mean._asdict() for row, mean in pairs if mean}
@@ -105,8 +109,7 @@ class LogComparison(Result):
 
 
 def compare(*logs: str | Path | Log) -> LogComparison:
-    """Compares logs side by side, with the differences of their experiments; the command is
-    `trilat compare`.
+    """Compares logs and the differences of their experiments; the command is `trilat compare`.
 
     >>> logs = [tn.simulate("two_sites", {"control.Kd": Kd}, duration_s=0.1) for Kd in (3, 5)]
     >>> len(tn.compare(*logs).metrics.row("rms_error_rad").values)
@@ -119,23 +122,27 @@ def compare(*logs: str | Path | Log) -> LogComparison:
     opened = [log if isinstance(log, Log) else open_log(log) for log in logs]
     if len(opened) < 2:
         raise UsageError(
-            "name two logs or more; or a scenario, as in: trilat compare --tune free"
+            "name at least two logs; or a scenario, as in: trilat compare --tune free"
         )
     names = name_columns([Path(log.sources[0]) for log in opened])
     remarks = {
         name: [describe_judgement(certify_run(log)), *check_final_posture(log)]
         for name, log in zip(names, opened, strict=True)
     }
-    found = compare_metrics(opened, names)
-    differences = list(compare_scenarios([log.scenario for log in opened]))
+    metrics = compare_metrics(opened, names)
     return LogComparison(
-        tuple(opened), found, differences, average_repeats(opened, found), remarks
+        logs=tuple(opened),
+        metrics=metrics,
+        differences=list(compare_scenarios([log.scenario for log in opened])),
+        means=average_repeats(opened, metrics),
+        remarks=remarks,
     )
 
 
 def name_columns(files: Sequence[Path]) -> list[str]:
-    """Returns a column name per log: the file's name, with as much of its path as tells them
-    apart.
+    """Returns a column name per log: the file's name, with a part of its path if needed.
+
+    The part is the shortest that makes the names differ.
     """
     for depth in range(1, max(len(file.parts) for file in files) + 1):
         names = ["/".join(file.with_suffix("").parts[-depth:]) for file in files]
@@ -144,31 +151,41 @@ def name_columns(files: Sequence[Path]) -> list[str]:
     return [f"{n}: {file}" for n, file in enumerate(files, 1)]
 
 
-def average_repeats(logs: Sequence[Log], found: MetricComparison) -> list[MeanInterval | None]:
-    """Returns the mean of each quantity over logs that differ in their seeds alone; [] of other
-    logs.
+def average_repeats(
+    logs: Sequence[Log], metrics: MetricComparison
+) -> list[MeanInterval | None]:
+    """Returns the mean of each quantity over logs that differ in their seeds only.
+
+    The list is empty for other logs.
     """
     first = logs[0].scenario
     if len({log.scenario.seed for log in logs}) < len(logs):
         return []
     if any(reseed_scenario(log.scenario, first.seed) != first for log in logs):
         return []
-    return [mean_interval(row.values) for row in found.rows]
+    return [mean_interval(row.values) for row in metrics.rows]
 
 
 def _tabulate_quantities(
-    found: MetricComparison, means: Sequence[MeanInterval | None]
+    metrics: MetricComparison, means: Sequence[MeanInterval | None]
 ) -> TextTable:
-    """Returns a row per quantity and a column per log; and one of the means where the logs are
-    repeats.
+    """Returns a table with a row per quantity and a column per log.
+
+    Args:
+        metrics: the metrics.
+        means: mean of each row, for a further column; empty: no such column.
     """
     rows: list[list[str]] = []
-    of_row = dict(zip(found.rows, means, strict=True)) if means else {}
-    for group, members in groupby(found.rows, key=lambda row: row.quantity.group):
+    mean_by_row = dict(zip(metrics.rows, means, strict=True)) if means else {}
+    for group, members in groupby(metrics.rows, key=lambda row: row.quantity.group):
         rows.append([group])
         for row in members:
-            values = [format_number(value, 4) for value in row.values]
-            values += [str(of_row[row] or "-")] if means else []
-            rows.append([f"  {row.quantity.name}", row.quantity.unit or "-", *values])
-    heads = ("", "unit", *found.columns, *(["mean, 95 %"] if means else []))
-    return TextTable(heads, rows, align="llr")
+            cells = [f"  {row.quantity.name}", row.quantity.unit or "-"]
+            cells += [format_number(value, 4) for value in row.values]
+            if means:
+                cells.append(str(mean_by_row[row] or "-"))
+            rows.append(cells)
+    header = ["", "unit", *metrics.columns]
+    if means:
+        header.append("mean, 95 %")
+    return TextTable(tuple(header), rows, align="llr")

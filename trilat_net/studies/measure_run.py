@@ -1,11 +1,15 @@
-"""The metrics of a run that [expect] can ask for, of a run in virtual time or of a log, and
-their outcomes.
+"""Metrics of a run for the table [expect], and their outcomes.
 
-Invariant: every metric has one definition: both sources feed the same running statistics of
-their sites with the same records, batch by batch in time order; a metric that a run cannot give
-is None, never a guess. Memory is bounded: kept are extrema, sums, the last second, and the
-buckets on which the judgement rests. How a run is cut into batches changes only the last bits
-of a mean. An outcome states value, limit and margin.
+The run is simulated in virtual time or read from a log.
+
+Invariant:
+    - Each metric has one definition: both sources feed the same running statistics of the sites
+      with the same records, batch by batch in time order.
+    - A metric that a run cannot give is None, and never a guess.
+    - Memory is bounded: extrema, sums, the last second, and the buckets for the verdict are
+      kept.
+    - The division of a run into batches changes only the last bits of a mean.
+    - An outcome states value, limit and margin.
 """
 
 import math
@@ -44,21 +48,23 @@ from ..scenario import Expect, Scenario
 from ..scenario.expect import ALL_SITES_QUANTITIES, END_WINDOW_S, ExpectWindow
 
 BATCH_RECORDS = 1000
-"""Records of a site that are collected before they are passed on."""
+"""Number of records of a site in a batch."""
+_VECTORS = ("q", "qd", "q_des", "tau", "tau_x", "x")
+"""Fields of a record from which `_build_batch` builds a batch."""
 
 
 class RecordBatch(NamedTuple):
-    """Some records of one site, one after the other.
+    """Consecutive records of one site.
 
     Attributes:
         t_ns: nominal time, shape (K,), ns.
         q: joint angles, shape (K, n), rad.
         qd: joint velocities, shape (K, n), rad/s.
-        e: its error against the reference, Eq. (9), shape (K, m), rad; m in task space.
+        e: error against the reference, Eq. (9), shape (K, m), rad; m in task space.
         tau: control torque, shape (K, n), N m.
         tau_x: exogenous torque in the sign of Eq. (8), shape (K, n), N m.
-        used: tick of the sample in use, -1 before the first, shape (K, P); of a compiled run
-            none, (K, 0).
+        used: tick of each peer's sample in use, -1 before the first, shape (K, P); (K, 0) for a
+            compiled run, which does not report samples.
     """
 
     t_ns: Ints
@@ -70,53 +76,69 @@ class RecordBatch(NamedTuple):
     used: Ints
 
     def since(self, t_ns: int) -> "RecordBatch":
-        """Returns the records that are later than a time."""
-        return self._part(int(np.searchsorted(self.t_ns, t_ns, side="right")), None)
+        """Returns the records after a time, ns."""
+        return self._slice(int(np.searchsorted(self.t_ns, t_ns, side="right")), None)
 
     def between(self, from_ns: int, to_ns: int) -> "RecordBatch":
-        """Returns the records from one time to another, which is no longer of them."""
-        return self._part(*np.searchsorted(self.t_ns, (from_ns, to_ns)).tolist())
+        """Returns the records from `from_ns` until before `to_ns`."""
+        first, stop = np.searchsorted(self.t_ns, (from_ns, to_ns)).tolist()
+        return self._slice(first, stop)
 
     def reduce(self, into: Array = NO_BUCKETS) -> Array:
-        """Returns the buckets of a judgement with these records added, see `reduce_to_buckets`."""
+        """Returns the buckets of a verdict with these records, see `reduce_to_buckets`."""
         bucket = self.t_ns * BUCKETS_PER_S // NS_PER_S
         return reduce_to_buckets(bucket=bucket, e=self.e, qd=self.qd, q=self.q, into=into)
 
-    def _part(self, first: int, last: int | None) -> "RecordBatch":
-        return RecordBatch._make(column[first:last] for column in self)
+    def _slice(self, first: int, stop: int | None) -> "RecordBatch":
+        """Returns the records from index `first` until before index `stop`."""
+        return RecordBatch._make(column[first:stop] for column in self)
 
 
-def join_batches(blocks: Sequence[RecordBatch]) -> RecordBatch:
-    """Returns blocks that follow each other as one."""
-    return RecordBatch._make(map(np.concatenate, zip(*blocks, strict=True)))
+def join_batches(batches: Sequence[RecordBatch]) -> RecordBatch:
+    """Returns consecutive batches as one."""
+    return RecordBatch._make(map(np.concatenate, zip(*batches, strict=True)))
 
 
-def _make_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
+def _build_batch(axes: Sequence[float], t_ns: Ints, used: Ints, *vectors: Array) -> RecordBatch:
+    """Returns a batch with the error against the reference.
+
+    Args:
+        axes: which coordinates of the task a site follows.
+        t_ns: nominal times, shape (K,), ns.
+        used: samples in use, shape (K, P).
+        vectors: q, qd, q_des, tau, tau_x and x, shape (K, ...) each.
+    """
     q, qd, q_des, tau, tau_x, x = vectors
     e = compute_task_errors(x, q_des, axes) if x.size else q - q_des
     return RecordBatch(t_ns=t_ns, q=q, qd=qd, e=e, tau=tau, tau_x=tau_x, used=used)
 
 
 def run_in_batches(
-    scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]
+    scenario: Scenario, receivers: Mapping[str, Callable[[RecordBatch], None]]
 ) -> tuple[float | None, int]:
-    """Runs a scenario in virtual time and passes every site's records on, batch by batch.
+    """Runs a scenario in virtual time and passes the records on, batch by batch.
+
+    Args:
+        scenario: the scenario.
+        receivers: function that receives the batches of each site.
 
     Returns:
-        when the first site left its limits, s, or None; and how many samples came late.
+        The time at which the first site left its limits, s, or None; and the number of late
+        samples.
     """
-    pending: dict[str, list[TickRecord]] = {name: [] for name in take}
+    pending: dict[str, list[TickRecord]] = {name: [] for name in receivers}
     sites: dict[str, Site] = {}
     diverged_at_s: float | None = None
 
     def flush(name: str) -> None:
-        if records := pending[name]:
-            rows = [(one.q, one.qd, one.q_des, one.tau, one.tau_x, one.x) for one in records]
-            t_ns = np.array([one.t_ns for one in records], dtype=np.int64)
-            used = np.array([one.used for one in records], dtype=np.int64)
-            vectors = map(np.array, zip(*rows, strict=True))
-            take[name](_make_batch(scenario.arms[name].axes, t_ns, used, *vectors))
-            records.clear()
+        records = pending[name]
+        if not records:
+            return
+        t_ns = np.array([record.t_ns for record in records], dtype=np.int64)
+        used = np.array([record.used for record in records], dtype=np.int64)
+        vectors = [np.array([getattr(record, key) for record in records]) for key in _VECTORS]
+        receivers[name](_build_batch(scenario.arms[name].axes, t_ns, used, *vectors))
+        records.clear()
 
     with process.pause_gc():
         for site, _, output in virtual.execute_virtual(scenario):
@@ -132,54 +154,58 @@ def run_in_batches(
 
 
 def run_compiled_in_batches(
-    scenario: Scenario, take: Mapping[str, Callable[[RecordBatch], None]]
+    scenario: Scenario, receivers: Mapping[str, Callable[[RecordBatch], None]]
 ) -> float | None:
-    """Does as `run_in_batches`, in the compiled loop, which does not say which samples are in
-    use.
+    """Runs a scenario in the compiled loop and passes the records on, batch by batch.
+
+    The compiled loop does not report the samples in use.
+
+    Args:
+        scenario: the scenario.
+        receivers: function that receives the batches of each site.
 
     Returns:
-        when the first site left its limits, s, or None.
+        The time at which the first site left its limits, s, or None.
     """
     run = FusedRun(scenario, keep=BATCH_RECORDS + 1)
     columns = [scenario.layout(name).columns() for name in scenario.names]
     period_s = BATCH_RECORDS / max(spec.rate_hz for spec in scenario.sites.values())
     while run.ran_s < scenario.duration_s and run.diverged_s is None:
         run.advance_to(min(run.ran_s + period_s, scenario.duration_s))
-        for name, place, (t_ns, rows) in zip(
+        for name, site_columns, (t_ns, rows) in zip(
             scenario.names, columns, run.pop_records(), strict=True
         ):
             if not len(t_ns):
                 continue
-            keys = ("q", "qd", "q_des", "tau", "tau_x", "x")
-            vectors = (rows[:, place.get(key, slice(0, 0))] for key in keys)
+            vectors = [rows[:, site_columns.get(key, slice(0, 0))] for key in _VECTORS]
             used = np.zeros((len(t_ns), 0), np.int64)
-            take[name](_make_batch(scenario.arms[name].axes, t_ns, used, *vectors))
+            receivers[name](_build_batch(scenario.arms[name].axes, t_ns, used, *vectors))
     return run.diverged_s
 
 
 def run_whole(scenario: Scenario) -> tuple[dict[str, RecordBatch], RunEnd]:
-    """Runs a scenario in the compiled loop; returns all records of each site, and how the run
-    ended.
-    """
-    kept: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
-    diverged_s = run_compiled_in_batches(scenario, {name: kept[name].append for name in kept})
-    records = {name: join_batches(blocks) for name, blocks in kept.items()}
-    found = records.values()
+    """Runs a scenario in the compiled loop; returns all records, and how the run ended."""
+    batches: dict[str, list[RecordBatch]] = {name: [] for name in scenario.names}
+    receivers = {name: batches[name].append for name in batches}
+    diverged_s = run_compiled_in_batches(scenario, receivers)
+    records = {name: join_batches(site_batches) for name, site_batches in batches.items()}
     trace = RunTrace(
-        [one.reduce() for one in found], [one.tau_x[-1] for one in found], diverged_s
+        [batch.reduce() for batch in records.values()],
+        [batch.tau_x[-1] for batch in records.values()],
+        diverged_s,
     )
     return records, classify_run_end(scenario, trace)
 
 
 class Range(NamedTuple):
-    """Smallest and largest value that a quantity had; twice the same where it has one value."""
+    """Smallest and largest value of a quantity; both are the same for a single value."""
 
     least: float
     most: float
 
 
 class WindowStats:
-    """Statistics of one site within a window, so far."""
+    """Running statistics of one site within a window of [expect]."""
 
     def __init__(self, window: ExpectWindow, scenario: Scenario, site: str) -> None:
         spec = scenario.sites[site]
@@ -189,7 +215,7 @@ class WindowStats:
         self._period_ns = NS_PER_S // spec.rate_hz + 1
         self._arm = build_arm_rows(scenario, site)
         self._walls = list_walls(spec)
-        self._seen_ns = -1
+        self._last_ns = -1
         self._records = 0
         self._peaks = {"error_peak_rad": 0.0, "speed_peak_rad_s": 0.0, "torque_peak_nm": 0.0}
         joints = len(spec.q0_rad)
@@ -197,12 +223,12 @@ class WindowStats:
         self._q_most = np.full(joints, -math.inf)
         self._push_sum = np.zeros(joints)
         self._force_sum = self._force_squares = self._force_peak = 0.0
-        self._touched: bool | None = None
+        self._was_touching: bool | None = None
         self._hits = 0
 
     def add(self, rows: RecordBatch) -> None:
-        """Takes in the next records of the site; those outside of the window leave no trace."""
-        self._seen_ns = int(rows.t_ns[-1])
+        """Adds the next records of the site; records outside of the window are ignored."""
+        self._last_ns = int(rows.t_ns[-1])
         inside = rows.between(self._from_ns, self._to_ns)
         if not len(inside.t_ns):
             return
@@ -215,42 +241,41 @@ class WindowStats:
         if self._walls:
             tip = self._arm.place_end_effector(inside.q, inside.qd)
             t_s = inside.t_ns / NS_PER_S
-            self._add_force(
-                np.sum([wall_force(wall, t_s, tip) for wall in self._walls], axis=0)
-            )
+            forces = [wall_force(wall, t_s, tip) for wall in self._walls]
+            self._add_wall_force(np.sum(forces, axis=0))
 
-    def _add_force(self, force: Array) -> None:
-        touching = force > 0.0
-        before = np.append(
-            touching[0] if self._touched is None else self._touched, touching[:-1]
-        )
-        self._hits += int((touching & ~before).sum())
-        self._touched = bool(touching[-1])
+    def _add_wall_force(self, force: Array) -> None:
+        """Adds the force of the walls at the next records, shape (K,), N."""
+        touches = force > 0.0
+        was_touching = touches[0] if self._was_touching is None else self._was_touching
+        previous = np.append(was_touching, touches[:-1])
+        self._hits += int((touches & ~previous).sum())
+        self._was_touching = bool(touches[-1])
         self._force_sum += float(force.sum())
         self._force_squares += float((force * force).sum())
         self._force_peak = max(self._force_peak, float(force.max()))
 
-    def figures(self) -> dict[str, Range]:
-        """Returns every quantity by its key in `Window`; none where the records end before the
-        window.
+    def compute_ranges(self) -> dict[str, Range]:
+        """Returns the range of each quantity, by its key in the window of [expect].
+
+        There are no quantities if the records end before the window.
         """
-        if not self._records or self._seen_ns < self._to_ns - self._period_ns:
+        if not self._records or self._last_ns < self._to_ns - self._period_ns:
             return {}
-        mean_n = self._force_sum / self._records
+        angles = zip(self._q_least.tolist(), self._q_most.tolist(), strict=True)
+        ranges = {f"q{n}_rad": Range(*ends) for n, ends in enumerate(angles, 1)}
         push_nm = (self._push_sum / self._records).tolist()
-        single = {
+        mean_n = self._force_sum / self._records
+        variance = max(0.0, self._force_squares / self._records - mean_n * mean_n)
+        single_values = {
             **self._peaks,
             **{f"push{n}_mean_nm": push for n, push in enumerate(push_nm, 1)},
             "wall_mean_n": mean_n,
-            "wall_deviation_n": math.sqrt(
-                max(0.0, self._force_squares / self._records - mean_n * mean_n)
-            ),
+            "wall_deviation_n": math.sqrt(variance),
             "wall_peak_n": self._force_peak,
             "wall_hits": float(self._hits),
         }
-        angles = zip(self._q_least.tolist(), self._q_most.tolist(), strict=True)
-        spans = {f"q{n}_rad": Range(*ends) for n, ends in enumerate(angles, 1)}
-        return {**spans, **{key: Range(value, value) for key, value in single.items()}}
+        return {**ranges, **{key: Range(value, value) for key, value in single_values.items()}}
 
 
 _BUCKET_NS = NS_PER_S // BUCKETS_PER_S
@@ -258,27 +283,26 @@ _END_NS = round(END_WINDOW_S * NS_PER_S)
 
 
 class SiteStats:
-    """Statistics of one site, so far.
+    """Running statistics of one site.
 
     Attributes:
-        stretches: per window of [expect] the statistics within it; None where a window is
-            another site's.
-        apart_ns: time of the last record whose |e| was not below `synchronised_rad`; -1 before
-            one was.
-        age_max_ms: per peer the largest age of the sample in use, shape (P,).
+        windows: statistics within each window of [expect]; None for windows of other sites.
+        unsynchronised_ns: time of the last record whose |e| was not below `synchronised_rad`;
+            -1 before the first such record.
+        age_max_ms: largest age of each peer's sample in use, shape (P,), ms.
     """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
         peer_rates = [scenario.sites[peer].rate_hz for peer in scenario.peers(site)]
         self._peer_rates = np.array(peer_rates, dtype=np.int64)
         self._synchronised_rad = scenario.expect.synchronised_rad
-        self.stretches = [
+        self.windows = [
             WindowStats(window, scenario, site) if window.site in ("", site) else None
             for window in scenario.expect.windows
         ]
         self.records = 0
         self.peak_error_rad = self.peak_torque_nm = self.peak_speed_rad_s = 0.0
-        self.apart_ns = -1
+        self.unsynchronised_ns = -1
         self.age_max_ms = np.zeros(len(peer_rates))
         self._age_sum_ms = np.zeros(len(peer_rates))
         self._age_records = np.zeros(len(peer_rates), dtype=np.int64)
@@ -287,7 +311,7 @@ class SiteStats:
         self._tail: list[RecordBatch] = []
 
     def add(self, rows: RecordBatch) -> None:
-        """Takes in the next records."""
+        """Adds the next records."""
         if not len(rows.t_ns):
             return
         error = np.abs(rows.e)
@@ -297,9 +321,9 @@ class SiteStats:
         self.peak_torque_nm = max(self.peak_torque_nm, float(np.abs(rows.tau).max()))
         self.peak_speed_rad_s = max(self.peak_speed_rad_s, float(np.abs(rows.qd).max()))
         self._squares = self._squares + (error * error).sum(axis=0)
-        apart = np.flatnonzero(largest >= self._synchronised_rad)
-        if len(apart):
-            self.apart_ns = int(rows.t_ns[apart[-1]])
+        unsynchronised = np.flatnonzero(largest >= self._synchronised_rad)
+        if len(unsynchronised):
+            self.unsynchronised_ns = int(rows.t_ns[unsynchronised[-1]])
         known = rows.used >= 0
         age_ms = (rows.t_ns[:, None] - rows.used * NS_PER_S // self._peer_rates) * 1e-6
         age_ms[~known] = 0.0
@@ -307,8 +331,8 @@ class SiteStats:
         self._age_sum_ms += age_ms.sum(axis=0)
         self._age_records += known.sum(axis=0)
         self._buckets = rows.reduce(self._buckets)
-        for stretch in filter(None, self.stretches):
-            stretch.add(rows)
+        for window in filter(None, self.windows):
+            window.add(rows)
         self._tail.append(rows)
         while len(self._tail) > 1 and self._tail[1].t_ns[0] < rows.t_ns[-1] - _END_NS:
             del self._tail[0]
@@ -325,7 +349,7 @@ class SiteStats:
 
     @property
     def link_ages(self) -> list["LinkAge"]:
-        """Per peer the age of the sample in use; None where there never was one."""
+        """Age of each peer's sample in use; None for a peer without samples."""
         rows = zip(
             self._age_sum_ms.tolist(),
             self._age_records.tolist(),
@@ -338,14 +362,15 @@ class SiteStats:
         ]
 
     def end(self, end_ns: int) -> RecordBatch:
-        """Returns the records of the last second before `end_ns`, which is not before the last
-        record.
+        """Returns the records of the last second before `end_ns`.
+
+        `end_ns` is not before the last record.
         """
         return join_batches(self._tail).since(end_ns - _END_NS)
 
     @property
     def buckets(self) -> Array:
-        """What `RunTrace.buckets` asks of a site."""
+        """The buckets of the site for `RunTrace.buckets`."""
         return self._buckets[: self.last_ns // _BUCKET_NS + 1]
 
     @property
@@ -355,8 +380,11 @@ class SiteStats:
 
 
 class LinkAge(msgspec.Struct, frozen=True):
-    """Age of the sample in use on one link, over the receiver's ticks from the first one on;
-    else None.
+    """Age of the sample in use on one link, over the receiver's ticks from the first sample on.
+
+    Attributes:
+        mean_ms: the mean age; None without a sample.
+        max_ms: the largest age; None without a sample.
     """
 
     mean_ms: float | None
@@ -364,13 +392,20 @@ class LinkAge(msgspec.Struct, frozen=True):
 
 
 class RunMetrics(msgspec.Struct, frozen=True, kw_only=True):
-    """One run, measured; the docstring of `Expect` defines every metric.
+    """The metrics of one run; the docstring of `Expect` defines each of them.
 
-    `end` is its judgement. None stands for what the run cannot give: too short, or it did not
-    come to it. `end_...` is of the last second, `ages` has links "j->i", `late_samples` came
-    too late for what their link meant to do with them, `missing` counts ticks without a record,
-    and a window has no quantities where the run ended before it did. `metrics` has those of
-    `docs/metrics.md` that are expected.
+    None stands for a metric that the run cannot give, because it is too short or the event did
+    not happen. Metrics `end_...` concern the last second.
+
+    Attributes:
+        end: the verdict on the run.
+        ages: ages of the samples in use, by link "j->i".
+        late_samples: number of samples that arrived too late for the use that their link
+            planned.
+        missing: number of ticks without a record.
+        windows: ranges of the quantities of each window; empty if the run ended before the
+            window.
+        metrics: the expected metrics of `docs/metrics.md`.
     """
 
     simulated_s: float
@@ -398,74 +433,100 @@ def compute_run_metrics(
     late_samples: int,
     missing: int,
 ) -> RunMetrics:
-    """Returns the metrics of a run from the statistics of its sites, in scenario order."""
-    ran = {name: tally for name, tally in tallies.items() if tally.records}
-    whole = len(ran) == len(tallies)
-    end_ns = max((tally.last_ns for tally in ran.values()), default=0)
-    found = tallies.values()
-    trace = RunTrace(
-        [one.buckets for one in found], [one.tau_x for one in found], diverged_at_s
-    )
-    span_s = [
-        tally.last_ns / NS_PER_S + 1.0 / scenario.sites[name].rate_hz
-        for name, tally in ran.items()
-    ]
-    apart_ns = [tally.apart_ns for tally in ran.values()]
-    synchronised = whole and not any(tally.apart_ns == tally.last_ns for tally in ran.values())
-    ends = {name: tally.end(end_ns) for name, tally in ran.items()}
+    """Returns the metrics of a run from the statistics of its sites.
 
-    def largest(name: str) -> float | None:
-        return max((getattr(tally, name) for tally in ran.values()), default=None)
+    Args:
+        scenario: the scenario.
+        tallies: statistics of the sites, in scenario order.
+        diverged_at_s: time at which the first site left its limits, s; None: never.
+        late_samples: number of late samples.
+        missing: number of ticks without a record.
+    """
+    with_records = {name: tally for name, tally in tallies.items() if tally.records}
+    all_ran = len(with_records) == len(tallies)
+    end_ns = max((tally.last_ns for tally in with_records.values()), default=0)
+    trace = RunTrace(
+        [tally.buckets for tally in tallies.values()],
+        [tally.tau_x for tally in tallies.values()],
+        diverged_at_s,
+    )
+    # to the end of the period after the last tick
+    durations_s = [
+        tally.last_ns / NS_PER_S + 1.0 / scenario.sites[name].rate_hz
+        for name, tally in with_records.items()
+    ]
+    unsynchronised_ns = [tally.unsynchronised_ns for tally in with_records.values()]
+    ends_synchronised = not any(
+        tally.unsynchronised_ns == tally.last_ns for tally in with_records.values()
+    )
+    synchronised_at_s = None
+    if all_ran and ends_synchronised:
+        synchronised_at_s = max(0, *unsynchronised_ns) / NS_PER_S
+    ends = {name: tally.end(end_ns) for name, tally in with_records.items()}
+    end_errors_rad = [float(np.abs(end.e).max(initial=0.0)) for end in ends.values()]
+    end_poses_rad = {
+        name: tuple(tally.end(tally.last_ns).q[-1].tolist())
+        for name, tally in with_records.items()
+    }
+    ages = {}
+    for name, tally in tallies.items():
+        for peer, age in zip(scenario.peers(name), tally.link_ages, strict=True):
+            ages[f"{peer}->{name}"] = age
+    windows = zip(*(tally.windows for tally in tallies.values()), strict=True)
+
+    def find_largest(name: str) -> float | None:
+        return max((getattr(tally, name) for tally in with_records.values()), default=None)
 
     return RunMetrics(
-        simulated_s=max(
-            span_s, default=0.0
-        ),  # to the end of the period that follows the last tick
+        simulated_s=max(durations_s, default=0.0),
         end=classify_run_end(scenario, trace),
-        synchronised_at_s=max(0, *apart_ns) / NS_PER_S if synchronised else None,
-        peak_error_rad=largest("peak_error_rad"),
-        rms_error_rad=largest("rms_error_rad"),
-        end_error_rad=max(
-            (float(np.abs(end.e).max(initial=0.0)) for end in ends.values()), default=None
-        ),
-        end_spread_rad=_end_spread_rad(list(ends.values())) if whole else None,
-        end_pose_rad={
-            name: tuple(tally.end(tally.last_ns).q[-1].tolist()) for name, tally in ran.items()
-        },
-        peak_torque_nm=largest("peak_torque_nm"),
-        peak_speed_rad_s=largest("peak_speed_rad_s"),
-        ages={
-            f"{peer}->{name}": age
-            for name, tally in tallies.items()
-            for peer, age in zip(scenario.peers(name), tally.link_ages, strict=True)
-        },
+        synchronised_at_s=synchronised_at_s,
+        peak_error_rad=find_largest("peak_error_rad"),
+        rms_error_rad=find_largest("rms_error_rad"),
+        end_error_rad=max(end_errors_rad, default=None),
+        end_spread_rad=_compute_end_spread_rad(list(ends.values())) if all_ran else None,
+        end_pose_rad=end_poses_rad,
+        peak_torque_nm=find_largest("peak_torque_nm"),
+        peak_speed_rad_s=find_largest("peak_speed_rad_s"),
+        ages=ages,
         late_samples=late_samples,
         missing=missing,
-        windows=tuple(
-            map(_window_ranges, zip(*(tally.stretches for tally in found), strict=True))
-        ),
+        windows=tuple(map(_merge_windows, windows)),
     )
 
 
-def _window_ranges(stretches: Sequence[WindowStats | None]) -> dict[str, Range]:
-    parts = [stretch.figures() for stretch in stretches if stretch is not None]
-    if len(parts) == 1:
-        return parts[0]
-    return {
-        key: Range(*(max(part[key][n] for part in parts) for n in (0, 1)))
-        for key in ALL_SITES_QUANTITIES
-        if all(key in part for part in parts)
-    }
+def _merge_windows(windows: Sequence[WindowStats | None]) -> dict[str, Range]:
+    """Returns the ranges of a window over all of its sites.
+
+    Args:
+        windows: statistics of each site within the window; None for a site that it excludes.
+    """
+    site_ranges = [window.compute_ranges() for window in windows if window is not None]
+    if len(site_ranges) == 1:
+        return site_ranges[0]
+    merged = {}
+    for key in ALL_SITES_QUANTITIES:
+        if all(key in ranges for ranges in site_ranges):
+            merged[key] = Range(
+                least=max(ranges[key].least for ranges in site_ranges),
+                most=max(ranges[key].most for ranges in site_ranges),
+            )
+    return merged
 
 
-def _end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
-    if not all(len(end.t_ns) for end in ends):  # a site's part ends long before the others'
+def _compute_end_spread_rad(ends: Sequence[RecordBatch]) -> float | None:
+    """Returns the largest difference of a joint's angles between sites in the last second.
+
+    None: a site has no records there, or the arms have different numbers of joints.
+    """
+    if not all(len(end.t_ns) for end in ends):
         return None
-    if len({end.q.shape[1] for end in ends}) > 1:  # unlike arms have no angle in common
+    if len({end.q.shape[1] for end in ends}) > 1:
         return None
-    at_ns = ends[0].t_ns[ends[0].t_ns >= max(end.t_ns[0] for end in ends)]
+    first_common_ns = max(end.t_ns[0] for end in ends)
+    times_ns = ends[0].t_ns[ends[0].t_ns >= first_common_ns]
     poses: Array = np.array(
-        [end.q[np.searchsorted(end.t_ns, at_ns, side="right") - 1] for end in ends]
+        [end.q[np.searchsorted(end.t_ns, times_ns, side="right") - 1] for end in ends]
     )
     return float((poses.max(axis=0) - poses.min(axis=0)).max(initial=0.0))
 
@@ -475,70 +536,76 @@ def measure_virtual_run(scenario: Scenario) -> RunMetrics:
     if scenario.expect.metrics:
         return measure_log(simulate_scenario(scenario))
     tallies = {name: SiteStats(scenario, name) for name in scenario.names}
-    diverged_at_s, late_samples = run_in_batches(
-        scenario, {name: tally.add for name, tally in tallies.items()}
-    )
-    made = sum(tally.records for tally in tallies.values())
+    receivers = {name: tally.add for name, tally in tallies.items()}
+    diverged_at_s, late_samples = run_in_batches(scenario, receivers)
+    missing = 0
+    if diverged_at_s is None:
+        records = sum(tally.records for tally in tallies.values())
+        missing = sum(map(scenario.ticks, scenario.names)) - records
     return compute_run_metrics(
         scenario,
         tallies,
         diverged_at_s=diverged_at_s,
         late_samples=late_samples,
-        missing=0
-        if diverged_at_s is not None
-        else sum(map(scenario.ticks, scenario.names)) - made,
+        missing=missing,
     )
 
 
 def measure_log(log: Log, expect: Expect | None = None) -> RunMetrics:
     """Returns the metrics of a log.
 
+    Args:
+        log: the log.
+        expect: expectations instead of those of the log's scenario.
+
     Raises:
         LogError: a record cannot be read.
     """
-    scenario = (
-        log.scenario if expect is None else msgspec.structs.replace(log.scenario, expect=expect)
-    )
-    made = {event.member: event.ticks for event in log.events if event.kind == "end"}
+    scenario = log.scenario
+    if expect is not None:
+        scenario = msgspec.structs.replace(scenario, expect=expect)
+    ticks_at_end = {event.member: event.ticks for event in log.events if event.kind == "end"}
     diverged_at_s = log.diverged_s
     tallies = {name: SiteStats(scenario, name) for name in log.sites}
     missing = 0
     for name, tally in tallies.items():
         part = log[name]
-        used = np.array([part.used[peer] for peer in part.peers]).T
-        tally.add(
-            RecordBatch(
-                t_ns=part.t_ns,
-                q=part.q,
-                qd=part.qd,
-                e=part.e,
-                tau=part.tau,
-                tau_x=part.tau_x,
-                used=used,
-            )
+        batch = RecordBatch(
+            t_ns=part.t_ns,
+            q=part.q,
+            qd=part.qd,
+            e=part.e,
+            tau=part.tau,
+            tau_x=part.tau_x,
+            used=np.array([part.used[peer] for peer in part.peers]).T,
         )
-        wanted = scenario.ticks(name) if diverged_at_s is None else made.get(name, 0)
-        missing += max(0, wanted - len(part))
-    found = compute_run_metrics(
+        tally.add(batch)
+        expected = scenario.ticks(name)
+        if diverged_at_s is not None:
+            expected = ticks_at_end.get(name, 0)
+        missing += max(0, expected - len(part))
+    late_samples = sum(sample.arrived_tick is not None for sample in find_absent_samples(log))
+    metrics = compute_run_metrics(
         scenario,
         tallies,
         diverged_at_s=diverged_at_s,
-        late_samples=sum(
-            sample.arrived_tick is not None for sample in find_absent_samples(log)
-        ),
+        late_samples=late_samples,
         missing=missing,
     )
-    return msgspec.structs.replace(found, metrics=measure_run(log, scenario.expect.metrics))
+    return msgspec.structs.replace(metrics, metrics=measure_run(log, scenario.expect.metrics))
 
 
 class ExpectationResult(msgspec.Struct, frozen=True):
-    """One thing that was expected of one run; values in words with their units.
+    """The outcome of one expectation of one run.
 
     Attributes:
-        key: the key of [expect] that asked, or a word for what every run must do.
-        margin: how far within the limit, as a fraction of the limit: 0.1 is 10 % to spare,
-            negative is beyond it. None where there is no such number.
-        value: the measured number, in the unit of the limit; None where it is none.
+        key: the key of [expect], or a word for a requirement on every run.
+        held: True if the expectation is met.
+        measured: the measured value as a text with its unit.
+        limit: the limit as a text with its unit.
+        margin: distance to the limit as a fraction of the limit, negative beyond the limit;
+            None if there is no such number.
+        value: the measured number in the unit of the limit; None if there is none.
     """
 
     key: str
@@ -550,120 +617,148 @@ class ExpectationResult(msgspec.Struct, frozen=True):
 
 
 def evaluate_expectations(expect: Expect, metrics: RunMetrics) -> list[ExpectationResult]:
-    """Returns an outcome for everything that is asked of a run, in the order of the keys of
-    `Expect`.
+    """Returns an outcome for each expectation of a run, in the order of the keys of `Expect`.
 
-    A run that diverged has an outcome `stable` even where that key is absent, see `Expect`.
+    A run that diverged has an outcome `stable` even if that key is absent, see `Expect`.
     """
-    limits = [
-        _compare_with_limit(key, _read_metric(key, metrics), limit)
-        for key in _LIMITS
-        if (limit := getattr(expect, key)) is not None
-    ]
-    missing = f"{metrics.missing} missing"
-    gaps = ExpectationResult("no_gaps", metrics.missing == 0, missing, "0 missing")
-    return [
-        *_evaluate_stability(expect, metrics),
-        *limits,
-        *_evaluate_poses(expect, metrics),
-        *([gaps] if expect.no_gaps else []),
-        *_evaluate_windows(expect, metrics),
-        *_evaluate_metrics(expect, metrics),
-    ]
+    outcomes = list(_evaluate_stability(expect, metrics))
+    for key in _LIMITS:
+        limit = getattr(expect, key)
+        if limit is not None:
+            outcomes.append(_compare_with_limit(key, _read_metric(key, metrics), limit))
+    outcomes += _evaluate_poses(expect, metrics)
+    if expect.no_gaps:
+        missing = f"{metrics.missing} missing"
+        outcomes.append(
+            ExpectationResult("no_gaps", metrics.missing == 0, missing, "0 missing")
+        )
+    outcomes += _evaluate_windows(expect, metrics)
+    outcomes += _evaluate_metrics(expect, metrics)
+    return outcomes
 
 
 def _evaluate_stability(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    wanted = expect.stable is not False
+    """Yields the outcome of `stable`, if it is expected or the run diverged."""
+    expects_stable = expect.stable is not False
     end = metrics.end
     if expect.stable is not None or end.diverged_at_s is not None:
-        held = end.stability is (Stability.STABLE if wanted else Stability.NOT_STABLE)
-        yield ExpectationResult(
-            "stable", held, f"{end.stability}: {end.text}", str(wanted).lower()
-        )
+        expected = Stability.STABLE if expects_stable else Stability.NOT_STABLE
+        measured = f"{end.stability}: {end.text}"
+        limit = str(expects_stable).lower()
+        yield ExpectationResult("stable", end.stability is expected, measured, limit)
 
 
 _LIMITS = tuple(key for key in field_names(Expect) if re.search("_(max|min|by)(_|$)", key))
+"""Keys of [expect] that limit a metric."""
 
 
 def _read_metric(key: str, metrics: RunMetrics) -> float | None:
-    """Returns what a limit is of; of ages that of the worst link, None if one never had a
-    sample.
+    """Returns the metric that a key of [expect] limits.
+
+    For ages it is that of the worst link, and None if a link never had a sample.
     """
     if not key.endswith("_ms"):
-        found: float | None = getattr(
-            metrics, re.sub("_(max|min)", "", key).replace("_by_", "_at_")
-        )
-        return found
-    ages = [
-        age.mean_ms if key.startswith("mean") else age.max_ms for age in metrics.ages.values()
-    ]
+        name = re.sub("_(max|min)", "", key).replace("_by_", "_at_")
+        value: float | None = getattr(metrics, name)
+        return value
+    is_mean = key.startswith("mean")
+    ages = [age.mean_ms if is_mean else age.max_ms for age in metrics.ages.values()]
     known = [age for age in ages if age is not None]
     choose = min if "_min_" in key else max
     return choose(known) if known and len(known) == len(ages) else None
 
 
 def _compare_with_limit(key: str, measured: float | None, limit: float) -> ExpectationResult:
-    least = "_min_" in key
+    """Returns the outcome of a smallest or a largest value.
+
+    Args:
+        key: the key of [expect].
+        measured: the measured value; None: the run has none.
+        limit: the limit, in the same unit.
+    """
+    is_minimum = "_min_" in key
     unit = split_unit(key)[1]
-    wanted = f"{'≥' if least else '≤'} {limit:g} {unit}".rstrip()
+    limit_text = f"{'≥' if is_minimum else '≤'} {limit:g} {unit}".rstrip()
     if measured is None:
-        return ExpectationResult(key, False, "never", wanted)
-    spare = measured - limit if least else limit - measured
-    text = f"{measured:.4g} {unit}".rstrip()
+        return ExpectationResult(key, False, "never", limit_text)
+    distance = measured - limit if is_minimum else limit - measured
     return ExpectationResult(
-        key, spare >= 0.0, text, wanted, spare / limit if limit else None, measured
+        key=key,
+        held=distance >= 0.0,
+        measured=f"{measured:.4g} {unit}".rstrip(),
+        limit=limit_text,
+        margin=distance / limit if limit else None,
+        value=measured,
     )
 
 
 def _evaluate_poses(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
-    within = expect.end_pose_within_rad
-    for site, wanted in expect.end_pose_rad.items():
+    """Yields the outcome of each expected end pose."""
+    tolerance = expect.end_pose_within_rad
+    for site, expected in expect.end_pose_rad.items():
         key = f"end_pose_rad.{site}"
-        limit = f"({', '.join(f'{angle:g}' for angle in wanted)}) ± {within:g} rad"
+        limit = f"({', '.join(f'{angle:g}' for angle in expected)}) ± {tolerance:g} rad"
         reached = metrics.end_pose_rad.get(site)
         if reached is None:
             yield ExpectationResult(key, False, "never", limit)
             continue
-        off = max(abs(a - b) for a, b in zip(reached, wanted, strict=True))
+        error = max(abs(a - b) for a, b in zip(reached, expected, strict=True))
         text = f"({', '.join(f'{angle:.4f}' for angle in reached)}) rad"
-        yield ExpectationResult(key, off <= within, text, limit, (within - off) / within)
+        margin = (tolerance - error) / tolerance
+        yield ExpectationResult(key, error <= tolerance, text, limit, margin)
 
 
 def _evaluate_windows(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
+    """Yields the outcome of each quantity of each window."""
     for window, ranges in zip(expect.windows, metrics.windows, strict=True):
         for key, limits in window.limits:
             site = f" {window.site}" if window.site else ""
-            name = (
-                f"{key}{site} {window.from_s:g}-{window.to_s:g} s"  # as in wall_mean_n s 9-15 s
-            )
+            # as in "wall_mean_n s 9-15 s"
+            name = f"{key}{site} {window.from_s:g}-{window.to_s:g} s"
             yield _compare_with_range(name, ranges.get(key), limits, split_unit(key)[1])
 
 
 def _evaluate_metrics(expect: Expect, metrics: RunMetrics) -> Iterator[ExpectationResult]:
+    """Yields the outcome of each expected metric of docs/metrics.md."""
     for key, limits in expect.metrics.items():
-        value, why, _ = metrics.metrics[key]
-        found = None if value is None else Range(value, value)
+        value, reason, _ = metrics.metrics[key]
         yield _compare_with_range(
             name=f"metrics.{key}",
-            found=found,
+            measured=None if value is None else Range(value, value),
             limits=limits,
             unit=find_quantity(key).unit,
-            why=why,
+            missing_text=reason,
         )
 
 
 def _compare_with_range(
-    name: str, found: Range | None, limits: Sequence[float], unit: str, why: str = "never"
+    name: str,
+    measured: Range | None,
+    limits: Sequence[float],
+    unit: str,
+    missing_text: str = "never",
 ) -> ExpectationResult:
+    """Returns the outcome of a quantity that must stay within a range.
+
+    Args:
+        name: name of the expectation.
+        measured: smallest and largest value; None: the run has none.
+        limits: lower and upper limit.
+        unit: unit of the quantity.
+        missing_text: text for a missing value.
+    """
     least, most = limits
-    wanted = f"{least:g} to {most:g} {unit}".rstrip()
-    if found is None:
-        return ExpectationResult(name, False, why, wanted)
-    text = " to ".join(f"{value:.4g}" for value in dict.fromkeys(found))
-    spare = min(found.least - least, most - found.most)
-    half = 0.5 * (most - least)
-    margin = spare / half if half else None
-    value = found.most if found.least == found.most else None
+    limit_text = f"{least:g} to {most:g} {unit}".rstrip()
+    if measured is None:
+        return ExpectationResult(name, False, missing_text, limit_text)
+    text = " to ".join(f"{value:.4g}" for value in dict.fromkeys(measured))
+    distance = min(measured.least - least, most - measured.most)
+    half_width = 0.5 * (most - least)
     return ExpectationResult(
-        name, spare >= 0.0, f"{text} {unit}".rstrip(), wanted, margin, value
+        key=name,
+        held=distance >= 0.0,
+        measured=f"{text} {unit}".rstrip(),
+        limit=limit_text,
+        margin=distance / half_width if half_width else None,
+        value=measured.most if measured.least == measured.most else None,
     )

@@ -1,11 +1,12 @@
-"""The folder of a study: its plan, and the journal with a line per finished run, which is only
-appended to.
+"""The folder of a study: its plan, and a journal with one line per finished run.
 
-A line is JSON, a tab, and the CRC-32 of study and JSON in hexadecimal digits.
+A line of the journal is JSON, a tab, and the CRC-32 of study and JSON in hexadecimal digits.
+The journal is only appended to.
 
-Invariant: by that checksum a torn line is ignored, and so is one of another study; a process
-that dies at any moment loses no earlier line and spoils no later one. A run that is in the
-journal is never made again.
+Invariant:
+    - A torn line, and a line of another study, has a wrong checksum and is ignored.
+    - A process that dies at any moment loses no earlier line and spoils no later line.
+    - A run that is in the journal is never repeated.
 """
 
 import csv
@@ -30,21 +31,29 @@ from ..scenario.imported_code import name_law_classes
 from .executor import Progress, WorkerPool
 
 
-def format_command(*words: str) -> str:
-    """Returns a command of the program."""
-    return join_arguments(["trilat", *words])
+def format_command(*arguments: str) -> str:
+    """Returns a command line of the program with these arguments."""
+    return join_arguments(["trilat", *arguments])
 
 
 def set_options(overrides: Iterable[str]) -> list[str]:
-    """Returns overrides, as texts KEY=VALUE, as options of a command."""
-    return [word for text in overrides for word in ("--set", text)]
+    """Returns the arguments --set KEY=VALUE of a command for overrides KEY=VALUE."""
+    arguments = []
+    for text in overrides:
+        arguments += ["--set", text]
+    return arguments
 
 
 def format_toml_value(value: Any) -> str:
-    """Returns a value as TOML on one line; numbers as short as they can be."""
+    """Returns a value as TOML on one line, with numbers as short as possible.
+
+    Raises:
+        ScenarioError: TOML has no such value.
+    """
     value = name_law_classes(value)
     if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{key} = {format_toml_value(entry)}' for key, entry in value.items())}}}"
+        entries = [f"{key} = {format_toml_value(entry)}" for key, entry in value.items()]
+        return f"{{{', '.join(entries)}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(format_toml_value, value))}]"
     if isinstance(value, float) and float(f"{value:g}") == value:
@@ -53,7 +62,7 @@ def format_toml_value(value: Any) -> str:
         return tomli_w.dumps({"v": value}).removeprefix("v = ").removesuffix("\n")
     except TypeError:
         raise ScenarioError(
-            f"{value!r:.80} is no value of a scenario: those are of TOML"
+            f"{value!r:.80} is no value of a scenario: scenarios have values of TOML"
         ) from None
 
 
@@ -61,23 +70,30 @@ _VERSIONS = ("version_trilat-net", "version_numba", "version_numpy")
 
 
 def describe_program() -> tuple[str, dict[str, str]]:
-    """Returns the arithmetic, and the versions of what computes: results depend on both."""
-    known = collect_provenance()
-    return compute_fingerprint(), {name: known[name] for name in _VERSIONS}
+    """Returns the fingerprint of the arithmetic and the versions of the computing packages.
+
+    Results depend on both.
+    """
+    provenance = collect_provenance()
+    return compute_fingerprint(), {name: provenance[name] for name in _VERSIONS}
 
 
-def build_resume_hint(*words: str) -> str:
-    """Returns how a command goes on with a study that the disk interrupted."""
-    return f"what is done is kept: make room, and go on with: {format_command(*words)}"
+def build_resume_hint(*arguments: str) -> str:
+    """Returns a hint how to continue a study that a full disk interrupted."""
+    command = format_command(*arguments)
+    return f"finished runs are kept: make room, and continue with: {command}"
 
 
 def encode_csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = ()) -> str:
-    """Returns rows as CSV with a line of heads: these columns, else all that rows have; None is
-    empty.
+    """Returns rows as CSV with a header; None becomes an empty field.
+
+    Args:
+        rows: the rows.
+        columns: the columns; empty: all keys of the rows, in their order.
     """
     stream = io.StringIO()
-    heads = columns or list(dict.fromkeys(key for row in rows for key in row))
-    writer = csv.DictWriter(stream, heads, extrasaction="ignore", lineterminator="\n")
+    header = columns or list(dict.fromkeys(key for row in rows for key in row))
+    writer = csv.DictWriter(stream, header, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return stream.getvalue()
@@ -88,11 +104,11 @@ class JournalEntry(Protocol):
 
     @property
     def cell(self) -> Hashable:
-        """What is run."""
+        """The cell of the run."""
 
     @property
     def seed(self) -> int:
-        """With which seed."""
+        """The seed of the run."""
 
 
 P = TypeVar("P")
@@ -101,16 +117,16 @@ E = TypeVar("E", bound=JournalEntry)
 
 
 class RunJournal(Generic[E]):
-    """The runs that are done; a context, which closes it.
+    """The finished runs of a study; a context manager that closes the file.
 
     Args:
         path: the file.
-        study: what the runs belong to, as a text.
-        kind: the type of its entries.
-        remedy: what the error of a full disk advises.
+        study: text that identifies the study.
+        kind: the type of the entries.
+        remedy: advice in the error for a full disk.
 
     Attributes:
-        done: the runs, by cell and seed; lines of another study count for nothing.
+        done: the finished runs, by cell and seed; lines of another study are ignored.
     """
 
     def __init__(self, path: Path, study: str, kind: type[E], remedy: str) -> None:
@@ -118,16 +134,17 @@ class RunJournal(Generic[E]):
         self._study = study
         self._remedy = remedy
         self.done: dict[tuple[Any, int], E] = {}
-        before = path.read_bytes() if path.exists() else b""
-        for line in before.split(b"\n"):
+        content = path.read_bytes() if path.exists() else b""
+        for line in content.split(b"\n"):
             text, tab, digits = line.rpartition(b"\t")
             if tab and digits == b"%08x" % self._checksum(text):
-                # unlike msgspec, json knows infinity
+                # json and not msgspec, because it accepts infinity
                 entry = msgspec.convert(json.loads(text), kind)
                 self.done.setdefault((entry.cell, entry.seed), entry)
         self._file = extend_file(path)
-        if before and not before.endswith(b"\n"):  # a line that was torn stays torn, by itself
-            self._put(b"\n")
+        if content and not content.endswith(b"\n"):
+            # ends the torn line, so that it does not spoil the next one
+            self._write(b"\n")
 
     def __enter__(self) -> "RunJournal[E]":
         return self
@@ -137,15 +154,15 @@ class RunJournal(Generic[E]):
         self._file.close()
 
     def add(self, entry: E) -> None:
-        """Writes one run down, at once; one that is there already changes nothing.
+        """Writes a run to the file at once; ignores a run that the journal has already.
 
         Raises:
-            LogRefused: the disk refused it.
+            LogRefused: the disk is full.
         """
         if (entry.cell, entry.seed) in self.done:
             return
         text = json.dumps(msgspec.to_builtins(entry), separators=(",", ":")).encode()
-        self._put(b"%s\t%08x\n" % (text, self._checksum(text)))
+        self._write(b"%s\t%08x\n" % (text, self._checksum(text)))
         self.done[entry.cell, entry.seed] = entry
 
     def run_pending(
@@ -157,31 +174,32 @@ class RunJournal(Generic[E]):
         total: int,
         show: Progress,
     ) -> None:
-        """Makes the runs of a study that are left, and writes each down as it ends.
+        """Executes the pending runs of a study, and writes each to the file as it ends.
 
         Args:
-            pool: makes them.
-            run: makes the run of a task.
-            tasks: those that are left, `total - done` at most.
-            done: how many runs there are already.
-            total: how many there will be.
-            show: called with the runs that are done, and their number.
+            pool: the workers.
+            run: executes the run of a task.
+            tasks: the pending tasks, at most `total - done`.
+            done: number of finished runs.
+            total: number of all runs.
+            show: called with the number of finished runs and `total`.
         """
-        for number, (_, entry) in enumerate(
-            pool.each(run, tasks, count=total - done), done + 1
-        ):
+        results = pool.iterate_results(run, tasks, count=total - done)
+        for number, (_, entry) in enumerate(results, done + 1):
             self.add(entry)
             show(number, total)
 
-    def _put(self, data: bytes) -> None:
+    def _write(self, data: bytes) -> None:
+        """Appends bytes to the file, or raises LogRefused."""
         try:
-            # a disk that became full takes a part, and says nothing
+            # on a full disk, write() returns the number of written bytes without an error
             if self._file.write(data) != len(data):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:
             raise describe_write_error(self._path, error, self._remedy) from None
 
     def _checksum(self, text: bytes) -> int:
+        """Returns the CRC-32 of the study and a line's text."""
         return zlib.crc32(text, zlib.crc32(self._study.encode()))
 
 
@@ -189,11 +207,11 @@ class StudyFolder(NamedTuple, Generic[P, E]):
     """The folder of a study.
 
     Attributes:
-        path: where it is.
-        plan: what is asked of it.
-        facts: what names the study, its arithmetic, and the versions it is made with.
-        remedy: what the error of a full disk advises.
-        journal: opens the journal.
+        path: path of the folder.
+        plan: the plan of the study.
+        facts: identification of the study, its arithmetic, and the package versions.
+        remedy: advice in the error for a full disk.
+        journal: function that opens the journal.
     """
 
     path: Path
@@ -203,6 +221,6 @@ class StudyFolder(NamedTuple, Generic[P, E]):
     journal: Callable[[], RunJournal[E]]
 
     def read_done(self) -> list[tuple[Any, int]]:
-        """Returns the cells and seeds of the runs that are done."""
+        """Returns the cells and seeds of the finished runs."""
         with self.journal() as journal:
             return list(journal.done)

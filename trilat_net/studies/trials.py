@@ -13,13 +13,17 @@ From pytest, one test per seed:
 
 Or all seeds in one, on all cores: `trilat_net.check("jitter", seeds=range(1, 21))`.
 
-Invariant: one command repeats a trial, and its result carries that command. An evaluation is a
-pure function of metrics and expectation; it states the measured value, the limit and the
-margin, held or not. A live trial is evaluated from its log by the same code; in addition its
-session must end in order and its records must re-execute bit for bit. Results come in the order
-of the trials, whatever ran them; a trial that ends its worker process again and again costs
-itself and no other. The XML follows Jenkins' `junit-10.xsd`: a suite per scenario, a case per
-run, one `failure` with everything that did not hold, an `error` for a run without a result.
+The XML report follows Jenkins' `junit-10.xsd`: a suite per scenario, a case per run, one
+`failure` with all unmet expectations, and an `error` for a run without a result.
+
+Invariant:
+    - One command repeats a trial, and the trial's result contains that command.
+    - An evaluation is a pure function of metrics and expectation. It states the measured value,
+      the limit and the margin, whether the expectation is met or not.
+    - A live trial is evaluated from its log by the same code. In addition its session must end
+      in order, and its records must be the same bit for bit when executed again.
+    - Results are in the order of the trials, whatever ran them.
+    - A trial that repeatedly kills its worker process affects no other trial.
 """
 
 import re
@@ -46,7 +50,7 @@ from ..results import Result
 from ..scenario import Scenario, load_scenario
 from ..scenario.code_consent import list_imported_code
 from ..scenario.scenario_reader import read_experiment, reseed_scenario
-from .executor import MAX_LOSSES, Workers, open_worker_pool
+from .executor import MAX_LOSSES, WorkerPool, Workers, open_worker_pool
 from .intervals import MeanInterval, mean_interval
 from .measure_run import (
     ExpectationResult,
@@ -59,8 +63,15 @@ from .study_folder import format_command, format_toml_value, set_options
 
 
 class TrialResult(NamedTuple):
-    """Result of a trial: an outcome per expectation, or why it came to no end; a live one has a
-    log.
+    """Result of a trial.
+
+    Attributes:
+        trial: the trial.
+        outcomes: an outcome per expectation.
+        simulated_s: duration of the run in its own time, s.
+        wall_s: duration in real time, s.
+        error: the reason why the run has no result; "" if it has.
+        log: log of a live trial.
     """
 
     trial: "Trial"
@@ -72,21 +83,30 @@ class TrialResult(NamedTuple):
 
     @property
     def held(self) -> bool:
-        """True if the run reached its end and met all expectations."""
+        """True if the run has a result and met all expectations."""
         return not self.error and all(outcome.held for outcome in self.outcomes)
 
     @property
     def failures(self) -> list[str]:
-        """Unmet expectations, a sentence each."""
-        missed = [outcome for outcome in self.outcomes if not outcome.held]
-        words = [
-            f"{outcome.key}: {outcome.measured}, asked {outcome.limit}" for outcome in missed
+        """One sentence per unmet expectation, after the error of a run without a result."""
+        sentences = [f"no result: {self.error}"] if self.error else []
+        sentences += [
+            f"{outcome.key}: {outcome.measured}, expected {outcome.limit}"
+            for outcome in self.outcomes
+            if not outcome.held
         ]
-        return [f"no result: {self.error}", *words] if self.error else words
+        return sentences
 
 
 class Trial(NamedTuple):
-    """One scenario with one seed; a command calls it by its source and overrides KEY=VALUE."""
+    """One scenario with one seed.
+
+    Attributes:
+        scenario: the scenario.
+        source: its name or path, as in a command.
+        overrides: overrides KEY=VALUE, as in a command.
+        live: run over a network instead of in virtual time.
+    """
 
     scenario: Scenario
     source: str
@@ -105,12 +125,12 @@ class Trial(NamedTuple):
 
     @property
     def look(self) -> str:
-        """The command that makes a log of the same run, to look at."""
-        words = ["--seed", str(self.scenario.seed), "-o", f"{self}.mcap"]
-        return format_command("sim", self.source, *words, *set_options(self.overrides))
+        """The command that writes a log of the same run, for inspection."""
+        arguments = ["--seed", str(self.scenario.seed), "-o", f"{self}.mcap"]
+        return format_command("sim", self.source, *arguments, *set_options(self.overrides))
 
     def evaluate(self, metrics: RunMetrics, wall_s: float) -> TrialResult:
-        """Returns the result that metrics of this trial mean."""
+        """Returns the result of this trial for measured metrics."""
         outcomes = evaluate_expectations(self.scenario.expect, metrics)
         return TrialResult(self, outcomes, metrics.simulated_s, wall_s)
 
@@ -126,13 +146,13 @@ class Trial(NamedTuple):
         return self.evaluate(metrics, (clock.monotonic_ns() - start_ns) * 1e-9)
 
     def check(self) -> TrialResult:
-        """Runs the trial in virtual time.
+        """Runs the trial in virtual time and returns the result if all expectations are met.
 
         Raises:
-            AssertionError: something that is expected did not hold; it says what, and how to
-                repeat it.
+            AssertionError: an expectation is not met; the text has the commands that repeat
+                the run.
         """
-        __tracebackhide__ = True  # pytest shows the reason, not this line
+        __tracebackhide__ = True  # pytest shows the reason instead of this line
         result = self.run()
         if not result.held:
             reasons = "; ".join(result.failures)
@@ -147,8 +167,7 @@ def trials(
     *,
     live: bool = False,
 ) -> list[Trial]:
-    """Returns the trials of a scenario, one per seed, ready to run, as for parameters of a
-    test.
+    """Returns the trials of a scenario, one per seed, as for parameters of a test.
 
     >>> [str(trial) for trial in tn.trials("jitter", seeds=[1, 2])]
     ['jitter-seed1', 'jitter-seed2']
@@ -158,37 +177,47 @@ def trials(
 
     Args:
         source: the name of a shipped scenario, a path, a TOML text, its tables, or a scenario.
-        seeds: which seeds; none means the scenario's own.
+        seeds: the seeds; empty: the scenario's own seed.
         set: overrides, as in `{"link.delay_ms": 400}` or `["link.delay_ms=400"]`.
-        live: whether they are to run over a network.
+        live: the trials will run over a network.
 
     Raises:
-        ScenarioError: the scenario or an override is not valid, or there is no [expect] in it.
+        ScenarioError: the scenario or an override is not valid, or the scenario has no
+            [expect].
     """
     scenario = load_scenario(source, set)
-    called = read_experiment(source).label
-    _check_expectations_reachable(scenario, called)
+    label = read_experiment(source).label
+    _check_expectations_reachable(scenario, label)
     if not live:
         virtual.check_virtual(scenario)
-    chosen = list(dict.fromkeys(seeds)) or [scenario.seed]
-    for seed in chosen:
+    distinct_seeds = list(dict.fromkeys(seeds)) or [scenario.seed]
+    for seed in distinct_seeds:
         if not 0 <= seed < 2**63:
             raise ScenarioError(
-                f"must be from 0 to 2^63 - 1, is {seed}", path="seed", source=called
+                f"must be from 0 to 2^63 - 1, is {seed}", path="seed", source=label
             )
     if not scenario.random and not live:
-        del chosen[1:]
-    texts = tuple(list_assignments(set) if isinstance(set, Mapping) else set)
-    return [Trial(reseed_scenario(scenario, seed), called, texts, live) for seed in chosen]
+        del distinct_seeds[1:]
+    overrides = tuple(list_assignments(set) if isinstance(set, Mapping) else set)
+    return [
+        Trial(reseed_scenario(scenario, seed), label, overrides, live)
+        for seed in distinct_seeds
+    ]
 
 
 def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
+    """Refuses expectations that no run of a scenario can meet.
+
+    Raises:
+        ScenarioError: the scenario expects nothing, a metric is unknown, or a time is after the
+            end of the run.
+    """
     expect = scenario.expect
     end_s = scenario.duration_s
     if not expect.has_expectations:
         raise ScenarioError(
-            "nothing is expected of it: add a table [expect] with keys such as stable = true or "
-            "synchronised_by_s = 12.0; the template of `trilat scenario new` lists them all",
+            "expects nothing: add a table [expect] with keys such as stable = true or "
+            "synchronised_by_s = 12.0; the template of `trilat scenario new` lists all keys",
             source=source,
         )
     for key in expect.metrics:
@@ -209,7 +238,12 @@ def _check_expectations_reachable(scenario: Scenario, source: str) -> None:
 
 
 def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Yields overrides as the command line takes them."""
+    """Yields overrides as texts KEY=VALUE of the command line.
+
+    Args:
+        overrides: the overrides, also as nested tables.
+        prefix: prefix of the keys.
+    """
     for key, value in overrides.items():
         if isinstance(value, Mapping) and not is_distribution(value):
             yield from list_assignments(value, f"{prefix}{key}.")
@@ -220,8 +254,15 @@ def list_assignments(overrides: Mapping[str, Any], prefix: str = "") -> Iterator
 def evaluate_live_log(
     trial: Trial, log_file: Path, problems: Sequence[str], wall_s: float
 ) -> TrialResult:
-    """Returns the result of a live trial."""
-    kept = log_file if log_file.exists() else None
+    """Returns the result of a live trial.
+
+    Args:
+        trial: the trial.
+        log_file: log of the session.
+        problems: problems of the session; empty if it ended in order.
+        wall_s: duration of the session, s.
+    """
+    existing_log = log_file if log_file.exists() else None
     try:
         log = open_log(log_file)
         if not any(len(log[name]) for name in log.sites):
@@ -229,27 +270,33 @@ def evaluate_live_log(
         result = trial.evaluate(measure_log(log, trial.scenario.expect), wall_s)
         verdict = verify(log)
     except LogError as error:
-        return TrialResult(
-            trial, wall_s=wall_s, error="; ".join([*problems, str(error)]), log=kept
-        )
-    ended = "; ".join(problems) or "ended in order"
-    session = ExpectationResult("session", not problems, ended, "ends in order")
-    judged = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
-    identical = f"{verdict.identical} identical{judged}"
+        text = "; ".join([*problems, str(error)])
+        return TrialResult(trial, wall_s=wall_s, error=text, log=existing_log)
+    session_end = "; ".join(problems) or "ended in order"
+    session = ExpectationResult("session", not problems, session_end, "ends in order")
+    coverage = "" if verdict.coverage.share == 1.0 else f"; judged {verdict.coverage}"
+    identical = f"{verdict.identical} identical{coverage}"
     records = f"{count_nouns(verdict.records, 'record')}"
-    again = ExpectationResult("executed again", verdict.passed, identical, records)
-    return result._replace(outcomes=[*result.outcomes, session, again], log=kept)
+    execution = ExpectationResult("executed again", verdict.passed, identical, records)
+    return result._replace(outcomes=[*result.outcomes, session, execution], log=existing_log)
 
 
 MAX_FAILURES_SHOWN = 5
-"""Failed runs of a scenario that are printed in full; of the others the seeds."""
+"""Failed runs of a scenario that are printed in full; of further runs only the seeds."""
 
 TRIAL_COLUMNS = ("", "scenario", "expected", "limit", "worst", "margin", "held")
 
 
 class ExpectationRow(NamedTuple):
-    """One expectation of one scenario: its worst outcome, in how many of its runs it held, and
-    the mean.
+    """One expectation of one scenario over its runs.
+
+    Attributes:
+        scenario: the scenario as in a command.
+        key: the expectation.
+        worst: the worst outcome.
+        held: number of runs that met the expectation.
+        runs: number of runs.
+        mean: mean of the measured values.
     """
 
     scenario: str
@@ -260,7 +307,7 @@ class ExpectationRow(NamedTuple):
     mean: MeanInterval | None = None
 
     def cells(self) -> tuple[str, ...]:
-        """Returns the row's texts, under `TRIAL_COLUMNS`."""
+        """Returns the texts of the row in the columns `TRIAL_COLUMNS`."""
         mark = "ok" if self.held == self.runs else "FAIL"
         worst = self.worst
         margin = format_margin(self.worst.margin)
@@ -270,19 +317,24 @@ class ExpectationRow(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class TrialReport(Result):
-    """All results, in the order of scenarios and seeds, and how long all of them took, s."""
+    """The results of several trials.
+
+    Attributes:
+        results: the results, in the order of scenarios and seeds.
+        wall_s: duration of all trials together, s.
+    """
 
     results: list[TrialResult]
     wall_s: float
 
     @property
     def held(self) -> bool:
-        """True where everything held."""
+        """True if all runs met all expectations."""
         return all(result.held for result in self.results)
 
     @property
     def scenarios(self) -> dict[str, list[TrialResult]]:
-        """The results by scenario, as a command calls it."""
+        """The results by scenario, with its name or path as in a command."""
         groups: dict[str, list[TrialResult]] = {}
         for result in self.results:
             groups.setdefault(result.trial.source, []).append(result)
@@ -292,122 +344,127 @@ class TrialReport(Result):
         """Returns the table: a row per scenario and expectation."""
         rows = []
         for name, results in self.scenarios.items():
-            by_key: dict[str, list[ExpectationResult]] = {}
-            for outcome in (outcome for result in results for outcome in result.outcomes):
-                by_key.setdefault(outcome.key, []).append(outcome)
-            for (
-                key,
-                outcomes,
-            ) in by_key.items():  # the worst is the first that failed, then by margin
-                worst = min(outcomes, key=lambda one: (one.held, one.margin or 0.0))
-                held = sum(one.held for one in outcomes)
-                mean = mean_interval([one.value for one in outcomes])
-                rows.append(
-                    ExpectationRow(
-                        scenario=name,
-                        key=key,
-                        worst=worst,
-                        held=held,
-                        runs=len(outcomes),
-                        mean=mean,
-                    )
+            outcomes_by_key: dict[str, list[ExpectationResult]] = {}
+            for result in results:
+                for outcome in result.outcomes:
+                    outcomes_by_key.setdefault(outcome.key, []).append(outcome)
+            for key, outcomes in outcomes_by_key.items():
+                # a failed outcome is worse than any other, and then the margin decides
+                worst = min(outcomes, key=lambda outcome: (outcome.held, outcome.margin or 0.0))
+                row = ExpectationRow(
+                    scenario=name,
+                    key=key,
+                    worst=worst,
+                    held=sum(outcome.held for outcome in outcomes),
+                    runs=len(outcomes),
+                    mean=mean_interval([outcome.value for outcome in outcomes]),
                 )
-            if broken := [result.error for result in results if result.error]:
-                worst = ExpectationResult("a result", False, broken[0], "")
-                whole = len(results) - len(broken)
-                rows.append(
-                    ExpectationRow(
-                        scenario=name, key=worst.key, worst=worst, held=whole, runs=len(results)
-                    )
+                rows.append(row)
+            errors = [result.error for result in results if result.error]
+            if errors:
+                row = ExpectationRow(
+                    scenario=name,
+                    key="a result",
+                    worst=ExpectationResult("a result", False, errors[0], ""),
+                    held=len(results) - len(errors),
+                    runs=len(results),
                 )
+                rows.append(row)
         return rows
 
     def failures(self) -> list[str]:
-        """Returns what failed and the commands that repeat it, line by line."""
+        """Returns lines with the failures and the commands that repeat them."""
         lines = []
         for results in self.scenarios.values():
             failed = [result for result in results if not result.held]
             for result in failed[:MAX_FAILURES_SHOWN]:
                 trial = result.trial
-                lines.append(
-                    f"{trial.source}, seed {trial.scenario.seed}: {'; '.join(result.failures)}"
-                )
-                lines += [f"  {line}" for line in _repeat_lines(result)]
-            if more := failed[MAX_FAILURES_SHOWN:]:
-                seeds = ", ".join(str(result.trial.scenario.seed) for result in more)
-                lines.append(f"  and {len(more)} more, seeds {seeds}")
+                reasons = "; ".join(result.failures)
+                lines.append(f"{trial.source}, seed {trial.scenario.seed}: {reasons}")
+                lines += [f"  {line}" for line in _list_repeat_commands(result)]
+            further = failed[MAX_FAILURES_SHOWN:]
+            if further:
+                seeds = ", ".join(str(result.trial.scenario.seed) for result in further)
+                lines.append(f"  and {len(further)} more, seeds {seeds}")
         return lines
 
     def remarks(self) -> list[str]:
-        """Returns what else there is to know: what ran once, and how fast it went."""
-        first = {name: results[0].trial for name, results in self.scenarios.items()}
-        once = [
-            name for name, trial in first.items() if not (trial.scenario.random or trial.live)
+        """Returns remarks: common overrides, scenarios that ran once, and the speed."""
+        remarks = []
+        overrides = self.results[0].trial.overrides if self.results else ()
+        if overrides:
+            remarks.append(f"changed in all: {', '.join(overrides)}")
+        first_trials = {name: results[0].trial for name, results in self.scenarios.items()}
+        run_once = [
+            name
+            for name, trial in first_trials.items()
+            if not (trial.scenario.random or trial.live)
         ]
-        changed = self.results[0].trial.overrides if self.results else ()
-        remarks = [f"changed in all: {', '.join(changed)}"] if changed else []
-        if once:
-            remarks.append(f"run once, nothing in it is random: {', '.join(once)}")
+        if run_once:
+            remarks.append(f"run once, nothing in it is random: {', '.join(run_once)}")
         simulated_s = sum(result.simulated_s for result in self.results)
-        how = "ran live" if any(result.trial.live for result in self.results) else "simulated"
-        runs = "run" if len(self.results) == 1 else "runs"
+        is_live = any(result.trial.live for result in self.results)
+        kind = "ran live" if is_live else "simulated"
         speed = f": {simulated_s / self.wall_s:.3g}x" if self.wall_s > 0.0 else ""
-        took = f"{simulated_s:.6g} s {how} in {self.wall_s:.1f} s{speed}"
-        return [*remarks, f"{len(self.results)} {runs}, {took}"]
+        runs = count_nouns(len(self.results), "run")
+        remarks.append(f"{runs}, {simulated_s:.6g} s {kind} in {self.wall_s:.1f} s{speed}")
+        return remarks
 
     def table(self) -> list[str]:
-        """Returns the table as aligned lines; the first holds the heads."""
+        """Returns the table as aligned lines; the first line is the header."""
         rows = self.rows()
+        cells = [row.cells() for row in rows]
         if not any(row.mean for row in rows):
-            return TextTable(
-                TRIAL_COLUMNS, [row.cells() for row in rows], align="lllllrr"
-            ).lines()
-        cells = [(*row.cells(), str(row.mean) if row.mean else "") for row in rows]
+            return TextTable(TRIAL_COLUMNS, cells, align="lllllrr").lines()
+        means = [str(row.mean) if row.mean else "" for row in rows]
+        cells = [(*texts, mean) for texts, mean in zip(cells, means, strict=True)]
         return TextTable((*TRIAL_COLUMNS, "mean, 95 %"), cells, align="lllllrrr").lines()
 
     def blocks(self) -> Iterator[Block]:
-        """Yields its text."""
-        heads, *rows = self.table()
-        yield heads
-        for line in rows:
+        """Yields the table, the failures and the remarks."""
+        header, *lines = self.table()
+        yield header
+        for line in lines:
             mark, _, rest = line.partition(" ")
             yield MarkedText(f"[{'green' if mark == 'ok' else 'red'}]{mark}[/]", rest)
         yield from [*self.failures(), *self.remarks()]
 
     def headline(self) -> str:
-        """Returns how many runs held."""
-        return (
-            f"{sum(result.held for result in self.results)} of "
-            f"{count_nouns(len(self.results), 'run')} as expected"
-        )
+        """Returns the number of runs that met all expectations."""
+        held = sum(result.held for result in self.results)
+        return f"{held} of {count_nouns(len(self.results), 'run')} as expected"
 
     def to_dict(self) -> dict[str, Any]:
         """Returns plain values, with the keys of `trilat test --json`."""
         runs = [
             {
-                "scenario": one.trial.source,
-                "seed": one.trial.scenario.seed,
-                "held": one.held,
-                "error": one.error or None,
-                "log": str(one.log) if one.log else None,
-                "again": one.trial.again,
-                "expected": [asdict(outcome) for outcome in one.outcomes],
+                "scenario": result.trial.source,
+                "seed": result.trial.scenario.seed,
+                "held": result.held,
+                "error": result.error or None,
+                "log": str(result.log) if result.log else None,
+                "again": result.trial.again,
+                "expected": [asdict(outcome) for outcome in result.outcomes],
             }
-            for one in self.results
+            for result in self.results
         ]
         return {"held": self.held, "wall_s": self.wall_s, "runs": runs}
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per run and expectation."""
         return [
-            {"scenario": one.trial.source, "seed": one.trial.scenario.seed, **asdict(outcome)}
-            for one in self.results
-            for outcome in one.outcomes
+            {
+                "scenario": result.trial.source,
+                "seed": result.trial.scenario.seed,
+                **asdict(outcome),
+            }
+            for result in self.results
+            for outcome in result.outcomes
         ]
 
 
 def _run_trial(trial: Trial) -> TrialResult:
-    """Runs a trial in a worker; an error that no other trial would have is its result."""
+    """Runs a trial in a worker; an error that concerns this trial only becomes its result."""
     try:
         return trial.run()
     except (TrilatError, ArithmeticError, ValueError, MemoryError) as error:
@@ -420,34 +477,46 @@ def run_trials(
     done: Callable[[TrialResult], None] = lambda _: None,
     on: Workers = None,
 ) -> TrialReport:
-    """Runs trials in virtual time and returns their results; `done` gets every one as it comes.
+    """Runs trials in virtual time and returns their results.
 
-    One trial, or one job, runs in this process; otherwise `jobs` and `on` are those of `check`.
+    A single trial, or a single job, runs in this process.
+
+    Args:
+        batch: the trials.
+        jobs: number of processes, as for `check`.
+        done: called with each result as it arrives.
+        on: runs the trials instead of processes, as for `check`.
     """
     clock = SystemClock()
     start_ns = clock.monotonic_ns()
     laws = list_imported_code(trial.scenario for trial in batch)
-    longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
     results: dict[int, TrialResult] = {}
     with open_worker_pool(jobs, on, most=len(batch), laws=laws) as pool:
-        if pool.is_local:
-            replies = ((n, trial.run()) for n, trial in enumerate(batch))
-        else:
-            if not is_core_cached():
-                # compiles, once for all processes
-                next(virtual.execute_virtual(batch[0].scenario))
-            queue = [batch[n] for n in longest_first]
-            lost = partial(TrialResult, error=f"its worker process ended, {MAX_LOSSES} times")
-            replies = (
-                (longest_first[place], result)
-                for place, result in pool.each(_run_trial, queue, lost, len(queue))
-            )
-        for n, result in replies:
+        for n, result in _iterate_results(pool, batch):
+            # the same object as in the batch, and not a worker's copy
             results[n] = result._replace(trial=batch[n])
             done(results[n])
-    return TrialReport(
-        [results[n] for n in range(len(batch))], (clock.monotonic_ns() - start_ns) * 1e-9
-    )
+    in_order = [results[n] for n in range(len(batch))]
+    return TrialReport(in_order, (clock.monotonic_ns() - start_ns) * 1e-9)
+
+
+def _iterate_results(
+    pool: WorkerPool, batch: Sequence[Trial]
+) -> Iterator[tuple[int, TrialResult]]:
+    """Yields the index and the result of each trial as it ends."""
+    if pool.is_local:
+        for n, trial in enumerate(batch):
+            yield n, trial.run()
+        return
+    if not is_core_cached():
+        # compiles the core once for all processes
+        next(virtual.execute_virtual(batch[0].scenario))
+    # the longest trials first, so that no worker is left with a long one at the end
+    longest_first = sorted(range(len(batch)), key=lambda n: -batch[n].scenario.duration_s)
+    queue = [batch[n] for n in longest_first]
+    lost = partial(TrialResult, error=f"its worker process ended, {MAX_LOSSES} times")
+    for index, result in pool.iterate_results(_run_trial, queue, lost, len(queue)):
+        yield longest_first[index], result
 
 
 def check(
@@ -458,43 +527,49 @@ def check(
     jobs: int | None = None,
     on: Workers = None,
 ) -> TrialReport:
-    """Runs a scenario in virtual time, once per seed, and returns the results if all of
-    [expect] held.
+    """Runs a scenario in virtual time, once per seed, and checks its [expect].
 
-    The command is `trilat test`.
+    Returns the results if all expectations are met. The command is `trilat test`.
 
     >>> tn.check("free", jobs=1).held
     True
 
     Args:
         source: the name of a shipped scenario, a path, or a scenario.
-        seeds: which seeds; none means the scenario's own.
+        seeds: the seeds; empty: the scenario's own seed.
         set: overrides, as in `{"link.delay_ms": 400}`.
-        jobs: how many processes; None for one per core.
-        on: what runs them instead: a Dask scheduler's address, as in "tcp://10.0.0.5:8786", or
-            an executor.
+        jobs: number of processes; None: one per core.
+        on: runs the trials instead of processes: a Dask scheduler's address, as in
+            "tcp://10.0.0.5:8786", or an executor.
 
     Raises:
-        ScenarioError: the scenario or an override is not valid, or there is no [expect] in it.
-        UsageError: the cluster cannot be reached, or one of its workers is not fit.
-        AssertionError: something did not hold; it says what, by how much, and how to repeat it.
+        ScenarioError: the scenario or an override is not valid, or the scenario has no
+            [expect].
+        UsageError: the cluster cannot be reached, or a worker does not meet the requirements.
+        AssertionError: an expectation is not met; the text has the margin and the command that
+            repeats the run.
     """
-    __tracebackhide__ = True  # pytest shows the reason, not this line
+    __tracebackhide__ = True  # pytest shows the reason instead of this line
     report = run_trials(trials(source, seeds, set), jobs, on=on)
-    if not report.held:
-        first = next(
-            f"{one.trial}: {'; '.join(one.failures)}" for one in report.results if not one.held
-        )
-        raise AssertionError(f"not as expected: {first}\n{report.summary()}")
+    for result in report.results:
+        if not result.held:
+            reasons = "; ".join(result.failures)
+            raise AssertionError(
+                f"not as expected: {result.trial}: {reasons}\n{report.summary()}"
+            )
     return report
 
 
 def format_margin(margin: float | None) -> str:
-    """Returns a margin in percent; "" where there is none."""
-    return "" if margin is None else f"{100.0 * margin:+,.{0 if abs(margin) >= 0.1 else 1}f} %"
+    """Returns a margin in percent; "" for None."""
+    if margin is None:
+        return ""
+    digits = 0 if abs(margin) >= 0.1 else 1
+    return f"{100.0 * margin:+,.{digits}f} %"
 
 
-def _repeat_lines(result: TrialResult) -> list[str]:
+def _list_repeat_commands(result: TrialResult) -> list[str]:
+    """Returns lines with the commands that repeat and show a run."""
     look = f"trilat report {result.log}" if result.log else result.trial.look
     return [f"again: {result.trial.again}", f"look:  {look}"]
 
@@ -503,7 +578,13 @@ _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> bytes:
-    """Returns the results as an XML document."""
+    """Returns the results as a JUnit XML document.
+
+    Args:
+        report: the results.
+        began_unix_ns: start of the trials, ns since 1970.
+        host: name of this machine.
+    """
     root = Xml.Element("testsuites", _counts(report.results), name="trilat test")
     began = datetime.fromtimestamp(began_unix_ns // 10**9, UTC)
     for name, results in report.scenarios.items():
@@ -518,7 +599,7 @@ def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> byte
         )
         properties = Xml.SubElement(suite, "properties")
         trial = results[0].trial
-        told = {
+        facts = {
             "driver": "live" if trial.live else "virtual",
             "source": trial.source,
             "overrides": " ".join(trial.overrides),
@@ -526,7 +607,7 @@ def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> byte
             "simulated_s": f"{sum(result.simulated_s for result in results):.6g}",
             "random": str(trial.scenario.random).lower(),
         }
-        for key, value in told.items():
+        for key, value in facts.items():
             Xml.SubElement(properties, "property", name=key, value=_clean(value))
         for result in results:
             _add_case(suite, result)
@@ -536,6 +617,7 @@ def encode_junit_xml(report: TrialReport, began_unix_ns: int, host: str) -> byte
 
 
 def _counts(results: Sequence[TrialResult]) -> dict[str, str]:
+    """Returns the attributes of a suite: counts of tests, failures, errors; and the time."""
     errors = sum(bool(result.error) for result in results)
     failures = sum(not result.held for result in results) - errors
     return {
@@ -547,6 +629,7 @@ def _counts(results: Sequence[TrialResult]) -> dict[str, str]:
 
 
 def _add_case(suite: Xml.Element, result: TrialResult) -> None:
+    """Adds the test case of a run to a suite."""
     trial = result.trial
     case = Xml.SubElement(
         suite,
@@ -556,16 +639,23 @@ def _add_case(suite: Xml.Element, result: TrialResult) -> None:
         time=f"{result.wall_s:.3f}",
     )
     if not result.held:
-        kind, why = ("error", "error") if result.error else ("failure", "expectation")
-        found = Xml.SubElement(case, kind, type=why, message=_clean("; ".join(result.failures)))
-        found.text = _clean("\n".join([*result.failures, *_repeat_lines(result)]))
-    lines = [
-        f"{'ok' if o.held else 'FAIL'} {o.key}: {o.measured}, asked {o.limit}"
-        + (f" ({format_margin(o.margin)})" if o.margin is not None else "")
-        for o in result.outcomes
-    ]
-    Xml.SubElement(case, "system-out").text = _clean("\n".join(lines))
+        tag = "error" if result.error else "failure"
+        problem_type = "error" if result.error else "expectation"
+        message = _clean("; ".join(result.failures))
+        problem = Xml.SubElement(case, tag, type=problem_type, message=message)
+        lines = [*result.failures, *_list_repeat_commands(result)]
+        problem.text = _clean("\n".join(lines))
+    output = [_describe_outcome(outcome) for outcome in result.outcomes]
+    Xml.SubElement(case, "system-out").text = _clean("\n".join(output))
+
+
+def _describe_outcome(outcome: ExpectationResult) -> str:
+    """Returns a line with the measured value, the limit and the margin of an outcome."""
+    mark = "ok" if outcome.held else "FAIL"
+    margin = "" if outcome.margin is None else f" ({format_margin(outcome.margin)})"
+    return f"{mark} {outcome.key}: {outcome.measured}, expected {outcome.limit}{margin}"
 
 
 def _clean(text: str) -> str:
+    """Returns a text in which characters that XML forbids are replaced."""
     return _NOT_XML.sub("\N{REPLACEMENT CHARACTER}", text)

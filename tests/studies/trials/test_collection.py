@@ -158,7 +158,7 @@ def test_the_cut_into_blocks_changes_no_statistics_of_a_site(
         "peak_error_rad",
         "peak_torque_nm",
         "peak_speed_rad_s",
-        "apart_ns",
+        "unsynchronised_ns",
         "last_ns",
     ):
         assert getattr(cut, figure) == getattr(whole, figure)
@@ -183,7 +183,7 @@ def test_statistics_of_a_site_are_those_of_all_records(seed: int) -> None:
         max(np.sqrt(np.mean(error[:, j] ** 2)) for j in (0, 1))
     )
     apart = [t for t, e in zip(rows.t_ns, error, strict=True) if e.max() >= 1.0]
-    assert tally.apart_ns == (apart[-1] if apart else -1)
+    assert tally.unsynchronised_ns == (apart[-1] if apart else -1)
     assert tally.end(tally.last_ns).t_ns.tolist() == rows.t_ns[-100:].tolist()
     ages = [(rows.t_ns[k] - rows.used[k, 1] * 20_000_000) * 1e-6 for k in range(20, TALLIED)]
     assert tally.link_ages[1].mean_ms == pytest.approx(np.mean(ages))
@@ -259,7 +259,7 @@ def stretched(records: RecordBatch, cuts: list[int], **window: Any) -> dict[str,
     for first, last in pairwise([0, *sorted(cuts), RECORDS]):
         if first < last:
             made.add(RecordBatch(*(column[first:last] for column in records)))
-    return made.figures()
+    return made.compute_ranges()
 
 
 @given(seed=st.integers(0, 100), cuts=st.lists(st.integers(0, RECORDS), max_size=8))

@@ -167,7 +167,7 @@ def test_suite_per_scenario_case_per_run_and_counts_add_up() -> None:
 def test_a_failure_carries_the_figures_and_the_command() -> None:
     root = document(mixed())
     (failure,) = root.iter("failure")
-    assert failure.get("message") == "rms_error_max_rad: 0.3 rad, asked ≤ 0.1 rad"
+    assert failure.get("message") == "rms_error_max_rad: 0.3 rad, expected ≤ 0.1 rad"
     assert failure.text is not None
     assert "again: trilat test quick.toml --seeds 1" in failure.text
     (error,) = root.iter("error")

@@ -73,7 +73,7 @@ def test_a_failed_trial_says_by_how_much(quick_file: Path) -> None:
         trial.check()
     lines = [line.strip() for line in str(failed.value).splitlines()]
     assert lines[0].startswith("quick-seed7: mean_age_max_ms: ")  # the line of pytest's summary
-    assert lines[0].endswith(" ms, asked ≤ 1 ms")
+    assert lines[0].endswith(" ms, expected ≤ 1 ms")
     assert lines[1:] == [
         f"trilat test {quick_file} --seeds 7 --set expect.mean_age_max_ms=1",
         f"trilat sim {quick_file} --seed 7 -o quick-seed7.mcap --set expect.mean_age_max_ms=1",
