@@ -115,7 +115,7 @@ class HandServer:
             memory=self._memory,
             t_ns=t_ns,
             commands=commands,
-            place=self._compute_pose,
+            locate=self._compute_pose,
         )
         self._memory = step.memory
         for reason in step.refused:

@@ -161,7 +161,7 @@ class PeerInbox:
             qd=sample.qd,
             latency_us=delay_ns // 1000,
             tau_x=sample.tau_x,
-            ch=link.channel.select_for_peer(sample.ch, link.place) if sample.ch else (),
+            ch=link.channel.select_for_peer(sample.ch, link.index_at_peer) if sample.ch else (),
         )
 
     def _is_reachable(self, index: int, sample: PeerSample) -> bool:

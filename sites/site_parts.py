@@ -321,7 +321,7 @@ def watch_law(
 
 
 def _run_warm_up(setup: SiteSetup, site: Site, step: Callable[[TickInput], TickRecord]) -> None:
-    site.begin_at(first_tick_at(0, site.rate_hz))
+    site.start_at(first_tick_at(0, site.rate_hz))
     site.release_tick(0, 0)  # as when a site joins late
     estimator = OffsetEstimator()
     measured = PlantState(setup.q0, setup.qd0) if setup.external else None

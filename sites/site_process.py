@@ -196,10 +196,10 @@ def join_session(parts: SiteParts, give_up_ns: int) -> "RunningSite | None":
             since_ns = parts.clock.monotonic_ns() - epoch.mono_ns
             options.connection.require_keys_until(scenario.duration_s - since_ns / NS_PER_S)
             return RunningSite(parts, publisher, pinger, epoch)
-        if joining.coming_at != first_tick:
-            first_tick = joining.coming_at
+        if joining.announced_first_tick != first_tick:
+            first_tick = joining.announced_first_tick
             # Prepared here, since it takes 0.1 s for every hour of the running session.
-            parts.site.begin_at(first_tick)
+            parts.site.start_at(first_tick)
         now_ns = parts.clock.monotonic_ns()
         if now_ns > give_up_ns:
             raise _describe_failed_join(parts, joining)
@@ -250,7 +250,7 @@ class RunningSite:
         self.publish_link = parts.publish_link
         self.use_slack = parts.buffer.answer_query
         parts.monitor.boots = epoch.boots
-        site.begin_at(epoch.first)
+        site.start_at(epoch.first)
         parts.buffer.start_at(epoch.first)
         self._timing = self._make_timing(pinger)
         self._clock_texts = describe_clocks(pinger, epoch.boots, epoch.mono_ns)
@@ -595,7 +595,7 @@ class RunningSite:
             return
         lost: Sequence[str] = ()
         if rule.degrades and mode is Mode.RETURN:
-            lost = parts.site.layout.find_lost(output.mem, parts.site.peers)
+            lost = parts.site.layout.list_lost_peers(output.mem, parts.site.peers)
         alarm = find_alarm(
             parts.options.session,
             parts.name,

@@ -307,7 +307,10 @@ WRONG: dict[str, tuple[Callable[[Path], object], str]] = {
         r"replace=NAME \(of m, s\), or closed_loop=True for all",
     ),
     "figure": (lambda file: tn.figure(file, "positions", "x"), "3.5 or 7 in wide, not x"),
-    "linear": (lambda _: tn.linear("two_sites", pose=["x"]), "a pose consists of angles in rad"),
+    "linear": (
+        lambda _: tn.linear("two_sites", pose=["x"]),
+        "a pose consists of angles in rad",
+    ),
     "bench": (lambda _: tn.bench(seeds=0), "^seeds is how many, 1 to 1000, not 0"),
 }
 

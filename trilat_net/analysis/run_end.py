@@ -611,7 +611,9 @@ def _find_disagreement(
     """
     for group in find_coupled_sites(scenario):
         names = [scenario.names[n] for n in group]
-        compares_positions = any(scenario.sites[name].control.compares_positions for name in names)
+        compares_positions = any(
+            scenario.sites[name].control.compares_positions for name in names
+        )
         shares_pose = any(scenario.arms[name].shares_pose for name in names)
         if len(group) < 2 or compares_positions or shares_pose:
             continue  # e itself shows whether the sites agree

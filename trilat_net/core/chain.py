@@ -223,7 +223,7 @@ def multiply(a: Matrix, b: Matrix) -> Matrix:
     rows: list[Any] = []
     for x, y, z in a:
         rows.append(tuple(x * u + y * v + z * w for u, v, w in columns))
-    return tuple(rows)  # type: ignore[return-value]
+    return tuple(rows)
 
 
 @leaf

@@ -525,8 +525,9 @@ class TeleoperationEnv(gymnasium.Env[dict[str, Array], Array]):
 
 def _flatten_space(parts: spaces.Dict) -> spaces.Box:
     """Returns the space of all numbers of an observation in one array of float32."""
-    low = np.concatenate([np.ravel(box.low) for box in parts.values()])
-    high = np.concatenate([np.ravel(box.high) for box in parts.values()])
+    boxes = [box for box in parts.values() if isinstance(box, spaces.Box)]
+    low = np.concatenate([np.ravel(box.low) for box in boxes])
+    high = np.concatenate([np.ravel(box.high) for box in boxes])
     return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
 
 
