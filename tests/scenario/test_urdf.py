@@ -293,7 +293,7 @@ def test_files_that_the_text_names_are_not_opened() -> None:
         ('<mass value="2"/>', '<mass value="0"/>', ["link 'upper'", "no mass"]),
         ('<mass value="2"/>', "", ["link 'upper'", "<mass>"]),
         (BODY, "", ["link 'upper'", "joint 'one'", "<inertial>"]),
-        ('izz="0.04"', 'izz="0.06"', ["link 'upper'", "0.06", "two others"]),
+        ('izz="0.04"', 'izz="0.06"', ["link 'upper'", "0.06", "the other two"]),
         ('izz="0.04"', 'izz="-0.04"', ["link 'upper'", "positive"]),
         ('izz="0.04"', "", ["link 'upper'", "izz"]),
         ('ixy="0"', 'ixy="0.03"', ["link 'upper'", "positive"]),
