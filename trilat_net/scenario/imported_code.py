@@ -445,8 +445,7 @@ def name_law_class(kind: type) -> str:
     if not module or not name.isidentifier():
         raise ScenarioError(
             f"{name} is not a class in a file, so that no log can name it: write it into a "
-            "file, "
-            "in a notebook with %%writefile mylaws.py, and import it from there; see "
+            "file, in a notebook with %%writefile mylaws.py, and import it from there; see "
             f"{find_page('own-controller.md')}"
         )
     return f"{module}:{name}"
