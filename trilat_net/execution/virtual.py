@@ -570,7 +570,7 @@ class SimulatedLog(Log):
         stream = io.BytesIO()
         write(stream, 0.0)
         stream.seek(0)
-        super().__init__(read_contents(stream, "log", own=True))
+        super().__init__(read_contents(stream, "log", trusted=True))
         self._write = write
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:

@@ -1,8 +1,11 @@
-"""Reader of an MCAP file, chunk by chunk; contents of a trilat-net log by topic.
+"""Reader of MCAP files, chunk by chunk, and contents of a trilat-net log by topic.
 
-Invariant: the reader holds one chunk at a time; what it cannot read it skips and reports.
-Messages of a log stay bytes until they are decoded. Channels for viewers (`/viz`) are skipped.
-A channel that would take the memory of all ends where its share does, and the others are read.
+Invariant:
+    - The reader holds one chunk at a time. Unreadable parts are skipped and reported.
+    - Messages of a log stay bytes until they are decoded.
+    - Channels for viewers (/viz) are skipped.
+    - A channel whose messages would need too much memory is read up to its share of the memory;
+      the other channels are read completely.
 """
 
 import math
@@ -32,44 +35,53 @@ _READ = {
     Opcode.ATTACHMENT,
     Opcode.HEADER,
 }
-"""Records that are read; indexes are of no use to a reader of the whole file."""
+"""Kinds of records that are read; a reader of the whole file needs no indexes."""
 
 KEPT_BYTES = 64 << 20
+"""Memory that the kept messages of any file may take, in bytes."""
 KEPT_RATIO = 300
-CHANNEL_SHARE = 1 / 3
-"""Messages that are kept take at most so much memory, or so many times the file's size; a
-channel its share.
+"""The kept messages of larger files may take this many times the size of the file.
 
-Arms at rest in virtual time pack best of all that is no bomb: 120 times.
+Logs of arms at rest in virtual time have the largest honest ratio, of about 120.
 """
+CHANNEL_SHARE = 1 / 3
+"""Largest share of that memory for one channel."""
 _DECODED_BYTES = 3_000
 _LONG_BYTES = 300
 _LONG_RATIO = 24
-"""A message of a log, decoded, takes some memory, and more if it is longer than a record must
-be.
+"""Memory of a decoded message: _DECODED_BYTES, and for every byte of its payload beyond
+_LONG_BYTES another _LONG_RATIO bytes.
 """
 _NAME_BYTES = 600
 _NAME_RATIO = 20
-"""What a channel and its metadata take, likewise."""
+"""Memory of a channel: _NAME_BYTES, and _NAME_RATIO bytes for every byte of its record."""
 
 Progress = Callable[[int, int], None]
-"""Takes how much of something is done: (bytes so far, bytes in all)."""
+"""Receives the progress of a task: (bytes done, all bytes)."""
 Watch = Callable[[mcap_records.RecordFrame, bytes, bytes], None]
-"""Takes a record of a file: its place, its content, and what a chunk holds (empty if it is
-unreadable).
+"""Receives a record of a file: its place, its content, and the unpacked records of a chunk.
+
+The unpacked records are empty if the chunk is unreadable.
 """
 
 
 def shift_progress(progress: Progress | None, before: int, total: int) -> Progress | None:
-    """Returns the progress of one file as a part of `total` bytes, of which `before` were done."""
+    """Returns a progress of one file within `total` bytes, of which `before` are done."""
     if progress is None:
         return None
     return lambda done, _: progress(before + done, total)
 
 
 class ChannelInfo(NamedTuple):
-    """A channel as its file describes it; `schema` is the name of its messages' schema, "" for
-    none.
+    """A channel as its file describes it.
+
+    Attributes:
+        topic: topic of the channel.
+        encoding: encoding of the messages.
+        schema: name of the messages' schema; "" without a schema.
+        schema_encoding: encoding of the schema.
+        metadata: metadata of the channel.
+        schema_data: content of the schema.
     """
 
     topic: str
@@ -84,11 +96,11 @@ class McapMessage(NamedTuple):
     """One message.
 
     Attributes:
-        topic: of its channel; "" if the file never named it.
-        payload: its bytes, as published.
-        log_time_ns: when it came, Unix ns.
-        publish_time_ns: when it was sent, by its own stamp, Unix ns.
-        sequence: its number, modulo 2^32.
+        topic: topic of its channel; "" if the file does not define the channel.
+        payload: bytes of the message, as published.
+        log_time_ns: arrival, Unix ns.
+        publish_time_ns: sending time that the message states, Unix ns.
+        sequence: number of the message, modulo 2^32.
     """
 
     topic: str
@@ -103,24 +115,24 @@ class McapReader:
 
     Args:
         stream: the file, opened for reading.
-        name: its name in errors.
+        name: name of the file in errors.
         progress: called after every record of the file.
-        kept: True if the caller keeps the messages: then what they take, decoded, is limited
-            (`KEPT_RATIO`).
+        kept: True if the caller keeps the messages: then their memory is limited, see
+            `KEPT_RATIO`.
 
     Attributes:
-        metadata, attachments: what was seen of them so far, by name.
-        channels: channels seen so far, by topic; the first definition of one holds.
-        library: what wrote the file, as its header states.
-        chunks: chunks read so far, by compression ("" for none).
-        packed_bytes, unpacked_bytes: what they take in the file, and unpacked.
-        size: bytes of the file.
-        offset: first byte of the record of the file that is being read.
-        complete: True once all was read, to the end mark's last byte: the file was finished.
-        scanner: finds its records.
-        watch: takes every record of the file before its messages, if it is set. It goes on
-            where the reader gives up, after `MAX_DAMAGED_PARTS`, and takes a file that begins
-            otherwise as well.
+        metadata, attachments: metadata and attachments read so far, by name.
+        channels: channels read so far, by topic; the first definition of a channel counts.
+        library: program that wrote the file, as its header states.
+        chunks: number of chunks read so far, by compression ("" without compression).
+        packed_bytes, unpacked_bytes: sizes of these chunks in the file, and unpacked.
+        size: size of the file, in bytes.
+        offset: offset of the record of the file that is being read.
+        complete: True once a finished file has been read to the last byte of its end mark.
+        scanner: finds the records of the file.
+        watch: receives every record of the file before the messages of the record, if it is
+            set. It also receives the records after `MAX_DAMAGED_PARTS` damaged parts, where
+            the reader gives up, and those of a file without the mark at its beginning.
     """
 
     def __init__(
@@ -147,28 +159,28 @@ class McapReader:
         self.watch: Watch | None = None
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._topics: dict[int, str] = {}
-        self._ours: set[int] = set()
-        self._room = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
-        share = math.inf if self._room is None else CHANNEL_SHARE * self._room
-        # what is left, by channel
-        self._shares: defaultdict[int, float] = defaultdict(lambda: share)
+        self._session_channels: set[int] = set()
+        # Memory that is left for all messages, and by channel, in bytes.
+        self._memory_left = max(KEPT_BYTES, KEPT_RATIO * self.size) if kept else None
+        share = math.inf if self._memory_left is None else CHANNEL_SHARE * self._memory_left
+        self._channel_memory_left: defaultdict[int, float] = defaultdict(lambda: share)
         self._more_damage: list[mcap_records.Damage] = []
 
     @property
     def damaged(self) -> list[mcap_records.Damage]:
-        """Parts that could not be read, so far, and channels that were read in part."""
+        """Parts that could not be read so far, and channels that were read only in part."""
         return self.scanner.damaged + self._more_damage
 
     @property
     def torn(self) -> mcap_records.Damage | None:
-        """The end that was cut off; None in a finished file, and before it was reached."""
+        """The end that was cut off; None in a finished file, and before the end is reached."""
         return self.scanner.torn
 
     def messages(self) -> Iterator[McapMessage]:
         """Yields every message in file order.
 
         Raises:
-            LogError: the file is no MCAP file, or holds absurdly much for its size.
+            LogError: the file is not an MCAP file, or unpacks to far too much for its size.
         """
         scanner = self.scanner
         if not scanner.begins and self.watch is None:
@@ -180,8 +192,8 @@ class McapReader:
                 try:
                     yield from self._read_records(self._open(frame), frame)
                 except mcap_records.UnreadableRecord as error:
-                    found = scanner.damaged if self.watch is None else self._more_damage
-                    found.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
+                    damaged = scanner.damaged if self.watch is None else self._more_damage
+                    damaged.append(mcap_records.Damage(frame.offset, frame.size, str(error)))
             if self._progress is not None:
                 self._progress(frame.end, self.size)
         self.complete = scanner.finished and not self._gave_up
@@ -202,8 +214,9 @@ class McapReader:
         return data
 
     def _unpack(self, frame: mcap_records.RecordFrame, content: bytes) -> bytes:
-        """Returns the records with messages and channels in a record of the file; stores other
-        contents.
+        """Returns the messages, schemas and channels in a record of the file, unpacked.
+
+        Metadata, attachments and the header are stored, and have no unpacked records.
         """
         match frame.opcode:
             case Opcode.CHUNK:
@@ -235,12 +248,14 @@ class McapReader:
         self, data: bytes, frame: mcap_records.RecordFrame
     ) -> Iterator[McapMessage]:
         find_topic = self._topics.get
-        ours = self._ours
-        shares = self._shares
+        session_channels = self._session_channels
+        memory_left = self._channel_memory_left
         parse_head = mcap_records.MESSAGE_HEAD.unpack_from
         head_bytes = mcap_records.MESSAGE_HEAD.size
-        new = tuple.__new__  # what the class does with its arguments, in half the time
-        memory = chained = messages = 0
+        new = tuple.__new__  # twice as fast as calling the class `McapMessage`
+        memory = 0
+        chained = 0  # end of the part of `data` that the digest chain includes
+        messages = 0
         view = memoryview(data)
         for opcode, begin, end in mcap_records.iterate_records(data):
             if opcode == mcap_records.OP_MESSAGE:
@@ -249,16 +264,17 @@ class McapReader:
                 if length < head_bytes:
                     raise mcap_records.UnreadableRecord("a message is shorter than its head")
                 channel, sequence, log_time_ns, publish_time_ns = parse_head(data, begin)
-                if channel in ours:
+                if channel in session_channels:
                     cost = _DECODED_BYTES
                     if length > _LONG_BYTES:
                         cost += (length - _LONG_BYTES) * _LONG_RATIO
                 else:
                     cost = 100 + length
-                if (left := shares[channel]) < cost:
+                remaining = memory_left[channel]
+                if remaining < cost:
                     self._cut_channel(channel, frame)
                     continue
-                shares[channel] = left - cost
+                memory_left[channel] = remaining - cost
                 memory += cost
                 payload = data[begin + head_bytes : end]
                 topic = find_topic(channel, "")
@@ -274,21 +290,20 @@ class McapReader:
         self._take_memory(memory, frame)
 
     def judge_digest(self) -> Integrity:
-        """Returns whether the file, once it was read, agrees with its digest chain."""
+        """Returns the agreement of the file, once it has been read, with its digest chain."""
         return self._chain.judge(
             self.metadata, finished=self.complete, damaged=bool(self.damaged)
         )
 
     @property
     def agrees_on_messages(self) -> bool:
-        """True if the messages that were read are all that the digest chain states, in its
-        order.
-        """
+        """True if number and order of the messages read agree with the digest chain."""
         stated = self.metadata.get(DIGESTS, {})
-        found = self._chain.facts()
-        return all(stated.get(key) == found[key] for key in ("messages", "records"))
+        computed = self._chain.facts()
+        return all(stated.get(key) == computed[key] for key in ("messages", "records"))
 
     def _define(self, opcode: int, content: bytes) -> None:
+        """Stores a schema or a channel."""
         self._chain.add_entry(opcode, content)
         record = mcap_records.parse_record(opcode, content)
         if opcode == Opcode.SCHEMA:
@@ -306,11 +321,12 @@ class McapReader:
             )
             self.channels.setdefault(topic, info)
             if topic.startswith("/trilat/"):
-                self._ours.add(record.id)
+                self._session_channels.add(record.id)
 
     def _cut_channel(self, channel: int, frame: mcap_records.RecordFrame) -> None:
-        if self._shares[channel] >= 0.0:
-            self._shares[channel] = -math.inf
+        """Ends the reading of a channel whose share of the memory is used up."""
+        if self._channel_memory_left[channel] >= 0.0:
+            self._channel_memory_left[channel] = -math.inf
             topic = self._topics.get(channel, f"channel {channel}")
             text = (
                 f"{topic[:80]} takes absurdly much for such a file; from here on it is not read"
@@ -318,15 +334,19 @@ class McapReader:
             self._more_damage.append(mcap_records.Damage(frame.offset, frame.size, text))
 
     def _take_memory(self, amount: int, frame: mcap_records.RecordFrame) -> None:
-        """Takes memory for what is kept; raises `LogError` if there is not so much."""
-        if self._room is None:
+        """Subtracts memory from the memory that is left.
+
+        Raises:
+            LogError: the memory does not suffice.
+        """
+        if self._memory_left is None:
             return
-        self._room -= amount
-        if self._room < 0:
+        self._memory_left -= amount
+        if self._memory_left < 0:
             raise LogError(
                 f"{self._source}: holds absurdly much for a file of "
-                f"{count_nouns(self.size, 'byte')}: up to byte "
-                f"{frame.end} alone it would take more than {KEPT_RATIO} times that in memory, and more than "
+                f"{count_nouns(self.size, 'byte')}: up to byte {frame.end} alone it would take "
+                f"more than {KEPT_RATIO} times that in memory, and more than "
                 f"{KEPT_BYTES >> 20} MiB"
             )
 
@@ -340,7 +360,8 @@ class ChannelMessages:
 
     Attributes:
         payloads: the messages as published.
-        log_ns, publish_ns: when each came, and was sent by its own stamp, Unix ns.
+        log_ns: arrival of each message, Unix ns.
+        publish_ns: sending time that each message states, Unix ns.
     """
 
     payloads: list[bytes] = field(default_factory=list)
@@ -354,29 +375,29 @@ class ChannelMessages:
         self.publish_ns.append(publish_ns)
 
     def times(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns when the messages came and when they were sent, shape (K,) each, Unix ns
-        below 2^63.
-        """
-        stored = (np.array(times, dtype=np.uint64) for times in (self.log_ns, self.publish_ns))
-        log_ns, publish_ns = (
-            np.minimum(times, _LAST_SIGNED_NS).astype(np.int64) for times in stored
-        )
-        return log_ns, publish_ns
+        """Returns the arrival and sending times, shape (K,) each, in Unix ns below 2^63."""
+        return _clip_times(self.log_ns), _clip_times(self.publish_ns)
+
+
+def _clip_times(times: "array[int]") -> NDArray[np.int64]:
+    unsigned = np.array(times, dtype=np.uint64)
+    return np.minimum(unsigned, _LAST_SIGNED_NS).astype(np.int64)
 
 
 @dataclass
 class LogContents:
-    """Contents of a file, or of several that are one session's; `sources` are the files' names.
+    """Contents of a log: of one file, or of several parts.
 
     Attributes:
-        session, metadata: metadata of the session; all metadata, by name.
+        sources: names of the files.
+        session: metadata of the session.
         scenario: text of the scenario.
+        metadata: all metadata, by name.
         channels: messages, by topic.
-        complete: True if all of it is there, finished and readable throughout; a later part
-            alone is not.
-        ended: True if the last one was finished.
-        damaged: what cannot be read, a sentence each.
-        chain: agreement with the digest chain, of several files the worst.
+        complete: True if all parts are present, finished, and readable throughout.
+        ended: True if the last part was finished.
+        damaged: a sentence for every part that cannot be read.
+        chain: agreement with the digest chain; of several files, the worst.
     """
 
     sources: tuple[str, ...]
@@ -391,67 +412,64 @@ class LogContents:
 
     @property
     def source(self) -> str:
-        """Its name in errors."""
+        """Name of the log in errors."""
         more = len(self.sources) - 1
-        return self.sources[0] + (
-            f" and {more} more {'parts' if more > 1 else 'part'}" if more else ""
-        )
+        if not more:
+            return self.sources[0]
+        return f"{self.sources[0]} and {more} more {'parts' if more > 1 else 'part'}"
 
 
 def read_contents(
-    stream: BinaryIO, name: str, progress: Progress | None = None, *, own: bool = False
+    stream: BinaryIO, name: str, progress: Progress | None = None, *, trusted: bool = False
 ) -> LogContents:
-    """Returns the contents of a file, called `name` in errors.
+    """Returns the contents of a log.
 
-    One that this program wrote just now is its `own`: however well a run that hardly moves is
-    packed, it holds no more than the run did.
+    Args:
+        stream: the file, opened for reading.
+        name: name of the file in errors.
+        progress: called after every record of the file.
+        trusted: True if this program has just written the file. Then the memory of the messages
+            is not limited: however well a run at rest is packed, the file holds no more than
+            the run did.
 
     Raises:
-        LogError: it is no MCAP file, or no log of trilat-net.
+        LogError: the file is not an MCAP file, or not a log of trilat-net.
     """
-    reader = McapReader(stream, name, progress, kept=not own)
+    reader = McapReader(stream, name, progress, kept=not trusted)
     channels: dict[str, ChannelMessages] = {}
-    taken: dict[str, ChannelMessages | None] = {}
+    channel_of_topic: dict[str, ChannelMessages | None] = {}  # None for skipped topics
     for topic, payload, log_ns, publish_ns, _ in reader.messages():
         try:
-            channel = taken[topic]
+            channel = channel_of_topic[topic]
         except KeyError:
             key = topics.parse_key(topic.removeprefix("/"))
-            is_ours = key is not None and key.channel in CHANNEL_TYPES
-            channel = taken[topic] = (
-                channels.setdefault(topic, ChannelMessages()) if is_ours else None
-            )
+            channel = None
+            if key is not None and key.channel in CHANNEL_TYPES:
+                channel = channels.setdefault(topic, ChannelMessages())
+            channel_of_topic[topic] = channel
         if channel is not None:
             channel.add(payload, log_ns, publish_ns)
     _check_head(reader, name)
-    session = reader.metadata[SESSION]
     damaged = [f"{name}: {damage}" for damage in reader.damaged]
-    complete = (
-        reader.complete
-        and not damaged
-        and reader.metadata.get(PART, {}).get("index", "1") == "1"
-    )
-    text = reader.attachments[SCENARIO]
-    chain = reader.judge_digest()
-    ended = reader.complete
+    is_first_part = reader.metadata.get(PART, {}).get("index", "1") == "1"
     return LogContents(
         sources=(name,),
-        session=session,
-        scenario=text,
+        session=reader.metadata[SESSION],
+        scenario=reader.attachments[SCENARIO],
         metadata=reader.metadata,
         channels=channels,
-        complete=complete,
-        ended=ended,
+        complete=reader.complete and not damaged and is_first_part,
+        ended=reader.complete,
         damaged=damaged,
-        chain=chain,
+        chain=reader.judge_digest(),
     )
 
 
 def check_log(stream: BinaryIO, name: str) -> None:
-    """Reads a file once, message by message, as a reader of a log does, and keeps nothing.
+    """Reads a log once, message by message, without keeping the messages.
 
     Raises:
-        LogError: no command opens the file; the text says why.
+        LogError: no command opens the file; the text states the reason.
     """
     reader = McapReader(stream, name)
     deque(reader.messages(), maxlen=0)
@@ -463,11 +481,16 @@ def check_log(stream: BinaryIO, name: str) -> None:
 
 
 def _check_head(reader: McapReader, name: str) -> None:
-    """Raises `LogError` unless a file that was read describes a session."""
+    """Checks that a file that was read describes a session.
+
+    Raises:
+        LogError: the file lacks the session's metadata or the scenario.
+    """
     session = reader.metadata.get(SESSION, {})
-    lacking = [key for key in ("session", "driver") if key not in session]
-    lacking += [] if SCENARIO in reader.attachments else [SCENARIO]
-    if lacking:
-        why = f"damaged: {reader.damaged[0]}" if reader.damaged else reader.torn
-        problem = f"{name}: is an MCAP file, but no log of trilat-net: no {lacking[0]}"
-        raise LogError(f"{problem}; {why}" if why else problem)
+    missing = [key for key in ("session", "driver") if key not in session]
+    if SCENARIO not in reader.attachments:
+        missing.append(SCENARIO)
+    if missing:
+        reason = f"damaged: {reader.damaged[0]}" if reader.damaged else reader.torn
+        problem = f"{name}: is an MCAP file, but no log of trilat-net: no {missing[0]}"
+        raise LogError(f"{problem}; {reason}" if reason else problem)

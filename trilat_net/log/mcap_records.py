@@ -1,12 +1,14 @@
-"""MCAP records in a file and in its chunks; the `mcap` package parses their content.
-
-Invariant: no number in a file is trusted. Nothing outside the file is read, a chunk is unpacked
-to at most what its size allows, and only if its head agrees with its data. Where the file makes
-no sense, the scan resumes at the next chunk that does. What makes no sense is an
-`UnreadableRecord` to every function.
+"""Records of MCAP files: scanning a file, and unpacking its chunks.
 
 A record is an opcode (1 byte), the length of its content (8 bytes) and the content; see the
-specification at mcap.dev. A chunk is a record that holds packed records.
+specification at mcap.dev. A chunk is a record whose content is packed records. The `mcap`
+package parses the content of other records.
+
+Invariant:
+    - No number in a file is trusted. Nothing outside the file is read. A chunk is unpacked to
+      at most the size that its packed size allows, and only if its head agrees with its data.
+    - Every function raises `UnreadableRecord` for bytes that make no sense.
+    - After such bytes, the scan of a file resumes at the next readable chunk.
 """
 
 import os
@@ -31,29 +33,31 @@ MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of a file."""
 RECORD_HEAD = struct.Struct("<BQ")
 RECORD_HEAD_BYTES = RECORD_HEAD.size
-"""Bytes of a record before its content: opcode and length."""
+"""Size of a record before its content, in bytes: opcode and length."""
 MESSAGE_HEAD = struct.Struct("<HIQQ")
-"""What precedes the payload of a message: channel, sequence, log time, publish time."""
+"""Head of a message before its payload: channel, sequence, log time, publish time."""
 OP_MESSAGE = int(Opcode.MESSAGE)  # a member of an enumeration compares slowly
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 FOOTER_BYTES = RECORD_HEAD_BYTES + 20 + len(MAGIC)
-"""Bytes of a finished file's end: its last record and the end mark."""
+"""Size of a finished file's footer and end mark, in bytes."""
 MAX_DAMAGED_PARTS = 100
-"""Damaged parts of a file after which reading ends."""
+"""Number of damaged parts of a file after which reading ends."""
 
 MAX_UNPACKED_BYTES = 32 << 20
+"""Largest size to which any chunk may unpack, in bytes."""
 MAX_UNPACKED_RATIO = 32
-"""A chunk unpacks to at most so many bytes, or to so many times its own where that is more."""
+"""Larger chunks may unpack to this many times their packed size."""
 MAX_WINDOW_BYTES = 32 << 20
-"""Largest window that Zstandard may ask for."""
+"""Largest window that a Zstandard frame may require, in bytes."""
 COMPRESSIONS = (b"zstd", b"lz4")
-"""How a chunk may be packed, besides not at all."""
+"""Supported compressions of chunks; chunks may also be uncompressed."""
 COMPRESSION_NAME_OFFSET = 28
-"""Where in a chunk's content the name of its compression is, with its length (4 bytes) before
-it.
+"""Offset of the compression's name in the content of a chunk.
+
+The length of the name (4 bytes) precedes the name.
 """
 MAX_HEAD_BYTES = COMPRESSION_NAME_OFFSET + 4 + 32 + 8
-"""A chunk's head is no longer; a name of a compression is at most 32 bytes."""
+"""Largest size of a chunk's head, with a compression name of at most 32 bytes."""
 
 _FIXED_HEAD = struct.Struct("<QQQII")
 _SIZE = struct.Struct("<Q")
@@ -64,14 +68,19 @@ _COMPRESSION_NAME = re.compile(
 
 
 class UnreadableRecord(Exception):  # noqa: N818 - describes a part of a file
-    """A part of a file that makes no sense; the text says why. Never leaves this package."""
+    """A part of a file makes no sense; the text states the reason. Raised within `log` only."""
 
 
 class ChunkHead(NamedTuple):
-    """Head of a chunk: first and last log time; of its records, unpacked, size and CRC-32 (0
-    for none).
+    """Head of a chunk.
 
-    They are packed by `compression`, and begin at `data_offset` in the chunk's content.
+    Attributes:
+        start_ns: first log time of the chunk's messages.
+        end_ns: last log time of the chunk's messages.
+        size: size of the unpacked records, in bytes.
+        crc: CRC-32 of the unpacked records; 0 if there is no checksum.
+        compression: name of the compression; "" if the records are not compressed.
+        data_offset: offset of the packed records in the content of the chunk.
     """
 
     start_ns: int
@@ -83,19 +92,23 @@ class ChunkHead(NamedTuple):
 
 
 def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
-    """Returns the head of a chunk of `length` bytes; its first `MAX_HEAD_BYTES` suffice as
-    content.
+    """Returns the head of a chunk.
+
+    Args:
+        content: content of the chunk, of which the first `MAX_HEAD_BYTES` suffice.
+        length: length of the whole content.
     """
     try:
-        start_ns, end_ns, size, crc, letters = _FIXED_HEAD.unpack_from(content)
-        (packed,) = _SIZE.unpack_from(content, _FIXED_HEAD.size + letters)
-        compression = content[_FIXED_HEAD.size : _FIXED_HEAD.size + letters].decode()
+        start_ns, end_ns, size, crc, name_bytes = _FIXED_HEAD.unpack_from(content)
+        (packed_bytes,) = _SIZE.unpack_from(content, _FIXED_HEAD.size + name_bytes)
+        compression = content[_FIXED_HEAD.size : _FIXED_HEAD.size + name_bytes].decode()
     except (struct.error, UnicodeDecodeError):
         raise UnreadableRecord("a chunk has no head") from None
-    data_offset = _FIXED_HEAD.size + letters + _SIZE.size
-    if data_offset + packed != length:
+    data_offset = _FIXED_HEAD.size + name_bytes + _SIZE.size
+    stated_length = data_offset + packed_bytes
+    if stated_length != length:
         raise UnreadableRecord(
-            f"a chunk of {count_nouns(length, 'byte')} says that it has {data_offset + packed}"
+            f"a chunk of {count_nouns(length, 'byte')} says that it has {stated_length}"
         )
     return ChunkHead(
         start_ns=start_ns,
@@ -108,12 +121,14 @@ def parse_chunk_head(content: bytes, length: int) -> ChunkHead:
 
 
 def unpack_chunk(content: bytes) -> bytes:
-    """Returns the records in a chunk."""
+    """Returns the unpacked records of a chunk, whose checksum is right if it has one."""
     head = parse_chunk_head(content, len(content))
     limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(content))
     if head.size > limit:
-        text = f"a chunk says that it unpacks to {count_nouns(head.size, 'byte')}, at most {limit} are taken"
-        raise UnreadableRecord(text)
+        raise UnreadableRecord(
+            f"a chunk says that it unpacks to {count_nouns(head.size, 'byte')}, "
+            f"at most {limit} are taken"
+        )
     data = _unpack(head, memoryview(content)[head.data_offset :])
     if len(data) != head.size:
         raise UnreadableRecord(
@@ -128,19 +143,15 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
     try:
         if head.compression == "zstd":
             declared = zstandard.get_frame_parameters(data).content_size
-            # the library would believe it
-            if declared not in (
-                head.size,
-                zstandard.CONTENTSIZE_UNKNOWN,
-            ):
+            # The library would allocate the declared size, whatever it is.
+            if declared not in (head.size, zstandard.CONTENTSIZE_UNKNOWN):
                 raise UnreadableRecord(
                     f"a chunk of {count_nouns(head.size, 'byte')} unpacks to {declared}"
                 )
-            return zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).decompress(
-                data, head.size
-            )
+            unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES)
+            return unpacker.decompress(data, head.size)
         if head.compression == "lz4":
-            # one byte more, so that one that is too long shows
+            # One byte more than stated reveals data that is too long.
             unpacked: bytes = lz4.frame.LZ4FrameDecompressor().decompress(
                 data, max_length=head.size + 1
             )
@@ -155,7 +166,7 @@ def _unpack(head: ChunkHead, data: memoryview) -> bytes:
 
 
 def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
-    """Yields the records in an unpacked chunk: opcode, where the content begins, where it ends."""
+    """Yields (opcode, begin, end) of the contents of the records in an unpacked chunk."""
     unpack = RECORD_HEAD.unpack_from
     size = len(data)
     end = 0
@@ -171,7 +182,13 @@ def iterate_records(data: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
 
 
 class RecordFrame(NamedTuple):
-    """Place of a record: its first byte in the file, its opcode, and the length of its content."""
+    """Place of a record in a file.
+
+    Attributes:
+        offset: offset of the record's first byte in the file.
+        opcode: kind of the record.
+        length: length of the record's content, in bytes.
+    """
 
     offset: int
     opcode: int
@@ -179,17 +196,23 @@ class RecordFrame(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes of the record with its head."""
+        """Size of the record including opcode and length, in bytes."""
         return RECORD_HEAD_BYTES + self.length
 
     @property
     def end(self) -> int:
-        """The first byte after it."""
+        """Offset of the first byte after the record."""
         return self.offset + self.size
 
 
 class Damage(NamedTuple):
-    """An unreadable part of a file: its first byte, its length, and what is wrong."""
+    """An unreadable part of a file.
+
+    Attributes:
+        offset: offset of the part's first byte.
+        length: length of the part, in bytes.
+        problem: description of the problem.
+    """
 
     offset: int
     length: int
@@ -203,15 +226,16 @@ class RecordScanner:
     """Scanner of the records of a file.
 
     Args:
-        stream: the file, opened for reading; it begins at the current position.
+        stream: the file, opened for reading; the file begins at the current position.
 
     Attributes:
-        size: bytes of the file. begins, ends: True if it begins as an MCAP file does, and ends
-        as a finished one: with the end mark.
-        finished: True once all was read, to the end of a file that was finished.
-        trailing: bytes that follow its end mark, once that was read.
-        damaged: parts that could not be read, so far; a torn end is none of them.
-        torn: the end that was cut off, once all before it was read; None if there is none.
+        size: size of the file, in bytes.
+        begins: True if the file begins with the mark of MCAP files.
+        ends: True if the file ends with a footer and the end mark.
+        finished: True once a finished file has been read to its end.
+        trailing: number of bytes after the end mark, once the mark has been read.
+        damaged: parts that could not be read so far, without a torn end.
+        torn: the end that was cut off, once everything before it has been read; else None.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -227,18 +251,20 @@ class RecordScanner:
         self.torn: Damage | None = None
 
     def read(self, offset: int, length: int) -> bytes:
-        """Returns the bytes of a part of the file, as far as they are there."""
+        """Returns the bytes of a part of the file; fewer at the end of the file."""
         self._stream.seek(self._base + offset)
         return self._stream.read(max(0, min(length, self.size - offset)))
 
     def frames(self) -> Iterator[RecordFrame]:
-        """Yields the place of every record, anew on every call; skips what makes no sense
-        (`damaged`).
+        """Yields the place of every record; every call starts anew.
+
+        Parts that make no sense are skipped, and added to `damaged`.
         """
         self.damaged = []
         self.torn = None
         self.finished = False
-        offset = sure = len(MAGIC)
+        offset = len(MAGIC)
+        search_start = offset  # where the search for a chunk starts after a damaged record
         while len(self.damaged) < MAX_DAMAGED_PARTS:
             try:
                 frame = self._frame_at(offset)
@@ -249,35 +275,47 @@ class RecordScanner:
                         f"a record (footer) of {count_nouns(frame.length, 'byte')} is none"
                     )
             except UnreadableRecord as error:
-                # the length of the record before may be what is wrong: search what it hid, too
-                found = self._resume(sure, offset, str(error))
-                if found is None:
+                # The length of the previous record may be wrong: search that record, too.
+                resumed_at = self._resume(search_start, offset, str(error))
+                if resumed_at is None:
                     return
-                offset = sure = found
+                offset = resumed_at
+                search_start = resumed_at
                 continue
             yield frame
             if frame.opcode == Opcode.FOOTER:
-                self.finished = self.read(frame.end, len(MAGIC)) == MAGIC
-                self.trailing = (
-                    max(0, self.size - frame.end - len(MAGIC)) if self.finished else 0
-                )
-                if not self.finished:
-                    self.torn = Damage(
-                        frame.end, self.size - frame.end, "its last mark is cut off"
-                    )
+                self._end_at(frame.end)
                 return
-            sure = frame.end if frame.opcode == Opcode.CHUNK else frame.offset + 1
+            # A readable chunk is trusted; the length of any other record may be wrong.
+            search_start = frame.end if frame.opcode == Opcode.CHUNK else frame.offset + 1
             offset = frame.end
         self.torn = Damage(
             offset, self.size - offset, f"it is damaged in {MAX_DAMAGED_PARTS} places before"
         )
 
-    def _resume(self, sure: int, offset: int, problem: str) -> int | None:
-        """Returns where reading resumes, or None at the end of the file."""
-        found = self._find_chunk(sure)
-        if found is not None:
-            first = offset if found >= offset else sure - 1
-            self.damaged.append(Damage(first, found - first, problem))
+    def _end_at(self, footer_end: int) -> None:
+        """Notes whether the end mark follows the footer."""
+        rest = self.size - footer_end
+        self.finished = self.read(footer_end, len(MAGIC)) == MAGIC
+        self.trailing = max(0, rest - len(MAGIC)) if self.finished else 0
+        if not self.finished:
+            self.torn = Damage(footer_end, rest, "its last mark is cut off")
+
+    def _resume(self, search_start: int, offset: int, problem: str) -> int | None:
+        """Notes a damaged part, and returns the offset of the next readable chunk.
+
+        Args:
+            search_start: offset at which the search for a chunk starts.
+            offset: offset of the unreadable record.
+            problem: description of the problem.
+
+        Returns:
+            The offset; None if no readable chunk follows.
+        """
+        chunk_offset = self._find_chunk(search_start)
+        if chunk_offset is not None:
+            damage_start = offset if chunk_offset >= offset else search_start - 1
+            self.damaged.append(Damage(damage_start, chunk_offset - damage_start, problem))
         elif self.ends:
             self.damaged.append(
                 Damage(offset, max(0, self.size - FOOTER_BYTES - offset), problem)
@@ -285,11 +323,13 @@ class RecordScanner:
             self.finished = True
         else:
             self.torn = Damage(offset, self.size - offset, problem)
-        return found
+        return chunk_offset
 
     def _frame_at(self, offset: int) -> RecordFrame:
-        """Returns the record that begins at an offset; raises if it does not lie within the
-        file.
+        """Returns the place of the record that begins at an offset.
+
+        Raises:
+            UnreadableRecord: there is no record within the file.
         """
         head = self.read(offset, RECORD_HEAD_BYTES)
         if len(head) < RECORD_HEAD_BYTES:
@@ -300,7 +340,8 @@ class RecordScanner:
         if length > self.size - offset - RECORD_HEAD_BYTES:
             name = _opcode_name(opcode)
             raise UnreadableRecord(
-                f"a record ({name}) of {count_nouns(length, 'byte')} reaches beyond the end of the file"
+                f"a record ({name}) of {count_nouns(length, 'byte')} reaches beyond the end "
+                "of the file"
             )
         return RecordFrame(offset, opcode, length)
 
@@ -314,30 +355,34 @@ class RecordScanner:
         return parse_chunk_head(content, frame.length)
 
     def _find_chunk(self, offset: int) -> int | None:
-        lead = RECORD_HEAD_BYTES + COMPRESSION_NAME_OFFSET
-        for at in range(offset, self.size, _SCAN_BYTES):
-            # holds the name of one that begins in it
-            window = self.read(at, _SCAN_BYTES + lead + 8)
+        """Returns the offset of the first readable chunk at or after an offset, or None.
+
+        Chunks are found by the name of their compression.
+        """
+        lead_bytes = RECORD_HEAD_BYTES + COMPRESSION_NAME_OFFSET
+        for window_offset in range(offset, self.size, _SCAN_BYTES):
+            # The window also holds the compression's name of a chunk that begins at its end.
+            window = self.read(window_offset, _SCAN_BYTES + lead_bytes + 8)
             for match in _COMPRESSION_NAME.finditer(window):
-                start = at + match.start() - lead
+                start = window_offset + match.start() - lead_bytes
+                if start < offset:
+                    continue
                 with suppress(UnreadableRecord):
-                    if (
-                        start >= offset
-                        and (frame := self._frame_at(start)).opcode == Opcode.CHUNK
-                    ):
+                    frame = self._frame_at(start)
+                    if frame.opcode == Opcode.CHUNK:
                         self.head(frame)
                         return start
         return None
 
     def crc(self, begin: int, end: int) -> int:
-        """Returns the CRC-32 of a part of the file, from one byte to before another."""
+        """Returns the CRC-32 of the file from offset `begin` to before offset `end`."""
         crc = 0
-        for at in range(begin, end, _SCAN_BYTES):
-            crc = zlib.crc32(self.read(at, min(_SCAN_BYTES, end - at)), crc)
+        for offset in range(begin, end, _SCAN_BYTES):
+            crc = zlib.crc32(self.read(offset, min(_SCAN_BYTES, end - offset)), crc)
         return crc
 
     def footer(self) -> records.Footer | None:
-        """Returns the footer of a finished file; None for another."""
+        """Returns the footer of a finished file, or None if the file is not finished."""
         content = self.read(max(0, self.size - FOOTER_BYTES) + RECORD_HEAD_BYTES, 20)
         return parse_record(Opcode.FOOTER, content) if self.ends else None
 
@@ -351,26 +396,27 @@ class RecordScanner:
 
 
 def has_right_crc(attachment: bytes) -> bool:
-    """True if the content of an attachment agrees with the checksum at its end; 0 stands for
-    none.
+    """True if the content of an attachment agrees with the checksum at its end.
+
+    A checksum of 0 stands for no checksum.
     """
     crc = int.from_bytes(attachment[-4:], "little")
     return not crc or zlib.crc32(memoryview(attachment)[:-4]) == crc
 
 
 def parse_record(opcode: int, content: bytes) -> Any:
-    """Returns a record of the `mcap` package: any but a message, a message index or a chunk."""
+    """Returns a parsed record of the `mcap` package, for the kinds in `KINDS`."""
     try:
         return KINDS[opcode].read(_Content(BytesIO(content)))
     except (McapError, struct.error, ValueError, OverflowError) as error:
-        why = str(error) or type(error).__name__
+        reason = str(error) or type(error).__name__
         raise UnreadableRecord(
-            f"a record ({_opcode_name(opcode)}) cannot be read: {why}"
+            f"a record ({_opcode_name(opcode)}) cannot be read: {reason}"
         ) from None
 
 
 class _Content(ReadDataStream):
-    """Content of a record; reading beyond its end is an error."""
+    """Stream of a record's content, for which reading beyond the end is an error."""
 
     def read(self, length: int) -> bytes:
         data = super().read(length)
