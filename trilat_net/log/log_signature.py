@@ -1,8 +1,11 @@
-"""Signatures of logs: Ed25519 over the digest chain of a file, in a file of its own beside it.
+"""Signatures of logs: Ed25519 signatures of a log's digest chain, in a separate file.
 
-Invariant: a log is read, never written. What is signed is what the chain covers, all messages
-and all that describes them, and not how they are packed; so a signature holds for a copy that
-was packed anew, and for nothing else. Only a file that agrees with its chain is signed.
+A signature covers what the digest chain covers: all messages, and everything that describes
+them, but not how they are packed. It therefore also holds for a copy that was packed anew.
+
+Invariant:
+    - A log is read, and never written.
+    - Only a log that agrees with its digest chain is signed.
 """
 
 import base64
@@ -34,21 +37,21 @@ from .mcap_reader import McapReader, Progress
 from .running_digest import DIGESTS, DigestState, Integrity
 
 SUFFIX = ".sig"
-"""Ending of a signature's file, behind the whole name of the log."""
+"""Suffix of a signature's file, which follows the whole name of the log."""
 _FORMAT = "trilat-net log signature 1"
-_MOST_BYTES = 65_536
-"""Of a key, and of a signature's file."""
+_MAX_BYTES = 65_536
+"""Largest size of a key's file and of a signature's file, in bytes."""
 
 
 class LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What stands in a signature's file.
+    """Content of a signature's file.
 
     Attributes:
-        format: names this format and its version.
+        format: name and version of the format.
         chain: the digests that are signed, as the log's chain states them.
-        public_key: of who signed, 32 bytes in base64; whether to trust it is the reader's
-            matter.
-        signature: 64 bytes in base64.
+        public_key: public key of the signer, 32 bytes in base64. Readers decide whether they
+            trust the key.
+        signature: the signature, 64 bytes in base64.
     """
 
     format: str
@@ -58,16 +61,16 @@ class LogSignature(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
-    """Makes a pair of keys, PATH.key, which nobody else may read, and PATH.pub; returns their
-    files.
+    """Creates a pair of keys, and returns the names of their files.
 
-    The command is `trilat keys pair`.
+    The private key is PATH.key, which only the user may read. The public key is PATH.pub. The
+    command is `trilat keys pair`.
 
     >>> [file.name for file in tn.create_signing_keys("lab")]
     ['lab.key', 'lab.pub']
 
     Raises:
-        UsageError: one of them exists, or cannot be made.
+        UsageError: one of the files exists, or cannot be written.
     """
     path = Path(path)
     if not path.name:
@@ -81,8 +84,8 @@ def create_signing_keys(path: str | Path) -> tuple[Path, Path]:
     plain = serialization.NoEncryption()
     secret = key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain)
     write_whole(private, secret, force=False, mode=0o600)
-    form = serialization.PublicFormat.SubjectPublicKeyInfo
-    write_whole(public, key.public_key().public_bytes(pem, form), force=False)
+    public_format = serialization.PublicFormat.SubjectPublicKeyInfo
+    write_whole(public, key.public_key().public_bytes(pem, public_format), force=False)
     return private, public
 
 
@@ -93,15 +96,18 @@ def sign_log(
     force: bool = False,
     progress: Progress | None = None,
 ) -> Path:
-    """Signs a finished log; returns the signature's file. The command is `trilat log sign`.
+    """Signs a finished log, and returns the name of the signature's file.
+
+    The command is `trilat log sign`.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("signed.mcap")
     >>> tn.sign_log(path, tn.create_signing_keys("mine")[0]).name
     'signed.mcap.sig'
 
     Raises:
-        LogError: the log cannot be read, has no digest chain, or does not agree with it.
-        UsageError: the key is none, others can read it, or there is a signature already.
+        LogError: the log cannot be read, has no digest chain, or does not agree with the chain.
+        UsageError: the key file is not a private key, other users can read it, or there is a
+            signature already.
     """
     path = Path(path)
     key_file = Path(key_file)
@@ -112,8 +118,8 @@ def sign_log(
     )
     if read_foreign_permissions(key_file):
         raise UsageError(f"{key_file}: can be read by others: chmod 600 {key_file}")
-    made = path.with_name((path.name or "log") + SUFFIX)
-    refuse_existing(made, force=force)
+    signature_file = path.with_name((path.name or "log") + SUFFIX)
+    refuse_existing(signature_file, force=force)
     integrity, chain = _read_chain(path, progress)
     if integrity.state is not DigestState.INTACT:
         advice = {
@@ -123,25 +129,33 @@ def sign_log(
         raise LogError(
             f"{path}: is not signed: {integrity.text}{advice.get(integrity.state, '')}"
         )
-    raw = key.public_key().public_bytes(
+    public_key = key.public_key().public_bytes(
         serialization.Encoding.Raw, serialization.PublicFormat.Raw
     )
-    texts = (base64.b64encode(data).decode() for data in (raw, key.sign(_signed_bytes(chain))))
-    content = msgspec.json.format(
-        msgspec.json.encode(LogSignature(_FORMAT, dict(chain), *texts)), indent=1
+    signature = LogSignature(
+        format=_FORMAT,
+        chain=dict(chain),
+        public_key=base64.b64encode(public_key).decode(),
+        signature=base64.b64encode(key.sign(_signed_bytes(chain))).decode(),
     )
-    write_whole(made, content + b"\n", force=force)
-    return made
+    content = msgspec.json.format(msgspec.json.encode(signature), indent=1)
+    write_whole(signature_file, content + b"\n", force=force)
+    return signature_file
 
 
 def check_signatures(
     paths: Sequence[Path], key_file: Path, progress: Progress | None = None
 ) -> Finding:
-    """Checks that files are what the owner of a public key signed.
+    """Checks that logs are equal to those that the owner of a public key signed.
+
+    Args:
+        paths: the logs, each with its signature's file beside it.
+        key_file: file of the public key.
+        progress: called after every record of a log.
 
     Raises:
         LogError: a log cannot be read.
-        UsageError: the key is none.
+        UsageError: the key file is not a public key.
     """
     key = _load_key(
         key_file, Ed25519PublicKey, "public Ed25519 key; trilat keys pair NAME makes NAME.pub"
@@ -155,11 +169,11 @@ def check_signatures(
 
 
 def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) -> str:
-    """Returns what is wrong with a log's signature; "" if nothing is."""
+    """Returns the problem of a log's signature, or "" if the signature is right."""
     file = path.with_name((path.name or "log") + SUFFIX)
     try:
         with open_regular(file) as stream:
-            stated = msgspec.json.decode(stream.read(_MOST_BYTES), type=LogSignature)
+            stated = msgspec.json.decode(stream.read(_MAX_BYTES), type=LogSignature)
         signature = base64.b64decode(stated.signature, validate=True)
     except FileNotFoundError:
         return f"there is no signature {file}"
@@ -183,11 +197,13 @@ def _find_problem(path: Path, key: Ed25519PublicKey, progress: Progress | None) 
 
 
 def _signed_bytes(chain: Mapping[str, str]) -> bytes:
+    """Returns the bytes that a signature signs: the format and the digests."""
     facts = json.dumps(dict(chain), sort_keys=True, separators=(",", ":"))
     return f"{_FORMAT}\n{facts}".encode()
 
 
 def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[str, str]]:
+    """Returns a log's agreement with its digest chain, and the digests that it states."""
     with reading(path) as stream:
         reader = McapReader(stream, str(path), progress, kept=False)
         deque(reader.messages(), maxlen=0)
@@ -197,16 +213,26 @@ def _read_chain(path: Path, progress: Progress | None) -> tuple[Integrity, dict[
     return integrity, reader.metadata.get(DIGESTS, {})
 
 
-def _load_key(path: Path, kind: Any, wanted: str) -> Any:
+def _load_key(path: Path, kind: Any, expected: str) -> Any:
+    """Returns the key in a file.
+
+    Args:
+        path: the file.
+        kind: class of the key.
+        expected: noun phrase for such a key, in the error.
+
+    Raises:
+        UsageError: the file is not such a key.
+    """
     with reading(path, UsageError) as stream:
-        data = stream.read(_MOST_BYTES)
+        data = stream.read(_MAX_BYTES)
     key: object = None
-    # TypeError: it needs a password
+    # TypeError: the key needs a password.
     with suppress(ValueError, TypeError, UnsupportedAlgorithm):
         if kind is Ed25519PrivateKey:
             key = serialization.load_pem_private_key(data, password=None)
         else:
             key = serialization.load_pem_public_key(data)
     if not isinstance(key, kind):
-        raise UsageError(f"{path}: is no {wanted}")
+        raise UsageError(f"{path}: is no {expected}")
     return key

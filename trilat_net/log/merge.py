@@ -1,8 +1,11 @@
-"""Merge of the parts of a session: a recording that was split, or continued by another
-recorder.
+"""Merge of the parts of a session's log.
 
-Invariant: a message in several parts is taken once; parts that disagree on a message and parts
-of different sessions are refused. The order in which the parts are given does not matter.
+A log has several parts if it was split, or continued by another recorder.
+
+Invariant:
+    - A message in several parts counts once.
+    - Parts that disagree on a message, and parts of different sessions, are refused.
+    - The order of the arguments does not matter.
 """
 
 import hashlib
@@ -24,50 +27,62 @@ from .running_digest import DIGESTS, PREVIOUS_DIGEST_KEY, DigestState
 
 
 def merge_parts(parts: Sequence[LogContents]) -> LogContents:
-    """Returns the parts of a session, one or more in any order, as one.
+    """Returns the contents of one or more parts of a session as one log.
 
-    The accounts of several keep only the counts that are none of a channel, summed up.
+    Of the accounts of several parts, only the counts that belong to no channel are kept, summed
+    up.
+
+    Args:
+        parts: the parts, in any order.
 
     Raises:
-        LogError: they are of different sessions, or disagree on a message, or one cannot be
-            read.
+        LogError: the parts are of different sessions, or disagree on a message, or a part
+            cannot be read.
     """
     if len(parts) == 1:
         return parts[0]
-    ours = identify_session(parts[0])
     for other in parts[1:]:
-        theirs = identify_session(other)
-        differ = [
-            f"{name} {theirs[name]}, not {ours[name]}"
-            for name in ours
-            if ours[name] != theirs[name]
-        ]
-        if differ:
-            session = f"the session in {parts[0].source}: {'; '.join(differ)}"
-            raise LogError(f"{other.source}: is no part of {session}")
+        _check_same_session(parts[0], other)
     ordered = sorted(parts, key=_first_time)
     first = ordered[0]
     last = ordered[-1]
     _check_digests(parts)
-    names = dict.fromkeys(topic for part in ordered for topic in part.channels)
-    whole = all(part.ended and not part.damaged for part in parts)
+    topic_names = dict.fromkeys(topic for part in ordered for topic in part.channels)
+    all_whole = all(part.ended and not part.damaged for part in parts)
+    indices = sorted(map(_part_index, parts))
+    states = list(DigestState)  # from best to worst
+    worst_chain = max(
+        (part.chain for part in parts), key=lambda chain: states.index(chain.state)
+    )
     return LogContents(
         sources=tuple(part.source for part in ordered),
         session=first.session,
         scenario=first.scenario,
         metadata={**first.metadata, ACCOUNTS: _sum_other_counts(ordered)},
-        channels={topic: _merge_channel(topic, ordered) for topic in names},
-        complete=whole and sorted(map(_part_index, parts)) == [*range(1, len(parts) + 1)],
+        channels={topic: _merge_channel(topic, ordered) for topic in topic_names},
+        complete=all_whole and indices == [*range(1, len(parts) + 1)],
         ended=last.ended,
         damaged=[damage for part in ordered for damage in part.damaged],
-        chain=max(
-            (part.chain for part in parts),
-            key=lambda chain: list(DigestState).index(chain.state),
-        ),
+        chain=worst_chain,
     )
 
 
+def _check_same_session(first: LogContents, other: LogContents) -> None:
+    """Raises a `LogError` unless two parts are of the same session."""
+    expected = identify_session(first)
+    actual = identify_session(other)
+    differences = [
+        f"{name} {actual[name]}, not {expected[name]}"
+        for name in expected
+        if expected[name] != actual[name]
+    ]
+    if differences:
+        session = f"the session in {first.source}: {'; '.join(differences)}"
+        raise LogError(f"{other.source}: is no part of {session}")
+
+
 def _check_digests(parts: Sequence[LogContents]) -> None:
+    """Raises a `LogError` unless every part follows the part whose digest it states."""
     finished = {_part_index(part): part for part in parts if DIGESTS in part.metadata}
     for part in parts:
         stated = part.metadata.get(PART, {}).get(PREVIOUS_DIGEST_KEY)
@@ -79,41 +94,44 @@ def _check_digests(parts: Sequence[LogContents]) -> None:
 
 
 def _first_time(part: LogContents) -> tuple[int, str]:
-    first = [channel.log_ns[0] for channel in part.channels.values() if channel.log_ns]
-    return min(first, default=1 << 63), part.source
+    """Returns the first log time of a part, and its name, as a sorting key."""
+    first_times = [channel.log_ns[0] for channel in part.channels.values() if channel.log_ns]
+    return min(first_times, default=1 << 63), part.source
 
 
 def _part_index(part: LogContents) -> int:
+    """Returns the index of a part, from 1; 0 if the part states no valid index."""
     text = part.metadata.get(PART, {}).get("index", "1")
     return int(text) if text.isdecimal() and len(text) < 10 else 0
 
 
 def _sum_other_counts(parts: Sequence[LogContents]) -> dict[str, str]:
-    """Returns the recorders' counts that are none of a channel, as of dropped messages by
-    reason.
+    """Returns the recorders' counts that belong to no channel, such as dropped messages.
 
-    A recorder counts on from part to part, so that its last part has it all.
+    A recorder continues its counts from part to part, so that its last part has the totals.
     """
-    last: dict[int | str, dict[str, str]] = {
-        _recorder_boot(part) or part.source: part.metadata.get(ACCOUNTS, {}) for part in parts
-    }
+    last_counts: dict[int | str, dict[str, str]] = {}
+    for part in parts:
+        recorder = _recorder_boot(part) or part.source
+        last_counts[recorder] = part.metadata.get(ACCOUNTS, {})
     sums: Counter[str] = Counter()
-    for name, n in chain.from_iterable(counts.items() for counts in last.values()):
-        if not name.startswith("/") and n.isdecimal():
-            sums[name] += int(n)
+    for name, count in chain.from_iterable(counts.items() for counts in last_counts.values()):
+        if not name.startswith("/") and count.isdecimal():
+            sums[name] += int(count)
     return {name: str(count) for name, count in sums.items()}
 
 
 def _recorder_boot(part: LogContents) -> int:
-    """Returns the boot of the recorder that wrote a part; 0 if it has no message of its own
-    there.
+    """Returns the boot of the recorder that wrote a part.
+
+    The boot is 0 if the part has no readable message of the recorder.
     """
     kinds: dict[str, Any] = {topics.STATS: RecorderStats, topics.EVENT: Event}
     for channel, kind in kinds.items():
         topic = "/" + topics.key(part.session["session"], topics.RECORDER, channel)
         messages = part.channels.get(topic)
         if messages is not None and messages.payloads:
-            with suppress(WireError):  # raised when its messages are read
+            with suppress(WireError):  # reading the messages reports the error
                 message: RecorderStats | Event = decode(messages.payloads[-1], kind, READABLE)
                 return message.boot
             return 0
@@ -121,7 +139,7 @@ def _recorder_boot(part: LogContents) -> int:
 
 
 def identify_session(part: LogContents) -> dict[str, str]:
-    """Returns what all parts of a session have in common, and no other session has."""
+    """Returns the facts that all parts of a session share, and that identify the session."""
     facts = {
         name: part.session.get(name, "unknown")
         for name in ("session", "driver", "epoch_unix_ns")
@@ -130,33 +148,40 @@ def identify_session(part: LogContents) -> dict[str, str]:
 
 
 def _merge_channel(topic: str, parts: Sequence[LogContents]) -> ChannelMessages:
-    """Returns a topic's messages of all parts, each once, in the order of the parts."""
+    """Returns the messages of a topic in all parts, each once, in the order of the parts."""
+    topic_parts = [part for part in parts if topic in part.channels]
+    if len(topic_parts) == 1:
+        return topic_parts[0].channels[topic]
     merged = ChannelMessages()
-    having = [part for part in parts if topic in part.channels]
-    if len(having) == 1:
-        return having[0].channels[topic]
-    places: dict[Hashable, int] = {}
-    ends: list[int] = []
-    for part in having:
+    merged_indices: dict[Hashable, int] = {}  # index of each message in `merged`, by its key
+    part_ends: list[int] = []  # number of merged messages after each part
+    for part in topic_parts:
         channel = part.channels[topic]
-        fresh: dict[Hashable, int] = {}
-        for n, key in enumerate(_find_keys(topic, channel, part.source)):
-            payload = channel.payloads[n]
-            place = places.get(key)
-            if place is None:
-                fresh[key] = len(merged.payloads)
-                merged.add(payload, channel.log_ns[n], channel.publish_ns[n])
-            elif merged.payloads[place] != payload:
-                names = f"{having[bisect_right(ends, place)].source} and {part.source}"
+        # Messages are compared with earlier parts only: a part may repeat its own messages.
+        new_indices: dict[Hashable, int] = {}
+        for number, key in enumerate(_list_keys(topic, channel, part.source)):
+            payload = channel.payloads[number]
+            index = merged_indices.get(key)
+            if index is None:
+                new_indices[key] = len(merged.payloads)
+                merged.add(payload, channel.log_ns[number], channel.publish_ns[number])
+            elif merged.payloads[index] != payload:
+                other = topic_parts[bisect_right(part_ends, index)]
                 raise LogError(
-                    f"{names} differ: {_describe_message(topic, key)} is not the same"
+                    f"{other.source} and {part.source} differ: "
+                    f"{_describe_message(topic, key)} is not the same"
                 )
-        places |= fresh
-        ends.append(len(merged.payloads))
+        merged_indices |= new_indices
+        part_ends.append(len(merged.payloads))
     return merged
 
 
-def _find_keys(topic: str, channel: ChannelMessages, source: str) -> Sequence[Hashable]:
+def _list_keys(topic: str, channel: ChannelMessages, source: str) -> Sequence[Hashable]:
+    """Returns a key for each message of a topic, which is equal for equal messages.
+
+    Raises:
+        LogError: a message cannot be read.
+    """
     payloads = channel.payloads
     try:
         match topic.rpartition("/")[2]:
@@ -167,23 +192,25 @@ def _find_keys(topic: str, channel: ChannelMessages, source: str) -> Sequence[Ha
                 return [decode(payload, LinkStats, READABLE).tick for payload in payloads]
             case topics.EVENT:
                 events = [decode(payload, Event, READABLE) for payload in payloads]
-                # before version 3 events have no number; their content is the key
+                # Events have no number before version 3; then their content is the key.
                 keys = zip(events, payloads, strict=True)
                 return [
                     (event.boot, event.n) if event.n >= 0 else payload
                     for event, payload in keys
                 ]
         stats = (decode(payload, RecorderStats, READABLE) for payload in payloads)
-        return [(one.boot, one.t_ns) for one in stats]
+        return [(statistics.boot, statistics.t_ns) for statistics in stats]
     except WireError as error:
         raise LogError(f"{source}: a message on {topic} cannot be read: {error}") from None
 
 
 def _describe_message(topic: str, key: Hashable) -> str:
+    """Returns a noun phrase for the message with a key, see `_list_keys`."""
     member, kind = topic.split("/")[-2:]
     match key:
         case int():
-            return f"the {'record' if kind == topics.STATE else 'statistics'} of tick {key} of {member}"
+            noun = "record" if kind == topics.STATE else "statistics"
+            return f"the {noun} of tick {key} of {member}"
         case (_, int(n)):
             if kind == topics.EVENT:
                 return f"event {n} of {member}"

@@ -1,7 +1,8 @@
-"""What a message of a log says that it is: its sender, its number, and when it was sent.
+"""Identity of a message by its content: sender, channel, number and sending time.
 
-Invariant: the answer depends on the content of the message alone, never on where it is stored,
-so that a place in a file can be compared with it.
+Invariant:
+    - The identity depends on the content of the message alone, and never on where the message
+      is stored, so that its place in a file can be compared with the identity.
 """
 
 import hashlib
@@ -18,11 +19,11 @@ class MessageIdentity(NamedTuple):
     """The identity of one message.
 
     Attributes:
-        sender: the member that published it.
-        channel: the kind of its channel: "state", "link", "event" or "stats".
-        number: its number in its channel; -1 if the message states none.
-        sequence: the number under which a file stores it; -1 if the message states none.
-        sent_ns: when it was sent, ns since the epoch; None if the message does not state that.
+        sender: the member that published the message.
+        channel: name of the channel: "state", "link", "event" or "stats".
+        number: number of the message in its channel; -1 if the message states no number.
+        sequence: sequence number of the message in a file; -1 if the message states no number.
+        sent_ns: sending time, ns since the epoch; None if the message states no time.
     """
 
     sender: str
@@ -33,14 +34,12 @@ class MessageIdentity(NamedTuple):
 
 
 def compute_virtual_boot(scenario_sha256: str, site: str) -> int:
-    """Returns the boot of a site in virtual time: a function of the scenario's hash and the
-    site's name.
+    """Returns the boot of a site in virtual time, from the scenario's hash and the site's name.
 
-    So every message of such a run names its scenario.
+    By the boot, every message of a run in virtual time identifies its scenario.
     """
-    return int.from_bytes(
-        hashlib.sha256(f"{scenario_sha256}/{site}".encode()).digest()[:8], "big"
-    )
+    digest = hashlib.sha256(f"{scenario_sha256}/{site}".encode()).digest()
+    return int.from_bytes(digest[:8], "big")
 
 
 def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:
@@ -48,8 +47,8 @@ def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:
 
     Args:
         message: the message.
-        rate_hz: tick rate of its sender, which numbers its statistics; any number for other
-            messages.
+        rate_hz: tick rate of the sender, on which the numbers of statistics depend; any number
+            for other messages.
     """
     match message:
         case messages.State():
@@ -71,7 +70,8 @@ def identify_message(message: AnyMessage, rate_hz: int) -> MessageIdentity:
                 sent_ns=message.t_ns,
             )
         case messages.Event():
-            # The recorder stamps its own events when it hears them; before the epoch there is no time.
+            # Events before the epoch have no time. The recorder stamps its own events when it
+            # receives them.
             is_stamped = message.t_ns >= 0 and message.member != topics.RECORDER
             event_ns = message.t_ns if is_stamped else None
             sequence = max(0, message.n)

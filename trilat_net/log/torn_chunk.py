@@ -1,14 +1,14 @@
-"""A chunk that was cut off: its records, block by block, as far as its packed bytes can be
-trusted.
-
-Invariant:
-- A block is what the compression unpacks as one piece. Its records are taken together or not at
-  all: damage in the packed bytes of a block falsifies any part of it, and of its records
-  perhaps some that still look right.
-- Of packed bytes none is read from the first page on that holds nothing but zeros, or the same
-  as another page of the file: such a page was never written, or was written to the wrong place.
+"""Records of a chunk that was cut off, block by block.
 
 The checksum of a chunk covers all of its records, so it proves nothing once the end is missing.
+A block is a piece of data that the compression unpacks as a whole.
+
+Invariant:
+    - The records of a block are used together or not at all: damage in the packed bytes of a
+      block may falsify any of its records, including records that still look right.
+    - Packed bytes are read up to the first doubtful page: a page that holds nothing but zeros
+      was never written, and one that equals another page of the file was written to the wrong
+      place.
 """
 
 from collections.abc import Callable, Iterator
@@ -32,11 +32,9 @@ from .mcap_records import (
 )
 
 PAGE_BYTES = 4096
-"""Unit in which memory and disks keep a file: what is lost or misplaced is a number of whole
-pages.
-"""
+"""Size of a page, in bytes. Memory and disks lose or misplace whole pages of a file."""
 MAX_SALVAGE_BYTES = 64 << 20
-"""No more of a cut chunk is read."""
+"""Largest part of a cut chunk that is read, in bytes."""
 _BLOCK_HEAD_BYTES = 3
 _RUN_LENGTH_BLOCK = 1
 _MAX_BLOCK_BYTES = 1 << 17
@@ -49,9 +47,9 @@ class TornChunk(NamedTuple):
     """A chunk that reaches beyond the end of its file.
 
     Attributes:
-        head: its head.
-        packed: its packed bytes, as far as they are there and can be trusted.
-        offset: offset of the first of these in the file.
+        head: head of the chunk.
+        packed: packed bytes of the chunk that are present and can be trusted.
+        offset: offset of the first packed byte in the file.
     """
 
     head: ChunkHead
@@ -63,11 +61,10 @@ class TornChunk(NamedTuple):
         """Returns the chunk at an offset of a file.
 
         Raises:
-            UnreadableRecord: its head makes no sense.
+            UnreadableRecord: the head of the chunk makes no sense.
         """
-        _, length = RECORD_HEAD.unpack(
-            scanner.read(offset, RECORD_HEAD_BYTES).ljust(RECORD_HEAD_BYTES, b"\0")
-        )
+        record_head = scanner.read(offset, RECORD_HEAD_BYTES).ljust(RECORD_HEAD_BYTES, b"\0")
+        _, length = RECORD_HEAD.unpack(record_head)
         begin = offset + RECORD_HEAD_BYTES
         content = scanner.read(begin, MAX_SALVAGE_BYTES)
         head = parse_chunk_head(content, length)
@@ -78,115 +75,118 @@ class TornChunk(NamedTuple):
         return cls(head, packed, begin + head.data_offset)
 
     def iterate_blocks(self) -> Iterator[list[InnerRecord]]:
-        """Yields the records that end in each block; ends where the rest cannot be unpacked.
+        """Yields the records that end in each block, until a block cannot be unpacked.
 
         Raises:
-            UnreadableRecord: what was unpacked last is no record.
+            UnreadableRecord: the bytes that were unpacked last are not a record.
         """
-        waiting = bytearray()
+        unpacked = bytearray()
         for block in self._unpack():
-            waiting += block
-            found, done = _split_records(waiting)
-            del waiting[:done]
-            yield found
+            unpacked += block
+            complete_records, complete_bytes = _split_records(unpacked)
+            del unpacked[:complete_bytes]
+            yield complete_records
 
     def _unpack(self) -> Iterator[bytes]:
+        """Yields the unpacked blocks, until one is damaged or the size exceeds the limit."""
         unpackers: dict[str, Callable[[bytes], Iterator[bytes]]] = {
             "": partial(_iterate_pages, offset=self.offset),
             "zstd": _unpack_zstd,
             "lz4": _unpack_lz4,
         }
         unpack = unpackers.get(self.head.compression)
-        room = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(self.packed))
-        room = min(room, self.head.size)
         if unpack is None:
             return
+        limit = max(MAX_UNPACKED_BYTES, MAX_UNPACKED_RATIO * len(self.packed))
+        remaining = min(limit, self.head.size)
         with suppress(zstandard.ZstdError, RuntimeError, ValueError, MemoryError, EOFError):
             for block in unpack(self.packed):
-                room -= len(block)
-                if room < 0:
+                remaining -= len(block)
+                if remaining < 0:
                     return
                 yield block
 
 
 def find_doubtful_page(scanner: RecordScanner, begin: int, end: int) -> int:
-    """Returns the offset of the first page of a part of a file that is empty or stands
-    elsewhere in it too.
+    """Returns the offset of the first doubtful page in a part of a file.
 
-    Without such a page that is the end of the part.
+    A page is doubtful if it is empty, or if the file also contains it elsewhere before the end
+    of the part.
 
     Args:
         scanner: reads the file.
-        begin: first byte of the part.
-        end: first byte after it.
+        begin: offset of the part's first byte.
+        end: offset of the first byte after the part.
+
+    Returns:
+        The offset of the page; `end` if no page is doubtful.
     """
     first_page = -(-begin // PAGE_BYTES) * PAGE_BYTES
-    places: dict[bytes, int] = {}
+    offsets: dict[bytes, int] = {}
     for offset in range(first_page, end, PAGE_BYTES):
         page = scanner.read(offset, min(PAGE_BYTES, end - offset))
-        if not any(page) or page in places:
+        if not any(page) or page in offsets:
             end = offset
             break
         if len(page) == PAGE_BYTES:
-            places[page] = offset
-    doubtful = end
+            offsets[page] = offset
+    first_doubtful = end
     for offset in range(0, min(first_page, scanner.size), PAGE_BYTES):
         page = scanner.read(offset, PAGE_BYTES)
-        doubtful = min(doubtful, places.get(page, doubtful))
-    return doubtful
+        first_doubtful = min(first_doubtful, offsets.get(page, first_doubtful))
+    return first_doubtful
 
 
 def _split_records(data: bytearray) -> tuple[list[InnerRecord], int]:
-    """Returns the complete records at the beginning of unpacked bytes, and the bytes that they
-    take.
+    """Returns the complete records at the beginning of unpacked bytes, and their total size.
 
     Raises:
-        UnreadableRecord: there is something that is no record.
+        UnreadableRecord: the bytes are not a record.
     """
-    found: list[InnerRecord] = []
+    complete: list[InnerRecord] = []
     end = 0
     while end + RECORD_HEAD_BYTES <= len(data):
         opcode, length = RECORD_HEAD.unpack_from(data, end)
         if not opcode or length > MAX_UNPACKED_BYTES:
             raise UnreadableRecord("there is no record")
         begin = end + RECORD_HEAD_BYTES
-        if begin + length > len(data):  # the rest comes with the next block
+        if begin + length > len(data):  # the next block contains the rest
             break
         end = begin + length
-        found.append((opcode, bytes(data[begin:end])))
-    return found, end
+        complete.append((opcode, bytes(data[begin:end])))
+    return complete, end
 
 
 def _iterate_pages(packed: bytes, offset: int = 0) -> Iterator[bytes]:
-    """Yields bytes that begin at an offset of the file, page by page of the file."""
-    place = 0
-    while place < len(packed):
-        end = place + PAGE_BYTES - (offset + place) % PAGE_BYTES
-        yield packed[place:end]
-        place = end
+    """Yields bytes that begin at an offset of the file, split at the pages of the file."""
+    start = 0
+    while start < len(packed):
+        end = start + PAGE_BYTES - (offset + start) % PAGE_BYTES
+        yield packed[start:end]
+        start = end
 
 
 def _unpack_zstd(packed: bytes) -> Iterator[bytes]:
-    """Yields what each complete block of a Zstandard frame unpacks to (RFC 8878, section
-    3.1.1.2).
-    """
+    """Yields the unpacked complete blocks of a Zstandard frame (RFC 8878, section 3.1.1.2)."""
     unpacker: Any = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).decompressobj()
-    place = zstandard.frame_header_size(packed)
-    unpacker.decompress(packed[:place])
+    start = zstandard.frame_header_size(packed)
+    unpacker.decompress(packed[:start])
     is_last = False
-    while not is_last and place + _BLOCK_HEAD_BYTES <= len(packed):
-        block_head = int.from_bytes(packed[place : place + _BLOCK_HEAD_BYTES], "little")
+    while not is_last and start + _BLOCK_HEAD_BYTES <= len(packed):
+        block_head = int.from_bytes(packed[start : start + _BLOCK_HEAD_BYTES], "little")
         is_last = bool(block_head & 1)
         kind = block_head >> 1 & 3
         size = block_head >> 3
-        end = place + _BLOCK_HEAD_BYTES + (1 if kind == _RUN_LENGTH_BLOCK else size)
+        # A run-length block holds one byte, and `size` is the length of the run.
+        end = start + _BLOCK_HEAD_BYTES + (1 if kind == _RUN_LENGTH_BLOCK else size)
         if size > _MAX_BLOCK_BYTES or end > len(packed):
             return
-        yield unpacker.decompress(packed[place:end])
-        place = end
+        yield unpacker.decompress(packed[start:end])
+        start = end
 
 
 def _unpack_lz4(packed: bytes) -> Iterator[bytes]:
+    """Yields the unpacked data of an LZ4 frame, page by page."""
     unpacker = lz4.frame.LZ4FrameDecompressor()
     for page in _iterate_pages(packed):
         yield unpacker.decompress(page)
