@@ -1,10 +1,13 @@
-"""The file of a log while it is written: `run.mcap.active` first, `run.mcap` once it is
-complete.
+"""The file of a log while it is written.
 
-Invariant: flushed data survives the death of the process, synced data a loss of power. Only a
-finished log bears the final name, and nothing is replaced without `force`. Disk space for the
-end of the file is reserved, so that a full disk ends the file in order, with all data given to
-it. Syncing runs in a thread unless `durable` is set.
+The file is called run.mcap.active at first, and run.mcap once it is complete.
+
+Invariant:
+    - Flushed data survive the death of the process, and synced data survive a loss of power.
+    - Only a finished log has the final name, and nothing is replaced without `force`.
+    - Disk space for the end of the file is reserved, so that on a full disk the file ends in
+      order, with all data that were written.
+    - Syncing runs in a thread unless `durable` is set.
 """
 
 import errno
@@ -25,45 +28,50 @@ from .log_layout import active_path
 from .mcap_records import MAGIC
 
 DISK_FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Errors of a disk that takes no more."""
+"""Errors of a disk that accepts no more data."""
 RESERVE_STEP_BYTES = 1 << 19
-"""Step by which a reserve grows."""
+"""Step by which a reserve grows, in bytes."""
 
 
 class DiskReserve:
-    """Space reserved on a disk, as a file without a name in a folder there; `size` is its
-    length, bytes.
+    """Space reserved on a disk by a file without a name.
+
+    Args:
+        folder: a folder on the disk.
+
+    Attributes:
+        size: reserved space, in bytes.
     """
 
     def __init__(self, folder: Path) -> None:
         self.size = 0
         self._folder = folder
         self._file: IO[bytes] | None = None
-        self._possible = True
+        self._is_possible = True
 
     def grow(self, size: int) -> None:
-        """Reserves so many bytes at least.
+        """Reserves at least `size` bytes.
 
         Raises:
-            OSError: the disk has no room for it.
+            OSError: the disk has no room.
         """
-        if not self._possible or size <= self.size:
+        if not self._is_possible or size <= self.size:
             return
-        wanted = -(-size // RESERVE_STEP_BYTES) * RESERVE_STEP_BYTES
+        new_size = -(-size // RESERVE_STEP_BYTES) * RESERVE_STEP_BYTES
         try:
             if self._file is None:
                 self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115
-            _allocate(self._file.fileno(), self.size, wanted)
+            _allocate(self._file.fileno(), self.size, new_size)
         except OSError as error:
             if error.errno in DISK_FULL_ERRNOS:
                 raise
             self.release()  # this disk cannot reserve space
         else:
-            self.size = wanted
+            self.size = new_size
 
     def release(self) -> None:
-        """Gives the space back, for good."""
-        self._possible = False
+        """Releases the space; nothing can be reserved afterwards."""
+        self._is_possible = False
         self.size = 0
         if self._file is not None:
             self._file.close()
@@ -71,6 +79,7 @@ class DiskReserve:
 
 
 def _allocate(descriptor: int, begin: int, end: int) -> None:
+    """Allocates the bytes of a file from `begin` to before `end`, if necessary by writing."""
     if hasattr(os, "posix_fallocate"):
         try:
             os.posix_fallocate(descriptor, begin, end - begin)
@@ -85,36 +94,35 @@ def _allocate(descriptor: int, begin: int, end: int) -> None:
 
 
 SYNC_PERIOD_NS = 1_000_000_000
-"""Period of syncing in a thread."""
+"""Period of syncing in a thread, in ns."""
 
 
 class FileSync:
-    """Syncing of one file: at once if `durable`, else once a second in a thread."""
+    """Syncing of one file: at every flush if `durable`, else once a second in a thread."""
 
     def __init__(self, descriptor: int, durable: bool, now_ns: Callable[[], int]) -> None:
         self._descriptor = descriptor
         self._durable = durable
         self._now_ns = now_ns
-        self._done_ns = now_ns()
+        self._synced_ns = now_ns()
         self._thread: threading.Thread | None = None
-        self._trouble: OSError | None = None
+        self._disk_error: OSError | None = None
 
     def sync_new(self) -> None:
-        """Puts new data onto the disk, now or in a thread when it is time.
+        """Syncs new data to the disk: now, or in a thread when a period has passed.
 
         Raises:
-            OSError: the disk refuses now, or refused earlier data.
+            OSError: the disk refuses the data, or has refused earlier data.
         """
         if self._durable:
             _datasync(self._descriptor)
             return
-        if self._trouble is not None:
-            raise self._trouble
+        if self._disk_error is not None:
+            raise self._disk_error
         now_ns = self._now_ns()
-        if now_ns - self._done_ns >= SYNC_PERIOD_NS and not (
-            self._thread and self._thread.is_alive()
-        ):
-            self._done_ns = now_ns
+        is_syncing = self._thread is not None and self._thread.is_alive()
+        if now_ns - self._synced_ns >= SYNC_PERIOD_NS and not is_syncing:
+            self._synced_ns = now_ns
             self._thread = threading.Thread(target=self._run, name="sync", daemon=True)
             self._thread.start()
 
@@ -122,20 +130,21 @@ class FileSync:
         try:
             _datasync(self._descriptor)
         except OSError as error:
-            self._trouble = error
+            self._disk_error = error
 
     def wait(self) -> None:
-        """Waits for the thread; then the file may be closed."""
+        """Waits for the thread, after which the file may be closed."""
         if self._thread is not None:
             self._thread.join()
 
 
 def _datasync(descriptor: int) -> None:
-    getattr(os, "fdatasync", os.fsync)(descriptor)  # of the metadata what reading it back needs
+    # `fdatasync` syncs only the metadata that reading the file needs.
+    getattr(os, "fdatasync", os.fsync)(descriptor)
 
 
 RESERVE_MARGIN_BYTES = 1 << 16
-"""Space that is reserved for the accounts."""
+"""Space that is reserved for the accounts, in bytes."""
 _ELSEWHERE = "take another disk with -o"
 _ADVICE = {
     errno.ENOSPC: ("the disk is full", f"make room, or {_ELSEWHERE}"),
@@ -150,27 +159,28 @@ _ADVICE = {
 
 
 class LogFile:
-    """A file that is written in order and survives any end of its writer; for use in a `with`
-    statement.
+    """A file that is written in order, and survives any end of its writer; a context manager.
 
     Written data stay in memory until `flush`, so that the file always ends at the end of a
     flush.
 
     Args:
-        path: its name once it is complete.
-        force: True if it may replace a file.
-        durable: True if every flush syncs it; else that happens once a second, in a thread.
-        working: its name until then; by default `active_path(path)`.
-        room: space reserved for its end; by default a `DiskReserve` in its folder.
+        path: name of the complete file.
+        force: True if the file may replace another one.
+        durable: True to sync the file at every flush; else once a second, in a thread.
+        working: name of the file until it is complete; by default `active_path(path)`.
+        room: space reserved for the end; by default a `DiskReserve` in the file's folder.
         opened: opens a file without a buffer, by name and mode.
         now_ns: the clock.
 
     Attributes:
-        size: its bytes; all of them were flushed.
+        path: name of the complete file.
+        working: name of the file until it is complete.
+        size: number of flushed bytes.
         disk_error: the first error of the disk, or None.
 
     Raises:
-        UsageError: it exists, or cannot be made.
+        UsageError: the file exists, or cannot be created.
     """
 
     def __init__(
@@ -191,7 +201,8 @@ class LogFile:
         self._force = force
         try:
             refuse_existing(path, force=force, unfinished=self.working)
-            if force:  # what is left there is removed, not written to: it may be a link
+            if force:
+                # An existing file is removed rather than overwritten, because it may be a link.
                 self.working.unlink(missing_ok=True)
             self._raw = (opened or FileIO)(self.working, "xb")
         except OSError as error:
@@ -202,60 +213,63 @@ class LogFile:
             self._raw.fileno(), durable, now_ns or SystemClock().monotonic_ns
         )
         self._pending = bytearray()
-        self._done = 0
-        self._owed = 0
+        self._written = 0  # bytes of `_pending` that the operating system has accepted
+        self._end_bytes = 0
         self._tail = b""
-        self._broken = self._closed = self._published = False
+        self._broken = False
+        self._closed = False
+        self._published = False
 
     def write(self, data: bytes, /) -> int:
-        """Takes bytes, to be written by the next `flush`."""
+        """Adds bytes, which the next `flush` writes."""
         self._pending += data
         return len(data)
 
     def reserve(self, size: int) -> None:
-        """Sets how many bytes the end of the file will take."""
-        self._owed = size
+        """Sets the number of bytes that the end of the file will take."""
+        self._end_bytes = size
 
     def flush(self) -> None:
-        """Hands everything to the operating system, in one piece where it takes that.
+        """Writes all pending data, in one piece if the operating system accepts that.
 
         Raises:
-            OSError: the disk refuses. The first time, pending data have been written all the
-                same if the reserved space sufficed. The end of the file may follow, and nothing
-                else.
+            OSError: the disk refuses the data. At the first such error, the pending data have
+                still been written if the reserved space sufficed. Only the end of the file may
+                follow.
         """
         if self._broken and self.disk_error:
             raise self.disk_error
         try:
             if self._pending and not self.disk_error:
-                self._room.grow(len(self._pending) + self._owed + RESERVE_MARGIN_BYTES)
-            self._put()
+                self._room.grow(len(self._pending) + self._end_bytes + RESERVE_MARGIN_BYTES)
+            self._write_pending()
             if not self.disk_error:
                 self._syncing.sync_new()
         except OSError as error:
             self.disk_error = self.disk_error or error
             self._room.release()
             try:
-                self._put()
+                self._write_pending()
             except OSError:
-                self._cut()
+                self._cut_off()
             raise
 
-    def _put(self) -> None:
-        while self._done < len(self._pending):
-            taken = self._raw.write(memoryview(self._pending)[self._done :])
-            if not taken:
+    def _write_pending(self) -> None:
+        while self._written < len(self._pending):
+            accepted = self._raw.write(memoryview(self._pending)[self._written :])
+            if not accepted:
                 raise OSError(errno.EIO, os.strerror(errno.EIO))
-            self._done += taken
+            self._written += accepted
         self._tail = bytes((self._tail + self._pending[-len(MAGIC) :])[-len(MAGIC) :])
-        self.size += self._done
+        self.size += self._written
         self._pending = bytearray()
-        self._done = 0
+        self._written = 0
 
-    def _cut(self) -> None:
+    def _cut_off(self) -> None:
+        """Removes the data of an incomplete flush."""
         self._broken = True
         self._pending = bytearray()
-        self._done = 0
+        self._written = 0
         with suppress(OSError):
             self._raw.truncate(self.size)
 
@@ -265,11 +279,11 @@ class LogFile:
         return self._tail == MAGIC and self.size > len(MAGIC) and not self._broken
 
     def close(self) -> None:
-        """Closes the file, and gives it its name if it is complete; an empty one is removed.
+        """Closes the file; a complete file gets its final name, an empty file is removed.
 
         Raises:
-            UsageError: its name is taken by now.
-            OSError: the disk refuses.
+            UsageError: a file with the final name exists by now.
+            OSError: the disk refuses the data.
         """
         if self._closed:
             return
@@ -299,11 +313,14 @@ class LogFile:
         self.size = 0
 
     def end(self, error: BaseException | None = None) -> None:
-        """Closes the file, whatever ended it.
+        """Closes the file.
+
+        Args:
+            error: the error that ended the writing, or None.
 
         Raises:
-            LogRefused: the disk refused, now or as `error` says; the text states what is kept,
-                and where.
+            LogRefused: the disk refuses the data, or has refused them as `error` states. The
+                text states which data are kept, and where.
         """
         try:
             self.close()
@@ -321,27 +338,32 @@ class LogFile:
         self.end(error)
 
     def refused(self, error: OSError) -> LogRefused:
-        """Returns the error of a file that the disk refused, once it is closed."""
-        what, advice = _ADVICE.get(error.errno or 0, (error.strerror or str(error), _ELSEWHERE))
+        """Returns the error for a closed file whose data the disk refused."""
+        problem, advice = _ADVICE.get(
+            error.errno or 0, (error.strerror or str(error), _ELSEWHERE)
+        )
         if self._published:
             content = _describe_content(self.path)
             return LogRefused(
-                f"{self.path}: {what}; the log ends there, finished, with {content}; {advice}"
+                f"{self.path}: {problem}; the log ends there, finished, with {content}; "
+                f"{advice}"
             )
         if not self.size:
-            return LogRefused(f"{self.path}: {what}; nothing was written; {advice}")
-        # another program has what it should replace open, on Windows
+            return LogRefused(f"{self.path}: {problem}; nothing was written; {advice}")
+        # On Windows, another program may have the file open that should be replaced.
         if self.whole and self.disk_error is None:
             return LogRefused(
-                f"{self.path}: {what}; the finished log is {self.working}: give it a name"
+                f"{self.path}: {problem}; the finished log is {self.working}: give it a name"
             )
         return LogRefused(
-            f"{self.working}: {what}, even for the end of the log; its {self.size / 1e6:.1f} MB up to the "
-            f"last whole chunk are kept; {advice}; make it whole with: trilat log recover {self.working}"
+            f"{self.working}: {problem}, even for the end of the log; its "
+            f"{self.size / 1e6:.1f} MB up to the last whole chunk are kept; {advice}; "
+            f"make it whole with: trilat log recover {self.working}"
         )
 
 
 def _describe_content(path: Path) -> str:
+    """Returns the numbers of records and other messages in a finished log, as a text."""
     from mcap.reader import make_reader
 
     with path.open("rb") as stream:
@@ -349,9 +371,10 @@ def _describe_content(path: Path) -> str:
     assert summary is not None
     assert summary.statistics is not None
     counts = summary.statistics.channel_message_counts
-    topic = {number: channel.topic for number, channel in summary.channels.items()}
-    records = sum(count for n, count in counts.items() if topic[n].endswith(f"/{topics.STATE}"))
-    return (
-        f"{count_nouns(records, 'record')} and "
-        f"{count_nouns(summary.statistics.message_count - records, 'other message')}"
+    records = sum(
+        counts.get(number, 0)
+        for number, channel in summary.channels.items()
+        if channel.topic.endswith(f"/{topics.STATE}")
     )
+    others = summary.statistics.message_count - records
+    return f"{count_nouns(records, 'record')} and {count_nouns(others, 'other message')}"

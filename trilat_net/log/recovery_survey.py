@@ -1,14 +1,17 @@
-"""First look at a damaged file: what describes it, and which of its chunks stand where they
+"""Survey of a damaged file before its recovery.
+
+The survey reads the records that describe the file, and finds chunks that are not where they
 were written.
 
 Invariant:
-- Of two definitions of a number, the one covered by a valid checksum wins, else the first.
-- Of several sessions and scenarios in a file those count that name each other; one whose epoch
-  contradicts all messages with a checksum is of another log, and does not count. In virtual
-  time, where the epoch is 0, the boots of the messages tell.
-- A chunk whose checksum is right may still be old, of another file, or in the wrong place. In a
-  finished file the index tells, which has a checksum of its own; in a log that was not finished
-  the times of the chunks do, which never go back.
+    - Of two definitions with one number, the one that a valid checksum covers counts; otherwise
+      the first one counts.
+    - Of several sessions and scenarios in a file, those count that name each other. A session
+      whose epoch contradicts all messages with a checksum is of another log, and does not
+      count. In virtual time, where the epoch is 0, the boots of the messages decide.
+    - A chunk with a right checksum may still be old, of another file, or in the wrong place. In
+      a finished file, the index decides, which has a separate checksum. In a log that was not
+      finished, the times of the chunks decide, which never decrease.
 """
 
 import hashlib
@@ -36,23 +39,26 @@ _SAMPLED_CHUNKS = 16
 
 
 class RecoverySurvey:
-    """Contents of a file besides messages, wherever they are.
+    """The contents of a file besides its messages, wherever they are in the file.
 
     Args:
-        scanner: finds its records.
+        scanner: finds the records of the file.
 
     Attributes:
-        profile, library: the MCAP profile, and what made the file.
+        profile: the MCAP profile.
+        library: program that wrote the file.
         definitions: schemas and channels outside of chunks.
-        metadata: the last of each name; of sessions the one that names the scenario.
-        attachments: the first of each name; of scenarios the one that the session names.
-        count: how many messages the file states; None if no checksum covers that.
-        is_redefined: True if a definition among the data is not what the index says, which has
-            a checksum.
+        metadata: the last metadata of each name; of several sessions, the one that names the
+            scenario.
+        attachments: the first attachment of each name; of several scenarios, the one that the
+            session names.
+        count: number of messages that the file states; None if no checksum covers the number.
+        is_redefined: True if a definition among the data differs from that in the summary,
+            which a checksum covers.
         is_foreign_session: True if the session that the file names is not that of its messages.
-        misplaced: what is wrong with chunks that are not where they were written, by offset.
+        misplaced: a problem for each chunk that is not where it was written, by offset.
         is_chunked: True if the file has chunks.
-        is_session_log: True if anything says that it is a log of a session.
+        is_session_log: True if anything in the file shows that it is the log of a session.
         why_empty: the reason if there is nothing to save; else "".
     """
 
@@ -62,46 +68,41 @@ class RecoverySurvey:
         self.attachments: dict[str, bytes] = {}
         self.count: int | None = None
         self._scanner = scanner
-        self._sessions: list[tuple[dict[str, str], int]] = []  # and where they stand
-        self._scenarios: list[tuple[bytes, bool]] = []  # and whether a checksum covers it
+        self._sessions: list[tuple[dict[str, str], int]] = []  # (metadata, offset)
+        self._scenarios: list[tuple[bytes, bool]] = []  # (text, True if a checksum covers it)
         self._chunks: list[tuple[RecordFrame, ChunkHead]] = []
-        self._indexes: dict[int, Any] = {}  # of chunks, by offset
-        footer = scanner.footer()
-        is_covered = (
-            footer is not None and footer.summary_crc and scanner.is_summary_intact(footer)
-        )
-        summary_offset = (
-            footer.summary_start if footer is not None and is_covered else 0
-        ) or scanner.size
-        # in the summary or not
-        found: dict[tuple[bool, int], list[Definition]] = defaultdict(list)
-        self._places: dict[Definition, int] = {}  # of definitions that no checksum covers
+        self._chunk_indexes: dict[int, Any] = {}  # by offset of the chunk
+        summary_offset = _find_intact_summary(scanner)
+        # Schemas and channels, by (True in the summary, opcode).
+        defined: dict[tuple[bool, int], list[Definition]] = defaultdict(list)
+        # Offsets of the definitions that no checksum covers.
+        self._uncovered_offsets: dict[Definition, int] = {}
         has_messages = False
         for frame in scanner.frames():
             has_messages |= frame.opcode in (Opcode.CHUNK, Opcode.MESSAGE)
             if frame.opcode in mcap_records.DEFINITIONS:
                 entry = frame.opcode, scanner.content(frame)
-                found[frame.offset >= summary_offset, frame.opcode].append(entry)
+                defined[frame.offset >= summary_offset, frame.opcode].append(entry)
                 if frame.offset < summary_offset:
-                    self._places.setdefault(entry, frame.offset)
+                    self._uncovered_offsets.setdefault(entry, frame.offset)
             elif frame.opcode == Opcode.CHUNK:
                 self._chunks.append((frame, scanner.head(frame)))
             elif frame.opcode in _DESCRIBING:
                 with suppress(UnreadableRecord):
-                    self._take(frame, scanner.content(frame))
+                    self._read_description(frame, scanner.content(frame))
         if summary_offset == scanner.size:
             self.count = None
-            self._indexes = {}
+            self._chunk_indexes = {}
         self.definitions = [
             entry
             for kind in mcap_records.DEFINITIONS
-            for entry in found[True, kind] or found[False, kind]
+            for entry in defined[True, kind] or defined[False, kind]
         ]
         for kind in mcap_records.DEFINITIONS:
-            for entry in found[True, kind]:
-                self._places.pop(entry, None)
+            for entry in defined[True, kind]:
+                self._uncovered_offsets.pop(entry, None)
         self.is_redefined = any(
-            found[True, kind] and not set(found[False, kind]) <= set(found[True, kind])
+            defined[True, kind] and not set(defined[False, kind]) <= set(defined[True, kind])
             for kind in mcap_records.DEFINITIONS
         )
         self.is_session_log = (
@@ -126,7 +127,8 @@ class RecoverySurvey:
                     "it does not begin as an MCAP file does" if scanner.size else "it is empty"
                 )
 
-    def _take(self, frame: RecordFrame, content: bytes) -> None:
+    def _read_description(self, frame: RecordFrame, content: bytes) -> None:
+        """Reads a header, metadata, an attachment, the statistics or a chunk index."""
         record = mcap_records.parse_record(frame.opcode, content)
         match frame.opcode:
             case Opcode.HEADER:
@@ -139,7 +141,7 @@ class RecoverySurvey:
             case Opcode.STATISTICS:
                 self.count = record.message_count
             case Opcode.CHUNK_INDEX:
-                self._indexes[record.chunk_start_offset] = record
+                self._chunk_indexes[record.chunk_start_offset] = record
             case _:
                 if record.name == SCENARIO and mcap_records.has_right_crc(content):
                     is_covered = content[-4:] != bytes(4)
@@ -149,8 +151,8 @@ class RecoverySurvey:
     def _choose_session(self) -> None:
         """Chooses the session and the scenario that belong together.
 
-        A scenario that no session names counts if a checksum covers it: one of 0 covers
-        nothing, and a page that was zeroed leaves it behind.
+        A scenario that no session names counts if a checksum covers it. A checksum of 0 covers
+        nothing: a page of zeros in the file may have replaced the right one.
         """
         self.attachments.pop(SCENARIO, None)
         covered = [text for text, is_covered in self._scenarios if is_covered]
@@ -166,10 +168,10 @@ class RecoverySurvey:
             self.metadata[SESSION], _ = self._sessions[0]
 
     def _judge_messages(self) -> None:
-        """Compares the first chunks that have messages with the session that the file names.
+        """Compares the messages of the first chunks with the session that the file names.
 
-        A chunk without a checksum tells that the file is a log, but nothing against its
-        session.
+        A chunk without a checksum may show that the file is a log of a session, but is no
+        evidence against the session.
         """
         origins = MessageOrigins(set(), set())
         for frame, head in self._chunks[:_SAMPLED_CHUNKS]:
@@ -188,63 +190,73 @@ class RecoverySurvey:
             self._reject_session(session, is_renamed=False)
 
     def _reject_session(self, session: dict[str, str], *, is_renamed: bool) -> None:
-        """Leaves out a session of another log, its scenario, and its channels unless a checksum
-        covers them.
+        """Removes a session of another log, with its scenario and its uncovered channels.
 
         Args:
-            session: metadata of that session.
-            is_renamed: False if the session of the messages may have the same name; then the
-                channels that are left out are those that stand in the same page.
+            session: metadata of the session.
+            is_renamed: False if the session of the messages may have the same name; then only
+                channels in the same page as the session are removed.
         """
         self.is_foreign_session = True
         pages = {offset // PAGE_BYTES for entry, offset in self._sessions if entry == session}
         del self.metadata[SESSION]
         self.attachments.pop(SCENARIO, None)
-        names = f"/{topics.ROOT}/{session.get('session', '')}/".encode()
+        topic_prefix = f"/{topics.ROOT}/{session.get('session', '')}/".encode()
 
-        def is_own(entry: Definition) -> bool:
-            offset = self._places.get(entry)
-            is_near = is_renamed or (offset is not None and offset // PAGE_BYTES in pages)
-            return offset is None or names not in entry[1] or not is_near
+        def is_kept(entry: Definition) -> bool:
+            offset = self._uncovered_offsets.get(entry)
+            if offset is None:  # a checksum covers the definition
+                return True
+            is_suspect = is_renamed or offset // PAGE_BYTES in pages
+            return topic_prefix not in entry[1] or not is_suspect
 
-        self.definitions = list(filter(is_own, self.definitions))
+        self.definitions = list(filter(is_kept, self.definitions))
 
     def _find_misplaced_chunks(self) -> dict[int, str]:
-        if self._indexes:
+        """Returns a problem for each chunk that is not where it was written, by offset."""
+        if self._chunk_indexes:
             return self._find_unnamed_chunks()
-        misplaced = {}
-        if SESSION in self.metadata:  # files of other programs may be in any order
-            ordered = _find_longest_ordered(
-                [(head.start_ns, head.end_ns) for _, head in self._chunks]
-            )
-            for place, (frame, _) in enumerate(self._chunks):
-                if place not in ordered:
-                    misplaced[frame.offset] = (
-                        "a chunk that is older or newer than those around it"
-                    )
-        return misplaced
+        if SESSION not in self.metadata:
+            return {}  # chunks in files of other programs may be in any order
+        spans_ns = [(head.start_ns, head.end_ns) for _, head in self._chunks]
+        ordered = _find_longest_ordered(spans_ns)
+        return {
+            frame.offset: "a chunk that is older or newer than those around it"
+            for index, (frame, _) in enumerate(self._chunks)
+            if index not in ordered
+        }
 
     def _find_unnamed_chunks(self) -> dict[int, str]:
-        """Returns the chunks that the index does not name; in a file that was shifted places do
-        not count.
+        """Returns a problem for each chunk that the index does not name, by offset.
+
+        In a file whose contents were shifted, a chunk counts as named if the index names one
+        with equal sizes and times at another offset.
         """
         unnamed = []
-        left = Counter(_chunk_measures(index) for index in self._indexes.values())
+        unmatched = Counter(_chunk_measures(index) for index in self._chunk_indexes.values())
         for frame, head in self._chunks:
-            index = self._indexes.get(frame.offset)
+            index = self._chunk_indexes.get(frame.offset)
             sizes = frame.size, head.size
             if index is not None and sizes == (index.chunk_length, index.uncompressed_size):
-                left[_chunk_measures(index)] -= 1
+                unmatched[_chunk_measures(index)] -= 1
             else:
                 unnamed.append((frame, head))
         misplaced = {}
         for frame, head in unnamed:
             measures = frame.size, head.size, head.start_ns, head.end_ns
-            if left[measures] > 0:
-                left[measures] -= 1
+            if unmatched[measures] > 0:
+                unmatched[measures] -= 1
             else:
                 misplaced[frame.offset] = "a chunk that the index of the file does not name"
         return misplaced
+
+
+def _find_intact_summary(scanner: mcap_records.RecordScanner) -> int:
+    """Returns the offset of the summary whose checksum is right, or the size of the file."""
+    footer = scanner.footer()
+    if footer is None or not footer.summary_crc or not scanner.is_summary_intact(footer):
+        return scanner.size
+    return footer.summary_start or scanner.size
 
 
 def _names_session(data: bytes) -> bool:
@@ -263,27 +275,32 @@ _DESCRIBING = frozenset(
 
 
 def _chunk_measures(index: Any) -> tuple[int, int, int, int]:
-    times = index.message_start_time, index.message_end_time
-    return index.chunk_length, index.uncompressed_size, *times
+    """Returns the sizes and the times of a chunk, as its index states them."""
+    return (
+        index.chunk_length,
+        index.uncompressed_size,
+        index.message_start_time,
+        index.message_end_time,
+    )
 
 
 def _find_longest_ordered(spans_ns: Sequence[tuple[int, int]]) -> set[int]:
-    """Returns the places of the longest sequence of spans of time of which each is later than
-    the one before.
+    """Returns the indices of the longest increasing sequence of time spans.
 
-    That is patience sorting. Equal spans are of a chunk that stands in the file twice.
+    The method is patience sorting. Equal spans belong to a chunk that the file contains twice,
+    so the sequence increases strictly.
     """
-    ends: list[tuple[int, int]] = []  # the earliest end of a sequence, by its length
-    places: list[int] = []  # where that sequence ends
-    before: list[int] = []  # of each place the place before it in its sequence, -1 for none
-    for place, span_ns in enumerate(spans_ns):
-        length = bisect_left(ends, span_ns)
-        before.append(places[length - 1] if length else -1)
-        ends[length : length + 1] = [span_ns]
-        places[length : length + 1] = [place]
+    last_spans: list[tuple[int, int]] = []  # earliest last span of a sequence, by its length
+    last_indices: list[int] = []  # index of that span
+    predecessors: list[int] = []  # index before each index in its sequence; -1 for the first
+    for index, span_ns in enumerate(spans_ns):
+        length = bisect_left(last_spans, span_ns)
+        predecessors.append(last_indices[length - 1] if length else -1)
+        last_spans[length : length + 1] = [span_ns]
+        last_indices[length : length + 1] = [index]
     ordered = set()
-    place = places[-1] if places else -1
-    while place >= 0:
-        ordered.add(place)
-        place = before[place]
+    index = last_indices[-1] if last_indices else -1
+    while index >= 0:
+        ordered.add(index)
+        index = predecessors[index]
     return ordered
