@@ -1,15 +1,16 @@
-"""A log as data tables: a row per record, arrival, statistics message or event.
+"""Convert a log to data tables, with a row per record, arrival, statistics message or event.
 
 Invariant:
-- Every number is the record's own, or follows from it exactly (an age is a difference of
-  stamps), except that an orientation is a unit quaternion whose sign continues from row to row:
-  the record's rotation vector jumps where it passes half a turn (see `orientations`). The
-  column's meaning says so.
-- A column's name ends in its unit; a missing value is null, never a number in its place.
-- Units come from the schema, meanings from the docstrings of the message types, and of what a
-  law sends from its declaration: there is no second list.
-- A number out of range, or an arrival of a peer that a site does not have, is a `LogError` that
-  names the file (`source`).
+    - Every number is that of the record, or follows from the record exactly (an age is a
+      difference of stamps). The only exception is an orientation, which is a unit quaternion
+      whose sign continues from row to row, because the rotation vector of the record jumps
+      where it passes half a turn (see `orientations`). The meaning of the column states that.
+    - The name of a column ends in its unit. A missing value is null, never a number.
+    - Units come from the schema, and meanings from the docstrings of the message types. Units
+      and names of the numbers that a law sends come from the law's declaration. There is no
+      second list of them.
+    - A number out of range, or an arrival of a peer that a site does not have, is a `LogError`
+      that names the file (`source`).
 """
 
 import dataclasses
@@ -53,36 +54,43 @@ UNIT_SUFFIXES = {
     "ns/s": "ppb",
     "byte": "bytes",
 }
-"""Units as the endings of names."""
+"""Endings of column names, by unit."""
 EVENTS_TABLE = "events"
+"""Name of the table of events."""
 SITE_TABLE_KINDS = ("state", "link", "arrivals")
-"""Tables of a site."""
+"""Kinds of the tables of a site."""
 _NONE_BELOW_0 = {"age_us", "delay_us", "delay_max_us", "rtt_us"}
-"""Statistics in which -1 stands for none."""
+"""Statistics in which -1 stands for a missing value."""
 _JOINT_VECTORS = ("q", "qd", "q_des", "qd_des", "tau", "tau_x")
-"""Vectors of a record with a number per joint, in joint space."""
+"""Vectors of a record that have a number per joint, in joint space."""
 _TASK_VECTORS = {
     **dict.fromkeys(("q_des", "x"), ("m", "rad")),
     **dict.fromkeys(("qd_des", "xd"), ("m/s", "rad/s")),
     "wrench": ("N", "N m"),
 }
-"""Those with a number per coordinate of the task: units of places and of orientations."""
+"""Vectors of a record that have a number per coordinate of the task, with the units of
+positions and of orientations.
+"""
 
 
 _POSES = ("q_des", "x")
-"""Those of them that have an orientation; the others have angular velocities and torques."""
+"""Vectors of `_TASK_VECTORS` with an orientation; the others have angular velocities or
+torques.
+"""
 _STEADY_QUATERNION = "a unit quaternion w, x, y, z, each nearest to the one before"
+"""Part of the meaning of orientation columns."""
 
 
 class Column(NamedTuple):
-    """One column.
+    """A column of a table.
 
     Attributes:
-        name: its name, with the unit at its end.
-        values: its values, shape (K,): numbers, or texts as objects.
-        unit, meaning: their unit ("" for texts and counts), and what they are.
-        source: the field of the message that they are from.
-        known: True for rows that have a value, shape (K,); None if all have.
+        name: name of the column, which ends in its unit.
+        values: the values, shape (K,): numbers, or texts as objects.
+        unit: unit of the values; "" for texts and counts.
+        meaning: description of the values.
+        source: field of the message from which the values come.
+        known: True for the rows that have a value, shape (K,); None if all rows have a value.
     """
 
     name: str
@@ -98,30 +106,33 @@ class Column(NamedTuple):
         return self.values.dtype == np.object_
 
     def numbers(self) -> NDArray[Any]:
-        """Returns the values of a column of numbers, with NaN for those that are missing."""
+        """Returns the values of a column of numbers, with NaN for missing values."""
         if self.known is None or self.known.all():
             return self.values
         return np.where(self.known, self.values, np.nan)
 
     def rows(self, first: int, last: int) -> list[Any]:
-        """Returns the values of some rows as Python's own numbers and texts, None for missing
-        ones.
+        """Returns the values of rows `first` to `last` - 1 as plain Python values.
+
+        Missing values are None.
         """
         values: list[Any] = self.values[first:last].tolist()
         if self.known is None:
             return values
         known = self.known[first:last].tolist()
-        return [value if there else None for value, there in zip(values, known, strict=True)]
+        return [
+            value if is_known else None for value, is_known in zip(values, known, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of one length.
+    """A table of columns with equal lengths.
 
     Attributes:
-        name: the site, or "events".
-        kind: of a site, one of `SITE_TABLE_KINDS`; else "".
-        about: what a row is.
+        name: name of the site, or "events".
+        kind: kind of a site's table, one of `SITE_TABLE_KINDS`; else "".
+        about: description of a row.
         columns: the columns.
     """
 
@@ -137,7 +148,7 @@ class Table:
         """Returns a column by its name.
 
         Raises:
-            KeyError: there is none of that name.
+            KeyError: the table has no column of that name.
         """
         columns = {column.name: column for column in self.columns}
         if name not in columns:
@@ -146,7 +157,7 @@ class Table:
 
     @property
     def label(self) -> str:
-        """Its name as that of a file: "m1_link", "events"."""
+        """Name of the table as the name of a file: "m1_link", "events"."""
         return f"{self.name}_{self.kind}" if self.kind else self.name
 
 
@@ -155,18 +166,24 @@ _UNITS_BY_NAME = {"t_ns": "ns", "sent_ns": "ns", "tick": "tick"}
 _UNITS_BY_ENDING = {"ns": "ns", "us": "us", "ppb": "ns/s"}
 _COMPLETE_TEXTS = {
     "qd_des": "derivative of the reference, Eq. (6)",
-    "delay_max_us": "per peer, largest one-way delay since the last statistics; -1 where nothing came",
+    "delay_max_us": (
+        "per peer, largest one-way delay since the last statistics; -1 where nothing came"
+    ),
     "late": "per peer, samples that came after they were due",
     "duplicate": "per peer, samples that came twice",
     "refused": "per peer, samples whose stamp was out of range",
     "lost": "per peer, samples that the link's model lost",
 }
-"""Meanings of fields whose docstring continues the line before."""
+"""Meanings of fields whose text in the docstring refers to the field before."""
 
 
 class FieldDoc(NamedTuple):
-    """Documentation of a field: its unit ("" for none), its meaning, and its type in JSON
-    Schema.
+    """Documentation of a field of a message.
+
+    Attributes:
+        unit: unit of the field; "" without a unit.
+        text: meaning of the field.
+        kind: type of the field in JSON Schema.
     """
 
     unit: str
@@ -176,9 +193,7 @@ class FieldDoc(NamedTuple):
 
 @cache
 def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, FieldDoc]:
-    """Returns the documentation of every field of a message type, in the order of its
-    definition.
-    """
+    """Returns the documentation of the fields of a message type, in order of definition."""
     texts = dict(_FIELD.findall(inspect.getdoc(kind) or ""))
     texts |= {name: _COMPLETE_TEXTS[name] for name in texts.keys() & _COMPLETE_TEXTS.keys()}
     properties: dict[str, dict[str, Any]] = json_schema(kind)["properties"]
@@ -193,7 +208,17 @@ def read_field_docs(kind: type[msgspec.Struct]) -> dict[str, FieldDoc]:
 def to_int_array(
     values: Iterable[int], source: str, field: str, kind: Any = np.int64
 ) -> NDArray[Any]:
-    """Returns whole numbers as an array of type `kind`."""
+    """Returns integers as an array.
+
+    Args:
+        values: the integers.
+        source: name of the file, for the error.
+        field: name of the field, for the error.
+        kind: data type of the array.
+
+    Raises:
+        LogError: a number does not fit into the data type.
+    """
     try:
         return np.fromiter(values, kind)
     except OverflowError:
@@ -203,13 +228,20 @@ def to_int_array(
 def _make_time_columns(
     tick: Ints | None, t_s: NDArray[Any], log_ns: Ints, publish_ns: Ints
 ) -> Iterator[Column]:
+    """Yields the columns of the nominal time, the tick, and the times of arrival and sending.
+
+    Args:
+        tick: ticks, shape (K,); None: no column of ticks.
+        t_s: nominal times since the epoch, s, shape (K,); NaN: unknown.
+        log_ns: times of arrival, Unix ns, shape (K,).
+        publish_ns: times of sending, Unix ns, shape (K,).
+    """
     known: NDArray[np.bool_] = ~np.isnan(t_s)
-    about = "nominal time since the session's epoch"
     yield Column(
         name="t_s",
         values=t_s,
         unit="s",
-        meaning=about,
+        meaning="nominal time since the session's epoch",
         source="t_ns",
         known=None if known.all() else known,
     )
@@ -271,9 +303,7 @@ def _make_vector_columns(site: SiteLog, arm: ArmModel) -> Iterator[Column]:
 
 
 def _make_orientation_columns(site: SiteLog, field: str, text: str) -> Iterator[Column]:
-    """Yields the orientation of a pose as a quaternion; its source is the record's rotation
-    vector.
-    """
+    """Yields the columns of the orientation of a pose, as a quaternion."""
     quaternions = compute_quaternions(getattr(site, field)[:, POSITION:])
     for name, values in zip(QUATERNION_AXES, quaternions.T, strict=True):
         meaning = f"{text}, {name[1]} of its orientation as {_STEADY_QUATERNION}"
@@ -295,8 +325,19 @@ def _make_number_column(
     text: str,
     known: NDArray[np.bool_] | None = None,
 ) -> Column:
+    """Returns the column of a number of a vector.
+
+    Args:
+        site: the records.
+        field: name of the vector.
+        n: index of the number in the vector.
+        stem: name of the column without its unit.
+        unit: unit of the number.
+        text: meaning of the number.
+        known: True for the rows that have a value, shape (K,); None if all rows have a value.
+    """
     suffix = UNIT_SUFFIXES.get(unit, "")
-    # else it is named already
+    # a stem such as "base_m" already ends in the unit
     if suffix and stem != suffix and not stem.endswith(f"_{suffix}"):
         stem = f"{stem}_{suffix}"
     values = np.ascontiguousarray(getattr(site, field)[:, n])
@@ -306,6 +347,7 @@ def _make_number_column(
 
 
 def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
+    """Yields the columns of the numbers that the site's law sends."""
     for n, entry in enumerate(site.channel.entries(site.peers)):
         (name, unit, length, _) = entry.vector
         peer = entry.peer
@@ -326,7 +368,7 @@ def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
 
 
 def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Column]:
-    """Yields what somebody who holds the arm does, a column per number."""
+    """Yields the columns of the action of a live hand."""
     held: NDArray[np.bool_] = site.hand[:, 2] > 0.0
     yield _make_number_column(
         site=site,
@@ -336,11 +378,11 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
         unit="",
         text="how firmly the arm is held, 0 to 1",
     )
-    whose = {
+    meanings = {
         "number": "number of the newest message of who holds the arm",
         "source": "who holds the arm",
     }
-    for n, (name, text) in enumerate(whose.items(), 1):
+    for n, (name, text) in enumerate(meanings.items(), 1):
         yield Column(
             name=f"hand_{name}",
             values=np.clip(site.hand[:, n], -1, 2**53).astype(np.int64),
@@ -352,9 +394,9 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
     names = arm.joint_names if mode == "joint" else TASK_AXES[:POSITION]
     units = {"tip": ("m", "m/s"), "joint": ("rad", "rad/s"), "force": ("N", "")}[mode]
     size = (site.layout.hand - 3) // 2
-    what = "force" if mode == "force" else "target"
-    for n in range(2 * size if what == "target" else size):
-        stem, unit = (what, units[0]) if n < size else (f"{what}_rate", units[1])
+    quantity = "force" if mode == "force" else "target"
+    for n in range(2 * size if quantity == "target" else size):
+        stem, unit = (quantity, units[0]) if n < size else (f"{quantity}_rate", units[1])
         meaning = f"{stem.replace('_', ' ')} of the hand, {names[n % size]}"
         yield _make_number_column(
             site=site,
@@ -368,6 +410,7 @@ def _make_hand_columns(site: SiteLog, arm: ArmModel, mode: str) -> Iterator[Colu
 
 
 def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Column]:
+    """Yields the columns of the poses of the bodies of the site's plant."""
     for number, body in enumerate(bodies):
         first = (POSITION + len(QUATERNION_AXES)) * number
         for n, axis in enumerate("xyz", first):
@@ -393,7 +436,7 @@ def _make_bodies_columns(site: SiteLog, bodies: Iterable[str]) -> Iterator[Colum
 
 
 def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
-    """Returns the records of a site, a row each, in order of their ticks."""
+    """Returns the table of the records of a site, in order of their ticks."""
     docs = read_field_docs(State)
     arm = scenario.arms[site.name]
     live = scenario.sites[site.name].find_live_hand()
@@ -446,14 +489,22 @@ def build_state_table(site: SiteLog, scenario: Scenario) -> Table:
 
 
 def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
-    """Returns the samples that came to a site, a row each, in the order in which it accepted
-    them.
+    """Returns the table of the samples that arrived at a site, in order of arrival.
+
+    Args:
+        site: the records.
+        source: name of the file, for errors.
+        live: whether the session was live, so that delays were measured.
+
+    Raises:
+        LogError: a record lists an arrival of a peer that the site does not have.
     """
     counts, entries = site.arrivals
     index = entries[:, 0]
     if ((index < 0) | (index >= len(site.peers))).any():
         raise LogError(
-            f"{source}: a record of {site.name} lists an arrival of a peer that it does not have"
+            f"{source}: a record of {site.name} lists an arrival of a peer "
+            "that it does not have"
         )
     row = np.repeat(np.arange(len(site)), counts)
     names = np.array(site.peers, dtype=np.object_)[index]
@@ -491,7 +542,7 @@ def build_arrivals_table(site: SiteLog, source: str, *, live: bool) -> Table:
 
 
 def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str) -> Table:
-    """Returns the statistics of a site's loop and links, a row each, in order of their ticks."""
+    """Returns the table of the statistics of a site, in order of their ticks."""
     stats = timed.messages
     tick = to_int_array((s.tick for s in stats), source, "tick")
     t_s = to_int_array((s.t_ns for s in stats), source, "t_ns") / NS_PER_S
@@ -502,10 +553,8 @@ def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str
         values = [getattr(s, field) for s in stats]
         if kind == "object":
             names: Iterable[str] = site.peers
-            if field == "dropped":  # by reason, one per column name
-                names = {
-                    _to_word(reason): reason for value in values for reason in sorted(value)
-                }.values()
+            if field == "dropped":
+                names = _list_reasons(values)
             columns += [_make_entry_column(source, field, name, values) for name in names]
         elif kind == "integer":
             columns.append(
@@ -531,16 +580,34 @@ def build_link_table(site: SiteLog, timed: TimedMessages[LinkStats], source: str
     return Table(site.name, "link", about, tuple(columns))
 
 
+def _list_reasons(dropped: Iterable[Mapping[str, int]]) -> list[str]:
+    """Returns the reasons for which messages were dropped, one for each column name."""
+    reasons: dict[str, str] = {}
+    for counts in dropped:
+        for reason in sorted(counts):
+            reasons[_to_word(reason)] = reason
+    return list(reasons.values())
+
+
 def _to_word(text: str) -> str:
+    """Returns a text as a part of a column name: small letters, digits and underscores."""
     return re.sub(r"[^a-z0-9]+", "_", text.lower())[:31]
 
 
 def _make_entry_column(
     source: str, field: str, name: str, values: Sequence[Mapping[str, int]]
 ) -> Column:
+    """Returns the column of one key of a field of the statistics that is a map.
+
+    Args:
+        source: name of the file, for errors.
+        field: name of the field.
+        name: the key: a peer, or a reason of `dropped`.
+        values: the maps, a row each.
+    """
     unit, text, _ = read_field_docs(LinkStats)[field]
     stem, _, ending = field.rpartition("_") if unit else (field, "", "count")
-    # a reason for which no message was dropped is not named
+    # `dropped` has no entry for a reason for which no message was dropped
     absent = 0 if field == "dropped" else None
     numbers = [value.get(name, absent) for value in values]
     lowest = 0 if field in _NONE_BELOW_0 else -math.inf
@@ -556,7 +623,7 @@ def _make_entry_column(
 
 
 def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
-    """Returns the events, a row each, in the order in which they came to the recorder."""
+    """Returns the table of the events, in order of their arrival at the recorder."""
     events = timed.messages
     t_ns = to_int_array((event.t_ns for event in events), source, "t_ns")
     t_s = np.where(t_ns >= 0, t_ns / NS_PER_S, np.nan)
@@ -576,15 +643,11 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
                     source=field,
                 )
             )
-        else:  # a map per member as JSON
-            texts = [
-                v if isinstance(v, str) else json.dumps(v, sort_keys=True) if v else ""
-                for v in values
-            ]
+        else:
             columns.append(
                 Column(
                     name=field,
-                    values=np.array(texts, dtype=np.object_),
+                    values=np.array(list(map(_to_text, values)), dtype=np.object_),
                     unit=unit,
                     meaning=text,
                     source=field,
@@ -593,17 +656,28 @@ def build_events_table(timed: TimedMessages[Event], source: str) -> Table:
     return Table(EVENTS_TABLE, "", "something that happened once", tuple(columns))
 
 
+def _to_text(value: str | Mapping[str, Any]) -> str:
+    """Returns a field of an event as text; a map per member as JSON, "" if it is empty."""
+    if isinstance(value, str):
+        return value
+    return json.dumps(value, sort_keys=True) if value else ""
+
+
 def to_pandas_frame(table: Table) -> "pandas.DataFrame":
-    """Returns a table as a pandas data frame; what is missing is None among texts, NaN among
-    numbers.
+    """Returns a table as a pandas data frame.
+
+    A missing value is None in a column of texts, and NaN in a column of numbers.
 
     Raises:
         UsageError: pandas is not installed.
     """
-    columns = {
-        c.name: c.rows(0, len(c.values)) if c.is_text else c.numbers() for c in table.columns
-    }
-    return import_extra("pandas", "frames", "data frames").DataFrame(columns)
+    values: dict[str, Any] = {}
+    for column in table.columns:
+        if column.is_text:
+            values[column.name] = column.rows(0, len(column.values))
+        else:
+            values[column.name] = column.numbers()
+    return import_extra("pandas", "frames", "data frames").DataFrame(values)
 
 
 def to_data_frame(table: Table) -> "polars.DataFrame":
@@ -613,15 +687,14 @@ def to_data_frame(table: Table) -> "polars.DataFrame":
         UsageError: polars is not installed.
     """
     pl = import_extra("polars", "frames", "data frames")
-    series = []
+    all_series = []
     for column in table.columns:
-        text = column.is_text
-        one = pl.Series(
-            column.name,
-            column.values.tolist() if text else column.values,
-            pl.String if text else None,
-        )
+        if column.is_text:
+            series = pl.Series(column.name, column.values.tolist(), pl.String)
+        else:
+            series = pl.Series(column.name, column.values, None)
         if column.known is not None:
-            one = one.zip_with(pl.Series(column.known), pl.Series([None], dtype=one.dtype))
-        series.append(one)
-    return cast("polars.DataFrame", pl.DataFrame(series))
+            null = pl.Series([None], dtype=series.dtype)
+            series = series.zip_with(pl.Series(column.known), null)
+        all_series.append(series)
+    return cast("polars.DataFrame", pl.DataFrame(all_series))

@@ -1,10 +1,12 @@
-"""Check of a log: bytes of its files, completeness of its session, agreement with scenario and
-accounts.
+"""Check a log: its bytes, its completeness, and its agreement with its scenario and accounts.
 
-Invariant: one finding per check, with the places where it fails; missing messages are named
-range by range. Any MCAP file is checked for its bytes, only a trilat-net log for its content: a
-message against its own content, its scenario and the messages before it. Nothing is executed:
-that is the task of `verify`.
+The bytes of any MCAP file are checked. The content is checked only for a trilat-net log: each
+message against its own content, the scenario, and the messages before it. Sites are not
+executed; that is the task of `verify`.
+
+Invariant:
+    - Each check has one finding, with the places where the check fails.
+    - Missing messages are listed by ranges.
 """
 
 import hashlib
@@ -45,25 +47,27 @@ from .ros2 import cdr
 from .running_digest import DigestState, Integrity
 
 MAX_AHEAD_NS = 10 * NS_PER_S
-"""No message is sent more than this after it came, whatever the clocks."""
+"""Largest time by which the stamp of sending may be later than the arrival, for any clocks."""
 MAX_BOOTS = 64
-"""Starts of a member that are distinguished."""
+"""Largest number of starts of a member that are distinguished."""
 _CDR_HEAD = b"\x00\x01"
+"""First bytes of a message in plain CDR, little-endian."""
 _RATE_TOLERANCE = 0.02
+"""Largest relative difference of a measured rate from the scenario's."""
 _RATE_SPAN_NS = 2 * NS_PER_S
-"""A rate is computed over no shorter a time."""
+"""Shortest time over which a rate is computed."""
 _ACCOUNTS_SINCE = 3
-"""First version whose logs have an account of every channel."""
+"""First schema version whose logs have an account of every channel."""
 
 
 @dataclass(frozen=True, repr=False)
 class LogCheckResult(CheckReport):
-    """Result of a check of files.
+    """The result of a check of files.
 
     Attributes:
-        files: their names.
-        findings: one per check.
-        ours: True if they are a trilat-net log; else only their bytes were checked.
+        files: names of the files.
+        findings: one finding per check.
+        ours: True if the files are a trilat-net log; else only their bytes were checked.
     """
 
     files: list[str]
@@ -82,20 +86,30 @@ class LogCheckResult(CheckReport):
 
     def to_rows(self) -> list[dict[str, Any]]:
         """Returns a row per check."""
-        keys = "check", "passed", "text", "places", "wrong"
-        rows = [{key: getattr(one, key) for key in keys} for one in self.findings]
-        return [{**row, "places": [at._asdict() for at in row["places"]]} for row in rows]
+        return [
+            {
+                "check": finding.check,
+                "passed": finding.passed,
+                "text": finding.text,
+                "places": [place._asdict() for place in finding.places],
+                "wrong": finding.wrong,
+            }
+            for finding in self.findings
+        ]
 
 
 def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheckResult:
-    """Checks that a log is well-formed, complete and consistent; the command is `trilat log
-    check`.
+    """Checks that a log is well-formed, complete and consistent, as `trilat log check` does.
 
-    Every byte of its file is checked, or of its parts.
+    Every byte of the file, or of all parts of the log, is checked.
 
     >>> path = tn.simulate("two_sites", duration_s=0.1).save("sound.mcap")
     >>> tn.check_file(path).passed
     True
+
+    Args:
+        files: the file, or the parts of the log.
+        progress: called now and then with the number of bytes read and their total.
 
     Raises:
         LogError: a file cannot be read, or is of another session than the files before it.
@@ -118,20 +132,23 @@ def check_file(*files: str | Path, progress: Progress | None = None) -> LogCheck
 
 
 class ChannelCheck:
-    """Check of one channel, message by message: numbering, schema and time stamps.
+    """Checks one channel, message by message: numbers, schema and time stamps.
 
     Args:
-        key: its member, and its kind: "state", "link", "event" or "stats".
+        key: session, member and channel ("state", "link", "event" or "stats").
         about: metadata of the session.
-        scenario: its scenario; None if it cannot be read.
+        scenario: the scenario; None if it cannot be read.
         findings: receives the problems.
-        accounts: those of the session, which count its messages.
+        accounts: the accounts of the session, which count the messages.
 
     Attributes:
-        rate_hz: tick rate of the member; 0 of the recorder.
-        received: number of messages, each number once.
-        boots: the member's starts. first, last: number and publish time of the messages with
-        the lowest and the highest number.
+        member: name of the member.
+        kind: the channel: "state", "link", "event" or "stats".
+        rate_hz: tick rate of the member, Hz; 0 for the recorder.
+        received: number of messages; repeated numbers count once.
+        boots: starts of the member.
+        first: number and time of sending of the message with the lowest number.
+        last: number and time of sending of the message with the highest number.
     """
 
     def __init__(
@@ -164,31 +181,34 @@ class ChannelCheck:
 
     @property
     def name(self) -> str:
-        """Its short name, as in "m1/state"."""
+        """Short name of the channel, as in "m1/state"."""
         return f"{self.member}/{self.kind}"
 
     def begin(self, file: str, channel: ChannelInfo) -> None:
-        """Begins with another file, and checks how it describes the channel."""
+        """Starts another file, and checks how the file describes the channel."""
         self._in_file = defaultdict(Account)
         self._file = file
         self._log_ns = 0
-        if fault := self._find_schema_fault(channel):
+        fault = self._find_schema_fault(channel)
+        if fault:
             self._add("schema", None, fault)
 
     def _find_schema_fault(self, channel: ChannelInfo) -> str:
+        """Returns the first fault in the description of the channel; "" without a fault."""
         kind = CHANNEL_TYPES[self.kind]
-        rate = channel.metadata.get("rate_hz", str(self.rate_hz))
         if not channel.schema:
             return "has no schema"
-        if (channel.encoding, channel.schema_encoding) != ("msgpack", "jsonschema"):
-            return f"is {channel.encoding} with {channel.schema_encoding}, not msgpack with jsonschema"
-        if channel.schema != (name := f"trilat.{kind.__name__}.v{self._version}"):
+        encodings = (channel.encoding, channel.schema_encoding)
+        if encodings != ("msgpack", "jsonschema"):
+            return f"is {encodings[0]} with {encodings[1]}, not msgpack with jsonschema"
+        name = f"trilat.{kind.__name__}.v{self._version}"
+        if channel.schema != name:
             return f"has the schema {channel.schema}, not {name}"
-        if (
-            self._version == messages.VERSION
-            and channel.schema_data != json.dumps(messages.json_schema(kind)).encode()
-        ):
-            return f"the schema {channel.schema} is not what it was released as"
+        if self._version == messages.VERSION:
+            released = json.dumps(messages.json_schema(kind)).encode()
+            if channel.schema_data != released:
+                return f"the schema {channel.schema} is not what it was released as"
+        rate = channel.metadata.get("rate_hz", str(self.rate_hz))
         if self.kind == topics.STATE and rate != str(self.rate_hz):
             return f"says {rate} Hz, the scenario {self.rate_hz}"
         return ""
@@ -204,8 +224,9 @@ class ChannelCheck:
         identity = identify_message(message, self.rate_hz)
         number = identity.number
         sequence = identity.sequence
-        if self.kind == topics.STATS:  # these state no number: the file counts them
-            number = sequence = self._in_file[message.boot].expected
+        if self.kind == topics.STATS:  # statistics of the recorder state no number
+            number = self._in_file[message.boot].expected
+            sequence = number
         if message.v != self._version:
             text = f"a message of version {message.v} in a log of version {self._version}"
             self._add("schema", offset, text)
@@ -227,30 +248,34 @@ class ChannelCheck:
         self._findings[check].add(self._file, offset, f"{self.name}: {text}")
 
     def _count(self, message: AnyMessage, number: int, publish_ns: int, offset: int) -> None:
+        """Counts a numbered message, and reports a number that occurs twice in the file."""
         if message.boot not in self.boots and len(self.boots) >= MAX_BOOTS:
             self._add("sequence", offset, f"more than {MAX_BOOTS} starts")
             return
         self.boots.add(message.boot)
-        # parts may repeat a message, a file may not
+        # two parts may hold the same message, a file may not
         if not self._in_file[message.boot].receive(number):
             self._add("sequence", offset, f"number {number} is there twice")
         if isinstance(message, messages.Event):
-            self.received += self._accounts.receive_event(self._topic, number, message)
+            is_new = self._accounts.receive_event(self._topic, number, message)
+        elif self.kind == topics.STATS:
+            is_new = True
         else:
-            self.received += self.kind == topics.STATS or self._accounts.count_message(
-                self._topic, number
-            )
+            is_new = self._accounts.count_message(self._topic, number)
+        self.received += is_new
         if self.rate_hz and isinstance(message, messages.State) and message.cmd:
-            self._accounts.mark_skipped_ticks(
-                self.member, message.tick, count_skipped_ticks(message.cmd)
-            )
-        place = (number, publish_ns)
-        self.first = place if self.first is None else min(self.first, place)
-        self.last = place if self.last is None else max(self.last, place)
+            skipped = count_skipped_ticks(message.cmd)
+            self._accounts.mark_skipped_ticks(self.member, message.tick, skipped)
+        numbered_time = (number, publish_ns)
+        if self.first is None or numbered_time < self.first:
+            self.first = numbered_time
+        if self.last is None or numbered_time > self.last:
+            self.last = numbered_time
 
     def _check_times(
         self, stored: McapMessage, number: int, stated_ns: int | None, offset: int
     ) -> None:
+        """Checks that arrivals ascend, and that the stamp of sending is that of the message."""
         log_ns = stored.log_time_ns
         publish_ns = stored.publish_time_ns
         if log_ns < self._log_ns:
@@ -272,16 +297,17 @@ class ChannelCheck:
 
 
 def _parse_number(about: Mapping[str, str], key: str) -> int:
+    """Returns a number of the metadata; 0 if it is missing or is not a number."""
     text = about.get(key, "")
     return int(text) if re.fullmatch(r"\d{1,19}", text) else 0
 
 
 class SessionCheck:
-    """Check of one session, in one file or in its parts.
+    """Checks one session, in one file or in its parts.
 
     Attributes:
-        ours: True if there is a trilat-net log at all.
-        channels: the checks of its channels, by topic.
+        ours: True if a file is a trilat-net log.
+        channels: the checks of the channels, by topic.
     """
 
     def __init__(self) -> None:
@@ -292,17 +318,25 @@ class SessionCheck:
         self._scenario: Scenario | None = None
         self._about: dict[str, str] = {}
         self._counted = SessionAccounts("", None)
-        self._accounts: dict[str, str] = {}  # of the last file
-        self._first_part = False  # the files begin with the session
-        self._files = self._parts = 0  # files of the session, and those that are parts of a log
-        self._views = self._version = 0
-        self._file = self._chain_text = ""
+        self._accounts: dict[str, str] = {}  # accounts that the last file states
+        self._first_part = False  # whether a file begins with the session
+        self._files = 0  # files of the session
+        self._parts = 0  # files that are parts of a log
+        self._views = 0  # messages for viewers
+        self._version = 0
+        self._file = ""
+        self._chain_text = ""
 
     def read(self, file: str, stream: BinaryIO, progress: Progress | None = None) -> None:
         """Checks every byte of a file, and its messages.
 
+        Args:
+            file: name of the file.
+            stream: the file, opened for reading.
+            progress: called now and then with the number of bytes read and their total.
+
         Raises:
-            LogError: it is of another session than the files before it.
+            LogError: the file is of another session than the files before it.
         """
         reader = McapReader(stream, file, progress, kept=False)
         structure = FileCheck(file, reader.scanner, self._findings)
@@ -395,11 +429,13 @@ class SessionCheck:
         }
         for key, value in facts.items():
             if about.get(key) != value:
-                there = about.get(key, "")[:40]
-                finding.add(self._file, None, f"has {key} {value}, the session {there!r}")
+                stated_value = about.get(key, "")[:40]
+                finding.add(
+                    self._file, None, f"has {key} {value}, the session {stated_value!r}"
+                )
 
     def _begin_channel(self, channel: ChannelInfo) -> ChannelCheck | None:
-        """Returns the check of a channel in this file; None if it is none of the session's own."""
+        """Returns the check of a channel in this file; None for channels of other members."""
         topic = channel.topic
         finding = self._findings["schema"]
         key = topics.parse_key(topic.removeprefix("/"))
@@ -428,42 +464,52 @@ class SessionCheck:
             if self._scenario and key.member not in (*self._scenario.sites, topics.RECORDER):
                 finding.add(self._file, None, f"{topic[:80]}: the scenario has no such member")
             self._counted.open_channel(topic)
-            of = self._about, self._scenario, self._findings, self._counted
-            self.channels[topic] = ChannelCheck(key, *of)
+            self.channels[topic] = ChannelCheck(
+                key=key,
+                about=self._about,
+                scenario=self._scenario,
+                findings=self._findings,
+                accounts=self._counted,
+            )
         self.channels[topic].begin(self._file, channel)
         return self.channels[topic]
 
     def findings(self) -> Iterator[Finding]:
-        """Yields the results, once all files were read; without a session only that it was
-        taken out.
+        """Yields the findings after all files were read.
+
+        For a file without a session the content is not checked, except that its digest chain
+        may show that the session was removed.
         """
         counts = self._counts
-        found = self._findings
+        findings = self._findings
         messages = counts["messages"]
         chunks = counts["chunks"]
-        yield found["whole"].conclude(f"finished, {counts['bytes'] / 1e6:.1f} MB")
-        yield found["checksums"].conclude(f"{counts['crcs']} compared, all agree")
-        yield found["records"].conclude(
-            f"{count_nouns(messages, 'message')} in {count_nouns(chunks, 'chunk')}, built as the format says"
-        )
-        yield found["index"].conclude("is what is there")
+        yield findings["whole"].conclude(f"finished, {counts['bytes'] / 1e6:.1f} MB")
+        yield findings["checksums"].conclude(f"{counts['crcs']} compared, all agree")
+        content = f"{count_nouns(messages, 'message')} in {count_nouns(chunks, 'chunk')}"
+        yield findings["records"].conclude(f"{content}, built as the format says")
+        yield findings["index"].conclude("is what is there")
         if not self.ours:
-            if "chain" in found:
-                yield found["chain"].conclude("")
+            if "chain" in findings:
+                yield findings["chain"].conclude("")
             return
         yield self._check_sequence()
         yield self._check_accounts()
-        yield found["chain"].conclude(self._chain_text)
+        yield findings["chain"].conclude(self._chain_text)
         kinds = f"every message is one of version {self._version}"
         views = f", and {count_nouns(self._views, 'view')}" if self._views else ""
-        yield found["schema"].conclude(kinds + views)
-        yield found["times"].conclude("log times never go back, publish times are the senders'")
+        yield findings["schema"].conclude(kinds + views)
+        yield findings["times"].conclude(
+            "log times never go back, publish times are the senders'"
+        )
         yield self._check_rates()
         scenario = self._scenario.name if self._scenario else ""
-        text = f"{scenario}, SHA-256 {self._about.get('scenario_sha256', '')[:16]}, as the session names it"
-        yield found["scenario"].conclude(text)
+        digest = self._about.get("scenario_sha256", "")[:16]
+        text = f"{scenario}, SHA-256 {digest}, as the session names it"
+        yield findings["scenario"].conclude(text)
 
     def _check_sequence(self) -> Finding:
+        """Returns the finding on missing and repeated messages."""
         finding = self._findings["sequence"]
         missing = 0
         reordered = 0
@@ -478,7 +524,8 @@ class SessionCheck:
                 )
             reordered += sum(account.reordered for account in self._counted.list_starts(topic))
         received = sum(check.received for check in self.channels.values())
-        text = f"{count_nouns(received, 'message')} of {count_nouns(len(self.channels), 'channel')}"
+        channels = count_nouns(len(self.channels), "channel")
+        text = f"{count_nouns(received, 'message')} of {channels}"
         if missing:
             text += f", {missing} missing in {len(gaps)} range{'s' * (len(gaps) > 1)}"
         elif finding.passed:
@@ -496,37 +543,43 @@ class SessionCheck:
 
     @property
     def _takes_events(self) -> bool:
-        """True if the files must tell how the sites ended: all of a log that leaves no events
-        out.
+        """True if the files must have an end event of every site.
+
+        A single part of a log, and a log without events, need not have them.
         """
         session = self._about["session"]
-        choice = parse_filter_facts(self._about)
+        channel_filter = parse_filter_facts(self._about)
         names = self._scenario.names if self._scenario else ()
-        takes = all(choice.accepts(topics.key(session, name, topics.EVENT)) for name in names)
+        keys = [topics.key(session, name, topics.EVENT) for name in names]
         is_single_part = self._files == self._parts == 1
-        return takes and not is_single_part
+        return all(map(channel_filter.accepts, keys)) and not is_single_part
 
     def _check_accounts(self) -> Finding:
+        """Returns the finding on the accounts that the file states, against its messages."""
         finding = self._findings["accounts"]
         if not self._accounts:
             return finding.conclude("there are none: the file was not finished")
-        own = (check for check in self.channels.values() if check.member == topics.RECORDER)
-        if not self._first_part or len({boot for check in own for boot in check.boots}) > 1:
+        recorder_boots: set[int] = set()
+        for check in self.channels.values():
+            if check.member == topics.RECORDER:
+                recorder_boots |= check.boots
+        if not self._first_part or len(recorder_boots) > 1:
             return finding.conclude("tell of parts that are not here, and were not compared")
         for topic, check in self.channels.items():
             stated = parse_counts(self._accounts.get(topic, ""))
             if check.kind != topics.STATS:
                 missing = sum(account.missing for account in self._counted.list_starts(topic))
-                there = {"received": check.received, "missing": missing}
-                for word, count in stated.items():
-                    if count != there[word]:
-                        text = f"{check.name}: {count} {word} by the account, {there[word]} by the file"
-                        finding.add("", None, text)
+                counted = {"received": check.received, "missing": missing}
+                for name, count in stated.items():
+                    if count != counted[name]:
+                        account = f"{check.name}: {count} {name} by the account"
+                        finding.add("", None, f"{account}, {counted[name]} by the file")
             if not stated and self._version >= _ACCOUNTS_SINCE:
                 finding.add("", None, f"{check.name}: has no account")
         return finding.conclude("agree with what is there")
 
     def _check_rates(self) -> Finding:
+        """Returns the finding on the rates at which the sites sent records."""
         finding = self._findings["rates"]
         texts = []
         for check in self.channels.values():
@@ -549,41 +602,47 @@ class SessionCheck:
 
 
 def judge_integrity(log: Log) -> Integrity:
-    """Returns whether a log is as it was made: by its digest chain, its accounts and its
-    statistics.
+    """Returns whether a log is as it was written.
+
+    The digest chain, the accounts and the statistics of the recorder are compared with the
+    records.
 
     Raises:
         LogError: a message cannot be read.
     """
     if log.chain.passed:
         for site in log.sites:
-            if seam := _find_unexplained(log, site):
-                return Integrity(DigestState.CHANGED, seam)
+            change = _describe_unexplained_gap(log, site)
+            if change:
+                return Integrity(DigestState.CHANGED, change)
     return log.chain
 
 
-def _find_unexplained(log: Log, site: str) -> str:
-    """Describes a gap of a site that is none of the run's own; "" if there is none.
+def _describe_unexplained_gap(log: Log, site: str) -> str:
+    """Returns a description of missing or added records that the log does not explain; else "".
 
-    One of which neither the accounts nor the recorder's statistics tell is the seam of a
-    splice, or a stretch that was cut out.
+    A gap that neither the accounts nor the recorder's statistics state shows that records were
+    cut out, or that two logs were joined.
     """
     if log.damaged:
         return ""
     ticks = np.unique(log[site].tick)
-    # of several it is counted anew
+    # the accounts of several files are counted from their records
     stated = parse_counts(log.account(site)) if len(log.sources) == 1 else {}
-    there = {"received": len(ticks), "missing": log.missing(site)}
-    if not log.part and stated not in ({}, there):
-        told = " and ".join(f"{stated.get(word, 0)} {word}" for word in there)
-        found = " and ".join(f"{n} {word}" for word, n in there.items())
-        return f"records of {site} were taken out or put in: its account says {told}, the file has {found}"
-    inner = int(ticks[-1] - ticks[0]) + 1 - len(ticks) if len(ticks) else 0
-    inner -= min(inner, log.absent_ticks(site))
-    if not inner or log.chain.state is DigestState.INTACT:
+    counted = {"received": len(ticks), "missing": log.missing(site)}
+    if not log.part and stated not in ({}, counted):
+        stated_text = " and ".join(f"{stated.get(name, 0)} {name}" for name in counted)
+        counted_text = " and ".join(f"{count} {name}" for name, count in counted.items())
+        return (
+            f"records of {site} were taken out or put in: its account says {stated_text}, "
+            f"the file has {counted_text}"
+        )
+    gaps = int(ticks[-1] - ticks[0]) + 1 - len(ticks) if len(ticks) else 0
+    gaps -= min(gaps, log.absent_ticks(site))
+    if not gaps or log.chain.state is DigestState.INTACT:
         return ""
-    counts = [stats.missing.get(f"{site}/state", 0) for stats in log.recorder_stats()]
-    if inner <= max([stated.get("missing", 0), *counts]):
+    reported = [stats.missing.get(f"{site}/state", 0) for stats in log.recorder_stats()]
+    if gaps <= max([stated.get("missing", 0), *reported]):
         return ""
-    lost = count_nouns(inner, f"record of {site} is", f"records of {site} are")
-    return f"{lost} missing in between, and nothing in the log explains it"
+    missing = count_nouns(gaps, f"record of {site} is", f"records of {site} are")
+    return f"{missing} missing in between, and nothing in the log explains it"
