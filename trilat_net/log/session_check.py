@@ -213,8 +213,8 @@ class ChannelCheck:
             return f"says {rate} Hz, the scenario {self.rate_hz}"
         return ""
 
-    def take(self, stored: McapMessage, offset: int) -> None:
-        """Checks a message; `offset` is its place, or that of its chunk."""
+    def check_message(self, stored: McapMessage, offset: int) -> None:
+        """Checks a message; `offset` is the byte of the message or of its chunk."""
         kind: Any = CHANNEL_TYPES[self.kind]
         try:
             message = decode(stored.payload, kind, messages.READABLE, self._layout)
@@ -347,37 +347,40 @@ class SessionCheck:
         self._counts += structure.counts
 
     def _read_messages(self, file: str, reader: McapReader) -> None:
+        """Checks the messages of a file, and its digest chain."""
         checks: dict[str, ChannelCheck | None] = {}
         self._file = file
-        begun = False
+        has_begun = False
         for message in reader.messages():
-            if not begun:
-                begun = True
-                self._begin(reader)
+            if not has_begun:  # the reader has the metadata once it yields a message
+                has_begun = True
+                self._begin_file(reader)
             topic = message.topic
             if not self.ours or not topic:
                 continue
             try:
                 check = checks[topic]
             except KeyError:
-                check = checks[topic] = self._begin_channel(reader.channels[topic])
+                check = self._begin_channel(reader.channels[topic])
+                checks[topic] = check
             if check is not None:
-                check.take(message, reader.offset)
+                check.check_message(message, reader.offset)
             elif topic.startswith(VIZ_ROOT):
                 self._views += 1
                 if message.payload[:2] != _CDR_HEAD:
                     self._findings["schema"].add(
                         file, reader.offset, f"{topic[:80]}: a message is no CDR"
                     )
-        if not begun:
-            self._begin(reader)
+        if not has_begun:
+            self._begin_file(reader)
         self._accounts = reader.metadata.get(ACCOUNTS, {})
         chain = reader.judge_digest()
         self._chain_text = chain.text
         if not chain.passed:
             self._findings["chain"].add(file, None, self._chain_text)
 
-    def _begin(self, reader: McapReader) -> None:
+    def _begin_file(self, reader: McapReader) -> None:
+        """Reads the session of a file, and refuses a file of another session."""
         about = reader.metadata.get(SESSION, {})
         if not {"session", "driver"} <= about.keys() or SCENARIO not in reader.attachments:
             if self.ours:
@@ -399,7 +402,7 @@ class SessionCheck:
             self._counted = SessionAccounts(
                 about["session"], self._scenario, continued=continued
             )
-            # events may tell of them first
+            # an event may tell of records before the first record
             for name in self._scenario.names if self._scenario else ():
                 for channel in (topics.STATE, topics.LINK):
                     self._counted.open_channel(
@@ -407,6 +410,7 @@ class SessionCheck:
                     )
 
     def _check_scenario(self, text: bytes) -> None:
+        """Checks the text of the scenario against the metadata of the session."""
         finding = self._findings["scenario"]
         about = self._about
         digest = hashlib.sha256(text).hexdigest()
