@@ -116,7 +116,7 @@ def test_nobody_is_dropped_without_whom_the_others_are_no_group() -> None:
     ("name", "overrides", "words"),
     [
         ("two_sites", RULE, "no master can be lost"),
-        ("paper", {"on_stale.on_lost": "degrade"}, "is of on_stale.action = 'glide' alone"),
+        ("paper", {"on_stale.on_lost": "degrade"}, "needs on_stale.action = 'glide'"),
         ("paper", {**RULE, "on_stale.on_lost": "drop"}, "'hold' or 'degrade'"),
     ],
 )

@@ -293,7 +293,7 @@ def test_an_environment_observes_orientations_that_never_jump() -> None:
     for _ in range(190):
         way = np.array([0.0, 0.02, 0.0])
         observed.append(env.step(observed[-1]["pose"] + way)[0])
-        view = env.unwrapped._look().view
+        view = env.unwrapped._build_scene().view
         shared.append(np.concatenate([view.q_des, view.peers[0].q]))
     assert env.observation_space.contains(observed[-1])
     for what, column in (("q_des", 3), ("peer_q", 9)):

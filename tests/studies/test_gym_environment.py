@@ -245,7 +245,7 @@ def test_goals_of_chains_are_reached_by_a_pose(scenario: str) -> None:
     env = tn.make_env(scenario, user=_first_master(scenario), duration_s=1)
     for seed in range(10):
         env.reset(seed=seed)
-        scene = env._look()
+        scene = env._build_scene()
         assert scene.can_reach("s", env.task.goal)
         assert not scene.can_reach("s", env.task.goal + 10.0)
 
