@@ -584,10 +584,10 @@ def upright_axes(chain: ChainSetup) -> Array:
     gravity = np.array(chain.gravity_m_s2)
     size = float(np.linalg.norm(gravity))
     up = -gravity / size if size else np.array([0.0, 0.0, 1.0])
-    ahead = np.eye(3)[int(np.argmin(np.abs(up) > 0.9))]  # x, unless gravity acts along x
-    ahead = ahead - (ahead @ up) * up
-    ahead /= np.linalg.norm(ahead)
-    return np.array([ahead, np.cross(up, ahead), up])
+    forward = np.eye(3)[int(np.argmin(np.abs(up) > 0.9))]  # x, unless gravity acts along x
+    forward = forward - (forward @ up) * up
+    forward /= np.linalg.norm(forward)
+    return np.array([forward, np.cross(up, forward), up])
 
 
 DEPENDENT_SHARE = 1e-9

@@ -176,7 +176,7 @@ def count_sent(log: Log, peer: str, newest: int) -> int:
     return min(max(newest + 1, recorded_ticks, *end_ticks), log.scenario.ticks(peer))
 
 
-def mark_judged_samples(log: Log, site: str, stamp_ns: Ints, came: Arrivals) -> Bools:
+def mark_judged_samples(log: Log, site: str, stamp_ns: Ints, arrivals: Arrivals) -> Bools:
     """Returns the samples of which it is known whether they arrived, shape (M,).
 
     These are the samples that arrived, those older than the newest arrival, and those older
@@ -187,15 +187,15 @@ def mark_judged_samples(log: Log, site: str, stamp_ns: Ints, came: Arrivals) -> 
         log: the log of a run.
         site: the receiver.
         stamp_ns: stamps of the samples 0 to M - 1, ns since the epoch.
-        came: first arrivals of the samples.
+        arrivals: first arrivals of the samples.
     """
     part = log[site]
     count = len(stamp_ns)
     if not len(part):
         return np.zeros(count, dtype=np.bool_)
     earliest_tick = first_ticks(stamp_ns + 1, part.rate_hz)
-    slowest_ticks = int((came.tick - earliest_tick[came.sample]).max(initial=0))
-    newest = int(came.sample.max(initial=-1))
+    slowest_ticks = int((arrivals.tick - earliest_tick[arrivals.sample]).max(initial=0))
+    newest = int(arrivals.sample.max(initial=-1))
     last_tick = min(int(part.tick[-1]), log.scenario.ticks(site) - 1)
     is_older_than_newest = np.arange(count) <= newest
     judged: Bools = is_older_than_newest | (earliest_tick + slowest_ticks <= last_tick)
@@ -207,7 +207,7 @@ def mark_judged_samples(log: Log, site: str, stamp_ns: Ints, came: Arrivals) -> 
         following = np.searchsorted(missing_ticks, earliest_tick)
         next_missing_tick = np.append(missing_ticks, never)[following]
         judged &= next_missing_tick - earliest_tick > slowest_ticks
-    judged[came.sample] = True
+    judged[arrivals.sample] = True
     return judged
 
 

@@ -597,22 +597,22 @@ class PushedTwins(Result):
     growth: TwinGrowth
     linear: LinearSizes | None = None
 
-    def describe(self, one: PushGrowth) -> str:
+    def describe(self, pushed: PushGrowth) -> str:
         """Returns a sentence on the growth of a push."""
-        rate = "" if math.isnan(one.rate_per_s) else f" ({one.rate_per_s:+.3g} /s)"
-        push = f"a push of {one.push.name} at {self.at_s:.4g} s"
+        rate = "" if math.isnan(pushed.rate_per_s) else f" ({pushed.rate_per_s:+.3g} /s)"
+        push = f"a push of {pushed.push.name} at {self.at_s:.4g} s"
         to_s = self.growth.to_s
-        if one.ended_s is not None:
+        if pushed.ended_s is not None:
             outcome = "makes the run diverge"
-            if one.trend is EnvelopeTrend.DECAYS:
+            if pushed.trend is EnvelopeTrend.DECAYS:
                 outcome = "dies down to the rounding of the numbers"
-            return f"{push} {outcome} in {one.ended_s - self.at_s:.3g} s{rate}"
-        if one.trend is EnvelopeTrend.GROWS:
-            growth = f"grows x {one.factor:.3g} in {to_s - self.growth.from_s:.4g} s"
-            return f"{push} {growth}{rate}, most at {one.joint}"
-        outcome = f"becomes {one.becomes_rad_s:.3g} rad/s in {to_s - self.at_s:.4g} s{rate}"
-        text = f"{push} {outcome}, most at {one.joint}"
-        return text if one.trend in _FALLING else f"{text}; it shows no clear trend"
+            return f"{push} {outcome} in {pushed.ended_s - self.at_s:.3g} s{rate}"
+        if pushed.trend is EnvelopeTrend.GROWS:
+            growth = f"grows x {pushed.factor:.3g} in {to_s - self.growth.from_s:.4g} s"
+            return f"{push} {growth}{rate}, most at {pushed.joint}"
+        outcome = f"becomes {pushed.becomes_rad_s:.3g} rad/s in {to_s - self.at_s:.4g} s{rate}"
+        text = f"{push} {outcome}, most at {pushed.joint}"
+        return text if pushed.trend in _FALLING else f"{text}; it shows no clear trend"
 
     def headline(self) -> str:
         """Returns the sizes for which a push is linear, or the growth of the worst push."""
