@@ -1,8 +1,11 @@
 """The network's effect on each sample of a directed link: its due time, or its loss.
 
-Invariant (L4): the delivery of sample m is a function of the link's key, m, and the model in
-force at its stamp. All memory (bursts of loss, correlated delay, order) advances sample by
-sample, by index, in whatever order samples arrive.
+Invariant (L4):
+
+- The delivery of sample m is a function of the link's key, of m, and of the model in force at
+  the stamp of m.
+- All memory (bursts of loss, correlated delay, order) advances from sample to sample by index,
+  whatever the order in which samples arrive.
 """
 
 from .delay import (
@@ -20,24 +23,23 @@ from .delay import (
 )
 from .jit import leaf
 from .philox import DrawKey, uniforms
+from .row_fields import LinkRow
 from .ticks import tick_ns
-from .vectors import IntArray, Points, Row
+from .vectors import IntArray, Points, Row, RowArray
 
 LOST = -1
-"""Stands for the time of a sample that is lost."""
+"""Stands for the due time of a lost sample."""
 
 _AR1 = int(DelayKind.AR1)
 _SINE = int(DelayKind.SINE)
 _TRACE = int(DelayKind.TRACE)
 _MEASURED = int(DelayKind.MEASURED)
-_OWN = int(DelayKind.CUSTOM)
+_CUSTOM = int(DelayKind.CUSTOM)
 
 
 @leaf
-def _in_outage(stamp_ns: int, link: Row, points: Points) -> bool:
-    """True if a stamp lies in an outage of the link, which includes its beginning and not its
-    end.
-    """
+def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
+    """True if a stamp lies in an outage of the link: at its start or later, before its end."""
     for n in range(link.outage_first, link.outage_first + link.outage_count):
         if points[n, 0] <= stamp_ns < points[n, 1]:
             return True
@@ -45,17 +47,18 @@ def _in_outage(stamp_ns: int, link: Row, points: Points) -> bool:
 
 
 @leaf
-def _draw_loss(sample: int, fresh: bool, link: Row, model: Row) -> bool:
-    """Advances the two-state chain of losses (Gilbert, Elliott) by one sample; True if that is
-    lost.
+def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
+    """Advances the chain of losses by one sample; true if the sample is lost.
 
-    A fresh chain begins in its stationary distribution.
+    The chain of Gilbert and Elliott has a good and a bad state, each with a probability of loss.
+    A fresh chain starts in its stationary distribution, where the bad state has the probability
+    enter / (enter + leave).
     """
     if model.loss_good == 0.0 and model.enter == 0.0:
         return False
-    key: DrawKey = link.key
-    u, v = uniforms(key, sample, LOSS, 0)
+    u, v = uniforms(link.key, sample, LOSS, 0)
     if fresh:
+        # A product and not a quotient: enter + leave may be zero.
         link.bad = u * (model.enter + model.leave) < model.enter
     elif link.bad:
         link.bad = u >= model.leave
@@ -67,9 +70,9 @@ def _draw_loss(sample: int, fresh: bool, link: Row, model: Row) -> bool:
 
 @leaf
 def _delay_us(
-    sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, points: Points
+    sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Returns the delay of a sample, us, or LOST by its trace."""
+    """Returns the delay of a sample, us; LOST if a trace says so."""
     key: DrawKey = link.key
     if model.kind == _MEASURED:
         return 0
@@ -82,7 +85,7 @@ def _delay_us(
             key=key, sample=sample, correlation=model.weight, before=link.memory, fresh=fresh
         )
         return clamp_delay_us(model.location + model.scale * link.memory)
-    if model.kind == _OWN:
+    if model.kind == _CUSTOM:
         return clamp_delay_us(
             custom_delay_us(
                 key=key, sample=sample, stamp_ns=stamp_ns, model=model, points=points
@@ -93,9 +96,13 @@ def _delay_us(
 
 @leaf
 def _due_ns(
-    sample: int, stamp_ns: int, fresh: bool, link: Row, model: Row, points: Points
+    sample: int, stamp_ns: int, fresh: bool, link: LinkRow, model: Row, points: Points
 ) -> int:
-    """Returns when a sample is due, ns since the epoch, or LOST."""
+    """Returns the due time of a sample, ns since the epoch, or LOST.
+
+    Loss and delay are drawn for every sample, also for lost ones, so that their memories advance
+    by index.
+    """
     lost = _draw_loss(sample, fresh, link, model)
     delay_us = _delay_us(
         sample=sample, stamp_ns=stamp_ns, fresh=fresh, link=link, model=model, points=points
@@ -103,14 +110,14 @@ def _due_ns(
     if lost or delay_us < 0 or _in_outage(stamp_ns, link, points):
         return LOST
     if model.duplicate > 0.0:
-        key: DrawKey = link.key
-        u, _ = uniforms(key, sample, DUPLICATE, 0)
+        u, _ = uniforms(link.key, sample, DUPLICATE, 0)
         if u < model.duplicate:
             link.copies += 1
-            if model.kind < _AR1:  # models with memory or by time give the copy the same delay
-                delay_us = min(
-                    delay_us, clamp_delay_us(draw_delay_us(key, sample, COPY, model))
-                )
+            # The receiver uses the earlier one. Models with memory or by time give the copy the
+            # same delay.
+            if model.kind < _AR1:
+                copy_us = clamp_delay_us(draw_delay_us(link.key, sample, COPY, model))
+                delay_us = min(delay_us, copy_us)
     due_ns: int = stamp_ns + max(delay_us, model.playout_us) * 1000
     if model.in_order == 1:
         due_ns = max(due_ns, link.due_before)
@@ -120,12 +127,18 @@ def _due_ns(
 
 @leaf
 def schedule_deliveries(
-    sample: int, link: Row, models: Row, dues: IntArray, points: Points
+    sample: int, link: LinkRow, models: RowArray, dues: IntArray, points: Points
 ) -> None:
-    """Decides when every sample up to one is due, and writes it into `dues`, the oldest ones
-    over.
+    """Computes the due times of all samples up to `sample` that have none yet.
 
-    `link` is a row of LINK_DTYPE; the others are those of `LinkArrays`.
+    The last model whose first stamp is not after the stamp of a sample applies to the sample.
+
+    Args:
+        sample: the newest sample to schedule.
+        link: the row of the link.
+        models: its models, see `LinkArrays`.
+        dues: the due times, which replace those of the oldest samples, see `LinkArrays`.
+        points: the site's traces and outages.
     """
     kept = dues.shape[0]
     while link.scheduled < sample:

@@ -1,8 +1,10 @@
 """Delay models of a link, as the core computes them.
 
-Invariant (L4): a delay is a function of the link's key, the sample's index and its stamp,
-rounded to whole microseconds. Only AR1 depends on the sample before; it advances by index, not
-by arrival.
+Invariant (L4):
+
+- A delay is a function of the link's key, the sample's index and its stamp, rounded to whole
+  microseconds.
+- Only AR1 depends on the previous sample. It advances by index, not by arrival.
 """
 
 import math
@@ -18,22 +20,27 @@ from .plugged import call_address
 from .vectors import Points, Row, count_started
 
 MAX_DELAY_US = 10_000_000
-"""No delay is longer; the tail of a distribution is cut off here."""
+"""Largest delay; the tail of a distribution is cut off here."""
 
 
 class DelayKind(IntEnum):
-    """The kinds of delay, and the meaning of the four parameters of a `LinkModel` in each;
-    times in us.
+    """The kinds of delay, with the meaning of the four parameters of a `LinkModel`.
 
-    CONSTANT: location. UNIFORM: location +- scale. NORMAL: mean `location`, deviation `scale`,
-    drawn again where it falls below zero. GAMMA: shape `extra`, `scale`. LOG_NORMAL: exp of
-    normal (`location`, `scale`).
-    HYPER_EXPONENTIAL: `location` + Exp(`scale`), or with probability `weight` + Exp(`extra`).
-    AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample, cut off
-    at zero.
-    SINE: location + scale sin(2 pi t / extra + weight). TRACE: a table by time. MEASURED: none
-    is injected; a sample is used as soon as it has come. CUSTOM: a function of its own, never
-    above `location`.
+    Times are in us.
+
+    - CONSTANT: location.
+    - UNIFORM: from location - scale to location + scale.
+    - NORMAL: mean `location`, deviation `scale`; negative draws are repeated.
+    - GAMMA: shape `extra`, scale `scale`.
+    - LOG_NORMAL: exp of a normal number of mean `location` and deviation `scale`.
+    - HYPER_EXPONENTIAL: `location` plus an exponential number, of mean `extra` with the
+      probability `weight`, otherwise of mean `scale`.
+    - AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample; cut off
+      at zero.
+    - SINE: location + scale sin(2 pi t / extra + weight).
+    - TRACE: a table of delays by time.
+    - MEASURED: no delay is injected; a sample is used as soon as it arrives.
+    - CUSTOM: a compiled function in a file of its own; never above `location`.
     """
 
     CONSTANT = 0
@@ -50,32 +57,34 @@ class DelayKind(IntEnum):
 
 
 class TraceEnd(IntEnum):
-    """How a trace goes on after its last point: it holds that, or begins again."""
+    """The continuation of a trace after its last point: hold its delay, or start again."""
 
     HOLD = 0
     LOOP = 1
 
 
 class LinkModel(NamedTuple):
-    """A link's effect on its samples from one stamp on.
+    """The effect of a link on its samples from a stamp on.
 
     Attributes:
-        from_ns: the first stamp that it applies to, ns since the epoch.
-        kind: a `DelayKind`, which gives `location`, `scale`, `extra` and `weight` their
-            meaning.
-        at_end: a `TraceEnd`, of a trace.
-        trace_first: where the points of a trace, or the numbers of an own kind, begin in the
-            site's table.
-        trace_count: how many they are.
+        from_ns: the first stamp to which the model applies, ns since the epoch.
+        kind: a `DelayKind`, which defines `location`, `scale`, `extra` and `weight`.
+        at_end: a `TraceEnd`, for a trace.
+        trace_first: the first row in the site's table of the points of a trace, or of the
+            numbers of a CUSTOM model.
+        trace_count: the number of these rows.
         loss_good: probability that a sample is lost in the good state.
-        loss_bad: probability that it is lost in the bad state.
-        enter: probability to go from good to bad, per sample.
-        leave: probability to go from bad to good, per sample.
-        duplicate: probability that a sample has a copy, with a delay of its own.
-        in_order: 1: no sample is released before an older one; 0: the newest wins.
-        playout_us: every sample is held at least so long, us.
-        call: the address of an own kind's function, which sees `key`, `sample` and `stamp_ns`,
-            and writes `drawn_us`; see `plugged`.
+        loss_bad: probability that a sample is lost in the bad state.
+        enter: probability of a change from good to bad, per sample.
+        leave: probability of a change from bad to good, per sample.
+        duplicate: probability that a sample has a copy, with another delay.
+        in_order: 1: no sample is released before an older sample; 0: the newest wins.
+        playout_us: the least delay of each sample, us (play-out buffer).
+        call: the address of the function of a CUSTOM model, see `plugged`.
+        key: input of that function: the key of the link.
+        sample: input: the sample.
+        stamp_ns: input: its stamp, ns since the epoch.
+        drawn_us: output: the delay, us.
     """
 
     from_ns: int = 0
@@ -114,23 +123,25 @@ LINK_MODEL_DTYPE = np.dtype(
 
 _LARGEST_NORMAL = 8.6
 _LARGEST_EXPONENTIAL = 36.8
-"""No draw is larger in magnitude: that of Box and Muller, and -log, of 2^-53, see
-`unit_interval`.
+"""Largest magnitudes of draws, at the least uniform number 2^-53 (see `unit_interval`):
+sqrt(-2 log 2^-53) by Box and Muller, and -log 2^-53.
 """
 
 
 def _longest_us(model: LinkModel, trace: Points | None) -> float:
-    """Returns a delay that no sample exceeds, us, by the least and the largest uniform numbers."""
+    """Returns a bound of the delays of a model, us, from the bounds of its random numbers."""
     location = model.location
     scale = model.scale
     extra = model.extra
     weight = abs(model.weight)
     if model.kind == DelayKind.GAMMA:
+        # The method of Marsaglia and Tsang at its largest normal number, see `standard_gamma`.
         d = extra + (extra < 1.0) - 1.0 / 3.0
         return scale * d * (1.0 + _LARGEST_NORMAL / math.sqrt(9.0 * d)) ** 3
     if model.kind == DelayKind.LOG_NORMAL:
         return math.exp(min(location + _LARGEST_NORMAL * scale, math.log(MAX_DELAY_US)))
-    if model.kind == DelayKind.AR1:  # the sum of all draws, each at its largest
+    if model.kind == DelayKind.AR1:
+        # The sum over all past draws, each at its largest: sqrt(1 - c^2) / (1 - c).
         most = math.sqrt((1.0 + weight) / (1.0 - weight)) if weight < 1.0 else math.inf
         return location + _LARGEST_NORMAL * scale * most
     return {
@@ -146,21 +157,26 @@ def _longest_us(model: LinkModel, trace: Points | None) -> float:
 
 
 def max_delay_us(models: Sequence[LinkModel], traces: Sequence[Points | None]) -> int:
-    """Returns a delay that no sample of a link exceeds, us, play-out included; traces: per
-    model, or None.
+    """Returns a bound of the delays of a link, us, play-out included.
+
+    Args:
+        models: the models of the link.
+        traces: per model the points of its trace, or None.
     """
-    longest = [
-        max(math.ceil(min(_longest_us(model, trace), MAX_DELAY_US)) + 1, model.playout_us)
-        for model, trace in zip(models, traces, strict=True)
-    ]
-    return min(MAX_DELAY_US, max(longest))
+    bounds_us = []
+    for model, trace in zip(models, traces, strict=True):
+        longest_us = min(_longest_us(model, trace), MAX_DELAY_US)
+        bounds_us.append(max(math.ceil(longest_us) + 1, model.playout_us))
+    return min(MAX_DELAY_US, max(bounds_us))
 
 
 LOSS = 0
 DUPLICATE = 1
 DELAY = 2
 COPY = 5
-"""Purposes of draws; a delay takes up to three, see `standard_gamma`."""
+"""Purposes of draws. DELAY and COPY also reserve the two purposes that follow them, see
+`standard_gamma`.
+"""
 
 _UNIFORM = int(DelayKind.UNIFORM)
 _NORMAL = int(DelayKind.NORMAL)
@@ -172,8 +188,13 @@ _LOOP = int(TraceEnd.LOOP)
 
 @leaf
 def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
-    """Returns a draw of a distribution without memory, us, not rounded; purpose: DELAY, or
-    COPY.
+    """Returns a draw of a delay model without memory, us, not rounded.
+
+    Args:
+        key: the key of the link.
+        sample: the sample.
+        purpose: DELAY or COPY.
+        model: the model, a row of LINK_MODEL_DTYPE.
     """
     location: float = model.location
     scale: float = model.scale
@@ -182,7 +203,7 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
         u, _ = uniforms(key, sample, purpose, 0)
         return location + scale * (2.0 * u - 1.0)
     if model.kind == _NORMAL:
-        # the mean is not negative: each attempt suits with 1/2 or more
+        # The mean is not negative, so each attempt succeeds with a probability of at least 1/2.
         for attempt in range(64):
             x = location + scale * standard_normal(key, sample, purpose, attempt)
             if x >= 0.0:
@@ -193,7 +214,8 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
         return math.exp(location + scale * standard_normal(key, sample, purpose, 0))
     if model.kind == _HYPER:
         u, v = uniforms(key, sample, purpose, 0)
-        return location - (extra if u < model.weight else scale) * math.log(v)
+        mean = extra if u < model.weight else scale
+        return location - mean * math.log(v)
     return location
 
 
@@ -201,18 +223,26 @@ def draw_delay_us(key: DrawKey, sample: int, purpose: int, model: Row) -> float:
 def next_ar1_value(
     key: DrawKey, sample: int, correlation: float, before: float, fresh: bool
 ) -> float:
-    """Returns the next number of an AR(1) sequence, standard normal; a fresh one has no number
-    before.
+    """Returns the next number of an AR(1) sequence of standard normal numbers.
+
+        x_m = c x_{m-1} + sqrt(1 - c^2) n_m,  n_m standard normal
+
+    Args:
+        key: the key of the link.
+        sample: the sample m.
+        correlation: c.
+        before: x_{m-1}.
+        fresh: true: the sequence starts here, with x_m = n_m.
     """
-    x = standard_normal(key, sample, DELAY, 0)
+    draw = standard_normal(key, sample, DELAY, 0)
     if fresh:
-        return x
-    return correlation * before + math.sqrt(1.0 - correlation * correlation) * x
+        return draw
+    return correlation * before + math.sqrt(1.0 - correlation * correlation) * draw
 
 
 @leaf
 def sine_delay_us(stamp_ns: int, model: Row) -> float:
-    """Returns T(t) of a sinusoidal delay, us."""
+    """Returns the sinusoidal delay of a sample with this stamp, us, not rounded."""
     location: float = model.location
     scale: float = model.scale
     turns = stamp_ns * 1e-3 / model.extra
@@ -221,11 +251,10 @@ def sine_delay_us(stamp_ns: int, model: Row) -> float:
 
 @leaf
 def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
-    """Returns the delay of a trace, that of its last point at or before the stamp; -1: the
-    sample is lost.
+    """Returns the delay of a trace at a stamp, us; -1: the sample is lost.
 
-    The last point lasts as long as the one before it; after that the trace holds it or begins
-    again.
+    The delay is that of the last point at or before the stamp. A trace that loops starts again
+    after its last point, which lasts as long as the point before it.
     """
     first = model.trace_first
     count = model.trace_count
@@ -233,15 +262,19 @@ def trace_delay_us(stamp_ns: int, model: Row, points: Points) -> int:
     if model.at_end == _LOOP and count > 1:
         end_us = points[first + count - 1, 0]
         t_us %= 2 * end_us - points[first + count - 2, 0]
-    before = count_started(points, first, count, t_us) - 1
-    delay_us: int = points[first + max(before, 0), 1]
+    index = count_started(points, first, count, t_us) - 1
+    delay_us: int = points[first + max(index, 0), 1]
     return delay_us
 
 
 @leaf
 def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
-    """Returns two uniform numbers for an own kind, a function of the link's key, an index and
-    an attempt.
+    """Returns two uniform numbers for the function of a CUSTOM model.
+
+    Args:
+        now: the input of that function.
+        index: the index of the draw, usually the sample.
+        attempt: the attempt of a method that rejects draws.
     """
     return uniforms(np.uint64(now.key), index, DELAY, attempt)
 
@@ -250,22 +283,24 @@ def draw_pair(now: Row, index: int, attempt: int) -> tuple[float, float]:
 def custom_delay_us(
     key: DrawKey, sample: int, stamp_ns: int, model: Row, points: Points
 ) -> float:
-    """Returns the delay of an own kind, us, not rounded; its numbers stand in the table, two a
-    row.
+    """Returns the delay of a CUSTOM model, us, not rounded and at most `location`.
+
+    The function of the model gets its own numbers, which are stored in the site's table of
+    points, two in each row.
     """
     model.key = np.int64(key)
     model.sample = sample
     model.stamp_ns = stamp_ns
     first = model.trace_first
     count = model.trace_count
-    call_address(
-        model.call, (points[first : first + count].reshape(-1).view(np.float64), model)
-    )
+    numbers = points[first : first + count].reshape(-1).view(np.float64)
+    call_address(model.call, (numbers, model))
     drawn_us: float = min(model.drawn_us, model.location)
     return drawn_us
 
 
 @leaf
 def clamp_delay_us(delay_us: float) -> int:
-    """Returns a delay in whole microseconds, from 0 to `MAX_DELAY_US`."""
-    return int(min(max(math.floor(delay_us + 0.5), 0.0), float(MAX_DELAY_US)))
+    """Returns a delay rounded to whole microseconds, from 0 to `MAX_DELAY_US`."""
+    rounded_us = math.floor(delay_us + 0.5)
+    return int(min(max(rounded_us, 0.0), float(MAX_DELAY_US)))

@@ -1,14 +1,20 @@
-"""Dominance: who follows whom, by how much, and the reference that a site derives from its
-peers.
+"""Dominance: the shares with which sites follow each other, and the reference of a site.
 
-Invariant: rows of alpha sum to one, the diagonal is zero, and beta is the LEFT null vector of
-Upsilon. While factors change, they are a function of time and of the ramps alone; between two
-rows that sum to 1 every row does. A stale peer stops the reference; the return is smooth: from
-the held pose to the peers along 3 x^2 - 2 x^3.
+Site i follows site j with the share alpha_ij (the dominance factor). Its reference is the sum of
+alpha_ij q_j over its peers, Eq. (6). Upsilon = I - alpha is the matrix of the coupling.
 
-Source: Eq. (6), (7), (20) of the paper. The paper takes beta = (1, 1, 1); that is the right
-null vector, and a left one only if the columns sum to one as well. The left one of an
-irreducible matrix is its Perron vector, positive and unique up to its length.
+Invariant:
+
+- Each row of alpha sums to one, Eq. (7), and the diagonal is zero.
+- beta is the LEFT null vector of Upsilon.
+- While factors change, they are a function of time and of the ramps alone. Between two rows that
+  sum to 1, every row sums to 1.
+- A stale peer stops the reference. The reference then returns from the held pose to the peers
+  along the smooth polynomial 3 x^2 - 2 x^3.
+
+Source: Eq. (6), (7), (20) of the paper. The paper uses beta = (1, 1, 1). That is the right null
+vector of Upsilon, and a left one only if the columns sum to one as well. The left null vector of
+an irreducible matrix is its Perron vector, positive and unique up to its length.
 """
 
 import numpy as np
@@ -16,21 +22,25 @@ from numpy.typing import NDArray
 
 from .jit import leaf
 from .lost_peers import regroup
+from .row_fields import LinkRow, SiteRow
 from .site_setup import StaleAction
 from .ticks import Mode, tick_ns
-from .vectors import Array, Row, RowArray, put
+from .vectors import Array, RowArray, put
 
 ROW_SUM_TOLERANCE = 1e-9
 
 
-def find_row_problem(row: Array, own: int) -> str | None:
-    """Returns the problem of one row of alpha, shape (N,), of site `own`, or None: Eq. (7) for
-    N sites.
+def find_row_problem(row: Array, site: int) -> str | None:
+    """Returns the violation of Eq. (7) by a row of alpha, or None.
+
+    Args:
+        row: the shares of one site, shape (N,).
+        site: the index of that site.
     """
     if not np.isfinite(row).all():
         return "shares must be finite numbers"
-    if row[own] != 0.0:
-        return f"a site does not follow itself, yet its own share is {row[own]:g}"
+    if row[site] != 0.0:
+        return f"a site does not follow itself, yet its own share is {row[site]:g}"
     if (row < 0.0).any() or (row > 1.0).any():
         return "shares must lie between 0 and 1"
     if abs(row.sum() - 1.0) > ROW_SUM_TOLERANCE:
@@ -39,46 +49,57 @@ def find_row_problem(row: Array, own: int) -> str | None:
 
 
 def find_reach(alpha: Array) -> NDArray[np.bool_]:
-    """Returns which site reaches which along links with a factor above 0, shape (N, N), for
-    alpha so.
+    """Returns the sites that each site reaches along links with a share above 0.
+
+    Args:
+        alpha: the shares, shape (N, N).
+
+    Returns:
+        Shape (N, N): true at [i, j] if site i follows site j, directly or through others.
     """
     reach: NDArray[np.bool_] = (alpha > 0.0) | np.eye(len(alpha), dtype=bool)
+    # Each squaring doubles the length of the paths.
     for _ in range(len(alpha).bit_length()):
         reach = reach @ reach
     return reach
 
 
 def is_irreducible(alpha: Array) -> bool:
-    """True if every site reaches every other along links with a factor above 0, alpha of shape
-    (N, N).
-    """
+    """True if every site reaches every other site along links with a share above 0."""
     return bool(find_reach(alpha).all())
 
 
 def find_balancing_weights(alpha: Array) -> Array | None:
-    """Returns D > 0 with D_i alpha_ij = D_j alpha_ji (detailed balance), shape (N,); None if
-    there is none.
+    """Returns D > 0 with D_i alpha_ij = D_j alpha_ji (detailed balance), or None.
 
-    Shares that have such weights are reversible: their products are the same along every circle
-    and against it (Kolmogorov), alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for three
+    Shares that have such weights are reversible: their products along each circle equal those
+    against it (Kolmogorov), as in alpha12 alpha23 alpha31 = alpha13 alpha32 alpha21 for three
     sites, and the eigenvalues of alpha are real. Links out of a group of sites that reach each
-    other are left out: no circle has them.
+    other belong to no circle and are ignored.
+
+    Args:
+        alpha: the shares, shape (N, N).
+
+    Returns:
+        D, shape (N,), with D = 1 at the first site of each group; None if no D exists.
     """
     reach = find_reach(alpha)
     followed = reach & reach.T & (alpha > 0.0)
     D = np.zeros(len(alpha))
     for first in range(len(alpha)):
-        waiting = [] if D[first] else [first]
-        D[first] = D[first] or 1.0
+        if D[first]:
+            continue
+        D[first] = 1.0
+        waiting = [first]
         while waiting:
             i = waiting.pop()
             for j in np.flatnonzero(followed[i]).tolist():
-                here = D[i] * alpha[i, j]
-                there = alpha[j, i]
-                if not D[j] and there:
-                    D[j] = here / there
+                forward = D[i] * alpha[i, j]
+                share_back = alpha[j, i]
+                if not D[j] and share_back:
+                    D[j] = forward / share_back
                     waiting.append(j)
-                elif abs(here - D[j] * there) > ROW_SUM_TOLERANCE * here:
+                elif abs(forward - D[j] * share_back) > ROW_SUM_TOLERANCE * forward:
                     return None
     return D
 
@@ -86,12 +107,12 @@ def find_balancing_weights(alpha: Array) -> Array | None:
 def perron_vector(alpha: Array) -> Array:
     """Returns beta > 0 with beta' Upsilon = 0 and sum 1, shape (N,), for an irreducible alpha.
 
-    By the elimination of Grassmann, Taksar and Heyman (1985): no subtraction occurs, so every
-    entry is right to a few units in its last place, however many orders of magnitude the
-    factors differ by.
+    The method is the elimination of Grassmann, Taksar and Heyman (1985). It contains no
+    subtraction, so that each entry is accurate to a few units in the last place even if the
+    shares differ by many orders of magnitude.
 
     Raises:
-        ValueError: alpha is reducible; then some site's weight would be zero, or beta not
+        ValueError: alpha is reducible, so that the weight of some site is zero or beta is not
             unique.
     """
     if not is_irreducible(alpha):
@@ -110,13 +131,17 @@ def perron_vector(alpha: Array) -> Array:
 
 
 RAMP_COLUMNS = 2
-"""A ramp is a row: start and end, ns, then the dominance factor of each peer at its end."""
+"""Columns of a ramp before its factors.
+
+A ramp is a row: its start and its end, ns, and then the dominance factor of each peer at its end.
+"""
 
 
 @leaf
 def _interpolate(
     t_ns: float, start_ns: float, end_ns: float, before: float, after: float
 ) -> float:
+    """Returns the factor at time t of a linear change from `before` to `after`."""
     if t_ns >= end_ns:
         return after
     return before + (after - before) * ((t_ns - start_ns) / (end_ns - start_ns))
@@ -124,14 +149,19 @@ def _interpolate(
 
 @leaf
 def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
-    """Writes alpha and its derivative at time t into every link.
+    """Writes alpha and its derivative at time t into each link.
 
-    The first `count` rows of `ramps`, shape (R, RAMP_COLUMNS + P), are filled, in the order of
-    their starts; row 0 holds the factors at the epoch. A ramp begins where the one before it is
-    at that time, complete or not.
+    A ramp starts at the factors that the previous ramp has at that time, complete or not.
+
+    Args:
+        t_ns: the time, ns since the epoch.
+        count: the number of filled rows of `ramps`.
+        ramps: the ramps in the order of their starts, shape (R, RAMP_COLUMNS + P); row 0 holds
+            the factors at the epoch.
+        links: the rows of the links, shape (P,).
     """
     for j in range(links.shape[0]):
-        link: Row = links[j]
+        link: LinkRow = links[j]
         column = RAMP_COLUMNS + j
         before = ramps[0, column]
         current = 0
@@ -152,18 +182,22 @@ def apply_ramps(t_ns: int, count: int, ramps: Array, links: RowArray) -> None:
         link.alpha = _interpolate(
             t_ns=t_ns, start_ns=start_ns, end_ns=end_ns, before=before, after=after
         )
-        link.alpha_rate = (
-            (after - before) / ((end_ns - start_ns) * 1e-9) if t_ns < end_ns else 0.0
-        )
+        if t_ns < end_ns:
+            link.alpha_rate = (after - before) / ((end_ns - start_ns) * 1e-9)
+        else:
+            link.alpha_rate = 0.0
 
 
 def fold_ramps(t_ns: int, count: int, ramps: Array) -> int:
-    """Folds the ramps that are over at time t into the first row, and returns how many rows are
-    left.
+    """Removes the ramps that no longer matter at time t, and returns the number of rows left.
 
-    A ramp begins where the one before it is at that time. Row 0 then holds that of the last one
-    that has
-    begun: from there on `apply_ramps` writes the same bits.
+    The last ramp that has started stays, after a row 0 with the factors at its start. From time
+    t on `apply_ramps` therefore writes the same bits as before.
+
+    Args:
+        t_ns: the time, ns since the epoch.
+        count: the number of filled rows of `ramps`.
+        ramps: the ramps, as in `apply_ramps`; changed in place.
     """
     last = int(np.searchsorted(ramps[1:count, 0], t_ns, side="right"))
     if last < 2:
@@ -197,11 +231,12 @@ _ACT_BRAKE = int(StaleAction.BRAKE)
 
 @leaf
 def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
-    """True if a peer that is followed is older than `age_ns`; before its first sample it is as
-    old as t.
+    """True if the sample in use of a peer with a share is older than `age_ns` at time t.
+
+    Before the first sample of a peer its age is the time since the epoch.
     """
     for j in range(links.shape[0]):
-        link: Row = links[j]
+        link: LinkRow = links[j]
         stamp_ns = tick_ns(max(link.used, 0), link.rate_hz)
         if link.alpha > 0.0 and t_ns - stamp_ns > age_ns:
             return True
@@ -209,16 +244,21 @@ def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
 
 
 @leaf
-def update_stale_mode(t_ns: int, site: Row, links: RowArray) -> None:
-    """Changes the mode if peers became stale or fresh, and the reference as the mode requires."""
+def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
+    """Applies the rule for stale peers: changes the mode, and the reference for the mode.
+
+    In HOLD the reference is that of the previous tick, in BRAKE the pose of the arm. In RETURN it
+    is q_held + s (q_des - q_held), with s = 3 x^2 - 2 x^3 and x the part of `return_ns` that has
+    passed.
+    """
     if site.on_stale == _USE or site.mode == _DIVERGED:
         return
     stale = any_peer_stale(t_ns, site.stale_ns, links)
     if stale and (site.mode == _RUN or site.mode == _RETURN):
         braking = site.on_stale == _ACT_BRAKE
         for i in range(site.q_held.shape[0]):
-            here = site.x[i] if site.task else site.q[i]
-            site.q_held[i] = here if braking else site.q_followed[i]
+            pose = site.x[i] if site.task else site.q[i]
+            site.q_held[i] = pose if braking else site.q_followed[i]
         site.mode = _BRAKE if braking else _HOLD
         site.return_from_ns = 0
     elif not stale and (site.mode == _HOLD or site.mode == _BRAKE):
@@ -232,16 +272,20 @@ def update_stale_mode(t_ns: int, site: Row, links: RowArray) -> None:
     share = x * x * (3.0 - 2.0 * x)
     share_rate = 6.0 * x * (1.0 - x) / (site.return_ns * 1e-9)
     for i in range(site.q_held.shape[0]):
-        way = site.q_des[i] - site.q_held[i]
-        site.q_des[i] = site.q_held[i] + share * way
-        site.qd_des[i] = share * site.qd_des[i] + share_rate * way
+        distance = site.q_des[i] - site.q_held[i]
+        site.q_des[i] = site.q_held[i] + share * distance
+        site.qd_des[i] = share * site.qd_des[i] + share_rate * distance
 
 
 @leaf
-def update_reference(t_ns: int, site: Row, links: RowArray, ramps: Array) -> None:
-    """Writes q_id and its derivative, Eq. (6), summing over peers in scenario order.
+def update_reference(t_ns: int, site: SiteRow, links: RowArray, ramps: Array) -> None:
+    """Writes the reference, its derivative and the reflected torque.
 
-    While factors change, the derivative includes their rates.
+        q_des  = sum_j alpha_ij q_j                                  Eq. (6)
+        qd_des = sum_j (alpha_ij qd_j + alpha_ij' q_j)
+        felt   = -sum_j alpha_ij tau_x_j
+
+    The order of the sums is that of the scenario: their bits depend on it.
     """
     if site.ramps > 1 or site.degrades:
         apply_ramps(t_ns, site.ramps, ramps, links)
@@ -252,7 +296,7 @@ def update_reference(t_ns: int, site: Row, links: RowArray, ramps: Array) -> Non
     for i in range(site.q_des.shape[0]):
         q_des = qd_des = felt = 0.0
         for j in range(links.shape[0]):
-            link: Row = links[j]
+            link: LinkRow = links[j]
             q_des += link.alpha * link.q[i]
             qd_des += link.alpha * link.qd[i] + link.alpha_rate * link.q[i]
             felt -= link.alpha * link.tau_x[i]

@@ -1,9 +1,11 @@
-"""One tick of one site, compiled: its eight stages in order, and the integrator of the arm.
+"""One tick of one site, compiled: its eight stages in order (README.md lists them).
 
-Invariant: one call computes a whole tick, and every stage is a leaf that the fused virtual-time
-run calls as well. The arm advances one period by the classical Runge-Kutta method of fourth
-order: each of its stages evaluates operators and environments, and what is held over the period
-is constant.
+Invariant:
+
+- One call computes a whole tick, and each stage is a leaf that the fused run calls as well.
+- The arm advances by one period with the classical Runge-Kutta method of fourth order. Each of
+  its four evaluations evaluates operators and environments anew.
+- The control torque and the torque of sampled sources are constant over the period.
 """
 
 from math import isfinite
@@ -14,13 +16,14 @@ from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
 from .link import ChannelArrays, LinkArrays, accept_sample, release_sample, release_tick
 from .resting import add_rest_torque, advance_rest, limit_torque_rate, rests, rests_by_law
+from .row_fields import ArrivalRow, SiteRow
 from .safeguards import is_torque_finite, limit_reference, return_to_law
 from .session_life import is_law_returning, latch_mode, update_session_life
 from .site_arrays import SiteArrays, TickBuffers
 from .site_setup import Law, Scheme, StaleAction
 from .task_space import POSE, update_orientation_reference
 from .ticks import LifeReason, Mode, tick_ns
-from .vectors import Array, IntArray, Points, Row, RowArray, Vector, put
+from .vectors import Array, IntArray, Points, RowArray, Vector, put
 
 _DIVERGED = int(Mode.DIVERGED)
 _FAULT = int(Mode.FAULT)
@@ -28,24 +31,27 @@ _NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
 _DIGITAL = int(Scheme.DIGITAL)
 _ADAPTIVE = int(Law.ADAPTIVE)
-_OWN = int(Law.USER)
+_USER = int(Law.USER)
 
 
 @leaf
-def _place_arm(s: Row, chain: RowArray | None, links: RowArray, refers: bool) -> None:
-    """Places the joints of a chain; if it refers to its peers anew, the orientation of its
-    reference too.
+def _place_arm(
+    s: SiteRow, chain: RowArray | None, links: RowArray, updates_reference: bool
+) -> None:
+    """Computes the kinematics of a chain, and the orientation of its reference if requested.
+
+    The planar arm needs neither.
     """
     if chain is None:
         return
     chain_stages.place_chain(s, chain)
-    if refers and s.task and s.shared == POSE:
+    if updates_reference and s.task and s.shared == POSE:
         update_orientation_reference(s, links)
 
 
 @leaf
-def _update_errors(s: Row, chain: RowArray | None) -> None:
-    """Stage 4: errors, r, and what the law needs of the arm's dynamics."""
+def _update_errors(s: SiteRow, chain: RowArray | None) -> None:
+    """Runs stage 4: errors, r, and the dynamics that the law needs."""
     if chain is None:
         two_link_stages.update_errors(s)
     else:
@@ -53,7 +59,8 @@ def _update_errors(s: Row, chain: RowArray | None) -> None:
 
 
 @leaf
-def _advance_estimate(s: Row, chain: RowArray | None, gain_s: float, Yr: Vector) -> None:
+def _advance_estimate(s: SiteRow, chain: RowArray | None, gain_s: float, Yr: Vector) -> None:
+    """Advances the estimate by theta_hat - gain_s Gamma Yr, within its box."""
     if chain is None:
         two_link_stages.advance_estimate(s, gain_s, Yr)
     else:
@@ -61,28 +68,33 @@ def _advance_estimate(s: Row, chain: RowArray | None, gain_s: float, Yr: Vector)
 
 
 @leaf
-def _adapts(s: Row) -> bool:
-    """True in a mode in which estimates follow their law."""
+def _adapts(s: SiteRow) -> bool:
+    """True if the mode lets the estimate adapt."""
     return bool(s.mode != _DIVERGED and (rests_by_law(s) or not rests(s)))
 
 
 @leaf
-def _update_estimate(k: int, s: Row, chain: RowArray | None) -> None:
-    """Stage 5: the trapezoid rule for Eq. (15), explicit since Y' r does not depend on the
-    estimate.
+def _update_estimate(k: int, s: SiteRow, chain: RowArray | None) -> None:
+    """Runs stage 5: the trapezoid rule for Eq. (15).
+
+        theta_k = theta_{k-1} - h/2 Gamma (Y'r_{k-1} + Y'r_k)
+
+    The rule is explicit, because Y' r does not depend on the estimate. The sum of both ends of
+    the period is multiplied by h/2. DIGITAL advances the estimate in stage 8 instead.
     """
     if s.scheme == _DIGITAL or k == s.first or s.law != _ADAPTIVE or not _adapts(s):
         return
     for p in range(s.Yr.shape[0]):
         s.Yr_before[p] += s.Yr[p]
-    _advance_estimate(s, chain, 0.5 / s.rate_hz, s.Yr_before)
+    half_h_s = 0.5 / s.rate_hz
+    _advance_estimate(s, chain, half_h_s, s.Yr_before)
 
 
 @leaf
 def torque_stage(site: RowArray, chain: RowArray | None) -> None:
-    """Stage 6 of a tick: the torque of the site's law; a user's law runs in Python instead."""
-    s: Row = site[0]
-    if s.law == _OWN:
+    """Runs stage 6 of a law that the kernel computes; `law_stage` runs a user's law."""
+    s: SiteRow = site[0]
+    if s.law == _USER:
         return
     if chain is None:
         two_link_stages.update_torque(s)
@@ -91,9 +103,9 @@ def torque_stage(site: RowArray, chain: RowArray | None) -> None:
 
 
 @leaf
-def _put_known_gravity(s: Row, chain: RowArray | None, torque: Array) -> None:
-    """Writes the torque of gravity as far as the law knows it, or has learnt it."""
-    learns = s.law == _ADAPTIVE or (s.law == _OWN and s.theta_known == 0)
+def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> None:
+    """Writes the gravity torque for the parameters that the law knows or has estimated."""
+    learns = s.law == _ADAPTIVE or (s.law == _USER and s.theta_known == 0)
     theta = s.theta_hat if learns else s.known
     if chain is None:
         two_link_stages.put_gravity(s, theta, torque)
@@ -102,9 +114,10 @@ def _put_known_gravity(s: Row, chain: RowArray | None, torque: Array) -> None:
 
 
 @leaf
-def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
-    """Ends stage 6: the torque of an arm at rest or on its way back, and none that changes too
-    fast.
+def _guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
+    """Ends stage 6: the torque of an arm at rest or returning to its law, and the limit of rate.
+
+    Under the rule `glide` a torque that is not finite leads to FAULT here.
     """
     resting = False
     if s.on_stale == _GLIDE:
@@ -123,35 +136,37 @@ def _guard_torque(k: int, t_ns: int, s: Row, chain: RowArray | None) -> None:
 
 
 @leaf
-def _write_record(s: Row, row: Array) -> None:
-    """Writes the record's floats, see `Layout.columns`; one that is not finite diverges the run
-    and is 0.
+def _write_record(s: SiteRow, row: Array) -> None:
+    """Runs stage 7: writes the record's floats in the order of `Layout.columns`.
+
+    A number that is not finite becomes 0, and the site becomes DIVERGED.
     """
     n = s.joints
     m = s.shared
     P = s.parameters
-    at = 2 * n
+    first = 2 * n
     for i in range(n):
         row[i] = s.q[i]
         row[n + i] = s.qd[i]
     for i in range(m):
-        row[at + i] = s.q_des[i]
-        row[at + m + i] = s.qd_des[i]
-    at += 2 * m
+        row[first + i] = s.q_des[i]
+        row[first + m + i] = s.qd_des[i]
+    first += 2 * m
     for i in range(n):
-        row[at + i] = s.tau[i]
-        row[at + n + i] = 0.0 - s.on_arm[i]  # 0.0, never -0.0, where nothing acts
-    at += 2 * n
+        row[first + i] = s.tau[i]
+        # A subtraction and not a negation: where nothing acts the record has 0.0, never -0.0.
+        row[first + n + i] = 0.0 - s.on_arm[i]
+    first += 2 * n
     for p in range(P):
-        row[at + p] = s.theta_hat[p]
-    at += P
+        row[first + p] = s.theta_hat[p]
+    first += P
     if s.task:
         for i in range(m):
-            row[at + i] = s.x[i]
-            row[at + m + i] = s.xd[i]
-            row[at + 2 * m + i] = s.wrench[i]
-        at += 3 * m
-    for i in range(at):
+            row[first + i] = s.x[i]
+            row[first + m + i] = s.xd[i]
+            row[first + 2 * m + i] = s.wrench[i]
+        first += 3 * m
+    for i in range(first):
         if not isfinite(row[i]):
             row[i] = 0.0
             s.mode = _DIVERGED
@@ -159,9 +174,9 @@ def _write_record(s: Row, row: Array) -> None:
 
 @leaf
 def _update_external_torque(
-    t_s: float, s: Row, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
+    t_s: float, s: SiteRow, chain: RowArray | None, actors: TorqueSourceRows, table: TorqueTable
 ) -> None:
-    """Writes the torque of operators and environments; a law may know that of its own tick."""
+    """Writes the torque of operators and environments at t_k, which stage 6 may use."""
     if chain is None:
         two_link_stages.update_external_torque(t_s, s, actors, table)
     else:
@@ -174,11 +189,12 @@ def _update_external_torque(
 def _advance_arm(
     t_s: float,
     h_s: float,
-    s: Row,
+    s: SiteRow,
     chain: RowArray | None,
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> bool:
+    """Advances q and qd by one period; returns false, without a change, if they overflow."""
     if chain is None:
         return two_link_stages.advance_arm(t_s=t_s, h_s=h_s, s=s, actors=actors, table=table)
     return chain_stages.advance_arm(
@@ -190,29 +206,32 @@ def _advance_arm(
 def _advance(
     k: int,
     t_ns: int,
-    s: Row,
+    s: SiteRow,
     chain: RowArray | None,
     actors: TorqueSourceRows,
     table: TorqueTable,
 ) -> None:
-    """Stage 8: advances the state from t_k to t_{k+1} and keeps what tick k+1 needs of tick k.
+    """Runs stage 8: advances the state from t_k to t_{k+1}, and keeps numbers for tick k+1.
 
-    Constant over the period are the control torque at its middle, and the sampled sources.
+    The torque that is held over the period is that of its middle, extrapolated linearly:
+
+        u = 1.5 tau_k - 0.5 tau_{k-1},  within the limit; u = tau_k at the first tick, in DIGITAL
     """
     h_s = 1.0 / s.rate_hz
-    adapts = _adapts(s)  # of this tick: whether an arm at rest is fast depends on its speed
+    # Evaluate this before the arm moves: whether an arm at rest is fast depends on its speed.
+    adapts = _adapts(s)
     put(s.q_before, s.q)
     if s.external == 0:
         for i in range(s.u.shape[0]):
             torque = s.tau[i]
             if s.scheme != _DIGITAL and k > s.first:
-                torque = control.limit_torque(
-                    1.5 * s.tau[i] - 0.5 * s.tau_before[i], s.tau_limit[i]
-                )
+                extrapolated = 1.5 * s.tau[i] - 0.5 * s.tau_before[i]
+                torque = control.limit_torque(extrapolated, s.tau_limit[i])
             s.u[i] = torque + s.held[i]
-        if not _advance_arm(
+        is_finite = _advance_arm(
             t_s=t_ns * 1e-9, h_s=h_s, s=s, chain=chain, actors=actors, table=table
-        ):
+        )
+        if not is_finite:
             s.mode = _DIVERGED
     if s.scheme == _DIGITAL and s.law == _ADAPTIVE and adapts and s.mode != _DIVERGED:
         _advance_estimate(s, chain, h_s, s.Yr)
@@ -224,9 +243,7 @@ def _advance(
 
 @leaf
 def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
-    """Returns what one peer sends, of what all peers do; of stacked arrays, what the peers of
-    one site do.
-    """
+    """Returns the channel of one peer; of stacked arrays, the channels of the peers of a site."""
     if channel is None:
         return None
     return ChannelArrays(channel.waiting[peer], channel.received[peer], channel.columns[peer])
@@ -247,28 +264,25 @@ def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
 
 @leaf
 def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
-    """Returns the site's tick that releases a peer's sample, or LOST; see `release_tick`."""
+    """Returns the site's tick that releases a peer's sample, or LOST; see `link.release_tick`."""
     return release_tick(tick, arrays.site[0].rate_hz, link_arrays(arrays, peer))
 
 
 @leaf
 def accept_stage(k: int, count: int, arrays: SiteArrays, buffers: TickBuffers) -> None:
-    """Stage 1: files the first `count` arrivals in their links."""
+    """Runs stage 1: files the first `count` arrivals in their links."""
     rate_hz = arrays.site[0].rate_hz
     for n in range(count):
-        arrival: Row = buffers.arrivals[n]
-        link = link_arrays(arrays, arrival.peer)
-        forces = buffers.forces[n]
-        sent = buffers.sent[n]
+        arrival: ArrivalRow = buffers.arrivals[n]
         accept_sample(
             k=k,
             rate_hz=rate_hz,
             tick=arrival.tick,
             q=arrival.q,
             qd=arrival.qd,
-            tau_x=forces,
-            sent=sent,
-            link=link,
+            tau_x=buffers.forces[n],
+            sent=buffers.sent[n],
+            link=link_arrays(arrays, arrival.peer),
         )
 
 
@@ -283,11 +297,10 @@ def reference_stages(
     table: TorqueTable,
     chain: RowArray | None,
 ) -> None:
-    """Stages 3 to 5 of a tick and its external torque, with the samples that it releases in
-    use.
-    """
-    s: Row = site[0]
-    update_reference(t_ns, s, links, ramps)  # 3 reference
+    """Runs stages 3 to 5 and computes the external torque, with the released samples in use."""
+    s: SiteRow = site[0]
+    # 3 reference
+    update_reference(t_ns, s, links, ramps)
     _place_arm(s, chain, links, True)
     if s.on_stale == _GLIDE:
         update_session_life(t_ns, s, links)
@@ -295,8 +308,10 @@ def reference_stages(
         update_stale_mode(t_ns, s, links)
     if not rests(s):
         limit_reference(k, s)
-    _update_errors(s, chain)  # 4 errors
-    _update_estimate(k, s, chain)  # 5 estimate
+    # 4 errors
+    _update_errors(s, chain)
+    # 5 estimate
+    _update_estimate(k, s, chain)
     _update_external_torque(t_s=t_ns * 1e-9, s=s, chain=chain, actors=actors, table=table)
 
 
@@ -304,26 +319,26 @@ def reference_stages(
 def sense_stages(
     k: int, t_ns: int, count: int, arrays: SiteArrays, buffers: TickBuffers
 ) -> None:
-    """Stages 1 to 5 of a tick: its arrivals, the reference, the errors, the estimate, the
-    external torque.
-    """
+    """Runs stages 1 to 5 of a tick with `count` arrivals, and computes the external torque."""
     rate_hz = arrays.site[0].rate_hz
-    for missed in range(k - arrays.site[0].skipped, k):  # ticks that the site did not make
+    # Missed ticks release their samples too: each page of a calendar must be read once.
+    for missed in range(k - arrays.site[0].skipped, k):
         for j in range(arrays.links.shape[0]):
             release_sample(missed, rate_hz, link_arrays(arrays, j))
+    # 1 accept
     accept_stage(k, count, arrays, buffers)
-    for j in range(arrays.links.shape[0]):  # 2 recall
+    # 2 release
+    for j in range(arrays.links.shape[0]):
         release_sample(k, rate_hz, link_arrays(arrays, j))
-    a = arrays
     reference_stages(
         k=k,
         t_ns=t_ns,
-        site=a.site,
-        links=a.links,
-        ramps=a.ramps,
-        actors=a.actors,
-        table=a.table,
-        chain=a.chain,
+        site=arrays.site,
+        links=arrays.links,
+        ramps=arrays.ramps,
+        actors=arrays.actors,
+        table=arrays.table,
+        chain=arrays.chain,
     )
 
 
@@ -337,16 +352,19 @@ def act_stages(
     chain: RowArray | None,
     record: Array,
 ) -> None:
-    """Stages 7 and 8 of a tick, with the law's torque in place: the record, and the step to the
-    next tick.
+    """Runs the end of stage 6 and stages 7 and 8 of a tick, after the law wrote its torque.
+
+    Without the rule `glide` a joint beyond its limit of speed makes the site DIVERGED here.
     """
-    s: Row = site[0]
+    s: SiteRow = site[0]
     _guard_torque(k, t_ns, s, chain)
     for i in range(s.joints):
         if s.on_stale != _GLIDE and not abs(s.qd[i]) <= s.qd_limit[i]:
             s.mode = _DIVERGED
-    _write_record(s, record)  # 7 emit
-    if s.mode != _DIVERGED:  # 8 advance
+    # 7 emit
+    _write_record(s, record)
+    # 8 advance
+    if s.mode != _DIVERGED:
         _advance(k=k, t_ns=t_ns, s=s, chain=chain, actors=actors, table=table)
 
 
@@ -371,10 +389,10 @@ def site_tick(
     sent: Array,
     record: Array,
 ) -> None:
-    """Computes tick k of one site at t_ns, ns since the epoch, with its first `count` arrivals.
+    """Computes tick k of one site at t_ns, ns since the epoch, with the first `count` arrivals.
 
-    It takes the fields of `SiteArrays` and `TickBuffers` one by one: passed from Python as
-    tuples they would cost more than a microsecond.
+    The other arguments are the fields of `SiteArrays` and `TickBuffers`. Passing the two tuples
+    from Python instead would cost more than a microsecond.
     """
     arrays = SiteArrays(
         site=site,
@@ -396,7 +414,8 @@ def site_tick(
         arrays=arrays,
         buffers=TickBuffers(arrivals, forces, sent, record),
     )
-    torque_stage(site, chain)  # 6 torque
+    # 6 torque
+    torque_stage(site, chain)
     act_stages(
         k=k, t_ns=t_ns, site=site, actors=actors, table=table, chain=chain, record=record
     )
@@ -404,10 +423,8 @@ def site_tick(
 
 @leaf
 def resume_stages(k: int, arrays: SiteArrays) -> None:
-    """Repeats the end of tick k (stages 4 and 8) from a state that was filled in from its
-    record.
-    """
-    s: Row = arrays.site[0]
+    """Repeats stages 4 and 8 of tick k, after its state was restored from records."""
+    s: SiteRow = arrays.site[0]
     t_ns = tick_ns(k, s.rate_hz)
     _place_arm(s, arrays.chain, arrays.links, False)
     _update_errors(s, arrays.chain)
