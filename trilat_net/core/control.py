@@ -1,8 +1,11 @@
-"""The control laws: the paper's adaptive one, split as its equations are, and the classics.
+"""The control laws of the kernel: the paper's adaptive law and the laws of known gravity.
 
-Invariant: errors and regressor of tick k never depend on the estimate of tick k, which keeps
-the second- order update explicit. Gains are diagonal and written as vectors, one number per
-joint (N m s/rad, Lambda in 1/s) or per parameter; angles are rad, speeds rad/s, torques N m.
+The functions are for the planar two-link arm; `chain_stages` has the same laws for chains. Gains
+are diagonal matrices, written as vectors with one number per joint (N m s/rad; Lambda in 1/s) or
+per parameter. Angles are in rad, speeds in rad/s, torques in N m.
+
+Invariant: the errors and the regressor of tick k never depend on the estimate of tick k, which
+keeps the update of second order explicit.
 
 Source: Eq. (9)-(13), (15) of the paper; P+d and PD+d after Nuno, Basanez, Ortega and Spong,
 "Position Tracking for Non-linear Teleoperators with Variable Time Delay", Int. J. Robotics
@@ -17,22 +20,40 @@ from .two_link_arm import gravity
 from .vectors import Five, Pair, Vector
 
 ROBUST_RESIDUE = ((5.0**0.5 - 1.0) / 2.0) ** 2.5
-"""The largest value of x - x^2 / sqrt(1 + x^2)."""
+"""The largest value of x - x^2 / sqrt(1 + x^2) for x >= 0."""
 
 
 @leaf
 def control_errors(
     q: Vector, qd: Vector, q_des: Vector, qd_des: Vector, Lambda: Vector
 ) -> tuple[Pair, Pair, Pair]:
-    """Returns e, its derivative and r = qd + Lambda e: Eq. (9), (18), (10)."""
-    e = (q[0] - q_des[0], q[1] - q_des[1])
-    ed = (qd[0] - qd_des[0], qd[1] - qd_des[1])
-    return e, ed, (qd[0] + Lambda[0] * e[0], qd[1] + Lambda[1] * e[1])
+    """Returns e, its derivative ed, and r.
+
+    e = q - q_des,  ed = qd - qd_des,  r = qd + Lambda e        Eq. (9), (18), (10)
+    """
+    e = (
+        q[0] - q_des[0],
+        q[1] - q_des[1],
+    )
+    ed = (
+        qd[0] - qd_des[0],
+        qd[1] - qd_des[1],
+    )
+    r = (
+        qd[0] + Lambda[0] * e[0],
+        qd[1] + Lambda[1] * e[1],
+    )
+    return e, ed, r
 
 
 @leaf
 def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
-    """Returns Y' r, which drives the estimate in Eq. (15), for the two rows of Y."""
+    """Returns Y' r, which drives the estimate in Eq. (15).
+
+    Args:
+        Y: the regressor of Eq. (12), two rows of five numbers.
+        r: shape (2,).
+    """
     a, b = Y
     return (
         a[0] * r[0] + b[0] * r[1],
@@ -45,7 +66,7 @@ def regressor_transpose_times(Y: tuple[Five, Five], r: Vector) -> Five:
 
 @leaf
 def update_estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector) -> Five:
-    """Returns theta_hat - gain_s Gamma Y' r, Eq. (15) over a time of gain_s."""
+    """Returns theta_hat - gain_s Gamma Y' r: Eq. (15) integrated over `gain_s` seconds."""
     return (
         theta_hat[0] - gain_s * Gamma[0] * Yr[0],
         theta_hat[1] - gain_s * Gamma[1] * Yr[1],
@@ -57,7 +78,7 @@ def update_estimate(theta_hat: Vector, gain_s: float, Gamma: Vector, Yr: Vector)
 
 @leaf
 def limit_torque(torque: float, limit: float) -> float:
-    """Returns a torque clipped to +-limit."""
+    """Returns a torque, limited to the range from -limit to limit."""
     return min(max(torque, -limit), limit)
 
 
@@ -71,11 +92,21 @@ def adaptive_torque(
     ed: Vector,
     limit: float,
 ) -> Pair:
-    """Returns tau = Y theta_hat - Kp r - Kd ed, Eq. (13), within +-limit.
+    """Returns the torque of the adaptive law, Eq. (13), within the limit.
 
-    Y is the regressor Y(q, qd, -Lambda e, -Lambda ed), two rows.
+        tau = Y theta_hat - Kp r - Kd ed
+
+    Args:
+        Y: the regressor Y(q, qd, -Lambda e, -Lambda ed), two rows of five numbers.
+        theta_hat: the estimate, shape (5,).
+        Kp: gain of r.
+        Kd: gain of ed.
+        r: see `control_errors`.
+        ed: derivative of the error.
+        limit: the largest torque of a joint.
     """
-    total_0 = total_1 = 0.0
+    total_0 = 0.0
+    total_1 = 0.0
     for p in range(5):
         total_0 += Y[0][p] * theta_hat[p]
         total_1 += Y[1][p] * theta_hat[p]
@@ -86,16 +117,17 @@ def adaptive_torque(
 
 @leaf
 def robust_torque(rho: float, width: float, r: float) -> float:
-    """Returns rho r / sqrt(r^2 + width^2), which opposes r: all of rho where it is fast, never
-    a step.
+    """Returns rho r / sqrt(r^2 + width^2), a smooth form of rho sign(r).
 
-    Against a disturbance of at most rho, r times both is never above ROBUST_RESIDUE rho width.
+    The law subtracts it. With a disturbance d of at most rho, the power (d - robust torque) r is
+    at most ROBUST_RESIDUE rho width.
     """
     return rho * (r / sqrt(r * r + width * width))
 
 
 @leaf
 def _clip(value: float, low: float, high: float) -> float:
+    """Returns a value, limited to the range from low to high."""
     if value < low:
         return low
     return high if value > high else value
@@ -103,10 +135,10 @@ def _clip(value: float, low: float, high: float) -> float:
 
 @leaf
 def project_estimate(theta_hat: Vector, low: Vector, high: Vector) -> Five:
-    """Returns every parameter clipped to its box.
+    """Returns the projection of an estimate on its box: each parameter, limited to its range.
 
-    For a diagonal Gamma and a truth inside the box this never lets (theta_hat - theta)'
-    Gamma^-1 (theta_hat - theta) rise, so that V' <= 0 stands.
+    If Gamma is diagonal and the true theta lies in the box, the projection never increases
+    (theta_hat - theta)' Gamma^-1 (theta_hat - theta). V' <= 0 therefore still holds.
     """
     return (
         _clip(theta_hat[0], low[0], high[0]),
@@ -132,17 +164,19 @@ def damped_torque(
     felt: Vector,
     limit: float,
 ) -> Pair:
-    """Returns tau = G(q) - K e - d qd - Kd ed + k_f felt, within +-limit: the laws of known
-    gravity.
+    """Returns the torque of the laws of known gravity, within the limit.
 
-    P+d has Kd = k_f = 0. For N sites with reversible shares, one K, one d and one constant
-    delay T its linearised loop is stable from d = max(abs(lambda_min(alpha)), 0.2172) K T on,
-    whatever the masses, for two sites with 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2; for other shares
-    no such bound holds. PD+d has k_f = 0. Direct force reflection has Kd = 0: K and d at the
-    slave, d and k_f at the master.
+        tau = G(q) - K e - d qd - Kd ed + k_f felt
+
+    - P+d: Kd = k_f = 0. For N sites with reversible shares, one K, one d and one constant delay
+      T, the linearised loop is stable for all masses if d >= max(abs(lambda_min(alpha)), 0.2172)
+      K T; for two sites if 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares no such bound
+      exists.
+    - PD+d: k_f = 0.
+    - Direct force reflection: Kd = 0, with K and d at the slave, d and k_f at the master.
 
     Args:
-        theta: the parameters that the law takes the arm to have, shape (5,).
+        theta: the parameters that the law assumes, shape (5,).
         g: gravitational acceleration, m/s^2.
         K: stiffness, N m/rad.
         d: damping of the arm's own velocity.
@@ -153,7 +187,7 @@ def damped_torque(
         e: position error.
         ed: its derivative.
         felt: the torque on the peers' arms as received, weighted by dominance.
-        limit: largest torque of a joint.
+        limit: the largest torque of a joint.
     """
     G = gravity(theta, g, q)
     total_0 = G[0] - K[0] * e[0] - d[0] * qd[0] - Kd[0] * ed[0] + k_f[0] * felt[0]

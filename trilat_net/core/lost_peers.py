@@ -1,143 +1,154 @@
-"""Peers that a site goes on without: a lost master's share goes to the others, until it is
-back.
+"""Lost peers: a site goes on without a lost master, whose share goes to the other peers.
 
-Invariant: what is decided follows from the samples in use and from what is remembered, tick by
-tick. Nobody is dropped without whom those that are left would not all reach each other, nor the
-last one that is followed: then the site holds. The reference never jumps: the site aligns with
-what is left, and with who is back.
+Invariant:
+
+- Each decision follows from the samples in use and from the memory of the site, tick by tick.
+- A peer is only dropped if the remaining sites all reach each other without it, and if it is not
+  the last peer that the site follows. Otherwise the site holds.
+- The reference never jumps: the site aligns with the remaining peers, and again with a peer that
+  returns.
+
+`gone` of a link is 0 while the peer is present, -1 while it is lost, and while it is heard again
+the time since then, ns since the epoch.
 """
 
 from .chain import add, scale, three
 from .jit import leaf
-from .rotation import length, relative_rotation, rotation_matrix
-from .task_space import count_linear_coordinates, has_orientation
+from .rotation import length, rotation_matrix, relative_rotation
+from .row_fields import LinkRow, SiteRow
+from .task_space import has_orientation, count_linear_coordinates
 from .ticks import LifeReason
-from .vectors import Row, RowArray
+from .vectors import RowArray
 
 BACK_NS = 250_000_000
-"""One that was dropped has its share again when it was heard for so long."""
+"""Time for which a dropped peer must be heard before it gets its share again, ns."""
 
 _DROPPED = int(LifeReason.DROPPED)
 _RESTORED = int(LifeReason.RESTORED)
 
 
 @leaf
-def _can_go_without(lost: int, t_ns: int, site: Row, links: RowArray) -> bool:
-    """True if those that are left, without this peer, follow each other, and the site one of
-    them.
+def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
+    """True if the remaining sites all reach each other without a peer, and the site follows one.
+
+    Sets of sites are numbers with one bit per site. `forward` are the sites that this site
+    reaches, `backward` the sites that reach this site; both must be all remaining sites.
     """
-    everyone = site.bit
-    own = 0
+    remaining = site.bit
+    followed = 0
     for j in range(links.shape[0]):
-        link: Row = links[j]
-        if (
-            j != lost
-            and link.gone == 0.0
-            and link.used >= 0
-            and t_ns - link.used_ns <= site.stale_ns
-        ):
-            everyone |= link.bit
+        link: LinkRow = links[j]
+        is_heard = link.gone == 0.0 and link.used >= 0
+        if j != lost and is_heard and t_ns - link.used_ns <= site.stale_ns:
+            remaining |= link.bit
             if link.alpha > 0.0:
-                own |= link.bit
-    ahead = behind = site.bit
+                followed |= link.bit
+    forward = site.bit
+    backward = site.bit
     for _ in range(links.shape[0]):
-        ahead |= own
+        forward |= followed
         for j in range(links.shape[0]):
             link = links[j]
-            if ahead & link.bit:
-                ahead |= link.followed & everyone
-            if everyone & link.bit and link.followed & behind:
-                behind |= link.bit
-    return own != 0 and ahead == everyone and behind == everyone
+            if forward & link.bit:
+                forward |= link.followed & remaining
+            if remaining & link.bit and link.followed & backward:
+                backward |= link.bit
+    return followed != 0 and forward == remaining and backward == remaining
 
 
 @leaf
-def _is_turned_little(back: int, site: Row, links: RowArray) -> bool:
-    """True if this peer's share turns the reference by no more than an alignment may.
+def _is_orientation_near(back: int, site: SiteRow, links: RowArray) -> bool:
+    """True if the share of peer `back` turns the reference by at most the alignment limit.
 
-    The turn between two orientations is no longer than the difference of their vectors from the
-    own one.
+    The turn between two orientations is at most as long as the difference of their rotation
+    vectors from the site's own orientation.
     """
-    own = rotation_matrix(three(site.x[3:]))
-    whole = 0.0
+    orientation = rotation_matrix(three(site.x[3:]))
+    total = 0.0
     sum_of_turns = (0.0, 0.0, 0.0)
     for j in range(links.shape[0]):
-        link: Row = links[j]
+        link: LinkRow = links[j]
         if link.gone == 0.0:
-            turn = relative_rotation(own, rotation_matrix(three(link.q[3:])))
+            turn = relative_rotation(orientation, rotation_matrix(three(link.q[3:])))
             sum_of_turns = add(sum_of_turns, scale(link.alpha, turn))
-            whole += link.alpha
+            total += link.alpha
     link = links[back]
-    turn = relative_rotation(own, rotation_matrix(three(link.q[3:])))
-    away = add(turn, scale(-1.0 / whole, sum_of_turns))
-    near: bool = length(away) * link.alpha / (whole + link.alpha) <= site.align_limit
+    turn = relative_rotation(orientation, rotation_matrix(three(link.q[3:])))
+    difference = add(turn, scale(-1.0 / total, sum_of_turns))
+    near: bool = length(difference) * link.alpha / (total + link.alpha) <= site.align_limit
     return near
 
 
 @leaf
-def _is_near(back: int, site: Row, links: RowArray) -> bool:
-    """True if the reference with this peer is no farther from that without it than an alignment
-    may go.
-    """
-    if has_orientation(site) and not _is_turned_little(back, site, links):
+def _is_near(back: int, site: SiteRow, links: RowArray) -> bool:
+    """True if the share of peer `back` moves the reference by at most the alignment limit."""
+    if has_orientation(site) and not _is_orientation_near(back, site, links):
         return False
     for i in range(count_linear_coordinates(site)):
-        rest = whole = 0.0
+        weighted = 0.0
+        total = 0.0
         for j in range(links.shape[0]):
-            link: Row = links[j]
+            link: LinkRow = links[j]
             if link.gone == 0.0:
-                rest += link.alpha * link.q[i]
-                whole += link.alpha
+                weighted += link.alpha * link.q[i]
+                total += link.alpha
         link = links[back]
-        there = (rest + link.alpha * link.q[i]) / (whole + link.alpha)
-        if not abs(there - rest / whole) <= site.align_limit:
+        with_peer = (weighted + link.alpha * link.q[i]) / (total + link.alpha)
+        without_peer = weighted / total
+        if not abs(with_peer - without_peer) <= site.align_limit:
             return False
     return True
 
 
 @leaf
-def _share_out(links: RowArray) -> bool:
-    """Gives the shares of those that are gone to the others; false if nobody is left to have
-    them.
+def _redistribute_shares(links: RowArray) -> bool:
+    """Divides the shares of lost peers among the other peers, in proportion to their shares.
+
+        alpha_j / sum alpha,  with the derivative by the quotient rule; 0 for a lost peer
+
+    Returns:
+        False, without a change, if no other peer has a share.
     """
-    whole = whole_rate = 0.0
-    some = False
+    total = 0.0
+    total_rate = 0.0
+    any_lost = False
     for j in range(links.shape[0]):
-        link: Row = links[j]
+        link: LinkRow = links[j]
         if link.gone == 0.0:
-            whole += link.alpha
-            whole_rate += link.alpha_rate
+            total += link.alpha
+            total_rate += link.alpha_rate
         else:
-            some = True
-    if some and whole <= 0.0:
+            any_lost = True
+    if not any_lost:
+        return True
+    if total <= 0.0:
         return False
-    for j in range(links.shape[0] if some else 0):
+    for j in range(links.shape[0]):
         link = links[j]
         if link.gone == 0.0:
-            link.alpha_rate = (link.alpha_rate * whole - link.alpha * whole_rate) / (
-                whole * whole
-            )
-            link.alpha /= whole
+            numerator = link.alpha_rate * total - link.alpha * total_rate
+            link.alpha_rate = numerator / (total * total)
+            link.alpha /= total
         else:
-            link.alpha = link.alpha_rate = 0.0
+            link.alpha = 0.0
+            link.alpha_rate = 0.0
     return True
 
 
 @leaf
-def regroup(t_ns: int, site: Row, links: RowArray) -> None:
-    """Drops peers that are lost and takes back those that are there again; divides the shares
-    among the rest.
+def regroup(t_ns: int, site: SiteRow, links: RowArray) -> None:
+    """Drops lost peers, takes returned peers back, and redistributes the shares.
 
-    Before it `alpha` of a link is the share that is planned, afterwards the one in force.
+    Before the call `alpha` of a link is the planned share, afterwards the share in force.
     """
     site.regrouped = 0
     for j in range(links.shape[0]):
-        link: Row = links[j]
+        link: LinkRow = links[j]
         if not link.alpha > 0.0 or link.used < 0:
             continue
         silent = t_ns - link.used_ns > site.stale_ns
         if link.gone == 0.0:
-            if silent and link.dispensable and _can_go_without(j, t_ns, site, links):
+            if silent and link.dispensable and _can_drop(j, t_ns, site, links):
                 link.gone = -1.0
                 site.regrouped = _DROPPED
         elif silent:
@@ -147,7 +158,8 @@ def regroup(t_ns: int, site: Row, links: RowArray) -> None:
         elif t_ns - link.gone >= BACK_NS and _is_near(j, site, links):
             link.gone = 0.0
             site.regrouped = _RESTORED
-    if not _share_out(links):  # the shares were changed meanwhile
+    # A change of the shares may leave all of them to lost peers: then no peer counts as lost.
+    if not _redistribute_shares(links):
         for j in range(links.shape[0]):
             link = links[j]
             link.gone = 0.0

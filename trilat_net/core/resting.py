@@ -1,63 +1,62 @@
-"""How an arm comes to rest where it is, and stays there: while its site waits, holds, is
-stopped or in fault.
+"""How an arm comes to rest where it is, and stays there.
 
-The reference of a joint begins at the joint's own angle and speed v, and comes to rest within
-T:
+An arm rests while its site waits, holds, is stopped or in fault. The reference of a joint starts
+at the joint's own angle and speed v, and comes to rest within T. Per period h,
 
-    |qd_ref| falls by (1 - h / T_left) per period h, T_left = max(LEAST_STOP_S - t, max_i
-    |qd_ref_i| / a_i) qd_ref = 0 from the tick on in which the joint turns, and never more than
-    the joint's own speed
+    |qd_ref| falls by the factor 1 - h / T_left,
+    T_left = max(LEAST_STOP_S - t, max_i |qd_ref_i| / a_i),
+    qd_ref = 0 from the tick on in which the joint reverses,
+    |qd_ref| is never larger than the speed of the joint,
 
 where a_i is the deceleration that half of the torque limit gives. If nothing slows the joints
 down sooner, this is qd_ref = v (1 - t / T) with T = max(LEAST_STOP_S, max_i |v_i| / a_i). q_ref
-is the integral of qd_ref; while an arm is fast (see below) or a torque is at its limit, q_ref
-moves along with a joint that would otherwise get farther away from it.
+is the integral of qd_ref. While an arm is fast (see below) or a torque is at its limit, q_ref
+moves along with a joint that would otherwise move away from it.
 
-The torque is that of the law on this reference. It is gravity, as far as that is known or
-learnt, for a law that failed, that does not hold by its reference, and for every law while the
-arm is fast: while B |qd| of some joint exceeds the limit of its torque. In both cases
+The torque is that of the law on this reference. Only the gravity torque, as far as it is known
+or estimated, replaces it for a law that failed, for a law that does not hold by its reference,
+and for each law while the arm is fast: while B |qd| of some joint exceeds the limit of its
+torque. To either torque
 
-    + w - B s,    s = qd - qd_ref + Lambda (q - q_ref),    w' = -k B s
+    w - B s,    s = qd - qd_ref + Lambda (q - q_ref),    w' = -k B s
 
-is added. w begins as the part of the last torque that the law does not account for, times 1 -
-max B |qd| /
-tau_limit: the torque of a slow arm holds what nobody knew of gravity or hands, that of a fast
-arm follows from its motion. While the arm brakes, w loses B |qd| in every tick in which it
-works with the motion of its joint. Lambda is that of the adaptive law in joint space, and else
-`REST_RATE_1_S`; in task space the estimate stays as it is. docs/links.md derives how much
-energy all this can add to an arm.
+is added. w starts as the part of the last torque that the law does not explain, times 1 - max B
+|qd| / tau_limit: the torque of a slow arm holds unknown gravity or hands, the torque of a fast
+arm follows from its motion. While the arm brakes, w loses B |qd| in each tick in which w acts in
+the direction of the joint's motion. Lambda is that of the adaptive law in joint space, and
+otherwise `REST_RATE_1_S`. In task space the estimate is kept. docs/links.md derives the energy
+that all this can add to an arm.
 
-The limit of a torque's rate never holds back what takes power from the arm: against its motion
-the torque of a joint may change by B |qd| more in a tick. That is the step of a viscous brake
-of B which is put on at that
-speed: it brings the joint to rest within `RestGains.time_s`, and it vanishes with the speed.
+The limit of a torque's rate never holds back a torque that takes power from the arm: against
+the motion of a joint its torque may change by B |qd| more in a tick. This is the step of a
+viscous brake B that is applied at that speed. It brings the joint to rest within
+`RestGains.time_s`, and vanishes with the speed.
 
 Invariant:
 
 - The reference of a joint only slows down, keeps its direction, and is never faster than the
   joint.
-- While an arm brakes, no term but w works with the motion of a joint, and w adds at most h w^2
-  / 2 B.
-- Once the reference rests and no torque is limited, S + 1/2 w' (k B)^-1 w of the adaptive law
-  in joint space never rises, S being its storage: B adds to Kp, and w is one more estimate, of
-  a constant torque whose true value is zero.
+- While an arm brakes, no term but w acts in the direction of a joint's motion, and w adds at
+  most h w^2 / 2 B.
+- Once the reference rests and no torque is limited, S + 1/2 w' (k B)^-1 w of the adaptive law in
+  joint space never rises, with S the storage of the law: B adds to Kp, and w is a further
+  estimate, of a constant torque whose true value is zero.
 """
 
 from math import inf, isfinite
 
 from .control import limit_torque
 from .jit import leaf
+from .row_fields import SiteRow
 from .site_setup import LEAST_STOP_S, Law, StaleAction
 from .ticks import NS_PER_S, LifeReason, Mode
-from .vectors import Array, Row
+from .vectors import Array
 
 REST_RATE_1_S = 3.0
-"""By how much of the way an arm goes back to its rest in a second, where its law has no Lambda
-of joints.
-"""
+"""Lambda of an arm at rest whose law has no Lambda of joints, 1/s."""
 
 _ROUNDING_S = 1e-9
-"""By less than this the last step of a reference misses the end of its time."""
+"""Rounding error of the last step of a reference, s: below it the reference rests."""
 
 _WAITING = int(Mode.WAITING)
 _HOLD = int(Mode.HOLD)
@@ -66,53 +65,52 @@ _STOPPED = int(Mode.STOPPED)
 _NOT_FINITE = int(LifeReason.NOT_FINITE)
 _GLIDE = int(StaleAction.GLIDE)
 _ADAPTIVE = int(Law.ADAPTIVE)
-_OWN = int(Law.USER)
+_USER = int(Law.USER)
 _KNOWN = int(Law.KNOWN)
 
 
 @leaf
-def rests(site: Row) -> bool:
-    """True if the arm comes to rest, or stays there."""
+def rests(site: SiteRow) -> bool:
+    """True if the arm comes to rest or stays at rest."""
     still = site.mode in (_WAITING, _HOLD, _FAULT, _STOPPED)
     return bool(still and site.on_stale == _GLIDE)
 
 
 @leaf
-def find_haste(site: Row) -> float:
-    """Returns the largest share that B |qd| is of the limit of a joint's torque."""
-    haste = 0.0
+def find_brake_ratio(site: SiteRow) -> float:
+    """Returns the largest ratio of B |qd| to the torque limit, over the joints."""
+    ratio = 0.0
     for i in range(site.joints):
-        haste = max(haste, site.damping[i] * abs(site.qd[i]) / site.tau_limit[i])
-    return haste
+        ratio = max(ratio, site.damping[i] * abs(site.qd[i]) / site.tau_limit[i])
+    return ratio
 
 
 @leaf
-def is_fast(site: Row) -> bool:
-    """True if a joint is so fast that B alone would ask for more than the limit of its torque."""
-    fast: bool = find_haste(site) > 1.0
+def is_fast(site: SiteRow) -> bool:
+    """True if a joint is so fast that B |qd| alone exceeds the limit of its torque."""
+    fast: bool = find_brake_ratio(site) > 1.0
     return fast
 
 
 @leaf
-def rests_by_law(site: Row) -> bool:
-    """True if the torque of a site that rests has that of its law in it, which then goes on
-    learning.
-    """
-    holds = site.law != _OWN or site.holds != 0
+def rests_by_law(site: SiteRow) -> bool:
+    """True if the torque of an arm at rest contains that of its law, which then still adapts."""
+    holds = site.law != _USER or site.holds != 0
     learns_in_task = site.task != 0 and site.law != _KNOWN
     usable = holds and not learns_in_task and site.reason != _NOT_FINITE
     return bool(usable and not is_fast(site))
 
 
 @leaf
-def enter_rest(t_ns: int, mode: int, reason: int, site: Row) -> None:
-    """Enters a mode in which the arm comes to rest; what rests already goes on, unless its law
-    failed.
+def enter_rest(t_ns: int, mode: int, reason: int, site: SiteRow) -> None:
+    """Enters a mode in which the arm comes to rest.
+
+    An arm that rests already keeps its reference, unless its law failed now or before.
     """
-    goes_on = rests(site) and reason != _NOT_FINITE and site.reason != _NOT_FINITE
+    keeps_reference = rests(site) and reason != _NOT_FINITE and site.reason != _NOT_FINITE
     site.mode = mode
     site.reason = reason
-    if goes_on:
+    if keeps_reference:
         return
     site.return_from_ns = t_ns
     for i in range(site.joints):
@@ -120,16 +118,16 @@ def enter_rest(t_ns: int, mode: int, reason: int, site: Row) -> None:
 
 
 @leaf
-def _read_reference(site: Row, i: int) -> tuple[float, float]:
-    """Returns the reference of a joint that comes to rest, rad, and its speed, rad/s."""
+def _read_reference(site: SiteRow, i: int) -> tuple[float, float]:
+    """Returns the rest reference of joint i, rad, and its rate, rad/s."""
     if site.task:
         return site.q_rest[i], site.qd_rest[i]
     return site.q_held[i], site.qd_held[i]
 
 
 @leaf
-def _write_reference(site: Row, i: int, q: float, qd: float) -> None:
-    """Writes the reference of a joint where the record's `mem` keeps it from tick to tick."""
+def _write_reference(site: SiteRow, i: int, q: float, qd: float) -> None:
+    """Writes the rest reference of joint i into the fields that the record's `mem` contains."""
     if site.task:
         site.q_rest[i] = q
         site.qd_rest[i] = qd
@@ -139,23 +137,26 @@ def _write_reference(site: Row, i: int, q: float, qd: float) -> None:
 
 
 @leaf
-def _find_remaining_s(elapsed_s: float, site: Row) -> float:
-    """Returns the time in which the reference comes to rest, `elapsed_s` after its beginning."""
+def _find_remaining_s(elapsed_s: float, site: SiteRow) -> float:
+    """Returns T_left of the reference, s, at `elapsed_s` after the start of the rest."""
     remaining_s = LEAST_STOP_S - elapsed_s
     for i in range(site.joints):
-        remaining_s = max(remaining_s, abs(_read_reference(site, i)[1]) / site.deceleration[i])
+        _, rate = _read_reference(site, i)
+        remaining_s = max(remaining_s, abs(rate) / site.deceleration[i])
     return remaining_s
 
 
 @leaf
-def advance_rest_reference(t_ns: int, ticks: int, site: Row) -> None:
-    """Advances the reference of an arm that comes to rest to time t, over a number of ticks."""
+def advance_rest_reference(t_ns: int, ticks: int, site: SiteRow) -> None:
+    """Advances the rest reference to time t, over `ticks` periods."""
     if t_ns == site.return_from_ns:
         return
     step_s = ticks / site.rate_hz
     elapsed_s = (t_ns - site.return_from_ns) * 1e-9 - step_s
     remaining_s = _find_remaining_s(elapsed_s, site)
-    share = 1.0 - step_s / remaining_s if remaining_s > step_s + _ROUNDING_S else 0.0
+    share = 0.0
+    if remaining_s > step_s + _ROUNDING_S:
+        share = 1.0 - step_s / remaining_s
     fast = is_fast(site)
     for i in range(site.joints):
         q_ref, rate_before = _read_reference(site, i)
@@ -166,27 +167,33 @@ def advance_rest_reference(t_ns: int, ticks: int, site: Row) -> None:
             rate = site.qd[i]
         step = 0.5 * step_s * (rate_before + rate)
         if fast or abs(site.tau[i]) >= site.tau_limit[i]:
-            # Without its law, or at its limit, the torque does not pay for a growing distance from the
-            # reference, which the spring would give back later as energy of its own.
-            own_step = site.q[i] - site.q_before[i]
-            if (own_step - step) * (site.q_before[i] - q_ref) >= 0.0:
-                step = own_step
+            # Without the law, or at its limit, the torque does not pay for a growing distance
+            # from the reference. The spring would later return that distance as energy of its
+            # own, so the reference moves along with the joint.
+            joint_step = site.q[i] - site.q_before[i]
+            if (joint_step - step) * (site.q_before[i] - q_ref) >= 0.0:
+                step = joint_step
         _write_reference(site, i, q_ref + step, rate)
 
 
 @leaf
-def _brakes(t_ns: int, site: Row) -> bool:
-    """True until the reference rests, for at least LEAST_STOP_S, and while a joint is fast."""
+def _brakes(t_ns: int, site: SiteRow) -> bool:
+    """True while the arm brakes.
+
+    It brakes for at least LEAST_STOP_S, until the reference rests, and while a joint is fast.
+    """
     brakes = t_ns - site.return_from_ns < LEAST_STOP_S * NS_PER_S or is_fast(site)
     for i in range(site.joints):
-        brakes = brakes or _read_reference(site, i)[1] != 0.0
+        _, rate = _read_reference(site, i)
+        brakes = brakes or rate != 0.0
     return brakes
 
 
 @leaf
-def put_rest_reference(site: Row, q: Array, qd: Array) -> None:
-    """Writes the reference of an arm that comes to rest; in task space where its end effector
-    is.
+def put_rest_reference(site: SiteRow, q: Array, qd: Array) -> None:
+    """Writes the rest reference in shared coordinates into q and qd.
+
+    In task space that is the present pose of the end effector: the joints rest by themselves.
     """
     for i in range(q.shape[0]):
         if site.task:
@@ -198,8 +205,8 @@ def put_rest_reference(site: Row, q: Array, qd: Array) -> None:
 
 
 @leaf
-def _find_slip(site: Row, i: int) -> float:
-    """Returns s of a joint, rad/s."""
+def _find_slip(site: SiteRow, i: int) -> float:
+    """Returns s = qd - qd_ref + Lambda (q - q_ref) of joint i, rad/s."""
     q, qd = _read_reference(site, i)
     rate = site.Lambda[i] if site.law == _ADAPTIVE and not site.task else REST_RATE_1_S
     slip: float = site.qd[i] - qd + rate * (site.q[i] - q)
@@ -208,31 +215,38 @@ def _find_slip(site: Row, i: int) -> float:
 
 @leaf
 def _shrink(torque: float, change: float) -> float:
-    """Returns a torque brought nearer to zero by a change of its own sign, but not beyond."""
+    """Returns a torque less a change of the same sign, or zero if the change is larger."""
     return torque - change if abs(torque) > abs(change) else 0.0
 
 
 @leaf
-def add_rest_torque(k: int, t_ns: int, site: Row) -> None:
-    """Adds w - B s to the torque in `tau`; `u` keeps what it would be without limits."""
+def add_rest_torque(k: int, t_ns: int, site: SiteRow) -> None:
+    """Adds w - B s to the torque in `tau`, within its limit; `u` is the sum without the limit.
+
+    At the start of a rest w is initialised with the unexplained part of the last torque.
+    """
     brakes = _brakes(t_ns, site)
-    share = max(0.0, 1.0 - find_haste(site)) if k > site.first else 0.0
+    share = 0.0
+    if k > site.first:
+        share = max(0.0, 1.0 - find_brake_ratio(site))
     for i in range(site.joints):
         if t_ns == site.return_from_ns:
             site.tau_held[i] = share * (site.tau_before[i] - site.tau[i])
         if brakes and site.tau_held[i] * site.qd[i] > 0.0:
             site.tau_held[i] = _shrink(site.tau_held[i], site.damping[i] * site.qd[i])
-        goal = site.tau[i] + site.tau_held[i] - site.damping[i] * _find_slip(site, i)
-        if not isfinite(goal):
-            goal = site.tau_held[i] = 0.0
-        site.u[i] = goal
-        site.tau[i] = limit_torque(goal, site.tau_limit[i])
+        torque = site.tau[i] + site.tau_held[i] - site.damping[i] * _find_slip(site, i)
+        if not isfinite(torque):
+            torque = 0.0
+            site.tau_held[i] = 0.0
+        site.u[i] = torque
+        site.tau[i] = limit_torque(torque, site.tau_limit[i])
 
 
 @leaf
-def advance_rest(site: Row) -> None:
-    """Advances w to the next tick, but no farther beyond a limit that already holds the torque
-    back.
+def advance_rest(site: SiteRow) -> None:
+    """Advances w to the next tick by -h k B s.
+
+    Anti-windup: w does not grow in a direction in which the torque is already limited.
     """
     for i in range(site.joints):
         step = -site.integral[i] * _find_slip(site, i) / site.rate_hz
@@ -241,9 +255,10 @@ def advance_rest(site: Row) -> None:
 
 
 @leaf
-def limit_torque_rate(site: Row) -> None:
-    """Holds the torque within reach of that of the tick before; before the first tick there is
-    none.
+def limit_torque_rate(site: SiteRow) -> None:
+    """Limits the torque's rate of change; before the first tick the torque counts as zero.
+
+    Torques that brake an arm at rest may change by B |qd| more in a tick.
     """
     braking = rests(site)
     for i in range(site.joints):

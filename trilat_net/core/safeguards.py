@@ -1,25 +1,28 @@
-"""How fast a reference may change, and a torque that goes back to that of the law.
+"""The limit of the reference's speed, and the return of the torque to that of the law.
 
-Invariant: whatever a law asks for, the reference moves no faster than its limit. Without
-limits, and in other modes, nothing changes.
+Invariant:
+
+- The reference moves no faster than its limit, whatever the peers do.
+- Without limits, and in modes in which the arm rests, nothing changes.
 """
 
 from math import inf, isfinite
 
 from .chain import put_three, scale, three
 from .jit import leaf
-from .rotation import compose_rotations, relative_rotation, rotation_matrix
-from .task_space import count_linear_coordinates, has_orientation
-from .vectors import Row
+from .rotation import compose_rotations, rotation_matrix, relative_rotation
+from .row_fields import SiteRow
+from .task_space import has_orientation, count_linear_coordinates
 
 BLEND_S = 0.1
-"""Time in which a torque goes over from that of an arm at rest to that of the law."""
+"""Duration of the change from the torque at rest to that of the law, s."""
 
 
 @leaf
-def limit_reference(k: int, site: Row) -> None:
-    """Holds the reference back to its limit of speed, from the own pose on; and makes up for it
-    so.
+def limit_reference(k: int, site: SiteRow) -> None:
+    """Limits the speed of the reference; a reference that was held back catches up later.
+
+    At the first tick the reference starts from the pose of the arm.
     """
     if k == site.first:
         for i in range(site.shared):
@@ -33,27 +36,26 @@ def limit_reference(k: int, site: Row) -> None:
         step = site.q_des[i] - site.q_followed[i]
         most = limit / site.rate_hz
         if abs(step) > most:
-            forward = step > 0.0
-            site.q_des[i] = site.q_followed[i] + (most if forward else -most)
-            site.qd_des[i] = limit if forward else -limit
+            sign = 1.0 if step > 0.0 else -1.0
+            site.q_des[i] = site.q_followed[i] + sign * most
+            site.qd_des[i] = sign * limit
         else:
             site.qd_des[i] = min(max(site.qd_des[i], -limit), limit)
 
 
 @leaf
-def _limit_turn(site: Row) -> None:
-    """Holds the orientation of the reference back to the limit of its speed about each axis."""
-    before = rotation_matrix(three(site.q_followed[3:]))
-    turn = relative_rotation(rotation_matrix(three(site.q_des[3:])), before)
+def _limit_turn(site: SiteRow) -> None:
+    """Limits the angular velocity of the reference about each axis, keeping the turn's axis."""
+    previous = rotation_matrix(three(site.q_followed[3:]))
+    turn = relative_rotation(rotation_matrix(three(site.q_des[3:])), previous)
     share = 1.0
     for i in range(3):
         most = site.qd_des_limit[3 + i] / site.rate_hz
         if abs(turn[i]) * share > most:
             share = most / abs(turn[i])
     if share < 1.0:
-        put_three(
-            site.q_des[3:], compose_rotations(scale(share, turn), three(site.q_followed[3:]))
-        )
+        limited_turn = scale(share, turn)
+        put_three(site.q_des[3:], compose_rotations(limited_turn, three(site.q_followed[3:])))
         put_three(site.qd_des[3:], scale(share * site.rate_hz, turn))
     for i in range(3, 6):
         limit = site.qd_des_limit[i]
@@ -61,8 +63,8 @@ def _limit_turn(site: Row) -> None:
 
 
 @leaf
-def is_torque_finite(site: Row) -> bool:
-    """True if the law gave a number for every joint."""
+def is_torque_finite(site: SiteRow) -> bool:
+    """True if the law's torque is finite for each joint."""
     finite = True
     for i in range(site.joints):
         finite = finite and isfinite(site.tau[i])
@@ -70,8 +72,8 @@ def is_torque_finite(site: Row) -> bool:
 
 
 @leaf
-def return_to_law(t_ns: int, site: Row) -> None:
-    """Writes the torque of a site that has its law again: from the last one to that of the law."""
+def return_to_law(t_ns: int, site: SiteRow) -> None:
+    """Blends the torque from the last torque at rest to that of the law, within BLEND_S."""
     share = min((t_ns - site.return_from_ns) * 1e-9 / BLEND_S, 1.0)
     for i in range(site.joints):
         site.tau[i] = site.tau_held[i] + share * (site.tau[i] - site.tau_held[i])

@@ -1,19 +1,29 @@
-"""The life of a site under the rule `glide`: it waits, aligns, follows, and holds while a peer
-is silent.
+"""The modes of a site under the rule `glide`: it waits, aligns, follows, and holds.
 
-    WAITING -> RETURN (aligns) -> RUN (engaged) -> HOLD -> RETURN -> RUN
-    any -> FAULT (a limit, a number that is not finite, its arm lost)  -- RESET  -> WAITING
-    any -> STOPPED (an order, or nobody holds its dead-man switch) -- ENABLE, HELD -> WAITING
+    WAITING -> RETURN (aligns) -> RUN (engaged) -> HOLD (a peer is silent) -> RETURN -> RUN
+    any mode -> FAULT (limit exceeded, number not finite, arm lost) -- order RESET -> WAITING
+    any mode -> STOPPED (order STOP, or switch released) -- order ENABLE or HELD -> WAITING
 
-Invariant: in WAITING, HOLD, STOPPED and FAULT the arm comes to rest where it is and stays
-there, in one way (`resting`): the reference leaves the peers, begins at the own pose with the
-own velocity, and falls to rest. From there to the peers and while it follows them neither it
-nor its derivative jumps, and the second is the derivative of the first: while the site aligns,
-the way from the peers' reference falls to zero with its rate, no faster than `align_speed`
-beyond what it had. Of an orientation the way is the rotation vector of the turn from the peers'
-to the own one, and a rate is an angular velocity. A peer that rests or aligns itself is
-followed like any other. FAULT and STOPPED are latched. No message of a peer leads there or
-back. A switch that is held again ends what its release began, but no stop by order.
+While a site aligns, its reference is that of the peers plus an offset. The offset starts at the
+difference between the site's reference and the peers' reference, and falls to zero within T:
+
+    offset(x) = D (1 - 3 x^2 + 2 x^3) + T D' x (1 - x)^2,    x = t / T from 0 to 1
+    T = max(MIN_ALIGN_NS, 1.5 |D| / align_speed)
+
+with D the offset and D' its rate at the start. The factor 1.5 is the largest slope of the
+polynomial, so that the offset is no faster than `align_speed` beyond its initial rate. For an
+orientation the offset is the rotation vector of the turn from the peers' orientation to the
+site's own, and a rate is an angular velocity.
+
+Invariant:
+
+- In WAITING, HOLD, STOPPED and FAULT the arm comes to rest where it is and stays there, always
+  in the same way (`resting`): the reference starts at the pose and the velocity of the arm.
+- From there to the peers, and while the site follows them, neither the reference nor its
+  derivative jumps, and the derivative is that of the reference.
+- A peer that rests or aligns is followed like any other peer.
+- FAULT and STOPPED are latched: no message of a peer leads to them or out of them.
+- A switch that is held again ends the stop that its release caused, but no stop by order.
 """
 
 from math import isfinite
@@ -30,18 +40,19 @@ from .rotation import (
     rotation_matrix,
     rotation_vector_rate,
 )
-from .task_space import count_linear_coordinates, has_orientation
+from .row_fields import LinkRow, SiteRow
+from .task_space import has_orientation, count_linear_coordinates
 from .ticks import LifeOrder, LifeReason, Mode, tick_ns
-from .vectors import Array, Row, RowArray, put
+from .vectors import Array, RowArray, put
 
 MIN_ALIGN_NS = 250_000_000
-"""The least time of an alignment."""
+"""Shortest duration of an alignment, ns."""
 RETURN_NS = 100_000_000
-"""Time in which a torque goes over from that of an arm at rest to that of the law."""
+"""Duration of the change from the torque at rest to that of the law, ns."""
 HELD_OVERRUN_TICKS = 20
-"""A site at an arm outside that missed more ticks than these holds."""
+"""Largest number of missed ticks without HOLD, of a site with an external arm."""
 FAULT_OVERRUN_TICKS = 200
-"""One that missed more than these is in FAULT."""
+"""Largest number of missed ticks without FAULT."""
 
 _RUN = int(Mode.RUN)
 _DIVERGED = int(Mode.DIVERGED)
@@ -69,53 +80,55 @@ _ARM_SILENT = int(LifeReason.ARM_SILENT)
 _ARM_BACK = int(LifeReason.ARM_BACK)
 _RELEASED = int(LifeReason.RELEASED)
 _HELD = int(LifeReason.HELD)
-_TO_STOP = int(LifeOrder.STOP)
-_TO_ENABLE = int(LifeOrder.ENABLE)
-_TO_RESET = int(LifeOrder.RESET)
-_HEAR_SILENCE = int(LifeOrder.ARM_SILENT)
-_LOSE_ARM = int(LifeOrder.ARM_LOST)
-_HEAR_ARM = int(LifeOrder.ARM_BACK)
-_LET_GO = int(LifeOrder.RELEASED)
-_TAKE_HOLD = int(LifeOrder.HELD)
+_ORDER_STOP = int(LifeOrder.STOP)
+_ORDER_ENABLE = int(LifeOrder.ENABLE)
+_ORDER_RESET = int(LifeOrder.RESET)
+_ORDER_ARM_SILENT = int(LifeOrder.ARM_SILENT)
+_ORDER_ARM_LOST = int(LifeOrder.ARM_LOST)
+_ORDER_ARM_BACK = int(LifeOrder.ARM_BACK)
+_ORDER_RELEASED = int(LifeOrder.RELEASED)
+_ORDER_HELD = int(LifeOrder.HELD)
 
 
 @leaf
 def _all_heard(t_ns: int, silence_ns: int, links: RowArray) -> bool:
-    """True if of every peer that is followed a sample came into use no longer ago than
-    `silence_ns`.
-    """
+    """True if a sample of each peer with a share came into use within the last `silence_ns`."""
     for j in range(links.shape[0]):
-        link: Row = links[j]
+        link: LinkRow = links[j]
         if link.alpha > 0.0 and (link.used < 0 or t_ns - link.used_ns > silence_ns):
             return False
     return True
 
 
 @leaf
-def _align_s(site: Row) -> float:
-    """Returns how long the way that is left at its beginning, `q_held`, takes."""
-    way = 0.0
+def _alignment_s(site: SiteRow) -> float:
+    """Returns the duration of the alignment whose offset starts at `q_held`, s."""
+    distance = 0.0
     for i in range(count_linear_coordinates(site)):
-        way = max(way, abs(site.q_held[i]))
+        distance = max(distance, abs(site.q_held[i]))
     if has_orientation(site):
-        way = max(way, length(three(site.q_held[3:])))
-    takes_s: float = max(MIN_ALIGN_NS * 1e-9, 1.5 * way / site.align_speed)
-    return takes_s
+        distance = max(distance, length(three(site.q_held[3:])))
+    duration_s: float = max(MIN_ALIGN_NS * 1e-9, 1.5 * distance / site.align_speed)
+    return duration_s
 
 
 @leaf
-def _begin_aligning(t_ns: int, site: Row, reason: int, q: Array, qd: Array) -> None:
-    """Begins to align from a reference q that moves at qd, if the peers are no farther than the
-    limit.
+def _start_alignment(t_ns: int, site: SiteRow, reason: int, q: Array, qd: Array) -> None:
+    """Starts an alignment, unless the peers are farther away than the limit.
+
+    Args:
+        t_ns: the time, ns since the epoch.
+        site: the row of the site, with the peers' reference in q_des and qd_des.
+        reason: the reason of the change of mode.
+        q: the reference from which the site aligns.
+        qd: its rate.
     """
     turn = rate = (0.0, 0.0, 0.0)
     if has_orientation(site):
-        turn = relative_rotation(
-            rotation_matrix(three(q[3:])), rotation_matrix(three(site.q_des[3:]))
-        )
-        rate = rotation_vector_rate(
-            turn, subtract(three(qd[3:]), rotate_by_vector(turn, three(site.qd_des[3:])))
-        )
+        peers_rotation = rotation_matrix(three(site.q_des[3:]))
+        turn = relative_rotation(rotation_matrix(three(q[3:])), peers_rotation)
+        peers_rate = rotate_by_vector(turn, three(site.qd_des[3:]))
+        rate = rotation_vector_rate(turn, subtract(three(qd[3:]), peers_rate))
     near = length(turn) <= site.align_limit
     for i in range(count_linear_coordinates(site)):
         near = near and abs(q[i] - site.q_des[i]) <= site.align_limit
@@ -135,15 +148,17 @@ def _begin_aligning(t_ns: int, site: Row, reason: int, q: Array, qd: Array) -> N
 
 
 @leaf
-def _leave_rest(t_ns: int, site: Row, reason: int) -> None:
-    """Begins to align from the reference of an arm at rest."""
+def _leave_rest(t_ns: int, site: SiteRow, reason: int) -> None:
+    """Starts an alignment from the reference of an arm at rest."""
     put_rest_reference(site, site.q_followed, site.qd_followed)
-    _begin_aligning(t_ns=t_ns, site=site, reason=reason, q=site.q_followed, qd=site.qd_followed)
+    _start_alignment(
+        t_ns=t_ns, site=site, reason=reason, q=site.q_followed, qd=site.qd_followed
+    )
 
 
 @leaf
-def _carry_on(site: Row) -> None:
-    """Moves the reference of the tick before to where its rate takes it until now."""
+def _extrapolate_reference(site: SiteRow) -> None:
+    """Extrapolates the reference of the previous tick by one period with its rate."""
     h_s = 1.0 / site.rate_hz
     for i in range(count_linear_coordinates(site)):
         site.q_followed[i] += h_s * site.qd_followed[i]
@@ -153,16 +168,19 @@ def _carry_on(site: Row) -> None:
 
 
 @leaf
-def is_law_returning(t_ns: int, site: Row) -> bool:
-    """True if a site aligns that was at rest until a moment ago."""
+def is_law_returning(t_ns: int, site: SiteRow) -> bool:
+    """True if the torque of a site still returns to that of its law after a rest."""
     rested = site.reason != _DROPPED and site.reason != _RESTORED
     returning: bool = site.mode == _ALIGN and rested and t_ns - site.return_from_ns < RETURN_NS
     return returning
 
 
 @leaf
-def latch_mode(t_ns: int, site: Row, mode: int, reason: int) -> None:
-    """Enters FAULT or STOPPED."""
+def latch_mode(t_ns: int, site: SiteRow, mode: int, reason: int) -> None:
+    """Enters FAULT or STOPPED, where the arm comes to rest.
+
+    Estimates that are not finite become zero, so that the gravity torque stays finite.
+    """
     for p in range(site.theta_hat.shape[0]):
         if not isfinite(site.theta_hat[p]):
             site.theta_hat[p] = 0.0
@@ -170,8 +188,8 @@ def latch_mode(t_ns: int, site: Row, mode: int, reason: int) -> None:
 
 
 @leaf
-def _find_fault(site: Row) -> int:
-    """Returns the reason for a fault that the arm's motion gives, or -1."""
+def _find_fault(site: SiteRow) -> int:
+    """Returns the reason for a fault in the arm's motion, or -1."""
     for i in range(site.joints):
         q = site.q[i]
         qd = site.qd[i]
@@ -185,40 +203,41 @@ def _find_fault(site: Row) -> int:
 
 
 @leaf
-def _obey(t_ns: int, site: Row) -> None:
-    """Carries out what is ordered, and what the ticks that were not made ask for."""
+def _apply_order(t_ns: int, site: SiteRow) -> None:
+    """Applies the waiting order and the consequences of missed ticks, and clears both."""
     order = site.order
     skipped = site.skipped
     mode = site.mode
-    site.order = site.skipped = 0
+    site.order = 0
+    site.skipped = 0
     moves = mode in (_RUN, _ALIGN)
-    if order == _TO_RESET and mode == _FAULT:
+    if order == _ORDER_RESET and mode == _FAULT:
         enter_rest(t_ns, _WAITING, _RESET, site)
-    elif order == _TO_ENABLE and mode == _STOPPED:
+    elif order == _ORDER_ENABLE and mode == _STOPPED:
         enter_rest(t_ns, _WAITING, _ENABLE, site)
-    elif order == _TAKE_HOLD and mode == _STOPPED and site.reason == _RELEASED:
+    elif order == _ORDER_HELD and mode == _STOPPED and site.reason == _RELEASED:
         enter_rest(t_ns, _WAITING, _HELD, site)
-    elif order == _TO_STOP and mode == _STOPPED:
+    elif order == _ORDER_STOP and mode == _STOPPED:
         site.reason = _STOP
-    elif order in (_TO_STOP, _LET_GO) and mode != _FAULT and mode != _STOPPED:
-        latch_mode(t_ns, site, _STOPPED, _STOP if order == _TO_STOP else _RELEASED)
+    elif order in (_ORDER_STOP, _ORDER_RELEASED) and mode != _FAULT and mode != _STOPPED:
+        latch_mode(t_ns, site, _STOPPED, _STOP if order == _ORDER_STOP else _RELEASED)
     elif mode in (_FAULT, _STOPPED):
         return
-    elif order == _LOSE_ARM or skipped > FAULT_OVERRUN_TICKS:
-        latch_mode(t_ns, site, _FAULT, _ARM_SILENT if order == _LOSE_ARM else _OVERRUN)
-    elif order == _HEAR_SILENCE and moves:
+    elif order == _ORDER_ARM_LOST or skipped > FAULT_OVERRUN_TICKS:
+        latch_mode(t_ns, site, _FAULT, _ARM_SILENT if order == _ORDER_ARM_LOST else _OVERRUN)
+    elif order == _ORDER_ARM_SILENT and moves:
         enter_rest(t_ns, _HOLD, _ARM_SILENT, site)
-    elif order == _HEAR_SILENCE:
+    elif order == _ORDER_ARM_SILENT:
         site.reason = _ARM_SILENT
-    elif order == _HEAR_ARM and site.reason == _ARM_SILENT:
+    elif order == _ORDER_ARM_BACK and site.reason == _ARM_SILENT:
         site.reason = _ARM_BACK
     elif skipped > HELD_OVERRUN_TICKS and moves:
         enter_rest(t_ns, _HOLD, _OVERRUN, site)
 
 
 @leaf
-def _update_mode(t_ns: int, site: Row, links: RowArray) -> None:
-    """Changes the mode where limits or the peers ask for it."""
+def _update_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
+    """Changes the mode for a fault of the motion, or for silent or returning peers."""
     fault = _find_fault(site)
     if fault >= 0 and site.mode != _FAULT:
         latch_mode(t_ns, site, _FAULT, fault)
@@ -232,21 +251,21 @@ def _update_mode(t_ns: int, site: Row, links: RowArray) -> None:
     elif not heard and (site.mode == _RUN or site.mode == _ALIGN):
         enter_rest(t_ns, _HOLD, _PEER_SILENT, site)
     elif site.regrouped and (site.mode == _RUN or site.mode == _ALIGN):
-        _carry_on(site)
-        _begin_aligning(
+        _extrapolate_reference(site)
+        _start_alignment(
             t_ns=t_ns, site=site, reason=site.regrouped, q=site.q_followed, qd=site.qd_followed
         )
-    elif site.mode == _ALIGN and (t_ns - site.return_from_ns) * 1e-9 >= _align_s(site):
+    elif site.mode == _ALIGN and (t_ns - site.return_from_ns) * 1e-9 >= _alignment_s(site):
         site.mode = _RUN
         site.reason = _ALIGNED
         site.return_from_ns = t_ns
 
 
 @leaf
-def update_session_life(t_ns: int, site: Row, links: RowArray) -> None:
-    """Changes the mode, and from the peers' reference makes the one that the mode asks for.
+def update_session_life(t_ns: int, site: SiteRow, links: RowArray) -> None:
+    """Changes the mode, and turns the peers' reference into the reference of the mode.
 
-    The reference of the tick before is in `q_followed` and `qd_followed`.
+    The reference of the previous tick is in `q_followed` and `qd_followed`.
     """
     if site.mode == _DIVERGED:
         return
@@ -254,39 +273,41 @@ def update_session_life(t_ns: int, site: Row, links: RowArray) -> None:
         enter_rest(t_ns, _WAITING, _START, site)
     ticks = 1 + site.skipped
     if site.order != 0 or site.skipped != 0:
-        _obey(t_ns, site)
+        _apply_order(t_ns, site)
     if rests(site):
         advance_rest_reference(t_ns, ticks, site)
     _update_mode(t_ns, site, links)
     if site.mode == _ALIGN:
-        _put_aligning(t_ns, site)
+        _add_offset(t_ns, site)
     elif rests(site):
         put_rest_reference(site, site.q_des, site.qd_des)
 
 
 @leaf
-def _find_way(t_ns: int, takes_s: float, site: Row, i: int) -> tuple[float, float]:
-    """Returns what is left of the way from the peers' reference, and its rate."""
-    x = (t_ns - site.return_from_ns) * 1e-9 / takes_s
-    way = site.q_held[i]
-    rate = takes_s * site.qd_held[i]
-    left = way * (1.0 - x * x * (3.0 - 2.0 * x)) + rate * x * (1.0 - x) * (1.0 - x)
-    return left, (rate * (1.0 - x) * (1.0 - 3.0 * x) - way * 6.0 * x * (1.0 - x)) / takes_s
+def _find_offset(t_ns: int, duration_s: float, site: SiteRow, i: int) -> tuple[float, float]:
+    """Returns the offset of coordinate i from the peers' reference, and its rate."""
+    x = (t_ns - site.return_from_ns) * 1e-9 / duration_s
+    start = site.q_held[i]
+    start_rate = duration_s * site.qd_held[i]
+    offset = start * (1.0 - x * x * (3.0 - 2.0 * x)) + start_rate * x * (1.0 - x) * (1.0 - x)
+    slope = start_rate * (1.0 - x) * (1.0 - 3.0 * x) - start * 6.0 * x * (1.0 - x)
+    return offset, slope / duration_s
 
 
 @leaf
-def _put_aligning(t_ns: int, site: Row) -> None:
-    """Adds what is left of the way to the peers' reference, and its rate."""
-    takes_s = _align_s(site)
+def _add_offset(t_ns: int, site: SiteRow) -> None:
+    """Adds the offset of an alignment and its rate to the peers' reference."""
+    duration_s = _alignment_s(site)
     for i in range(count_linear_coordinates(site)):
-        left, rate = _find_way(t_ns, takes_s, site, i)
-        site.q_des[i] += left
+        offset, rate = _find_offset(t_ns, duration_s, site, i)
+        site.q_des[i] += offset
         site.qd_des[i] += rate
     if has_orientation(site):
-        x, wx = _find_way(t_ns, takes_s, site, 3)
-        y, wy = _find_way(t_ns, takes_s, site, 4)
-        z, wz = _find_way(t_ns, takes_s, site, 5)
+        x, x_rate = _find_offset(t_ns, duration_s, site, 3)
+        y, y_rate = _find_offset(t_ns, duration_s, site, 4)
+        z, z_rate = _find_offset(t_ns, duration_s, site, 5)
         turn = (x, y, z)
-        carried = rotate_by_vector(turn, three(site.qd_des[3:]))
+        peers_rate = rotate_by_vector(turn, three(site.qd_des[3:]))
+        turn_velocity = angular_velocity(turn, (x_rate, y_rate, z_rate))
         put_three(site.q_des[3:], compose_rotations(turn, three(site.q_des[3:])))
-        put_three(site.qd_des[3:], add(angular_velocity(turn, (wx, wy, wz)), carried))
+        put_three(site.qd_des[3:], add(turn_velocity, peers_rate))
