@@ -1,6 +1,6 @@
-"""The setup of a site: resolved numbers and names.
+"""The setup of a site: the resolved numbers and names from which a site is built.
 
-Invariant: nothing else influences a site's numbers.
+Invariant: besides the setup, only the inputs of the ticks influence a site's numbers.
 """
 
 import math
@@ -23,10 +23,11 @@ from .vectors import Array, Points, Vector
 
 
 class Scheme(IntEnum):
-    """How the continuous law is sampled.
+    """The sampling of the continuous law.
 
-    SECOND_ORDER extrapolates the torque to mid-period and updates the estimate by the trapezoid
-    rule; DIGITAL is zero-order hold and forward Euler, as in a plain digital controller.
+    SECOND_ORDER extrapolates the torque to the middle of the period and updates the estimate by
+    the trapezoid rule. DIGITAL is zero-order hold and forward Euler, as in a plain digital
+    controller.
     """
 
     SECOND_ORDER = 0
@@ -36,10 +37,9 @@ class Scheme(IntEnum):
 class Law(IntEnum):
     """The control law of a site.
 
-    ADAPTIVE is the paper's, Eq. (13) and (15), with its estimate in a box if one is given.
-    KNOWN knows
-    gravity: tau = G(q) - K e - d qd - Kd ed + k_f felt, which is P+d, PD+d, or direct force
-    reflection. USER is a user's law, in Python.
+    ADAPTIVE is the paper's law, Eq. (13) and (15), with its estimate in a box if bounds are
+    given. KNOWN assumes known gravity: tau = G(q) - K e - d qd - Kd ed + k_f felt, which is P+d,
+    PD+d or direct force reflection. USER is a law in Python, of a user or of `trilat_net.laws`.
     """
 
     ADAPTIVE = 0
@@ -48,15 +48,15 @@ class Law(IntEnum):
 
 
 LEAST_STOP_S = 0.1
-"""The least time in which the reference of an arm that is to rest comes to rest."""
+"""Shortest time in which the reference of an arm comes to rest, s."""
 
 
 class StaleAction(IntEnum):
     """The action of a site while a peer that it follows is stale.
 
-    USE goes on with the last sample; HOLD stays at the reference that was in force; BRAKE stays
-    where the arm was. GLIDE lets the reference come to rest, and begins by waiting for all
-    peers, see `session_life`.
+    USE continues with the last sample. HOLD keeps the last reference, BRAKE the pose of the arm.
+    GLIDE lets the reference come to rest, and starts by waiting for all peers, see
+    `session_life`.
     """
 
     USE = 0
@@ -66,17 +66,16 @@ class StaleAction(IntEnum):
 
 
 class StaleRule(NamedTuple):
-    """When a peer counts as stale, and the consequence.
+    """The condition under which a peer is stale, and the consequence.
 
     Attributes:
-        action: the site's action then.
-        age_ns: a peer whose sample in use is older is stale, ns; of GLIDE one of which none
-            came into use for so long.
+        action: the action of the site while a peer is stale.
+        age_ns: largest age of the sample in use, ns; for GLIDE the largest time since a sample
+            of the peer came into use.
         return_ns: duration of the return to the peers, ns.
-        align_speed: of GLIDE, the largest speed of the way to the peers, rad/s (of a place
-            m/s).
-        align_limit: of GLIDE, the longest way that it goes by itself, rad (of a place m).
-        degrades: of GLIDE, true: it goes on without a peer that is lost, see `lost_peers`.
+        align_speed: for GLIDE, the largest speed of an alignment, rad/s (of a position m/s).
+        align_limit: for GLIDE, the longest distance of an alignment, rad (of a position m).
+        degrades: for GLIDE, true: the site goes on without a lost peer, see `lost_peers`.
     """
 
     action: StaleAction = StaleAction.USE
@@ -88,8 +87,9 @@ class StaleRule(NamedTuple):
 
 
 class MotionLimits(NamedTuple):
-    """How far an arm may go, and how fast its reference and its torque may change; one number,
-    or one each.
+    """Limits of an arm's angles, and of the rates of its reference and torque.
+
+    Each is one number for all, or one number per joint or coordinate.
 
     Attributes:
         q_min: least joint angles, rad.
@@ -105,12 +105,13 @@ class MotionLimits(NamedTuple):
 
 
 class RestGains(NamedTuple):
-    """How an arm comes to rest and stays there, see `resting`; one number, or one per joint.
+    """The gains of an arm that comes to rest, see `resting`; one number, or one per joint.
 
     Attributes:
         damping: B, N m s/rad.
-        time_s: time in which B alone brings the joint to rest whose inertia it was made for, s.
-        deceleration: of the reference, rad/s^2.
+        time_s: time constant in which B alone stops a joint of the inertia for which B was
+            chosen, s.
+        deceleration: deceleration of the reference, rad/s^2.
     """
 
     damping: Vector = (0.0,)
@@ -118,7 +119,7 @@ class RestGains(NamedTuple):
     deceleration: Vector = (math.inf,)
 
     def vectors(self) -> dict[str, Vector]:
-        """Returns the gains that the core has: k B besides, k one quarter of 1 / time_s."""
+        """Returns the gains for the core: B, k B with k = 1 / (4 time_s), and the deceleration."""
         integral = tuple(float(B) / (4.0 * self.time_s) for B in self.damping)
         return {
             "damping": self.damping,
@@ -127,33 +128,37 @@ class RestGains(NamedTuple):
         }
 
     def stop_s(self, qd: Array) -> Array:
-        """Returns the time in which the reference comes to rest from velocities of shape (...,
-        n), rad/s.
+        """Returns the time in which the reference comes to rest from joint velocities, s.
+
+        Args:
+            qd: joint velocities, shape (..., n), rad/s.
         """
-        found: Array = np.maximum(LEAST_STOP_S, (np.abs(qd) / self.deceleration).max(axis=-1))
-        return found
+        slowest_s = (np.abs(qd) / self.deceleration).max(axis=-1)
+        duration_s: Array = np.maximum(LEAST_STOP_S, slowest_s)
+        return duration_s
 
 
 class LinkSetup(NamedTuple):
-    """One peer as a site sees it.
+    """The setup of the link from one peer to a site.
 
     Attributes:
         peer: the peer's name.
         alpha: its dominance factor in this site's reference, Eq. (6), dimensionless.
         rate_hz: the peer's tick rate, Hz.
-        q0: the peer's start pose, rad, or its end effector's, in use until its first sample is
-            due (L7).
+        q0: the start pose of the peer, rad, or of its end effector; in use until the first
+            sample is due (L7).
         key: the key of the link's draws, see `link_key`.
-        models: in the order of their first stamps; the first applies from stamp 0.
+        models: the models of the link in the order of their first stamps; the first one applies
+            from stamp 0.
         traces: per model the points of its trace, shape (n, 2), see `Points`, or None.
-        outages: when the link is cut: pairs of first stamp and end, ns.
-        channel: what the peer's law sends besides its motion.
-        index_at_peer: the site's place among the peers of its peer, in scenario order.
-        speed_limit: largest speed of the peer's joints, rad/s, for who drops samples beyond; ()
-            for no one.
-        bit: of the peer in sets of sites.
+        outages: the interruptions of the link: pairs of first stamp and end, ns.
+        channel: the numbers that the peer's law sends besides its motion.
+        index_at_peer: the index of the site among the peers of its peer, in scenario order.
+        speed_limit: largest speeds of the peer's joints, rad/s, beyond which its samples are
+            dropped; (): no limit.
+        bit: the bit of the peer in sets of sites.
         followed: the set of sites that the peer follows.
-        dispensable: true: a site that degrades may go on without it.
+        dispensable: true: a site that degrades may go on without the peer.
     """
 
     peer: str
@@ -173,17 +178,17 @@ class LinkSetup(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """How many numbers the vectors of a site have.
+    """The lengths of a site's vectors.
 
     Attributes:
-        joints: one per joint of the arm.
-        shared: one per coordinate that sites exchange.
-        parameters: one per dynamic parameter of the arm.
-        chain: true: the arm is a chain of joints, else the planar two-link arm.
-        task: true: the coordinates are those of the end effector, else the joint angles.
+        joints: joints of the arm.
+        shared: coordinates that sites exchange.
+        parameters: dynamic parameters of the arm.
+        chain: true: the arm is a chain of joints; false: the planar two-link arm.
+        task: true: the shared coordinates are those of the end effector; false: joint angles.
         sent: numbers that the law sends in a record, see `LawChannel.record_size`.
-        hand: numbers that a live hand has in a record, see `live_hand`; 0: the site has none.
-        bodies: numbers of the poses of its plant's bodies, see `TickRecord.bodies`.
+        hand: numbers of a live hand in a record, see `live_hand`; 0: no live hand.
+        bodies: numbers of the poses of the plant's bodies, see `TickRecord.bodies`.
     """
 
     joints: int = JOINTS
@@ -199,21 +204,28 @@ class Layout(NamedTuple):
     def of_arm(
         cls, chain: "ChainSetup | None", sent: int = 0, actors: Sequence[TorqueSource] = ()
     ) -> "Layout":
-        """Returns the layout of a chain, or without one of the planar two-link arm; its law
-        sends so much.
+        """Returns the layout of an arm.
+
+        Args:
+            chain: the chain of joints; None: the planar two-link arm.
+            sent: numbers that the law sends in a record.
+            actors: operators and environments, among them a live hand or none.
         """
-        n = JOINTS if chain is None else len(chain.joints)
+        joints = JOINTS if chain is None else len(chain.joints)
         live = next((actor.kind for actor in actors if actor.kind in LIVE_KINDS), None)
-        size = n if live is TorqueKind.LIVE_JOINT else 2 if chain is None else 3
-        hand = 0 if live is None else count_hand_numbers(size)
+        if live is None:
+            hand = 0
+        elif live is TorqueKind.LIVE_JOINT:
+            hand = count_hand_numbers(joints)
+        else:
+            hand = count_hand_numbers(2 if chain is None else 3)
         if chain is None:
             return cls(sent=sent, hand=hand)
         task = chain.task
-        shared = n if task is None else len(task.axes)
         return cls(
-            joints=n,
-            shared=shared,
-            parameters=LINK_PARAMETERS * n,
+            joints=joints,
+            shared=joints if task is None else len(task.axes),
+            parameters=LINK_PARAMETERS * joints,
             chain=True,
             task=task is not None,
             sent=sent,
@@ -225,22 +237,22 @@ class Layout(NamedTuple):
         return {"joints": self.joints, "shared": self.shared, "parameters": self.parameters}
 
     def lengths(self) -> dict[str, int]:
-        """Returns how many numbers the vectors of a record have, in their order."""
+        """Returns the lengths of the vectors of a record, in their order."""
         n = self.joints
         m = self.shared
-        vectors = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
-        shared = {"x": m, "xd": m, "wrench": m} if self.task else {}
-        others = {"ch": self.sent, "hand": self.hand, "bodies": self.bodies}
-        given = {name: count for name, count in others.items() if count}
-        return {**vectors, "theta_hat": self.parameters, **shared, **given}
+        lengths = {"q": n, "qd": n, "q_des": m, "qd_des": m, "tau": n, "tau_x": n}
+        lengths["theta_hat"] = self.parameters
+        if self.task:
+            lengths |= {"x": m, "xd": m, "wrench": m}
+        optional = {"ch": self.sent, "hand": self.hand, "bodies": self.bodies}
+        lengths |= {name: count for name, count in optional.items() if count}
+        return lengths
 
     def columns(self) -> dict[str, slice]:
-        """Returns where the vectors that a tick computes stand in its row of floats, in their
-        order.
-        """
-        lengths = {
-            name: n for name, n in self.lengths().items() if name not in ("hand", "bodies")
-        }
+        """Returns the columns of each vector in the row of floats that a tick computes."""
+        lengths = self.lengths()
+        for name in ("hand", "bodies"):  # inputs of the tick
+            lengths.pop(name, None)
         ends = accumulate(lengths.values())
         return {
             name: slice(end - length, end)
@@ -248,50 +260,51 @@ class Layout(NamedTuple):
         }
 
     def count_life_memory(self, peers: int, *, degrades: bool = False) -> int:
-        """Returns how many numbers a site that glides, with so many peers, has in a record's
-        `mem`.
+        """Returns the length of the memory of `session_life` in a record's `mem`.
 
-        In task space there are the pose and the velocities of `rest_columns`. Of one that
-        degrades the last of them are `gone` of its peers.
+        In task space it contains the pose and the velocities of `rest_columns`. The memory of a
+        site that degrades ends with `gone` of its peers.
+
+        Args:
+            peers: the number of peers.
+            degrades: true: the site goes on without lost peers.
         """
         end: int = self.rest_columns(peers).stop
         return end + peers * degrades
 
     def rest_columns(self, peers: int) -> slice:
-        """Returns where `mem` has the joint pose and the velocities from which an arm in task
-        space rests.
+        """Returns the columns of the rest reference in the `mem` of a site in task space.
+
+        They hold the pose of the joints and then their velocities. In joint space there are no
+        such columns.
         """
         first = 2 * (self.shared + 1) + peers + self.joints
         return slice(first, first + 2 * self.joints * self.task)
 
     def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
-        """Returns the peers without which a site that degrades goes on, by a record's `mem`."""
+        """Returns the names of the lost peers of a site that degrades, from a record's `mem`."""
         end = self.count_life_memory(len(peers), degrades=True)
-        return [
-            peer for peer, gone in zip(peers, mem[end - len(peers) : end], strict=False) if gone
-        ]
+        all_gone = mem[end - len(peers) : end]
+        # A record of another rule has a shorter memory, and then no lost peers.
+        return [peer for peer, gone in zip(peers, all_gone, strict=False) if gone]
 
     @property
     def floats(self) -> int:
-        """Length of a record's row of floats."""
-        return (
-            4 * self.joints
-            + (5 if self.task else 2) * self.shared
-            + self.parameters
-            + self.sent
-        )
+        """The length of the row of floats that a tick computes."""
+        shared_vectors = 5 if self.task else 2
+        return 4 * self.joints + shared_vectors * self.shared + self.parameters + self.sent
 
 
 class TaskSetup(NamedTuple):
-    """How a site follows with its end effector.
+    """The setup of a site that follows its peers with its end effector.
 
     Attributes:
-        axes: per coordinate 1: the site follows along it, 0: not. Three of them: a place; six:
-            a pose.
+        axes: per coordinate 1 if the site follows along it, otherwise 0. Three coordinates are
+            a position, six are a pose.
         scale: metres of the task per metre of this arm.
-        posture: joint angles that it moves towards as far as the task leaves it free, rad.
-        posture_rate: by how much of the way in a second, 1/s.
-        singular_value: least singular value of the Jacobian that needs no damping, m/rad.
+        posture: joint angles that the arm seeks as far as the task leaves it free, rad.
+        posture_rate: rate of the approach to the posture, 1/s.
+        singular_value: least singular value of the Jacobian without damping, m/rad.
     """
 
     axes: tuple[float, ...]
@@ -302,14 +315,14 @@ class TaskSetup(NamedTuple):
 
 
 class ChainSetup(NamedTuple):
-    """An arm that is a chain of joints.
+    """The setup of an arm that is a chain of joints.
 
     Attributes:
-        joints: its joints, from the base on.
-        gravity_m_s2: gravitational acceleration in the base's frame.
-        tip_m: the end effector in the last link's frame.
-        tip_rotation: its orientation there.
-        task: how it follows with its end effector; None: it follows joint by joint.
+        joints: the joints, from the base on.
+        gravity_m_s2: gravitational acceleration in the frame of the base, m/s^2.
+        tip_m: position of the end effector in the frame of the last link, m.
+        tip_rotation: orientation of the end effector in that frame.
+        task: the setup in task space; None: the arm follows joint by joint.
     """
 
     joints: tuple[ChainJoint, ...]
@@ -320,10 +333,9 @@ class ChainSetup(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """A control law and its gains, diagonal ones as vectors; those of other laws have no
-    effect.
+    """A control law and its gains; gains of other laws have no effect.
 
-    A vector of one number stands for one whose entries are all that number.
+    Diagonal matrices are vectors. A vector of one number has this number for all its entries.
 
     Attributes:
         law: the law.
@@ -334,15 +346,15 @@ class Gains(NamedTuple):
         theta_hat0: the first estimate, shape (P,).
         low: lower bound of each estimate, shape (P,).
         high: upper bound, shape (P,).
-        known: the parameters that KNOWN takes the arm to have, shape (P,).
+        known: the parameters that KNOWN assumes, shape (P,).
         K: stiffness of KNOWN, shape (n,), N m/rad.
         d: damping of KNOWN, shape (n,), N m s/rad.
         k_f: gain of the reflected force of KNOWN, shape (n,), dimensionless.
         rho: largest robust torque of ADAPTIVE, shape (n,), N m.
-        width: speed r at which it is 0.71 of that, shape (n,), rad/s.
+        width: speed r at which the robust torque is 0.71 rho, shape (n,), rad/s.
         friction: share of a chain's joint friction that ADAPTIVE compensates, shape (n,).
-        absolute: true: r of ADAPTIVE is qd + Lambda q, and Kp takes it to that of the peers;
-            only linearised.
+        absolute: true: r of ADAPTIVE is qd + Lambda q, and Kp couples it to r of the peers; only
+            linear analysis uses this.
     """
 
     law: Law
@@ -364,34 +376,34 @@ class Gains(NamedTuple):
 
 
 class SiteSetup(NamedTuple):
-    """All that a site is built from.
+    """All numbers and names from which a site is built.
 
     Attributes:
         name: the site's name.
-        rate_hz: tick rate, Hz.
-        scheme: how the law is sampled.
+        rate_hz: the tick rate, Hz.
+        scheme: the sampling of the law.
         gains: the law and its gains.
-        theta: true parameters of the arm, shape (P,).
-        g_m_s2: gravitational acceleration, m/s^2; of a chain its setup says it.
-        lengths_m: of the two links; of a chain without effect.
+        theta: the true parameters of the arm, shape (P,).
+        g_m_s2: gravitational acceleration, m/s^2; a chain has that of its setup instead.
+        lengths_m: lengths of the two links, m; without effect for a chain.
         tau_limit_nm: largest control torque of a joint, N m; one number, or one per joint.
         qd_limit_rad_s: joint speed beyond which the run counts as diverged, rad/s.
-        q0: start pose, rad.
-        qd0: start velocity, rad/s.
+        q0: the start pose, rad.
+        qd0: the start velocity, rad/s.
         actors: operators and environments.
-        links: the peers in scenario order.
-        ramps: scripted changes of the dominance factors, in the order of their starts.
+        links: the links from the peers, in scenario order.
+        ramps: the scripted changes of the dominance factors, in the order of their starts.
         on_stale: the rule for a stale peer.
-        external: true: the arm is outside of the program; it is measured, and nothing is
-            integrated.
-        law_factory: makes the user's law, if it is one.
-        theta_known: false: `theta` is not that of the arm, which is outside of the program and
-            unidentified.
-        chain: the arm, if it is a chain; None: it is the planar two-link arm.
-        channel: what the site's law sends to its peers.
-        limits: further limits.
-        rest: how its arm comes to rest.
-        bit: of the site in sets of sites.
+        external: true: the arm is outside of the program: it is measured, and not integrated.
+        law_factory: creates the user's law; None: the kernel computes the law.
+        theta_known: false: `theta` does not describe the arm, which is external and not
+            identified.
+        chain: the arm if it is a chain; None: the planar two-link arm.
+        channel: the numbers that the site's law sends to its peers.
+        limits: limits of the motion.
+        rest: the gains with which the arm comes to rest.
+        bit: the bit of the site in sets of sites.
+        bodies: the number of bodies of the plant whose poses are recorded.
     """
 
     name: str
@@ -421,18 +433,18 @@ class SiteSetup(NamedTuple):
 
     @property
     def layout(self) -> Layout:
-        """How many numbers its vectors have."""
-        return Layout.of_arm(self.chain, self.channel.record_size, self.actors)._replace(
-            bodies=7 * self.bodies
-        )
+        """The lengths of the site's vectors."""
+        layout = Layout.of_arm(self.chain, self.channel.record_size, self.actors)
+        return layout._replace(bodies=7 * self.bodies)
 
     @property
     def received_vectors(self) -> tuple[SentVector, ...]:
-        """The vectors that its law finds of each peer; one that a peer does not send is zero."""
-        return join_received([*(link.channel for link in self.links), self.channel])
+        """The vectors that the law reads of each peer; zero if the peer does not send them."""
+        channels = [link.channel for link in self.links]
+        return join_received([*channels, self.channel])
 
     def law_context(self) -> LawContext:
-        """Returns what a plugged law may know before it begins."""
+        """Returns the facts that a user's law gets when it is created."""
         return LawContext(
             site=self.name,
             rate_hz=self.rate_hz,
