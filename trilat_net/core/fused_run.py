@@ -1,11 +1,14 @@
-"""A run of all sites in virtual time, compiled as a whole and reduced to peaks as it proceeds.
+"""A run of all sites in virtual time, compiled as a whole and reduced to peaks and sums.
 
-Invariant: its leaves are those of `Site.step`, in the order of the virtual-time driver (nominal
-time, then the scenario's order of sites), and its numbers are that driver's, bit for bit.
+Invariant:
+
+- Its leaves are those of `Site.step`, in the order of the virtual-time driver: by nominal time,
+  then by the scenario's order of sites.
+- Its numbers are those of that driver, bit for bit.
 """
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,38 +18,27 @@ from .exogenous import TorqueSourceRows, TorqueTable
 from .jit import leaf
 from .kernel import act_stages, channel_of, reference_stages, torque_stage
 from .link import LinkArrays, accept_sample, release_sample
+from .row_fields import ProgressRow, SiteRow, SumsRow, row_dtype
 from .site_arrays import SiteArrays
 from .task_space import POSITION
 from .ticks import BUCKETS_PER_S, Mode, tick_ns
 from .vectors import Array, IntArray, Row, RowArray
 
 NEVER_NS = 2**63 - 1
-"""The time of the next tick of a site that has made all its ticks."""
+"""The time of the next tick of a site that has made all its ticks, ns."""
 
-_PROGRESS = (
-    "tick",
-    "t_ns",
-    "ticks",
-    "rate_hz",
-    "bucket",
-    "part",
-    "unsettled_ns",
-    "diverged_ns",
-)
-PROGRESS_DTYPE = np.dtype((np.record, [(name, "i8") for name in _PROGRESS]))
-"""A site's progress: its next tick and the time of that, how many it makes in all; the bucket,
-and how many BUCKETS_PER_S-th ticks of it are gone; when its |e| last was above the limit of
-rest, and when it diverged (-1: never).
-"""
+PROGRESS_DTYPE = row_dtype("progress", {})
+"""The layout of a site's progress, see `ProgressRow`."""
 
 
 class RecentRecords(NamedTuple):
-    """The last records of a site, kept as long as a peer may still want them; of all sites one
-    axis more.
+    """The last records of a site, kept while a peer may still need them, as a ring.
+
+    The records of all sites have one more axis in front.
 
     Attributes:
         t_ns: their nominal times, ns since the epoch, shape (a power of two,).
-        rows: their floats, see `Layout.columns`, a row each.
+        rows: their floats, see `Layout.columns`, one row per record.
     """
 
     t_ns: IntArray
@@ -55,48 +47,45 @@ class RecentRecords(NamedTuple):
 
 @cache
 def sums_dtype(joints: int) -> np.dtype[np.void]:
-    """Returns the layout of a site's sums over its records.
-
-    Of |tau - G|^2 and of e^2; the largest force of a wall; the work of its environments, from
-    which of its actors on (-1: it has none). And of the record before: q, the present and the
-    held torque of the environments; `off` is scratch.
-    """
-    fields: list[Any] = [("first_environment", "i8")]
-    fields += [(name, "f8") for name in ("effort", "force_peak_n", "environment_j")]
-    names = ("errors", "q", "now_before", "held_before", "G", "now", "held")
-    return np.dtype((np.record, fields + [(name, "f8", (joints,)) for name in names]))
+    """Returns the layout of a site's sums over its records, see `SumsRow`."""
+    return row_dtype("sums", {"joints": joints})
 
 
 _DIVERGED = int(Mode.DIVERGED)
 
 
 def max_over_joints(buckets: Array) -> Array:
-    """Returns the largest |e| and |qd| of any joint, of buckets as `run_until` makes them,
-    shape (K, 2).
+    """Returns the largest |e| and the largest |qd| over the joints, per bucket.
+
+    Args:
+        buckets: the peaks of a site, see `run_until`, shape (K, 3 n).
+
+    Returns:
+        Shape (K, 2), rad and rad/s.
     """
     joints = buckets.shape[1] // 3
-    found: Array = buckets[:, : 2 * joints].reshape(-1, 2, joints).max(axis=2)
-    return found
+    peaks: Array = buckets[:, : 2 * joints].reshape(-1, 2, joints).max(axis=2)
+    return peaks
 
 
 @leaf
-def _first_sent(s: Row) -> int:
-    """Returns where in a site's row of floats the numbers begin that its law sends."""
-    first: int = 4 * s.joints + (5 if s.task else 2) * s.shared + s.parameters
-    return first
+def _first_sent(s: SiteRow) -> int:
+    """Returns the first column of the numbers that a law sends in its site's row of floats."""
+    shared_vectors = 5 if s.task else 2
+    return 4 * s.joints + shared_vectors * s.shared + s.parameters
 
 
 class ReplayedInputs(NamedTuple):
-    """What came to the sites of a recorded run from outside, in place of prompt samples and
-    free hands.
+    """The arrivals and the live hands of a recorded run, which a fused run repeats.
 
     Attributes:
-        first: by site, peer and tick the place of its first arrival, shape (N, P, K + 1); K =
-            0: every sample comes at the first tick after its stamp.
-        samples: the ticks of the samples that arrive, in order.
-        hands: by site and tick grip, target, and target plus rate of its live hand, shape (N,
-            K, 1 + 2 size).
-        hand_rows: which of a site's torque sources that is, shape (N,); -1: it has none.
+        first: index into `samples` of the first arrival, by site, peer and tick, shape (N, P,
+            K + 1). With K = 0 each sample arrives at the first tick after its stamp.
+        samples: the stamps of the samples, in the order of their arrival.
+        hands: the action of the live hand by site and tick: grip, target, and target plus rate,
+            shape (N, K, 1 + 2 size). Without actions all hands are free.
+        hand_indices: per site the index of the live hand among the torque sources, shape (N,);
+            -1: no live hand.
     """
 
     first: IntArray
@@ -106,20 +95,23 @@ class ReplayedInputs(NamedTuple):
 
 
 @leaf
-def _accept_made(
-    k: int, rate_hz: int, peer: Row, sample: int, sent: RecentRecords, link: LinkArrays
+def _accept_record(
+    k: int, rate_hz: int, peer: SiteRow, sample: int, sent: RecentRecords, link: LinkArrays
 ) -> None:
-    """Accepts a sample that its sender has made."""
+    """Accepts the record of a peer's tick `sample` as an arrival at tick k.
+
+    The columns are those of `TickRecord.shared`.
+    """
     n = peer.joints
     m = peer.shared
+    first_sent = _first_sent(peer)
     q = 0
     qd = n
     tau_x = 3 * n + 2 * m
-    sent_at = _first_sent(peer)
     if peer.task:
-        q = sent_at - 3 * m
-        qd = sent_at - 2 * m
-        tau_x = sent_at - m
+        q = first_sent - 3 * m
+        qd = first_sent - 2 * m
+        tau_x = first_sent - m
     row = sent.rows[sample & (sent.t_ns.shape[0] - 1)]
     accept_sample(
         k=k,
@@ -128,34 +120,50 @@ def _accept_made(
         q=row[q:],
         qd=row[qd:],
         tau_x=row[tau_x:],
-        sent=row[sent_at:],
+        sent=row[first_sent:],
         link=link,
     )
 
 
 @leaf
-def _receive(
+def _accept_prompt_records(
     k: int,
     t_ns: int,
     rate_hz: int,
-    peer: Row,
-    made: int,
+    peer: SiteRow,
+    records: int,
     next_sample: int,
     sent: RecentRecords,
     link: LinkArrays,
 ) -> int:
-    """Accepts a peer's samples before time t, of the `made` there are; returns which is the
-    next.
+    """Accepts a peer's records with a stamp before time t, as if they arrived without delay.
+
+    Args:
+        k: the tick of the receiver.
+        t_ns: its nominal time, ns since the epoch.
+        rate_hz: its tick rate, Hz.
+        peer: the row of the peer.
+        records: the number of records that the peer has made.
+        next_sample: the first record that was not accepted yet.
+        sent: the last records of the peer.
+        link: the link from the peer.
+
+    Returns:
+        The first record that is not accepted yet.
     """
-    while next_sample < made and sent.t_ns[next_sample & (sent.t_ns.shape[0] - 1)] < t_ns:
-        _accept_made(k=k, rate_hz=rate_hz, peer=peer, sample=next_sample, sent=sent, link=link)
+    while next_sample < records and sent.t_ns[next_sample & (sent.t_ns.shape[0] - 1)] < t_ns:
+        _accept_record(
+            k=k, rate_hz=rate_hz, peer=peer, sample=next_sample, sent=sent, link=link
+        )
         next_sample += 1
     return next_sample
 
 
 @leaf
-def _take_hand(i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs) -> None:
-    """Lets the live hand of a site do what it did at tick k."""
+def _apply_recorded_hand(
+    i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs
+) -> None:
+    """Writes the recorded action of the live hand of site i at tick k into its row."""
     if feed.hand_indices[i] < 0 or k >= feed.hands.shape[1]:
         return
     hand: Row = actors[feed.hand_indices[i]]
@@ -168,30 +176,49 @@ def _take_hand(i: int, k: int, actors: TorqueSourceRows, feed: ReplayedInputs) -
 
 @leaf
 def _update_peaks(
-    row: Array, t_ns: int, apart_rad: float, s: Row, progress: Row, peaks: Array, sums: Row
+    row: Array,
+    t_ns: int,
+    settled_rad: float,
+    s: SiteRow,
+    progress: ProgressRow,
+    peaks: Array,
+    sums: SumsRow,
 ) -> None:
-    """Updates the present bucket by a record, see `run_until`; a full bucket is left."""
-    error = 0.0
+    """Updates the peaks of the present bucket by a record, and advances to the next bucket.
+
+    Args:
+        row: the floats of the record.
+        t_ns: its nominal time, ns since the epoch.
+        settled_rad: errors below this are settled, rad.
+        s: the row of the site.
+        progress: the progress of the site.
+        peaks: the peaks of the site, see `run_until`, shape (buckets, 3 n).
+        sums: the sums of the site.
+    """
+    largest_error = 0.0
     bucket = progress.bucket
     joints = peaks.shape[1] // 3
-    here = _first_sent(s) - 3 * s.shared if s.task else 0
-    # where a task has more or fewer coordinates than there are joints, zeros stand
+    pose = _first_sent(s) - 3 * s.shared if s.task else 0
+    reference = 2 * s.joints
+    # A task may have fewer coordinates than the arm has joints, or more: the rest are zeros.
     for i in range(joints):
-        e = speed = angle = 0.0
+        e = 0.0
+        speed = 0.0
+        angle = 0.0
         if i < s.shared:
-            e = row[here + i] - row[2 * s.joints + i]
-            if i >= POSITION and s.task:  # of an orientation
+            e = row[pose + i] - row[reference + i]
+            if i >= POSITION and s.task:  # an orientation: differences of vectors are no error
                 e = s.e[i]
         if i < s.joints:
             speed = abs(row[s.joints + i])
             angle = row[i]
         sums.errors[i] += e * e
-        apart = abs(e)
-        error = max(error, apart)
-        peaks[bucket, i] = max(peaks[bucket, i], apart)
+        error = abs(e)
+        largest_error = max(largest_error, error)
+        peaks[bucket, i] = max(peaks[bucket, i], error)
         peaks[bucket, joints + i] = max(peaks[bucket, joints + i], speed)
         peaks[bucket, 2 * joints + i] = angle
-    if error >= apart_rad:
+    if largest_error >= settled_rad:
         progress.unsettled_ns = t_ns
     progress.part += BUCKETS_PER_S
     while progress.part >= progress.rate_hz:
@@ -200,7 +227,8 @@ def _update_peaks(
 
 
 @leaf
-def _put_gravity_torque(s: Row, chain: RowArray | None, row: Array, torque: Array) -> None:
+def _put_gravity_torque(s: SiteRow, chain: RowArray | None, row: Array, torque: Array) -> None:
+    """Writes the gravity torque at the pose of a record, N m."""
     if chain is None:
         two_link_stages.put_gravity_torque(s, torque)
     else:
@@ -210,7 +238,7 @@ def _put_gravity_torque(s: Row, chain: RowArray | None, row: Array, torque: Arra
 @leaf
 def _put_source_torque(
     t_s: float,
-    s: Row,
+    s: SiteRow,
     chain: RowArray | None,
     row: Array,
     actors: TorqueSourceRows,
@@ -218,6 +246,7 @@ def _put_source_torque(
     sampled: int,
     torque: Array,
 ) -> None:
+    """Writes the torque of the actors with this `sampled` at the state of a record, N m."""
     if chain is None:
         two_link_stages.put_source_torque(
             t_s=t_s, s=s, state=row, actors=actors, table=table, sampled=sampled, torque=torque
@@ -239,14 +268,18 @@ def _put_source_torque(
 def _update_sums(
     k: int,
     t_ns: int,
-    s: Row,
+    s: SiteRow,
     chain: RowArray | None,
     actors: TorqueSourceRows,
     table: TorqueTable,
     row: Array,
-    sums: Row,
+    sums: SumsRow,
 ) -> None:
-    """Adds a record to the effort, and the period before it to the work of the environments."""
+    """Adds a record to the effort, and the period before it to the work of the environments.
+
+    The work over a period is the mean of the present torque at both ends (trapezoid rule), plus
+    the torque held over the period, times the change of q.
+    """
     n = s.joints
     t_s = t_ns * 1e-9
     first = sums.first_environment
@@ -254,15 +287,16 @@ def _update_sums(
     tau = 2 * (n + s.shared)
     effort = 0.0
     for i in range(n):
-        off = row[tau + i] - sums.G[i]
-        effort += off * off
+        beyond_gravity = row[tau + i] - sums.G[i]
+        effort += beyond_gravity * beyond_gravity
     sums.effort += effort
     if first < 0:
         return
     for i in range(n):
         sums.held[i] = s.held[i]
         sums.now[i] = s.on_arm[i] - s.held[i]
-    if first > 0:  # beside operators, whose rows come first
+    # Rows of operators come first. With operators, s.held and s.on_arm contain their torque too.
+    if first > 0:
         _put_source_torque(
             t_s=t_s,
             s=s,
@@ -294,13 +328,13 @@ def _update_sums(
 
 
 class LawArrays(NamedTuple):
-    """The plugged laws of all sites.
+    """The users' laws of all sites.
 
     Attributes:
-        addresses: of the machine code of each site's law, shape (N,); 0: it has none, see
-            `CompiledLaw`.
+        addresses: the address of the machine code of each site's law, shape (N,), see
+            `CompiledLaw`; 0: the law has none.
         rows: the numbers of each law, shape (N, most).
-        sent: what each law sends, shape (N, most).
+        sent: the numbers that each law sends, shape (N, most).
     """
 
     addresses: IntArray
@@ -309,10 +343,14 @@ class LawArrays(NamedTuple):
 
 
 @leaf
-def _find_torque(
-    i: int, own: Row, arrays: SiteArrays, chain: RowArray | None, laws: LawArrays | None
+def _compute_torque(
+    i: int,
+    progress: ProgressRow,
+    arrays: SiteArrays,
+    chain: RowArray | None,
+    laws: LawArrays | None,
 ) -> None:
-    """Stage 6 of a site; a law in plain Python was asked already."""
+    """Runs stage 6 of site i; the driver has already called a law in plain Python."""
     if laws is None:
         torque_stage(arrays.site[i], chain)
         return
@@ -320,26 +358,22 @@ def _find_torque(
     if laws.addresses[i] == 0 or channel is None:
         torque_stage(arrays.site[i], chain)
         return
-    site = arrays.site[i]
-    links = arrays.links[i]
-    row = laws.rows[i]
-    sent = laws.sent[i]
-    address = laws.addresses[i]
     law_stage(
-        k=own.tick,
-        t_ns=own.t_ns,
-        address=address,
-        law=row,
-        site=site,
-        links=links,
+        k=progress.tick,
+        t_ns=progress.t_ns,
+        address=laws.addresses[i],
+        law=laws.rows[i],
+        site=arrays.site[i],
+        links=arrays.links[i],
         chain=chain,
         channel=channel,
-        sent=sent,
+        sent=laws.sent[i],
     )
 
 
 @leaf
-def _record_sent(s: Row, i: int, row: Array, laws: LawArrays | None) -> None:
+def _record_sent(s: SiteRow, i: int, row: Array, laws: LawArrays | None) -> None:
+    """Writes the numbers that the law of site i sends into its record."""
     if laws is not None:
         first = _first_sent(s)
         for c in range(s.sent):
@@ -350,22 +384,21 @@ def _record_sent(s: Row, i: int, row: Array, laws: LawArrays | None) -> None:
 def sense_site(
     i: int,
     progress: RowArray,
-    taken: IntArray,
+    next_samples: IntArray,
     sent: RecentRecords,
     feed: ReplayedInputs,
     arrays: SiteArrays,
     chain: RowArray | None,
 ) -> None:
-    """Stages 1 to 5 of a site's next tick."""
-    own: Row = progress[i]
-    k = own.tick
-    t_ns = own.t_ns
-    rate_hz = own.rate_hz
-    site = arrays.site[i]
+    """Runs stages 1 to 5 of the next tick of site i; the arguments are those of `run_until`."""
+    site_progress: ProgressRow = progress[i]
+    k = site_progress.tick
+    t_ns = site_progress.t_ns
+    rate_hz = site_progress.rate_hz
     links = arrays.links[i]
     for p in range(links.shape[0]):
+        # The peers of a site are all other sites, in scenario order.
         j = p if p < i else p + 1
-        peer: Row = progress[j]
         link = LinkArrays(
             state=links[p : p + 1],
             models=arrays.models[i, p],
@@ -374,35 +407,36 @@ def sense_site(
             points=arrays.points,
             channel=channel_of(channel_of(arrays.channel, i), p),
         )
-        sender: Row = arrays.site[j, 0]
-        kept = RecentRecords(sent.t_ns[j], sent.rows[j])
+        peer: SiteRow = arrays.site[j, 0]
+        peer_progress: ProgressRow = progress[j]
+        records = RecentRecords(sent.t_ns[j], sent.rows[j])
         if k + 1 < feed.first.shape[2]:
             for n in range(feed.first[i, p, k], feed.first[i, p, k + 1]):
-                _accept_made(
+                _accept_record(
                     k=k,
                     rate_hz=rate_hz,
-                    peer=sender,
+                    peer=peer,
                     sample=feed.samples[n],
-                    sent=kept,
+                    sent=records,
                     link=link,
                 )
         else:
-            taken[i, p] = _receive(
+            next_samples[i, p] = _accept_prompt_records(
                 k=k,
                 t_ns=t_ns,
                 rate_hz=rate_hz,
-                peer=sender,
-                made=peer.tick,
-                next_sample=taken[i, p],
-                sent=kept,
+                peer=peer,
+                records=peer_progress.tick,
+                next_sample=next_samples[i, p],
+                sent=records,
                 link=link,
             )
         release_sample(k, rate_hz, link)
-    _take_hand(i, k, arrays.actors[i], feed)
+    _apply_recorded_hand(i, k, arrays.actors[i], feed)
     reference_stages(
         k=k,
         t_ns=t_ns,
-        site=site,
+        site=arrays.site[i],
         links=links,
         ramps=arrays.ramps[i],
         actors=arrays.actors[i],
@@ -414,7 +448,7 @@ def sense_site(
 @leaf
 def finish_site(
     i: int,
-    apart_rad: float,
+    settled_rad: float,
     progress: RowArray,
     sent: RecentRecords,
     peaks: Array,
@@ -423,13 +457,19 @@ def finish_site(
     chain: RowArray | None,
     laws: LawArrays | None,
 ) -> int:
-    """Stages 6 to 8 of a site's next tick, and what is kept of it; returns its mode."""
-    own: Row = progress[i]
-    k = own.tick
-    t_ns = own.t_ns
-    rate_hz = own.rate_hz
+    """Runs stages 6 to 8 of the next tick of site i, and adds its record to peaks and sums.
+
+    The arguments are those of `run_until`.
+
+    Returns:
+        The site's mode.
+    """
+    site_progress: ProgressRow = progress[i]
+    k = site_progress.tick
+    t_ns = site_progress.t_ns
+    rate_hz = site_progress.rate_hz
     site = arrays.site[i]
-    _find_torque(i=i, own=own, arrays=arrays, chain=chain, laws=laws)
+    _compute_torque(i=i, progress=site_progress, arrays=arrays, chain=chain, laws=laws)
     page = k & (sent.t_ns.shape[1] - 1)
     sent.t_ns[i, page] = t_ns
     record = sent.rows[i, page]
@@ -443,15 +483,14 @@ def finish_site(
         record=record,
     )
     _record_sent(site[0], i, record, laws)
-    total: Row = sums[i]
     _update_peaks(
         row=record,
         t_ns=t_ns,
-        apart_rad=apart_rad,
+        settled_rad=settled_rad,
         s=site[0],
-        progress=own,
+        progress=site_progress,
         peaks=peaks[i],
-        sums=total,
+        sums=sums[i],
     )
     _update_sums(
         k=k,
@@ -461,20 +500,60 @@ def finish_site(
         actors=arrays.actors[i],
         table=arrays.table,
         row=record,
-        sums=total,
+        sums=sums[i],
     )
-    own.tick = k + 1
-    own.t_ns = tick_ns(k + 1, rate_hz) if k + 1 < own.ticks else NEVER_NS
+    site_progress.tick = k + 1
+    if k + 1 < site_progress.ticks:
+        site_progress.t_ns = tick_ns(k + 1, rate_hz)
+    else:
+        site_progress.t_ns = NEVER_NS
     mode: int = site[0].mode
     return mode
 
 
 @leaf
+def _step_site(
+    i: int,
+    settled_rad: float,
+    progress: RowArray,
+    next_samples: IntArray,
+    sent: RecentRecords,
+    feed: ReplayedInputs,
+    peaks: Array,
+    sums: RowArray,
+    arrays: SiteArrays,
+    chain: RowArray | None,
+    laws: LawArrays | None,
+) -> int:
+    """Makes the next tick of site i, and returns the site's mode."""
+    sense_site(
+        i=i,
+        progress=progress,
+        next_samples=next_samples,
+        sent=sent,
+        feed=feed,
+        arrays=arrays,
+        chain=chain,
+    )
+    return finish_site(
+        i=i,
+        settled_rad=settled_rad,
+        progress=progress,
+        sent=sent,
+        peaks=peaks,
+        sums=sums,
+        arrays=arrays,
+        chain=chain,
+        laws=laws,
+    )
+
+
+@leaf
 def run_until(
     last_ns: int,
-    apart_rad: float,
+    settled_rad: float,
     progress: RowArray,
-    taken: IntArray,
+    next_samples: IntArray,
     sent: RecentRecords,
     feed: ReplayedInputs,
     peaks: Array,
@@ -483,50 +562,44 @@ def run_until(
     chains: RowArray | None,
     laws: LawArrays | None,
 ) -> None:
-    """Steps every site up to a time, or to the instant at which one diverges.
+    """Steps all sites up to a time, or to the instant at which a site diverges.
 
     Args:
-        last_ns: the last nominal time that is stepped, ns since the epoch.
-        apart_rad: the time of the last |e| of this or more is kept, see PROGRESS_DTYPE.
-        progress: of each site, shape (N,), PROGRESS_DTYPE.
-        taken: the next sample of each peer to accept, shape (N, P).
-        sent: each site's last records.
-        feed: what came from outside in a run that was recorded.
-        peaks: of each bucket per joint the largest |e|, then per joint the largest |qd|, then
-            the last q of each; -1 where there is no record; shape (N, buckets, 3 n).
-        sums: of each site, shape (N,), see `sums_dtype`.
-        arrays: of all sites, see `stack_site_arrays`.
-        chains: its `chain` once more: an argument that is None keeps the leaves of chains
-            uncompiled.
-        laws: compiled laws that are plugged in; None: there are none.
+        last_ns: the last nominal time to step, ns since the epoch.
+        settled_rad: `unsettled_ns` is the last time of an |e| of this or more, rad.
+        progress: the progress of the sites, shape (N,), PROGRESS_DTYPE.
+        next_samples: the next sample of each peer to accept, shape (N, P).
+        sent: the last records of the sites.
+        feed: the inputs of a recorded run.
+        peaks: per bucket the largest |e| of each joint, then the largest |qd| of each joint,
+            then the last q of each joint; -1 where there is no record; shape (N, buckets, 3 n).
+        sums: the sums of the sites, shape (N,), see `sums_dtype`.
+        arrays: the arrays of all sites, see `stack_site_arrays`.
+        chains: its `chain` once more: as an argument that is None it keeps Numba from compiling
+            the leaves of chains.
+        laws: the users' compiled laws; None: there are none.
     """
     count = progress.shape[0]
     while True:
         t_ns = NEVER_NS
         for i in range(count):
-            own: Row = progress[i]
-            t_ns = min(t_ns, own.t_ns)
+            site_progress: ProgressRow = progress[i]
+            t_ns = min(t_ns, site_progress.t_ns)
         if t_ns > last_ns or t_ns == NEVER_NS:
             return
         for i in range(count):
-            own = progress[i]
-            if own.t_ns != t_ns:
+            site_progress = progress[i]
+            if site_progress.t_ns != t_ns:
                 continue
+            # Two calls, because Numba needs one type of `chain` in each.
             if chains is None:
-                sense_site(
+                mode = _step_site(
                     i=i,
+                    settled_rad=settled_rad,
                     progress=progress,
-                    taken=taken,
+                    next_samples=next_samples,
                     sent=sent,
                     feed=feed,
-                    arrays=arrays,
-                    chain=None,
-                )
-                mode = finish_site(
-                    i=i,
-                    apart_rad=apart_rad,
-                    progress=progress,
-                    sent=sent,
                     peaks=peaks,
                     sums=sums,
                     arrays=arrays,
@@ -534,27 +607,19 @@ def run_until(
                     laws=laws,
                 )
             else:
-                chain = chains[i, : arrays.site[i, 0].joints]
-                sense_site(
+                mode = _step_site(
                     i=i,
+                    settled_rad=settled_rad,
                     progress=progress,
-                    taken=taken,
+                    next_samples=next_samples,
                     sent=sent,
                     feed=feed,
-                    arrays=arrays,
-                    chain=chain,
-                )
-                mode = finish_site(
-                    i=i,
-                    apart_rad=apart_rad,
-                    progress=progress,
-                    sent=sent,
                     peaks=peaks,
                     sums=sums,
                     arrays=arrays,
-                    chain=chain,
+                    chain=chains[i, : arrays.site[i, 0].joints],
                     laws=laws,
                 )
             if mode == _DIVERGED:
-                own.diverged_ns = t_ns
+                site_progress.diverged_ns = t_ns
                 last_ns = t_ns

@@ -320,6 +320,45 @@ class ArrivalRow(Protocol):
     qd: Annotated[Array, Field("shared", "rad/s or m/s", "its derivative", "input")]
 
 
+class ProgressRow(Protocol):
+    """The row of a site's progress in the fused run."""
+
+    tick: Annotated[int, Field("", "tick", "next tick", "fused run")]
+    t_ns: Annotated[int, Field("", "ns", "its nominal time; NEVER_NS at the end", "fused run")]
+    ticks: Annotated[int, Field("", "ticks", "ticks of the whole run", "setup")]
+    rate_hz: Annotated[int, Field("", "Hz", "tick rate", "setup")]
+    bucket: Annotated[int, Field("", "", "index of the present bucket", "fused run")]
+    part: Annotated[
+        int, Field("", "", "ticks of the bucket so far, times BUCKETS_PER_S", "fused run")
+    ]
+    unsettled_ns: Annotated[
+        int, Field("", "ns", "last time of |e| at the limit or above; -1: never", "fused run")
+    ]
+    diverged_ns: Annotated[int, Field("", "ns", "time of divergence; -1: never", "fused run")]
+
+
+class SumsRow(Protocol):
+    """The row of a site's sums over its records in the fused run."""
+
+    first_environment: Annotated[
+        int, Field("", "", "index of the first environment; -1: no environment", "setup")
+    ]
+    effort: Annotated[float, Field("", "N^2 m^2", "sum of |tau - G|^2", "fused run")]
+    force_peak_n: Annotated[float, Field("", "N", "largest force of a wall", "fused run")]
+    environment_j: Annotated[float, Field("", "J", "work of the environments", "fused run")]
+    errors: Annotated[Array, Field("joints", "rad^2", "sum of e^2", "fused run")]
+    q: Annotated[Array, Field("joints", "rad", "q of the record before", "fused run")]
+    now_before: Annotated[
+        Array, Field("joints", "N m", "`now` of the record before", "fused run")
+    ]
+    held_before: Annotated[
+        Array, Field("joints", "N m", "`held` of the record before", "fused run")
+    ]
+    G: Annotated[Array, Field("joints", "N m", "gravity torque", "scratch")]
+    now: Annotated[Array, Field("joints", "N m", "present torque of environments", "scratch")]
+    held: Annotated[Array, Field("joints", "N m", "held torque of environments", "scratch")]
+
+
 _KINDS = {int: "i8", float: "f8", np.uint64: "u8", Array: "f8"}
 
 
@@ -337,6 +376,8 @@ FIELDS: dict[str, dict[str, Field]] = {
     "link": _read_fields(LinkRow),
     "sample": _read_fields(SampleRow),
     "arrival": _read_fields(ArrivalRow),
+    "progress": _read_fields(ProgressRow),
+    "sums": _read_fields(SumsRow),
 }
 """The fields of each row, by the row's name and the field's name."""
 
