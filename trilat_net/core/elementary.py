@@ -1,40 +1,43 @@
 """Sine, cosine and hyperbolic tangent by plain arithmetic: the same bits on every machine.
 
-Invariant: additions and products in a fixed order, nothing of the platform's mathematics
-library, so an arm moves alike on every machine with IEEE doubles. The platform's own functions
-differ in the last bit from one C library to the next, and a replay must not.
+The platform's own functions differ in the last bit from one C library to the next, and a replay
+must not.
 
-The angle is reduced by pi/2 in three parts (Cody and Waite, "Software Manual for the Elementary
-Functions", 1980); the polynomials are those of S. Moshier's Cephes library, for an eighth of a
-turn on either side.
+- The angle is reduced by multiples of pi/2, which is stored in three parts (Cody and Waite,
+  "Software Manual for the Elementary Functions", 1980).
+- The polynomials of sine and cosine, for up to an eighth of a turn in either direction, and the
+  rational functions of the hyperbolic tangent are those of S. Moshier's Cephes library.
 
-The hyperbolic tangent has the fractions of S. Moshier's Cephes library.
+Invariant: all results are additions and products in a fixed order, without the mathematics
+library of the platform. An arm therefore moves alike on each machine with IEEE doubles.
 """
 
 import math
 
 from .jit import leaf
 
-_TURNS = 2.0 / math.pi
+_QUARTERS_PER_RAD = 2.0 / math.pi
+# pi/2 in three parts: products of the first two with small integers are exact.
 _PART_1 = 1.5707963267341256
 _PART_2 = 6.077100506303966e-11
 _PART_3 = 2.0222662487959506e-21
 LARGEST_RAD = 2.0**30
-"""Beyond this the angle itself is known to no better than a tenth of a microradian."""
+"""Largest angle, rad: beyond it a double resolves angles to only a tenth of a microradian."""
 
 
 @leaf
 def sincos(x: float) -> tuple[float, float]:
-    """Returns sine and cosine of an angle, rad, to one unit in the last place of 1.
+    """Returns the sine and the cosine of an angle in rad, to one unit in the last place of 1.
 
-    NaN where the angle is not finite or beyond `LARGEST_RAD`. Beyond 1e5 rad the reduction
-    rounds as the angle itself does.
+    Both are NaN if the angle is not finite or beyond `LARGEST_RAD`. Beyond 1e5 rad the error of
+    the reduction is as large as the rounding of the angle itself.
     """
     if not abs(x) <= LARGEST_RAD:
         return math.nan, math.nan
-    quarter = math.floor(x * _TURNS + 0.5)
+    quarter = math.floor(x * _QUARTERS_PER_RAD + 0.5)
     y = ((x - quarter * _PART_1) - quarter * _PART_2) - quarter * _PART_3
     z = y * y
+    # Horner's scheme for sin(y) and cos(y), with y from -pi/4 to pi/4.
     s = 1.58962301576546568060e-10
     s = s * z - 2.50507477628578072866e-8
     s = s * z + 2.75573136213857245213e-6
@@ -61,41 +64,42 @@ def sincos(x: float) -> tuple[float, float]:
 
 _LOG_2_HIGH = 6.93145751953125e-1
 _LOG_2_LOW = 1.42860682030941723212e-6
-"""The natural logarithm of 2 in two parts."""
+"""The natural logarithm of 2 in two parts, of which the first has few bits."""
 _LOG_2_OF_E = 1.4426950408889634
 _SMALL = 0.625
 _LARGE = 20.0
-"""From here on the tangent is 1 to the last bit."""
+"""From this number on the hyperbolic tangent is 1 to the last bit."""
 
 
 @leaf
 def tanh(x: float) -> float:
-    """Returns the hyperbolic tangent, to two units in the last place; NaN of NaN."""
+    """Returns the hyperbolic tangent, to two units in the last place; NaN for NaN.
+
+    Small arguments use a rational function. Larger ones use 1 - 2 / (exp(2 |x|) + 1), with the
+    exponential as 2^n (1 + 2 P / (Q - P)).
+    """
     z = x * x
     size = abs(x)
     if size < _SMALL:
-        above = (
-            -9.64399179425052238628e-1 * z - 9.92877231001918586564e1
-        ) * z - 1.61468768441708447952e3
-        below = (
-            (z + 1.12811678491632931402e2) * z + 2.23548839060100448583e3
-        ) * z + 4.84406305325125486048e3
+        above = -9.64399179425052238628e-1 * z - 9.92877231001918586564e1
+        above = above * z - 1.61468768441708447952e3
+        below = z + 1.12811678491632931402e2
+        below = below * z + 2.23548839060100448583e3
+        below = below * z + 4.84406305325125486048e3
         return x + x * z * (above / below)
     if size >= _LARGE:
         return 1.0 if x > 0.0 else -1.0
+    # Only NaN fails both comparisons.
     if not size < _LARGE:
         return math.nan
-    halvings = math.floor(2.0 * size * _LOG_2_OF_E + 0.5)
-    y = (2.0 * size - halvings * _LOG_2_HIGH) - halvings * _LOG_2_LOW
+    n = math.floor(2.0 * size * _LOG_2_OF_E + 0.5)
+    y = (2.0 * size - n * _LOG_2_HIGH) - n * _LOG_2_LOW
     z = y * y
-    above = y * (
-        (1.26177193074810590878e-4 * z + 3.02994407707441961300e-2) * z
-        + 9.99999999999999999910e-1
-    )
-    below = (
-        3.00198505138664455042e-6 * z + 2.52448340349684104192e-3
-    ) * z + 2.27265548208155028766e-1
-    below = below * z + 2.0
-    grown = (1.0 + 2.0 * above / (below - above)) * float(1 << int(halvings))
-    tangent = 1.0 - 2.0 / (grown + 1.0)
+    P = 1.26177193074810590878e-4 * z + 3.02994407707441961300e-2
+    P = y * (P * z + 9.99999999999999999910e-1)
+    Q = 3.00198505138664455042e-6 * z + 2.52448340349684104192e-3
+    Q = Q * z + 2.27265548208155028766e-1
+    Q = Q * z + 2.0
+    exponential = (1.0 + 2.0 * P / (Q - P)) * float(1 << int(n))
+    tangent = 1.0 - 2.0 / (exponential + 1.0)
     return tangent if x > 0.0 else -tangent

@@ -1,8 +1,8 @@
-"""A fingerprint of the platform's arithmetic, by behaviour.
+"""A fingerprint of the platform's arithmetic, computed from its results.
 
 Invariant (L5): two platforms with the same fingerprint gave the same bits for many sines and
-cosines and for a short run of two sites with random links; only between such platforms does
-verification demand bit equality.
+cosines, and for a short run of two sites with random links. Only between such platforms does
+verification require equal bits.
 """
 
 import hashlib
@@ -25,12 +25,14 @@ _LINK = LinkModel(kind=DelayKind.GAMMA, extra=2.7, scale=900.0, playout_us=2_000
 
 
 @leaf
-def _sines(angles: Array, results: Array) -> None:
+def _compute_sines(angles: Array, results: Array) -> None:
+    """Writes the sines and cosines of angles into the two rows of `results`."""
     for n in range(angles.shape[0]):
         results[0, n], results[1, n] = sincos(angles[n])
 
 
-def _setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
+def _build_setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
+    """Returns the setup of a site with its start pose and the name of its peer."""
     theta = theta_from_links(
         ArmLinks(
             l1_m=1.0,
@@ -73,17 +75,20 @@ def _setup(name: str, peer: str, q0: tuple[float, float]) -> SiteSetup:
 
 @cache
 def compute_fingerprint() -> str:
-    """Returns sixteen hexadecimal digits that name this platform's arithmetic."""
+    """Returns sixteen hexadecimal digits that identify this platform's arithmetic."""
     angles = np.linspace(-12.0, 12.0, 4001)
     results = np.empty((2, len(angles)))
-    _sines(angles, results)
+    _compute_sines(angles, results)
     digest = hashlib.sha256(results.tobytes())
-    sites = [Site(_setup("a", "b", (0.6, -0.4))), Site(_setup("b", "a", (-0.5, 0.8)))]
-    outputs = [site.step(TickInput(0)) for site in sites]
+    a = Site(_build_setup("a", "b", (0.6, -0.4)))
+    b = Site(_build_setup("b", "a", (-0.5, 0.8)))
+    record_a = a.step(TickInput(0))
+    record_b = b.step(TickInput(0))
     for k in range(1, _TICKS):
-        arrivals = [[Arrival(0, k - 1, outputs[1 - i].q, outputs[1 - i].qd)] for i in (0, 1)]
-        outputs = [
-            site.step(TickInput(k, came)) for site, came in zip(sites, arrivals, strict=True)
-        ]
-        digest.update(np.array([o.q + o.qd + o.tau + o.theta_hat for o in outputs]).tobytes())
+        from_b = Arrival(0, k - 1, record_b.q, record_b.qd)
+        from_a = Arrival(0, k - 1, record_a.q, record_a.qd)
+        record_a = a.step(TickInput(k, [from_b]))
+        record_b = b.step(TickInput(k, [from_a]))
+        numbers = [r.q + r.qd + r.tau + r.theta_hat for r in (record_a, record_b)]
+        digest.update(np.array(numbers).tobytes())
     return digest.hexdigest()[:16]

@@ -1,12 +1,19 @@
 # mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
-"""The one typed wrapper around Numba.
+"""The typed wrapper around Numba: `leaf` compiles a function and keeps its machine code.
 
-Invariants: a leaf is compiled for float64 without reordering (no fastmath), so compiled and
-plain Python runs give the same bits. Machine code is cached in the user's cache directory, in a
-folder named after a hash of all sources of the core: Numba alone notices a change of the file
-that holds a leaf, not of the leaves it calls. A wheel brings such a folder with code for the
-generic processor of its platform, which is used where the user's has none for this processor.
-Nobody else's code is compiled or looked for otherwise.
+Machine code is kept in the user's cache directory, in a folder named after a hash of all sources
+of the core. (Numba alone notices a change of the file that holds a leaf, but not of the leaves
+that it calls.) A wheel contains such a folder with code for the generic processor of its
+platform, which is used if the user's folder has no code for this processor.
+
+A leaf that another leaf calls is an inner leaf. It is kept as unoptimised LLVM code, which is
+optimised as a part of the leaf that Python calls.
+
+Invariant:
+
+- A leaf is compiled without reordering (no fastmath), so that compiled and plain Python runs give
+  the same bits.
+- The compilation and the caches of other code in the process are not affected.
 """
 
 import hashlib
@@ -36,19 +43,16 @@ from ..process import end_process_at_signals
 P = ParamSpec("P")
 R = TypeVar("R")
 
-with suppress(OSError, IndexError):  # of Linux alone
-    _addresses = (
-        Path("/proc/self/limits")
-        .read_text("utf-8")
-        .partition("Max address space")[2]
-        .split()[0]
-    )
-    if _addresses != "unlimited" and int(_addresses) < 1 << 30:
-        raise MemoryError  # LLVM and OpenBLAS would try for ever, deaf to signals, or abort
+# With little address space LLVM and OpenBLAS would try for ever, deaf to signals, or abort.
+with suppress(OSError, IndexError):  # only Linux has the file
+    _limits = Path("/proc/self/limits").read_text("utf-8")
+    _address_space = _limits.partition("Max address space")[2].split()[0]
+    if _address_space != "unlimited" and int(_address_space) < 1 << 30:
+        raise MemoryError
 
 
 def _cache_root() -> Path:
-    """Returns the user's cache directory by the custom of each platform."""
+    """Returns the user's cache directory, by the convention of the platform."""
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
     if sys.platform == "darwin":
@@ -57,7 +61,7 @@ def _cache_root() -> Path:
 
 
 def _core_digest() -> str:
-    """Returns a hash of every source file of the core and of Numba's version."""
+    """Returns a hash of all source files of the core and of Numba's version."""
     digest = hashlib.sha256(numba.__version__.encode())
     for source in sorted(Path(__file__).parent.rglob("*.py")):
         digest.update(source.read_bytes())
@@ -65,8 +69,9 @@ def _core_digest() -> str:
 
 
 def _writable_cache() -> Path | None:
-    """Returns the directory for compiled leaves, or None if it cannot be written (then: memory
-    only).
+    """Returns the directory for compiled leaves; None if it cannot be written.
+
+    Without a directory, compiled leaves are kept in memory only.
     """
     try:
         directory = _cache_root() / "trilat-net" / _core_digest()
@@ -76,47 +81,58 @@ def _writable_cache() -> Path | None:
     return directory if os.access(directory, os.W_OK) else None
 
 
-_config: Any = numba.config  # made at import from the environment; its stubs name no options
+_config: Any = numba.config  # set from the environment at import; its stubs name no options
 _CACHE = None if _config.DISABLE_JIT else _writable_cache()
 _SHIPPED = Path(__file__).parent / "compiled" / _core_digest()
 _ships = _SHIPPED.is_dir()
 
 
 def is_core_cached() -> bool:
-    """True if there is machine code of a whole tick of this version of the core, which is
-    compiled last.
+    """True if machine code of this version of the core is kept.
+
+    The whole tick is compiled last, so its code stands for all.
     """
-    folders = (
-        folder for folder in (_CACHE, _SHIPPED if _ships else None) if folder is not None
-    )
-    return any(next(folder.rglob("kernel.site_tick-*.nbc"), None) for folder in folders)
+    folders = [_CACHE, _SHIPPED if _ships else None]
+    for folder in folders:
+        if folder is not None and any(folder.rglob("kernel.site_tick-*.nbc")):
+            return True
+    return False
 
 
-COMPILING = "compiling, once for this machine and each number of joints: half a minute, or minutes of a busy one ..."
+COMPILING = (
+    "compiling, once for this machine and each number of joints: "
+    "half a minute, or minutes if the machine is busy ..."
+)
 
 
 class _CompilingNotice(event.Listener):
-    """Says once, wherever errors go, why the first run takes longer; a signal may end it at any
-    time.
+    """Reports once that the core is compiled, which makes a first run take longer.
+
+    During a compilation signals end the process at once.
+
+    Attributes:
+        is_reported: true: the notice was reported, or must not be.
+        report: writes the notice; by default to standard error.
     """
 
     def __init__(self) -> None:
         self.is_reported = False
         self.report: Callable[[str], None] = partial(print, file=sys.stderr, flush=True)
-        self._restore: list[Callable[[], None]] = []  # of compilations inside one another
+        # Compilations may be nested: each one restores the handling of signals before it.
+        self._restorers: list[Callable[[], None]] = []
 
-    def on_start(self, begun: Any) -> None:
-        """Says so as anything of the core is compiled."""
-        self._restore.append(end_process_at_signals())
-        if not self.is_reported and begun.data["dispatcher"].py_func.__module__.startswith(
-            __package__
-        ):
+    def on_start(self, event_data: Any) -> None:
+        """Reports the first compilation of a function of the core."""
+        self._restorers.append(end_process_at_signals())
+        module = event_data.data["dispatcher"].py_func.__module__
+        if not self.is_reported and module.startswith(__package__):
             self.is_reported = True
             self.report(COMPILING)
 
     def on_end(self, _: Any) -> None:
-        """Says nothing."""
-        self._restore.pop()()
+        """Restores the handling of signals."""
+        restore = self._restorers.pop()
+        restore()
 
 
 compiling_notice = _CompilingNotice()
@@ -125,11 +141,11 @@ _register("numba:compile", compiling_notice)
 
 
 def _mangle_record(record: types.Record) -> tuple[str, tuple[str]]:
-    """Names a record in the symbols of machine code by its fields.
+    """Returns the name of a record in symbols of machine code, from a hash of its fields.
 
-    Numba numbers records in the order in which a process meets them. Leaves that two processes
-    compiled for two layouts then have the same symbols, and a third process that loads both
-    from the cache mixes them up.
+    Numba itself numbers records in the order in which a process meets them. Leaves that two
+    processes compiled for two layouts would then have equal symbols, and a third process that
+    loads both from the cache would mix them up.
     """
     return "Record", (f"r{hashlib.sha256(record.name.encode()).hexdigest()[:16]}",)
 
@@ -138,15 +154,17 @@ _record: Any = types.Record
 _record.mangling_args = property(_mangle_record)
 
 _OPTIONS: Any = {"_nrt": False}
-"""No leaf makes an array, so no reference is counted, which would cost more than the arithmetic
-does.
+"""Options of leaves: no leaf allocates an array, so Numba need not count references, which would
+cost more than the arithmetic.
 """
-_WITHIN = "within"  # another leaf, compiled as a part of it
+_INNER = "within"
+"""Marks kept code as that of an inner leaf."""
 
 
-class _Place:
-    """Where the machine code of a function is kept, as Numba asks for it; its source counts by
-    content.
+class _LeafLocator:
+    """Locates the machine code of a function, with the interface of Numba's cache locators.
+
+    Numba compares the source stamp, here a hash of the file, instead of the time of the file.
     """
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
@@ -168,19 +186,21 @@ class _Place:
         Path(self.get_cache_path()).mkdir(parents=True, exist_ok=True)
 
 
-class _Placed(CompileResultCacheImpl):
-    """How the machine code of a leaf is kept; of one within others it is what LLVM optimises
-    later.
+class _LeafCacheImpl(CompileResultCacheImpl):
+    """Converts compiled leaves to what the cache keeps, and back.
+
+    An inner leaf is kept as LLVM code, other leaves as machine code.
     """
 
-    _locator_classes = cast(Any, [_Place])
+    _locator_classes = cast(Any, [_LeafLocator])
 
     def rebuild(self, context: Any, kept: Any) -> Any:
+        """Returns the compiled leaf of a kept tuple, as `CompileResult._reduce` wrote it."""
         name, kind, code = kept[0]
-        if kind != _WITHIN:
+        if kind != _INNER:
             return super().rebuild(context, kept)
         library = _LeafLibrary(context.codegen(), name)
-        library.within = True
+        library.is_inner = True
         library._finalized = True
         library._final_module = parse_bitcode(code)
         names = (
@@ -190,22 +210,31 @@ class _Placed(CompileResultCacheImpl):
             "objectmode",
             "lifted",
             "type_annotation",
+            "reload_init",
+            "referenced_envs",
         )
-        fields = dict(zip((*names, "reload_init", "referenced_envs"), kept[1:], strict=True))
-        contexts = {"target_context": context, "typing_context": context.typing_context}
-        return _within(compile_result(library=library, **contexts, **fields))
+        fields = dict(zip(names, kept[1:], strict=True))
+        result = compile_result(
+            library=library,
+            target_context=context,
+            typing_context=context.typing_context,
+            **fields,
+        )
+        return _as_inner(result)
 
 
-class _CodeFiles(IndexDataCacheFile):
-    """The files of one function, compressed to a quarter.
+class _CompressedFiles(IndexDataCacheFile):
+    """The cache files of one function, compressed to a quarter.
 
-    Numba numbers them, and two processes may write other code into one.
+    Numba numbers the files, so that two processes may write different code into one file. Here
+    the name of a file contains a hash of its key.
     """
 
     def save(self, key: Any, code: Any) -> None:
         names = self._load_index()
         first, _, last = self._data_name(0).rpartition(".0.")
-        names[key] = f"{first}.{hashlib.sha256(repr(key).encode()).hexdigest()[:8]}.{last}"
+        digest = hashlib.sha256(repr(key).encode()).hexdigest()[:8]
+        names[key] = f"{first}.{digest}.{last}"
         self._save_index(names)
         self._save_data(names[key], code)
 
@@ -218,173 +247,180 @@ class _CodeFiles(IndexDataCacheFile):
 
 
 class _LeafCache(FunctionCache):
-    """Machine code of a leaf: the user's, for this processor, else what came with the wheel."""
+    """The machine code of a leaf: from the user's folder, else from the wheel."""
 
-    _impl_class = _Placed
+    _impl_class = _LeafCacheImpl
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
         base = self._impl.filename_base
         stamp = self._cache_file._source_stamp
-        place = Path(self._cache_path)
-        files = cast(Any, _CodeFiles)
-        self._cache_file = files(str(place), base, stamp)
-        self._shipped = files(str(_SHIPPED / place.name), base, stamp)
-        self._within = files(str(place), f"{base}-within", stamp)
+        folder = Path(self._cache_path)
+        files = cast(Any, _CompressedFiles)
+        self._cache_file = files(str(folder), base, stamp)
+        self._shipped = files(str(_SHIPPED / folder.name), base, stamp)
+        self._inner = files(str(folder), f"{base}-within", stamp)
 
     def load_overload(self, signature: Any, context: Any) -> Any:
-        """Returns what is kept, or None; Numba first readies itself to compile, which takes far
-        longer.
+        """Returns the kept code for a signature, or None.
+
+        Numba's method first prepares the compiler, which takes far longer than loading.
         """
         with self._guard_against_spurious_io_errors():
-            found = self._load_overload(signature, context)
-            if found is None and _ships:
-                triple = context.codegen().magic_tuple()[0]
-                generic = SimpleNamespace(magic_tuple=lambda: (triple, "generic", ""))
-                kept = self._shipped.load(self._index_key(signature, generic))
-                found = None if kept is None else self._impl.rebuild(context, kept)
-            return found
+            result = self._load_overload(signature, context)
+            if result is not None or not _ships:
+                return result
+            triple = context.codegen().magic_tuple()[0]
+            generic = SimpleNamespace(magic_tuple=lambda: (triple, "generic", ""))
+            kept = self._shipped.load(self._index_key(signature, generic))
+            return None if kept is None else self._impl.rebuild(context, kept)
 
-    def _save_overload(self, signature: Any, made: Any) -> None:
+    def _save_overload(self, signature: Any, result: Any) -> None:
         if _CACHE is not None:
-            super()._save_overload(signature, made)
+            super()._save_overload(signature, result)
 
-    def load_within(self, kinds: Any, context: Any) -> Any:
-        kept = self._within.load(self._index_key(kinds, context.codegen()))
+    def load_inner(self, argument_types: Any, context: Any) -> Any:
+        """Returns the kept inner leaf for these types of arguments, or None."""
+        kept = self._inner.load(self._index_key(argument_types, context.codegen()))
         return None if kept is None else self._impl.rebuild(context, kept)
 
-    def save_within(self, kinds: Any, made: Any) -> None:
+    def save_inner(self, argument_types: Any, result: Any) -> None:
+        """Keeps a compiled inner leaf."""
         if _CACHE is not None:
             self._impl.locator.ensure_cache_path()
-            self._within.save(self._index_key(kinds, made.codegen), self._impl.reduce(made))
+            key = self._index_key(argument_types, result.codegen)
+            self._inner.save(key, self._impl.reduce(result))
 
 
 class _LeafLibrary(JITCodeLibrary):
-    """The code of a leaf; that of one within another is neither optimised nor made executable
-    by itself.
+    """The code of a leaf; that of an inner leaf is neither optimised nor made executable.
 
-    It is optimised as a part of whatever calls it, once. Numba does so at every leaf between as
-    well, and has wrappers for calls from Python at each: half of the time to compile.
+    It is optimised once, as a part of the outer leaf. Numba would also optimise each leaf on the
+    way, and add a wrapper for calls from Python to each: half of the time of compilation.
     """
 
-    within = False
+    is_inner = False
 
     def serialize_using_object_code(self) -> tuple[str, str, Any]:
-        if not self.within:
+        if not self.is_inner:
             return super().serialize_using_object_code()
-        return self.name, _WITHIN, self._get_module_for_linking().as_bitcode()
+        return self.name, _INNER, self._get_module_for_linking().as_bitcode()
 
     def _optimize_final_module(self) -> None:
-        if not self.within:
+        if not self.is_inner:
             super()._optimize_final_module()
 
     def _finalize_final_module(self) -> None:
-        if self.within:
+        if self.is_inner:
             self._finalized = True
         else:
             super()._finalize_final_module()
 
 
-def _within(made: Any) -> Any:
-    """Returns a leaf within others as they find it: by an object in place of what Python would
-    call.
+def _as_inner(result: Any) -> Any:
+    """Returns a compiled inner leaf that other leaves can call.
+
+    Leaves find a function by its entry point. An inner leaf has no machine code, so that any
+    object serves.
     """
-    made = made._replace(entry_point=object())
-    made.target_context.insert_user_function(made.entry_point, made.fndesc, [made.library])
-    return made
+    result = result._replace(entry_point=object())
+    context = result.target_context
+    context.insert_user_function(result.entry_point, result.fndesc, [result.library])
+    return result
 
 
 class _LeafCompiler(Compiler):
-    """Compiles a leaf, within another one or for calls from Python."""
+    """Compiles a leaf, as an inner leaf or for calls from Python.
+
+    Attributes:
+        depth: number of leaves whose compilation is in progress.
+    """
 
     depth = 0
 
     def compile_extra(self, function: Any) -> Any:
         state = self.state
-        within = _LeafCompiler.depth > 0
+        is_inner = _LeafCompiler.depth > 0
         state.library = _LeafLibrary(state.targetctx.codegen(), function.__qualname__)
         state.library.enable_object_caching()
-        state.library.within = within
-        if within:
-            state.flags.no_compile = state.flags.no_cpython_wrapper = (
-                state.flags.no_cfunc_wrapper
-            ) = True
+        state.library.is_inner = is_inner
+        if is_inner:
+            state.flags.no_compile = True
+            state.flags.no_cpython_wrapper = True
+            state.flags.no_cfunc_wrapper = True
         _LeafCompiler.depth += 1
         try:
-            made = super().compile_extra(function)
+            result = super().compile_extra(function)
         finally:
             _LeafCompiler.depth -= 1
-        if within:
-            return _within(made)
-        for environment in made._find_referenced_environments():  # of leaves within it
-            made.library.codegen.set_env(environment.env_name, environment)
-        return made
+        if is_inner:
+            return _as_inner(result)
+        # The environments of inner leaves have no wrapper that would set them.
+        for environment in result._find_referenced_environments():
+            result.library.codegen.set_env(environment.env_name, environment)
+        return result
 
 
 class _Leaf(CPUDispatcher):
-    """A leaf, compiled anew for calls from Python where so far it was within others only."""
+    """A leaf; it is compiled again for calls from Python if it only was an inner leaf before."""
 
     _cache: Any
     _compiler: Any
 
-    def get_call_template(self, arguments: Any, named: Any) -> Any:
-        """Returns what a caller is to know: not one leaf for every constant that somebody
-        passes.
-        """
-        plain = {name: types.unliteral(one) for name, one in named.items()}
+    def get_call_template(self, arguments: Any, keywords: Any) -> Any:
+        """Returns the call for a caller: constants count by type, so that they compile nothing."""
+        plain = {name: types.unliteral(keyword) for name, keyword in keywords.items()}
         return super().get_call_template(tuple(map(types.unliteral, arguments)), plain)
 
-    def add_overload(self, made: Any) -> None:
-        """Takes in what was compiled; Python is not to call what is within a leaf."""
-        if getattr(made.library, "within", False):
-            self.overloads[tuple(made.signature.args)] = made
+    def add_overload(self, result: Any) -> None:
+        """Adds a compiled form; an inner leaf is not registered for calls from Python."""
+        if getattr(result.library, "is_inner", False):
+            self.overloads[tuple(result.signature.args)] = result
         else:
-            super().add_overload(made)
+            super().add_overload(result)
 
     def compile(self, signature: Any) -> Any:
-        """Returns what is to be called for arguments of these types."""
+        """Returns the entry point for arguments of these types, compiled or loaded."""
         with global_compiler_lock:
-            kinds, result = normalize_signature(signature)
-            known: Any = self.overloads.get(kinds)
+            argument_types, return_type = normalize_signature(signature)
+            known: Any = self.overloads.get(argument_types)
             if _LeafCompiler.depth == 0:
-                if known is not None and getattr(known.library, "within", False):
-                    del self.overloads[kinds]
+                if known is not None and getattr(known.library, "is_inner", False):
+                    del self.overloads[argument_types]
                 return super().compile(signature)
             if known is None:
-                known = self._cache.load_within(kinds, self.targetctx)
+                known = self._cache.load_inner(argument_types, self.targetctx)
                 if known is None:
-                    with event.trigger_event(
-                        "numba:compile", data={"dispatcher": self, "args": kinds}
-                    ):
-                        known = self._compiler.compile(kinds, result)
-                    self._cache.save_within(kinds, known)
+                    data = {"dispatcher": self, "args": argument_types}
+                    with event.trigger_event("numba:compile", data=data):
+                        known = self._compiler.compile(argument_types, return_type)
+                    self._cache.save_inner(argument_types, known)
                 self.add_overload(known)
             return known.entry_point
 
 
 def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Callable[P, R]:
-    """Returns a leaf for arguments of the types of these; it does not look at types any more."""
+    """Returns a leaf compiled for the types of these arguments, which checks types no more."""
     if _config.DISABLE_JIT:
         return function
-    compiled: Any = function
-    return cast(Callable[P, R], compiled.compile(tuple(map(numba.typeof, arguments))))
+    dispatcher: Any = function
+    return cast(Callable[P, R], dispatcher.compile(tuple(map(numba.typeof, arguments))))
 
 
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function of numbers and arrays; its type, as seen by a reader or mypy, stays
-    the same.
-    """
+    """Compiles a function of numbers and arrays; for readers and mypy its type stays the same."""
     if _config.DISABLE_JIT:
         return function
     options = {"nopython": True, "boundscheck": None, **_OPTIONS}
-    made = cast(Any, _Leaf)(function, targetoptions=options, pipeline_class=_LeafCompiler)
-    made._cache = cast(Any, _LeafCache)(function)
-    return cast(Callable[P, R], made)
+    dispatcher = cast(Any, _Leaf)(function, targetoptions=options, pipeline_class=_LeafCompiler)
+    dispatcher._cache = cast(Any, _LeafCache)(function)
+    return cast(Callable[P, R], dispatcher)
 
 
 class _NamedCache(_LeafCache):
-    """Machine code of a function whose name tells all that it is made of, what it closes over
-    too.
+    """The machine code of a closure whose name identifies all that it is compiled from.
+
+    Numba's own key contains the values that a closure captured; the name replaces them.
     """
 
     def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, Any]:
@@ -394,13 +430,19 @@ class _NamedCache(_LeafCache):
 def compile_named(
     function: Callable[..., None], name: str, signature: Any, **options: Any
 ) -> Any:
-    """Compiles a closure for a signature, or loads it if one of this name was compiled before.
+    """Compiles a closure for a signature, or loads the closure that was compiled by this name.
 
-    The name goes into the symbols of the machine code: no two closures may share one in any
-    process.
+    The name is part of the symbols of the machine code: no two closures may have the same name
+    in any process.
+
+    Args:
+        function: the closure.
+        name: its name.
+        signature: its signature, as Numba has it.
+        **options: options of `numba.njit`.
     """
     function.__qualname__ = name
-    # what is only loaded counts no references
+    # Loaded code must count no references either, so the options hold in both cases.
     dispatcher = numba.njit(**{**options, **_OPTIONS})(function)
     dispatcher._cache = cast(Any, _NamedCache)(function)
     dispatcher.compile(signature)

@@ -1,11 +1,11 @@
-"""Counter-based random numbers: a pure function of where they are used, without state or order.
+"""Counter-based random numbers: pure functions of their purpose, without state or order.
 
-Invariant (L4): a draw is a function of (seed, link, sample index, purpose) and of nothing else;
-the same on every machine, in every driver, in any order of arrival.
+Invariant (L4): a draw is a function of (seed, link, sample index, purpose) alone. It is the same
+on every machine, in every driver, and in any order of arrival.
 
-Philox-4x32 with ten rounds: Salmon, Moraes, Dror and Shaw, "Parallel Random Numbers: As Easy as
-1, 2, 3", SC 2011. It is written here because compiled leaves call it per sample; the tests hold
-its known-answer vectors.
+The generator is Philox-4x32 with ten rounds: Salmon, Moraes, Dror and Shaw, "Parallel Random
+Numbers: As Easy as 1, 2, 3", SC 2011. NumPy has Philox too, but compiled leaves need it for
+each sample. The tests contain known-answer vectors.
 """
 
 import hashlib
@@ -15,6 +15,7 @@ import numpy as np
 
 from .jit import leaf
 
+# The multipliers of the rounds (M) and the increments of the key (W), as in the paper.
 _M0 = np.uint64(0xD2511F53)
 _M1 = np.uint64(0xCD9E8D57)
 _W0 = np.uint64(0x9E3779B9)
@@ -32,16 +33,26 @@ DrawKey = np.uint64
 
 
 def link_key(seed: int, link: str) -> int:
-    """Returns the 64-bit key of the draws of a link, named as in "m1->s"."""
-    return int.from_bytes(hashlib.sha256(f"{seed}/{link}".encode()).digest()[:8], "little")
+    """Returns the 64-bit key of the draws of a link, whose name is like "m1->s"."""
+    digest = hashlib.sha256(f"{seed}/{link}".encode()).digest()
+    return int.from_bytes(digest[:8], "little")
 
 
 @leaf
 def philox(
     c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
 ) -> PhiloxWords:
-    """Returns four 32-bit words for a 128-bit counter and a 64-bit key, all as 32-bit words in
-    uint64.
+    """Returns four random 32-bit words.
+
+    All words are 32-bit numbers in uint64, so that products keep their upper halves.
+
+    Args:
+        c0: lowest word of the 128-bit counter.
+        c1: second word of the counter.
+        c2: third word of the counter.
+        c3: highest word of the counter.
+        k0: lower word of the 64-bit key.
+        k1: upper word of the key.
     """
     for _ in range(_ROUNDS):
         p0 = _M0 * c0
@@ -57,20 +68,28 @@ def philox(
 
 @leaf
 def unit_interval(high: np.uint64, low: np.uint64) -> float:
-    """Returns a number of the open interval (0, 1) from two 32-bit words: 52 bits, then a half,
-    exactly.
+    """Returns a number of the open interval (0, 1) from two 32-bit words.
 
-    With 53 bits the largest one would round to 1.
+        (52 random bits + 1/2) / 2^52
+
+    The result is exact. With 53 bits the largest number would round to 1.
     """
-    return (float(high >> _TO_26) * _TWO_26 + float(low >> _TO_26) + 0.5) / _TWO_52
+    upper_bits = float(high >> _TO_26) * _TWO_26
+    lower_bits = float(low >> _TO_26)
+    return (upper_bits + lower_bits + 0.5) / _TWO_52
 
 
 @leaf
 def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[float, float]:
-    """Returns two numbers, uniform on the open interval (0, 1).
+    """Returns two random numbers, uniform on the open interval (0, 1).
 
-    Draws of different purposes are independent; `attempt` counts those of a method that rejects
-    some.
+    Draws with different arguments are independent.
+
+    Args:
+        key: the key of the link.
+        sample: the index of the sample.
+        purpose: the purpose of the draw.
+        attempt: the attempt of a method that rejects draws, from 0.
     """
     index = np.uint64(sample)
     a, b, c, d = philox(
@@ -86,20 +105,22 @@ def uniforms(key: DrawKey, sample: int, purpose: int, attempt: int) -> tuple[flo
 
 @leaf
 def standard_normal(key: DrawKey, sample: int, purpose: int, attempt: int) -> float:
-    """Returns a standard normal number, by the method of Box and Muller; arguments as in
-    `uniforms`.
+    """Returns a standard normal number by the method of Box and Muller.
+
+    The arguments are those of `uniforms`.
     """
     u, v = uniforms(key, sample, purpose, attempt)
-    return math.sqrt(-2.0 * math.log(u)) * math.cos(2.0 * math.pi * v)
+    radius = math.sqrt(-2.0 * math.log(u))
+    return radius * math.cos(2.0 * math.pi * v)
 
 
 @leaf
 def standard_gamma(key: DrawKey, sample: int, purpose: int, shape: float) -> float:
-    """Returns a gamma number of the given shape and scale 1.
+    """Returns a gamma number of this shape and of scale 1.
 
-    By rejection: Marsaglia and Tsang, "A Simple Method for Generating Gamma Variables", ACM
-    TOMS 26 (2000); below shape 1 by their boost from shape + 1. It uses up `purpose + 1` and
-    `purpose + 2` as well.
+    The method is rejection after Marsaglia and Tsang, "A Simple Method for Generating Gamma
+    Variables", ACM TOMS 26 (2000). For shapes below 1 a number of shape + 1 is multiplied by
+    u^(1 / shape). The draws use `purpose`, `purpose + 1` and `purpose + 2`.
     """
     boost = 1.0
     k = shape
@@ -109,7 +130,8 @@ def standard_gamma(key: DrawKey, sample: int, purpose: int, shape: float) -> flo
         k += 1.0
     d = k - 1.0 / 3.0
     c = 1.0 / math.sqrt(9.0 * d)
-    for attempt in range(64):  # one in twenty is rejected at most: 64 in a row never happen
+    # At most one attempt in twenty is rejected: 64 in a row never happen.
+    for attempt in range(64):
         x = standard_normal(key, sample, purpose, attempt)
         root = 1.0 + c * x
         v = root * root * root

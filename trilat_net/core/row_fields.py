@@ -332,7 +332,8 @@ class ProgressRow(Protocol):
         int, Field("", "", "ticks of the bucket so far, times BUCKETS_PER_S", "fused run")
     ]
     unsettled_ns: Annotated[
-        int, Field("", "ns", "last time of |e| at the limit or above; -1: never", "fused run")
+        int,
+        Field("", "ns", "last time of an error at the limit or above; -1: never", "fused run"),
     ]
     diverged_ns: Annotated[int, Field("", "ns", "time of divergence; -1: never", "fused run")]
 
@@ -343,7 +344,7 @@ class SumsRow(Protocol):
     first_environment: Annotated[
         int, Field("", "", "index of the first environment; -1: no environment", "setup")
     ]
-    effort: Annotated[float, Field("", "N^2 m^2", "sum of |tau - G|^2", "fused run")]
+    effort: Annotated[float, Field("", "N^2 m^2", "sum of (tau - G)^2", "fused run")]
     force_peak_n: Annotated[float, Field("", "N", "largest force of a wall", "fused run")]
     environment_j: Annotated[float, Field("", "J", "work of the environments", "fused run")]
     errors: Annotated[Array, Field("joints", "rad^2", "sum of e^2", "fused run")]
