@@ -14,9 +14,9 @@ the time since then, ns since the epoch.
 
 from .chain import add, scale, three
 from .jit import leaf
-from .rotation import length, rotation_matrix, relative_rotation
+from .rotation import length, relative_rotation, rotation_matrix
 from .row_fields import LinkRow, SiteRow
-from .task_space import has_orientation, count_linear_coordinates
+from .task_space import count_linear_coordinates, has_orientation
 from .ticks import LifeReason
 from .vectors import RowArray
 

@@ -10,9 +10,9 @@ from math import inf, isfinite
 
 from .chain import put_three, scale, three
 from .jit import leaf
-from .rotation import compose_rotations, rotation_matrix, relative_rotation
+from .rotation import compose_rotations, relative_rotation, rotation_matrix
 from .row_fields import SiteRow
-from .task_space import has_orientation, count_linear_coordinates
+from .task_space import count_linear_coordinates, has_orientation
 
 BLEND_S = 0.1
 """Duration of the change from the torque at rest to that of the law, s."""

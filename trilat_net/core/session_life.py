@@ -41,7 +41,7 @@ from .rotation import (
     rotation_vector_rate,
 )
 from .row_fields import LinkRow, SiteRow
-from .task_space import has_orientation, count_linear_coordinates
+from .task_space import count_linear_coordinates, has_orientation
 from .ticks import LifeOrder, LifeReason, Mode, tick_ns
 from .vectors import Array, RowArray, put
 

@@ -196,7 +196,7 @@ class TickInput(NamedTuple):
         arrivals: the samples that arrived since the previous tick, in order.
         commands: the changes that were commanded since the previous tick.
         measured: the present state of an external arm; None: unchanged.
-        hand: the action of a live hand in this tick, see `live_hand.free_hand`; empty: nobody
+        hand: the action of a live hand in this tick, see `live_hand.empty_hand_vector`; empty: nobody
             holds the arm.
     """
 

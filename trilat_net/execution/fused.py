@@ -417,9 +417,9 @@ class FusedRun:
             else:
                 run_until(
                     last_ns=last_ns,
-                    apart_rad=self._settled_rad,
+                    settled_rad=self._settled_rad,
                     progress=self._progress,
-                    taken=self._taken,
+                    next_samples=self._taken,
                     sent=self._sent,
                     feed=self._inputs.feed,
                     peaks=self._peaks,
@@ -447,7 +447,7 @@ class FusedRun:
                 sense_site(
                     i=i,
                     progress=progress,
-                    taken=self._taken,
+                    next_samples=self._taken,
                     sent=self._sent,
                     feed=self._inputs.feed,
                     arrays=tables,
@@ -458,7 +458,7 @@ class FusedRun:
                     law.compute(int(progress[i]["tick"]), t_ns)
                 mode = finish_site(
                     i=i,
-                    apart_rad=self._settled_rad,
+                    settled_rad=self._settled_rad,
                     progress=progress,
                     sent=self._sent,
                     peaks=self._peaks,
