@@ -50,9 +50,9 @@ def _in_outage(stamp_ns: int, link: LinkRow, points: Points) -> bool:
 def _draw_loss(sample: int, fresh: bool, link: LinkRow, model: Row) -> bool:
     """Advances the chain of losses by one sample; true if the sample is lost.
 
-    The chain of Gilbert and Elliott has a good and a bad state, each with a probability of loss.
-    A fresh chain starts in its stationary distribution, where the bad state has the probability
-    enter / (enter + leave).
+    The chain of Gilbert and Elliott has a good and a bad state, each with a probability of
+    loss. A fresh chain starts in its stationary distribution, where the bad state has the
+    probability enter / (enter + leave).
     """
     if model.loss_good == 0.0 and model.enter == 0.0:
         return False
@@ -100,8 +100,8 @@ def _due_ns(
 ) -> int:
     """Returns the due time of a sample, ns since the epoch, or LOST.
 
-    Loss and delay are drawn for every sample, also for lost ones, so that their memories advance
-    by index.
+    Loss and delay are drawn for every sample, also for lost ones, so that their memories
+    advance by index.
     """
     lost = _draw_loss(sample, fresh, link, model)
     delay_us = _delay_us(

@@ -1,8 +1,8 @@
 """The control laws of the kernel: the paper's adaptive law and the laws of known gravity.
 
-The functions are for the planar two-link arm; `chain_stages` has the same laws for chains. Gains
-are diagonal matrices, written as vectors with one number per joint (N m s/rad; Lambda in 1/s) or
-per parameter. Angles are in rad, speeds in rad/s, torques in N m.
+The functions are for the planar two-link arm; `chain_stages` has the same laws for chains.
+Gains are diagonal matrices, written as vectors with one number per joint (N m s/rad; Lambda in
+1/s) or per parameter. Angles are in rad, speeds in rad/s, torques in N m.
 
 Invariant: the errors and the regressor of tick k never depend on the estimate of tick k, which
 keeps the update of second order explicit.
@@ -119,8 +119,8 @@ def adaptive_torque(
 def robust_torque(rho: float, width: float, r: float) -> float:
     """Returns rho r / sqrt(r^2 + width^2), a smooth form of rho sign(r).
 
-    The law subtracts it. With a disturbance d of at most rho, the power (d - robust torque) r is
-    at most ROBUST_RESIDUE rho width.
+    The law subtracts it. With a disturbance d of at most rho, the power (d - robust torque) r
+    is at most ROBUST_RESIDUE rho width.
     """
     return rho * (r / sqrt(r * r + width * width))
 
@@ -169,9 +169,9 @@ def damped_torque(
         tau = G(q) - K e - d qd - Kd ed + k_f felt
 
     - P+d: Kd = k_f = 0. For N sites with reversible shares, one K, one d and one constant delay
-      T, the linearised loop is stable for all masses if d >= max(abs(lambda_min(alpha)), 0.2172)
-      K T; for two sites if 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares no such bound
-      exists.
+      T, the linearised loop is stable for all masses if d >= max(abs(lambda_min(alpha)),
+      0.2172) K T; for two sites if 4 d_1 d_2 > (T_1 + T_2)^2 K_1 K_2. For other shares no such
+      bound exists.
     - PD+d: k_f = 0.
     - Direct force reflection: Kd = 0, with K and d at the slave, d and k_f at the master.
 

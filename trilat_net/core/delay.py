@@ -35,8 +35,8 @@ class DelayKind(IntEnum):
     - LOG_NORMAL: exp of a normal number of mean `location` and deviation `scale`.
     - HYPER_EXPONENTIAL: `location` plus an exponential number, of mean `extra` with the
       probability `weight`, otherwise of mean `scale`.
-    - AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample; cut off
-      at zero.
+    - AR1: mean `location`, deviation `scale`, correlation `weight` from sample to sample; cut
+      off at zero.
     - SINE: location + scale sin(2 pi t / extra + weight).
     - TRACE: a table of delays by time.
     - MEASURED: no delay is injected; a sample is used as soon as it arrives.

@@ -1,20 +1,20 @@
 """Dominance: the shares with which sites follow each other, and the reference of a site.
 
-Site i follows site j with the share alpha_ij (the dominance factor). Its reference is the sum of
-alpha_ij q_j over its peers, Eq. (6). Upsilon = I - alpha is the matrix of the coupling.
+Site i follows site j with the share alpha_ij (the dominance factor). Its reference is the sum
+of alpha_ij q_j over its peers, Eq. (6). Upsilon = I - alpha is the matrix of the coupling.
 
 Invariant:
 
 - Each row of alpha sums to one, Eq. (7), and the diagonal is zero.
 - beta is the LEFT null vector of Upsilon.
-- While factors change, they are a function of time and of the ramps alone. Between two rows that
-  sum to 1, every row sums to 1.
+- While factors change, they are a function of time and of the ramps alone. Between two rows
+  that sum to 1, every row sums to 1.
 - A stale peer stops the reference. The reference then returns from the held pose to the peers
   along the smooth polynomial 3 x^2 - 2 x^3.
 
 Source: Eq. (6), (7), (20) of the paper. The paper uses beta = (1, 1, 1). That is the right null
-vector of Upsilon, and a left one only if the columns sum to one as well. The left null vector of
-an irreducible matrix is its Perron vector, positive and unique up to its length.
+vector of Upsilon, and a left one only if the columns sum to one as well. The left null vector
+of an irreducible matrix is its Perron vector, positive and unique up to its length.
 """
 
 import numpy as np
@@ -133,7 +133,8 @@ def perron_vector(alpha: Array) -> Array:
 RAMP_COLUMNS = 2
 """Columns of a ramp before its factors.
 
-A ramp is a row: its start and its end, ns, and then the dominance factor of each peer at its end.
+A ramp is a row: its start and its end, ns, and then the dominance factor of each peer at its
+end.
 """
 
 
@@ -247,9 +248,9 @@ def any_peer_stale(t_ns: int, age_ns: int, links: RowArray) -> bool:
 def update_stale_mode(t_ns: int, site: SiteRow, links: RowArray) -> None:
     """Applies the rule for stale peers: changes the mode, and the reference for the mode.
 
-    In HOLD the reference is that of the previous tick, in BRAKE the pose of the arm. In RETURN it
-    is q_held + s (q_des - q_held), with s = 3 x^2 - 2 x^3 and x the part of `return_ns` that has
-    passed.
+    In HOLD the reference is that of the previous tick, in BRAKE the pose of the arm. In RETURN
+    it is q_held + s (q_des - q_held), with s = 3 x^2 - 2 x^3 and x the part of `return_ns` that
+    has passed.
     """
     if site.on_stale == _USE or site.mode == _DIVERGED:
         return

@@ -295,7 +295,8 @@ def _update_sums(
     for i in range(n):
         sums.held[i] = s.held[i]
         sums.now[i] = s.on_arm[i] - s.held[i]
-    # Rows of operators come first. With operators, s.held and s.on_arm contain their torque too.
+    # Rows of operators come first. With operators, s.held and s.on_arm contain their torque
+    # too.
     if first > 0:
         _put_source_torque(
             t_s=t_s,

@@ -1,9 +1,9 @@
 # mypy: disallow-untyped-calls=False, disable-error-code="no-any-return"
 """The typed wrapper around Numba: `leaf` compiles a function and keeps its machine code.
 
-Machine code is kept in the user's cache directory, in a folder named after a hash of all sources
-of the core. (Numba alone notices a change of the file that holds a leaf, but not of the leaves
-that it calls.) A wheel contains such a folder with code for the generic processor of its
+Machine code is kept in the user's cache directory, in a folder named after a hash of all
+sources of the core. (Numba alone notices a change of the file that holds a leaf, but not of the
+leaves that it calls.) A wheel contains such a folder with code for the generic processor of its
 platform, which is used if the user's folder has no code for this processor.
 
 A leaf that another leaf calls is an inner leaf. It is kept as unoptimised LLVM code, which is
@@ -11,8 +11,8 @@ optimised as a part of the leaf that Python calls.
 
 Invariant:
 
-- A leaf is compiled without reordering (no fastmath), so that compiled and plain Python runs give
-  the same bits.
+- A leaf is compiled without reordering (no fastmath), so that compiled and plain Python runs
+  give the same bits.
 - The compilation and the caches of other code in the process are not affected.
 """
 
@@ -154,8 +154,8 @@ _record: Any = types.Record
 _record.mangling_args = property(_mangle_record)
 
 _OPTIONS: Any = {"_nrt": False}
-"""Options of leaves: no leaf allocates an array, so Numba need not count references, which would
-cost more than the arithmetic.
+"""Options of leaves: no leaf allocates an array, so Numba need not count references, which
+would cost more than the arithmetic.
 """
 _INNER = "within"
 """Marks kept code as that of an inner leaf."""
@@ -295,8 +295,8 @@ class _LeafCache(FunctionCache):
 class _LeafLibrary(JITCodeLibrary):
     """The code of a leaf; that of an inner leaf is neither optimised nor made executable.
 
-    It is optimised once, as a part of the outer leaf. Numba would also optimise each leaf on the
-    way, and add a wrapper for calls from Python to each: half of the time of compilation.
+    It is optimised once, as a part of the outer leaf. Numba would also optimise each leaf on
+    the way, and add a wrapper for calls from Python to each: half of the time of compilation.
     """
 
     is_inner = False
@@ -362,13 +362,13 @@ class _LeafCompiler(Compiler):
 
 
 class _Leaf(CPUDispatcher):
-    """A leaf; it is compiled again for calls from Python if it only was an inner leaf before."""
+    """A leaf; an inner leaf is compiled again for calls from Python."""
 
     _cache: Any
     _compiler: Any
 
     def get_call_template(self, arguments: Any, keywords: Any) -> Any:
-        """Returns the call for a caller: constants count by type, so that they compile nothing."""
+        """Returns the call for these types; constants count by their type alone."""
         plain = {name: types.unliteral(keyword) for name, keyword in keywords.items()}
         return super().get_call_template(tuple(map(types.unliteral, arguments)), plain)
 
@@ -408,7 +408,7 @@ def bind_leaf(function: Callable[P, R], *arguments: P.args, **_: P.kwargs) -> Ca
 
 
 def leaf(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a function of numbers and arrays; for readers and mypy its type stays the same."""
+    """Compiles a function of numbers and arrays; its type for readers and mypy is unchanged."""
     if _config.DISABLE_JIT:
         return function
     options = {"nopython": True, "boundscheck": None, **_OPTIONS}

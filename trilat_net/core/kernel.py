@@ -115,7 +115,7 @@ def _put_known_gravity(s: SiteRow, chain: RowArray | None, torque: Array) -> Non
 
 @leaf
 def _guard_torque(k: int, t_ns: int, s: SiteRow, chain: RowArray | None) -> None:
-    """Ends stage 6: the torque of an arm at rest or returning to its law, and the limit of rate.
+    """Ends stage 6: the torque of an arm at rest or returning to its law, and its limits.
 
     Under the rule `glide` a torque that is not finite leads to FAULT here.
     """
@@ -215,7 +215,9 @@ def _advance(
 
     The torque that is held over the period is that of its middle, extrapolated linearly:
 
-        u = 1.5 tau_k - 0.5 tau_{k-1},  within the limit; u = tau_k at the first tick, in DIGITAL
+        u = 1.5 tau_k - 0.5 tau_{k-1}, within the limit
+
+    At the first tick, and under DIGITAL, u = tau_k.
     """
     h_s = 1.0 / s.rate_hz
     # Evaluate this before the arm moves: whether an arm at rest is fast depends on its speed.
@@ -243,7 +245,7 @@ def _advance(
 
 @leaf
 def channel_of(channel: ChannelArrays | None, peer: int) -> ChannelArrays | None:
-    """Returns the channel of one peer; of stacked arrays, the channels of the peers of a site."""
+    """Returns the channel of one peer, or of one site of stacked arrays."""
     if channel is None:
         return None
     return ChannelArrays(channel.waiting[peer], channel.received[peer], channel.columns[peer])
@@ -264,7 +266,7 @@ def link_arrays(arrays: SiteArrays, peer: int) -> LinkArrays:
 
 @leaf
 def find_release(peer: int, tick: int, arrays: SiteArrays) -> int:
-    """Returns the site's tick that releases a peer's sample, or LOST; see `link.release_tick`."""
+    """Returns the tick that releases a peer's sample, or LOST, as `link.release_tick`."""
     return release_tick(tick, arrays.site[0].rate_hz, link_arrays(arrays, peer))
 
 

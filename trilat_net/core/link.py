@@ -1,8 +1,8 @@
 """The receiving end of one directed link j -> i, which applies the delay.
 
 A link is a calendar: a ring of pages, one for each of the receiver's next ticks.
-`accept_sample` files a sample in the page of the tick that releases it, unless that page holds a
-newer sample. `release_sample` reads the page of the present tick. Both cost the same at any
+`accept_sample` files a sample in the page of the tick that releases it, unless that page holds
+a newer sample. `release_sample` reads the page of the present tick. Both cost the same at any
 delay. A calendar only spans the ticks for which samples may wait. The due times of samples, of
 eight bytes each, are kept for as long as a late sample or a duplicate may arrive.
 
@@ -124,8 +124,8 @@ def calendar_pages(
 def release_tick(tick: int, rate_hz: int, link: LinkArrays) -> int:
     """Returns the receiver's tick at which sample `tick` comes into use if it arrives in time.
 
-    LOST if the link loses the sample, or if the sample is so old that the link has forgotten its
-    due time.
+    LOST if the link loses the sample, or if the sample is so old that the link has forgotten
+    its due time.
     """
     row: LinkRow = link.state[0]
     dues = link.dues

@@ -3,13 +3,13 @@
 Invariant:
 
 - Each decision follows from the samples in use and from the memory of the site, tick by tick.
-- A peer is only dropped if the remaining sites all reach each other without it, and if it is not
-  the last peer that the site follows. Otherwise the site holds.
-- The reference never jumps: the site aligns with the remaining peers, and again with a peer that
-  returns.
+- A peer is only dropped if the remaining sites all reach each other without it, and if it is
+  not the last peer that the site follows. Otherwise the site holds.
+- The reference never jumps: the site aligns with the remaining peers, and again with a peer
+  that returns.
 
-`gone` of a link is 0 while the peer is present, -1 while it is lost, and while it is heard again
-the time since then, ns since the epoch.
+`gone` of a link is 0 while the peer is present, -1 while it is lost, and while it is heard
+again the time since then, ns since the epoch.
 """
 
 from .chain import add, scale, three
@@ -29,7 +29,7 @@ _RESTORED = int(LifeReason.RESTORED)
 
 @leaf
 def _can_drop(lost: int, t_ns: int, site: SiteRow, links: RowArray) -> bool:
-    """True if the remaining sites all reach each other without a peer, and the site follows one.
+    """True if the remaining sites reach each other without a peer, and the site follows one.
 
     Sets of sites are numbers with one bit per site. `forward` are the sites that this site
     reaches, `backward` the sites that reach this site; both must be all remaining sites.

@@ -1,7 +1,7 @@
 """Counter-based random numbers: pure functions of their purpose, without state or order.
 
-Invariant (L4): a draw is a function of (seed, link, sample index, purpose) alone. It is the same
-on every machine, in every driver, and in any order of arrival.
+Invariant (L4): a draw is a function of (seed, link, sample index, purpose) alone. It is the
+same on every machine, in every driver, and in any order of arrival.
 
 The generator is Philox-4x32 with ten rounds: Salmon, Moraes, Dror and Shaw, "Parallel Random
 Numbers: As Easy as 1, 2, 3", SC 2011. NumPy has Philox too, but compiled leaves need it for

@@ -1,7 +1,7 @@
 """How an arm comes to rest where it is, and stays there.
 
-An arm rests while its site waits, holds, is stopped or in fault. The reference of a joint starts
-at the joint's own angle and speed v, and comes to rest within T. Per period h,
+An arm rests while its site waits, holds, is stopped or in fault. The reference of a joint
+starts at the joint's own angle and speed v, and comes to rest within T. Per period h,
 
     |qd_ref| falls by the factor 1 - h / T_left,
     T_left = max(LEAST_STOP_S - t, max_i |qd_ref_i| / a_i),
@@ -22,8 +22,8 @@ torque. To either torque
 
 is added. w starts as the part of the last torque that the law does not explain, times 1 - max B
 |qd| / tau_limit: the torque of a slow arm holds unknown gravity or hands, the torque of a fast
-arm follows from its motion. While the arm brakes, w loses B |qd| in each tick in which w acts in
-the direction of the joint's motion. Lambda is that of the adaptive law in joint space, and
+arm follows from its motion. While the arm brakes, w loses B |qd| in each tick in which w acts
+in the direction of the joint's motion. Lambda is that of the adaptive law in joint space, and
 otherwise `REST_RATE_1_S`. In task space the estimate is kept. docs/links.md derives the energy
 that all this can add to an arm.
 
@@ -38,8 +38,8 @@ Invariant:
   joint.
 - While an arm brakes, no term but w acts in the direction of a joint's motion, and w adds at
   most h w^2 / 2 B.
-- Once the reference rests and no torque is limited, S + 1/2 w' (k B)^-1 w of the adaptive law in
-  joint space never rises, with S the storage of the law: B adds to Kp, and w is a further
+- Once the reference rests and no torque is limited, S + 1/2 w' (k B)^-1 w of the adaptive law
+  in joint space never rises, with S the storage of the law: B adds to Kp, and w is a further
   estimate, of a constant torque whose true value is zero.
 """
 
@@ -94,7 +94,7 @@ def is_fast(site: SiteRow) -> bool:
 
 @leaf
 def rests_by_law(site: SiteRow) -> bool:
-    """True if the torque of an arm at rest contains that of its law, which then still adapts."""
+    """True if the torque of an arm at rest contains that of its law, which still adapts."""
     holds = site.law != _USER or site.holds != 0
     learns_in_task = site.task != 0 and site.law != _KNOWN
     usable = holds and not learns_in_task and site.reason != _NOT_FINITE

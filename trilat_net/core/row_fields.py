@@ -1,4 +1,4 @@
-"""The fields of the core's rows: for each its shape, unit, meaning, and the stage that writes it.
+"""The fields of the core's rows: shape, unit, meaning, and the stage that writes each field.
 
 A row is one record of a NumPy structured array. Each class below is a row at once as a reader
 and mypy see it (its attributes and their types) and as NumPy lays it out: `row_dtype` reads the
@@ -45,8 +45,8 @@ class Field(NamedTuple):
 class SiteRow(Protocol):
     """The row of a site: its settings and gains, its state, and the results within a tick.
 
-    "shared" is the number of coordinates that sites exchange. Fields that the laws of users read
-    in `LawInput` keep its names.
+    "shared" is the number of coordinates that sites exchange. Fields that the laws of users
+    read in `LawInput` keep its names.
     """
 
     rate_hz: Annotated[int, Field("", "Hz", "tick rate", "setup")]
@@ -303,7 +303,7 @@ class LinkRow(Protocol):
 
 
 class SampleRow(Protocol):
-    """The row of a calendar's page: the newest sample that one tick of the receiver releases."""
+    """The row of a calendar's page: the newest sample that a tick of the receiver releases."""
 
     tick: Annotated[int, Field("", "tick", "stamp of the sample; -1: no sample", "1 accept")]
     q: Annotated[Array, Field("shared", "rad or m", "joint angles or pose", "1 accept")]

@@ -289,7 +289,8 @@ def add_model(arrays: SiteArrays, peer: int, model: LinkModel) -> None:
     models[index + 1 : count + 1] = models[index:count].copy()
     models[index] = model
     link.models = count + 1
-    # The model in force moves down one row. Samples that are scheduled already keep their times.
+    # The model in force moves down one row. Samples that are scheduled already keep their
+    # times.
     if link.model >= index:
         link.model += 1
 
@@ -337,9 +338,9 @@ _NEAR_NS = NS_PER_S // 4
 MAX_LINKS_BYTES = 64 << 20
 """Largest memory of a site's links beyond what their delays need, bytes."""
 _SLACK = 4
-"""Additional ticks: a sample is scheduled up to two ticks before it is filed; and some reserve."""
+"""Reserve, ticks: a sample is scheduled up to two ticks before it is filed."""
 _NEVER_SAMPLED = 2
-"""Marks an actor that fills up a stack: evaluated neither in every stage (0) nor per tick (1)."""
+"""Marks an actor that only fills up a stack: it is evaluated neither per stage nor per tick."""
 
 
 def stack_site_arrays(
@@ -422,8 +423,8 @@ def _stack_channels(
 ) -> ChannelArrays:
     """Returns the channels of several sites stacked.
 
-    Their columns become those of the peer's record, which holds what the peer sends to all sites
-    and then what it sends to each of them.
+    Their columns become those of the peer's record, which holds what the peer sends to all
+    sites and then what it sends to each of them.
     """
     for setup, channel in zip(setups, channels, strict=True):
         for link, columns in zip(setup.links, channel.columns, strict=True):

@@ -38,8 +38,9 @@ class Law(IntEnum):
     """The control law of a site.
 
     ADAPTIVE is the paper's law, Eq. (13) and (15), with its estimate in a box if bounds are
-    given. KNOWN assumes known gravity: tau = G(q) - K e - d qd - Kd ed + k_f felt, which is P+d,
-    PD+d or direct force reflection. USER is a law in Python, of a user or of `trilat_net.laws`.
+    given. KNOWN assumes known gravity: tau = G(q) - K e - d qd - Kd ed + k_f felt, which is
+    P+d, PD+d or direct force reflection. USER is a law in Python, of a user or of
+    `trilat_net.laws`.
     """
 
     ADAPTIVE = 0
@@ -54,8 +55,8 @@ LEAST_STOP_S = 0.1
 class StaleAction(IntEnum):
     """The action of a site while a peer that it follows is stale.
 
-    USE continues with the last sample. HOLD keeps the last reference, BRAKE the pose of the arm.
-    GLIDE lets the reference come to rest, and starts by waiting for all peers, see
+    USE continues with the last sample. HOLD keeps the last reference, BRAKE the pose of the
+    arm. GLIDE lets the reference come to rest, and starts by waiting for all peers, see
     `session_life`.
     """
 
@@ -119,7 +120,7 @@ class RestGains(NamedTuple):
     deceleration: Vector = (math.inf,)
 
     def vectors(self) -> dict[str, Vector]:
-        """Returns the gains for the core: B, k B with k = 1 / (4 time_s), and the deceleration."""
+        """Returns the gains for the core: B, k B with k = 1 / (4 time_s), and deceleration."""
         integral = tuple(float(B) / (4.0 * self.time_s) for B in self.damping)
         return {
             "damping": self.damping,
@@ -282,7 +283,7 @@ class Layout(NamedTuple):
         return slice(first, first + 2 * self.joints * self.task)
 
     def list_lost_peers(self, mem: Sequence[float], peers: Sequence[str]) -> list[str]:
-        """Returns the names of the lost peers of a site that degrades, from a record's `mem`."""
+        """Returns the names of the lost peers of a degrading site, from a record's `mem`."""
         end = self.count_life_memory(len(peers), degrades=True)
         all_gone = mem[end - len(peers) : end]
         # A record of another rule has a shorter memory, and then no lost peers.
@@ -353,7 +354,8 @@ class Gains(NamedTuple):
         rho: largest robust torque of ADAPTIVE, shape (n,), N m.
         width: speed r at which the robust torque is 0.71 rho, shape (n,), rad/s.
         friction: share of a chain's joint friction that ADAPTIVE compensates, shape (n,).
-        absolute: true: r of ADAPTIVE is qd + Lambda q, and Kp couples it to r of the peers; only
+        absolute: true: r of ADAPTIVE is qd + Lambda q, and Kp couples it to r of the peers;
+        only
             linear analysis uses this.
     """
 

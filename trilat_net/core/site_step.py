@@ -1,7 +1,8 @@
 """A site, and `Site.step`, which computes each tick of a site.
 
 `Site` is thin Python around `kernel.site_tick`: it packs the arrivals into arrays, calls the
-compiled tick, and unpacks the record. A user's law runs between two compiled halves of the tick.
+compiled tick, and unpacks the record. A user's law runs between two compiled halves of the
+tick.
 
 Invariant:
 
@@ -146,7 +147,7 @@ class Site:
         )
 
     def _plug_law(self, setup: SiteSetup) -> None:
-        """Creates the user's law of a setup, if it has one, and compiles the stages around it."""
+        """Creates the user's law of a setup, if any, and compiles the stages around it."""
         self._user_law = None
         if setup.law_factory is not None:
             self._user_law = setup.law_factory(setup.law_context())
@@ -180,8 +181,8 @@ class Site:
     def start_at(self, k: int) -> None:
         """Makes tick k the first tick of a site that joins a running session.
 
-        The site must not have made a tick. Its arm stands at the start pose, no sample of a peer
-        is in use or waits, and the channels of its links are in the state of tick k - 1.
+        The site must not have made a tick. Its arm stands at the start pose, no sample of a
+        peer is in use or waits, and the channels of its links are in the state of tick k - 1.
         """
         if k <= self._site["first"]:
             self.restore_links(k, [None] * len(self.peers), ())
@@ -272,8 +273,8 @@ class Site:
         """Runs stage 6 of a user's law; returns the law's memory.
 
         Under the rule `glide` a law that fails gives NaN as torque, which leads to FAULT. The
-        law is not called again until the fault is reset, and then continues from the memory that
-        it had before the failure.
+        law is not called again until the fault is reset, and then continues from the memory
+        that it had before the failure.
         """
         assert self._law is not None
         s: Row = self._site[0]
@@ -375,7 +376,7 @@ class Site:
         )
 
     def release_tick(self, peer: int, tick: int) -> int | None:
-        """Returns the site's tick at which a peer's sample comes into use if it arrives in time.
+        """Returns the site's tick that brings a peer's sample into use if it arrives in time.
 
         None if its link loses the sample or has forgotten its due time.
         """

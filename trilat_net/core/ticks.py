@@ -101,7 +101,8 @@ class LifeOrder(IntEnum):
     - HELD: somebody holds the dead-man switch again.
     - OVERRUN: the site missed ticks.
 
-    Of several orders in one tick the one with the highest number counts. OVERRUN counts besides.
+    Of several orders in one tick the one with the highest number counts. OVERRUN counts
+    besides.
     """
 
     ENABLE = 1
@@ -196,7 +197,8 @@ class TickInput(NamedTuple):
         arrivals: the samples that arrived since the previous tick, in order.
         commands: the changes that were commanded since the previous tick.
         measured: the present state of an external arm; None: unchanged.
-        hand: the action of a live hand in this tick, see `live_hand.empty_hand_vector`; empty: nobody
+        hand: the action of a live hand in this tick, see `live_hand.empty_hand_vector`; empty:
+        nobody
             holds the arm.
     """
 
@@ -266,7 +268,8 @@ class TickRecord(NamedTuple):
     def shared(self) -> tuple[Sequence[float], Sequence[float], Sequence[float]]:
         """Returns the motion and the exogenous torque that peers receive.
 
-        They are in shared coordinates: those of the end effector in task space, else the joints.
+        They are in shared coordinates: those of the end effector in task space, else the
+        joints.
         """
         if self.x:
             return self.x, self.xd, self.wrench
@@ -315,7 +318,7 @@ _REASONS = {
 
 
 def find_life_reason(output: TickRecord) -> LifeReason:
-    """Returns the reason, stored in a record, for which a gliding site last changed its mode."""
+    """Returns the reason in a record for the last change of mode of a gliding site."""
     shared = len(output.q_des)
     return LifeReason(int(output.mem[2 * shared + 1]))
 

@@ -46,8 +46,8 @@ def put(a: Any, values: Any) -> None:
 def count_started(table: Any, first: int, count: int, now: float) -> int:
     """Returns how many rows of a table start at the time `now` or before.
 
-    The rows `first` to `first + count - 1` are ordered by time, which is their first column. The
-    method is bisection.
+    The rows `first` to `first + count - 1` are ordered by time, which is their first column.
+    The method is bisection.
     """
     low = first
     high = first + count
@@ -63,7 +63,7 @@ def count_started(table: Any, first: int, count: int, now: float) -> int:
 Array = NDArray[np.float64]
 
 Row = Any
-"""A row of a structured array whose fields no type names; `row_fields` has types of most rows."""
+"""A row of a structured array without named fields; `row_fields` has types of most rows."""
 
 Points = NDArray[np.int64]
 """A table of pairs, shape (n, 2), of traces and then of outages.
