@@ -1,10 +1,15 @@
-"""Errors, by who has to act: the author of a scenario, the caller, a peer, a file, the program.
+"""The error classes, and helpers for the wording of messages.
 
-Invariant: an error carries its data and one sentence that names the problem, its place and the
-remedy. The command line prints that sentence and nothing else; `exit_code` is the code that a
-command ends with. Options that it names are those of a command in a command, and arguments in
-Python. Every text of the program that counts things goes through `count_nouns`, as in "1
-record" and "2 records" (`tests/test_wording.py`).
+The classes distinguish who has to act: the author of a scenario, the caller, a peer, the owner
+of a file, or the developers.
+
+Invariant:
+    - An error carries its data and one sentence that names the problem, its location and the
+      remedy. The command line prints that sentence and nothing else.
+    - `exit_code` is the exit code of a command that the error ends.
+    - Messages name options of the command line. In Python, they name the arguments instead.
+    - Each text that counts things uses `count_nouns`, as in "1 record" and "2 records"
+      (`tests/test_wording.py`).
 """
 
 import re
@@ -17,16 +22,22 @@ _OPTION = re.compile(
 _IRREGULAR = {"axis": "axes", "datum": "data", "is": "are", "was": "were", "has": "have"}
 _SWITCHES = ("--force", "--insecure", "--full", "--closed-loop")
 _ARGUMENTS = {
-    "-o": "out", "--resume": "the same out", "--duration": "duration_s", "--longest": "longest_s",
-    "--law": "laws", "--metric": "metrics", "--margin": "along", "--gravity": "gravity_percent",
+    "-o": "out",
+    "--resume": "the same out",
+    "--duration": "duration_s",
+    "--longest": "longest_s",
+    "--law": "laws",
+    "--metric": "metrics",
+    "--margin": "along",
+    "--gravity": "gravity_percent",
     "--at": "at_s",
-}  # fmt: skip
-"""Arguments in Python that are not called as their options."""
+}
+"""Arguments in Python whose names differ from their options."""
 
 
-def _name_argument(found: re.Match[str]) -> str:
-    """Returns an option as an argument; a whole command stays."""
-    command, option, value = found.groups()
+def _name_argument(match: re.Match[str]) -> str:
+    """Returns an option as a Python argument; a whole command is not changed."""
+    command, option, value = match.groups()
     if command:
         return str(command)
     name = _ARGUMENTS.get(option) or option.lstrip("-").replace("-", "_")
@@ -42,21 +53,22 @@ class TrilatError(Exception):
     """True in a process that runs a command."""
 
     def __str__(self) -> str:
-        text = Exception.__str__(self)  # a KeyError's would be quoted
+        # KeyError.__str__ would quote the text.
+        text = Exception.__str__(self)
         return text if TrilatError.in_command else _OPTION.sub(_name_argument, text)
 
 
 class UnknownName(TrilatError, KeyError):  # noqa: N818 - it names an outcome
-    """A name that a mapping of results does not have, as of a site that a log lacks."""
+    """A name that a mapping of results lacks, for instance a site that is not in a log."""
 
     exit_code = 2
 
 
 class ScenarioError(TrilatError):
-    """An invalid scenario, override or argument: its author must act.
+    """An invalid scenario, override or argument, which its author must correct.
 
     Args:
-        problem: the error and its remedy.
+        problem: the problem and its remedy.
         path: the dotted key, or "".
         source: the file or the name of the scenario, or "".
     """
@@ -71,7 +83,7 @@ class ScenarioError(TrilatError):
 
 
 class CodeWithheld(ScenarioError):  # noqa: N818 - it names an outcome
-    """A law, hand or plant that a log names, and that nobody here allowed to run."""
+    """A law, hand or plant that a log names, but that has not been allowed to run here."""
 
     exit_code = 4
 
@@ -83,7 +95,12 @@ class UsageError(TrilatError):
 
 
 class WireError(TrilatError):
-    """A payload from a peer that is no message of this program; it is counted under `reason`."""
+    """A payload from a peer that is not a message of this program.
+
+    Args:
+        reason: the category under which such payloads are counted.
+        detail: the problem of this payload.
+    """
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f"{reason}: {detail}")
@@ -91,25 +108,25 @@ class WireError(TrilatError):
 
 
 class SessionError(TrilatError):
-    """A session that cannot begin: a missing peer, another scenario, a session that is running."""
+    """A session that cannot start: a missing peer, another scenario, or a running session."""
 
     exit_code = 2
 
 
 class LogError(TrilatError):
-    """A log that is missing, torn, or not written by this program."""
+    """A log that is missing, incomplete, or not written by this program."""
 
     exit_code = 2
 
 
 class LogRefused(LogError):  # noqa: N818 - it names an outcome
-    """A log that the machine refused to continue, as on a full disk; everything before is kept."""
+    """A log that the machine cannot continue, as on a full disk; earlier records are kept."""
 
     exit_code = 5
 
 
 class NotRepeatable(LogError):  # noqa: N818 - it names an outcome
-    """A run cannot be executed again from its log; the message says why."""
+    """A run that cannot be executed again from its log; the message says why."""
 
 
 class NothingSaved(LogError):  # noqa: N818 - it names an outcome
@@ -123,19 +140,19 @@ class RunFailed(TrilatError):  # noqa: N818 - it names an outcome, as the exit s
 
 
 class PeerLeft(RunFailed):
-    """A run of which another site ended its part before the end, and did not come back."""
+    """A run that another site left before the end, without rejoining."""
 
     exit_code = 3
 
 
 class CodeFailed(RunFailed):
-    """Code of a user's own that raised, was too slow, or gave nothing that can be used.
+    """A user's code that raised an exception, was too slow, or returned unusable results.
 
     Args:
-        problem: its failure.
-        site: its site.
+        problem: the failure.
+        site: the site of the code.
         code: the class, as in "package.module:Law".
-        tick: the tick of the failure; None if it was being resumed.
+        tick: the tick of the failure; None if the code failed while it was resumed.
     """
 
     kind: ClassVar[str] = "code"
@@ -149,20 +166,19 @@ class CodeFailed(RunFailed):
         self.tick = tick
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Restores the error of another process."""
-        return partial(type(self), site=self.site, code=self.code, tick=self.tick), (
-            self.problem,
-        )
+        """Returns how to rebuild the error in another process."""
+        rebuild = partial(type(self), site=self.site, code=self.code, tick=self.tick)
+        return rebuild, (self.problem,)
 
 
 class LawFailed(CodeFailed):
-    """A user's control law failed."""
+    """A user's control law that failed."""
 
     kind = "law"
 
 
 class PlantFailed(CodeFailed):
-    """A plant of one's own failed."""
+    """A user's plant that failed."""
 
     kind = "plant"
 
@@ -172,22 +188,25 @@ class RuntimeFault(TrilatError):  # noqa: N818 - a fault of ours, by its name in
 
 
 def count_nouns(count: object, singular: str, plural: str = "") -> str:
-    """Returns a number and what it counts, in the singular for 1.
+    """Returns a number with the noun that it counts, in the singular for 1.
 
-    >>> count_nouns(1, "record"), count_nouns(2, "record"), count_nouns(1, "mark waits", "marks
-    wait") ('1 record', '2 records', '1 mark waits')
+    >>> count_nouns(1, "record"), count_nouns(2, "record")
+    ('1 record', '2 records')
+    >>> count_nouns(1, "mark waits", "marks wait")
+    '1 mark waits'
 
     Args:
         count: the number, or its text, as in "1,000".
-        singular: the noun, with words before it if there are any, as in "late sample".
-        plural: the same for other numbers; by default `pluralise` of the singular.
+        singular: the noun, possibly with words before it, as in "late sample".
+        plural: the noun for other numbers; by default `pluralise(singular)`.
     """
-    words = singular if str(count) == "1" else plural or pluralise(singular)
-    return f"{count} {words}"
+    if str(count) == "1":
+        return f"{count} {singular}"
+    return f"{count} {plural or pluralise(singular)}"
 
 
 def pluralise(singular: str) -> str:
-    """Returns the plural of a noun, of which the last word is that noun."""
+    """Returns the plural of a noun, which is the last word of `singular`."""
     *before, noun = singular.split(" ")
     if noun in _IRREGULAR:
         plural = _IRREGULAR[noun]

@@ -1,9 +1,9 @@
-"""Fields of a scenario: the base of its types, ranges of its numbers, and checks of an author's
-tables.
+"""Fields of a scenario: base of its types, ranges of its numbers, checks of its tables.
 
-Invariant: an error names the path of the key as the author wrote it, and the nearest valid
-name. No quantity of an arm, a gain or a torque exceeds `MAX_QUANTITY`, which keeps arithmetic
-far from its limits.
+Invariant:
+    - An error names the path of the key as the author wrote it, and the nearest valid name.
+    - No quantity of an arm, a gain or a torque exceeds `MAX_QUANTITY`, which keeps arithmetic
+      far from overflow.
 """
 
 import difflib
@@ -19,33 +19,39 @@ from msgspec import Meta
 
 from .core.chain import LINK_PARAMETERS, MAX_JOINTS
 from .core.two_link_arm import JOINTS, PARAMETERS
-from .errors import ScenarioError
+from .errors import ScenarioError, count_nouns
 
 
 class Frozen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Immutable; unknown keys are refused."""
+    """Base of a scenario's types: immutable, and unknown keys are refused."""
 
 
 K = TypeVar("K", bound=Frozen)
 
 
 def find_kinds(package: str, base: type[K]) -> Iterator[type[K]]:
-    """Yields the kinds of a base, named by a tag, that the files of its package define, by file
-    and place.
+    """Yields the subclasses of `base` with a tag that the files of a package define.
+
+    They are ordered by file and by position in the file.
+
+    Args:
+        package: the dotted name of the package.
+        base: the base class.
     """
-    for found in pkgutil.iter_modules(import_module(package).__path__):
-        module = f"{package}.{found.name}"
-        for one in vars(import_module(module)).values():
-            own = isinstance(one, type) and issubclass(one, base) and one.__module__ == module
-            # else it is a base of others
-            if own and one.__struct_config__.tag not in (
-                None,
-                one.__name__,
-            ):
-                yield one
+    for file in pkgutil.iter_modules(import_module(package).__path__):
+        name = f"{package}.{file.name}"
+        for value in vars(import_module(name)).values():
+            if not (isinstance(value, type) and issubclass(value, base)):
+                continue
+            tag = value.__struct_config__.tag
+            # Without a tag of its own, a class is only a base of others.
+            has_tag = tag is not None and tag != value.__name__
+            if value.__module__ == name and has_tag:
+                yield value
 
 
 MAX_QUANTITY = 1e9
+"""Largest absolute value of a scenario's quantities."""
 
 Positive = Annotated[float, Meta(gt=0.0, le=MAX_QUANTITY)]
 NotNegative = Annotated[float, Meta(ge=0.0, le=MAX_QUANTITY)]
@@ -73,8 +79,13 @@ StructType = type[msgspec.Struct]
 
 
 class VectorCounts(NamedTuple):
-    """How many numbers the vectors of a site have: per joint, parameter, axis, shared
-    coordinate.
+    """Counts of the numbers in the vectors of a site.
+
+    Attributes:
+        joints: count of a vector with one number per joint.
+        parameters: count of a vector with one number per dynamic parameter.
+        axes: count of a vector with one number per axis of space.
+        shared: count of a vector with one number per coordinate that sites share.
     """
 
     joints: int = JOINTS
@@ -84,13 +95,26 @@ class VectorCounts(NamedTuple):
 
     @classmethod
     def of_chain(cls, joints: int, shared: int = 0) -> "VectorCounts":
-        """Returns those of a chain of so many joints, which shares them or so many coordinates."""
-        return cls(joints, LINK_PARAMETERS * joints, 3, shared or joints)
+        """Returns the counts of a chain.
+
+        Args:
+            joints: the number of its joints.
+            shared: the number of coordinates that sites share; by default that of the joints.
+        """
+        return cls(
+            joints=joints,
+            parameters=LINK_PARAMETERS * joints,
+            axes=3,
+            shared=shared or joints,
+        )
 
 
 class KeyProblem(NamedTuple):
-    """A key that cannot be as it is, below the table that is checked ("": the table itself),
-    and why.
+    """A key with an invalid value.
+
+    Attributes:
+        key: the path of the key below the checked table; "" for the table itself.
+        problem: the problem.
     """
 
     key: str
@@ -99,36 +123,45 @@ class KeyProblem(NamedTuple):
 
 @cache
 def _vector_keys(kind: StructType, extra: str) -> Mapping[str, str]:
-    """Returns the keys of a type whose vectors have a number per joint, parameter or axis, and
-    per which.
+    """Returns the vector keys of a type, with the count that each vector has.
+
+    Args:
+        kind: the type.
+        extra: the annotation: "per" for vectors, "point" for points.
+
+    Returns:
+        Per key the name of a field of `VectorCounts`.
     """
-    return {
-        key: str(meta.extra[extra])
-        for key, hint in get_type_hints(kind, include_extras=True).items()
-        for meta in getattr(hint, "__metadata__", ())
-        if isinstance(meta, Meta) and meta.extra is not None and extra in meta.extra
-    }
+    counts = {}
+    for key, hint in get_type_hints(kind, include_extras=True).items():
+        for meta in getattr(hint, "__metadata__", ()):
+            if isinstance(meta, Meta) and meta.extra is not None and extra in meta.extra:
+                counts[key] = str(meta.extra[extra])
+    return counts
 
 
 def expand_vectors(table: TomlTable, kind: StructType, counts: VectorCounts) -> TomlTable:
-    """Returns a table with every single number or distribution written out as the vector of its
-    type.
+    """Returns a table with single numbers and distributions expanded to vectors.
 
-    A vector that is absent has its type's default, as long as the arm needs it.
+    A missing vector gets the default of its type, with the length that the arm needs.
+
+    Args:
+        table: the table of a scenario.
+        kind: the type of the table.
+        counts: the counts of the site's vectors.
     """
     per = _vector_keys(kind, "per")
-    defaults = {
-        field.name: [field.default[0]] * getattr(counts, per[field.name])
-        for field in msgspec.structs.fields(kind)
-        if field.name in per and isinstance(field.default, tuple)
-    }
-    written = {
-        key: [value] * getattr(counts, per[key])
-        if key in per and (is_number(value) or is_distribution(value))
-        else value
-        for key, value in table.items()
-    }
-    return {**defaults, **written}
+    expanded: TomlTable = {}
+    for field in msgspec.structs.fields(kind):
+        if field.name in per and isinstance(field.default, tuple):
+            expanded[field.name] = [field.default[0]] * getattr(counts, per[field.name])
+    for key, value in table.items():
+        is_single = is_number(value) or is_distribution(value)
+        if key in per and is_single:
+            expanded[key] = [value] * getattr(counts, per[key])
+        else:
+            expanded[key] = value
+    return expanded
 
 
 _OWNERS = {
@@ -142,70 +175,79 @@ def find_count_problem(
     table: TomlTable, kind: StructType, counts: VectorCounts
 ) -> KeyProblem | None:
     """Returns the first vector of a table that has too few or too many numbers, or None."""
-    for key, per in {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}.items():
-        wanted = getattr(counts, per)
+    vectors = {**_vector_keys(kind, "per"), **_vector_keys(kind, "point")}
+    for key, per in vectors.items():
+        required = getattr(counts, per)
         value = table.get(key)
-        if isinstance(value, list) and len(value) != wanted:
-            owner = f"{_OWNERS[per]} {wanted} {per if per != 'shared' else 'coordinates'}"
-            return KeyProblem(
-                key, f"has {len(value)} number{'s' * (len(value) != 1)}, and {owner}"
-            )
+        if isinstance(value, list) and len(value) != required:
+            noun = "coordinates" if per == "shared" else per
+            numbers = count_nouns(len(value), "number")
+            return KeyProblem(key, f"has {numbers}, and {_OWNERS[per]} {required} {noun}")
     return None
 
 
 def is_number(value: Any) -> TypeGuard[float]:
-    """True for a number as an author writes it; true and false are none."""
+    """True for a number in a scenario; true and false do not count as numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def is_distribution(value: Any) -> bool:
-    """True for a table that stands for a number: { normal = [...] } or { uniform = [...] }."""
+    """True for a distribution in place of a number, as { uniform = [...] }."""
     return isinstance(value, dict) and not value.keys().isdisjoint(("normal", "uniform"))
 
 
 def split_refusal(error: msgspec.ValidationError) -> tuple[str, str]:
-    """Returns the problem of a refused value, and the path of its key below what was converted."""
-    problem, _, place = str(error).partition(" - at ")
-    return problem, place.strip("`$")
+    """Returns the problem of a refused value, and the path of its key below the whole value."""
+    problem, _, path = str(error).partition(" - at ")
+    return problem, path.strip("`$")
 
 
 def reword_problem(problem: str) -> str:
     """Returns a validation message in the words of a scenario's author."""
-    words = (("`", ""), ("Expected ", "expected "), ("array", "list"), ("str", "text"))
-    for old, new in words:
+    replacements = (("`", ""), ("Expected ", "expected "), ("array", "list"), ("str", "text"))
+    for old, new in replacements:
         problem = problem.replace(old, new)
     return problem
 
 
 MOST_LETTERS = 80
+"""Longest word for which `suggest_nearest` compares."""
 MOST_COMPARED = 500
-"""Of a word that is compared with others, and how many these are: the time grows by more than
-the product.
+"""Largest number of words that `suggest_nearest` compares: its time grows by more than the
+product of their number and their length.
 """
 
 
 def suggest_nearest(word: str, valid: Sequence[str]) -> str:
-    """Returns "; did you mean ...?", or "" if nothing valid is near, or there is too much to
-    compare.
+    """Returns "; did you mean ...?" with the most similar valid word, or "".
+
+    The result is "" if no valid word is similar, or if the word is too long to compare.
     """
-    named = [name for name in valid[:MOST_COMPARED] if len(name) <= MOST_LETTERS]
-    match = (
-        difflib.get_close_matches(word, named, n=1, cutoff=0.5)
-        if len(word) <= MOST_LETTERS
-        else []
-    )
-    return f"; did you mean {match[0]!r}?" if match else ""
+    if len(word) > MOST_LETTERS:
+        return ""
+    candidates = [name for name in valid[:MOST_COMPARED] if len(name) <= MOST_LETTERS]
+    matches = difflib.get_close_matches(word, candidates, n=1, cutoff=0.5)
+    return f"; did you mean {matches[0]!r}?" if matches else ""
 
 
 def check_keys(table: Any, valid: Sequence[str], path: str) -> TomlTable:
-    """Returns the table if it is one and has no key but the valid ones; errors call it `path`."""
+    """Returns a table after checking that its keys are valid.
+
+    Args:
+        table: the value of a scenario.
+        valid: the valid keys.
+        path: the path of the table, for errors.
+
+    Raises:
+        ScenarioError: the value is not a table, or has an unknown key.
+    """
     if not isinstance(table, dict):
         raise ScenarioError("must be a table", path=path)
     for key in table:
         if key not in valid:
-            where = f"{path}.{key}" if path else key
+            key_path = f"{path}.{key}" if path else key
             hint = suggest_nearest(key, valid) or f"; valid are {', '.join(valid)}"
-            raise ScenarioError(f"unknown key{hint}", path=where)
+            raise ScenarioError(f"unknown key{hint}", path=key_path)
     return table
 
 
@@ -215,16 +257,23 @@ def field_names(kind: StructType) -> tuple[str, ...]:
 
 
 def check_choice(word: Any, valid: Sequence[str], path: str) -> None:
-    """Refuses a word that is not valid."""
+    """Refuses a word that is not among the valid ones.
+
+    Raises:
+        ScenarioError: with the path of the key.
+    """
     if word not in valid:
+        choices = ", ".join(map(repr, valid))
         hint = suggest_nearest(str(word), valid)
-        raise ScenarioError(
-            f"is {word!r}, must be one of {', '.join(map(repr, valid))}{hint}", path=path
-        )
+        raise ScenarioError(f"is {word!r}, must be one of {choices}{hint}", path=path)
 
 
 def check_finite(value: Any, path: str) -> None:
-    """Refuses a number that is not finite, or has more than 64 bits, at any depth."""
+    """Refuses numbers that are not finite or have more than 64 bits, at any depth.
+
+    Raises:
+        ScenarioError: with the path of the key.
+    """
     if isinstance(value, float) and not math.isfinite(value):
         raise ScenarioError(f"must be a finite number, is {value}", path=path)
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
@@ -257,18 +306,20 @@ UNITS = {
     "nm_rad": "N m/rad",
     "nm_s_rad": "N m s/rad",
 }
-"""Units by how they are written at the ends of names."""
+"""Units by their spelling at the end of names."""
 
 
 def split_unit(name: str) -> tuple[str, str]:
-    """Returns a name in words without its unit, and that: of the longest ending that is one, ""
-    without any.
+    """Returns a name in words without its unit, and the unit, or "" without a unit.
+
+    The longest ending that is a unit counts.
 
     >>> split_unit("contact_stiffness_n_m")
     ('contact stiffness', 'N/m')
     """
-    words = name.split("_")
-    endings = (
-        (" ".join(words[:n]), UNITS.get("_".join(words[n:]), "")) for n in range(1, len(words))
-    )
-    return next((found for found in endings if found[1]), (" ".join(words), ""))
+    parts = name.split("_")
+    for n in range(1, len(parts)):
+        unit = UNITS.get("_".join(parts[n:]), "")
+        if unit:
+            return " ".join(parts[:n]), unit
+    return " ".join(parts), ""

@@ -1,14 +1,13 @@
-"""Output files and folders: refused where something exists, replaced only by force, written
-whole.
+"""Output files and folders, input files, and optional packages.
 
 Invariant:
-- Nothing that exists is replaced unless the caller forces it, and an output bears its name only
-  once it is complete.
-- No output is written through a symbolic link that stands in place of an output file, or of a
-  folder that the program makes within its output: whoever planted the link would choose the
-  file that is overwritten.
-- An optional package is imported where it is used; if it is missing, the error names what
-  installs it.
+    - An existing output is replaced only if the caller forces it, and an output gets its name
+      only when it is complete.
+    - No output is written through a symbolic link in place of an output file, or of a folder
+      that the program makes within its output. Otherwise, the author of the link could choose
+      which file is overwritten.
+    - An optional package is imported where it is used. If it is missing, the error names the
+      command that installs it.
 """
 
 import errno
@@ -31,27 +30,35 @@ from typing import Any, BinaryIO
 from .errors import LogError, LogRefused, TrilatError, UsageError
 
 DISK_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
-
-
+"""Errors with which a disk refuses data."""
 STUDY_LIBRARIES = ("loky", "matplotlib", "scipy")
-"""What `trilat-net` installs, and `trilat-net-core` does without (pyproject.toml)."""
+"""Libraries that `trilat-net` installs and `trilat-net-core` does not (pyproject.toml)."""
 
 
 def require_libraries(*names: str) -> None:
-    """Refuses what needs these libraries, or all of `STUDY_LIBRARIES`, before any of it is
-    done.
+    """Refuses a command before it starts if a library that it needs is missing.
+
+    Args:
+        names: the libraries; by default all of `STUDY_LIBRARIES`.
 
     Raises:
-        UsageError: one of them is not installed.
+        UsageError: a library is not installed.
     """
-    if missing := [name for name in names or STUDY_LIBRARIES if find_spec(name) is None]:
-        text = f"this needs {', '.join(missing)}, which trilat-net-core does without"
-        raise UsageError(f"{text}: pip install trilat-net")
+    missing = [name for name in names or STUDY_LIBRARIES if find_spec(name) is None]
+    if missing:
+        raise UsageError(
+            f"this needs {', '.join(missing)}, which trilat-net-core does without: "
+            "pip install trilat-net"
+        )
 
 
 def import_extra(module: str, extra: str, purpose: str) -> Any:
-    """Imports a module of an optional package; `purpose` names the features that need it, in
-    the plural.
+    """Imports and returns a module of an optional package.
+
+    Args:
+        module: the module.
+        extra: the extra of trilat-net that installs the package.
+        purpose: the features that need the package, in the plural.
 
     Raises:
         UsageError: the package is not installed.
@@ -64,12 +71,12 @@ def import_extra(module: str, extra: str, purpose: str) -> Any:
 
 
 def format_extra_install(extra: str) -> str:
-    """Returns the command that installs an extra where this program runs.
+    """Returns the command that installs an extra in the environment of this program.
 
-    - In the `.venv` of a clone: a target of the clone's Makefile, which installs locked
-      versions.
-    - In another environment that uses a clone: pip, with the clone.
-    - Anywhere else: pip, with the distribution.
+    - In the `.venv` of a clone, the command is a target of the clone's Makefile, which installs
+      locked versions.
+    - In another environment that uses a clone, the command is pip with the clone.
+    - Anywhere else, the command is pip with the distribution.
     """
     clone = Path(__file__).resolve().parents[1]
     if not all((clone / name).is_file() for name in ("Makefile", "pyproject.toml")):
@@ -81,7 +88,7 @@ def format_extra_install(extra: str) -> str:
 
 
 def find_version() -> str:
-    """Returns the version of this program, whichever of its distributions has its files."""
+    """Returns the version of this program, from either of its distributions."""
     for name in ("trilat-net-core", "trilat-net"):
         with suppress(metadata.PackageNotFoundError):
             return metadata.version(name)
@@ -89,27 +96,33 @@ def find_version() -> str:
 
 
 def find_page(name: str) -> Path:
-    """Returns where a page of the documentation is on this machine: beside the sources, or as
-    installed.
-    """
-    sources = Path(__file__).parents[1] / "docs" / name
-    return (
-        sources
-        if sources.is_file()
-        else Path(sys.prefix) / "share" / "doc" / "trilat-net" / name
-    )
+    """Returns the path of a documentation page, beside the sources or as installed."""
+    beside_sources = Path(__file__).parents[1] / "docs" / name
+    if beside_sources.is_file():
+        return beside_sources
+    return Path(sys.prefix) / "share" / "doc" / "trilat-net" / name
 
 
-def open_regular(path: Path, **how: Any) -> Any:
-    """Opens a file for reading, as text if its encoding is given; a pipe or a device may have
-    no end.
+def open_regular(path: Path, **options: Any) -> Any:
+    """Opens a regular file for reading, as text if `encoding` is among the options.
+
+    Pipes and devices are refused because they may have no end.
+
+    Args:
+        path: the file.
+        options: further arguments of `open`.
 
     Raises:
-        OSError: it is one of these, or cannot be opened.
+        OSError: the path is a pipe or a device, or cannot be opened.
     """
-    mode = "r" if "encoding" in how else "rb"
-    ways = getattr(os, "O_NONBLOCK", 0)  # or a pipe without a writer would be waited for
-    stream = open(path, mode, opener=lambda name, flags: os.open(name, flags | ways), **how)  # noqa: SIM115
+    mode = "r" if "encoding" in options else "rb"
+    # Without this flag, opening a pipe that has no writer would block.
+    no_block = getattr(os, "O_NONBLOCK", 0)
+
+    def open_without_blocking(name: str, flags: int) -> int:
+        return os.open(name, flags | no_block)
+
+    stream = open(path, mode, opener=open_without_blocking, **options)  # noqa: SIM115
     if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
         stream.close()
         raise OSError(errno.EINVAL, "it is a pipe or a device, no file", str(path))
@@ -130,7 +143,7 @@ _ZIPPED_KINDS = {
     b"Index/Tables": "a spreadsheet (.numbers)",
     b"word/document": "a text document (.docx)",
 }
-"""Kinds of ZIP archives by what stands in them uncompressed."""
+"""Kinds of ZIP archives by a text that they contain uncompressed."""
 
 
 def decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
@@ -138,24 +151,23 @@ def decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
 
     Args:
         raw: the content of the file.
-        any_code_page: True: other texts are read as well, since programs on Windows print in
-            the code page of their country. Their letters beyond ASCII come out as those of
-            Latin-1.
+        any_code_page: True: texts in another encoding are decoded as Latin-1, since programs
+            on Windows print in the code page of their country. Letters beyond ASCII may be
+            wrong then.
 
     Raises:
         ValueError: the content is not text; the message names a spreadsheet as a spreadsheet.
     """
     if raw[:4] == b"PK\x03\x04":
-        kind = next(
-            (kind for mark, kind in _ZIPPED_KINDS.items() if mark in raw), "a ZIP archive"
-        )
-        raise ValueError(_say_not_text(kind))
+        kinds = [kind for mark, kind in _ZIPPED_KINDS.items() if mark in raw]
+        raise ValueError(_describe_kind(kinds[0] if kinds else "a ZIP archive"))
     for mark, kind in _OTHER_KINDS.items():
         if raw.startswith(mark):
-            raise ValueError(_say_not_text(kind))
+            raise ValueError(_describe_kind(kind))
     if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return raw.decode("utf-16")
-    if raw[:2].count(0) == 1:  # UTF-16 without its mark: ASCII has a zero byte in each pair
+    # UTF-16 without a byte order mark: each pair of bytes of ASCII text has one zero.
+    if raw[:2].count(0) == 1:
         return raw.decode("utf-16-be" if raw[0] == 0 else "utf-16-le")
     if 0 in raw:
         raise ValueError("is not text: it has zero bytes")
@@ -167,17 +179,22 @@ def decode_text(raw: bytes, *, any_code_page: bool = False) -> str:
         return raw.decode("latin-1")
 
 
-def _say_not_text(kind: str) -> str:
+def _describe_kind(kind: str) -> str:
+    """Returns the problem of a file that is not text, with advice."""
     advice = "save its sheet as CSV" if "spreadsheet" in kind else "a text file is needed"
     return f"is {kind}, not text: {advice}"
 
 
 @contextmanager
 def reading(path: Path, kind: type[TrilatError] = LogError) -> Iterator[BinaryIO]:
-    """Yields a file opened for reading.
+    """Opens a regular file for reading as a context.
+
+    Args:
+        path: the file.
+        kind: the error class.
 
     Raises:
-        TrilatError: of this kind, the file cannot be read.
+        TrilatError: of class `kind`, if the file cannot be read.
     """
     try:
         with open_regular(path) as stream:
@@ -193,17 +210,18 @@ def digest_file(path: Path) -> str:
 
 
 def read_foreign_permissions(path: Path) -> int:
-    """Returns the bits of a file's mode that let others in; 0 on Windows, where a list says who
-    may.
+    """Returns the permission bits of a file for its group and others.
+
+    The result is 0 on Windows, which has access control lists instead.
     """
     return 0 if os.name == "nt" else path.stat().st_mode & 0o077
 
 
 def make_folder(folder: Path) -> Path:
-    """Makes a folder and its parents, and returns it.
+    """Makes a folder and its parents, and returns the folder.
 
     Raises:
-        UsageError: it cannot be made.
+        UsageError: the folder cannot be made.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -215,14 +233,14 @@ def make_folder(folder: Path) -> Path:
 
 
 SYSTEM_FOLDERS = ("/dev", "/dev/fd", "/proc/self/fd")
-"""Folders in which symbolic links are the system's own, as /dev/stdout is."""
+"""Folders in which the system itself has symbolic links, for instance /dev/stdout."""
 
 
 def refuse_link(path: Path) -> None:
     """Refuses a symbolic link in place of an output.
 
     Raises:
-        UsageError: the path is one, and not one of the system's own.
+        UsageError: the path is a symbolic link outside of `SYSTEM_FOLDERS`.
     """
     if path.is_symlink() and path.parent.as_posix() not in SYSTEM_FOLDERS:
         problem = "is a symbolic link, and no output is written through one"
@@ -230,21 +248,20 @@ def refuse_link(path: Path) -> None:
 
 
 def make_subfolder(folder: Path) -> Path:
-    """Makes a folder within an output folder, and returns it; it may exist.
+    """Makes a folder within an output folder unless it exists, and returns the folder.
 
     Raises:
-        UsageError: a symbolic link stands in its place, or it cannot be made.
+        UsageError: the path is a symbolic link, or the folder cannot be made.
     """
     refuse_link(folder)
     return make_folder(folder)
 
 
 def create_file(path: Path) -> BinaryIO:
-    """Returns a new file without a buffer, in place of any earlier one, which is removed and
-    not written to.
+    """Returns a new unbuffered file, after removing an earlier file of that name.
 
     Raises:
-        UsageError: a symbolic link stands in its place.
+        UsageError: the path is a symbolic link.
         OSError: the file cannot be made.
     """
     refuse_link(path)
@@ -253,28 +270,32 @@ def create_file(path: Path) -> BinaryIO:
 
 
 def extend_file(path: Path) -> BinaryIO:
-    """Returns a file without a buffer that is written to at its end; it may exist.
+    """Returns an unbuffered file for appending, which is created if necessary.
 
     Raises:
-        UsageError: a symbolic link stands in its place.
+        UsageError: the path is a symbolic link.
         OSError: the file cannot be opened.
     """
     refuse_link(path)
-    no_link = getattr(os, "O_NOFOLLOW", 0)  # Windows has none
-    return open(
-        path,
-        "ab",
-        buffering=0,
-        opener=lambda name, flags: os.open(name, flags | no_link, 0o666),
-    )
+    # Windows does not have this flag.
+    no_follow = getattr(os, "O_NOFOLLOW", 0)
+
+    def open_without_following(name: str, flags: int) -> int:
+        return os.open(name, flags | no_follow, 0o666)
+
+    return open(path, "ab", buffering=0, opener=open_without_following)
 
 
 def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -> Path:
-    """Makes a folder for results: the given one, or the next free `runs/NAME-N`.
+    """Makes and returns a folder for results.
+
+    Args:
+        folder: the folder; None chooses the next free `runs/NAME-N`.
+        name: NAME.
+        force: whether the folder may have content; None if the command has no option for it.
 
     Raises:
-        UsageError: it holds something (and `force` is not set; None: cannot be set), or it
-            cannot be made.
+        UsageError: the folder has content and `force` is not set, or it cannot be made.
     """
     if folder is None:
         return _make_next_folder(name)
@@ -283,13 +304,13 @@ def make_results_folder(folder: Path | None, name: str, *, force: bool | None) -
     except OSError as error:
         raise UsageError(f"{folder}: cannot be made or read: {error.strerror}") from None
     if occupied:
-        forced = "" if force is None else ", or use --force"
-        raise UsageError(f"{folder}: holds something; choose another folder{forced}")
+        advice = "" if force is None else ", or use --force"
+        raise UsageError(f"{folder}: holds something; choose another folder{advice}")
     return make_folder(folder)
 
 
 def _make_next_folder(name: str) -> Path:
-    """Makes the next free `runs/NAME-N`, which no other process gets as well."""
+    """Makes and returns the next free `runs/NAME-N`; no other process gets the same folder."""
     for n in itertools.count(1):
         folder = Path("runs") / f"{name}-{n:03d}"
         try:
@@ -310,30 +331,31 @@ def refuse_existing(
     Args:
         path: the output.
         force: whether an earlier output of the same kind may be replaced.
-        unfinished: name of the output while it is written, which must be free too.
-        manifest: file that marks a folder as an earlier output; None where the output is a
-            file.
+        unfinished: name of the output while it is written, which must also be free.
+        manifest: file that marks a folder as an earlier output; None if the output is a file.
 
     Raises:
         UsageError: the name is taken, or is that of a symbolic link.
     """
     refuse_link(path)
-    if os.path.lexists(path) and not (manifest and path.is_dir() and not any(path.iterdir())):
-        replaceable = (path / manifest).is_file() if manifest else path.is_file()
-        if not replaceable:
+    is_empty_folder = manifest and path.is_dir() and not any(path.iterdir())
+    if os.path.lexists(path) and not is_empty_folder:
+        is_replaceable = (path / manifest).is_file() if manifest else path.is_file()
+        if not is_replaceable:
             kind = "folder that was exported" if manifest else "file"
             raise UsageError(f"{path}: exists, and is no {kind}; choose another name")
         if not force:
             raise UsageError(f"{path}: exists; choose another name, or replace it with --force")
     if unfinished is not None and unfinished.exists() and not force:
         raise UsageError(
-            f"{unfinished}: exists: it is being written, or was never finished; make it whole with: "
-            f"trilat log recover {unfinished}; or choose another name, or replace it with --force"
+            f"{unfinished}: exists: it is being written, or was never finished; make it whole "
+            f"with: trilat log recover {unfinished}; or choose another name, or replace it "
+            "with --force"
         )
 
 
 def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
-    """Gives a complete file its name; without `force` an existing file of that name stays.
+    """Gives a complete file its name; without `force` an existing file is not replaced.
 
     Raises:
         UsageError: the name is taken.
@@ -342,13 +364,14 @@ def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
         unfinished.replace(path)
         return
     try:
-        os.link(unfinished, path)  # unlike a renaming it never replaces
+        # In contrast to a rename, a link never replaces an existing file.
+        os.link(unfinished, path)
         unfinished.unlink()
     except FileExistsError:
         raise UsageError(
             f"{path}: exists by now; the finished file is {unfinished}: give it a name"
         ) from None
-    except OSError:  # a file system without links
+    except OSError:  # the file system does not support links
         refuse_existing(path, force=False)
         unfinished.rename(path)
 
@@ -356,22 +379,21 @@ def publish_file(unfinished: Path, path: Path, *, force: bool) -> None:
 def write_whole(
     path: Path, data: bytes | str, *, force: bool = True, remedy: str = "", mode: int = 0o666
 ) -> None:
-    """Writes a file so that it exists whole or not at all; a device or pipe is written to
-    directly.
+    """Writes a file so that it exists completely or not at all.
 
-    A symbolic link in its place is refused; one that appears meanwhile is replaced, and not
-    followed.
+    A device or a pipe is written directly. A symbolic link is refused; a link that appears
+    meanwhile is replaced, not followed.
 
     Args:
         path: the file.
         data: its content; text is encoded as UTF-8.
         force: whether it may replace a file.
-        remedy: what the error of a full disk advises.
-        mode: rights of a new file, less those that the umask takes.
+        remedy: advice in the error of a full disk.
+        mode: permissions of a new file, before the umask.
 
     Raises:
-        UsageError: it exists, is a symbolic link, or cannot be made.
-        LogRefused: the disk refused it.
+        UsageError: the file exists, is a symbolic link, or cannot be made.
+        LogRefused: the disk refused the data.
     """
     content = data.encode() if isinstance(data, str) else data
     refuse_link(path)
@@ -383,7 +405,8 @@ def write_whole(
             return
         unfinished = path.with_name(f"{path.name}.unfinished")
         try:
-            unfinished.unlink(missing_ok=True)  # of an earlier try: its rights may be others
+            # A file of an earlier attempt may have other permissions.
+            unfinished.unlink(missing_ok=True)
             with open(unfinished, "xb", opener=partial(os.open, mode=mode)) as stream:
                 stream.write(content)
                 stream.flush()
@@ -398,17 +421,16 @@ def write_whole(
 
 @contextmanager
 def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Iterator[Path]:
-    """Yields a scratch path; what is written there gets the output's name when the block ends
-    well.
+    """Yields a scratch path, which gets the output's name if the block succeeds.
 
     Args:
         path: the output.
         force: whether an earlier output of the same kind may be replaced.
-        manifest: see `refuse_existing`; with one, the scratch path is a folder.
+        manifest: see `refuse_existing`; with a manifest the scratch path is a folder.
 
     Raises:
-        UsageError: the name is taken, or nothing can be written there.
-        LogRefused: the disk refused it.
+        UsageError: the name is taken, or the path is not writable.
+        LogRefused: the disk refused the data.
     """
     refuse_existing(path, force=force, manifest=manifest)
     remedy = "nothing is left of it. Make room, or take another disk"
@@ -431,7 +453,7 @@ def stage_output(path: Path, *, force: bool, manifest: str | None = None) -> Ite
 
 
 def sync_folder(folder: Path) -> None:
-    """Syncs the names in a folder to the disk, where the platform can."""
+    """Writes a folder's directory entries to the disk, if the platform supports it."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -443,7 +465,13 @@ def sync_folder(folder: Path) -> None:
 def describe_write_error(
     path: Path, error: OSError, remedy: str = ""
 ) -> LogRefused | UsageError:
-    """Returns the error of a failed write: `LogRefused`, with a remedy, if the disk refused it."""
+    """Returns the error of a failed write.
+
+    Args:
+        path: the file.
+        error: the error of the system.
+        remedy: advice that is added if the disk refused the data (`LogRefused`).
+    """
     text = f"{path}: cannot be written: {error.strerror or error}"
     if error.errno in DISK_ERRNOS:
         return LogRefused(f"{text}; {remedy}" if remedy else text)

@@ -1,10 +1,11 @@
-"""Process control: garbage collection, signals that end a program, commands for a shell, worker
-processes.
+"""Process control: garbage collection, ending signals, shell commands, worker processes.
 
-Invariants: garbage collection pauses only around code whose many objects form no cycles
-(records, lists of numbers). A signal ends nothing by itself: a loop polls it and ends in order.
-Worker processes leave Ctrl-C to the process that started them, and end with it or when it
-fails.
+Invariant:
+    - Garbage collection pauses only around code whose many objects form no cycles (records,
+      lists of numbers).
+    - A signal does not end the program by itself: a loop polls it and ends in order.
+    - Worker processes leave Ctrl-C to the process that started them. They end when that process
+      ends or fails.
 """
 
 import gc
@@ -26,7 +27,7 @@ from typing import Any
 from .errors import TrilatError
 
 _PARENT_POLL_S = 0.5
-"""How often a worker looks whether its parent is still there."""
+"""Period in which a worker checks that its parent process still exists, s."""
 
 
 @contextmanager
@@ -42,31 +43,33 @@ def pause_gc() -> Iterator[None]:
 
 
 def freeze_gc() -> None:
-    """Collects once and exempts all existing objects: later rounds visit new objects alone.
+    """Collects once, and exempts all existing objects from later collections.
 
-    A full round over everything that a program has imported takes a quarter of a second.
+    A full collection of all objects that a program has imported takes a quarter of a second.
     """
     gc.collect()
     gc.freeze()
 
 
 def disable_gc() -> None:
-    """Freezes and stops the collector, for a loop that must not pause."""
+    """Exempts all existing objects and stops the collector, for a loop that must not pause."""
     freeze_gc()
     gc.disable()
 
 
 class LinePrinter:
-    """A context that prints lines in a thread of its own, so that a loop never waits for a
-    terminal.
+    """A context that prints lines in a separate thread, so that a loop never waits for it.
 
-    Of lines that are not printed yet it keeps 256; more are lost.
+    Up to 256 lines wait to be printed; further lines are lost.
+
+    Args:
+        print_line: prints a line.
     """
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._say = say
+    def __init__(self, print_line: Callable[[str], None]) -> None:
+        self._print_line = print_line
         self._lines: queue.Queue[str | None] = queue.Queue(256)
-        self._thread = threading.Thread(target=self._print, daemon=True)
+        self._thread = threading.Thread(target=self._print_lines, daemon=True)
 
     def __enter__(self) -> "LinePrinter":
         self._thread.start()
@@ -78,49 +81,52 @@ class LinePrinter:
         self._thread.join(1.0)
 
     def put(self, text: str) -> None:
-        """Prints a line soon."""
+        """Adds a line to the lines that wait to be printed."""
         with suppress(queue.Full):
             self._lines.put_nowait(text)
 
-    def _print(self) -> None:
+    def _print_lines(self) -> None:
         while (text := self._lines.get()) is not None:
             with suppress(OSError):
-                self._say(text)
+                self._print_line(text)
 
 
-# the terminal, or window, has gone
+# The signal of a terminal or window that has closed.
 _HANG_UP = getattr(signal, "SIGHUP", getattr(signal, "SIGBREAK", None))
-ENDING_SIGNALS = tuple(
-    one for one in (signal.SIGINT, signal.SIGTERM, _HANG_UP) if one is not None
-)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, _HANG_UP)
+ENDING_SIGNALS = tuple(number for number in _SIGNALS if number is not None)
 """Signals that end a program in order."""
-_SAME_WISH_S = 0.2
-"""Signals that come within this time are one wish: a terminal and a parent process may both
+_SAME_REQUEST_S = 0.2
+"""Signals within this time count as one request, since a terminal and a parent process may both
 deliver it.
 """
 
 
 class Interrupt:
-    """A context that records the first signal that ends a program, as `number` (else 0).
+    """A context that records the first signal that ends a program, as `number`, else 0.
 
-    The first signal asks for an orderly end, which may take seconds; a second one `insists` on
-    an end at once. Whoever ignores the end of its terminal (`nohup`) goes on doing so. Where it
-    `compiles`, and nothing else is to be ended in order, a signal ends the process at once
-    while the compiler runs.
+    The first signal requests an orderly end, which may take seconds; a second signal requests
+    the end at once (`is_repeated`). A process that ignores the end of its terminal (`nohup`)
+    continues to ignore it.
+
+    Args:
+        compiles: True if a signal may end the process at once while the compiler runs, because
+            nothing else has to be ended in order.
     """
 
     def __init__(self, *, compiles: bool = False) -> None:
         self.number = 0
         self.compiles = compiles
-        self._asked_s: float | None = None  # when the first SIGINT or SIGTERM came
-        self._insists = False
+        # Time of the first SIGINT or SIGTERM.
+        self._requested_s: float | None = None
+        self._is_repeated = False
         self._before: dict[int, Any] = {}
         self.raises = False
 
     def __enter__(self) -> "Interrupt":
-        for name in ENDING_SIGNALS:
-            if name != _HANG_UP or signal.getsignal(name) is not signal.SIG_IGN:
-                self._before[name] = signal.signal(name, self._take)
+        for number in ENDING_SIGNALS:
+            if number != _HANG_UP or signal.getsignal(number) is not signal.SIG_IGN:
+                self._before[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(
@@ -129,27 +135,30 @@ class Interrupt:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        for name, handler in self._before.items():
-            signal.signal(name, handler)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
         outer = getattr(self._before.get(signal.SIGINT), "__self__", None)
         if kind is KeyboardInterrupt and isinstance(outer, Interrupt):
             outer.number = outer.number or self.number
 
-    def _take(self, number: int, _frame: FrameType | None) -> None:
+    def _handle(self, number: int, _frame: FrameType | None) -> None:
         self.number = self.number or number
-        if number != _HANG_UP:  # a terminal that closes, and its shell, send one each
+        # A terminal that closes and its shell send one SIGHUP each: these are not repetitions.
+        if number != _HANG_UP:
             now_s = os.times().elapsed
-            self._insists |= self._asked_s is not None and now_s - self._asked_s > _SAME_WISH_S
-            self._asked_s = now_s if self._asked_s is None else self._asked_s
+            if self._requested_s is None:
+                self._requested_s = now_s
+            elif now_s - self._requested_s > _SAME_REQUEST_S:
+                self._is_repeated = True
         if self.raises:
             raise KeyboardInterrupt
 
     @contextmanager
     def raising(self) -> Iterator[None]:
-        """Lets a signal interrupt the block at once, for long work that polls nothing.
+        """Raises KeyboardInterrupt in the block at a signal, for long work that does not poll.
 
-        Python swallows an exception raised inside a `__del__`; then the block is left at its
-        end.
+        Python ignores an exception that is raised inside a `__del__`; then the block is left at
+        its end.
         """
         self.raises = True
         try:
@@ -164,48 +173,58 @@ class Interrupt:
         return self.number != 0
 
     def is_repeated(self) -> bool:
-        """True once a second SIGINT or SIGTERM has arrived, later than one that a parent passes
-        on.
-        """
-        return self._insists
+        """True once a second SIGINT or SIGTERM has arrived that is not a copy of the first."""
+        return self._is_repeated
 
     @property
     def exit_code(self) -> int:
-        """Exit code of a process that the signal ended, by the shell's convention."""
+        """Exit code of a process that the signal has ended, by the shell's convention."""
         return 128 + self.number
 
 
 def end_process_at_signals() -> Callable[[], None]:
-    """Lets signals end the process at once where they may break off work; the function returned
-    ends that.
+    """Makes signals end the process at once, where they may interrupt its work.
 
-    Python sees a signal between two of its instructions: one call of a compiler takes minutes.
-    The first process of a container is not ended by what it leaves to the kernel: there a
-    thread ends it.
+    Python handles a signal between two of its instructions, but one call of a compiler takes
+    minutes. The default action of a signal does not end the first process of a container: there
+    a thread ends the process.
+
+    Returns:
+        A function that restores the handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         return lambda: None
-    handlers = ((name, signal.getsignal(name)) for name in ENDING_SIGNALS)
-    taken = {name: one for name, one in handlers if _breaks_off(getattr(one, "__self__", None))}
-    first = bool(taken) and os.getpid() == 1
-    for name in taken:
-        signal.signal(
-            name, (lambda number, _: os._exit(128 + number)) if first else signal.SIG_DFL
-        )
-    unwatch = _watch_signals() if first else lambda: None
+    replaced = {}
+    for number in ENDING_SIGNALS:
+        handler = signal.getsignal(number)
+        if _may_interrupt(getattr(handler, "__self__", None)):
+            replaced[number] = handler
+    is_first_process = bool(replaced) and os.getpid() == 1
+    for number in replaced:
+        signal.signal(number, _exit_by_signal if is_first_process else signal.SIG_DFL)
+    unwatch = _watch_signals() if is_first_process else lambda: None
 
     def restore() -> None:
         unwatch()
-        for name, handler in taken.items():
-            signal.signal(name, handler)
+        for number, handler in replaced.items():
+            signal.signal(number, handler)
 
     return restore
 
 
+def _exit_by_signal(number: int, _frame: FrameType | None) -> None:
+    os._exit(128 + number)
+
+
 def _watch_signals() -> Callable[[], None]:
-    """Ends the process at a signal, from a thread, until the function returned is called."""
+    """Starts a thread that ends the process at a signal.
+
+    Returns:
+        A function that stops the thread.
+    """
     reader, writer = os.pipe()
-    if sys.platform != "win32":  # where no process is the first of a container
+    # Windows has no containers whose first process is this one.
+    if sys.platform != "win32":
         os.set_blocking(writer, False)
     before = signal.set_wakeup_fd(writer)
 
@@ -223,28 +242,30 @@ def _watch_signals() -> Callable[[], None]:
     return unwatch
 
 
-def _breaks_off(owner: object) -> bool:
+def _may_interrupt(owner: object) -> bool:
+    """True if the owner of a signal's handler allows the signal to interrupt its work."""
     return isinstance(owner, Interrupt) and (owner.raises or owner.compiles)
 
 
-def join_arguments(words: Iterable[str]) -> str:
+def join_arguments(arguments: Iterable[str]) -> str:
     """Returns a command as it is typed into a shell of this system."""
     if os.name != "nt":
-        return shlex.join(words)
-    # as cmd and PowerShell both take it
-    quoted = ('"' + word.replace('"', '\\"') + '"' for word in words)
-    return " ".join(
-        one[1:-1] if re.fullmatch(r'"[\w.:/\\=+-]+"', one) else one for one in quoted
-    )
+        return shlex.join(arguments)
+    # Both cmd and PowerShell accept this form.
+    texts = []
+    for argument in arguments:
+        escaped = argument.replace('"', '\\"')
+        needs_quotes = not re.fullmatch(r"[\w.:/\\=+-]+", escaped)
+        texts.append(f'"{escaped}"' if needs_quotes else escaped)
+    return " ".join(texts)
 
 
 def raise_priority(nice: int) -> bool:
-    """Runs the threads of this process but the main one above normal priority, where that is
-    permitted.
+    """Raises the priority of this process's threads, except the main thread, if permitted.
 
-    The main thread is left out because the processes that it starts would inherit the priority.
-    Linux gives every thread a nice value of its own; on other systems, and without the
-    privilege, nothing changes.
+    The main thread is excluded because the processes that it starts would inherit the priority.
+    On Linux each thread has its own nice value. On other systems, and without the privilege,
+    nothing changes.
 
     Args:
         nice: below 0 for a priority above normal; -20 is the highest.
@@ -255,12 +276,12 @@ def raise_priority(nice: int) -> bool:
     tasks = Path("/proc/self/task")
     if not (sys.platform.startswith("linux") and tasks.is_dir()):
         return False
-    own = threading.get_native_id()
-    others = (int(entry.name) for entry in tasks.iterdir())
-    threads = [own, *(thread for thread in others if thread not in (own, os.getpid()))]
+    calling = threading.get_native_id()
+    all_threads = [int(entry.name) for entry in tasks.iterdir()]
+    others = [thread for thread in all_threads if thread not in (calling, os.getpid())]
     try:
-        for thread in threads:
-            with suppress(ProcessLookupError):  # it has ended meanwhile
+        for thread in (calling, *others):
+            with suppress(ProcessLookupError):  # the thread has ended meanwhile
                 os.setpriority(os.PRIO_PROCESS, thread, nice)
     except OSError:
         return False
@@ -269,32 +290,31 @@ def raise_priority(nice: int) -> bool:
 
 def count_cores() -> int:
     """Returns the number of processors that this process may use."""
-    return (
-        len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count() or 1
-    )
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @contextmanager
 def worker_pool(count: int) -> Iterator[Executor]:
-    """Yields an executor over worker processes; all of them are gone when the block ends.
+    """Yields an executor with worker processes, which all have ended when the block ends.
 
-    The processes are started afresh (never forked, so threads and compiled code are safe) and
-    do not import the caller's script. An exception in the block, Ctrl-C included, kills them in
+    The processes are started, not forked, so threads and compiled code are safe, and they do
+    not import the caller's script. An exception in the block, Ctrl-C included, kills them in
     the middle of their work.
     """
     from loky import ProcessPoolExecutor
 
-    # no pgrep: workers have no children
+    # loky misses pgrep, but the workers have no children to kill.
     warnings.filterwarnings("ignore", "Failed to kill subprocesses")
-    # each keeps the laws that it compiled
+    # A worker whose memory grows is restarted, since it keeps the laws that it compiled.
     warnings.filterwarnings("ignore", "A worker was restarted")
-    facts = (os.getpid(), TrilatError.in_command)
-    pool = ProcessPoolExecutor(count, initializer=_prepare_worker, initargs=facts)
+    arguments = (os.getpid(), TrilatError.in_command)
+    pool = ProcessPoolExecutor(count, initializer=_prepare_worker, initargs=arguments)
     try:
         with hold_sigint():
-            pool.submit(os.getpid)  # starts all processes, which inherit it
+            # The first task starts all processes, which inherit the held signal.
+            pool.submit(os.getpid)
         yield pool
         pool.shutdown()
     finally:
@@ -303,11 +323,11 @@ def worker_pool(count: int) -> Iterator[Executor]:
 
 @contextmanager
 def hold_sigint() -> Iterator[None]:
-    """Holds Ctrl-C back in the block: processes that start there never get it, this one does
-    afterwards.
+    """Delays Ctrl-C until the end of the block, and hides it from processes started there.
 
-    The mask is for the processes. It does not hold what arrives in another thread of this one,
-    whose handler Python runs here all the same: so the handler is exchanged too.
+    The signal mask serves the started processes. It does not delay signals that another thread
+    of this process receives, whose handler Python runs in the main thread. Therefore the
+    handler is replaced as well.
     """
     if sys.platform == "win32" or threading.current_thread() is not threading.main_thread():
         yield
@@ -325,18 +345,20 @@ def hold_sigint() -> Iterator[None]:
 
 
 def _prepare_worker(parent: int, in_command: bool) -> None:
+    """Prepares a worker: it ignores Ctrl-C, and ends after its parent process."""
     TrilatError.in_command = in_command
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_exit_after, args=(parent,), daemon=True).start()
 
 
 def _exit_after(parent: int) -> None:
+    """Ends this process as soon as its parent process has ended."""
     from multiprocessing import connection, parent_process
 
-    started_by = getattr(parent_process(), "sentinel", None)
-    # the number of a parent stays the same when it has gone
-    if os.name == "nt" and started_by is not None:
-        connection.wait([started_by])
+    sentinel = getattr(parent_process(), "sentinel", None)
+    # On Windows the number of the parent does not change when the parent has ended.
+    if os.name == "nt" and sentinel is not None:
+        connection.wait([sentinel])
         os._exit(1)
     pause = threading.Event()
     while os.getppid() == parent:

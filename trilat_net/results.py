@@ -1,9 +1,9 @@
-"""What a command found, as an object: in a line, as the text that the command prints, as a
-table, as JSON.
+"""The result of a command as an object: as a line, a text, a table or JSON.
 
-Invariant: a result holds values alone. Its text has one home, in `reporting`, which is imported
-when it is asked for: so a room that computes knows nothing of what is for eyes. JSON has no
-words for NaN and infinity; a quantity that is not known is null.
+Invariant:
+    - A result holds values only. Its text is composed in `reporting`, which is imported when
+      the text is requested, so that modules that compute do not depend on presentation.
+    - JSON has no NaN and no infinity; an unknown quantity is null.
 """
 
 import math
@@ -20,8 +20,10 @@ _REPR_LENGTH = 200
 
 
 class Result:
-    """What a command found. A type states `to_dict` where that is not its fields; `to_rows` for
-    many rows.
+    """The result of a command.
+
+    A subclass overrides `to_dict` if its keys differ from its fields, and `to_rows` if its
+    table has several rows.
     """
 
     def to_dict(self) -> dict[str, Any]:
@@ -29,14 +31,10 @@ class Result:
         return dict(vars(self))
 
     def to_rows(self) -> Sequence[Mapping[str, Any]]:
-        """Returns the rows of `to_frame`."""
-        return [
-            {
-                key: one
-                for key, one in self.to_dict().items()
-                if not isinstance(one, dict | list)
-            }
-        ]
+        """Returns the rows of the table of `to_frame`."""
+        values = self.to_dict().items()
+        row = {key: value for key, value in values if not isinstance(value, dict | list)}
+        return [row]
 
     def summary(self) -> str:
         """Returns the text that the command prints."""
@@ -48,13 +46,15 @@ class Result:
         Raises:
             UsageError: pandas is not installed.
         """
-        return import_extra("pandas", "frames", "data frames").DataFrame(list(self.to_rows()))
+        pandas = import_extra("pandas", "frames", "data frames")
+        return pandas.DataFrame(list(self.to_rows()))
 
     def headline(self) -> str:
         """Returns the result in one line."""
-        return next(
-            (line.strip() for line in self.summary().splitlines() if line.strip()), "nothing"
-        )
+        for line in self.summary().splitlines():
+            if line.strip():
+                return line.strip()
+        return "nothing"
 
     def __repr__(self) -> str:
         text = self.headline()
@@ -66,6 +66,7 @@ class Result:
 
 
 def _texts() -> Any:
+    """Returns the module that composes the texts of results, imported when needed."""
     return import_module(f"{__package__}.reporting.result_text")
 
 
@@ -73,5 +74,5 @@ JsonObject = dict[str, Any]
 
 
 def finite_or_none(value: float) -> float | None:
-    """Returns a number for JSON; None for NaN and infinity."""
+    """Returns the number for JSON, or None for NaN and infinity."""
     return value if math.isfinite(value) else None

@@ -1,10 +1,13 @@
-"""What a control law sends to its peers besides the motion and the exogenous torque of its
-record.
+"""The vectors that a control law sends to its peers besides motion and exogenous torque.
 
-Invariant: a law declares its vectors once; their numbers stand one behind the other in the
-field `ch` of its record and of its sample: first the vectors that go to all peers, then per
-peer, in scenario order, those that go to that peer alone. A receiver takes the first part and
-its own; what it took in is thereby found in the sender's record.
+A receiver gets the vectors for all peers and the vectors for itself. Therefore the vectors that
+it received can be found in the sender's record.
+
+Invariant:
+    - A law declares its vectors once.
+    - Their numbers stand one after another in the field `ch` of the law's record and sample:
+      first the vectors that go to all peers, then, per peer in scenario order, the vectors that
+      go to that peer alone.
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,21 +16,19 @@ from typing import NamedTuple
 from ..errors import count_nouns
 
 MAX_SENT = 16
-"""Most numbers per joint that a law sends to a peer."""
+"""Largest count of numbers per joint that a law sends to a peer."""
 MAX_RECORD_SENT = 1024
-"""Most numbers that a law sends to all its peers together, which are in the record of every
-tick.
-"""
+"""Largest count of numbers that a law sends to all its peers together; each record has them."""
 
 
 class SentVector(NamedTuple):
     """A vector that a law sends at every tick.
 
     Attributes:
-        name: its name, as the law uses it.
-        unit: of its numbers.
-        length: how many numbers it has.
-        per_peer: true: another one for each peer; false: the same for all.
+        name: the vector's name, as the law uses it.
+        unit: unit of its numbers.
+        length: count of its numbers.
+        per_peer: true: each peer gets its own vector; false: all peers get the same vector.
     """
 
     name: str
@@ -37,104 +38,114 @@ class SentVector(NamedTuple):
 
 
 class SentEntry(NamedTuple):
-    """One number of what a law sends.
+    """One number that a law sends.
 
     Attributes:
-        vector: the vector that it belongs to.
-        peer: the peer that it goes to, or "": to all.
-        place: its place in the vector.
+        vector: the vector of the number.
+        peer: the peer that gets the vector alone, or "" if all peers get it.
+        index: index of the number in the vector.
     """
 
     vector: SentVector
     peer: str
-    place: int
+    index: int
 
     @property
     def key(self) -> str:
-        """The vector's name, and in brackets the peer that it goes to alone: "E", "u[m2]"."""
+        """The vector's name, with the peer that gets it alone in brackets: "E", "u[m2]"."""
         return f"{self.vector.name}[{self.peer}]" if self.peer else self.vector.name
 
     def __str__(self) -> str:
-        return f"{self.key}[{self.place}]"
+        return f"{self.key}[{self.index}]"
 
 
 class LawChannel(NamedTuple):
-    """All that the law of a site sends.
+    """All vectors that the law of a site sends.
 
     Attributes:
-        vectors: those for all peers before those of each peer.
-        peers: how many peers the site has.
+        vectors: the vectors, those for all peers before those for each peer.
+        peers: the number of the site's peers.
     """
 
     vectors: tuple[SentVector, ...] = ()
     peers: int = 0
 
     def select_vectors(self, *, per_peer: bool) -> tuple[SentVector, ...]:
-        """Returns the vectors that go to each peer alone, or to all."""
+        """Returns the vectors that go to each peer alone, or those that go to all peers."""
         return tuple(vector for vector in self.vectors if vector.per_peer is per_peer)
 
     def count_numbers(self, *, per_peer: bool) -> int:
-        """Returns how many numbers go to each peer alone, or to all."""
+        """Returns the count of numbers that go to each peer alone, or to all peers."""
         return sum(vector.length for vector in self.select_vectors(per_peer=per_peer))
 
     @property
     def received_size(self) -> int:
-        """How many numbers one peer gets."""
+        """Count of the numbers that one peer receives."""
         return sum(vector.length for vector in self.vectors)
 
     @property
     def record_size(self) -> int:
-        """How many numbers stand in a record."""
-        return self.count_numbers(per_peer=False) + self.peers * self.count_numbers(
-            per_peer=True
-        )
+        """Count of the numbers in a record."""
+        to_all = self.count_numbers(per_peer=False)
+        to_each = self.count_numbers(per_peer=True)
+        return to_all + self.peers * to_each
 
     def find_columns(self, vectors: Sequence[SentVector]) -> list[int]:
-        """Returns where each number of some vectors stands in a peer's part; -1: it is not
-        sent.
+        """Returns the index of each number of the vectors among the numbers of a peer.
+
+        The index is -1 for a vector that this law does not send.
         """
-        first = 0
-        firsts = {}
+        start = 0
+        starts = {}
         for vector in self.vectors:
-            firsts[vector.name] = first
-            first += vector.length
-        return [
-            firsts[vector.name] + n if vector.name in firsts else -1
-            for vector in vectors
-            for n in range(vector.length)
-        ]
+            starts[vector.name] = start
+            start += vector.length
+        columns = []
+        for vector in vectors:
+            for n in range(vector.length):
+                is_sent = vector.name in starts
+                columns.append(starts[vector.name] + n if is_sent else -1)
+        return columns
 
     def entries(self, peers: Sequence[str]) -> Iterator[SentEntry]:
-        """Yields what each number of a record is, in order; `peers` are the names of the site's
-        peers.
-        """
-        for per_peer, places in ((False, ("",)), (True, peers)):
-            for peer in places:
-                for vector in self.vectors:
-                    if vector.per_peer is per_peer:
-                        yield from (SentEntry(vector, peer, n) for n in range(vector.length))
+        """Yields an entry for each number of a record, in order.
 
-    def select_for_peer(self, sent: Sequence[float], place: int) -> Sequence[float]:
-        """Returns what the peer at a place among the sender's peers gets of a record's numbers."""
-        own = self.count_numbers(per_peer=True)
-        common = self.count_numbers(per_peer=False)
-        if not own:
+        Args:
+            peers: the names of the site's peers, in scenario order.
+        """
+        to_all = self.select_vectors(per_peer=False)
+        to_each = self.select_vectors(per_peer=True)
+        for peer, vectors in (("", to_all), *((peer, to_each) for peer in peers)):
+            for vector in vectors:
+                for n in range(vector.length):
+                    yield SentEntry(vector, peer, n)
+
+    def select_for_peer(self, sent: Sequence[float], peer_index: int) -> Sequence[float]:
+        """Returns the numbers of a record that a peer receives.
+
+        Args:
+            sent: the numbers of the record.
+            peer_index: index of the peer among the sender's peers.
+        """
+        to_all = self.count_numbers(per_peer=False)
+        to_each = self.count_numbers(per_peer=True)
+        if not to_each:
             return sent
-        first = common + place * own
-        return [*sent[:common], *sent[first : first + own]]
+        start = to_all + peer_index * to_each
+        return [*sent[:to_all], *sent[start : start + to_each]]
 
 
 def join_received(channels: Sequence[LawChannel]) -> tuple[SentVector, ...]:
     """Returns the vectors that a law may receive from any of its peers, each name once.
 
     Raises:
-        ValueError: two peers send vectors of one name and of different lengths.
+        ValueError: two peers send vectors with the same name and different lengths.
     """
-    found: dict[str, SentVector] = {}
-    for vector in (vector for channel in channels for vector in channel.vectors):
-        other = found.setdefault(vector.name, vector)
-        if other.length != vector.length:
-            raise ValueError(
-                f"peers send {vector.name} of {other.length} and of {count_nouns(vector.length, 'number')}"
-            )
-    return tuple(found.values())
+    by_name: dict[str, SentVector] = {}
+    for channel in channels:
+        for vector in channel.vectors:
+            other = by_name.setdefault(vector.name, vector)
+            if other.length != vector.length:
+                count = count_nouns(vector.length, "number")
+                raise ValueError(f"peers send {vector.name} of {other.length} and of {count}")
+    return tuple(by_name.values())

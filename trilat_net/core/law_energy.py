@@ -1,9 +1,9 @@
-"""The energies by which a control law is proved passive, as functions of what its site
-recorded.
+"""The energies that prove a control law passive, as functions of its site's records.
 
-Invariant: of energy that a law gives to a peer the peer takes no more than came; what a law
-stores is never below zero, and what it has taken for good never falls. Then the arms get no
-more than they gave.
+Invariant:
+    - A peer takes no more energy than has arrived from the law that gave it.
+    - The stored energy of a law is never below zero, and its dissipated energy never falls.
+    - From these rules it follows that the arms get no more energy than they gave.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,13 +15,13 @@ from .vectors import Array, IntArray
 
 
 class PeerRecords(NamedTuple):
-    """A peer as the law saw it at K ticks, a row each, and what the law sent to it.
+    """A peer as the law saw it at K ticks, one row per tick, and the vectors sent to it.
 
     Attributes:
-        tick: of the sample in use, shape (K,); -1 before the first.
-        received: what the peer's law sent with that sample, by name, shape (K, length); zeros
-            before one.
-        sent: what went to this peer alone at that tick, by name.
+        tick: stamp of the sample in use, shape (K,); -1 before the first sample.
+        received: the vectors of that sample by name, shape (K, length); zeros before the first
+            sample.
+        sent: the vectors that went to this peer alone, by name, shape (K, length).
     """
 
     tick: IntArray
@@ -30,17 +30,17 @@ class PeerRecords(NamedTuple):
 
 
 class LawRecords(NamedTuple):
-    """What a site recorded of its law, a row per tick, K of them.
+    """The records of a law's site, K ticks with one row per tick.
 
     Attributes:
         h_s: the period, s.
-        q, qd: joint angles and velocities, shape (K, n), rad and rad/s.
+        q: joint angles, shape (K, n), rad.
+        qd: joint velocities, shape (K, n), rad/s.
         tau: control torque within its limits, shape (K, n), N m.
-        tau_x: exogenous torque; ON the arm acts its negative.
-        to_all: what went to all peers, by name, shape (K, length).
-        memory: what the law remembered after the tick, by the names of `remembers`, shape (K,
-            length).
-        peers: in scenario order.
+        tau_x: exogenous torque, shape (K, n), N m; the torque ON the arm is its negative.
+        to_all: the vectors that went to all peers, by name, shape (K, length).
+        memory: the law's memory after the tick, by the names of `remembers`, shape (K, length).
+        peers: the peers in scenario order.
     """
 
     h_s: float
@@ -54,21 +54,24 @@ class LawRecords(NamedTuple):
 
 
 class LawEnergies(NamedTuple):
-    """Energies of a law at K ticks, J, shape (K,) each, or (K, parts); flows are sums since the
-    beginning.
+    """Energies of a law at K ticks, J, shape (K,) or (K, parts) each.
 
-    Each part, a joint's for instance, must not be below zero by itself.
+    Flows are sums since the beginning. Each part, for instance that of a joint, must not be
+    below zero by itself.
 
     Attributes:
-        gave: per peer, what was sent to it.
-        took: per peer, what was taken of what it sent, part by part.
-        port: what the arm gave to the law by the law's own books; None: what it gave indeed.
-        store: what the law stores.
-        taken: what it has taken for good, by its own formula; None: what is left of the others.
-        observed: per peer, what the site knows to be left of what the peer sent; (): nothing of
-            that kind.
-        weight: by which its arm's energy counts in the sum over all sites.
-        gravity: share of gravity that the law carries, whose work is not its own.
+        gave: per peer, the energy that was sent to it.
+        took: per peer, the energy that was taken of the energy it sent, part by part.
+        port: the energy that the arm gave to the law, by the law's own account; None: the
+            energy computed from the records.
+        store: the energy that the law stores.
+        taken: the energy that the law has dissipated, by its own formula; None: the remainder
+            of the other energies.
+        observed: per peer, the energy that the site knows to remain of the energy sent by the
+            peer; () if the law does not observe it.
+        weight: weight of the arm's energy in the sum over all sites.
+        gravity: share of gravity that the law compensates; the work of gravity is not the
+            law's.
     """
 
     gave: Sequence[Array]
@@ -82,8 +85,11 @@ class LawEnergies(NamedTuple):
 
 
 def sum_work(tau: Array, q: Array) -> Array:
-    """Returns the work of torques that are held from tick to tick, up to each tick, shape (K,),
-    J.
+    """Returns the work of held torques from the first tick up to each tick, shape (K,), J.
+
+    Args:
+        tau: torque held from each tick to the next, shape (K, n), N m.
+        q: joint angles at each tick, shape (K, n), rad.
     """
     steps: Array = np.einsum("kj,kj->k", tau[:-1], np.diff(q, axis=0))
     return np.concatenate([[0.0], np.cumsum(steps)])

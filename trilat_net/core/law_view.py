@@ -1,8 +1,8 @@
-"""What a plugged control law gets to see of a tick, filled into the site's row and the rows of
-its links.
+"""The view of a tick that a plugged control law gets, in the rows of its site and links.
 
-Invariant: of one tick the compiled and the plain form of a law see the same numbers. What a law
-sends stays in force until it writes it anew.
+Invariant:
+    - The compiled and the plain form of a law see the same numbers.
+    - A sent vector keeps its numbers until the law writes it again.
 """
 
 from collections.abc import Sequence
@@ -34,8 +34,9 @@ def _update_model(s: Row, chain: RowArray | None) -> None:
 def update_law_view(
     k: int, t_ns: int, site: RowArray, links: RowArray, chain: RowArray | None
 ) -> None:
-    """Writes what a law sees of a tick that no stage wrote: time, model, peers; and no torque
-    yet.
+    """Writes the parts of a law's view that no stage has written: time, model and peers.
+
+    The torque becomes NaN, so that a torque which the law does not write is found.
     """
     s: Row = site[0]
     s.k = k
@@ -55,11 +56,11 @@ def update_law_view(
 _PER_JOINT = ("q", "qd", "tau_x", "tau_before", "q_before", "tau", "gravity", "bias")
 _PER_COORDINATE = ("q_des", "qd_des", "felt")
 _IN_ROW = {"gravity": "G"}
-"""Where names of a law's input differ from those of the site's row."""
+"""Fields of the site's row whose names differ from those of a law's input."""
 
 
 def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> SimpleNamespace:
-    """Returns numbers by the names of the vectors that they are."""
+    """Returns a namespace of vectors, filled with consecutive numbers."""
     named = SimpleNamespace()
     first = 0
     for vector in vectors:
@@ -69,14 +70,15 @@ def _name_vectors(vectors: Sequence[SentVector], numbers: list[float]) -> Simple
 
 
 class PlainLaw:
-    """A law in plain Python at its site: it gets lists, and its results are written into the
-    site's row.
+    """A law in plain Python at its site.
+
+    The law gets lists, and its results are written into the site's row.
 
     Args:
         law: the law.
-        setup: of its site.
-        arrays: of its site; its vectors may be longer than the site's.
-        sent: what its record names as sent, see `LawChannel`.
+        setup: the setup of the site.
+        arrays: the arrays of the site; their vectors may be longer than the site's.
+        sent: the sent vectors in the site's record, see `LawChannel`.
     """
 
     def __init__(self, law: UserLaw, setup: SiteSetup, arrays: SiteArrays, sent: Array) -> None:
@@ -102,20 +104,21 @@ class PlainLaw:
             per_peer: setup.channel.select_vectors(per_peer=per_peer)
             for per_peer in (False, True)
         }
-        self._common = setup.channel.count_numbers(per_peer=False)
-        self._own = setup.channel.count_numbers(per_peer=True)
+        self._to_all_size = setup.channel.count_numbers(per_peer=False)
+        self._peer_size = setup.channel.count_numbers(per_peer=True)
 
     def bind(self) -> None:
-        """Compiles what `compute` calls, and looks up its types once for all."""
+        """Compiles the leaf that `compute` calls, and looks up its types once and for all."""
         a = self._arrays
         self._update = bind_leaf(update_law_view, 0, 0, a.site, a.links, a.chain)
 
     def compute(self, k: int, t_ns: int) -> list[float]:
-        """Stage 6 of tick k: takes torque, estimate and what is sent in; returns the law's
-        memory.
+        """Computes stage 6 of tick k, and returns the law's memory.
+
+        Torque, estimate and sent vectors are written into the site's arrays.
 
         Raises:
-            LawFailed: it failed.
+            LawFailed: the law failed.
         """
         a = self._arrays
         setup = self._setup
@@ -128,7 +131,7 @@ class PlainLaw:
 
     @property
     def memory(self) -> list[float]:
-        """What the law remembers now."""
+        """The numbers that the law remembers now."""
         return read_memory(self._law)
 
     def restore(self, memory: Sequence[float]) -> None:
@@ -139,44 +142,56 @@ class PlainLaw:
         """Returns the input of tick k, after `update_law_view`."""
         setup = self._setup
         columns: list[Any] = [column.tolist() for column in self._of_peers]
-        columns[4:] = [map(LawVector, rows) for rows in columns[4:]]  # q, qd, tau_x
+        # The last three columns are the vectors q, qd and tau_x.
+        columns[4:] = [map(LawVector, rows) for rows in columns[4:]]
+        peers = tuple(map(PeerView, *columns))
         received = () if self._received is None else self._received.tolist()
         sent = self._sent.tolist()
-        common = self._common
-        own = self._own
+        to_peers = []
+        for j in range(len(peers)):
+            first = self._to_all_size + j * self._peer_size
+            to_peers.append(_name_vectors(self._sends[True], sent[first:]))
         return LawInput(
             k=k,
             t_s=k / setup.rate_hz,
             h_s=1.0 / setup.rate_hz,
             joints=setup.layout.joints,
             coordinates=setup.layout.shared,
-            peers=tuple(map(PeerView, *columns)),
+            peers=peers,
             received=tuple(_name_vectors(self._receives, numbers) for numbers in received),
-            sent=tuple(
-                _name_vectors(self._sends[True], sent[common + j * own :])
-                for j in range(len(columns[0]))
-            ),
+            sent=tuple(to_peers),
             to_all=_name_vectors(self._sends[False], sent),
             inertia=LawVector(map(LawVector, self._inertia.tolist())),
             **{name: LawVector(view.tolist()) for name, view in self._views.items()},
         )
 
     def _collect_sent(self, now: LawInput) -> list[float]:
-        """Returns all that the law sends.
+        """Returns the numbers of all vectors that the law sends, in the order of the record.
 
         Raises:
             ValueError: a vector has another length than the law declares.
         """
-        sent: list[float] = []
-        for per_peer, names in ((False, [now.to_all]), (True, now.sent)):
-            for place, named in enumerate(names):
-                for vector in self._sends[per_peer]:
-                    values = list(getattr(named, vector.name))
-                    if len(values) != vector.length:
-                        where = f"sent[{place}]" if per_peer else "to_all"
-                        problem = (
-                            f"has {count_nouns(len(values), 'number')}, not {vector.length}"
-                        )
-                        raise ValueError(f"{where}.{vector.name} {problem}")
-                    sent += map(float, values)
+        sent = self._collect_vectors(now.to_all, "to_all", per_peer=False)
+        for j, to_peer in enumerate(now.sent):
+            sent += self._collect_vectors(to_peer, f"sent[{j}]", per_peer=True)
         return sent
+
+    def _collect_vectors(self, vectors: Any, name: str, *, per_peer: bool) -> list[float]:
+        """Returns the numbers of the vectors for all peers, or for one peer.
+
+        Args:
+            vectors: the law's values by name.
+            name: name of these vectors in the law's input, for errors.
+            per_peer: which of the declared vectors they are.
+
+        Raises:
+            ValueError: a vector has another length than the law declares.
+        """
+        numbers: list[float] = []
+        for vector in self._sends[per_peer]:
+            values = list(getattr(vectors, vector.name))
+            if len(values) != vector.length:
+                count = count_nouns(len(values), "number")
+                raise ValueError(f"{name}.{vector.name} has {count}, not {vector.length}")
+            numbers += map(float, values)
+        return numbers

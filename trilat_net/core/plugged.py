@@ -1,9 +1,9 @@
-"""Functions that the kernel calls by their address: of operators and delay models in files of
-their own.
+"""Functions of operators and delay models that the kernel calls by their address.
 
-Invariant: a function is compiled for the layout of its numbers and of its row; the numbers
-themselves stand in a table, so that no value compiles anything and no function recompiles the
-kernel.
+Invariant:
+    - A function is compiled for the layout of its numbers and of its row.
+    - The numbers themselves are in a table, so that another value compiles nothing.
+    - No function recompiles the kernel.
 """
 
 import hashlib
@@ -23,17 +23,24 @@ from .vectors import Array
 _OPTIONS: Any = {"_nrt": False, "error_model": "numpy"}
 _config: Any = numba.config
 _PLAIN: dict[int, Callable[..., None]] = {}
-"""Without a compiler: the functions by the numbers that stand for their addresses."""
+"""The functions by the numbers that replace their addresses if Numba is disabled."""
 
 
 @intrinsic
 def _call_compiled(_context: Any, address: Any, arguments: Any) -> Any:
+    """Generates the call of a compiled function, which returns nothing, by its address.
+
+    An exception of the function propagates to the caller.
+    """
+
     def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        kinds = tuple(signature.args[1])
-        form = context.call_conv.get_function_type(types.none, kinds)
-        place = builder.inttoptr(values[0], form.as_pointer())
-        given: Any = cgutils.unpack_tuple(builder, values[1])  # type: ignore[no-untyped-call]
-        status, _ = context.call_conv.call_function(builder, place, types.none, kinds, given)
+        argument_types = tuple(signature.args[1])
+        function_type = context.call_conv.get_function_type(types.none, argument_types)
+        pointer = builder.inttoptr(values[0], function_type.as_pointer())
+        unpacked: Any = cgutils.unpack_tuple(builder, values[1])  # type: ignore[no-untyped-call]
+        status, _ = context.call_conv.call_function(
+            builder, pointer, types.none, argument_types, unpacked
+        )
         with builder.if_then(status.is_error, likely=False):
             context.call_conv.return_status_propagate(builder, status)
         return context.get_dummy_value()
@@ -46,52 +53,54 @@ def _call_plain(address: int, arguments: tuple[Any, ...]) -> None:
 
 
 call_address: Any = _call_plain if _config.DISABLE_JIT else _call_compiled
-"""Calls the function at an address with a tuple of arguments; what it raises goes on to the
-caller.
-"""
+"""Calls the function at an address with a tuple of arguments; its exceptions propagate."""
 
 
 def digest_sibling_sources(function: Callable[..., Any]) -> str:
-    """Returns a hash of the sources beside a function of this package; "": it is from
-    elsewhere.
+    """Returns a hash of all source files in the folder of a function of this package.
+
+    It is "" for a function from elsewhere.
     """
     folder = Path(function.__code__.co_filename).parent
     if not folder.is_relative_to(Path(__file__).parents[1]):
         return ""
-    return hashlib.sha256(
-        b"".join(one.read_bytes() for one in sorted(folder.glob("*.py")))
-    ).hexdigest()
+    sources = [file.read_bytes() for file in sorted(folder.glob("*.py"))]
+    return hashlib.sha256(b"".join(sources)).hexdigest()
 
 
 def find_address(compiled: Any) -> int:
-    """Returns the address of the machine code of a function that was compiled for one
-    signature.
-    """
+    """Returns the address of a function's machine code, compiled for one signature."""
     result = compiled.get_compile_result(compiled.nopython_signatures[0])
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
 
-def _numbers_of(model: Any) -> dict[str, Array]:
-    """Returns the numbers of a model by name; what is no number is left out."""
-    named = {name: np.asarray(getattr(model, name)) for name in model.__struct_fields__}
-    return {
-        name: value.astype(np.float64)
-        for name, value in named.items()
-        if value.dtype.kind in "fiub"
-    }
+def _find_numbers(model: Any) -> dict[str, Array]:
+    """Returns the fields of a model that are numbers, by name."""
+    numbers = {}
+    for name in model.__struct_fields__:
+        value = np.asarray(getattr(model, name))
+        if value.dtype.kind in "fiub":
+            numbers[name] = value.astype(np.float64)
+    return numbers
 
 
 def list_numbers(model: Any) -> Array:
-    """Returns the numbers of a model one after another, as its compiled function finds them."""
-    return np.concatenate(
-        [np.zeros(0), *(value.ravel() for value in _numbers_of(model).values())]
-    )
+    """Returns the numbers of a model one after another, in the order of its fields."""
+    fields = [value.ravel() for value in _find_numbers(model).values()]
+    return np.concatenate([np.zeros(0), *fields])
 
 
 @cache
 def _compile(
     function: Callable[..., None], form: np.dtype[np.void], row: np.dtype[np.void]
 ) -> Any:
+    """Returns the compiled form of a function, called with a row of numbers and a row.
+
+    Args:
+        function: the function.
+        form: layout of its numbers.
+        row: layout of its row.
+    """
     count = form.itemsize // 8
     compute = numba.njit(**_OPTIONS)(function)
 
@@ -100,21 +109,26 @@ def _compile(
 
     if _config.DISABLE_JIT:
         return call
-    kinds: Any = numba
-    signature = types.none(types.float64[::1], kinds.from_dtype(row))
-    if made_of := digest_sibling_sources(function):
-        name = hashlib.sha256(
-            f"{made_of} {function.__module__} {function.__qualname__} {form} {row}".encode()
-        )
-        return compile_named(call, f"own_{name.hexdigest()[:32]}", signature, **_OPTIONS)
+    numba_types: Any = numba
+    signature = types.none(types.float64[::1], numba_types.from_dtype(row))
+    sources = digest_sibling_sources(function)
+    if sources:
+        text = f"{sources} {function.__module__} {function.__qualname__} {form} {row}"
+        digest = hashlib.sha256(text.encode()).hexdigest()
+        return compile_named(call, f"own_{digest[:32]}", signature, **_OPTIONS)
     return numba.njit(signature, **_OPTIONS)(call)
 
 
 def compile_to_address(model: Any, name: str, row: np.dtype[np.void]) -> int:
-    """Returns the address of a function of a model, called with its numbers and a row of that
-    layout.
+    """Compiles a function of a model, and returns the address of the machine code.
+
+    Args:
+        model: the model; the function is called with its numbers and a row.
+        name: the name of the function.
+        row: layout of the row.
     """
-    fields: Any = [(key, value.dtype, value.shape) for key, value in _numbers_of(model).items()]
+    numbers = _find_numbers(model)
+    fields: Any = [(key, value.dtype, value.shape) for key, value in numbers.items()]
     function = getattr(type(model), name)
     call = _compile(function, np.dtype((np.record, fields or [("nothing", "f8")])), row)
     if _config.DISABLE_JIT:

@@ -1,7 +1,8 @@
-"""A user's control law, in plain Python.
+"""A user's control law in plain Python: its input, its results and its memory.
 
-Invariant: it is part of the site's step, a function of its input and its memory; the memory is
-in the record of every tick, so a log resumes in the middle of a run.
+Invariant:
+    - A law is part of the site's step and a function of its input and its memory.
+    - The record of each tick contains the memory, so a log can resume in the middle of a run.
 """
 
 import math
@@ -16,11 +17,11 @@ from ..errors import LawFailed, count_nouns
 from .vectors import Vector
 
 MAX_LAW_MEMORY = 1024
-"""Most numbers of a law's memory, which is in the record of every tick."""
+"""Largest count of numbers in a law's memory, which each record contains."""
 
 
 class LawContext(NamedTuple):
-    """The knowledge of a law before it begins.
+    """The facts that a law gets before the run.
 
     >>> class Damper:
     ...     def __init__(self, facts: tn.LawContext, d: float = 2.0) -> None:
@@ -28,14 +29,14 @@ class LawContext(NamedTuple):
 
     Attributes:
         site: the site's name.
-        rate_hz: its tick rate, Hz.
+        rate_hz: tick rate of the site, Hz.
         g_m_s2: gravitational acceleration, m/s^2.
-        lengths_m: of the two links.
-        theta: the arm's true parameters, shape (5,), for a law that claims to know them; () if
-            they are unknown, as of a real arm that was not identified.
+        lengths_m: lengths of the two links, m.
+        theta: the arm's true parameters, shape (5,), for a law that knows them; () if they are
+            unknown, as for a real arm that was not identified.
         tau_limit_nm: largest torque of a joint, N m; one number, or one per joint.
-        joints: how many joints the arm has.
-        coordinates: how many numbers q, qd and tau_x of a peer have: one per joint, or one per
+        joints: the number of joints of the arm.
+        coordinates: count of numbers in q, qd and tau_x of a peer: one per joint, or one per
             coordinate of the end effector.
         peers: names of the peers, in scenario order.
     """
@@ -51,12 +52,15 @@ class LawContext(NamedTuple):
     peers: tuple[str, ...] = ()
 
 
-def _by_number(operate: Callable[[Any, Any], Any]) -> Any:
+def _make_operator(operate: Callable[[Any, Any], Any]) -> Any:
+    """Returns an arithmetic method of `LawVector` that works number by number."""
+
     def compute(numbers: "LawVector", other: Any) -> Any:
         if isinstance(other, Real):
-            return LawVector([operate(one, other) for one in numbers])
+            return LawVector([operate(number, other) for number in numbers])
         if not isinstance(other, list | tuple):
-            return NotImplemented  # an array's own arithmetic, and its array
+            # An array computes the result itself, as an array.
+            return NotImplemented
         if len(other) != len(numbers):
             raise ValueError(
                 f"arithmetic of {count_nouns(len(numbers), 'number')} with {len(other)}"
@@ -67,13 +71,13 @@ def _by_number(operate: Callable[[Any, Any], Any]) -> Any:
 
 
 class LawVector(list[Any]):
-    """Numbers with arithmetic one by one: `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`."""
+    """A list with arithmetic by number: `-5.0 * (now.q - now.q_des) - 2.0 * now.qd`."""
 
-    __add__ = __radd__ = __iadd__ = _by_number(operator.add)
-    __sub__ = _by_number(operator.sub)
-    __rsub__ = _by_number(lambda own, first: first - own)
-    __mul__ = __rmul__ = __imul__ = _by_number(operator.mul)
-    __truediv__ = _by_number(operator.truediv)
+    __add__ = __radd__ = __iadd__ = _make_operator(operator.add)
+    __sub__ = _make_operator(operator.sub)
+    __rsub__ = _make_operator(lambda right, left: left - right)
+    __mul__ = __rmul__ = __imul__ = _make_operator(operator.mul)
+    __truediv__ = _make_operator(operator.truediv)
 
     def __neg__(self) -> "LawVector":
         return LawVector(map(operator.neg, self))
@@ -83,14 +87,13 @@ class PeerView(NamedTuple):
     """A peer as a law sees it at a tick: its sample in use, or its start pose at rest.
 
     Attributes:
-        alpha: its dominance factor now.
-        tick: the stamp of the sample in use, a tick of the peer; -1 before the first.
-        age_s: the age of that sample, s; before the first, the time since the epoch.
-        new: 1 if it came into use at this tick, else 0.
-        q: of the sample, rad or m.
-        qd: its derivative.
-        tau_x: the exogenous torque of the peer, N m or N; the torque ON its arm is the
-            negative.
+        alpha: dominance factor of the peer now.
+        tick: stamp of the sample in use, a tick of the peer; -1 before the first sample.
+        age_s: age of that sample, s; before the first sample, the time since the epoch.
+        new: 1 if the sample came into use at this tick, else 0.
+        q: joint angles or coordinates of the sample, rad or m.
+        qd: derivative of q, rad/s or m/s.
+        tau_x: exogenous torque of the peer, N m or N; the torque ON its arm is the negative.
     """
 
     alpha: float
@@ -103,14 +106,15 @@ class PeerView(NamedTuple):
 
 
 class LawInput(NamedTuple):
-    """The input of a law at a tick; a vector has one number per joint, or per coordinate that
-    sites share.
+    """The input of a law at a tick.
+
+    A vector has one number per joint, or one per coordinate that the sites share.
 
     >>> def torque(self, now: tn.LawInput) -> list[float]:
     ...     return [-d * speed for d, speed in zip(self.d, now.qd)]
 
-    In plain Python vectors are `LawVector`, with arithmetic; compiled, their numbers are taken
-    one by one.
+    In plain Python the vectors are `LawVector`, which has arithmetic. A compiled law uses their
+    numbers one by one.
 
     Attributes:
         k: the tick.
@@ -119,26 +123,25 @@ class LawInput(NamedTuple):
         q: joint angles, rad.
         qd: joint velocities, rad/s.
         q_des: reference of Eq. (6), rad.
-        qd_des: its derivative, rad/s.
+        qd_des: derivative of q_des, rad/s.
         felt: the torque on the peers' arms as received, weighted by dominance, N m.
-        joints: how many there are.
-        coordinates: how many numbers the vectors of a peer have.
-        tau: the torque of each joint, N m, for the law to write; more than the limit is cut
-            off.
+        joints: the number of joints.
+        coordinates: count of numbers in the vectors of a peer.
+        tau: the torque of each joint, N m, written by the law and then limited.
         peers: the peers in scenario order.
-        received: per peer the vectors that its law sent with the sample in use, by their names;
-            zeros before the first, and of a peer whose law sends no such vector.
-        sent: per peer the vectors that go to it alone, for the law to write; unwritten, they
-            stay.
-        to_all: the vectors that go to all peers, likewise.
+        received: per peer the vectors that its law sent with the sample in use, by name; zeros
+            before the first sample, and for a vector that the peer's law does not send.
+        sent: per peer the vectors that go to this peer alone, written by the law; a vector that
+            is not written keeps its numbers.
+        to_all: the vectors that go to all peers, also written by the law.
         tau_x: exogenous torque of this tick, N m; the torque ON the arm is its negative.
-        tau_before: torque of the tick before, within its limits, N m; zeros at tick 0.
-        q_before: joint angles of the tick before, rad; the start pose at tick 0.
-        gravity: the torque that holds the arm, N m; zeros where its parameters are unknown.
-        theta_hat: the estimate in the record, for the law to write; unwritten, it stays as it
-            was.
-        inertia: M(q), a row per joint, for a law that `needs_model`; else zeros.
-        bias: C qd + G (of a chain with friction, less the torque of its stops), N m, likewise.
+        tau_before: torque of the previous tick, within its limits, N m; zeros at tick 0.
+        q_before: joint angles of the previous tick, rad; the start pose at tick 0.
+        gravity: the torque that holds the arm, N m; zeros if its parameters are unknown.
+        theta_hat: the estimate in the record, written by the law; otherwise it does not change.
+        inertia: M(q), one row per joint, for a law with `needs_model`; otherwise zeros.
+        bias: C qd + G (for a chain with friction, less the torque of its stops), N m, for a law
+            with `needs_model`; otherwise zeros.
     """
 
     k: int
@@ -166,19 +169,21 @@ class LawInput(NamedTuple):
 
 
 class UserLaw(Protocol):
-    """A control law; its class is called with `LawContext` and the keys of its `[control]`
-    table, by name.
+    """A user's control law.
 
-    All that `torque` needs of the ticks so far is its memory: the attributes that its class
-    names in `remembers`, or what a method `memory()` returns as numbers, from which
-    `recall(memory)` restores it. It may have an attribute `theta_hat`, a number per parameter,
-    which is recorded. One whose torque is right while the reference is held, because it follows
-    that and nothing else of its peers, has `holds = True`.
+    Its class is called with `LawContext` and with the keys of its `[control]` table by name.
+
+    The memory of a law contains all that `torque` needs of earlier ticks: the attributes that
+    the class names in `remembers`, or the numbers that a method `memory()` returns and from
+    which `recall(memory)` restores the law. The record contains an optional attribute
+    `theta_hat`, a number per parameter. `holds = True` marks a law that depends on its peers
+    through the reference alone, so that its torque remains right while the reference is held.
     """
 
     def torque(self, now: LawInput) -> Sequence[float] | None:
-        """Returns the torque of each joint, N m, or writes `now.tau`; more than the limit is
-        cut off.
+        """Returns the torque of each joint, N m, or writes `now.tau` and returns None.
+
+        The torque is limited afterwards.
         """
 
 
@@ -188,10 +193,16 @@ UserLawFactory = Callable[[LawContext], UserLaw]
 def call_law(
     law: UserLaw, site: str, now: LawInput, collect_sent: Callable[[LawInput], list[float]]
 ) -> "LawResults":
-    """Returns the results of a law at a tick; `collect_sent` returns what it sends.
+    """Calls a law at a tick and returns its results.
+
+    Args:
+        law: the law.
+        site: the name of its site.
+        now: the input of the tick.
+        collect_sent: returns the numbers of the vectors that the law sends.
 
     Raises:
-        LawFailed: it raised, or its results are not finite numbers of the right count.
+        LawFailed: the law raised, or its results are not finite numbers of the right count.
     """
     try:
         returned = law.torque(now)
@@ -200,28 +211,21 @@ def call_law(
         torque = [float(value) for value in (now.tau if returned is None else returned)]
         estimate = [float(value) for value in getattr(law, "theta_hat", now.theta_hat)]
         results = LawResults(torque, estimate, read_memory(law), collect_sent(now))
-    except LawFailed:  # its watchdog has stopped it
+    except LawFailed:  # the watchdog has stopped the law
         raise
     except (Exception, SystemExit) as error:
         raise describe_failure(law, site, now.k, error) from error
-    parameters = len(now.theta_hat)
-    for name, values, length in (
-        ("torque", torque, now.joints),
-        ("theta_hat", estimate, parameters),
-    ):
+    lengths = (("torque", torque, now.joints), ("theta_hat", estimate, len(now.theta_hat)))
+    for name, values, length in lengths:
         if len(values) != length:
-            raise _law_error(
-                law,
-                site,
-                now.k,
-                f"{name} has {count_nouns(len(values), 'number')}, not {length}",
-            )
+            problem = f"{name} has {count_nouns(len(values), 'number')}, not {length}"
+            raise _law_error(law, site, now.k, problem)
     check_results(law, site, now.k, results)
     return results
 
 
 class LawResults(NamedTuple):
-    """What a law gives at a tick: its torque, estimate and memory, and all that it sends."""
+    """The results of a law at a tick: torque, estimate, memory and sent numbers."""
 
     torque: list[float]
     theta_hat: list[float]
@@ -230,65 +234,67 @@ class LawResults(NamedTuple):
 
 
 def check_results(law: UserLaw, site: str, tick: int, results: LawResults) -> None:
-    """Refuses numbers that are not finite, and a memory that is too large.
+    """Refuses results that are not finite, and a memory that is too large.
 
     Raises:
-        LawFailed: with the first of them.
+        LawFailed: with the first problem.
     """
-    if (count := len(results.memory)) > MAX_LAW_MEMORY:
-        problem = (
-            f"memory has {count_nouns(count, 'number')}, at most {MAX_LAW_MEMORY} are kept"
-        )
+    count = len(results.memory)
+    if count > MAX_LAW_MEMORY:
+        numbers = count_nouns(count, "number")
+        problem = f"memory has {numbers}, at most {MAX_LAW_MEMORY} are kept"
         raise _law_error(law, site, tick, problem)
     for name, values in zip(results._fields, results, strict=True):
         if not all(map(math.isfinite, values)):
             first = next(n for n, value in enumerate(values) if not math.isfinite(value))
-            raise _law_error(
-                law, site, tick, f"{name}[{first}] is {values[first]}, no finite number"
-            )
+            problem = f"{name}[{first}] is {values[first]}, no finite number"
+            raise _law_error(law, site, tick, problem)
 
 
 def describe_failure(
     law: UserLaw, site: str, tick: int | None, error: BaseException
 ) -> LawFailed:
-    """Returns the failure of a law that raised."""
+    """Returns the failure of a law that raised an exception."""
     problem = _one_line(error)
     hint = "; for more than + - * / make it an array, as in numpy.asarray(now.q)"
     return _law_error(law, site, tick, problem + (hint if "LawVector" in problem else ""))
 
 
 def _flatten(value: Any) -> Iterator[float]:
+    """Yields the numbers of a value: of a number, or of nested lists."""
     if isinstance(value, Real):
         yield float(value)
         return
-    for one in value:
-        yield from _flatten(one)
+    for entry in value:
+        yield from _flatten(entry)
 
 
 def _fill(value: Any, numbers: Iterator[float]) -> Any:
-    """Returns a value of the same form as another, of the next numbers."""
+    """Returns a value of the same form as `value`, filled with the next numbers."""
     if isinstance(value, bool):
         return bool(next(numbers))
     if isinstance(value, Real):
         number = next(numbers)
         return int(number) if isinstance(value, int) and number.is_integer() else number
     if isinstance(value, np.ndarray):
-        return np.array([next(numbers) for _ in range(value.size)], value.dtype).reshape(
-            value.shape
-        )
-    return type(value)(_fill(one, numbers) for one in value)
+        entries = [next(numbers) for _ in range(value.size)]
+        return np.array(entries, value.dtype).reshape(value.shape)
+    return type(value)(_fill(entry, numbers) for entry in value)
 
 
 def list_remembered(law: Any) -> tuple[str, ...]:
-    """Returns the names of the attributes that a law remembers; none of one without memory."""
+    """Returns the names of the attributes that a law remembers; () without memory."""
     return tuple(getattr(law, "remembers", ()))
 
 
 def read_memory(law: Any) -> list[float]:
-    """Returns the memory of a law: of the attributes that it remembers, or what it says itself."""
+    """Returns the memory of a law: by its method `memory`, or its remembered attributes."""
     if callable(getattr(law, "memory", None)):
         return [float(value) for value in law.memory()]
-    return [number for name in list_remembered(law) for number in _flatten(getattr(law, name))]
+    numbers: list[float] = []
+    for name in list_remembered(law):
+        numbers += _flatten(getattr(law, name))
+    return numbers
 
 
 def write_memory(law: Any, memory: Sequence[float]) -> None:
@@ -305,7 +311,7 @@ def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
     """Restores a law from the memory in a record.
 
     Raises:
-        LawFailed: it raised.
+        LawFailed: the law raised an exception.
     """
     try:
         write_memory(law, memory)
@@ -314,7 +320,7 @@ def restore_law(law: UserLaw, site: str, memory: Sequence[float]) -> None:
 
 
 def law_name(law: UserLaw) -> str:
-    """Returns the name of a law as in a scenario."""
+    """Returns the name of a law as a scenario writes it, "module:Class"."""
     return f"{type(law).__module__}:{type(law).__qualname__}"
 
 
