@@ -43,12 +43,12 @@ class SentEntry(NamedTuple):
     Attributes:
         vector: the vector of the number.
         peer: the peer that gets the vector alone, or "" if all peers get it.
-        index: index of the number in the vector.
+        position: position of the number in the vector, from 0.
     """
 
     vector: SentVector
     peer: str
-    index: int
+    position: int
 
     @property
     def key(self) -> str:
@@ -56,7 +56,7 @@ class SentEntry(NamedTuple):
         return f"{self.vector.name}[{self.peer}]" if self.peer else self.vector.name
 
     def __str__(self) -> str:
-        return f"{self.key}[{self.index}]"
+        return f"{self.key}[{self.position}]"
 
 
 class LawChannel(NamedTuple):

@@ -1,4 +1,4 @@
-"""A user's hand program, which sees its site's knowledge and moves, turns or pushes the arm.
+"""A user's hand program, which sees its site's knowledge and moves or pushes the arm.
 
 Invariant:
     - A decision that is based on tick k acts a fixed time after tick k, wherever it is made, as

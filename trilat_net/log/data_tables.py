@@ -351,11 +351,11 @@ def _make_sent_columns(site: SiteLog) -> Iterator[Column]:
     for n, entry in enumerate(site.channel.entries(site.peers)):
         (name, unit, length, _) = entry.vector
         peer = entry.peer
-        stem = f"ch_{name}" + f"_{peer}" * bool(peer) + f"_{entry.index + 1}" * (length > 1)
+        stem = f"ch_{name}" + f"_{peer}" * bool(peer) + f"_{entry.position + 1}" * (length > 1)
         suffix = UNIT_SUFFIXES.get(unit) or _to_word(unit).strip("_")
         text = (
             f"{name} that the law sends to {peer or 'all'}"
-            + f", number {entry.index + 1}" * (length > 1)
+            + f", number {entry.position + 1}" * (length > 1)
         )
         values = np.ascontiguousarray(site.ch[:, n])
         yield Column(
