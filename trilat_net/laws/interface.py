@@ -22,7 +22,7 @@ from msgspec.structs import asdict
 from ..core.site_setup import Gains, Law
 from ..core.user_law import LawContext, UserLaw, UserLawFactory
 from ..core.vectors import Array
-from ..errors import ScenarioError
+from ..errors import ScenarioError, count_nouns
 from ..fields import Frozen, KeyProblem, NotNegative
 from ..files import find_page
 from .conditions import LawSituation, LinearForm, LinearSituation, StabilityCondition
@@ -230,7 +230,9 @@ class ControlLaw:
         required = getattr(cls, "sites", None)
         if required in (None, len(roles)):
             return ""
-        return f"is for {required} sites, and this has {len(roles)}: leave it out"
+        return (
+            f"is for {count_nouns(required, 'site')}, and this has {len(roles)}: leave it out"
+        )
 
     @classmethod
     def write_control(cls, gains: Mapping[str, float], at: TuningSite) -> dict[str, Any]:
@@ -360,10 +362,8 @@ def _check_site_count(kind: Any, code: str, path: str, sites: int) -> None:
         )
     least, most = bounds
     if not least <= sites <= most:
-        allowed = f"{least}" if least == most else f"{least} to {most}"
-        raise ScenarioError(
-            f"{code} is for {allowed} sites, and the scenario has {sites}", path=path
-        )
+        allowed = count_nouns(f"{least}" if least == most else f"{least} to {most}", "site")
+        raise ScenarioError(f"{code} is for {allowed}, and the scenario has {sites}", path=path)
 
 
 def _find_written_attributes(kind: Any) -> list[str]:
