@@ -1,1 +1,1 @@
-"""A session while it runs, for people: a page that shows it and takes part, and `trilat live`."""
+"""A running session for people: a page that shows it and takes part, and `trilat live`."""

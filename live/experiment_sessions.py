@@ -1,10 +1,11 @@
-"""An experiment with people: a session for each trial, one page for all of them, and what is
-written down.
+"""An experiment with people: a session for each trial, one page for all of them, and its notes.
 
-Invariant: what counts is a function of the log, which is in its place before the journal has
-the trial: a process that dies at any moment loses no trial whose session it had ended, and
-counts no other. Every try has a folder of its own, which stays if the trial does not count,
-with a note that says why.
+Invariant:
+    - A trial counts by its log alone. The log is in its place before the journal has the
+      trial, so a process that dies at any moment loses no trial whose session has ended, and
+      counts no other.
+    - Every attempt has a folder of its own. If the trial does not count, that folder stays,
+      with a note of the reason.
 """
 
 import shutil
@@ -32,31 +33,32 @@ from trilat_net.studies.experiment.trial_run import ExperimentTrial
 from .experiment_stage import Stage, TrialWatch
 from .page_server import PageOptions, PageServer
 
-TRIES = "tries"
+ATTEMPTS = "tries"
 POLL_NS = 20_000_000
-GOODBYE_NS = NS_PER_S
-"""From when all is done to the end of the server, in which every page hears of it."""
+FAREWELL_NS = NS_PER_S
+"""Time between the last step and the end of the server, in which every page is told."""
 
-SOON_NS = 60 * NS_PER_S
-"""A session that fails sooner than this, before it has begun, would fail again."""
+EARLY_FAILURE_NS = 60 * NS_PER_S
+"""A session that fails earlier than this, before it has begun, would fail again."""
 
 SessionRunner = Callable[[TrialWatch, Path, Callable[[], bool]], SessionResult]
-"""Runs the session of a trial in a folder: from when the function given returns true until its
-watch is over, or people end the experiment.
+"""A function of the watch of a trial, a folder, and a function that returns True at the start.
+
+It runs the session of the trial until the watch is over, or people end the experiment.
 """
 
 
 @dataclass
 class ExperimentSessions:
-    """What is left of an experiment, made with people step by step.
+    """The remaining steps of an experiment with people.
 
     Attributes:
-        experiment: in its folder.
-        stage: what its pages are asked.
-        clock: of the stage.
+        experiment: the experiment.
+        stage: what its pages show.
+        clock: the clock of the stage.
         run_session: runs the session of a trial.
-        ends: returns true once the experiment is to end for now.
-        say: tells people at the terminal.
+        ends: returns True once the experiment must end for now.
+        say: prints a line for the user.
     """
 
     experiment: Experiment
@@ -67,11 +69,11 @@ class ExperimentSessions:
     say: Callable[[str], None]
 
     def run(self) -> bool:
-        """Goes on to the end; false if it was ended before.
+        """Runs the remaining steps; returns False if the experiment was ended earlier.
 
         Raises:
-            LogRefused: a disk refused something; all that was done is kept.
-            UsageError: its trials are of synthetic participants.
+            LogRefused: the disk refused a file; everything that was done is kept.
+            UsageError: the experiment is one of synthetic participants.
         """
         trials = self.experiment.open_trials(people=True)
         notes = self.experiment.open_notes()
@@ -81,137 +83,162 @@ class ExperimentSessions:
                 is_trial = step.kind == "trial"
                 if is_trial and step.planned.number in done:
                     continue
-                if not (self._make_trial(step) if is_trial else self._ask(step)):
+                if not (self._run_trial(step) if is_trial else self._request_step(step)):
                     return False
-            self.stage.close()
+            self.stage.show_end()
         return True
 
-    def _ask(self, step: Step, rest_s: float = 0.0) -> bool:
-        """Waits until every user has done a step; notes consents and answers as they come."""
+    def _request_step(self, step: Step, rest_s: float = 0.0) -> bool:
+        """Waits until every user has completed a step, and notes consents and answers.
+
+        Returns:
+            False if the experiment was ended before.
+        """
         users = dict(zip(self.stage.users, step.planned.group, strict=True))
         cells = {site: f"{step.key} {who}" for site, who in users.items()}
-        asked = self.stage.ask(
-            step,
-            rest_s,
-            [site for site, cell in cells.items() if (cell, 0) in self._notes.done],
-        )
+        done = [site for site, cell in cells.items() if (cell, 0) in self._notes.done]
+        request = self.stage.request_step(step, rest_s, done)
         noted = len(self._notes.done)
-        while not asked.replies.keys() >= users.keys():
+        form_name = step.form.name if step.form else ""
+        while not request.replies.keys() >= users.keys():
             if self.ends():
                 return False
             self.clock.sleep_until(self.clock.monotonic_ns() + POLL_NS)
-            for site, (answers, _) in (
-                list(asked.replies.items()) if step.kind != "trial" else ()
-            ):
-                told = step.form.name if step.form else ""
-                self._note(
-                    cells[site], step.kind, users[site], step.planned.number, told, answers
+            if step.kind == "trial":
+                continue
+            for site, (answers, _) in list(request.replies.items()):
+                self._add_note(
+                    cells[site],
+                    step.kind,
+                    users[site],
+                    step.planned.number,
+                    form_name,
+                    answers,
                 )
         if len(self._notes.done) > noted:
             self.experiment.write_tables()
         return True
 
-    def _note(self, cell: str, kind: str, who: str, number: int, *told: Any) -> None:
-        self._notes.add(
-            Note(cell, kind, who, number, round(self.clock.unix_ns() / NS_PER_S, 3), *told)
-        )
+    def _add_note(self, cell: str, kind: str, who: str, number: int, *details: Any) -> None:
+        unix_s = round(self.clock.unix_ns() / NS_PER_S, 3)
+        self._notes.add(Note(cell, kind, who, number, unix_s, *details))
 
-    def _make_trial(self, step: Step) -> bool:
-        """Makes a trial until one counts; false if the experiment was ended before."""
+    def _run_trial(self, step: Step) -> bool:
+        """Repeats a trial until one attempt counts.
+
+        Returns:
+            False if the experiment was ended before.
+        """
         plan = self.experiment.plan
         planned = step.planned
         scenario = plan.find_scenario(planned, self.experiment.list_choices())
         trial = ExperimentTrial(plan.protocol, scenario, planned, plan.digest)
         path = make_subfolder(self.experiment.folder / LOGS) / planned.file
-        # a program was killed before it was counted
-        if path.exists() and not self._count(trial, path):
+        # The log exists if the program was killed before it had counted the trial.
+        if path.exists() and not self._count_trial(trial, path):
             return True
-        for left in self._list_tries(planned)[-1:]:
-            if any(left.glob("*.mcap*")):
-                self._note_aborted(planned, "the program was ended")
+        for last_attempt in self._list_attempts(planned)[-1:]:
+            if any(last_attempt.glob("*.mcap*")):
+                self._record_aborted(planned, "the program was ended")
             else:  # its session had not begun
-                shutil.rmtree(left, ignore_errors=True)
+                shutil.rmtree(last_attempt, ignore_errors=True)
         rest_s = plan.rest_before_s(planned)
-        while not self._try(step, trial, path, rest_s):
+        while not self._run_attempt(step, trial, path, rest_s):
             if self.ends():
                 return False
             rest_s = 0.0
         return True
 
-    def _list_tries(self, planned: PlannedTrial) -> list[Path]:
-        return sorted((self.experiment.folder / TRIES).glob(f"{planned.number:05d}-*"))
+    def _list_attempts(self, planned: PlannedTrial) -> list[Path]:
+        return sorted((self.experiment.folder / ATTEMPTS).glob(f"{planned.number:05d}-*"))
 
-    def _note_aborted(self, planned: PlannedTrial, why: str) -> None:
-        """Notes why the newest try does not count, unless that is noted."""
-        cell = f"aborted {self._list_tries(planned)[-1].name}"
-        self._note(cell, "aborted", "-".join(planned.group), planned.number, why)
+    def _record_aborted(self, planned: PlannedTrial, reason: str) -> None:
+        """Notes why the newest attempt does not count, unless that is noted already."""
+        cell = f"aborted {self._list_attempts(planned)[-1].name}"
+        self._add_note(cell, "aborted", "-".join(planned.group), planned.number, reason)
         self.experiment.write_tables()
 
-    def _try(self, step: Step, trial: ExperimentTrial, path: Path, rest_s: float) -> bool:
-        """Runs the session of a trial, once all users are ready; false if it does not count."""
-        number = len(self._list_tries(step.planned)) + 1
+    def _run_attempt(
+        self, step: Step, trial: ExperimentTrial, path: Path, rest_s: float
+    ) -> bool:
+        """Runs the session of a trial once all users are ready.
+
+        Returns:
+            True if the trial counts.
+        """
+        number = len(self._list_attempts(step.planned)) + 1
         begun_ns = self.clock.monotonic_ns()
-        tries = make_subfolder(self.experiment.folder / TRIES)
-        folder = make_subfolder(tries / f"{step.planned.number:05d}-{number:02d}")
+        attempts = make_subfolder(self.experiment.folder / ATTEMPTS)
+        folder = make_subfolder(attempts / f"{step.planned.number:05d}-{number:02d}")
         watch = TrialWatch(trial, self.clock)
-        asked = self.stage.ask(step, rest_s)
-        ready: list[str] = []
+        request = self.stage.request_step(step, rest_s)
+        has_begun = False
 
         def begins() -> bool:
-            if not ready and asked.replies.keys() >= set(self.stage.users):
-                ready.extend(self.stage.users)
-                self.stage.begin(watch)
-            return bool(ready)
+            nonlocal has_begun
+            if not has_begun and request.replies.keys() >= set(self.stage.users):
+                has_begun = True
+                self.stage.show_trial(watch)
+            return has_begun
 
         try:
             result = self.run_session(watch, folder, begins)
         except OSError as error:
             raise describe_write_error(folder, error) from None
-        self.stage.check()
+        self.stage.show_checking()
         if result.problems and result.exit_code == LogRefused.exit_code:
             raise LogRefused("; ".join(result.problems))
-        # nobody has begun anything: people have ended it, or the sites have waited for long
-        if not ready:
+        if not has_begun:
+            # People have ended the experiment, or the sites have waited for too long.
             shutil.rmtree(folder, ignore_errors=True)
-            if result.problems and self.clock.monotonic_ns() - begun_ns < SOON_NS:
+            elapsed_ns = self.clock.monotonic_ns() - begun_ns
+            if result.problems and elapsed_ns < EARLY_FAILURE_NS:
                 raise RunFailed("; ".join(result.problems))
             return False
-        why = _find_reason(watch, result)
-        if not why:
+        reason = _find_repeat_reason(watch, result)
+        if not reason:
             result.log.replace(path)
-            why = self._count(trial, path)
-        if why:
-            self._note_aborted(step.planned, why)
-            self.stage.tell(None, why)
-            self.say(f"trial {step.planned.number} is to be made again: {why}")
-        return not why
+            reason = self._count_trial(trial, path)
+        if reason:
+            self._record_aborted(step.planned, reason)
+            self.stage.show_feedback(None, reason)
+            self.say(f"trial {step.planned.number} is to be made again: {reason}")
+        return not reason
 
-    def _count(self, trial: ExperimentTrial, path: Path) -> str:
-        """Counts a trial by its log, which is in its place; returns why it does not count, ""
-        if it does.
+    def _count_trial(self, trial: ExperimentTrial, path: Path) -> str:
+        """Counts a trial by its log; returns why it does not count, "" if it does.
+
+        Args:
+            trial: the trial.
+            path: the log, which is in its place already.
         """
-        tries = self._list_tries(trial.planned)[-1:]
+        attempts = self._list_attempts(trial.planned)[-1:]
         try:
             entry = trial.settle(path)
         except LogError as error:
-            path.replace((*tries, self.experiment.folder)[0] / path.name)
+            folder = attempts[0] if attempts else self.experiment.folder
+            path.replace(folder / path.name)
             return str(error)
         self._trials.add(entry)
-        for folder in tries:
+        for folder in attempts:
             shutil.rmtree(folder, ignore_errors=True)
-        self.stage.tell(entry)
+        self.stage.show_feedback(entry)
         self.experiment.write_tables()
         planned = trial.planned
-        took_s = entry.measures["completion_s"]
-        how = f"{'succeeded' if entry.succeeded else 'failed'} after {took_s:.2f} s"
-        whose = f"trial {planned.number} of {len(self.experiment.plan.trials)}, {', '.join(planned.group)}"
-        self.say(f"{whose}, {planned.condition}: {how}")
+        total = len(self.experiment.plan.trials)
+        outcome = "succeeded" if entry.succeeded else "failed"
+        completion_s = entry.measures["completion_s"]
+        self.say(
+            f"trial {planned.number} of {total}, {', '.join(planned.group)}, "
+            f"{planned.condition}: {outcome} after {completion_s:.2f} s"
+        )
         return ""
 
 
-def _find_reason(watch: TrialWatch, result: SessionResult) -> str:
-    """Returns why the session of a trial is none that counts; an arm that diverged is a trial
-    that failed.
+def _find_repeat_reason(watch: TrialWatch, result: SessionResult) -> str:
+    """Returns why a trial must be repeated, "" if it counts.
+
+    A trial in which an arm has diverged counts, as a failed one.
     """
     if result.interrupted:
         return "the experiment was interrupted"
@@ -223,11 +250,19 @@ def _find_reason(watch: TrialWatch, result: SessionResult) -> str:
 def run_with_people(
     experiment: Experiment, options: PageOptions, say: Callable[[str], None]
 ) -> int:
-    """Goes on with an experiment, with people on its page; returns the exit code.
+    """Continues an experiment with people on its page.
+
+    Args:
+        experiment: the experiment.
+        options: how the page is served.
+        say: prints a line for the user.
+
+    Returns:
+        The exit code.
 
     Raises:
-        LogRefused: a disk refused something; all that was done is kept.
-        UsageError: its trials are of synthetic participants.
+        LogRefused: the disk refused a file; everything that was done is kept.
+        UsageError: the experiment is one of synthetic participants.
     """
     clock = SystemClock()
     plan = experiment.plan
@@ -241,7 +276,7 @@ def run_with_people(
             def run_session(
                 watch: TrialWatch, folder: Path, begins: Callable[[], bool]
             ) -> SessionResult:
-                attend = partial(_attend, page, idle, watch)
+                attend = partial(_show_session, page, idle, watch)
                 result = run_demo(
                     scenario=watch.trial.scenario,
                     folder=folder,
@@ -255,20 +290,21 @@ def run_with_people(
             def ends() -> bool:
                 return interrupt.is_requested() or page.end_requested.is_set()
 
-            if ExperimentSessions(
+            sessions = ExperimentSessions(
                 experiment=experiment,
                 stage=stage,
                 clock=clock,
                 run_session=run_session,
                 ends=ends,
                 say=say,
-            ).run():
-                clock.sleep_until(clock.monotonic_ns() + GOODBYE_NS)
+            )
+            if sessions.run():
+                clock.sleep_until(clock.monotonic_ns() + FAREWELL_NS)
     return interrupt.exit_code if interrupt.is_requested() else 0
 
 
 @contextmanager
-def _attend(
+def _show_session(
     page: PageServer,
     idle: Bus,
     watch: TrialWatch,
@@ -276,7 +312,7 @@ def _attend(
     endpoints: Sequence[str],
     _say: Callable[[str], None],
 ) -> Iterator[Callable[[], bool]]:
-    """The `SessionAttendant` of a trial: the page shows its session, and then none."""
+    """Shows the session of a trial on the page while it runs: a `SessionAttendant`."""
     with closing(ZenohBus([], endpoints)) as bus:
         page.show(bus, session)
         try:

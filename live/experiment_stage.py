@@ -1,9 +1,11 @@
-"""What an experiment asks of people on their pages: consent, whether they are ready, a trial,
-questionnaires.
+"""The steps of an experiment on its pages: consent, readiness, trials, questionnaires.
 
-Invariant: a reply counts for the step that its page was shown, from the first page of a user's
-site alone. A trial is judged by every record of its slave, as its log is afterwards. How long
-people rest or are away is told by the monotonic clock. Users are not told the condition.
+Invariant:
+    - A reply counts only for the step that its page was shown, and only from the first page of
+      a user's site.
+    - A trial is judged by every record of its slave, as it is later judged by its log.
+    - Rests and absences are measured on the monotonic clock.
+    - Users are not told the condition.
 """
 
 from collections.abc import Collection, Sequence
@@ -22,12 +24,10 @@ from trilat_net.studies.experiment.trial_run import ExperimentTrial, TrialEntry,
 from .page_orders import AbortTrial, StageMessage
 from .session_view import SessionView
 
-AWAY_NS = 8 * NS_PER_S
-"""A page that is reloaded within a trial is back by then; one that is away for longer ends the
-trial.
-"""
-END_NS = NS_PER_S // 2
-"""From the end of a trial to that of its session, in which its last mark reaches the log."""
+MAX_ABSENCE_NS = 8 * NS_PER_S
+"""Absence of a user's page after which a trial is aborted; a reload takes less time."""
+END_DELAY_NS = NS_PER_S // 2
+"""Time between the end of a trial and that of its session, so that its mark reaches the log."""
 
 Json = dict[str, Any]
 
@@ -35,11 +35,15 @@ Json = dict[str, Any]
 class TrialWatch:
     """A trial while its session runs.
 
+    Args:
+        trial: the trial.
+        clock: the clock of this process.
+
     Attributes:
-        trial: which.
-        judge: judges it, record by record.
-        aborted: why it is to be made again; "" if it is not.
-        diverged: whether an arm went past its limits, with which the trial has failed.
+        trial: the trial.
+        judge: judges the trial, record by record.
+        aborted: why the trial must be repeated; "" if it need not.
+        diverged: whether an arm has diverged, which makes the trial fail.
     """
 
     def __init__(self, trial: ExperimentTrial, clock: Clock) -> None:
@@ -47,88 +51,104 @@ class TrialWatch:
         self.judge = TrialJudge(trial)
         self.aborted = ""
         self._clock = clock
-        self._next = 0
+        self._next_tick = 0
         self._ended_ns = 0
-        self._appeared = self.diverged = False
+        self._has_appeared = False
+        self.diverged = False
 
     @property
     def over(self) -> bool:
-        """True once its session can end."""
-        ended = self.judge.outcome is not None
-        return bool(self.aborted) or (
-            ended and self._clock.monotonic_ns() - self._ended_ns > END_NS
-        )
+        """True once the session of the trial can end."""
+        if self.aborted:
+            return True
+        has_outcome = self.judge.outcome is not None
+        return has_outcome and self._clock.monotonic_ns() - self._ended_ns > END_DELAY_NS
 
-    def poll(self, view: SessionView, away: Collection[str]) -> list[str]:
-        """Takes in the records that have come, and whose page is `away`; returns moments for
-        the log.
+    def poll(self, view: SessionView, absent: Collection[str]) -> list[str]:
+        """Judges the records that have arrived.
+
+        Args:
+            view: the session.
+            absent: the users whose page has been absent for too long.
+
+        Returns:
+            Moments to mark in the log.
         """
         if self.over or self.judge.outcome is not None or not view.running:
             return []
         modes = {name: site.record.mode for name, site in view.sites.items() if site.record}
         self.diverged = "diverged" in modes.values()
         halted = [name for name, mode in modes.items() if mode in HALTED_MODES]
-        if away or halted:
-            self.aborted = (
-                f"the page of {', '.join(away)} is gone"
-                if away
-                else f"{', '.join(halted)} stopped"
-            )
+        if absent:
+            self.aborted = f"the page of {', '.join(absent)} is gone"
+        elif halted:
+            self.aborted = f"{', '.join(halted)} stopped"
+        if self.aborted:
             return [f"trial {self.trial.planned.number} aborted: {self.aborted}"]
-        return self._judge(view)
+        return self._judge_records(view)
 
-    def _judge(self, view: SessionView) -> list[str]:
+    def _judge_records(self, view: SessionView) -> list[str]:
+        """Judges the complete records up to the outcome; returns moments to mark in the log."""
         slave = view.sites[self.trial.slave]
         number = self.trial.planned.number
         moments = list[str]()
-        first = max(self._next, slave.window.first)
+        first = max(self._next_tick, slave.window.first)
         last = slave.complete
         if last < first:
             return []
-        if self._next == 0:
+        if self._next_tick == 0:
             moments.append(f"trial {number} begins")
-        self._next = last + 1
+        self._next_tick = last + 1
         rows = slave.window.rows(first, last)
-        told = rows.known.tolist(), rows.q.tolist(), rows.tau_x.tolist()
-        for tick, known, q, tau_x in zip(range(first, last + 1), *told, strict=True):
+        ticks = range(first, last + 1)
+        columns = zip(
+            ticks, rows.known.tolist(), rows.q.tolist(), rows.tau_x.tolist(), strict=True
+        )
+        for tick, is_known, q, tau_x in columns:
             t_s = tick_ns(tick, slave.window.rate_hz) / NS_PER_S
-            if not self._appeared and t_s >= self.trial.appears_s:
-                self._appeared = True
+            if not self._has_appeared and t_s >= self.trial.appears_s:
+                self._has_appeared = True
                 moments.append("target appears")
-            if known and (outcome := self.judge.take(t_s, q, tau_x)) is not None:
+            outcome = self.judge.accept(t_s, q, tau_x) if is_known else None
+            if outcome is not None:
                 self._ended_ns = self._clock.monotonic_ns()
-                return [
-                    *moments,
-                    f"trial {number} {'succeeded' if outcome.succeeded else 'failed'}",
-                ]
+                result = "succeeded" if outcome.succeeded else "failed"
+                return [*moments, f"trial {number} {result}"]
         return moments
 
     def describe(self, t_s: float, site: str) -> Json:
-        """Returns what a page draws at a time of its arms, s; a user's page as that user is
-        shown it.
+        """Returns the target as a page draws it.
+
+        Args:
+            t_s: the time of the arms on the page, s.
+            site: the site of the page's user; "" for other pages.
         """
         goal = self.judge.goal
         trial = self.trial
-        users = self.trial.protocol.users
-        at = goal.place(t_s, users.index(site) if site in users else None)
-        way = goal.find_corridor(t_s)
-        return {
-            "target": {"site": trial.slave, "at": at.tolist(), "width_m": goal.width_m},
-            **({} if way is None else {"way": {"from": way[0].tolist(), "width_m": way[1]}}),
-            "appeared": t_s >= goal.appears_s,
-            "left_s": max(0.0, trial.longest_s - max(t_s, goal.appears_s)),
+        users = trial.protocol.users
+        user = users.index(site) if site in users else None
+        position = goal.find_target_m(t_s, user)
+        fields: Json = {
+            "target": {"site": trial.slave, "at": position.tolist(), "width_m": goal.width_m}
         }
+        corridor = goal.find_corridor(t_s)
+        if corridor is not None:
+            start, width_m = corridor
+            fields["way"] = {"from": start.tolist(), "width_m": width_m}
+        fields["appeared"] = t_s >= goal.appears_s
+        fields["left_s"] = max(0.0, trial.longest_s - max(t_s, goal.appears_s))
+        return fields
 
 
 @dataclass
-class Asked:
-    """A step that people are asked for.
+class StepRequest:
+    """A step that the users are asked to complete.
 
     Attributes:
-        step: which.
-        from_ns: until then people rest.
-        replies: of the users who have done it, by site: the answers, and the page that gave
-            them.
+        step: the step.
+        from_ns: the end of the users' rest; earlier replies are refused.
+        replies: the answers of the users who have completed the step, by site, and the number
+            of the page that sent them.
     """
 
     step: Step
@@ -137,13 +157,14 @@ class Asked:
 
 
 class Stage:
-    """What pages are shown around a session; the one who runs the experiment sets it, the
-    server asks it.
+    """What the pages show around the sessions of an experiment.
+
+    The experiment sets the stage, and the page's server polls it.
 
     Attributes:
-        users: the sites of those who take part.
-        shows_ages: whether pages begin with the ages of samples shown; they could tell the
-            answer of a pair.
+        users: the sites of the participants.
+        shows_ages: whether pages first show the ages of samples. A staircase hides them,
+            because they could reveal the answer.
     """
 
     def __init__(self, plan: ExperimentPlan, clock: Clock) -> None:
@@ -151,166 +172,198 @@ class Stage:
         self._plan = plan
         self._clock = clock
         self.shows_ages = plan.protocol.staircase is None
-        self._asked: Asked | None = None
+        self._request: StepRequest | None = None
         self._watch: TrialWatch | None = None
         self._step: Step | None = None
         self._phase = "checking"
-        self._told: Json = {"why": "", "measures": {}}
+        self._feedback: Json = {"why": "", "measures": {}}
         self._holders: dict[str, int] = {}
-        self._seen_ns: dict[str, int] = {}
+        self._page_seen_ns: dict[str, int] = {}
 
-    def ask(self, step: Step, rest_s: float = 0.0, done: Collection[str] = ()) -> Asked:
-        """Asks users for a step, but those who have `done` it; returns what they reply, as it
-        comes.
+    def request_step(
+        self, step: Step, rest_s: float = 0.0, done: Collection[str] = ()
+    ) -> StepRequest:
+        """Asks the users to complete a step.
+
+        Args:
+            step: the step.
+            rest_s: the rest before the step, s.
+            done: the sites of users who have completed the step already.
+
+        Returns:
+            The request, which collects the replies.
         """
-        asked = Asked(step, self._clock.monotonic_ns() + int(rest_s * NS_PER_S))
-        asked.replies |= {site: ({}, 0) for site in done}
+        request = StepRequest(step, self._clock.monotonic_ns() + int(rest_s * NS_PER_S))
+        request.replies |= {site: ({}, 0) for site in done}
         self._step = step
         self._watch = None
         self._phase = step.kind
-        self._asked = asked
-        return asked
+        self._request = request
+        return request
 
-    def begin(self, watch: TrialWatch) -> None:
+    def show_trial(self, watch: TrialWatch) -> None:
         """Shows a trial whose session is about to begin."""
-        self._asked = None
+        self._request = None
         self._watch = watch
         self._phase = "starting"
 
-    def check(self) -> None:
-        """Shows that a trial has ended, and its log is looked at."""
+    def show_checking(self) -> None:
+        """Shows that a trial has ended and its log is being checked."""
         self._watch = None
         self._phase = "checking"
 
-    def tell(self, entry: TrialEntry | None, why: str = "") -> None:
-        """Shows the feedback on a trial, as far as the protocol has any; or why it is made
-        again.
-        """
-        names = self._plan.protocol.feedback if entry is not None else ()
-        self._told = {
-            "why": why,
-            "measures": {
-                name: entry.measures[name] for name in names if entry and name in entry.measures
-            },
-        }
-        if entry is not None and names:
-            self._told["succeeded"] = entry.succeeded
+    def show_feedback(self, entry: TrialEntry | None, why: str = "") -> None:
+        """Shows the feedback of the protocol on a trial, or why the trial must be repeated.
 
-    def close(self) -> None:
-        """Shows that all is done."""
-        self._asked = None
+        Args:
+            entry: the result of the trial; None if it must be repeated.
+            why: the reason for the repetition.
+        """
+        measures = {}
+        names = self._plan.protocol.feedback if entry is not None else ()
+        if entry is not None:
+            measures = {name: entry.measures[name] for name in names if name in entry.measures}
+        self._feedback = {"why": why, "measures": measures}
+        if entry is not None and names:
+            self._feedback["succeeded"] = entry.succeeded
+
+    def show_end(self) -> None:
+        """Shows that the experiment has ended."""
+        self._request = None
         self._step = None
         self._phase = "over"
 
     def poll(self, view: SessionView, pages: Sequence[tuple[str, int]]) -> list[str]:
-        """Takes in what has come, and site and number of each user's page; returns moments for
-        the log.
+        """Judges the records that have arrived, and follows which users are present.
+
+        Args:
+            view: the session.
+            pages: site and number of each user's page.
+
+        Returns:
+            Moments to mark in the log.
         """
         now_ns = self._clock.monotonic_ns()
-        asked = self._asked
-        self._holders = {site: min(n for at, n in pages if at == site) for site, _ in pages}
-        self._seen_ns |= dict.fromkeys(self._holders, now_ns)
-        if asked is not None and asked.step.kind == "trial":  # who leaves is not ready any more
-            for site, (_, page) in list(asked.replies.items()):
+        request = self._request
+        self._holders = {
+            site: min(number for page_site, number in pages if page_site == site)
+            for site, _ in pages
+        }
+        self._page_seen_ns |= dict.fromkeys(self._holders, now_ns)
+        if request is not None and request.step.kind == "trial":
+            # A user who leaves is not ready any more.
+            for site, (_, page) in list(request.replies.items()):
                 if self._holders.get(site) != page:
-                    del asked.replies[site]
+                    del request.replies[site]
         if self._watch is None:
             return []
         if view.running and self._phase == "starting":
             self._phase = "trial"
-        away = [
-            site for site in self.users if now_ns - self._seen_ns.get(site, now_ns) > AWAY_NS
+        absent = [
+            site
+            for site in self.users
+            if now_ns - self._page_seen_ns.get(site, now_ns) > MAX_ABSENCE_NS
         ]
-        return self._watch.poll(view, away)
+        return self._watch.poll(view, absent)
 
-    def take(self, site: str, page: int, message: StageMessage) -> bool:
-        """Takes a message of a user's page, or of an experimenter's, ""; false: nobody asked
-        for it.
+    def accept(self, site: str, page: int, message: StageMessage) -> bool:
+        """Applies a message of a page.
+
+        Args:
+            site: the site of the user; "" for an experimenter.
+            page: the number of the page.
+            message: the message.
+
+        Returns:
+            False if the message was not requested from that page.
         """
+        is_holder = self._holders.get(site) == page
         if isinstance(message, AbortTrial):
             watch = self._watch
-            who = site or "the experimenter"
-            if watch is None or watch.over or (site and self._holders.get(site) != page):
+            if watch is None or watch.over or (site and not is_holder):
                 return False
-            watch.aborted = f"{who} stopped it" + (f": {message.why}" if message.why else "")
+            reason = f": {message.why}" if message.why else ""
+            watch.aborted = f"{site or 'the experimenter'} stopped it{reason}"
             return True
-        asked = self._asked
-        early = self._asked and self._clock.monotonic_ns() < self._asked.from_ns
-        if (
-            asked is None
-            or early
-            or self._holders.get(site) != page
-            or message.key != asked.step.key
-        ):
+        request = self._request
+        if request is None or self._clock.monotonic_ns() < request.from_ns:
             return False
+        if not is_holder or message.key != request.step.key:
+            return False
+        form = request.step.form
         try:
-            asked.replies[site] = (
-                asked.step.form.read(message.answers) if asked.step.form else {},
-                page,
-            )
+            answers = form.read(message.answers) if form else {}
         except UsageError:
             return False
+        request.replies[site] = (answers, page)
         return True
 
     def describe(self, role: str, site: str, page: int, t_s: float | None) -> Json:
-        """Returns what a page shows, by role, site and number, at a time of its arms, s, if
-        there are any.
+        """Returns what a page shows of the stage.
+
+        Args:
+            role: the role of the page.
+            site: the site of its user, or "".
+            page: its number.
+            t_s: the time of the arms on the page, s; None without arms.
         """
         step = self._step
-        asked = self._asked
+        request = self._request
         watch = self._watch
         protocol = self._plan.protocol
-        found: Json = {
+        fields: Json = {
             "phase": self._phase,
             "title": protocol.title or protocol.name,
-            "told": self._told,
+            "told": self._feedback,
         }
         if step is None:
-            return found
+            return fields
         planned = step.planned
-        replies = {} if asked is None else asked.replies
+        replies = {} if request is None else request.replies
         names = dict(zip(self.users, planned.group, strict=True))
-        states = {
-            at: "done" if at in replies else "here" if at in self._holders else ""
-            for at in self.users
-        }
-        found |= {
+        users = []
+        for user in self.users:
+            state = "here" if user in self._holders else ""
+            if user in replies:
+                state = "done"
+            users.append({"site": user, "who": names[user], "state": state})
+        fields |= {
             "key": step.key,
-            "users": [
-                {"site": at, "who": names[at], "state": state} for at, state in states.items()
-            ],
-            "task": protocol.task.ask(self._plan.scenarios[planned.condition].slave),
+            "users": users,
+            "task": protocol.task.render_instructions(
+                self._plan.scenarios[planned.condition].slave
+            ),
             "trial": planned.trial,
             "trials": self._plan.trials[-1].trial,
             "block": planned.block,
             "blocks": len(protocol.conditions),
             "practice": planned.practice,
         }
-        if asked is not None:
-            found["rest_s"] = max(0.0, (asked.from_ns - self._clock.monotonic_ns()) / NS_PER_S)
+        if request is not None:
+            rest_ns = request.from_ns - self._clock.monotonic_ns()
+            fields["rest_s"] = max(0.0, rest_ns / NS_PER_S)
         if watch is not None and t_s is not None:
-            found |= watch.describe(t_s, site)
+            fields |= watch.describe(t_s, site)
         if role == "experimenter":
-            found |= {"number": planned.number, "of": len(self._plan.trials)}
-            also = (
-                f", {planned.phase}"
-                if planned.phase
-                else ", a catch trial"
-                if planned.catch
-                else ""
-            )
-            found |= {"condition": planned.condition + also}
-        if site in names and role == "user":
-            found |= {
+            condition = planned.condition
+            if planned.phase:
+                condition += f", {planned.phase}"
+            elif planned.catch:
+                condition += ", a catch trial"
+            fields |= {
+                "number": planned.number,
+                "of": len(self._plan.trials),
+                "condition": condition,
+            }
+        if role == "user" and site in names:
+            fields |= {
                 "who": names[site],
                 "done": site in replies,
                 "second": self._holders.get(site) != page,
             }
             if step.kind == "consent":
-                found["text"] = protocol.consent
+                fields["text"] = protocol.consent
             if step.form is not None:
-                found["form"] = {
-                    **msgspec.to_builtins(step.form),
-                    "forced": step.form.is_forced,
-                }
-        return found
+                form = msgspec.to_builtins(step.form)
+                fields["form"] = {**form, "forced": step.form.is_forced}
+        return fields

@@ -1,13 +1,13 @@
-"""Who gets a connection to the page's server: strangers without a role, and pages by their
-role.
+"""Which connections the page's server keeps: strangers without a role, and pages by their role.
 
 Invariant:
-- Connections whose role is not known yet (silent ones, slow ones, downloads) are bounded in
-  number. The oldest one gives way to a new one, so that nobody who holds many of them keeps
-  others out.
-- Pages have places by role. Watchers take places of their own and no others. A page of an
-  experimenter or a user always gets in: if all places of its role are taken, the oldest page of
-  that role gives way. Among experimenters those that do not take part go first.
+    - Connections whose role is not known yet (silent or slow ones, downloads) are bounded in
+      number. The oldest one is closed for a new one, so that nobody who holds many of them
+      keeps others out.
+    - The number of pages is limited for each role. Watchers do not use up the places of other
+      roles.
+    - A page of an experimenter or a user is always accepted. If there are too many, the oldest
+      page of that role is closed; among experimenters, those that do not take part first.
 """
 
 from collections import Counter
@@ -18,63 +18,68 @@ from websockets.asyncio.server import ServerConnection
 
 from .page_orders import Role
 
-MOST_STRANGERS = 64
-"""Open connections without a role."""
-MOST_PAGES = {"experimenter": 4, "user": 2, "watcher": 12}
-"""Open pages of a role; of users at each site."""
+MAX_STRANGERS = 64
+"""Largest number of open connections without a role."""
+MAX_PAGES = {"experimenter": 4, "user": 2, "watcher": 12}
+"""Largest number of open pages of a role; for users, at each site."""
 
 
 class Strangers:
-    """The connections whose role is not known yet, the oldest first."""
+    """The connections whose role is not known yet, the oldest first.
+
+    Args:
+        refused: counts refusals by reason.
+    """
 
     def __init__(self, refused: Counter[str]) -> None:
-        self._open: dict[ServerConnection, None] = {}
+        self._connections: dict[ServerConnection, None] = {}
         self._refused = refused
 
     def add(self, connection: ServerConnection) -> None:
-        """Takes in a new connection; ends the oldest one if there are too many."""
-        if len(self._open) >= MOST_STRANGERS:
-            oldest = next(iter(self._open))
+        """Adds a new connection; closes the oldest one if there are too many."""
+        if len(self._connections) >= MAX_STRANGERS:
+            oldest = next(iter(self._connections))
             self.remove(oldest)
             self._refused["too many connections"] += 1
             oldest.transport.abort()
-        self._open[connection] = None
+        self._connections[connection] = None
 
     def remove(self, connection: ServerConnection) -> None:
-        """Forgets a connection, which was closed or got a role."""
-        self._open.pop(connection, None)
+        """Removes a connection that was closed or has a role now."""
+        self._connections.pop(connection, None)
 
 
-class Placed(Protocol):
-    """A page that has a place."""
+class SeatedPage(Protocol):
+    """A page that counts towards the limit of its role."""
 
     role: Role
     number: int
     takes_part: bool
 
 
-P = TypeVar("P", bound=Placed)
+P = TypeVar("P", bound=SeatedPage)
 
 
-def is_full(pages: Iterable[Placed], role: Role) -> bool:
-    """True if a role has no free place."""
-    return len(_list_alike(pages, role)) >= MOST_PAGES[role.kind]
+def is_full(pages: Iterable[SeatedPage], role: Role) -> bool:
+    """Returns whether there are as many pages of a role as allowed."""
+    return len(_list_pages_like(pages, role)) >= MAX_PAGES[role.kind]
 
 
-def choose_to_leave(pages: Iterable[P], role: Role) -> P | None:
-    """Returns the page that gives its place to a new page of a role; None if there is a free
-    place.
-    """
-    alike = _list_alike(pages, role)
-    if len(alike) < MOST_PAGES[role.kind]:
+def choose_page_to_close(pages: Iterable[P], role: Role) -> P | None:
+    """Returns the page to close for a new page of a role; None if there is room."""
+    candidates = _list_pages_like(pages, role)
+    if len(candidates) < MAX_PAGES[role.kind]:
         return None
     return min(
-        alike, key=lambda page: (role.kind == "experimenter" and page.takes_part, page.number)
+        candidates,
+        key=lambda page: (role.kind == "experimenter" and page.takes_part, page.number),
     )
 
 
-def _list_alike(pages: Iterable[P], role: Role) -> list[P]:
-    def place_of(one: Role) -> tuple[str, str]:
-        return one.kind, one.site if one.kind == "user" else ""
+def _list_pages_like(pages: Iterable[P], role: Role) -> list[P]:
+    """Returns the pages of a role; for users, those of the same site."""
 
-    return [page for page in pages if place_of(page.role) == place_of(role)]
+    def group_of(role: Role) -> tuple[str, str]:
+        return role.kind, role.site if role.kind == "user" else ""
+
+    return [page for page in pages if group_of(page.role) == group_of(role)]

@@ -1,8 +1,9 @@
-"""What the page's server sends for a request: the page's own files, and report and log of an
-ended session.
+"""The files that the page's server sends: its own, and the report and log of an ended session.
 
-Invariant: a page runs scripts of its own server alone; a report runs its own, cut off from the
-page. Nobody can guess the address of a report or a log.
+Invariant:
+    - A page runs scripts of its own server only. A report runs its own scripts, isolated from
+      the page.
+    - Nobody can guess the address of a report or a log.
 """
 
 import secrets
@@ -22,14 +23,15 @@ _KINDS = {
     "LICENSE": "text/plain; charset=utf-8",
 }
 _REPORT_POLICY = (
-    "sandbox allow-scripts allow-downloads allow-popups; default-src 'none'; script-src 'unsafe-inline'; "
-    "style-src 'unsafe-inline'; img-src data: blob:"
+    "sandbox allow-scripts allow-downloads allow-popups; default-src 'none'; "
+    "script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
 )
-LARGEST_BYTES = 256 << 20
-"""A larger log is not sent to a page: it is read from its folder."""
+MAX_FILE_BYTES = 256 << 20
+"""A larger log is not sent to a page; the user opens it in its folder."""
 _POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
-    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
+    "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'"
 )
 
 
@@ -37,47 +39,50 @@ class PageFiles:
     """The files of one server.
 
     Attributes:
-        results: report and log by their addresses, once the session has ended.
+        results: the report and the log of the ended session, by their addresses.
     """
 
     def __init__(self) -> None:
-        self._own = _list_assets()
+        self._assets = _list_assets()
         self.results: dict[str, Path] = {}
 
-    def offer(self, paths: Iterable[Path]) -> None:
+    def add_results(self, paths: Iterable[Path]) -> None:
         """Adds files of the ended session, unless they are too large."""
         secret = secrets.token_urlsafe()
-        small = (path for path in paths if path.stat().st_size <= LARGEST_BYTES)
-        self.results |= {f"/{secret}/{path.name}": path for path in small}
+        sendable = (path for path in paths if path.stat().st_size <= MAX_FILE_BYTES)
+        self.results |= {f"/{secret}/{path.name}": path for path in sendable}
 
     def find(self, path: str) -> Response | None:
-        """Returns the answer to a request for a path; None if there is no such file."""
-        if (result := self.results.get(path)) is not None and result.is_file():
+        """Returns the response to a request for a path; None if there is no such file."""
+        result = self.results.get(path)
+        if result is not None and result.is_file():
             kind = _KINDS.get(result.suffix[1:], "application/octet-stream")
-            return _send_file(kind, result.read_bytes(), _REPORT_POLICY, "no-store")
-        if (file := self._own.get(path)) is None:
+            return _make_response(kind, result.read_bytes(), _REPORT_POLICY, "no-store")
+        asset = self._assets.get(path)
+        if asset is None:
             return None
-        return _send_file(
-            *file, _POLICY, "no-store" if path in ("/", "/index.html") else "no-cache"
-        )
+        kind, content = asset
+        # The start page has a token in its address, and must not be stored.
+        cache = "no-store" if path in ("/", "/index.html") else "no-cache"
+        return _make_response(kind, content, _POLICY, cache)
 
 
 def _list_assets() -> dict[str, tuple[str, bytes]]:
-    plots = (resources.files("trilat_net.reporting") / "assets").iterdir()
-    files = {}
-    for file in [*(resources.files("live") / "assets").iterdir(), *plots]:
+    """Returns type and content of the page's own files, by their addresses."""
+    plot_assets = (resources.files("trilat_net.reporting") / "assets").iterdir()
+    page_assets = (resources.files("live") / "assets").iterdir()
+    assets = {}
+    for file in [*page_assets, *plot_assets]:
+        address = "/" + file.name
         kind = _KINDS.get(file.name.rpartition(".")[2].rpartition("-")[2])
-        if (
-            kind is not None
-            and not file.name.startswith("report.")
-            and "/" + file.name not in files
-        ):
-            files["/" + file.name] = kind, file.read_bytes()
-    files["/"] = files["/index.html"]
-    return files
+        is_report_asset = file.name.startswith("report.")
+        if kind is not None and not is_report_asset and address not in assets:
+            assets[address] = kind, file.read_bytes()
+    assets["/"] = assets["/index.html"]
+    return assets
 
 
-def _send_file(kind: str, content: bytes, policy: str, cache: str) -> Response:
+def _make_response(kind: str, content: bytes, policy: str, cache: str) -> Response:
     headers = {
         "Content-Type": kind,
         "Content-Length": str(len(content)),

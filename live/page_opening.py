@@ -1,8 +1,9 @@
 """Opens a browser at a link whose token no other user of the machine may see.
 
-Invariant: the token stands in no command line, since every user of the machine can list those.
-The browser gets a file that only its user can read, and which leads on to the link; it is
-removed once the page is there.
+Invariant:
+    - The token is in no command line, since every user of the machine can list those.
+    - The browser opens a file that only its user can read, and that redirects to the link. The
+      file is removed once the page is open.
 """
 
 import html
@@ -15,32 +16,34 @@ from pathlib import Path
 
 
 class BrowserOpening:
-    """A file that leads a browser to a link, until the page is open."""
+    """A file that redirects a browser to a link, until the page is open."""
 
     def __init__(self, link: str) -> None:
-        self._link = link
+        self._target_link = link
         self._folder: Path | None = None
 
     def open(self) -> None:
-        """Opens a browser, if the system has one; whatever fails, the link is printed anyway."""
-        with suppress(OSError, webbrowser.Error, RuntimeError):  # the last: there is no home
+        """Opens a browser, if there is one. Failures do not matter: the link is printed too."""
+        # A RuntimeError means that the user has no home directory.
+        with suppress(OSError, webbrowser.Error, RuntimeError):
             webbrowser.open(self.write().as_uri())
 
     def write(self) -> Path:
-        """Returns the file, which leads on to the link.
+        """Writes the file that redirects to the link, and returns its path.
 
-        The file is in a folder of the home directory: browsers that run confined (snap) can
-        read neither /tmp nor hidden folders.
+        The file is in a folder of the home directory: confined browsers (snap) can read neither
+        /tmp nor hidden folders.
 
         Raises:
             OSError: the file cannot be written.
         """
-        # of mode 0700
+        # `mkdtemp` creates the folder with mode 0700.
         self._folder = Path(tempfile.mkdtemp(prefix="trilat-live-", dir=Path.home()))
-        link = html.escape(self._link)
+        link = html.escape(self._target_link)
         text = (
             '<!DOCTYPE html><meta charset="utf-8"><title>trilat live</title>'
-            f'<meta http-equiv="refresh" content="0; url={link}"><p><a href="{link}">trilat live</a>'
+            f'<meta http-equiv="refresh" content="0; url={link}">'
+            f'<p><a href="{link}">trilat live</a>'
         )
         file = self._folder / "open.html"
         descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -48,7 +51,7 @@ class BrowserOpening:
             stream.write(text.encode())
         return file
 
-    def forget(self) -> None:
+    def remove_file(self) -> None:
         """Removes the file."""
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)

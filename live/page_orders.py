@@ -1,13 +1,17 @@
-"""What a page may ask for, by who looks at it: roles and their links, messages, and how they
-reach the sites.
+"""The messages that a page may send, the roles of its users, and how orders reach the sites.
 
-Invariant: a message is one of the types below with finite numbers in range and names of the
-session, and comes no oftener than its kind may, or it is counted and dropped. What a site takes
-in is for the site to decide. Of a link or a row only the newest order waits, however often it
-is changed, and one question to a site is open at a time, besides that to stop. A token gives a
-role and, to a user, a site; the rest of a link may lower the role and never raises it. Every
-link has a token, on loopback as well: other users of the machine reach that too. Every role
-stops the arms.
+Invariant:
+    - A message has one of the types below, with finite numbers in range and names of the
+      session, and comes no more often than its kind allows. Otherwise it is counted and
+      dropped.
+    - The sites decide whether they accept an order.
+    - Only the newest order for a link or a row of shares waits. One query at a time is open at
+      each site, besides that for a stop.
+    - A token grants a role and, to a user, a site. The rest of a link may lower the role, and
+      never raises it.
+    - Every link has a token, on loopback as well, because other users of the machine can
+      connect there too.
+    - Every role may stop the arms.
 """
 
 import hmac
@@ -33,12 +37,12 @@ from trilat_net.net.wire import decode, encode
 
 MAX_MESSAGE_BYTES = 4_096
 REPLY_TIMEOUT_NS = 3_000_000_000
-MOST_WAITING = 256
+MAX_PENDING = 256
 TOKEN_BYTES = 16
 RELEASE = "release"
-"""The subject of waiting orders that let an arm follow again or end its fault."""
-LEAST_RAMP_S = 0.25
-"""The time in which shares change that somebody drags, s."""
+"""The subject of pending orders that let an arm follow again or end its fault."""
+MIN_RAMP_S = 0.25
+"""Duration of a change of shares that somebody drags, s."""
 
 Name = Annotated[str, Meta(max_length=64)]
 Numbers = Annotated[list[float], Meta(max_length=12)]
@@ -47,38 +51,38 @@ Numbers = Annotated[list[float], Meta(max_length=12)]
 class PageMessage(
     msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="do"
 ):
-    """A message of a page; the tag says what it is."""
+    """A message of a page; its tag names the kind."""
 
 
 class Seen(PageMessage, frozen=True, kw_only=True, tag="seen"):
-    """The page has drawn frame `n`; the next one may come."""
+    """The page has drawn frame `n`, so that the next one may be sent."""
 
     n: Annotated[int, Meta(ge=0, lt=2**53)]
 
 
 class TakePart(PageMessage, frozen=True, kw_only=True, tag="control"):
-    """The page wants to take part, or no longer."""
+    """The page wants to hold arms and give orders, or no longer."""
 
     want: bool
 
 
 class AnswerPage(PageMessage, frozen=True, kw_only=True, tag="answer"):
-    """A page that holds an arm lets another one take part, or not."""
+    """A page that holds an arm allows another page to take part, or not."""
 
     page: Annotated[int, Meta(ge=0, lt=2**53)]
     yes: bool
 
 
 class StopArms(PageMessage, frozen=True, kw_only=True, tag="stop"):
-    """Every arm is to stop, while the session goes on."""
+    """All arms must stop, while the session goes on."""
 
 
 class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
-    """Arms that were stopped are to follow again, or the fault of arms is to end.
+    """Stopped arms must follow again, or the faults of arms must end.
 
     Attributes:
-        order: "enable" for arms that were stopped, "reset" for arms in fault.
-        sites: which arms.
+        order: "enable" for stopped arms, "reset" for arms in fault.
+        sites: the sites of these arms.
     """
 
     order: Literal["enable", "reset"]
@@ -86,7 +90,7 @@ class ReleaseArms(PageMessage, frozen=True, kw_only=True, tag="release"):
 
 
 class SetLink(PageMessage, frozen=True, kw_only=True, tag="link"):
-    """New values of a link, as `trilat set` takes them."""
+    """New settings of a link, as `trilat set` accepts them."""
 
     link: Name
     to: Annotated[dict[Name, float | Name], Meta(max_length=8)]
@@ -100,21 +104,23 @@ class SetShares(PageMessage, frozen=True, kw_only=True, tag="shares"):
 
 
 class MarkMoment(PageMessage, frozen=True, kw_only=True, tag="mark"):
-    """A text that the log keeps as an event of this moment."""
+    """A text that the log keeps as an event at this moment."""
 
     text: Annotated[str, Meta(min_length=1, max_length=80)]
 
 
 class ShowAges(PageMessage, frozen=True, kw_only=True, tag="ages"):
-    """Users are to see how old what they see of their peers is, or no longer."""
+    """Users see the age of what they are shown of their peers, or no longer."""
 
     shown: bool
 
 
 class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
-    """The page takes hold of an arm, moves what it holds, or lets go.
+    """The page takes hold of an arm, moves it, or releases it.
 
     Attributes:
+        site: the site of the arm.
+        grip: False to release the arm.
         to: the target of the end effector, m, or of the joints, rad; for an arm that is pushed
             the force, N.
     """
@@ -125,16 +131,16 @@ class MoveHand(PageMessage, frozen=True, kw_only=True, tag="hand"):
 
 
 class EndSession(PageMessage, frozen=True, kw_only=True, tag="end"):
-    """The session is to end, in order."""
+    """The session must end, in order."""
 
 
 class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
-    """A user has done what the stage asks for: has agreed, is ready, or has answered.
+    """A user has completed a step of an experiment: has agreed, is ready, or has answered.
 
     Attributes:
-        key: of the step, as the page was shown it.
-        answers: of a questionnaire, in the order of its items; None for an item that was left
-            out.
+        key: the key of the step, as the page was shown it.
+        answers: the answers to a questionnaire, in the order of its items; None for an item
+            without an answer.
     """
 
     key: Name
@@ -142,7 +148,7 @@ class DoStep(PageMessage, frozen=True, kw_only=True, tag="step"):
 
 
 class AbortTrial(PageMessage, frozen=True, kw_only=True, tag="abort"):
-    """The trial that runs is to end, and to be made again later."""
+    """The running trial must end, and be repeated later."""
 
     why: Annotated[str, Meta(max_length=200)] = ""
 
@@ -161,36 +167,38 @@ _RATES: dict[type[PageMessage], tuple[float, int]] = {
     DoStep: (2.0, 5),
     AbortTrial: (1.0, 3),
 }
-"""Messages of a kind, and of all, that a page may send on average, 1/s, and at once."""
+"""Largest mean rate of a page's messages of each kind, 1/s, and largest burst.
+
+`PageMessage` stands for all kinds together.
+"""
 
 
 class MessageLimits:
-    """What a page may still send: of each kind with a rate, and of all, a bucket that fills at
-    that rate.
-    """
+    """The limits of a page's message rates: token buckets for each kind and for all kinds."""
 
     def __init__(self) -> None:
         self._buckets = {kind: (float(burst), 0) for kind, (_, burst) in _RATES.items()}
 
     def allows(self, kind: type[PageMessage], now_ns: int) -> bool:
-        """True if a message of a kind may come now; one more has come then."""
+        """Returns whether a message of a kind is allowed now, and counts the message if so."""
         if kind not in _RATES:
             return True
         rate, burst = _RATES[kind]
-        left, filled_ns = self._buckets[kind]
-        left = min(left + (now_ns - filled_ns) * 1e-9 * rate, burst) if filled_ns else left
-        self._buckets[kind] = left - (left >= 1.0), now_ns
-        return left >= 1.0
+        tokens, filled_ns = self._buckets[kind]
+        if filled_ns:
+            tokens = min(tokens + (now_ns - filled_ns) * 1e-9 * rate, burst)
+        self._buckets[kind] = tokens - (tokens >= 1.0), now_ns
+        return tokens >= 1.0
 
 
 def read_page_message(text: str | bytes) -> PageMessage:
     """Returns the message of a page.
 
     Raises:
-        WireError: it is none, or a number in it is out of range.
+        WireError: the text is not a valid message, or a number is out of range.
     """
     try:
-        # JSON has no infinity, and 1e999 is refused
+        # All numbers are finite: JSON has no infinity, and the decoder refuses 1e999.
         message: PageMessage = _DECODER.decode(text)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise WireError("malformed", str(error)) from None
@@ -199,78 +207,83 @@ def read_page_message(text: str | bytes) -> PageMessage:
 
 @dataclass(frozen=True, slots=True)
 class Role:
-    """What somebody may do, and which view of the arms is shown.
+    """The rights of a page's user, and the view of the arms.
 
     Attributes:
         kind: an experimenter may do everything, a user holds the arm of one site, a watcher
-            does nothing.
-        site: as which site the arms are shown; "": as they are, without delay.
+            only stops the arms.
+        site: the site as whose user the arms are shown; "" shows them without delay.
     """
 
     kind: Literal["experimenter", "user", "watcher"] = "experimenter"
     site: str = ""
 
     def may(self, message: PageMessage) -> bool:
-        """True if a message is one that this role may send."""
+        """Returns whether this role may send a message."""
         if isinstance(message, Seen | StopArms) or self.kind == "experimenter":
             return True
-        own = isinstance(message, MoveHand) and message.site == self.site
-        return self.kind == "user" and (own or isinstance(message, StageMessage))
+        if self.kind != "user":
+            return False
+        moves_arm = isinstance(message, MoveHand) and message.site == self.site
+        return moves_arm or isinstance(message, StageMessage)
 
     @property
     def noun(self) -> str:
-        """Who this is, in a sentence of an event."""
-        return {"experimenter": "the experimenter", "user": f"the user of {self.site}"}.get(
-            self.kind, "a watcher"
-        )
+        """The noun for the role in the sentence of an event."""
+        if self.kind == "experimenter":
+            return "the experimenter"
+        return f"the user of {self.site}" if self.kind == "user" else "a watcher"
 
     @property
     def query(self) -> str:
         """The query of this role's link."""
-        words = ["watch"] if self.kind == "watcher" else []
-        return "&".join([*words, f"as={self.site}"] if self.site else words)
+        parts = ["watch"] if self.kind == "watcher" else []
+        if self.site:
+            parts.append(f"as={self.site}")
+        return "&".join(parts)
 
 
 class RoleLinks:
-    """The links of a page that is served, a token for each role."""
+    """The links of a served page, with a token for each role."""
 
     def __init__(self) -> None:
         self._secret = secrets.token_bytes(TOKEN_BYTES)
 
     def link(self, address: str, role: Role) -> str:
-        """Returns the link of a role; its token stands where a browser sends it to no server by
-        itself.
+        """Returns the link of a role.
+
+        The token is in the fragment, which a browser does not send to a server by itself.
         """
         query = f"?{role.query}" if role.query else ""
         return f"{address}{query}#token={self._make_token(role)}"
 
     def find(self, query: str) -> Role | None:
-        """Returns the role of whoever comes by a link with this query; None if no role has its
-        token.
-        """
-        asked = parse_qs(query, keep_blank_values=True)
-        token, site = (asked.get(key, [""])[0] for key in ("token", "as"))
-        able = Role(), Role("user", site), Role("watcher")
-        given = next((role for role in able if self._is_token(token, role)), None)
-        if given is None or given.kind == "user":
-            return given
-        if given.kind == "watcher" or "watch" in asked:
+        """Returns the role that a link's query grants; None if no role has its token."""
+        fields = parse_qs(query, keep_blank_values=True)
+        token = fields.get("token", [""])[0]
+        site = fields.get("as", [""])[0]
+        roles = Role(), Role("user", site), Role("watcher")
+        role = next((role for role in roles if self._is_token(token, role)), None)
+        if role is None or role.kind == "user":
+            return role
+        # An experimenter may use a lower role.
+        if role.kind == "watcher" or "watch" in fields:
             return Role("watcher", site)
-        return Role("user", site) if site else given
+        return Role("user", site) if site else role
 
     def _make_token(self, role: Role) -> str:
-        return hmac.digest(self._secret, f"{role.kind} {role.site}".encode(), "sha256")[
-            :TOKEN_BYTES
-        ].hex()
+        text = f"{role.kind} {role.site}".encode()
+        return hmac.digest(self._secret, text, "sha256")[:TOKEN_BYTES].hex()
 
     def _is_token(self, token: str, role: Role) -> bool:
         return hmac.compare_digest(token.encode(), self._make_token(role).encode())
 
 
 class PageHands:
-    """The hands of one page, one for each arm that it has ever held.
+    """The hands of one page, one for each arm that the page has held.
 
-    A hand lives by the page's own messages: if these stay away, the site lets go.
+    The page's own messages are the heartbeat of its hands: if they stop, the site releases the
+    arm.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, source: str) -> None:
@@ -279,27 +292,32 @@ class PageHands:
         self._session = session
         self._source = source
         self._senders: dict[str, SiteSender] = {}
-        self._held: set[str] = set()
+        self._held_sites: set[str] = set()
 
     def move(self, order: MoveHand, *, pushes: bool) -> None:
-        """Sends an arm's site what the page wants of it."""
+        """Sends a hand message to the site of an arm.
+
+        Args:
+            order: the message of the page.
+            pushes: whether the hand applies a force instead of moving a target.
+        """
         site = order.site
         if site not in self._senders:
             if not order.grip:
                 return
             self._senders[site] = make_hand_sender(self._bus, self._clock, self._session, site)
             self._senders[site].number = 0  # a page counts from 1
-        (self._held.add if order.grip else self._held.discard)(site)
+        (self._held_sites.add if order.grip else self._held_sites.discard)(site)
         goals = {"force" if pushes else "target": order.to if order.grip else []}
         self._senders[site].send(HandMessage, source=self._source, grip=order.grip, **goals)
 
     def release(self) -> None:
-        """Lets go of every arm."""
-        for site in list(self._held):
+        """Releases every arm."""
+        for site in list(self._held_sites):
             self.move(MoveHand(site=site, grip=False), pushes=False)
 
     def holds(self, site: str, source: int) -> bool:
-        """True if it is this page that a record of a site names as holding its arm."""
+        """Returns whether this page is the holder that a site's record names by `source`."""
         return source != 0 and site in self._senders and self._senders[site].boot == source
 
 
@@ -307,9 +325,9 @@ class OrderDesk:
     """The orders of all pages to the sites.
 
     Attributes:
-        replies: the answers that nobody has read yet: site, channel of the order, if it is
-            accepted, text.
-        refused: counts what is refused, and why.
+        replies: the replies that have not been read yet: the site, the channel of the order,
+            whether it is accepted, and the text.
+        refused: counts refused orders by reason.
     """
 
     def __init__(
@@ -318,123 +336,132 @@ class OrderDesk:
         self._bus = bus
         self._clock = clock
         self._session = session
-        self._waiting: dict[tuple[str, str], ChangeRequest] = {}
-        self._open: dict[tuple[str, str], tuple[Inbox, int, ChangeRequest]] = {}
+        self._pending: dict[tuple[str, str], ChangeRequest] = {}
+        self._open_queries: dict[tuple[str, str], tuple[Inbox, int, ChangeRequest]] = {}
         self.replies: list[tuple[str, str, bool, str]] = []
         self.refused: Counter[str] = Counter() if refused is None else refused
 
-    def order(
+    def queue_change(
         self, order: Order, sites: Collection[str], links: Collection[str], source: str = ""
     ) -> None:
-        """Takes an order, if the session has the site or the link; it replaces one that waits
-        for that.
+        """Queues a change of a link or of shares; it replaces a pending one of the same object.
+
+        A change of an unknown site or link is refused.
 
         Args:
-            order: the new values of a link, or a new row of shares.
+            order: the new settings of a link, or a new row of shares.
             sites: the sites of the session.
-            links: its links.
-            source: who orders it, for the site's event.
+            links: the links of the session.
+            source: who sends the order, for the site's event.
         """
         if isinstance(order, SetLink):
-            what = "link"
+            kind = "link"
             site = order.link.partition("->")[2]
-            known = order.link in links
-            request = _link_request(order)
+            is_known = order.link in links
+            request = _make_link_request(order)
         else:
-            what = "site"
+            kind = "site"
             site = order.site
-            known = order.site in sites
-            request = ChangeRequest(dominance=site, to={**order.to}, ramp_s=LEAST_RAMP_S)
-        if not known:
-            self.refused[f"no such {what}"] += 1
+            is_known = order.site in sites
+            request = ChangeRequest(dominance=site, to={**order.to}, ramp_s=MIN_RAMP_S)
+        if not is_known:
+            self.refused[f"no such {kind}"] += 1
         else:
-            self._wait(site, request.link, _name_source(request, source))
+            self._enqueue(site, request.link, _add_source(request, source))
 
     def stop(self, sites: Iterable[str], source: str = "") -> None:
-        """Orders sites to stop, at once, whatever they have been asked before.
+        """Orders sites to stop at once, ahead of all pending orders.
 
         Args:
-            sites: which sites.
-            source: who orders it, for the sites' events.
+            sites: the names of the sites.
+            source: who sends the order, for the sites' events.
         """
         for site in sites:
-            # An order that is not carried out yet would let the arm go again right after the stop.
-            self._waiting.pop((site, RELEASE), None)
-            self._ask(site, topics.STOP, _name_source(ChangeRequest(order="stop"), source))
+            # A pending release would let the arm move again right after the stop.
+            self._pending.pop((site, RELEASE), None)
+            self._send_request(
+                site, topics.STOP, _add_source(ChangeRequest(order="stop"), source)
+            )
 
     def release(self, order: ReleaseArms, sites: Collection[str], source: str = "") -> None:
-        """Orders arms to follow again, or their faults to end.
+        """Queues orders that let arms follow again, or end their faults.
 
         Args:
-            order: which order, and of which arms.
+            order: the order and the sites of the arms.
             sites: the sites of the session.
-            source: who orders it, for the sites' events.
+            source: who sends the order, for the sites' events.
         """
         for site in order.sites:
             if site not in sites:
                 self.refused["no such site"] += 1
             else:
-                self._wait(
-                    site, RELEASE, _name_source(ChangeRequest(order=order.order), source)
+                self._enqueue(
+                    site, RELEASE, _add_source(ChangeRequest(order=order.order), source)
                 )
 
-    def _wait(self, site: str, subject: str, request: ChangeRequest) -> None:
-        """Keeps a request until the site is asked; a newer one of the same subject replaces it."""
-        if (site, subject) in self._waiting or len(self._waiting) < MOST_WAITING:
-            self._waiting[site, subject] = request
+    def _enqueue(self, site: str, subject: str, request: ChangeRequest) -> None:
+        """Queues a request; it replaces a pending one of the same subject."""
+        if (site, subject) in self._pending or len(self._pending) < MAX_PENDING:
+            self._pending[site, subject] = request
 
-    def _ask(self, site: str, channel: str, request: ChangeRequest) -> None:
+    def _send_request(self, site: str, channel: str, request: ChangeRequest) -> None:
         inbox = self._bus.query(topics.key(self._session, site, channel), encode(request))
-        self._open[site, channel] = inbox, self._clock.monotonic_ns(), request
+        self._open_queries[site, channel] = inbox, self._clock.monotonic_ns(), request
 
     def mark(self, site: str, text: str) -> None:
-        """Asks a site to mark this moment in the log."""
-        self._wait(site, f"mark {text}", ChangeRequest(mark=text))
+        """Queues a mark of this moment in a site's log."""
+        self._enqueue(site, f"mark {text}", ChangeRequest(mark=text))
 
     def poll(self) -> None:
-        """Asks the sites, one question each at a time, and reads their answers."""
+        """Reads the replies of the sites, and sends each site its next pending request."""
         now_ns = self._clock.monotonic_ns()
-        for (site, channel), (inbox, asked_ns, request) in list(self._open.items()):
-            if (answer := inbox.poll()) is not None:
-                del self._open[site, channel]
+        for (site, channel), (inbox, sent_ns, request) in list(self._open_queries.items()):
+            if (reply := inbox.poll()) is not None:
+                del self._open_queries[site, channel]
+                _, payload = reply
                 try:
-                    self._take_reply(site, channel, request, decode(answer[1], ChangeReply))
+                    self._handle_reply(site, channel, request, decode(payload, ChangeReply))
                 except WireError as error:
                     self.refused[error.reason] += 1
-            elif now_ns - asked_ns > REPLY_TIMEOUT_NS:
-                del self._open[site, channel]
+            elif now_ns - sent_ns > REPLY_TIMEOUT_NS:
+                del self._open_queries[site, channel]
                 self.replies.append((site, channel, False, f"{site} does not answer"))
-        for (site, what), request in list(self._waiting.items()):
-            if (site, topics.SET) not in self._open:
-                del self._waiting[site, what]
-                self._ask(site, topics.SET, request)
+        for (site, subject), request in list(self._pending.items()):
+            if (site, topics.SET) not in self._open_queries:
+                del self._pending[site, subject]
+                self._send_request(site, topics.SET, request)
 
-    def _take_reply(
+    def _handle_reply(
         self, site: str, channel: str, request: ChangeRequest, reply: ChangeReply
     ) -> None:
-        """Keeps an answer for the pages; a stop that was refused is ordered again without its
-        source.
+        """Stores a reply for the pages, or repeats a refused stop without its source.
 
-        A site of an older program knows no source and refuses the whole request; its arm has to
-        stop too.
+        A site of an older program does not know the source and refuses the whole request, but
+        its arm has to stop too.
         """
         if (
             channel == topics.STOP
             and not reply.accepted
             and request.source is not msgspec.UNSET
         ):
-            self._ask(site, channel, msgspec.structs.replace(request, source=msgspec.UNSET))
+            self._send_request(
+                site, channel, msgspec.structs.replace(request, source=msgspec.UNSET)
+            )
         else:
             self.replies.append((site, channel, reply.accepted, reply.text))
 
 
-def _name_source(request: ChangeRequest, source: str) -> ChangeRequest:
-    """Returns a request that names who makes it, if that is known."""
+def _add_source(request: ChangeRequest, source: str) -> ChangeRequest:
+    """Returns a request with its source; "" leaves the request unchanged."""
     return msgspec.structs.replace(request, source=source) if source else request
 
 
-def _link_request(order: SetLink) -> ChangeRequest:
-    """Returns the request of a link: constant delay, or one that jitters; or a preset."""
+def _make_link_request(order: SetLink) -> ChangeRequest:
+    """Returns the request for new settings of a link.
+
+    Without a preset, a delay with a deviation becomes a gamma distribution, and a delay
+    without one is constant.
+    """
     to: dict[str, Any] = dict(order.to)
     if "preset" not in to and "delay_ms" in to:
         jitters = all(

@@ -1,15 +1,16 @@
-"""The page's server: its socket, and its files by HTTP, from one `websockets` server in a
-thread of its own.
+"""The server of the page: its files by HTTP and its socket, from one `websockets` server.
 
-It is an onlooker of a session that is started for it, or of one that runs already: the session
-neither waits for it nor needs it, and runs on if it fails. In an experiment it shows one
-session after the other, with a stage around them. A browser is opened only where there is one.
+The server runs in a thread of its own and observes a session, which neither waits for it nor
+needs it: if the server fails, the session continues. In an experiment it shows one session
+after the other, with a stage around them. A browser is opened only if there is one.
 
-Invariant: newest state wins. A page gets its next frame when it has drawn one of those before,
-so that a slow page sees fewer frames and nobody waits for it. A page of another origin, without
-a token, with messages that are too many, too large or not of its role is refused and counted;
-nothing of it reaches a site. Places are kept by role (`page_entrance`). One thread serves all
-pages and takes in the session's messages.
+Invariant:
+    - A page receives its next frame when it has drawn an earlier one, so a slow page sees fewer
+      frames and nobody waits for it. The newest state is always sent.
+    - Pages of another origin, pages without a token, and messages that are too many, too large
+      or not of the page's role are refused and counted. None of their contents reaches a site.
+    - `page_entrance` limits the number of pages of each role.
+    - One thread serves all pages and receives the session's messages.
 """
 
 import asyncio
@@ -41,7 +42,7 @@ from trilat_net.net.member_keys import CERTIFICATE, HERE, PRIVATE_KEY, read_memb
 from trilat_net.net.zenoh_bus import ZenohBus
 from trilat_net.process import raise_priority
 
-from .page_entrance import Strangers, choose_to_leave, is_full
+from .page_entrance import Strangers, choose_page_to_close, is_full
 from .page_files import PageFiles
 from .page_opening import BrowserOpening
 from .page_orders import (
@@ -73,51 +74,52 @@ if TYPE_CHECKING:  # an experiment's libraries are for experiments alone
     from .experiment_stage import Stage
 
 NICE = -5
-"""Priority of the page's threads and of those that bring its messages: above normal, below the
-sites' own.
+"""Priority of the page's threads and of those that deliver its messages.
+
+It is above the normal one, and below that of the sites.
 """
 FRAMES_PER_S = 30
 FRAMES_AHEAD = 2
-"""Frames that a page may have got and not drawn yet: one is on its way while it draws the
-other.
-"""
-MOST_EXCESS = 1_000
-"""A page that sends so many more messages than it may is closed."""
-OPENING_S = 3.0
-"""Time for a connection to say what it wants: for the encryption, and again for its request, s.
-"""
-ANSWER_NS = 10_000_000_000
-"""A page that holds an arm may say for so long whether another one takes part."""
+"""Largest number of frames that are sent and not drawn yet: one travels while one is drawn."""
+MAX_EXCESS = 1_000
+"""Number of messages beyond the allowed rate after which a page is closed."""
+REQUEST_TIMEOUT_S = 3.0
+"""Longest wait for the encryption of a connection, and again for its request, s."""
+ANSWER_TIMEOUT_NS = 10_000_000_000
+"""Time for a page that holds an arm to answer whether another page may take part."""
 RESTART_S = 1.0
-TURN_NS = 10_000_000
-WAITING_FRAMES = 10
-"""Frames between two looks at who is there, before a session begins."""
+SWITCH_POLL_NS = 10_000_000
+WAITING_FRAME_STEP = 10
+"""Number of frame periods between two frames before a session begins."""
 POINTS_PER_FRAME = 240
-"""Points of the plots that one frame brings at most; a page that was away longer has a gap."""
+"""Largest number of points of the plots in one frame; a page that was away longer has a gap."""
 _POLICY_VIOLATION = 1008
 _BROKEN = {1002: "broken frames", 1007: "no text", 1009: "too large"}
-"""Codes with which a socket is closed, RFC 6455."""
+"""Codes with which the library closes a socket (RFC 6455), and reasons for the counts."""
 _SILENT = logging.getLogger("trilat.page")
 _SILENT.addHandler(logging.NullHandler())
 _SILENT.propagate = False
-"""For the library of sockets: what strangers send is counted, and prints no tracebacks."""
+"""The logger of the socket library: messages of strangers are counted, and print nothing."""
 
-OFFERED_NS = 600_000_000_000
-"""So long an open page has report and log at most."""
-LONGEST_S = 3600.0
-"""A session with a page runs for so long at most, unless told otherwise, s."""
+RESULTS_TIMEOUT_NS = 600_000_000_000
+"""Longest time for which an open page can load the report and the log."""
+MAX_DURATION_S = 3600.0
+"""Longest duration of a session with a page, s, unless the user sets another one."""
 
 _NO_HTTP = b"HTTP/1.1 400 Bad Request\r\nContent-Length: 0\r\nConnection: close\r\n\r\n"
 
 
 class Visitor(ServerConnection):
-    """One connection: what is no request of a page is counted, and answered with 400 if it is
-    not HTTP.
+    """One connection.
+
+    Data that are not a request of a page are counted, and answered with 400 if they are not
+    HTTP.
     """
 
     refused: Counter[str]
     strangers: Strangers
-    _heard = _counted = False
+    _has_received = False
+    _is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Begins the connection."""
@@ -130,15 +132,16 @@ class Visitor(ServerConnection):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Takes in what has come."""
-        self._heard = True  # browsers open connections ahead, and close some of them unused
+        """Receives data."""
+        # Browsers open connections in advance and close some unused; those are not counted.
+        self._has_received = True
         super().data_received(data)
 
     def send_data(self) -> None:
-        """Sends what is to be sent."""
+        """Sends pending data; counts a failed handshake first."""
         problem = self.protocol.handshake_exc
-        if problem is not None and self._heard and not self._counted:
-            self._counted = True
+        if problem is not None and self._has_received and not self._is_counted:
+            self._is_counted = True
             self.refused["malformed request"] += 1
             if self.request is None and isinstance(problem, InvalidMessage):
                 self.transport.write(_NO_HTTP)
@@ -149,10 +152,20 @@ class Page:
     """One connected page.
 
     Attributes:
-        role: what it may do, and as which site it is shown the arms.
+        connection: its socket.
+        number: its number; pages are counted from 1.
+        role: the rights of its user, and the site as which the arms are shown.
+        hands: its hands at the arms.
+        takes_part: whether it may give orders.
         asks: the pages that it has asked whether it may take part, and when, ns.
-        wake: set when there is a frame that it has not got.
-        excess: how many messages it has sent that were too many.
+        wake: set when there is a frame that it has not received.
+        drawn, sent, notified: numbers of the last frame that it has drawn, of the last one that
+            it was sent, and of the one before.
+        unseen: numbers of the frames that it has not drawn yet.
+        points, energies, events: how many of these it has received.
+        greeted: whether it has received the constants of the running session.
+        limits: its rate limits.
+        excess: the number of messages that exceeded its rate.
     """
 
     def __init__(
@@ -171,9 +184,13 @@ class Page:
         self.takes_part = takes_part
         self.asks: tuple[set[Page], int] | None = None
         self.wake = asyncio.Event()
-        self.drawn = self.sent = self.notified = 0
+        self.drawn = 0
+        self.sent = 0
+        self.notified = 0
         self.unseen: deque[int] = deque()
-        self.points = self.energies = self.events = 0
+        self.points = 0
+        self.energies = 0
+        self.events = 0
         self.greeted = False
         self.limits = MessageLimits()
         self.excess = 0
@@ -184,12 +201,11 @@ class PageOptions:
     """How a page is served.
 
     Attributes:
-        port: 0: any.
-        insecure: true: another address than this machine's is allowed, though nothing is
-            encrypted.
-        opens: true: a browser is opened where there is one.
-        tls: the folder of a member's keys, by which page and socket are encrypted; None: they
-            are not.
+        host: the address to listen at.
+        port: the port; 0 for any.
+        insecure: whether an address outside this machine is allowed without encryption.
+        opens: whether a browser is opened, if there is one.
+        tls: the folder of a member's keys for encryption; None for no encryption.
     """
 
     host: str = "127.0.0.1"
@@ -199,30 +215,29 @@ class PageOptions:
     tls: Path | None = None
 
     def make_context(self) -> ssl.SSLContext | None:
-        """Returns the keys by which the page is encrypted, or None.
+        """Returns the settings of the encryption, or None without encryption.
 
         Raises:
-            UsageError: they cannot be used.
+            UsageError: the keys cannot be used.
         """
         if self.tls is None:
             return None
-        read_member_keys(self.tls)  # refuses those that have ended, or that others can read
+        read_member_keys(self.tls)  # refuses keys that have ended, or that others can read
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
         context.load_cert_chain(self.tls / CERTIFICATE, self.tls / PRIVATE_KEY)
         return context
 
     def check(self) -> None:
-        """Refuses an address that is taken, and to serve others without being told that it is
-        not safe.
+        """Checks that the address is free, and that it is safe or declared as `insecure`.
 
         Raises:
-            UsageError: with the reason.
+            UsageError: the address cannot be used.
         """
         if self.make_context() is None and self.host not in HERE and not self.insecure:
             raise UsageError(
-                f"--host {self.host}: whoever reads the network reads the page's token and could take part; "
-                "give the keys of a member with --tls, say --insecure if that network is yours, or leave out "
-                "--host and use an SSH tunnel"
+                f"--host {self.host}: whoever reads the network reads the page's token and "
+                "could take part; give the keys of a member with --tls, say --insecure if "
+                "that network is yours, or leave out --host and use an SSH tunnel"
             )
         try:
             family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
@@ -234,18 +249,23 @@ class PageOptions:
 
 
 class PageServer:
-    """Serves one session's page; a context, at whose beginning a browser is opened at it.
+    """Serves the page of a session; a context manager that opens a browser at its beginning.
 
     Args:
-        options: how it is served.
-        ends: true if pages may end the session.
-        say: tells the people at the terminal what went wrong.
-        stage: what is asked of people between sessions and in them, in an experiment.
+        bus: a bus that reaches the session.
+        clock: the clock of this process.
+        session: the session's name.
+        options: how the page is served.
+        ends: whether pages may end the session.
+        say: prints a line for the user.
+        stage: the stage of an experiment; None without an experiment.
 
     Attributes:
-        address: where a browser finds the page of an experimenter, token included.
-        end_requested: set once a page has asked for the end.
-        files: what it sends by HTTP.
+        address: the link for an experimenter, with its token.
+        end_requested: set once a page has requested the end.
+        files: the files that are sent by HTTP.
+        refused: counts refused messages and requests by reason.
+        view: the session.
     """
 
     def __init__(
@@ -269,15 +289,16 @@ class PageServer:
         self._scheme = "http" if self._tls is None else "https"
         self._pages: set[Page] = set()
         self.refused: Counter[str] = Counter()
-        self._next: tuple[Bus, str] | None = None
-        self._turn_to(bus, session)
+        self._next_session: tuple[Bus, str] | None = None
+        self._switch_session(bus, session)
         self._is_local = options.host in HERE
         self._opens = options.opens
         self._links = RoleLinks()
-        self._told = False
+        self._links_are_printed = False
         self.files = PageFiles()
-        self._ages = stage is None or stage.shows_ages
-        self._met = self._n = 0
+        self._shows_ages = stage is None or stage.shows_ages
+        self._page_count = 0
+        self._frame_number = 0
         self.end_requested = threading.Event()
         self.address = ""
         self._opening = BrowserOpening("")
@@ -313,38 +334,41 @@ class PageServer:
             with suppress(RuntimeError):  # its loop has ended already
                 self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(5.0)
-        self._opening.forget()
+        self._opening.remove_file()
 
     def show(self, bus: Bus, session: str) -> None:
-        """Shows another session from now on; the bus of the one before is no longer used on
-        return.
+        """Shows another session from now on.
+
+        On return, the bus of the previous session is no longer used.
         """
-        self._next = bus, session
-        while self._next is not None and self._thread.is_alive():
-            self._clock.sleep_until(self._clock.monotonic_ns() + TURN_NS)
+        self._next_session = bus, session
+        while self._next_session is not None and self._thread.is_alive():
+            self._clock.sleep_until(self._clock.monotonic_ns() + SWITCH_POLL_NS)
 
-    def _turn_over(self) -> None:
-        if self._next is not None:
+    def _switch_session_if_asked(self) -> None:
+        if self._next_session is not None:
             try:
-                self._turn_to(*self._next)
+                self._switch_session(*self._next_session)
             finally:
-                self._next = None
+                self._next_session = None
 
-    def _turn_to(self, bus: Bus, session: str) -> None:
+    def _switch_session(self, bus: Bus, session: str) -> None:
         self._bus = bus
         self.view = SessionView(bus, self._clock, session)
         self._frames = SessionFrames(self.view)
         self._desk = OrderDesk(bus, self._clock, session, self.refused)
         self._frame: dict[str, Any] | None = None
-        self._known: dict[str, dict[str, Any]] = {}
+        self._frames_as_site: dict[str, dict[str, Any]] = {}
         self._notices: list[dict[str, Any]] = []
         for page in self._pages:
             page.hands = PageHands(bus, self._clock, session, f"page {page.number}")
-            page.points = page.energies = page.events = 0
+            page.points = 0
+            page.energies = 0
+            page.events = 0
             page.greeted = False
 
     def _run(self) -> None:
-        """Serves pages until the end, and again after whatever ended it."""
+        """Serves pages until the end, and restarts the server after a failure."""
         raise_priority(NICE)
         while not self._ending.is_set() and self._problem is None:
             try:
@@ -359,15 +383,13 @@ class PageServer:
                     self._ending.wait(RESTART_S)
             self._ready.set()
 
-    def tell_refused(self) -> None:
-        """Tells the people at the terminal what was refused."""
+    def report_refusals(self) -> None:
+        """Prints how many messages were refused, by reason."""
         for reason, count in sorted((+self.refused).items()):
             self._say(f"the page refused {count_nouns(count, 'message')} or requests: {reason}")
 
     def _count_failure(self, of: str, error: Exception) -> None:
-        """Counts a failure, and says it the first time: no failure of the page is one of the
-        session.
-        """
+        """Counts a failure of the page, and prints it the first time; the session continues."""
         reason = f"{of} failed: {type(error).__name__}"
         self.refused[reason] += 1
         with suppress(OSError, ValueError):  # no terminal any more
@@ -377,21 +399,23 @@ class PageServer:
     async def _serve(self) -> None:
         self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
-        counted = {"refused": self.refused, "strangers": Strangers(self.refused)}
+        members = {"refused": self.refused, "strangers": Strangers(self.refused)}
         timeouts: dict[str, Any] = {}
         if self._tls is not None:
-            timeouts = {"ssl_handshake_timeout": OPENING_S, "ssl_shutdown_timeout": 1.0}
+            timeouts = {"ssl_handshake_timeout": REQUEST_TIMEOUT_S, "ssl_shutdown_timeout": 1.0}
         server = await serve(
-            *(self._attend, self._host, self._port),
+            self._serve_page,
+            self._host,
+            self._port,
             ssl=self._tls,
-            process_request=self._answer,
-            create_connection=type("Counted", (Visitor,), counted),
+            process_request=self._answer_http,
+            create_connection=type("Counted", (Visitor,), members),
             max_size=MAX_MESSAGE_BYTES,
             max_queue=32,
             compression=None,
             ping_interval=5,
-            ping_timeout=30,  # a busy machine is no dead page
-            open_timeout=OPENING_S,
+            ping_timeout=30,  # long, because the page of a busy machine is slow and not dead
+            open_timeout=REQUEST_TIMEOUT_S,
             close_timeout=1,
             logger=_SILENT,
             **timeouts,
@@ -399,38 +423,49 @@ class PageServer:
         async with server, asyncio.TaskGroup() as tasks:
             self._pages.clear()
             self._port = server.sockets[0].getsockname()[1]
-            self.address = self._links.link(self._base, Role())
+            self.address = self._links.link(self._base_address, Role())
             self._ready.set()
             ticking = tasks.create_task(self._tick())
             await self._stop.wait()
             ticking.cancel()
 
     @property
-    def _base(self) -> str:
-        return f"{self._scheme}://{f'[{self._host}]' if ':' in self._host else self._host}:{self._port}/"
+    def _base_address(self) -> str:
+        host = f"[{self._host}]" if ":" in self._host else self._host
+        return f"{self._scheme}://{host}:{self._port}/"
 
-    def _tell_links(self) -> None:
-        """Tells the links of the other roles at the terminal, once the scenario is known."""
+    def _print_links(self) -> None:
+        """Prints the links of the other roles, once the scenario is known."""
         scenario = self.view.scenario
-        if self._told or (scenario is None and self._stage is None):
+        if self._links_are_printed or (scenario is None and self._stage is None):
             return
-        self._told = True
-        sites = {} if scenario is None else scenario.sites
-        users = [name for name, spec in sites.items() if spec.role == "master"]
-        users = users if self._stage is None else [*self._stage.users]
+        self._links_are_printed = True
+        if self._stage is not None:
+            users = [*self._stage.users]
+        else:
+            sites = {} if scenario is None else scenario.sites
+            users = [name for name, spec in sites.items() if spec.role == "master"]
         for role in (*(Role("user", site) for site in users), Role("watcher")):
-            self._say(
-                f"{role.kind} {role.site}".rstrip() + f": {self._links.link(self._base, role)}"
-            )
+            name = f"{role.kind} {role.site}".rstrip()
+            self._say(f"{name}: {self._links.link(self._base_address, role)}")
 
     async def _tick(self) -> None:
-        """Takes in the session's messages and makes a frame, thirty times a second; failures
-        end a turn.
+        """Receives the session's messages and makes a frame, thirty times a second.
+
+        A failure of one step does not prevent the others.
         """
         while True:
             begun_ns = self._clock.monotonic_ns()
-            polls = self._desk.poll, self.view.poll, self._turn_over, self._poll_stage
-            for step in (*polls, self._tell_links, self._settle_asked, self._make_frame):
+            steps = (
+                self._desk.poll,
+                self.view.poll,
+                self._switch_session_if_asked,
+                self._poll_stage,
+                self._print_links,
+                self._settle_requests,
+                self._make_frame,
+            )
+            for step in steps:
                 try:
                     step()
                 except Exception as error:
@@ -441,31 +476,37 @@ class PageServer:
             await asyncio.sleep(max(0.002, 1.0 / FRAMES_PER_S - spent_s))
 
     def _poll_stage(self) -> None:
-        if self._stage is not None:
-            users = [
-                (page.role.site, page.number)
-                for page in self._pages
-                if page.role.kind == "user"
-            ]
-            for moment in self._stage.poll(self.view, users):
-                self._desk.mark(next(iter(self.view.sites)), moment)
+        if self._stage is None:
+            return
+        users = [
+            (page.role.site, page.number) for page in self._pages if page.role.kind == "user"
+        ]
+        for moment in self._stage.poll(self.view, users):
+            self._desk.mark(next(iter(self.view.sites)), moment)
 
     def _make_frame(self) -> None:
-        self._n += 1
+        self._frame_number += 1
         for site, channel, accepted, text in self._desk.replies:
-            notice = {"n": self._n, "site": site, "of": channel, "ok": accepted, "text": text}
-            self._notices.append(notice)
+            self._notices.append(
+                {
+                    "n": self._frame_number,
+                    "site": site,
+                    "of": channel,
+                    "ok": accepted,
+                    "text": text,
+                }
+            )
         self._desk.replies.clear()
         del self._notices[:-20]
-        self._frame = self._frames.make() or self._frame
-        self._known.clear()
+        self._frame = self._frames.make_frame() or self._frame
+        self._frames_as_site.clear()
 
-    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """Answers a request for a file; None lets a socket open."""
+    def _answer_http(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Returns the response to a request for a file; None opens a socket."""
         try:
             target = urlsplit(request.path)
-            problem = self._problem_of(request, target.query)
-        except (ValueError, LookupError):  # no address; two hosts
+            problem = self._find_refusal(request, target.query)
+        except (ValueError, LookupError):  # an invalid address, or two hosts
             self.refused["malformed request"] += 1
             return connection.respond(HTTPStatus.BAD_REQUEST, "malformed request\n")
         if problem is not None:
@@ -477,14 +518,15 @@ class PageServer:
                 self.refused["too many watchers"] += 1
                 return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many watchers\n")
             return None
-        found = self.files.find(target.path)
-        return found or connection.respond(HTTPStatus.NOT_FOUND, "there is no such file\n")
+        response = self.files.find(target.path)
+        return response or connection.respond(HTTPStatus.NOT_FOUND, "there is no such file\n")
 
-    def _problem_of(self, request: Request, query: str) -> str | None:
+    def _find_refusal(self, request: Request, query: str) -> str | None:
+        """Returns why a request is refused; None if it is accepted."""
         host = request.headers.get("Host", "")
         name = urlsplit(f"//{host}").hostname or ""
         if self._is_local and name not in HERE:
-            return "foreign host"  # a name of somebody else's that leads here
+            return "foreign host"  # another site's name that resolves to this machine
         origin = request.headers.get("Origin")
         if origin is not None and origin != f"{self._scheme}://{host}":
             return "foreign origin"
@@ -492,28 +534,29 @@ class PageServer:
             return "no token"
         return None
 
-    async def _attend(self, connection: ServerConnection) -> None:
-        """Serves one page until it goes."""
+    async def _serve_page(self, connection: ServerConnection) -> None:
+        """Serves one page until its connection ends."""
         assert connection.request is not None
         role = self._links.find(urlsplit(connection.request.path).query)
-        assert role is not None  # or it would have been refused
-        self._met += 1
-        hands = PageHands(self._bus, self._clock, self.view.session, f"page {self._met}")
-        alone = role.kind == "experimenter" and not any(
-            one.takes_part for one in self.experimenters
+        assert role is not None  # a request without a role has been refused
+        self._page_count += 1
+        hands = PageHands(self._bus, self._clock, self.view.session, f"page {self._page_count}")
+        is_first = role.kind == "experimenter" and not any(
+            other.takes_part for other in self.experimenters
         )
-        page = Page(connection, self._met, role, hands, takes_part=alone or role.kind == "user")
-        self._make_room(role)
+        takes_part = is_first or role.kind == "user"
+        page = Page(connection, self._page_count, role, hands, takes_part=takes_part)
+        self._close_page_for(role)
         self._pages.add(page)
         if isinstance(connection, Visitor):
             connection.strangers.remove(connection)
         if role.kind == "experimenter":
-            self._opening.forget()
+            self._opening.remove_file()
         sending = asyncio.create_task(self._send(page))
         try:
             async for text in connection:
-                self._take(page, text)
-                if page.excess > MOST_EXCESS:  # what else it has sent is not even read
+                self._receive(page, text)
+                if page.excess > MAX_EXCESS:  # its further messages are not even read
                     await connection.close(_POLICY_VIOLATION, "too many messages")
                     break
         except ConnectionClosed as closed:
@@ -524,11 +567,9 @@ class PageServer:
             sending.cancel()
             self._pages.discard(page)
 
-    def _make_room(self, role: Role) -> None:
-        """Closes the page that gives way to a new page of a role, if all places of that role
-        are taken.
-        """
-        page = choose_to_leave(self._pages, role)
+    def _close_page_for(self, role: Role) -> None:
+        """Closes a page for a new page of a role, if there are as many as allowed."""
+        page = choose_page_to_close(self._pages, role)
         if page is None:
             return
         self._pages.discard(page)
@@ -540,8 +581,8 @@ class PageServer:
         self._closing.add(task)
         task.add_done_callback(self._closing.discard)
 
-    def _take(self, page: Page, text: str | bytes) -> None:
-        """Takes a message of a page, unless it sends more than it may; its failure is its own."""
+    def _receive(self, page: Page, text: str | bytes) -> None:
+        """Handles a message of a page, unless the page exceeds its limits."""
         now_ns = self._clock.monotonic_ns()
         if not page.limits.allows(PageMessage, now_ns):
             page.excess += 1
@@ -549,9 +590,9 @@ class PageServer:
             return
         try:
             message = read_page_message(text)
-            lets_go = isinstance(message, MoveHand) and not message.grip
-            if lets_go or page.limits.allows(type(message), now_ns):
-                self._obey(page, message)
+            is_release = isinstance(message, MoveHand) and not message.grip
+            if is_release or page.limits.allows(type(message), now_ns):
+                self._handle_message(page, message)
             else:
                 self.refused[f"too many: {type(message).__struct_config__.tag}"] += 1
         except WireError as error:
@@ -559,7 +600,8 @@ class PageServer:
         except Exception as error:
             self._count_failure("message", error)
 
-    def _obey(self, page: Page, message: PageMessage) -> None:
+    def _handle_message(self, page: Page, message: PageMessage) -> None:
+        """Does what a message of a page requests, if the page may request it."""
         view = self.view
         if not page.role.may(message):
             self.refused["not of its role"] += 1
@@ -568,23 +610,23 @@ class PageServer:
             while page.unseen and page.unseen[0] <= page.drawn:
                 page.unseen.popleft()
             page.wake.set()
-        elif isinstance(message, StopArms):  # of whoever sees the page
+        elif isinstance(message, StopArms):  # every role may stop the arms
             self._desk.stop(view.sites, page.role.noun)
         elif isinstance(message, TakePart):
-            self._ask_to_take_part(page, message.want)
+            self._request_part(page, message.want)
         elif isinstance(message, AnswerPage):
-            self._let_take_part(page, message)
+            self._answer_request(page, message)
         elif not page.takes_part:
             self.refused["does not take part"] += 1
         elif isinstance(message, SetLink | SetShares):
-            self._desk.order(message, view.sites, view.links, page.role.noun)
+            self._desk.queue_change(message, view.sites, view.links, page.role.noun)
         elif isinstance(message, ReleaseArms):
             self._desk.release(message, view.sites, page.role.noun)
         elif isinstance(message, MarkMoment):
             if view.scenario is not None:
                 self._desk.mark(view.scenario.names[0], message.text)
         elif isinstance(message, ShowAges):
-            self._ages = message.shown
+            self._shows_ages = message.shown
         elif isinstance(message, MoveHand):
             site = view.sites.get(message.site)
             if site is None or site.hand is None:
@@ -592,30 +634,33 @@ class PageServer:
             else:
                 page.hands.move(message, pushes=site.hand.mode == "force")
         elif isinstance(message, StageMessage):
-            asked = self._stage is not None and self._stage.take(
+            is_expected = self._stage is not None and self._stage.accept(
                 page.role.site, page.number, message
             )
-            self.refused["was not asked"] += not asked
+            if not is_expected:
+                self.refused["was not asked"] += 1
         elif isinstance(message, EndSession) and self._ends:
             self.end_requested.set()
 
-    def _ask_to_take_part(self, page: Page, want: bool) -> None:
-        """Lets a page take part, or no longer; while others hold an arm they are asked first."""
+    def _request_part(self, page: Page, want: bool) -> None:
+        """Lets a page take part, or no longer. Pages that hold an arm are asked first."""
         if not want:
             page.takes_part = False
             page.asks = None
             page.hands.release()
         elif not page.takes_part and page.asks is None:
-            holders = {other for other in self.experimenters - {page} if self._list_held(other)}
+            others = self.experimenters - {page}
+            holders = {other for other in others if self._list_held_sites(other)}
             page.asks = (holders, self._clock.monotonic_ns()) if holders else None
             page.takes_part = not holders
 
     @property
     def experimenters(self) -> set[Page]:
-        """The pages of experimenters that are open."""
+        """The open pages of experimenters."""
         return {page for page in set(self._pages) if page.role.kind == "experimenter"}
 
-    def _let_take_part(self, page: Page, answer: AnswerPage) -> None:
+    def _answer_request(self, page: Page, answer: AnswerPage) -> None:
+        """Applies the answer of a page to another page's request to take part."""
         for other in self._pages:
             if other.number == answer.page and other.asks is not None and page in other.asks[0]:
                 other.takes_part = answer.yes
@@ -623,18 +668,23 @@ class PageServer:
                 return
         self.refused["was not asked"] += 1
 
-    def _settle_asked(self) -> None:
-        """Lets pages take part that nobody has answered, if whom they asked has gone or holds
-        no arm.
+    def _settle_requests(self) -> None:
+        """Decides on requests to take part that nobody has answered in time.
+
+        The page takes part if the asked pages have gone or hold no arm.
         """
         now_ns = self._clock.monotonic_ns()
         for page in self._pages:
-            here = page.asks[0] & self._pages if page.asks is not None else set()
-            if page.asks is not None and (not here or now_ns - page.asks[1] > ANSWER_NS):
-                page.takes_part = not any(map(self._list_held, here))
+            if page.asks is None:
+                continue
+            asked_pages, asked_ns = page.asks
+            remaining = asked_pages & self._pages
+            if not remaining or now_ns - asked_ns > ANSWER_TIMEOUT_NS:
+                page.takes_part = not any(map(self._list_held_sites, remaining))
                 page.asks = None
 
-    def _list_held(self, page: Page) -> list[str]:
+    def _list_held_sites(self, page: Page) -> list[str]:
+        """Returns the sites whose arms a page holds."""
         sites = (self._frame or {}).get("sites", {})
         return [
             name
@@ -643,16 +693,20 @@ class PageServer:
         ]
 
     async def _send(self, page: Page) -> None:
-        """Sends a page what is newest, again and again, each time it has drawn what it got."""
+        """Sends a page the newest frame, each time it has drawn an earlier one."""
         encode: Callable[[Any], bytes] = msgspec.json.encode
         with suppress(ConnectionClosed):
             while True:
                 await page.wake.wait()
                 page.wake.clear()
-                if len(page.unseen) >= FRAMES_AHEAD or page.sent == self._n:
+                if len(page.unseen) >= FRAMES_AHEAD or page.sent == self._frame_number:
                     continue
                 begins = self._frame is not None
-                if not begins and page.sent and self._n - page.sent < WAITING_FRAMES:
+                if (
+                    not begins
+                    and page.sent
+                    and self._frame_number - page.sent < WAITING_FRAME_STEP
+                ):
                     continue
                 scenario = self.view.scenario
                 if scenario is not None and page.role.site not in ("", *scenario.names):
@@ -660,11 +714,13 @@ class PageServer:
                         _POLICY_VIOLATION, "the session has no such site"
                     )
                 page.notified = page.sent
-                page.sent = self._n
+                page.sent = self._frame_number
                 page.unseen.append(page.sent)
                 try:
                     payload = encode(
-                        self._frame_for(page) if page.greeted and begins else self._greet(page)
+                        self._describe_frame(page)
+                        if page.greeted and begins
+                        else self._describe_greeting(page)
                     )
                 except Exception as error:
                     self._count_failure("frame", error)
@@ -672,71 +728,81 @@ class PageServer:
                 page.greeted = begins
                 await page.connection.send(payload, text=True)
 
-    def _greet(self, page: Page) -> dict[str, Any]:
+    def _describe_greeting(self, page: Page) -> dict[str, Any]:
+        """Returns the first message to a page, with the constants of the session."""
         role = page.role
-        about = self._frames.describe_narrowed() if role.site else self._frames.describe()
-        ends = self._ends and role.kind == "experimenter"
-        shown = {
+        frames = self._frames
+        constants = frames.describe_session_as_user() if role.site else frames.describe()
+        fields = {
+            **constants,
             "role": role.kind,
             "as": role.site,
-            "n": self._n,
-            "ends": ends,
+            "n": self._frame_number,
+            "ends": self._ends and role.kind == "experimenter",
             **self._describe_stage(page),
         }
-        return {"hello": {**about, **shown}}
+        return {"hello": fields}
 
     def _describe_stage(self, page: Page, t_s: float | None = None) -> dict[str, Any]:
         if self._stage is None:
             return {}
         return {"stage": self._stage.describe(page.role.kind, page.role.site, page.number, t_s)}
 
-    def _frame_for(self, page: Page) -> dict[str, Any]:
-        notices = [one for one in self._notices if one["n"] > page.notified]
-        if page.role.kind != "experimenter":
-            # The answers of sites name keys and commands, which only an experimenter can use.
-            stops = [
-                notice for notice in notices if notice["of"] == topics.STOP and not notice["ok"]
-            ]
-            notices = [
-                {**notice, "text": f"{notice['site']} was not stopped"} for notice in stops
-            ]
-        shown = self._show_as(page.role.site) if page.role.site else self._show_all(page)
+    def _describe_frame(self, page: Page) -> dict[str, Any]:
+        """Returns the newest frame for a page."""
+        site = page.role.site
+        state = self._describe_as_site(site) if site else self._describe_all(page)
         return {
-            "n": self._n,
-            **shown,
+            "n": self._frame_number,
+            **state,
             "results": list(self.files.results) if page.role == Role() else [],
-            "notices": notices,
-            "ages": self._ages,
+            "notices": self._list_notices(page),
+            "ages": self._shows_ages,
             "pages": len(self._pages),
             "takes_part": page.takes_part,
             "asks": page.asks is not None,
             "asked": [
-                one.number
-                for one in self._pages
-                if one.asks is not None and page in one.asks[0]
+                other.number
+                for other in self._pages
+                if other.asks is not None and page in other.asks[0]
             ],
-            "holds": self._list_held(page),
+            "holds": self._list_held_sites(page),
             "refused": sum(self.refused.values()),
-            **self._describe_stage(page, shown["t"]),
+            **self._describe_stage(page, state["t"]),
         }
 
-    def _show_as(self, site: str) -> dict[str, Any]:
-        """Returns what a site knows at this frame."""
-        if site not in self._known:
-            assert self._frame is not None
-            self._known[site] = self._frames.narrow(self._frame, site, ages=self._ages)
-        return {**self._known[site], "points": [], "energies": [], "events": []}
+    def _list_notices(self, page: Page) -> list[dict[str, Any]]:
+        """Returns the replies of sites that a page has not received yet.
 
-    def _show_all(self, page: Page) -> dict[str, Any]:
-        """Returns what is, and what has been added to plots and events since the page's last
-        frame.
+        The replies name keys and commands, which only an experimenter can use. Other roles are
+        told which sites were not stopped.
         """
+        notices = [notice for notice in self._notices if notice["n"] > page.notified]
+        if page.role.kind == "experimenter":
+            return notices
+        return [
+            {**notice, "text": f"{notice['site']} was not stopped"}
+            for notice in notices
+            if notice["of"] == topics.STOP and not notice["ok"]
+        ]
+
+    def _describe_as_site(self, site: str) -> dict[str, Any]:
+        """Returns the frame for the user of a site."""
+        if site not in self._frames_as_site:
+            assert self._frame is not None
+            self._frames_as_site[site] = self._frames.describe_as(
+                self._frame, site, ages=self._shows_ages
+            )
+        return {**self._frames_as_site[site], "points": [], "energies": [], "events": []}
+
+    def _describe_all(self, page: Page) -> dict[str, Any]:
+        """Returns the frame for a page that sees everything, with its new points and events."""
         frames = self._frames
         view = self.view
-        first = page.points == 0 and page.energies == 0
-        most = 100_000 if first else POINTS_PER_FRAME
-        points = frames.points.since(page.points, most)
-        energies = frames.energies.since(page.energies, most)
+        is_first = page.points == 0 and page.energies == 0
+        limit = 100_000 if is_first else POINTS_PER_FRAME
+        points = frames.points.since(page.points, limit)
+        energies = frames.energies.since(page.energies, limit)
         events = [show_event(event) for event in view.events.since(page.events, 100)]
         page.points = frames.points.count
         page.energies = frames.energies.count
@@ -745,8 +811,9 @@ class PageServer:
 
 
 class PageAttendant(ExitStack):
-    """The page of a session that is run here; a context, as the page outlives the session for
-    its report.
+    """The page of a session that this process runs.
+
+    It is a context manager, because the page outlives the session to show its report.
     """
 
     def __init__(self, options: PageOptions, clock: Clock) -> None:
@@ -759,37 +826,35 @@ class PageAttendant(ExitStack):
     def attend(
         self, session: str, endpoints: Sequence[str], say: Callable[[str], None]
     ) -> Iterator[Callable[[], bool]]:
-        """The `SessionAttendant` that serves the page, until that asks for the end of the
-        session.
-        """
+        """Serves the page of a session until a page requests the end: a `SessionAttendant`."""
         bus = self.enter_context(closing(ZenohBus([], endpoints)))
         page = PageServer(bus, self._clock, session, self._options, ends=True, say=say)
         self._page = self.enter_context(page)
         yield self._page.end_requested.is_set
-        self._page.tell_refused()
+        self._page.report_refusals()
 
-    def offer(self, paths: Iterable[Path]) -> None:
-        """Offers files of the ended session to experimenters while their page is open, or until
-        Ctrl-C.
+    def offer_results(self, paths: Iterable[Path]) -> None:
+        """Offers files of the ended session to experimenters while their page is open.
 
-        The address of a file cannot be guessed, and only these pages are told.
+        Ctrl-C ends the offer.
+        The address of a file cannot be guessed, and only these pages receive it.
         """
         page = self._page
         clock = self._clock
-        assert page is not None  # a session was attended
-        page.view.finish()  # its processes are gone, whatever they could still say
-        page.files.offer(paths)
-        give_up_ns = clock.monotonic_ns() + OFFERED_NS
+        assert page is not None  # `attend` has been called
+        page.view.finish()  # the processes of the session are gone
+        page.files.add_results(paths)
+        give_up_ns = clock.monotonic_ns() + RESULTS_TIMEOUT_NS
         with suppress(KeyboardInterrupt):
             while page.experimenters and clock.monotonic_ns() < give_up_ns:
-                clock.sleep_until(clock.monotonic_ns() + OFFERED_NS // 3000)
+                clock.sleep_until(clock.monotonic_ns() + RESULTS_TIMEOUT_NS // 3000)
 
 
 @contextmanager
 def show_on_page(
     options: PageOptions, clock: Clock, session: str, say: Callable[[str], None], bus: Bus
 ) -> Iterator[tuple[SessionView, Callable[[], None]]]:
-    """The `SessionOnlooker` of a page."""
+    """Serves a page of a running session; the `SessionOnlooker` of `trilat watch --page`."""
     with PageServer(bus, clock, session, options, say=say) as page:
         yield page.view, lambda: None
-        page.tell_refused()
+        page.report_refusals()

@@ -1,12 +1,14 @@
-"""Frames of a session for pages: what never changes, what is now, and the newest points of the
-plots.
+"""Frames of a session for pages: its constants, its present state, and new points of the plots.
 
-Invariant: a frame is a function of the records since the frame before; whatever a page misses,
-the next is whole. Extremes between two frames are kept. Forces are those ON the arm, N; of
-people and of the law by the transpose of the Jacobian, which near a singular pose gives the
-least force that explains the torque. A frame as one site knows the session shows of a peer
-nothing but its pose at one tick: that of the sample that the site has in use, or to which the
-picture of the site's user has come (`SessionView.find_shown`).
+Invariant:
+    - A frame is a function of the records since the previous frame. If a page misses some
+      frames, the next one is still complete.
+    - Extremes between two frames are kept.
+    - Forces are those ON the arm, N. The forces of people and of the law follow by the
+      transpose of the Jacobian; near a singular pose that gives the least force which explains
+      the torque.
+    - A frame for the user of one site shows of each peer only its pose at one tick: that of the
+      sample in use, or of the delayed picture (`SessionView.find_shown`).
 """
 
 import math
@@ -35,27 +37,34 @@ from trilat_net.scenario.laws import identify_law
 from .session_view import SessionView, SiteView, Tail
 
 POINTS_KEPT = 1200
-"""Points of a plot that a new page gets: 40 s."""
-ENERGY_EVERY_S = 0.025
+"""Points of a plot that a new page receives: 40 s."""
+ENERGY_PERIOD_S = 0.025
 COLOURS = 6
-"""Of sites, in `page.css`."""
-LONGEST_FRAME_S = 0.5
-"""A frame looks at no more records than this, s."""
-_LEAST_SINGULAR_VALUE = 0.05
-"""Forces along directions in which the end effector moves less are not told apart from none,
-m/rad.
+"""Number of colours for sites in `page.css`."""
+MAX_FRAME_S = 0.5
+"""Longest time whose records one frame evaluates, s."""
+_MIN_SINGULAR_VALUE = 0.05
+"""Smallest singular value of the Jacobian that is inverted, m/rad.
+
+Along directions in which the end effector moves less, the force counts as zero.
 """
 
 Json = dict[str, Any]
 
 
-def _rounded(values: Array, digits: int = 5) -> list[Any]:
-    found: list[Any] = np.round(values, digits).tolist()
-    return found
+def _round(values: Array, digits: int = 5) -> list[Any]:
+    """Returns an array as nested lists of rounded numbers."""
+    rounded: list[Any] = np.round(values, digits).tolist()
+    return rounded
 
 
 class ArmFrames:
-    """One arm in frames: its fixed shape, and its pose, ghost and forces in some records."""
+    """One arm in frames: its fixed shape; its pose, reference pose and forces in some records.
+
+    Args:
+        scenario: the scenario of the session.
+        site: the site of the arm.
+    """
 
     def __init__(self, scenario: Scenario, site: str) -> None:
         self._scenario = scenario
@@ -64,179 +73,191 @@ class ArmFrames:
         self._spec = scenario.sites[site]
         self._walls = list_walls(self._spec)
         self._hand = self._spec.find_live_hand()
-        counts = self._model.counts.joints
-        limits = np.broadcast_to(
-            np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64), (counts,)
-        )
-        self._tau_limit = limits
+        limits_nm = np.asarray(self._spec.limits.tau_limit_nm, dtype=np.float64)
+        self._tau_limit = np.broadcast_to(limits_nm, (self._model.counts.joints,))
         self._rows = build_arm_rows(scenario, site)
 
     def describe(self) -> Json:
-        """Returns what never changes."""
+        """Returns the constants of the arm."""
         chain = self._model.chain
-        places = self._scenario.assign_colours(COLOURS)
-        start = joint_positions_m(self._model, np.array([self._spec.q0_rad], dtype=np.float64))[
-            0
-        ]
-        reach = float(np.linalg.norm(np.diff(start, axis=0), axis=1).sum())
+        colours = self._scenario.assign_colours(COLOURS)
+        index = self._scenario.names.index(self._site)
+        q0 = np.array([self._spec.q0_rad], dtype=np.float64)
+        start = joint_positions_m(self._model, q0)[0]
+        link_lengths_m = np.linalg.norm(np.diff(start, axis=0), axis=1)
+        shares_pose = self._model.shares_pose
         return {
             "role": self._spec.role,
-            "colour": places[self._scenario.names.index(self._site) % len(places)],
+            "colour": colours[index % len(colours)],
             "rate_hz": self._spec.rate_hz,
             "planar": chain is None,
-            "up": None if chain is None else _rounded(upright_axes(chain)),
+            "up": None if chain is None else _round(upright_axes(chain)),
             "joints": len(self._spec.q0_rad),
-            "start": _rounded(start),
-            "reach": reach,
-            "tau_limit": _rounded(self._tau_limit),
+            "start": _round(start),
+            "reach": float(link_lengths_m.sum()),
+            "tau_limit": _round(self._tau_limit),
             "bodies": [list(size) for size in self._scenario.bodies_m(self._site).values()],
             "walls": [{"at": list(wall.a), "normal": list(wall.b)} for wall in self._walls],
-            "task": self._model.shares_pose,
-            "unit": "m" if self._model.shares_pose else "rad",
+            "task": shares_pose,
+            "unit": "m" if shares_pose else "rad",
             "hand": self._describe_hand(),
             "stops": self._spec.on_stale.action == "glide",
             "law": identify_law(self._spec.control),
         }
 
     def _describe_hand(self) -> Json | None:
-        if (hand := self._hand) is None:
+        hand = self._hand
+        if hand is None:
             return None
-        how = hand.device
-        rows = hand.device.rows(self._model.counts.axes)
-        device = {"rows": rows, "scale": how.scale, "jump_m_s": how.jump_m_s}
+        settings = hand.device
+        axes = settings.rows(self._model.counts.axes)
         centre, _, outer_m, *_ = self._model.reach
-        reach = {"centre": list(centre), "most": outer_m if outer_m < math.inf else None}
-        return {"mode": hand.mode, "limit": hand.actor.limit, "device": device, "reach": reach}
-
-    def pose(self, q: Array) -> Json:
-        """Returns the arm at its joints' coordinates q, shape (n,), rad."""
+        is_bounded = outer_m < math.inf
         return {
-            "points": _rounded(joint_positions_m(self._model, q[np.newaxis])[0]),
-            "q": _rounded(q),
+            "mode": hand.mode,
+            "limit": hand.actor.limit,
+            "device": {"rows": axes, "scale": settings.scale, "jump_m_s": settings.jump_m_s},
+            "reach": {"centre": list(centre), "most": outer_m if is_bounded else None},
         }
 
-    def at_start(self) -> Json:
-        """Returns the arm as a scenario places it: before tick 0."""
+    def describe_pose(self, q: Array) -> Json:
+        """Returns the pose of the arm at joint coordinates `q`, shape (n,), rad."""
         return {
-            **self.pose(np.array(self._spec.q0_rad, dtype=np.float64)),
+            "points": _round(joint_positions_m(self._model, q[np.newaxis])[0]),
+            "q": _round(q),
+        }
+
+    def describe_start(self) -> Json:
+        """Returns the pose of the arm before tick 0, as the scenario places it."""
+        return {
+            **self.describe_pose(np.array(self._spec.q0_rad, dtype=np.float64)),
             "tick": -1,
             "bodies": [],
         }
 
-    def now(self, own: AlignedRecords) -> tuple[Json, list[float]]:
-        """Returns the arm in the last of some records, and extremes over all: |e|, torque,
-        hand, wall.
+    def describe_now(self, records: AlignedRecords) -> tuple[Json, list[float]]:
+        """Returns the present state of the arm, and extremes since the previous frame.
+
+        Args:
+            records: the records since the previous frame; the last one is the present.
+
+        Returns:
+            The state, and the largest |e|, torque, hand force and wall force.
         """
-        split = split_torque(own, self._scenario)
-        last = slice(len(own.known) - 1, None)
-        hand = self._hand_force(own, split)
-        wall = self._wall_force(own, split)
-        e = np.linalg.norm(own.e, axis=1)
-        tau = np.abs(own.tau)
+        split = split_torque(records, self._scenario)
+        last = slice(len(records.known) - 1, None)
+        hand_force = self._compute_hand_force(records, split)
+        wall_force_n = self._compute_wall_force(records, split)
+        error = np.linalg.norm(records.e, axis=1)
+        tau = np.abs(records.tau)
         if self._model.shares_pose:
-            ghost = own.q_des[-1, :3][np.newaxis] / self._spec.task.scale
+            ghost = records.q_des[-1, :3][np.newaxis] / self._spec.task.scale
         else:
-            ghost = joint_positions_m(self._model, own.q_des[last])[0]
-        now = {
-            **self.pose(own.q[-1]),
-            "ghost": _rounded(ghost),
-            "e": float(e[-1]),
-            "tau": _rounded(own.tau[-1], 3),
+            ghost = joint_positions_m(self._model, records.q_des[last])[0]
+        state = {
+            **self.describe_pose(records.q[-1]),
+            "ghost": _round(ghost),
+            "e": float(error[-1]),
+            "tau": _round(records.tau[-1], 3),
             "clamped": bool((tau >= self._tau_limit * (1.0 - 1e-12)).any()),
-            "hand": _rounded(hand[-1], 3),
-            "pull": self._find_pull(own, split),
-            "wall": _rounded(wall[-1], 3),
-            **self._describe_grip(own, hand[-1]),
+            "hand": _round(hand_force[-1], 3),
+            "pull": self._compute_pull(records, split),
+            "wall": _round(wall_force_n[-1], 3),
+            **self._describe_grip(records, hand_force[-1]),
         }
-        sizes = (np.linalg.norm(force, axis=1).max() for force in (hand, wall))
-        return now, [float(e.max()), float(tau.max()), *map(float, sizes)]
+        largest_hand_n = float(np.linalg.norm(hand_force, axis=1).max())
+        largest_wall_n = float(np.linalg.norm(wall_force_n, axis=1).max())
+        return state, [float(error.max()), float(tau.max()), largest_hand_n, largest_wall_n]
 
-    def _describe_grip(self, own: AlignedRecords, force: Array) -> Json:
-        if not own.hand.size:
+    def _describe_grip(self, records: AlignedRecords, force: Array) -> Json:
+        """Returns the state of the live hand in the last record; {} without a live hand."""
+        if not records.hand.size:
             return {}
-        held = HandInForce.read(own.hand[-1].tolist())
+        grip = HandInForce.read(records.hand[-1].tolist())
         hand = self._hand
-        limited = False
-        if hand is not None and hand.mode != "joint" and held.source:
-            limited = float(np.linalg.norm(force)) >= held.grip * hand.force_limit_n * (
-                1.0 - 1e-6
-            )
-        shown = (
-            held.target if hand is not None and hand.mode == "tip" and held.grip > 0.0 else None
-        )
+        is_limited = False
+        if hand is not None and hand.mode != "joint" and grip.source:
+            limit_n = grip.grip * hand.force_limit_n * (1.0 - 1e-6)
+            is_limited = float(np.linalg.norm(force)) >= limit_n
+        has_target = hand is not None and hand.mode == "tip" and grip.grip > 0.0
         return {
-            "grip": held.grip,
-            "source": held.source,
-            "target": shown,
-            "hand_limited": limited,
+            "grip": grip.grip,
+            "source": grip.source,
+            "target": grip.target if has_target else None,
+            "hand_limited": is_limited,
         }
 
-    def _hand_force(self, own: AlignedRecords, split: TorqueSplit) -> Array:
+    def _compute_hand_force(self, records: AlignedRecords, split: TorqueSplit) -> Array:
         """Returns the force of people at the end effector, shape (K, 2) or (K, 3), N."""
         torque = split.operator
-        if not self._spec.hands and np.abs(torque).max() < 1e-9 * (
-            1.0 + np.abs(own.tau_x).max()
-        ):
+        # Without a hand in the scenario, a tiny torque is a rounding error of the split.
+        rounding = 1e-9 * (1.0 + np.abs(records.tau_x).max())
+        if not self._spec.hands and np.abs(torque).max() < rounding:
             return np.zeros_like(split.end_effector.position)
-        return split.end_effector.find_force(torque, _LEAST_SINGULAR_VALUE)
+        return split.end_effector.find_force(torque, _MIN_SINGULAR_VALUE)
 
-    def _find_pull(self, own: AlignedRecords, split: TorqueSplit) -> list[float]:
-        """Returns the force with which the law pulls the end effector, which a user feels, at
-        the end.
+    def _compute_pull(self, records: AlignedRecords, split: TorqueSplit) -> list[float]:
+        """Returns the law's force on the end effector in the last record, N; a user feels it.
 
-        It is that of the torque beyond what carries the arm; [] if nobody knows the masses.
+        It is the force of the torque beyond gravity; [] if the masses are not known.
         """
         if not self._spec.arm.known:
             return []
         last = EndEffectorRows(*(rows[-1:] for rows in split.end_effector))
-        torque = own.tau[-1:] - self._rows.gravity_torque(own.q[-1:])
-        return _rounded(last.find_force(torque, _LEAST_SINGULAR_VALUE)[0], 3)
+        torque = records.tau[-1:] - self._rows.gravity_torque(records.q[-1:])
+        return _round(last.find_force(torque, _MIN_SINGULAR_VALUE)[0], 3)
 
-    def _wall_force(self, own: AlignedRecords, split: TorqueSplit) -> Array:
+    def _compute_wall_force(self, records: AlignedRecords, split: TorqueSplit) -> Array:
+        """Returns the force of all walls at the end effector, shape (K, 2) or (K, 3), N."""
         total = np.zeros_like(split.end_effector.position)
         for wall in self._walls:
-            force = wall_force(wall, own.nominal_s, split.end_effector)
+            force = wall_force(wall, records.nominal_s, split.end_effector)
             total = total + force[:, np.newaxis] * np.array(wall.b)
         return total
 
 
 class SessionFrames:
-    """The frames of one session; `make` is called at the rate of the pages.
+    """The frames of one session; `make_frame` is called at the rate of the pages.
+
+    Args:
+        view: the session.
 
     Attributes:
         points: rows of the plots, in the order of `columns`.
-        energies: rows of t, s, V and what operator and environment have supplied, J.
+        energies: rows of time, s, V, J, and the energy supplied by operator and environment, J.
     """
 
     def __init__(self, view: SessionView) -> None:
         self._view = view
         self._arms: dict[str, ArmFrames] = {}
         self._shapes: Json = {}
-        self._seen: dict[str, int] = {}
+        self._last_ticks: dict[str, int] = {}
         self.points: Tail[list[float | None]] = Tail(POINTS_KEPT)
         self.energies: Tail[list[float]] = Tail(POINTS_KEPT)
         self._energy_s = -1.0
-        self._known: dict[tuple[str, str], Json] = {}
+        self._shown_peers: dict[tuple[str, str], Json] = {}
         self._turns: defaultdict[tuple[str, str], BodyTurns] = defaultdict(BodyTurns)
 
     def describe(self) -> Json:
-        """Returns the session as a page needs it once: sites, links, columns of the plots."""
+        """Returns the constants of the session: its sites, links and columns of plots."""
         view = self._view
-        scenario = self._view.scenario
-        # before it runs: the compiled arms take seconds to load
+        scenario = view.scenario
+        # Prepared before the session runs, because loading the compiled arms takes seconds.
         if scenario is not None and not self._arms:
             self._arms = {site: ArmFrames(scenario, site) for site in scenario.names}
             self._shapes = {site: arm.describe() for site, arm in self._arms.items()}
         if scenario is None or not view.running:
-            here = sorted(view.met)
-            sites = (
-                []
-                if scenario is None
-                else [name for name in scenario.names if name not in view.met]
-            )
-            waiting = {"running": False, "title": "", "here": here, "missing": sites}
-            return {"session": view.session, **waiting}
-        links = {name: list(name.split("->")) for name in scenario.links}
+            names = [] if scenario is None else scenario.names
+            return {
+                "session": view.session,
+                "running": False,
+                "title": "",
+                "here": sorted(view.met),
+                "missing": [name for name in names if name not in view.met],
+            }
+        kinds = ("e", "tau", "hand", "wall")
+        columns = [f"{site}.{kind}" for site in scenario.names for kind in kinds]
+        columns += [f"{link}.age" for link in scenario.links]
         return {
             "running": True,
             "session": view.session,
@@ -245,166 +266,170 @@ class SessionFrames:
             "about": scenario.about,
             "duration_s": scenario.duration_s,
             "sites": self._shapes,
-            "links": links,
+            "links": {name: list(name.split("->")) for name in scenario.links},
             "shares": {site: scenario.dominance[site] for site in scenario.names},
-            "columns": [
-                f"{site}.{kind}"
-                for site in scenario.names
-                for kind in ("e", "tau", "hand", "wall")
-            ]
-            + [f"{link}.age" for link in scenario.links],
+            "columns": columns,
         }
 
-    def make(self) -> Json | None:
-        """Returns what is now; None until every site has a record."""
+    def make_frame(self) -> Json | None:
+        """Returns the present state; None until every site has a record."""
         view = self._view
         if not view.running or any(site.record is None for site in view.sites.values()):
             return None
         if not self._arms:
             self.describe()
         sites = {}
-        row = []
+        row: list[float | None] = []
         t_s = 0.0
         for name, site in view.sites.items():
-            sites[name], extremes = self._site_now(name, site)
+            sites[name], extremes = self._describe_site(name, site)
             t_s = max(t_s, sites[name]["t"])
             row += extremes
-        links = {name: self._link_now(name) for name in view.links}
+        links = {name: self._describe_link(name) for name in view.links}
         row += [link["age_ms"] for link in links.values()]
         if any(site["new"] for site in sites.values()):
-            self.points.add(
-                [round(t_s, 4), *(None if x is None else float(f"{x:.5g}") for x in row)]
-            )
-        course = view.advance_energy()
-        for t_energy_s, V, supplied in zip(
-            *(column.tolist() for column in course or ()), strict=True
-        ):
-            if t_energy_s >= self._energy_s + ENERGY_EVERY_S - 1e-9:
-                self._energy_s = t_energy_s
-                self.energies.add([t_energy_s, V, supplied])
-        energy = view.energy
+            rounded = [None if value is None else float(f"{value:.5g}") for value in row]
+            self.points.add([round(t_s, 4), *rounded])
+        self._add_energies()
         return {
             "t": t_s,
             "sites": sites,
             "links": links,
             "shares": view.dominance,
-            "energy": "" if energy is None else energy.reason,
+            "energy": "" if view.energy is None else view.energy.reason,
             "ended": view.ended,
             "silent_s": 0.0 if view.ended else round(view.session_silence_s, 1),
             "dropped": sum(view.dropped.values()),
         }
 
-    def describe_narrowed(self) -> Json:
-        """Returns the session as a page needs it that shows it as one site knows it."""
-        about = self.describe()
-        hidden: Json = {"about": "", "links": {}, "shares": {}, "columns": []}
-        return {**about, **hidden} if about["running"] else about
+    def _add_energies(self) -> None:
+        """Adds points of V and the supplied energy, at most one per `ENERGY_PERIOD_S`."""
+        course = self._view.advance_energy()
+        if course is None:
+            return
+        columns = [column.tolist() for column in course]
+        for t_s, V, supplied in zip(*columns, strict=True):
+            if t_s >= self._energy_s + ENERGY_PERIOD_S - 1e-9:
+                self._energy_s = t_s
+                self.energies.add([t_s, V, supplied])
 
-    def narrow(self, frame: Json, site: str, *, ages: bool) -> Json:
-        """Returns a frame as one site knows the session: its own arm now, its peers as shown to
-        its user.
+    def describe_session_as_user(self) -> Json:
+        """Returns the constants of the session for the page of a site's user."""
+        constants = self.describe()
+        if not constants["running"]:
+            return constants
+        hidden: Json = {"about": "", "links": {}, "shares": {}, "columns": []}
+        return {**constants, **hidden}
+
+    def describe_as(self, frame: Json, site: str, *, ages: bool) -> Json:
+        """Returns a frame for the user of a site: the site's arm now, its peers as shown there.
 
         Args:
-            frame: the newest that `make` has returned.
-            site: whose knowledge it is.
-            ages: true: each peer has the age of what is shown, ms.
+            frame: the newest frame of `make_frame`.
+            site: the site of the user.
+            ages: whether each peer has the age of the shown sample, ms.
         """
-        own = frame["sites"][site]
-        shown = self._view.find_shown(site, own["tick"], own["used"])
-        known = {name: self._find_known(site, name, tick) for name, tick in shown.items()}
+        local = frame["sites"][site]
+        ticks = self._view.find_shown(site, local["tick"], local["used"])
+        peers = {
+            name: self._describe_shown_peer(site, name, tick) for name, tick in ticks.items()
+        }
         if ages:
-            rates = {name: self._view.sites[name].window.rate_hz for name in known}
-            for name, peer in known.items():
-                age_ms = own["t"] * 1e3 - peer["tick"] * 1e3 / rates[name]
-                known[name] = {**peer, "age_ms": age_ms if peer["tick"] >= 0 else None}
-        sites = {name: known.get(name, own) for name in frame["sites"]}
+            for name, peer in peers.items():
+                rate_hz = self._view.sites[name].window.rate_hz
+                age_ms = local["t"] * 1e3 - peer["tick"] * 1e3 / rate_hz
+                peers[name] = {**peer, "age_ms": age_ms if peer["tick"] >= 0 else None}
         return {
-            "t": own["t"],
-            "sites": sites,
+            "t": local["t"],
+            "sites": {name: peers.get(name, local) for name in frame["sites"]},
             "links": {},
             "shares": {},
             "energy": "",
             "ended": frame["ended"],
-            "silent_s": own["silent_s"],
+            "silent_s": local["silent_s"],
         }
 
-    def _find_known(self, site: str, peer: str, tick: int) -> Json:
-        """Returns a peer at a tick; while its record is not there, as it was found last."""
-        known = self._known.get((site, peer)) or self._arms[peer].at_start()
-        other = self._view.sites[peer]
-        if tick != known["tick"] and other.window.has_record(tick):
-            q = other.window.rows(tick, tick).q[0]
-            bodies = _rounded(self._turns[site, peer].align(other.bodies.get(tick, [])))
-            known = {**self._arms[peer].pose(q), "tick": tick, "bodies": bodies}
-        self._known[site, peer] = known
-        return known
+    def _describe_shown_peer(self, site: str, peer: str, tick: int) -> Json:
+        """Returns the pose of a peer at a tick; without that record, the pose shown before."""
+        shown = self._shown_peers.get((site, peer)) or self._arms[peer].describe_start()
+        view = self._view.sites[peer]
+        if tick != shown["tick"] and view.window.has_record(tick):
+            q = view.window.rows(tick, tick).q[0]
+            bodies = _round(self._turns[site, peer].align(view.bodies.get(tick, [])))
+            shown = {**self._arms[peer].describe_pose(q), "tick": tick, "bodies": bodies}
+        self._shown_peers[site, peer] = shown
+        return shown
 
-    def _site_now(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
+    def _describe_site(self, name: str, site: SiteView) -> tuple[Json, list[float]]:
+        """Returns the present state of a site, and extremes since the previous frame."""
         window = site.window
         record = site.record
         stats = site.stats
         assert record is not None
         newest = max(window.newest, 0)
-        longest = round(LONGEST_FRAME_S * window.rate_hz)
-        seen = self._seen.get(name, -1)
-        first = max(min(seen + 1, newest), newest - longest, window.first)
-        now, extremes = self._arms[name].now(window.rows(first, newest))
-        self._seen[name] = newest
+        max_ticks = round(MAX_FRAME_S * window.rate_hz)
+        last_tick = self._last_ticks.get(name, -1)
+        first = max(min(last_tick + 1, newest), newest - max_ticks, window.first)
+        state, extremes = self._arms[name].describe_now(window.rows(first, newest))
+        self._last_ticks[name] = newest
         account = site.reception.accounts["state"]
-        alarm = None if self._view.ended else site.find_alarm(self._view.session, name)
-        return {
-            **now,
-            "new": newest > seen,
+        has_ended = self._view.ended
+        alarm = None if has_ended else site.find_alarm(self._view.session, name)
+        fields = {
+            **state,
+            "new": newest > last_tick,
             "t": record.t_ns / NS_PER_S,
             "tick": record.tick,
             "used": record.used,
             "mode": record.mode,
-            "bodies": _rounded(self._turns["", name].align(record.bodies)),
-            "alarm": None if alarm is None else _show_alarm(alarm),
-            "ended": site.ended or self._view.ended,
-            "silent_s": 0.0 if self._view.ended else round(self._view.silence_s(site), 1),
-            "holder": site.holder if now.get("source") else "",
+            "bodies": _round(self._turns["", name].align(record.bodies)),
+            "alarm": None if alarm is None else _describe_alarm(alarm),
+            "ended": site.ended or has_ended,
+            "silent_s": 0.0 if has_ended else round(self._view.silence_s(site), 1),
+            "holder": site.holder if state.get("source") else "",
             "late_us": stats.late_max_us if stats else 0,
             "overruns": stats.overruns if stats else 0,
             "missing": account.missing if site.holds_from == 0 else 0,
-        }, extremes
+        }
+        return fields, extremes
 
-    def _link_now(self, name: str) -> Json:
+    def _describe_link(self, name: str) -> Json:
+        """Returns the present state of a link."""
         view = self._view
         peer, _, receiver = name.partition("->")
-        own = view.sites[receiver]
-        other = view.sites[peer]
-        record = own.record
-        stats = own.stats
-        table = view.links[name]
+        receiving = view.sites[receiver]
+        sending = view.sites[peer]
+        record = receiving.record
         used = -1 if record is None else record.used.get(peer, -1)
-        rate_hz = other.window.rate_hz
         age_ms = None
         if record is not None and used >= 0:
-            age_ms = record.t_ns / 1e6 - used * 1e3 / rate_hz
-        newest = other.record.tick if other.record else used
-        shown = ("delay_us", -1), ("accepted", 0), ("late", 0), ("lost", 0)
-        counts = (
-            {}
-            if stats is None
-            else {key: getattr(stats, key).get(peer, none) for key, none in shown}
-        )
+            age_ms = record.t_ns / 1e6 - used * 1e3 / sending.window.rate_hz
+        newest = sending.record.tick if sending.record else used
+        counts = {}
+        if receiving.stats is not None:
+            defaults = {"delay_us": -1, "accepted": 0, "late": 0, "lost": 0}
+            counts = {
+                key: getattr(receiving.stats, key).get(peer, default)
+                for key, default in defaults.items()
+            }
+        settings = {
+            key: value
+            for key, value in view.links[name].items()
+            if isinstance(value, str | int | float)
+        }
         return {
             "age_ms": age_ms,
             "under_way": max(0, min(newest - used, 100_000)) if used >= 0 else 0,
-            "stated": {
-                key: value
-                for key, value in table.items()
-                if isinstance(value, str | int | float)
-            },
+            "stated": settings,
             "share": view.dominance.get(receiver, {}).get(peer, 0.0),
             **counts,
         }
 
 
-def _show_alarm(alarm: LifeAlarm) -> Json:
-    """Returns an alarm for a page, whose button gives the order: no page shows a command of a
-    shell.
+def _describe_alarm(alarm: LifeAlarm) -> Json:
+    """Returns an alarm for a page.
+
+    The page has a button for the order, so the advice does not name a shell command.
     """
     advice = alarm.before if alarm.order else alarm.advice
     return {"word": alarm.word, "reason": alarm.reason, "advice": advice, "order": alarm.order}

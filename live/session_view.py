@@ -1,13 +1,13 @@
-"""What a session does now: the records, statistics and events of its sites as they come in.
+"""The present state of a session, by the messages of its sites as they arrive.
 
 Invariant:
-- Every record counts. What is missing is asked for as a recorder asks, from the same buffers,
-  so that energies are those of the log; a page is shown fewer, and always the newest.
-- A view that begins late asks for no records from before it, and for all events, which say what
-  was changed.
-- A site has ended if its `end` message says so, and never because it is silent: on a busy
-  machine a running site may be silent for long, and its records are taken in when they come
-  again.
+    - Every record counts. Missing records are requested as a recorder requests them, from the
+      same buffers, so that energies equal those of the log. A page is shown fewer records, and
+      always the newest.
+    - A view that starts late does not request earlier records. It requests all events, because
+      they hold the changes.
+    - A site has ended if its `end` event says so, never because it is silent: on a busy machine
+      a running site may be silent for long, and its records are used when they arrive.
 """
 
 from collections import Counter, deque
@@ -38,16 +38,23 @@ from trilat_net.scenario.run_changes import LinkTables, find_requester
 from trilat_net.scenario.sample_uses import PictureDelay
 
 LATE_S = 3.0
-"""A view whose first record of a site is of a later time has joined late."""
-SILENT_NS = 2 * NS_PER_S
-"""A running site that was not heard for so long is shown as silent."""
+"""A view has joined late if the first record of a site that it sees is of a later time."""
+MIN_SILENCE_NS = 2 * NS_PER_S
+"""Silence after which a running site is shown as silent."""
 EVENTS_KEPT = 400
 
 T = TypeVar("T")
 
 
 class Tail(Generic[T]):
-    """The last entries of a sequence without end, for readers that come when they can."""
+    """The last entries of an endless sequence, for readers that come at any time.
+
+    Args:
+        most: the largest number of entries that are kept.
+
+    Attributes:
+        count: the number of entries that have been added.
+    """
 
     def __init__(self, most: int) -> None:
         self._entries: deque[T] = deque(maxlen=most)
@@ -59,24 +66,30 @@ class Tail(Generic[T]):
         self.count += 1
 
     def since(self, count: int, most: int) -> list[T]:
-        """Returns the entries after the first `count`, of those that are kept; the newest
-        `most` of them.
-        """
-        new = min(self.count - count, most, len(self._entries))
-        return [self._entries[n] for n in range(len(self._entries) - new, len(self._entries))]
+        """Returns the entries after the first `count`, at most the newest `most`."""
+        size = len(self._entries)
+        new = min(self.count - count, most, size)
+        return [self._entries[n] for n in range(size - new, size)]
 
 
 class SiteView:
-    """One running site: its reception, its newest record and statistics.
+    """One running site: its reception, its newest record and its statistics.
 
     Attributes:
-        record, stats: the newest; None before the first.
-        holds_from: its first tick that was seen.
+        glides: whether the site follows the rule `glide`.
+        peers: the names of its peers.
+        layout: the layout of its records, if it continues without a lost peer, else None.
+        hand: its live hand, if people can hold its arm.
+        reception: which of its messages have arrived.
+        window: its latest records.
         holder: who took hold of its arm last.
-        stopped_by: who ordered its last stop, as far as its events say.
-        bodies: poses of its plant's bodies by tick, as far back as the window reaches; {}
-            without bodies.
-        layout: of its records, if it may go on without a lost one of its peers; else None.
+        stopped_by: who ordered its last stop, as its events say.
+        bodies: poses of its plant's bodies by tick, as far back as the window reaches.
+        dropped: counts dropped messages by reason.
+        repair: requests its missing messages.
+        record: its newest record; None before the first.
+        stats: its newest statistics; None before the first.
+        holds_from: the first tick that the view has seen.
     """
 
     def __init__(
@@ -105,7 +118,12 @@ class SiteView:
         self.holds_from = 0
 
     def find_alarm(self, session: str, name: str) -> LifeAlarm | None:
-        """Returns what nobody may overlook of the site, of some name; None if there is nothing."""
+        """Returns the alarm of the site; None if there is none.
+
+        Args:
+            session: the session's name.
+            name: the site's name.
+        """
         record = self.record
         if record is None or not self.glides or self.ended:
             return None
@@ -128,13 +146,14 @@ class SiteView:
 
     @property
     def ended(self) -> bool:
-        """True once the site has said that it ends."""
+        """True once the site has published its end."""
         return self.reception.final_ticks is not None
 
     @property
     def complete(self) -> int:
-        """The last tick up to which all records are there or cannot be had; -1 before the
-        first.
+        """The last tick up to which no record can arrive any more; -1 before the first.
+
+        All records up to that tick have arrived or are lost.
         """
         account = self.reception.accounts[topics.STATE]
         gap = account.find_requestable_gap()
@@ -142,14 +161,22 @@ class SiteView:
 
 
 class SessionView:
-    """A session as an onlooker sees it; `poll` takes in what has come.
+    """A session as an observer sees it; `poll` receives what has arrived.
+
+    Args:
+        bus: a bus that reaches the session.
+        clock: the clock of this process.
+        session: the session's name.
 
     Attributes:
-        scenario: the session's; None until a member has told it.
-        sites: its running sites by name; {} until all of them run.
-        links: every link as it is at present, as tables.
-        dominance: the dominance matrix that was asked for last, by site.
-        events: what happened, oldest first.
+        scenario: the scenario of the session; None until a member has sent it.
+        sites: the running sites by name; {} until all of them run.
+        met: the identities of the members that have replied.
+        links: the present settings of every link, as tables.
+        dominance: the dominance matrix that was requested last, by site.
+        energy: the running energy; None until all sites run.
+        events: the events, oldest first.
+        dropped: counts dropped messages by reason.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str) -> None:
@@ -166,7 +193,7 @@ class SessionView:
         self.dropped: Counter[str] = Counter()
         self._finished = False
         self._pictures: dict[str, PictureDelay] = {}
-        self._changes: set[tuple[str, str]] = set()
+        self._applied_changes: set[tuple[str, str]] = set()
         self._query = MemberQuery(bus, clock, session)
         self._queue = InboundQueue(clock)
         for channel in (topics.STATE, topics.LINK, topics.EVENT):
@@ -179,71 +206,74 @@ class SessionView:
 
     @property
     def ended(self) -> bool:
-        """True once every site has said that it ends, or `finish` was called."""
+        """True once every site has published its end, or `finish` was called."""
         return self.running and (
             self._finished or all(site.ended for site in self.sites.values())
         )
 
     def finish(self) -> None:
-        """Shows the session as ended: whoever has started its sites knows that their processes
-        are gone.
-        """
+        """Marks the session as ended; called by the process that has seen all sites end."""
         self._finished = True
 
     def silence_s(self, site: SiteView) -> float:
-        """Returns for how long a running site was not heard, s.
+        """Returns for how long a running site has been silent, s.
 
-        It is 0.0 below `SILENT_NS`, and once the site has ended.
+        It is 0.0 below `MIN_SILENCE_NS`, and once the site has ended.
         """
         heard_ns = site.reception.last_received_ns
         if heard_ns is None or site.ended:
             return 0.0
         silence_ns = self._clock.monotonic_ns() - heard_ns
-        return silence_ns / NS_PER_S if silence_ns >= SILENT_NS else 0.0
+        return silence_ns / NS_PER_S if silence_ns >= MIN_SILENCE_NS else 0.0
 
     @property
     def session_silence_s(self) -> float:
-        """For how long no running site was heard, s; 0.0 while one is."""
+        """For how long all running sites have been silent, s; 0.0 while one is heard."""
         running = [site for site in self.sites.values() if not site.ended]
         return min((self.silence_s(site) for site in running), default=0.0)
 
     def poll(self) -> None:
-        """Takes in what has come, and asks for what is missing."""
+        """Receives what has arrived, and requests missing messages."""
         now_ns = self._clock.monotonic_ns()
         if not self.running:
-            self._meet()
+            self._connect_to_sites()
         if not self.running:
             return
         for arrived in self._queue.drain(now_ns):
             try:
-                self._take(arrived)
+                self._receive(arrived)
             except WireError as error:
                 self.dropped[error.reason] += 1
         for name, site in self.sites.items():
-            # A silent site is asked too: its answer may be the `end` message that was lost.
+            # Silent sites are queried too: the missing message may be their `end` event.
             for channel, message, _ in site.repair.poll(now_ns, alive=not site.ended):
-                self._keep(name, site, channel, message.content)
+                self._store(name, site, channel, message.content)
         newest_ns = max(
             (site.record.t_ns for site in self.sites.values() if site.record), default=0
         )
         self.links.advance_to(newest_ns)
 
     def advance_energy(self) -> EnergyCourse | None:
-        """Returns V at the ticks of which all records have come since the last call; None
-        without any.
-        """
+        """Returns V at the ticks completed since the last call; None if there are none."""
         complete = {name: site.complete for name, site in self.sites.items()}
         return None if self.energy is None else self.energy.compute_next(complete)
 
     def find_shown(self, site: str, tick: int, used: Mapping[str, int]) -> Mapping[str, int]:
-        """Returns the tick of each peer that a site's user is shown; see `PictureDelay.advance_to`."""
+        """Returns the tick of each peer that a site's user is shown.
+
+        Args:
+            site: the site of the user.
+            tick: the tick of the site's record.
+            used: the ticks of the samples in use at that tick, by peer.
+        """
         assert self.scenario is not None
         if site not in self._pictures:
             self._pictures[site] = PictureDelay(self.scenario, site)
         shown = self._pictures[site].advance_to(tick, used)
         return {peer: min(last, self.sites[peer].window.newest) for peer, last in shown.items()}
 
-    def _meet(self) -> None:
+    def _connect_to_sites(self) -> None:
+        """Reads the replies of members; creates the sites once all of them run."""
         for info in self._query.poll():
             self.met[info.member] = info
             if self.scenario is None and info.scenario:
@@ -253,13 +283,12 @@ class SessionView:
                     self.dropped["another scenario"] += 1
         if self.scenario is None:
             return
-        boots = {name: self.met[name].boot for name in self.scenario.names if name in self.met}
-        if len(boots) == len(self.scenario.names) and all(
-            self.met[name].running for name in boots
-        ):
-            self._begin(self.scenario, boots)
+        names = self.scenario.names
+        boots = {name: self.met[name].boot for name in names if name in self.met}
+        if len(boots) == len(names) and all(self.met[name].running for name in boots):
+            self._create_sites(self.scenario, boots)
 
-    def _begin(self, scenario: Scenario, boots: dict[str, int]) -> None:
+    def _create_sites(self, scenario: Scenario, boots: dict[str, int]) -> None:
         windows = {name: RecordWindow(scenario, name) for name in scenario.names}
         self.links = LinkTables(scenario.links, scenario.timeline)
         self.dominance = {site: dict(scenario.dominance[site]) for site in scenario.names}
@@ -276,27 +305,34 @@ class SessionView:
             for name in scenario.names
         }
 
-    def _take(self, arrived: InboundMessage) -> None:
+    def _receive(self, arrived: InboundMessage) -> None:
+        """Reads a message of a site, and stores its contents.
+
+        Raises:
+            WireError: the message cannot be read.
+        """
         parts = topics.parse_key(arrived.key)
         if parts is None or (site := self.sites.get(parts.member)) is None:
-            return  # a recorder's own
-        single = parts.channel != topics.STATE
-        for payload in (arrived.payload,) if single else split_states(arrived.payload):
+            return  # a message of the recorder
+        is_block = parts.channel == topics.STATE
+        payloads = split_states(arrived.payload) if is_block else (arrived.payload,)
+        for payload in payloads:
             try:
                 message = site.reception.read(parts.channel, payload)
             except WireError:
-                if parts.channel != topics.EVENT or not self._begin_start(
-                    parts.member, payload
-                ):
+                if parts.channel != topics.EVENT:
+                    raise
+                if not self._accept_new_boot(parts.member, payload):
                     raise
                 message = site.reception.read(parts.channel, payload)
-            if site.record is None and site.stats is None and parts.channel != topics.EVENT:
-                self._join(site, message.content)
+            has_nothing = site.record is None and site.stats is None
+            if has_nothing and parts.channel != topics.EVENT:
+                self._skip_records_before(site, message.content)
             if site.reception.accept(parts.channel, message, arrived.mono_ns):
-                self._keep(parts.member, site, parts.channel, message.content)
+                self._store(parts.member, site, parts.channel, message.content)
 
-    def _begin_start(self, name: str, payload: bytes) -> bool:
-        """Goes over to another start of a site, if that says that it joins."""
+    def _accept_new_boot(self, name: str, payload: bytes) -> bool:
+        """Follows another boot of a site if its event is a join; otherwise returns False."""
         event = decode(payload, Event)
         site = self.sites[name]
         joins = (
@@ -310,8 +346,8 @@ class SessionView:
         site.repair = GapRepair(self.bus, self.session, site.reception, site.dropped)
         return True
 
-    def _join(self, site: SiteView, content: State | LinkStats | Event) -> None:
-        """Asks a site for no record from before a late first one, and for its events."""
+    def _skip_records_before(self, site: SiteView, content: State | LinkStats | Event) -> None:
+        """Requests no records from before a late first message, but all events of its site."""
         tick = content.tick if isinstance(content, State | LinkStats) else 0
         if tick / site.window.rate_hz < LATE_S:
             return
@@ -320,9 +356,10 @@ class SessionView:
             site.reception.accounts[channel].abandon_below(tick)
         site.repair.probe()
 
-    def _keep(
+    def _store(
         self, name: str, site: SiteView, channel: str, content: State | LinkStats | Event
     ) -> None:
+        """Stores the contents of a message, and applies the changes in it."""
         if isinstance(content, State):
             if site.record is None or content.tick > site.record.tick:
                 site.record = content
@@ -332,23 +369,29 @@ class SessionView:
                 while len(site.bodies) > KEPT_S * site.window.rate_hz:
                     del site.bodies[next(iter(site.bodies))]
             for text in content.cmd:
-                self._change(name, text)
+                self._apply_change(name, text)
         elif isinstance(content, LinkStats):
             site.stats = content
         elif channel == topics.EVENT:
             self.events.add(content)
-            words, took_hold, _ = content.text.partition(f" {TAKEN} ")
-            if content.kind == "hand" and took_hold:
-                site.holder = words.removeprefix(f"{name}: ")
+            if content.kind == "hand":
+                holder, separator, _ = content.text.partition(f" {TAKEN} ")
+                if separator:
+                    site.holder = holder.removeprefix(f"{name}: ")
             if content.kind == "change":
                 site.stopped_by = find_requester(content.text) or site.stopped_by
-            if content.command and content.kind == "change":
-                self._change(name, content.command)
+                if content.command:
+                    self._apply_change(name, content.command)
 
-    def _change(self, site: str, text: str) -> None:
-        if (site, text) in self._changes or self.scenario is None or self.energy is None:
+    def _apply_change(self, site: str, text: str) -> None:
+        """Applies a change to links, shares and the energy, once for each text."""
+        if (
+            (site, text) in self._applied_changes
+            or self.scenario is None
+            or self.energy is None
+        ):
             return
-        self._changes.add((site, text))
+        self._applied_changes.add((site, text))
         try:
             change = parse_core_change(self.scenario, site, text)
         except ScenarioError:

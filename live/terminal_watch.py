@@ -1,7 +1,6 @@
-"""A session that runs already, watched until it ends: by `trilat watch` in a terminal, by a
-page elsewhere.
+"""Watches a running session until it ends: `trilat watch` in a terminal, or a page elsewhere.
 
-Where standard input is a terminal, a key stops every arm.
+If standard input is a terminal, a key stops every arm.
 """
 
 import os
@@ -31,8 +30,9 @@ STOP_KEYS = frozenset(" sS")
 SessionOnlooker = Callable[
     [Bus], AbstractContextManager[tuple[SessionView, Callable[[], None]]]
 ]
-"""Given a bus that reaches a session, a context that shows it: its view, and what is to be
-called often.
+"""A function of a bus that reaches a session; it returns a context that shows the session.
+
+The context yields the view of the session, and a function that is called often to update it.
 """
 
 
@@ -44,11 +44,21 @@ def watch_session(
     say: Callable[[str], None],
     timeout_s: float,
 ) -> int:
-    """Shows a session that runs already, until it ends or a signal comes; returns the exit
-    code.
+    """Shows a running session until it ends or a signal arrives.
+
+    Args:
+        session: the session's name.
+        connection: the endpoints and keys.
+        clock: the clock of this process.
+        show: shows the session.
+        say: prints a line for the user.
+        timeout_s: longest wait for a reply of a site, s.
+
+    Returns:
+        The exit code.
 
     Raises:
-        SessionError: the session is not there, or no site answers in time.
+        SessionError: there is no such session, or no site replies in time.
         UsageError: an endpoint cannot be used.
     """
     with Interrupt() as interrupt:
@@ -60,10 +70,10 @@ def watch_session(
         with reached as bus:
             if bus is None:
                 return interrupt.exit_code
-            with show(bus) as (view, look):
+            with show(bus) as (view, update_display):
                 give_up_ns = clock.monotonic_ns() + int(timeout_s * NS_PER_S)
                 while not (stopped() or view.ended):
-                    look()
+                    update_display()
                     now_ns = clock.monotonic_ns()
                     if now_ns > give_up_ns and not view.met:
                         raise SessionError(
@@ -77,35 +87,41 @@ def watch_session(
 
 
 class SessionWatch:
-    """What is shown of a session, or of it to the user of one site; `update` takes in what has
-    come.
+    """The texts that show a session in a terminal.
+
+    Args:
+        bus: a bus that reaches the session.
+        clock: the clock of this process.
+        session: the session's name.
+        as_site: the site as whose user the session is shown; "" shows everything.
     """
 
     def __init__(self, bus: Bus, clock: Clock, session: str, as_site: str = "") -> None:
         self.view = SessionView(bus, clock, session)
-        self._V = ""
+        self._energy_text = ""
         self._as_site = as_site
 
     def update(self) -> None:
-        """Takes in what has come, and computes V as far as all records are there."""
+        """Receives the messages that have arrived, and computes V for the complete ticks."""
         view = self.view
         view.poll()
         if self._as_site and view.scenario is not None:
             find_site(view.scenario, self._as_site)
-        if (course := view.advance_energy()) is not None:
-            self._V = (
-                f"V = {course.V[-1]:.4g} J at {course.t_s[-1]:.1f} s, people and walls gave "
+        course = view.advance_energy()
+        if course is not None:
+            self._energy_text = (
+                f"V = {course.V[-1]:.4g} J at {course.t_s[-1]:.1f} s, "
+                f"people and walls gave {course.supplied[-1]:.4g} J"
             )
-            self._V += f"{course.supplied[-1]:.4g} J"
         elif view.energy is not None and view.energy.reason:
-            self._V = f"no V: {view.energy.reason}"
+            self._energy_text = f"no V: {view.energy.reason}"
 
     @property
     def title(self) -> str:
-        """The session, and its V; or that it has ended, or for how long no site was heard."""
+        """The session and its state: V, that it has ended, or how long it has been silent."""
         view = self.view
         silence_s = view.session_silence_s
-        state = f"as {self._as_site} knows it" if self._as_site else self._V
+        state = f"as {self._as_site} knows it" if self._as_site else self._energy_text
         if not view.running:
             state = "waits for its members"
         elif view.ended:
@@ -116,42 +132,47 @@ class SessionWatch:
 
     @property
     def alarms(self) -> list[tuple[str, LifeAlarm]]:
-        """The sites that hold, are stopped or in fault, each with its alarm, while they run."""
+        """The sites that hold, are stopped or in fault, with their alarms, while they run."""
         view = self.view
-        known = {name: site for name, site in view.sites.items() if self._as_site in ("", name)}
-        found = ((name, site.find_alarm(view.session, name)) for name, site in known.items())
-        return [(name, alarm) for name, alarm in found if alarm is not None]
+        alarms = []
+        for name, site in view.sites.items():
+            if self._as_site not in ("", name):
+                continue
+            alarm = site.find_alarm(view.session, name)
+            if alarm is not None:
+                alarms.append((name, alarm))
+        return alarms
 
     def rows(self) -> list[SiteRow]:
-        """Returns the row of each site; of a peer of the site that is watched, what its user is
-        shown.
+        """Returns the row of each site.
+
+        With `as_site`, the row of a peer holds what the user of that site is shown.
         """
         view = self.view
-        scenario = self.view.scenario
-        own = self._as_site
-        every = {
-            name: describe_site(
-                scenario,
-                name,
-                site.record,
-                site.stats,
-                ended=site.ended or view.ended,
-                silent_s=view.silence_s(site),
-            )
-            for name, site in view.sites.items()
-            if scenario is not None and own in ("", name)
-        }
-        record = view.sites[own].record if own in every else None
-        for peer, tick in (
-            view.find_shown(own, record.tick, record.used).items() if record else ()
-        ):
+        scenario = view.scenario
+        as_site = self._as_site
+        all_rows: dict[str, SiteRow] = {}
+        for name, site in view.sites.items():
+            if scenario is not None and as_site in ("", name):
+                all_rows[name] = describe_site(
+                    scenario,
+                    name,
+                    site.record,
+                    site.stats,
+                    ended=site.ended or view.ended,
+                    silent_s=view.silence_s(site),
+                )
+        record = view.sites[as_site].record if as_site in all_rows else None
+        if record is None:
+            return list(all_rows.values())
+        for peer, tick in view.find_shown(as_site, record.tick, record.used).items():
             window = view.sites[peer].window
-            seen = {"site": peer}
+            row = dict.fromkeys(HEADS, "") | {"site": peer}
             if window.has_record(tick):
-                angles = describe_angles(window.rows(tick, tick).q[0].tolist())
-                seen |= {"time": f"{tick / window.rate_hz:.3f} s", "angles": angles}
-            every[peer] = dict.fromkeys(HEADS, "") | seen
-        return list(every.values())
+                row["time"] = f"{tick / window.rate_hz:.3f} s"
+                row["angles"] = describe_angles(window.rows(tick, tick).q[0].tolist())
+            all_rows[peer] = row
+        return list(all_rows.values())
 
 
 @contextmanager
@@ -165,7 +186,7 @@ def show_in_terminal(
         if read_keys is not None:
             display.say("S or space: stop every arm")
 
-        def look() -> None:
+        def update_display() -> None:
             watch.update()
             if read_keys is not None and STOP_KEYS.intersection(read_keys()):
                 display.say(
@@ -174,17 +195,19 @@ def show_in_terminal(
                 desk.stop(watch.view.sites, "a watcher at a terminal")
             desk.poll()
             while desk.replies:
-                display.say(desk.replies.pop(0)[3])
+                *_, text = desk.replies.pop(0)
+                display.say(text)
             if display.due:
                 display.show(watch.title, watch.rows(), watch.alarms)
 
-        yield watch.view, look
+        yield watch.view, update_display
 
 
 @contextmanager
 def _read_keys() -> Iterator[Callable[[], str] | None]:
-    """Yields what returns the keys pressed since it was asked last; None without a terminal of
-    ours.
+    """Yields a function that returns the keys pressed since its last call.
+
+    Yields None if this process does not own a terminal.
     """
     try:
         import termios
@@ -193,14 +216,9 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
         keyboard = sys.stdin.fileno()
         if os.tcgetpgrp(keyboard) != os.getpgrp():  # its keys go to another program
             raise OSError
-        before = termios.tcgetattr(keyboard)
-    # no terminal, or a system without them
-    except (
-        ImportError,
-        OSError,
-        ValueError,
-        AttributeError,
-    ):
+        settings = termios.tcgetattr(keyboard)
+    except (ImportError, OSError, ValueError, AttributeError):
+        # There is no terminal, or the operating system has none.
         yield None
         return
 
@@ -215,4 +233,4 @@ def _read_keys() -> Iterator[Callable[[], str] | None]:
         yield read
     finally:
         with suppress(termios.error):
-            termios.tcsetattr(keyboard, termios.TCSADRAIN, before)
+            termios.tcsetattr(keyboard, termios.TCSADRAIN, settings)

@@ -50,7 +50,7 @@ def judged_again(done: Experiment, row: dict[str, Any]) -> tuple[bool, float, fl
     part = open_log(done.folder / row["log"])["s"]
     arm, task = scenario.arms["s"], done.plan.protocol.task
     at_m = np.array([arm.end_effector(q) for q in part.q])
-    inside = np.linalg.norm(at_m - goal.place(1e3), axis=1) <= goal.width_m / 2.0
+    inside = np.linalg.norm(at_m - goal.find_target_m(1e3), axis=1) <= goal.width_m / 2.0
     inside &= part.t_s >= goal.appears_s
     left = np.concatenate([[-1], np.flatnonzero(~inside)])
     since = left[np.searchsorted(left, np.arange(len(inside)), side="right") - 1] + 1
@@ -149,7 +149,7 @@ def test_two_people_do_what_else_a_task_asks(what: str, stage: Stage) -> None:
         take_part(people, running.ended)
     assert running.code() == 0, running
     done, (row,) = open_experiment(folder), rows_of(folder)
-    asked = done.plan.protocol.task.ask("s")
+    asked = done.plan.protocol.task.render_instructions("s")
     assert [one["task"] for one in shown] == [asked, asked]
     assert ("way" in shown[0]) == (what == "carry")
     assert (shown[0]["target"]["at"] != shown[1]["target"]["at"]) == (what == "settle")

@@ -49,7 +49,7 @@ class People(ManualClock):
             shown = self.stage.describe("user", site, n, None)
             items = shown.get("form", {}).get("items", {})
             message = DoStep(key=shown.get("key", ""), answers=[self._answer] * len(items))
-            if not shown.get("done") and self.stage.take(site, n, message):
+            if not shown.get("done") and self.stage.accept(site, n, message):
                 self.steps.append((site, message.key))
 
     def run(self, fault: Fault = lambda _, __: None) -> bool:

@@ -149,7 +149,7 @@ def _record(
     points = energies = events = n = 0
     while not view.ended:
         view.poll()
-        frame = pages.make()
+        frame = pages.make_frame()
         if stage is not None:
             stage.poll(view, [(site, n) for n, site in enumerate(stage.users, 1)])
         if frame is not None and 1.0 < frame["t"] < scenario.duration_s - 0.2:
@@ -169,7 +169,7 @@ def _record(
             )
             every = {"n": n, **_ABOUT_PAGES}
             nothing: Json = {key: [] for key in added}
-            known = pages.narrow(frame, found.user, ages=True)
+            known = pages.describe_as(frame, found.user, ages=True)
             found.frames["experimenter"].append({**every, **frame, **added, "takes_part": True})
             found.frames["watcher"].append({**every, **frame, **added, "takes_part": False})
             found.frames["user"].append({**every, **known, **nothing, "takes_part": True})

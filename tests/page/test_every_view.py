@@ -220,24 +220,24 @@ def set_phase(
             plan.protocol, plan.scenarios["near"], plan.trials[0], plan.digest
         )
         entry = made.write(folder / "log.mcap")
-        stage.tell(msgspec.structs.replace(entry, succeeded=phase == "success"))
+        stage.show_feedback(msgspec.structs.replace(entry, succeeded=phase == "success"))
     if phase == "repetition":
-        stage.tell(None, "an arm was stopped")
+        stage.show_feedback(None, "an arm was stopped")
     if phase == "starting":
-        stage.ask(trial)
-        stage.begin(TrialWatch(watched_trial(experiment), clock))
+        stage.request_step(trial)
+        stage.show_trial(TrialWatch(watched_trial(experiment), clock))
     elif phase == "checking":
-        stage.ask(trial)
-        stage.check()
+        stage.request_step(trial)
+        stage.show_checking()
     elif phase == "over":
-        stage.close()
+        stage.show_end()
     elif phase != "no step":
         step = {
             "consent": ("consent", ""),
             "sliders": ("questionnaire", "tlx"),
             "buttons": ("questionnaire", "trust"),
         }
-        stage.ask(
+        stage.request_step(
             steps[step.get(phase, ("trial", ""))], rest_s=30.0 if phase == "rest" else 0.0
         )
 
@@ -293,9 +293,11 @@ def test_stage_in_a_trial_draws_everything(
     )
     clock = ManualClock(1)
     stage = Stage(experiment.plan, clock)
-    stage.ask(next(step for step in experiment.plan.list_steps() if step.kind == "trial"))
+    stage.request_step(
+        next(step for step in experiment.plan.list_steps() if step.kind == "trial")
+    )
     trial = watched_trial(experiment)
-    stage.begin(TrialWatch(trial, clock))
+    stage.show_trial(TrialWatch(trial, clock))
     (tmp_path / "log").mkdir()
     session = record_views(
         Session.whole(trial.scenario, tmp_path / "log", ends={}), "m1", stage=stage

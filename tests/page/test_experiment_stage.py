@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from live.experiment_stage import AWAY_NS, END_NS, Stage, TrialWatch
+from live.experiment_stage import END_DELAY_NS, MAX_ABSENCE_NS, Stage, TrialWatch
 from live.page_orders import AbortTrial, DoStep
 from live.page_server import PageServer
 from sites.demo_session import SessionResult
@@ -243,37 +243,39 @@ def first_trial(experiment: Experiment) -> Any:
 
 
 def test_first_page_of_a_role_speaks_for_it(experiment: Experiment, stage: Stage) -> None:
-    asked = stage.ask(first_trial(experiment))
+    asked = stage.request_step(first_trial(experiment))
     stage.poll(NO_SESSION, [("m1", 7), ("m1", 9), ("m2", 8)])
     ready = DoStep(key="trial 1")
-    assert not stage.take("m1", 9, ready)
-    assert not stage.take("m1", 7, DoStep(key="trial 2"))
-    assert not stage.take("", 3, ready)
-    assert stage.take("m1", 7, ready)
+    assert not stage.accept("m1", 9, ready)
+    assert not stage.accept("m1", 7, DoStep(key="trial 2"))
+    assert not stage.accept("", 3, ready)
+    assert stage.accept("m1", 7, ready)
     assert asked.replies.keys() == {"m1"}
     assert stage.describe("user", "m1", 9, None)["second"]
     assert not stage.describe("user", "m1", 7, None)["second"]
     stage.poll(NO_SESSION, [("m1", 9), ("m2", 8)])  # who leaves is not ready any more
     assert not asked.replies
-    assert stage.take("m1", 9, ready)
+    assert stage.accept("m1", 9, ready)
 
 
 def test_answers_are_those_of_the_scale(experiment: Experiment, stage: Stage) -> None:
     step = next(one for one in experiment.plan.list_steps() if one.kind == "questionnaire")
-    asked = stage.ask(step)
+    asked = stage.request_step(step)
     stage.poll(NO_SESSION, [("m1", 1), ("m2", 2)])
     for answers in ([], [40.0] * 5, [41.0] * 6, [105.0] * 6, [-5.0] * 6):
-        assert not stage.take("m1", 1, DoStep(key=step.key, answers=answers))
-    assert stage.take(
+        assert not stage.accept("m1", 1, DoStep(key=step.key, answers=answers))
+    assert stage.accept(
         "m1", 1, DoStep(key=step.key, answers=[0.0, 100.0, 5.0, 50.0, 60.0, 95.0])
     )
     assert asked.replies["m1"][0]["physical"] == 100.0
-    assert stage.take("m2", 2, DoStep(key=step.key, answers=[0.0, None, 5.0, None, 60.0, 95.0]))
+    assert stage.accept(
+        "m2", 2, DoStep(key=step.key, answers=[0.0, None, 5.0, None, 60.0, 95.0])
+    )
     assert asked.replies["m2"][0]["physical"] is None  # a slider that nobody touched
 
 
 def test_users_are_not_told_the_condition(experiment: Experiment, stage: Stage) -> None:
-    stage.ask(first_trial(experiment))
+    stage.request_step(first_trial(experiment))
     stage.poll(NO_SESSION, [("m1", 1)])
     shown = {
         who: stage.describe(who, site, 1, None)
@@ -333,7 +335,7 @@ def test_watch_judges_as_the_log_does(watched: Any, clock: ManualClock) -> None:
     assert watch.judge.outcome.ended_s - trial.appears_s == entry.measures["completion_s"]
     assert moments == ["trial 1 begins", "target appears", "trial 1 succeeded"]
     assert not watch.over
-    clock.sleep_until(clock.monotonic_ns() + END_NS + 1)
+    clock.sleep_until(clock.monotonic_ns() + END_DELAY_NS + 1)
     assert watch.over
 
 
@@ -349,21 +351,21 @@ def test_page_that_stays_away_ends_the_trial(
 ) -> None:
     trial, _, log = watched
     clock = stage._clock
-    stage.ask(first_trial(experiment))
+    stage.request_step(first_trial(experiment))
     both = [("m1", 1), ("m2", 2)]
     stage.poll(NO_SESSION, both)
     watch = TrialWatch(trial, clock)
-    stage.begin(watch)
+    stage.show_trial(watch)
     for pages, passed_ns in (
         (both, 0),
-        (both[:1], AWAY_NS // 2),
+        (both[:1], MAX_ABSENCE_NS // 2),
         ([("m1", 1), ("m2", 3)], 1),
         (both[:1], 1),
     ):
         clock.sleep_until(clock.monotonic_ns() + passed_ns)
         stage.poll(view_of(trial, log, 5), pages)
         assert not watch.aborted  # a page that was reloaded is back in time
-    clock.sleep_until(clock.monotonic_ns() + AWAY_NS + 1)
+    clock.sleep_until(clock.monotonic_ns() + MAX_ABSENCE_NS + 1)
     stage.poll(view_of(trial, log, 5), both[:1])
     assert watch.aborted == "the page of m2 is gone"
 
@@ -373,18 +375,18 @@ def test_users_and_experimenters_stop_a_trial(stage: Stage, watched: Any) -> Non
     for site, page, whose in (("m1", 1, "m1"), ("", 9, "the experimenter")):
         stage.poll(NO_SESSION, [("m1", 1), ("m1", 5)])
         watch = TrialWatch(trial, stage._clock)
-        stage.begin(watch)
-        assert not stage.take("m1", 5, AbortTrial())
-        assert stage.take(site, page, AbortTrial(why="it is too hot"))
+        stage.show_trial(watch)
+        assert not stage.accept("m1", 5, AbortTrial())
+        assert stage.accept(site, page, AbortTrial(why="it is too hot"))
         assert watch.aborted == f"{whose} stopped it: it is too hot"
-        assert not stage.take(site, page, AbortTrial())
+        assert not stage.accept(site, page, AbortTrial())
 
 
 def test_server_turns_from_session_to_session(experiment: Experiment) -> None:
     """A user's page answers for its own site; each session greets every page anew."""
     clock, network = SystemClock(), LocalNetwork()
     stage = Stage(experiment.plan, clock)
-    asked = stage.ask(first_trial(experiment))
+    asked = stage.request_step(first_trial(experiment))
     with (
         PageServer(network.join(), clock, "idle", stage=stage) as server,
         page_client(with_query(server.address, "as=m1")) as user,

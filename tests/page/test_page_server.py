@@ -16,10 +16,10 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Origin
 
-from live.page_entrance import MOST_PAGES, MOST_STRANGERS
+from live.page_entrance import MAX_PAGES, MAX_STRANGERS
 from live.page_opening import BrowserOpening
 from live.page_orders import MAX_MESSAGE_BYTES, MoveHand, PageHands
-from live.page_server import MOST_EXCESS, OPENING_S, PageOptions, PageServer
+from live.page_server import MAX_EXCESS, REQUEST_TIMEOUT_S, PageOptions, PageServer
 from tests.cli.running import trilat
 from tests.live.page_client import socket_address, with_query
 from tests.net.local_bus import LocalBus, LocalNetwork
@@ -226,7 +226,7 @@ def test_ten_megabytes_and_a_hundred_thousand_messages_end_the_connection(
     until(lambda: server.refused["too large"] == 1)
     with socket(server) as hostile, pytest.raises(ConnectionClosed):
         flood(hostile, 100_000)
-    assert server.refused["too many"] == MOST_EXCESS + 1
+    assert server.refused["too many"] == MAX_EXCESS + 1
     with socket(server) as page:
         page.send("x" * (MAX_MESSAGE_BYTES - 2))
         assert "hello" in hears(page)
@@ -581,8 +581,8 @@ def test_report_and_log_are_the_experimenters_alone(
     server: PageServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At an address that no other page is told and nobody guesses; the report's scripts reach nothing."""
-    monkeypatch.setattr(server._frames, "make", lambda: {"sites": {}, "t": 0.0})
-    monkeypatch.setattr(server._frames, "narrow", lambda *_, **__: {"t": 0.0})
+    monkeypatch.setattr(server._frames, "make_frame", lambda: {"sites": {}, "t": 0.0})
+    monkeypatch.setattr(server._frames, "describe_as", lambda *_, **__: {"t": 0.0})
     report = tmp_path / "report.html"
     report.write_text("<p>a report</p>")
     server.files.results = {"/secret/report.html": report}
@@ -608,7 +608,7 @@ def test_watchers_take_no_places_of_others(network: LocalNetwork) -> None:
         ExitStack() as stack,
     ):
         links = told_links(server, said)
-        for _ in range(MOST_PAGES["watcher"]):
+        for _ in range(MAX_PAGES["watcher"]):
             hears(stack.enter_context(socket(server, link=links["watcher"])))
         for _ in range(3):
             with pytest.raises(InvalidStatus, match="503"):
@@ -629,7 +629,7 @@ def test_newest_page_of_experimenter_or_user_gets_in(who: str, network: LocalNet
         links = told_links(server, said)
         kind = who.split()[0]
         pages = []
-        for _ in range(MOST_PAGES[kind] + 1):
+        for _ in range(MAX_PAGES[kind] + 1):
             pages.append(stack.enter_context(socket(server, link=links[who])))
             assert "hello" in hears(pages[-1])
         other = stack.enter_context(socket(server, link=links["user m2"]))
@@ -640,7 +640,7 @@ def test_newest_page_of_experimenter_or_user_gets_in(who: str, network: LocalNet
             until(lambda: hears(oldest) and False)
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.reason == "a newer page took its place"
-        until(lambda: len(server._pages) == MOST_PAGES[kind] + 1)
+        until(lambda: len(server._pages) == MAX_PAGES[kind] + 1)
         assert server.refused[f"too many pages of {kind}s"] == 1
 
 
@@ -651,19 +651,19 @@ def test_silent_and_slow_connections_keep_nobody_out(sent: bytes, server: PageSe
     """Connections that say nothing, half of a request, or never read their answer."""
     at = urlsplit(server.address)
     with ExitStack() as stack:
-        for _ in range(3 * MOST_STRANGERS):
+        for _ in range(3 * MAX_STRANGERS):
             slow = stack.enter_context(create_connection((at.hostname, at.port), 5))
             slow.sendall(sent)
         with socket(server) as page:
             assert "hello" in hears(page)
         assert get(server, "/")[0] == 200
     if len(sent) < 10:  # the others were answered, and closed
-        assert server.refused["too many connections"] >= 2 * MOST_STRANGERS - 10
+        assert server.refused["too many connections"] >= 2 * MAX_STRANGERS - 10
 
 
 def test_silent_connections_are_closed(server: PageServer) -> None:
     at = urlsplit(server.address)
-    with create_connection((at.hostname, at.port), 20 * OPENING_S) as silent:
+    with create_connection((at.hostname, at.port), 20 * REQUEST_TIMEOUT_S) as silent:
         silent.sendall(b"GET / HT")
         assert silent.recv(100) == b""
 
@@ -674,7 +674,7 @@ def test_silent_connections_to_encrypted_page_are_closed(
     (keys,) = create_keys(tmp_path / "keys", ["operator"])
     with PageServer(network.join(), SystemClock(), "s1", PageOptions(tls=keys)) as server:
         at = urlsplit(server.address)
-        with create_connection((at.hostname, at.port), 20 * OPENING_S) as silent:
+        with create_connection((at.hostname, at.port), 20 * REQUEST_TIMEOUT_S) as silent:
             assert silent.recv(100) == b""
 
 
@@ -693,5 +693,5 @@ def test_browser_is_opened_by_a_file_of_the_user(
     assert "secret" not in opened[0]
     assert 'href="http://127.0.0.1:1/?as=m1&amp;x=&lt;b&gt;#token=secret"' in file.read_text()
     assert (folder.stat().st_mode & 0o777, file.stat().st_mode & 0o777) == (0o700, 0o600)
-    opening.forget()
+    opening.remove_file()
     assert not list(tmp_path.iterdir())

@@ -42,7 +42,7 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Json]:
     found = {}
     for step in experiment.plan.list_steps():
         if step.form is not None and step.form.name not in found:
-            stage.ask(step)
+            stage.request_step(step)
             stage.poll(NO_SESSION, [("m1", 1), ("m2", 2)])
             found[step.form.name] = stage.describe("user", "m1", 1, None)
     return found

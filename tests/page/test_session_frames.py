@@ -42,8 +42,8 @@ def looking(
         pages = SessionFrames(view)
         while not view.ended:
             view.poll()
-            if (frame := pages.make()) is not None:
-                frames.append(pages.narrow(frame, site, ages=ages))
+            if (frame := pages.make_frame()) is not None:
+                frames.append(pages.describe_as(frame, site, ages=ages))
             clock.sleep_until(clock.monotonic_ns() + FRAME_NS)
 
     return look
@@ -180,8 +180,8 @@ def test_pages_terminals_and_programs_know_the_same(
             while not view.ended:
                 watch.update()
                 found = find()
-                if (frame := pages.make()) is not None:
-                    sites = pages.narrow(frame, "m1", ages=True)["sites"]
+                if (frame := pages.make_frame()) is not None:
+                    sites = pages.describe_as(frame, "m1", ages=True)["sites"]
                     assert sites["m1"]["tick"] == found["m1"].tick
                     ticks = {name: sites[name]["tick"] for name in found}
                     assert ticks == {name: record.tick for name, record in found.items()}

@@ -88,7 +88,7 @@ def test_one_arm_stops_and_goes_on_while_the_session_does(tmp_path: Path) -> Non
         pages, console = SessionFrames(watch.view), Console(file=screen, width=100)
         while not watch.view.ended:
             watch.update()
-            frames.extend([frame] if (frame := pages.make()) else [])
+            frames.extend([frame] if (frame := pages.make_frame()) else [])
             if watch.alarms and watch.alarms != raised[-1:]:
                 raised.extend(watch.alarms)
                 console.print(*frame_alarms(watch.alarms))

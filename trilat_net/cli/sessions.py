@@ -83,7 +83,7 @@ def run_and_report(
         [outcome.log], results, as_json=run.as_json, png=run.png
     )
     if page is not None:
-        page.offer((conclusion.page, outcome.log))
+        page.offer_results((conclusion.page, outcome.log))
     if outcome.problems or not conclusion.passed:
         raise typer.Exit(outcome.exit_code)
 
@@ -106,7 +106,7 @@ def live_command(
     Options:
         session: Show this running session instead of starting one.
     """
-    from live.page_server import LONGEST_S, PageAttendant, PageOptions, show_on_page
+    from live.page_server import MAX_DURATION_S, PageAttendant, PageOptions, show_on_page
     from live.terminal_watch import watch_session
 
     clock = SystemClock()
@@ -136,7 +136,7 @@ def live_command(
     if any(reach):
         raise UsageError("--connect, --router, --zenoh-config and --keys go with --session")
     with PageAttendant(page, clock) as attendant:
-        run_and_report(run.load(scenario, LONGEST_S), run, attendant)
+        run_and_report(run.load(scenario, MAX_DURATION_S), run, attendant)
 
 
 _START_OPTIONS = {

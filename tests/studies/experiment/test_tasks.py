@@ -98,7 +98,9 @@ def test_after_a_handover_the_second_user_alone_leads(tmp_path: Path) -> None:
         assert np.linalg.norm(last[0] - last[1]) < 0.2  # what the slave follows in the end
         assert row["completion_s"] > 4.0
         targets = ReachTrial(targets=4, distance_m=0.1)
-        first = targets.begin(place_rows(log)[0], planned.target, planned.seed).place(1.0)
+        first = targets.make_goal(
+            place_rows(log)[0], planned.target, planned.seed
+        ).find_target_m(1.0)
         ramp = (log["s"].t_s >= appears_s + 3.0) & (log["s"].t_s < appears_s + 4.0)
         most_m = np.linalg.norm(place_rows(log)[ramp] - first, axis=1).max()
         assert row["error_handover_mm"] == pytest.approx(1e3 * most_m, abs=1.0)
@@ -112,11 +114,11 @@ def test_users_shown_two_targets_settle_by_their_shares(tmp_path: Path) -> None:
         _, rows = run(folder, PAIR, APART, "", first)
         found[first] = np.mean([row["first_settled"] for row in rows])
     assert found[0.2] < 0.5 < found[0.8]
-    goal = TrackTrial(apart_m=0.1).begin(np.zeros(2), 0, 1)
-    apart = goal.place(1.0, 0) - goal.place(1.0, 1)
+    goal = TrackTrial(apart_m=0.1).make_goal(np.zeros(2), 0, 1)
+    apart = goal.find_target_m(1.0, 0) - goal.find_target_m(1.0, 1)
     assert apart.tolist() == pytest.approx([0.1, 0.0])
-    assert goal.place(1.0).tolist() == pytest.approx(
-        (goal.place(1.0, 1) + 0.5 * apart).tolist()
+    assert goal.find_target_m(1.0).tolist() == pytest.approx(
+        (goal.find_target_m(1.0, 1) + 0.5 * apart).tolist()
     )
 
 
@@ -138,8 +140,8 @@ def test_authority_moves_from_the_expert_trial_by_trial(tmp_path: Path) -> None:
         trial = ExperimentTrial(plan.protocol, plan.scenarios[one.condition], one, plan.digest)
         row = trial.scenario.dominance["s"]
         assert (row["m1"], row["m2"]) == pytest.approx((one.lead, 1.0 - (one.lead or 0.0)))
-        assert trial.make_goal().leads(5.0, 1)
-        assert trial.make_goal().leads(5.0, 0) == (one.phase == "training")
+        assert trial.make_goal().has_authority(5.0, 1)
+        assert trial.make_goal().has_authority(5.0, 0) == (one.phase == "training")
 
 
 def test_what_was_learnt_is_before_less_after(tmp_path: Path) -> None:
@@ -165,7 +167,7 @@ def test_what_was_learnt_is_before_less_after(tmp_path: Path) -> None:
 
 
 def test_a_force_counts_only_while_it_is_held() -> None:
-    goal = ContactTrial(force_n=5.0, tolerance_n=1.0, dwell_s=0.5, timeout_s=2.0).begin(
+    goal = ContactTrial(force_n=5.0, tolerance_n=1.0, dwell_s=0.5, timeout_s=2.0).make_goal(
         np.zeros(2), 0, 1
     )
     at = np.zeros(2)
@@ -175,7 +177,7 @@ def test_a_force_counts_only_while_it_is_held() -> None:
     outcome = goal.judge(1.1, at, 5.0)
     assert outcome is not None
     assert outcome == (True, 1.1)
-    goal = ContactTrial(timeout_s=2.0).begin(np.zeros(2), 0, 1)
+    goal = ContactTrial(timeout_s=2.0).make_goal(np.zeros(2), 0, 1)
     assert goal.judge(2.0, at, 0.0) == (False, 2.0)
 
 
@@ -187,9 +189,9 @@ def test_force_at_the_slave_is_that_of_the_wall(tmp_path: Path) -> None:
     judge = TrialJudge(ExperimentTrial(plan.protocol, scenario, plan.trials[0], plan.digest))
     judge.goal.appears_s, judge.goal.force_n = 0.0, 5.0
     assert all(
-        judge.take(t_s, q[0].tolist(), tau_x.tolist()) is None
+        judge.accept(t_s, q[0].tolist(), tau_x.tolist()) is None
         for t_s in np.linspace(0.0, 0.9, 10)
     )
-    outcome = judge.take(1.0, q[0].tolist(), tau_x.tolist())
+    outcome = judge.accept(1.0, q[0].tolist(), tau_x.tolist())
     assert outcome is not None
     assert outcome.succeeded

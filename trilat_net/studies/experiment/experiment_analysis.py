@@ -173,7 +173,7 @@ class ExperimentAnalysis(Result):
                 absent[name] = "nobody has answered it"
             elif all(score is None for score in scores):
                 absent[name] = "every questionnaire lacks an answer"
-        is_reaching = self._experiment.plan.protocol.task.words.startswith("reaching")
+        is_reaching = self._experiment.plan.protocol.task.description.startswith("reaching")
         if is_reaching and not self.throughput_rows:
             absent["throughput_bits_s"] = (
                 f"no {self.unit} has enough completed trials under a condition"
@@ -227,7 +227,7 @@ class ExperimentAnalysis(Result):
         for (who, condition), rows in by.items():
             done = [row for row in rows if row["succeeded"]]
             if (
-                self._experiment.plan.protocol.task.words.startswith("reaching")
+                self._experiment.plan.protocol.task.description.startswith("reaching")
                 and len(done) > 1
             ):
                 left, aims, ends = (
@@ -248,7 +248,7 @@ class ExperimentAnalysis(Result):
         """Yields by how much each pair has become better by a training: at once (transfer), and
         later.
         """
-        learnt = self._experiment.plan.protocol.task.learnt
+        learnt = self._experiment.plan.protocol.task.learning_measure
         means = dict[str, Any]()
         for phase in ("before", "after", "retention"):
             if rows := [row for row in self.learning_rows if row.get("phase") == phase]:
@@ -420,7 +420,7 @@ class ExperimentAnalysis(Result):
             figures[COMPLETION] = draw_times(self.rows, self._limit_s, unit=self.unit)
         if len({row["trial"] for row in self.learning_rows}) > 1:
             protocol = self._experiment.plan.protocol
-            learnt = "difference" if protocol.staircase else protocol.task.learnt
+            learnt = "difference" if protocol.staircase else protocol.task.learning_measure
             limit_s = self._limit_s if self._is_censored(learnt) else None
             figures["learning"] = draw_learning(
                 self.learning_rows, learnt, unit=self.unit, limit_s=limit_s

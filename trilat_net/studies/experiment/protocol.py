@@ -340,8 +340,8 @@ class ExperimentPlan(Result):
         protocol = self.protocol
         facts = self.to_dict()
         whose = "pairs" if len(protocol.users) > 1 else "participants"
-        yield f"{protocol.name}: {protocol.title or protocol.task.words}"
-        yield f"{facts['groups']} {whose} at {', '.join(protocol.users)}, {protocol.task.words}"
+        yield f"{protocol.name}: {protocol.title or protocol.task.description}"
+        yield f"{facts['groups']} {whose} at {', '.join(protocol.users)}, {protocol.task.description}"
         trials = self.trials[-1].trial - protocol.practice
         each = (
             f"{count_nouns(len(protocol.conditions), 'condition')} of "
@@ -496,7 +496,7 @@ def _prepare(scenario: Scenario, protocol: Protocol) -> Scenario:
                 path=f"sites.{user}.hands",
             )
     slave = scenario.slave
-    if protocol.task.presses and not scenario.sites[slave].environment:
+    if protocol.task.needs_wall and not scenario.sites[slave].environment:
         raise ScenarioError("there is no wall to press", path=f"sites.{slave}.environment")
     shares = [scenario.dominance[slave].get(user, 0.0) for user in protocol.users]
     if (protocol.training is not None or protocol.task.needs_pair) and min(shares) <= 0.0:

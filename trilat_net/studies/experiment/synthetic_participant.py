@@ -114,11 +114,13 @@ class SyntheticParticipant:
         self._seen = seen
         if moved > 0.02 * self._goal.width_m:
             self._still_s = now.t_s
-        if not self._goal.leads(now.t_s, self._user):  # goes along
+        if not self._goal.has_authority(now.t_s, self._user):  # goes along
             self._from = self._to = now.pose
             return now.pose
-        target = self._goal.place(now.t_s - self._model.reaction_s, self._user)[: self._size]
-        if self._goal.moves:
+        target = self._goal.find_target_m(now.t_s - self._model.reaction_s, self._user)[
+            : self._size
+        ]
+        if self._goal.is_moving:
             return self._follow(now, target - seen, slave.age_s)
         if (
             self._goal.force_n
@@ -138,7 +140,7 @@ class SyntheticParticipant:
         a wall.
         """
         felt_n = self._find_force_n(slave.q, slave.tau_x)
-        towards = (self._goal.place(t_s) - self._goal.start_m)[: self._size]
+        towards = (self._goal.find_target_m(t_s) - self._goal.start_m)[: self._size]
         way: Array = towards * (self._goal.width_m / np.linalg.norm(towards))
         return way * (1.0 - felt_n / self._goal.force_n) if felt_n else 0.0 * way
 

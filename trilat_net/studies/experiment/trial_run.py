@@ -1,9 +1,10 @@
-"""One trial: its scenario, how it is judged record by record, what its log says; and synthetic
-participants.
+"""One trial: its scenario, its judgement record by record, and the results of its log.
 
-Invariant: what counts is a function of the log, whoever took part. It is executed again, and
-judged by every record of the slave in it. A synthetic trial is run twice by the same numbers:
-compiled, to find when it ends, and into its log, which then lasts just that long.
+Invariant:
+    - The result of a trial is a function of its log, for people and for synthetic participants
+      alike. The log is executed again, and judged by every record of the slave in it.
+    - A trial of synthetic participants is run twice with the same numbers: compiled, to find
+      its end, and then into its log, which lasts just that long.
 """
 
 import hashlib
@@ -37,26 +38,26 @@ from .protocol import PlannedTrial, Protocol, limit_forces
 from .synthetic_participant import SyntheticParticipant
 from .tasks import Outcome, TrialGoal
 
-EVERY = 5
-"""Of the slave's records one in so many is measured."""
+RECORD_STEP = 5
+"""Every fifth record of the slave is measured."""
 HAND_HZ = 50
+"""Rate at which a synthetic participant acts, 1/s."""
 HAND_DELAY_S = 0.02
+"""Time from the decision of a synthetic participant to its effect on the arm, s."""
 REST_S = 0.1
-"""How often a synthetic participant acts; time from what it decides to what its arm does; after
-the end.
-"""
+"""Time after the end of a trial that its log still has, s."""
 
 
 class TrialEntry(msgspec.Struct, frozen=True):
-    """A trial that is done, in the journal.
+    """A finished trial in the journal.
 
     Attributes:
-        cell: its number.
+        cell: the number of the trial.
         seed: its seed.
-        sha256: digest of its log.
-        succeeded: whether its task was done.
-        measures: by name, units in the names.
-        people: whether people made it, and no models of them.
+        sha256: the digest of its log.
+        succeeded: whether the task was done.
+        measures: the measures by name, with units in the names.
+        people: False for synthetic participants.
     """
 
     cell: int
@@ -71,8 +72,8 @@ class TrialJudge:
     """Judges a trial by the records of its slave, one after the other.
 
     Attributes:
-        goal: what is asked.
-        outcome: how it ended; None: it goes on.
+        goal: the goal of the trial.
+        outcome: how the trial has ended; None while it goes on.
     """
 
     def __init__(self, trial: "ExperimentTrial") -> None:
@@ -80,27 +81,35 @@ class TrialJudge:
         self._trial = trial
         self.outcome: Outcome | None = None
 
-    def take(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
-        """Takes in angles and exogenous torques of a record; returns the outcome, once there is
-        one.
+    def accept(self, t_s: float, q: Sequence[float], tau_x: Sequence[float]) -> Outcome | None:
+        """Judges a record of the slave; returns the outcome once the trial has ended.
+
+        Args:
+            t_s: time since the epoch, s.
+            q: joint coordinates, rad or m.
+            tau_x: exogenous torques, N m or N.
         """
         if self.outcome is None:
             force_n = self._trial.find_force_n(q, tau_x) if self.goal.force_n else 0.0
-            self.outcome = self.goal.judge(
-                t_s, np.array(self._trial.arm.end_effector(q)), force_n
-            )
+            position_m = np.array(self._trial.arm.end_effector(q))
+            self.outcome = self.goal.judge(t_s, position_m, force_n)
         return self.outcome
 
 
 class ExperimentTrial:
-    """A trial of the plan, of people.
+    """A trial of the plan with people.
+
+    Args:
+        protocol: the protocol of the experiment.
+        scenario: the scenario of the trial's condition.
+        planned: the trial in the plan.
+        digest: the digest of the plan.
 
     Attributes:
-        people: whether they are people, and no models of them.
-        planned: its place in the plan.
-        slave, arm: the site whose arm it is about, and that arm.
-        scenario: its own, which lasts as long as the trial may.
-        appears_s, longest_s: when its target appears, and when it has ended at the latest, s.
+        people: False for synthetic participants.
+        slave, arm: the site whose arm is moved, and that arm.
+        scenario: the scenario of this trial, which lasts as long as the trial may.
+        appears_s, longest_s: when the target appears, and the latest end of the trial, s.
     """
 
     people = True
@@ -114,169 +123,191 @@ class ExperimentTrial:
         self.arm = scenario.arms[scenario.slave]
         spec = scenario.sites[self.slave]
         self._start_m = np.array(self.arm.end_effector(spec.q0_rad), dtype=np.float64)
-        whose = "" if self.people else "synthetic "
-        about = f"trial {planned.number} of {protocol.name}: {whose}{', '.join(planned.group)}, condition "
-        about += f"{planned.condition}, block {planned.block}, trial {planned.trial}; protocol sha256 {digest}"
-        drawn_s = np.random.default_rng(planned.seed).uniform(*protocol.foreperiod_s)
-        self.appears_s = round(float(drawn_s), 3)
-        scenario = self._share_out(scenario)
+        foreperiod_s = np.random.default_rng(planned.seed).uniform(*protocol.foreperiod_s)
+        self.appears_s = round(float(foreperiod_s), 3)
+        scenario = self._set_authority(scenario)
         self.longest_s = self.appears_s + protocol.task.longest_s + 1.0 / HAND_HZ
-        lasts_s = self.longest_s + REST_S
-        sites = limit_forces(scenario, protocol, planned.group)
+        kind = "" if self.people else "synthetic "
+        about = (
+            f"trial {planned.number} of {protocol.name}: {kind}{', '.join(planned.group)}, "
+            f"condition {planned.condition}, block {planned.block}, trial {planned.trial}; "
+            f"protocol sha256 {digest}"
+        )
+        limited_sites = limit_forces(scenario, protocol, planned.group)
         self.scenario = replace(
             scenario,
-            duration_s=lasts_s,
+            duration_s=self.longest_s + REST_S,
             seed=planned.seed,
             about=about,
-            sites={**scenario.sites, **sites},
+            sites={**scenario.sites, **limited_sites},
         )
         self._rows = build_arm_rows(self.scenario, self.slave)
 
-    def _share_out(self, scenario: Scenario) -> Scenario:
-        """Returns a scenario in which users have the authority over the slave that the trial
-        gives them.
+    def _set_authority(self, scenario: Scenario) -> Scenario:
+        """Returns the scenario with the users' authority over the slave as the trial defines it.
+
+        The two users share the sum of their dominance factors; a handover exchanges the parts.
         """
-        row = scenario.dominance[self.slave]
-        (first, *rest) = self.protocol.users
         goal = self.make_goal()
         if goal.lead is None:
             return scenario
-        both = row[first] + row[rest[0]]
-        before, after = (
-            {**row, first: both * lead, rest[0]: both - both * lead}
-            for lead in (goal.lead, 1.0 - goal.lead)
-        )
-        dominance = {**scenario.dominance, self.slave: before}
+        row = scenario.dominance[self.slave]
+        first, second = self.protocol.users
+        sum_of_shares = row[first] + row[second]
+
+        def divide(lead: float) -> dict[str, float]:
+            first_share = sum_of_shares * lead
+            return {**row, first: first_share, second: sum_of_shares - first_share}
+
+        dominance = {**scenario.dominance, self.slave: divide(goal.lead)}
         timeline = scenario.timeline
         if goal.handover is not None:
-            at_s = self.appears_s + goal.handover[0]
-            ramp_s = goal.handover[1]
-            timeline = (*timeline, Change(at_s, dominance=self.slave, to=after, ramp_s=ramp_s))
+            after_s, ramp_s = goal.handover
+            handover = Change(
+                self.appears_s + after_s,
+                dominance=self.slave,
+                to=divide(1.0 - goal.lead),
+                ramp_s=ramp_s,
+            )
+            timeline = (*timeline, handover)
         return replace(scenario, dominance=dominance, timeline=timeline)
 
     def find_force_n(self, q: Sequence[float], tau_x: Sequence[float]) -> float:
-        """Returns the magnitude of what presses on the slave's end effector, N."""
+        """Returns the magnitude of the external force on the slave's end effector, N."""
         return float(self._find_forces_n(np.array([q]), np.array([tau_x]))[0])
 
     def _find_forces_n(self, q: Array, tau_x: Array) -> Array:
-        """Returns the same of K records, shape (K,)."""
-        force_n: Array = np.linalg.norm(self._place(q).find_force(tau_x), axis=1)
+        """Returns the magnitude of that force for K records, shape (K,), N."""
+        force_n: Array = np.linalg.norm(self._locate_end_effector(q).find_force(tau_x), axis=1)
         return force_n
 
-    def _place(self, q: Array) -> EndEffectorRows:
+    def _locate_end_effector(self, q: Array) -> EndEffectorRows:
         return self._rows.place_end_effector(q, 0.0 * q)
 
     def make_goal(self) -> TrialGoal:
-        """Returns what is asked."""
+        """Returns the goal of the trial."""
         planned = self.planned
-        goal = self.protocol.task.begin(self._start_m, planned.target, planned.seed)
+        goal = self.protocol.task.make_goal(self._start_m, planned.target, planned.seed)
         goal.appears_s = self.appears_s
         goal.lead = planned.lead if goal.lead is None else goal.lead
         return goal
 
     def settle(self, path: Path) -> TrialEntry:
-        """Executes its log again and returns what that says of the trial.
+        """Executes the log of the trial again, and returns the trial's result.
 
         Raises:
-            LogError: its records are not those of a run, or they end before the trial does.
+            LogError: the records are not those of a run, or they end before the trial does.
         """
         log = open_log(path)
         if not verify(log).passed:
             raise LogError(f"{path}: its records are not those of the run")
-        if (outcome := self._judge(log)) is None:
+        outcome = self._judge_log(log)
+        if outcome is None:
             raise LogError(f"{path}: ends before its trial does")
-        of_log = digest_file(path), outcome.succeeded, self._measure(log, outcome)
-        return TrialEntry(self.planned.number, self.planned.seed, *of_log, self.people)
+        return TrialEntry(
+            cell=self.planned.number,
+            seed=self.planned.seed,
+            sha256=digest_file(path),
+            succeeded=outcome.succeeded,
+            measures=self._measure(log, outcome),
+            people=self.people,
+        )
 
-    def _judge(self, log: Log) -> Outcome | None:
+    def _judge_log(self, log: Log) -> Outcome | None:
+        """Returns the outcome of the trial in a log; None if the log ends before the trial."""
         judge = TrialJudge(self)
         part = log[self.slave]
-        for moment in zip(part.t_s.tolist(), part.q.tolist(), part.tau_x.tolist(), strict=True):
-            if (outcome := judge.take(*moment)) is not None:
+        columns = zip(part.t_s.tolist(), part.q.tolist(), part.tau_x.tolist(), strict=True)
+        for t_s, q, tau_x in columns:
+            outcome = judge.accept(t_s, q, tau_x)
+            if outcome is not None:
                 return outcome
         return None if log.diverged_s is None else Outcome(False, log.diverged_s)
 
     def _measure(self, log: Log, outcome: Outcome) -> dict[str, float]:
-        """Returns the measures of a trial, units in the names."""
-        found = self._measure_motion(log, outcome.ended_s)
+        """Returns the measures of a trial, with units in the names."""
+        measures = self._measure_motion(log, outcome.ended_s)
         aligned = align_records(log)
+        users = self.protocol.users
         forces = list[Array]()
-        for place, user in enumerate(self.protocol.users, 1):
-            own = aligned[user]
-            which = f"_user{place}" if len(self.protocol.users) > 1 else ""
-            split = split_torque(own, log.scenario)
-            until = own.t_s <= outcome.ended_s
-            # of the hand ON its arm
-            forces.append(split.end_effector.find_force(split.operator)[until])
-            force_n = np.linalg.norm(forces[-1], axis=1)
-            found |= {
-                f"force_mean{which}_n": float(force_n.mean()),
-                f"force_peak{which}_n": float(force_n.max()),
-                f"work{which}_j": energy_j(
-                    forces[-1], split.end_effector.speed[until], own.rate_hz
-                ),
-            }
+        for number, user in enumerate(users, 1):
+            records = aligned[user]
+            suffix = f"_user{number}" if len(users) > 1 else ""
+            split = split_torque(records, log.scenario)
+            is_in_trial = records.t_s <= outcome.ended_s
+            # The force of the hand ON its arm, shape (K, 2) or (K, 3).
+            force = split.end_effector.find_force(split.operator)[is_in_trial]
+            forces.append(force)
+            magnitude_n = np.linalg.norm(force, axis=1)
+            velocity = split.end_effector.speed[is_in_trial]
+            measures[f"force_mean{suffix}_n"] = float(magnitude_n.mean())
+            measures[f"force_peak{suffix}_n"] = float(magnitude_n.max())
+            measures[f"work{suffix}_j"] = energy_j(force, velocity, records.rate_hz)
         if len(forces) > 1:
-            found |= self._measure_pair(aligned, forces, outcome.ended_s)
-        age_ms = sample_ages_ns(log, self.slave, self.protocol.users[0]) / 1e6
-        return {**found, "delay_ms": float(age_ms.mean()) if len(age_ms) else 0.0}
+            measures |= self._measure_pair(aligned, forces, outcome.ended_s)
+        age_ms = sample_ages_ns(log, self.slave, users[0]) / 1e6
+        measures["delay_ms"] = float(age_ms.mean()) if len(age_ms) else 0.0
+        return measures
 
-    def _follow(
+    def _measure_path(
         self, part: SiteLog | AlignedRecords, from_s: float, until_s: float
     ) -> tuple[Ints, Array, Array, float]:
-        """Returns which records of the slave are measured, its places and velocities, and their
-        rate, Hz.
+        """Returns the measured records of the slave between two times.
+
+        Returns:
+            The indices of the records; positions, m, and velocities, m/s, of the end effector,
+            shape (K, 2) or (K, 3); and the rate of these samples, 1/s.
         """
-        rows = np.flatnonzero((part.t_s >= from_s) & (part.t_s <= until_s))[::EVERY]
-        places = self._place(part.q[rows]).position
-        rate_hz = part.rate_hz / EVERY
-        return rows, places, np.gradient(places, 1.0 / rate_hz, axis=0), rate_hz
+        rows = np.flatnonzero((part.t_s >= from_s) & (part.t_s <= until_s))[::RECORD_STEP]
+        positions = self._locate_end_effector(part.q[rows]).position
+        rate_hz = part.rate_hz / RECORD_STEP
+        return rows, positions, np.gradient(positions, 1.0 / rate_hz, axis=0), rate_hz
 
     def _measure_pair(
         self, aligned: Mapping[str, AlignedRecords], forces: Sequence[Array], ended_s: float
     ) -> dict[str, float]:
-        """Returns what two users do to the slave, as if each pushed at its end effector."""
+        """Returns the measures of two users, as if each pushed at the slave's end effector."""
         slave = aligned[self.slave]
-        rows, _, moves, rate_hz = self._follow(slave, 0.0, ended_s)
+        rows, _, velocities, rate_hz = self._measure_path(slave, 0.0, ended_s)
         t_s = slave.t_s[rows]
-        one, other = (
-            np.column_stack(
-                [np.interp(t_s, aligned[user].t_s[: len(force)], axis) for axis in force.T]
-            )
-            for user, force in zip(self.protocol.users, forces, strict=True)
-        )
-        found = measure_pair(one, other, moves, rate_hz)
-        return {name: value for name, value in found._asdict().items() if value is not None}
+
+        def interpolate(user: str, force: Array) -> Array:
+            force_t_s = aligned[user].t_s[: len(force)]
+            return np.column_stack([np.interp(t_s, force_t_s, axis) for axis in force.T])
+
+        first, second = map(interpolate, self.protocol.users, forces)
+        measures = measure_pair(first, second, velocities, rate_hz)._asdict()
+        return {name: value for name, value in measures.items() if value is not None}
 
     def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
-        """Returns what the slave did from when the target appears until the trial ends."""
+        """Returns the measures of the slave's motion, from the target's appearance to the end."""
         goal = self.make_goal()
         part = log[self.slave]
-        rows, places, moves, rate_hz = self._follow(part, goal.appears_s, ended_s)
+        rows, positions, velocities, rate_hz = self._measure_path(part, goal.appears_s, ended_s)
         t_s = part.t_s[rows]
-        speed = np.linalg.norm(moves, axis=1)
-        wanted = np.array([goal.place(t) for t in t_s])
-        apart_m = np.linalg.norm(places - wanted, axis=1)
-        smooth = sparc(speed, rate_hz)
-        force_n = (
-            self._find_forces_n(part.q[rows], part.tau_x[rows]) if goal.force_n else 0.0 * t_s
-        )
-        ends = {"start": goal.start_m, "target": wanted[-1], "end": places[-1]}
-        return {
+        speed = np.linalg.norm(velocities, axis=1)
+        targets = np.array([goal.find_target_m(t) for t in t_s])
+        errors_m = np.linalg.norm(positions - targets, axis=1)
+        force_n = 0.0 * t_s
+        if goal.force_n:
+            force_n = self._find_forces_n(part.q[rows], part.tau_x[rows])
+        measures = {
             "completion_s": ended_s - goal.appears_s,
             "movement_s": movement_time_s(speed, rate_hz) or 0.0,
             "reaction_s": float(np.argmax(speed > 0.05 * speed.max())) / rate_hz,
-            "error_end_mm": 1e3 * float(apart_m[-1]),
-            "error_rms_mm": 1e3 * float(np.sqrt(np.mean(apart_m**2))),
-            "path_m": path_length_m(places),
-            **({} if smooth is None else {"sparc": smooth}),
-            **goal.measure(t_s - goal.appears_s, places, force_n),
-            **{
-                f"{name}_{axis}_m": float(x)
-                for name, at in ends.items()
-                for axis, x in zip("xyz", at, strict=False)
-            },
+            "error_end_mm": 1e3 * float(errors_m[-1]),
+            "error_rms_mm": 1e3 * float(np.sqrt(np.mean(errors_m**2))),
+            "path_m": path_length_m(positions),
         }
+        smoothness = sparc(speed, rate_hz)
+        if smoothness is not None:
+            measures["sparc"] = smoothness
+        measures |= goal.measure(t_s - goal.appears_s, positions, force_n)
+        points = {"start": goal.start_m, "target": targets[-1], "end": positions[-1]}
+        for name, point in points.items():
+            for axis, coordinate_m in zip("xyz", point, strict=False):
+                measures[f"{name}_{axis}_m"] = float(coordinate_m)
+        return measures
 
 
 class SyntheticTrial(ExperimentTrial):
@@ -285,39 +316,46 @@ class SyntheticTrial(ExperimentTrial):
     people = False
 
     def _make_players(self, scenario: Scenario) -> dict[str, HandPlayer]:
-        found = dict[str, HandPlayer]()
+        """Returns the synthetic participants of the trial, by the sites that they hold."""
+        players = dict[str, HandPlayer]()
         for user, name in zip(self.protocol.users, self.planned.group, strict=True):
             hand = scenario.sites[user].find_live_hand(is_open=True)
-            assert hand is not None  # see `plan_experiment`
-            at = HandSite(
+            assert hand is not None  # `plan_experiment` has checked it
+            hand_site = HandSite(
                 scenario=scenario, name=user, spec=hand, rate_hz=HAND_HZ, delay_s=HAND_DELAY_S
             )
-            own = int.from_bytes(
-                hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()[:4], "big"
+            digest = hashlib.sha256(f"{self.protocol.seed}/{name}".encode()).digest()
+            participant_seed = int.from_bytes(digest[:4], "big")
+            participant = SyntheticParticipant(
+                facts=hand_site.describe(),
+                model=self.protocol.model.draw(participant_seed),
+                goal=self.make_goal(),
+                slave=(self.slave, self.arm, self.find_force_n),
+                before=self.planned.before,
+                seed=self.planned.seed,
+                user=len(players),
             )
-            model = self.protocol.model.draw(own)
-            slave = (self.slave, self.arm, self.find_force_n)
-            mine = (self.make_goal(), slave, self.planned.before, self.planned.seed, len(found))
-            act = SyntheticParticipant(at.describe(), model, *mine)
-            found[user] = HandPlayer(at, act)
-        return found
+            players[user] = HandPlayer(hand_site, participant)
+        return players
 
     def find_end_s(self) -> float:
-        """Runs the trial, compiled, until it ends; returns when that is, s."""
+        """Runs the trial, compiled, until it ends; returns its end, s since the epoch."""
         scenario = self.scenario
         judge = TrialJudge(self)
-        site = self.slave
-        kept = scenario.sites[site].rate_hz // HAND_HZ + 1
-        run = FusedRun(scenario, keep=kept, hands=self._make_players(scenario))
+        slave = self.slave
+        kept_ticks = scenario.sites[slave].rate_hz // HAND_HZ + 1
+        run = FusedRun(scenario, keep=kept_ticks, hands=self._make_players(scenario))
         run.plan([scenario.ticks(name) for name in scenario.names])
-        place = scenario.names.index(site)
-        columns = scenario.layout(site).columns()
+        slave_index = scenario.names.index(slave)
+        columns = scenario.layout(slave).columns()
         for piece in range(math.ceil(self.longest_s * HAND_HZ)):
             run.step_to((piece + 1) * NS_PER_S // HAND_HZ)
-            t_ns, rows = run.pop_records()[place]
-            moments = (rows[:, columns[name]].tolist() for name in ("q", "tau_x"))
-            for moment in zip((t_ns / NS_PER_S).tolist(), *moments, strict=True):
-                judge.take(*moment)
+            t_ns, rows = run.pop_records()[slave_index]
+            times_s = (t_ns / NS_PER_S).tolist()
+            angles = rows[:, columns["q"]].tolist()
+            torques = rows[:, columns["tau_x"]].tolist()
+            for t_s, q, tau_x in zip(times_s, angles, torques, strict=True):
+                judge.accept(t_s, q, tau_x)
             if judge.outcome is not None:
                 return judge.outcome.ended_s
             if run.diverged_s is not None:
@@ -325,20 +363,23 @@ class SyntheticTrial(ExperimentTrial):
         return self.longest_s
 
     def write(self, path: Path) -> TrialEntry:
-        """Runs the trial into its log, and returns what that says."""
-        lasts = replace(self.scenario, duration_s=self.find_end_s() + REST_S)
-        hands = {name: player.track for name, player in self._make_players(lasts).items()}
-        record_virtual(lasts, path, force=True, views_hz=0.0, hands=hands)
+        """Runs the trial into its log, and returns its result."""
+        scenario = replace(self.scenario, duration_s=self.find_end_s() + REST_S)
+        hands = {name: player.track for name, player in self._make_players(scenario).items()}
+        record_virtual(scenario, path, force=True, views_hz=0.0, hands=hands)
         return self.settle(path)
 
 
 def run_trial(task: tuple[Protocol, str, PlannedTrial, str, Path]) -> TrialEntry:
-    """Runs a trial, by the text of its scenario, and keeps its log.
+    """Runs a trial of synthetic participants, and keeps its log.
+
+    Args:
+        task: the protocol, the text of the scenario, the planned trial, the digest of the
+            plan, and the folder of the log.
 
     Raises:
         LogError: the log is not that of its run.
     """
     protocol, text, planned, digest, folder = task
-    return SyntheticTrial(protocol, parse_scenario(text), planned, digest).write(
-        folder / planned.file
-    )
+    trial = SyntheticTrial(protocol, parse_scenario(text), planned, digest)
+    return trial.write(folder / planned.file)
