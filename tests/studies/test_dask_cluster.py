@@ -21,7 +21,7 @@ from trilat_net.studies import dask_cluster
 from trilat_net.studies.dask_cluster import (
     WorkerRequirements,
     describe_worker,
-    find_unfit_workers,
+    explain_unfit_worker,
 )
 from trilat_net.studies.executor import open_worker_pool
 from trilat_net.studies.sweep import prepare_sweep_folder, run_sweep
@@ -214,12 +214,12 @@ def test_a_worker_without_the_file_of_a_law_is_refused(
 
 def test_what_differs_is_named_on_both_sides() -> None:
     here = describe_worker()
-    assert find_unfit_workers(WorkerRequirements(here), here, []) == ""
+    assert explain_unfit_worker(WorkerRequirements(here), here, []) == ""
     for name in ("trilat-net", "arithmetic", "Python", "numpy", "numba", "scipy"):
-        text = find_unfit_workers(WorkerRequirements(here), {**here, name: "other"}, [])
+        text = explain_unfit_worker(WorkerRequirements(here), {**here, name: "other"}, [])
         assert f"has {name} other, and here is {name} {here[name]}" in text
-    assert find_unfit_workers(WorkerRequirements(here), {**here, "commit": "other"}, []) == ""
-    assert "a.b:Law" in find_unfit_workers(WorkerRequirements(here), here, ["a.b:Law"])
+    assert explain_unfit_worker(WorkerRequirements(here), {**here, "commit": "other"}, []) == ""
+    assert "a.b:Law" in explain_unfit_worker(WorkerRequirements(here), here, ["a.b:Law"])
 
 
 @pytest.mark.long

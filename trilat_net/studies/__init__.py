@@ -1,6 +1,6 @@
-"""Studies of many runs: trials against expectations, sweeps over a plane of keys, and tuning of
-control laws.
+"""Studies of many runs: trials, sweeps, tuning, benchmarks, experiments with people.
 
-Invariant: a study is a function of its plan; the number of worker processes and the order in
-which they finish enter no result.
+Invariant:
+    - A study is a function of its plan: the number of worker processes and the order in which
+      they finish do not change any result.
 """

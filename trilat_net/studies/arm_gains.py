@@ -1,4 +1,4 @@
-"""The largest gains for an arm over a delay: an edge along a ray of gains, confirmed by runs.
+"""The largest gains for an arm over a delay: an edge along a ray, confirmed by runs.
 
     K = k m,    d + Kd = 2 zeta sqrt(k) m
 

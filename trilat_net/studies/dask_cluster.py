@@ -1,9 +1,12 @@
 """A Dask cluster that runs the items of a study.
 
-Invariant: an item runs only on a worker with the same program, the same arithmetic and the same
-versions of what computes. Workers are asked before anything is sent, and each checks itself
-before every batch, so one that joins later is held to the same. A user's control law is not
-sent along: its hash covers one file, and that file may import others; the worker must have it.
+Workers are checked before any item is sent. Each worker also checks itself before every batch,
+so that a worker that joins later meets the same requirements. A user's control law is not sent
+to workers: its hash covers one file, and that file may import others. The worker must have it.
+
+Invariant:
+    - An item runs only on a worker with the same program, the same arithmetic and the same
+      versions of the computing packages.
 """
 
 import hashlib
@@ -25,23 +28,24 @@ from ..scenario.code_consent import ImportedCode
 from ..scenario.imported_code import read_code
 
 CONNECT_S = 10.0
-"""A scheduler that does not answer within this time, or has no worker by then, is given up."""
+"""Longest wait for the answer of a scheduler and for its first worker, s."""
 NO_WORKER_S = 60.0
-"""A cluster that has lost its last worker may take this long to find another."""
+"""Longest time that a cluster may be without a worker, s."""
 _PACKAGES = ("numpy", "numba", "scipy")
 
 
-def _distributed() -> Any:
+def _import_distributed() -> Any:
+    """Returns the package `distributed`."""
     return import_extra("distributed", "cluster", "clusters")
 
 
 WorkerIdentity = Mapping[str, str]
-"""Per name of a property its text: program, sources, commit, arithmetic, Python, packages."""
+"""Text of each property: program, sources, commit, arithmetic, Python, packages."""
 
 
 @cache
 def describe_worker() -> WorkerIdentity:
-    """Returns all of this process that results depend on, besides the items."""
+    """Returns the properties of this process on which results depend."""
     root = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     for file in sorted(root.rglob("*.py")):
@@ -58,60 +62,86 @@ def describe_worker() -> WorkerIdentity:
 
 
 class WorkerRequirements(NamedTuple):
-    """What a worker must have: an identity, and the files of laws by (code, sha256)."""
+    """The requirements on a worker.
+
+    Attributes:
+        identity: the properties of the worker.
+        laws: the code and the SHA-256 of the file of each imported law.
+    """
 
     identity: WorkerIdentity
     laws: tuple[tuple[str, str], ...] = ()
 
 
-def find_unfit_workers(
+def explain_unfit_worker(
     required: WorkerRequirements, identity: WorkerIdentity, lacks: Sequence[str]
 ) -> str:
-    """Returns why a worker is refused, or ""."""
-    here = required.identity
-    named = [name for name in here if name != "commit" and identity.get(name) != here[name]]
-    if named:
-        named += ["commit"] if "source files" in named else []
-        there, own = (
-            ", ".join(f"{name} {one.get(name, 'unknown')}" for name in named)
-            for one in (identity, here)
+    """Returns the reason why a worker is refused, or "".
+
+    Args:
+        required: the requirements.
+        identity: the properties of the worker.
+        lacks: imported laws whose file the worker lacks.
+    """
+    local = required.identity
+    differing = [
+        name for name in local if name != "commit" and identity.get(name) != local[name]
+    ]
+    if differing:
+        if "source files" in differing:
+            differing.append("commit")
+        remote_text = _list_properties(identity, differing)
+        local_text = _list_properties(local, differing)
+        return f"has {remote_text}, and here is {local_text}; results are not mixed"
+    if lacks:
+        return (
+            f"lacks the control law {', '.join(lacks)}, or has another file of it: "
+            "put the file that the scenario names into the worker's folder or PYTHONPATH"
         )
-        return f"has {there}, and here is {own}; results are not mixed"
-    remedy = "put the file that the scenario names into the worker's folder or PYTHONPATH"
-    return (
-        f"lacks the control law {', '.join(lacks)}, or has another file of it: {remedy}"
-        if lacks
-        else ""
-    )
+    return ""
+
+
+def _list_properties(identity: WorkerIdentity, names: Sequence[str]) -> str:
+    """Returns properties of a worker as a text."""
+    return ", ".join(f"{name} {identity.get(name, 'unknown')}" for name in names)
 
 
 def find_missing_laws(laws: Sequence[tuple[str, str]]) -> list[str]:
-    """Returns the laws whose file this process has not, or not with that hash."""
+    """Returns the laws whose file this process lacks, or has with another hash.
+
+    Args:
+        laws: the code and the SHA-256 of the file of each law.
+    """
     missing = []
     for code, sha256 in laws:
         try:
-            found = read_code(code, "control.law").sha256
+            local_sha256 = read_code(code, "control.law").sha256
         except ScenarioError:
-            found = ""
-        if found != sha256:
+            local_sha256 = ""
+        if local_sha256 != sha256:
             missing.append(code)
     return missing
 
 
 def check_this_worker(required: WorkerRequirements) -> None:
-    """Refuses to work in a process that is not as required.
+    """Checks that this process meets the requirements.
 
     Raises:
-        UsageError: it is not; names the worker and both sides.
+        UsageError: it does not; the text names the worker and the differences.
     """
-    why = find_unfit_workers(required, describe_worker(), find_missing_laws(required.laws))
-    if why:
-        raise UsageError(f"the worker {_distributed().get_worker().address} {why}")
+    reason = explain_unfit_worker(required, describe_worker(), find_missing_laws(required.laws))
+    if reason:
+        worker = _import_distributed().get_worker()
+        raise UsageError(f"the worker {worker.address} {reason}")
 
 
 def _make_probe() -> Callable[
     [Sequence[tuple[str, str]]], tuple[WorkerIdentity, Sequence[str]]
 ]:
+    """Returns a function that describes the process in which it is called.
+
+    It is nested so that Dask sends its code: the worker may lack this module.
+    """
 
     def probe(laws: Sequence[tuple[str, str]]) -> tuple[WorkerIdentity, Sequence[str]]:
         try:
@@ -124,8 +154,10 @@ def _make_probe() -> Callable[
 
 
 class DaskCluster:
-    """A connection to a Dask scheduler; a context, which closes it and cancels what is under
-    way.
+    """A connection to a Dask scheduler; a context manager that closes it, with its items.
+
+    Args:
+        address: address of the scheduler, as "tcp://HOST:PORT".
 
     Raises:
         UsageError: Dask is not installed, the scheduler does not answer, or it has no worker.
@@ -134,10 +166,10 @@ class DaskCluster:
     def __init__(self, address: str) -> None:
         self.address = address
         self._clock = SystemClock()
-        self._alone_ns = -1
+        self._last_worker_ns = -1
         try:
             check_hosts([address])
-            self._client = _distributed().Client(
+            self._client = _import_distributed().Client(
                 address, timeout=CONNECT_S, set_as_default=False
             )
         except UnknownHost as unknown:
@@ -155,79 +187,80 @@ class DaskCluster:
 
     @property
     def executor(self) -> Executor:
-        """Runs a function on some worker."""
+        """Executor that runs functions on the workers."""
         executor: Executor = self._client.get_executor(pure=False)
         return executor
 
     @property
     def workers(self) -> int:
-        """How many items its workers run at the same time."""
-        return sum(
-            worker["nthreads"] for worker in self._client.scheduler_info()["workers"].values()
-        )
+        """Number of items that the workers run at the same time."""
+        workers = self._client.scheduler_info()["workers"]
+        return sum(worker["nthreads"] for worker in workers.values())
 
     def require(self, laws: Sequence[ImportedCode]) -> WorkerRequirements:
-        """Returns what every worker must have, and checks those that are there.
+        """Returns the requirements on every worker, and checks the present workers.
+
+        Args:
+            laws: imported laws that the items need.
 
         Raises:
-            UsageError: there is none within some seconds, or one has it not.
+            UsageError: there is no worker within `CONNECT_S`, or a worker is refused.
         """
         try:
             self._client.wait_for_workers(1, timeout=CONNECT_S)
         except TimeoutError:
             raise UsageError(
-                f"--on {self.address}: the scheduler has no worker; start some with: dask worker "
-                f"{self.address}"
+                f"--on {self.address}: the scheduler has no worker; "
+                f"start some with: dask worker {self.address}"
             ) from None
         files = tuple(dict.fromkeys((law.code, law.source_sha256) for law in laws))
         required = WorkerRequirements(describe_worker(), files)
+        # asked of Dask itself first: code cannot be sent between versions of Python
         python = required.identity["Python"]
-        versions = self._client.get_versions()["workers"]
-        for (
-            worker,
-            found,
-        ) in versions.items():  # by Dask itself: code crosses no two versions of Python
-            there = ".".join(str(found["host"]["python"]).split(".")[:2])
-            if there != python:
+        for worker, versions in self._client.get_versions()["workers"].items():
+            worker_python = ".".join(str(versions["host"]["python"]).split(".")[:2])
+            if worker_python != python:
                 raise UsageError(
-                    f"the worker {worker} has Python {there}, and here is Python {python}"
+                    f"the worker {worker} has Python {worker_python}, "
+                    f"and here is Python {python}"
                 )
-        for worker, answer in self._client.run(_make_probe(), files, on_error="return").items():
+        answers = self._client.run(_make_probe(), files, on_error="return")
+        for worker, answer in answers.items():
             if isinstance(answer, BaseException):
-                raise UsageError(
-                    f"the worker {worker} cannot be asked for its version: {answer}"
-                )
-            if why := find_unfit_workers(required, *answer):
-                raise UsageError(f"the worker {worker} {why}")
+                raise UsageError(f"the worker {worker} does not report its version: {answer}")
+            identity, missing_laws = answer
+            reason = explain_unfit_worker(required, identity, missing_laws)
+            if reason:
+                raise UsageError(f"the worker {worker} {reason}")
         return required
 
     def check_alive(self) -> None:
-        """Gives up a cluster that is gone, or has been without a worker for `NO_WORKER_S`.
+        """Checks that the cluster still works.
 
         Raises:
-            RunFailed: it is.
+            RunFailed: the scheduler is gone, or has been without a worker for `NO_WORKER_S`.
         """
         try:
             workers = self.workers
         except (OSError, TimeoutError) as error:
             raise RunFailed(f"the scheduler at {self.address} is gone: {error}") from None
         now_ns = self._clock.monotonic_ns()
-        if workers or self._alone_ns < 0:
-            self._alone_ns = now_ns
-        elif now_ns - self._alone_ns > NO_WORKER_S * 1e9:
+        if workers or self._last_worker_ns < 0:
+            self._last_worker_ns = now_ns
+        elif now_ns - self._last_worker_ns > NO_WORKER_S * 1e9:
             raise RunFailed(
                 f"the cluster at {self.address} has had no worker for {NO_WORKER_S:g} s"
             )
 
     def is_worker_loss(self, error: BaseException) -> bool:
-        """Returns whether an item's workers died.
+        """True if an error says that the workers of an item died.
 
         Raises:
-            RunFailed: the scheduler is gone, or a worker cannot take items.
+            RunFailed: the scheduler is gone, or a worker cannot receive items.
         """
-        if isinstance(error, _distributed().KilledWorker):
+        if isinstance(error, _import_distributed().KilledWorker):
             return True
         if isinstance(error, UsageError):
             return False
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise RunFailed(f"the cluster at {self.address} cannot go on: {reason}") from None
+        raise RunFailed(f"the cluster at {self.address} cannot continue: {reason}") from None

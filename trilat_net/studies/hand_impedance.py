@@ -1,4 +1,4 @@
-"""Mass, damping and stiffness of the hand at an arm, from a log in which sines move that arm.
+"""Mass, damping and stiffness of the hand at an arm that sines move, from a log.
 
 Somebody holds the arm of a site while an operator of kind `multisine`, at any site, moves it.
 The force of the hand and the position follow the sines; the person's own movements do not. At

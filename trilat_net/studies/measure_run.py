@@ -380,7 +380,7 @@ class SiteStats:
 
 
 class LinkAge(msgspec.Struct, frozen=True):
-    """Age of the sample in use on one link, over the receiver's ticks from the first sample on.
+    """Age of the sample in use on one link, over the ticks from the first sample on.
 
     Attributes:
         mean_ms: the mean age; None without a sample.

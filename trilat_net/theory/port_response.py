@@ -16,7 +16,7 @@ control architectures", ICRA (2000); the ratio is our own measure (docs/ports.md
 Invariant:
     - Torque is ON the joint: torque times velocity is the power that the operator puts in.
     - A law that reflects force reflects the torque of a clamp like any torque on the joint.
-    - Frequencies are rad/s; those shown to people are Hz, and their names end in `_hz`.
+    - Frequencies are rad/s; those shown to people are Hz, and their names end in _hz.
 """
 
 import math

@@ -404,7 +404,7 @@ def relative_rotation_vector(other: Numbers, R: Numbers) -> Numbers:
     return vector_from_rotation(np.einsum("ab...,cb...->ac...", R, other))
 
 
-def evaluate_reference(shares: Array, own: Numbers, shared: Sequence[Numbers]) -> Numbers:
+def evaluate_reference(shares: Array, site_pose: Numbers, shared: Sequence[Numbers]) -> Numbers:
     """Returns the pose that a site follows, in the coordinates of its shared pose, Eq. (6).
 
     The position is the mean of the peers' positions, weighted with the dominance factors. The
@@ -412,23 +412,23 @@ def evaluate_reference(shares: Array, own: Numbers, shared: Sequence[Numbers]) -
 
     Args:
         shares: row of the dominance matrix, shape (N,).
-        own: the shared pose of the site itself, shape (m, ...).
+        site_pose: the shared pose of the site itself, shape (m, ...).
         shared: the shared pose of each site, shape (m, ...).
     """
     followed = [
         (share, pose) for share, pose in zip(shares.tolist(), shared, strict=True) if share
     ]
     position = sum(share * pose[:POSITION] for share, pose in followed)
-    if len(own) == POSITION:
+    if len(site_pose) == POSITION:
         return np.asarray(position)
-    R = rotation_from_vector(own[POSITION:])
+    R = rotation_from_vector(site_pose[POSITION:])
     difference = sum(
         share * relative_rotation_vector(rotation_from_vector(pose[POSITION:]), R)
         for share, pose in followed
     )
     reference = _multiply(rotation_from_vector(-np.asarray(difference)), R)
-    # zero times the own pose gives the position the same number of columns
-    columns = np.asarray(position) + 0.0 * own[:POSITION]
+    # zero times the site's pose gives the position the same number of columns
+    columns = np.asarray(position) + 0.0 * site_pose[:POSITION]
     return np.concatenate([columns, vector_from_rotation(reference)])
 
 
