@@ -28,8 +28,8 @@ from .characteristic_roots import limit_blas_threads
 from .numeric_law import NumericLaw
 from .operating_point import Equilibrium, OperatingConditions, derive_operating_conditions
 from .site_dynamics import (
+    compute_following,
     describe_switching_points,
-    follow_peers,
     has_estimate,
     lay_out_arguments,
     place_arm,
@@ -192,7 +192,7 @@ def _refuse_singular_poses(conditions: OperatingConditions, rest: Equilibrium) -
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
         arm = place_arm(site, x[lay_out_arguments(site).q])
-        if not follow_peers(site, arm, x).least > SINGULAR:
+        if not compute_following(site, arm, x).least > SINGULAR:
             raise ScenarioError(
                 "rests in a singular pose, where the inverse of its Jacobian, and so the loop, "
                 "has no derivative: end it elsewhere, or follow fewer axes",
@@ -433,7 +433,7 @@ def reach_pose(site: SiteSetup, pose: Array) -> Array:
         x = np.zeros(layout.arguments)
         x[layout.q] = q
         x[layout.q_des] = pose
-        following = follow_peers(site, place_arm(site, q), x)
+        following = compute_following(site, place_arm(site, q), x)
         if np.abs(following.e).max() <= _NEWTON_RESIDUAL:
             return q
         assert following.J is not None
@@ -524,7 +524,7 @@ def _describe_limits(conditions: OperatingConditions, rest: Equilibrium) -> Iter
     arguments = linear_loop.gather_site_arguments(conditions, rest)
     for site, x in zip(conditions.sites, arguments, strict=True):
         arm = place_arm(site, x[lay_out_arguments(site).q])
-        least = follow_peers(site, arm, x).least ** 0.5
+        least = compute_following(site, arm, x).least ** 0.5
         task = None if site.chain is None else site.chain.task
         if task is not None and least < task.singular_value:
             yield (

@@ -49,7 +49,7 @@ from .port_passivity import (
     llewellyn_rounding,
 )
 from .port_response import QUOTED_AT_HZ, Transparency, measure_transparency
-from .site_dynamics import follow_peers, lay_out_arguments, place_arm
+from .site_dynamics import compute_following, lay_out_arguments, place_arm
 
 
 def freeze_external_torques(
@@ -518,7 +518,7 @@ def move_ports_to_end_effectors(
     for site, x in zip(conditions.sites, arguments, strict=True):
         layout = lay_out_arguments(site)
         followed = list_followed_axes(site)
-        full_J = follow_peers(site, place_arm(site, x[layout.q]), x).J
+        full_J = compute_following(site, place_arm(site, x[layout.q]), x).J
         assert full_J is not None
         J: Array = full_J[[n - 1 for n in followed]]
         N = null_space(J)

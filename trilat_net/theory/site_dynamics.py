@@ -123,7 +123,7 @@ class SiteRates(NamedTuple):
     reflected: Numbers
 
 
-def follow_peers(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers) -> Following:
+def compute_following(site: SiteSetup, arm: PlacedArm | PlacedChain, x: Numbers) -> Following:
     """Returns how a site follows its reference, in joint space or in task space.
 
     Args:
@@ -169,7 +169,7 @@ def evaluate_site_rates(site: SiteSetup, x: Numbers) -> SiteRates:
     layout = lay_out_arguments(site)
     arm = place_arm(site, x[layout.q])
     qd = x[layout.qd]
-    following = follow_peers(site, arm, x)
+    following = compute_following(site, arm, x)
     external = x[layout.external_torque] + _sum_actors(site, arm, x, sampled=False)
     held = _sum_actors(site, arm, x, sampled=True)
     if isinstance(site.law_factory, NumericLaw):
