@@ -1,9 +1,11 @@
-"""An experiment in its folder: a verified log for each trial, journals, and tables in the end.
+"""An experiment in its folder: a verified log for each trial, journals, and tables.
 
-Invariant: a folder belongs to one plan, by its digest. A trial in the journal is never made
-again, and one that was interrupted is made anew, whole: nothing is there twice and nothing is
-lost, wherever it was killed. The tables are a function of the journals. People and synthetic
-participants never share a folder.
+Invariant:
+    - A folder belongs to one plan, by its digest.
+    - A trial in the journal is never run again, and an interrupted trial is run anew as a
+      whole: nothing is stored twice or lost, whenever the process was killed.
+    - The tables are a function of the journals.
+    - People and synthetic participants never share a folder.
 """
 
 import json
@@ -37,16 +39,16 @@ LOGS = "logs"
 
 
 class Note(msgspec.Struct, frozen=True):
-    """What happened with people besides the trials that are done, in a journal of its own.
+    """An event with people that is not a finished trial, in a journal of its own.
 
     Attributes:
-        cell: what it is of, once: a step and a participant, or a trial that was aborted.
+        cell: the unique name of the event: a step and a participant, or an aborted trial.
         kind: "consent", "questionnaire" or "aborted".
-        who: the participant; of a trial all of them.
-        number: of the trial that it is, comes before, or comes after.
-        unix_s: when, by the machine's clock.
-        text: of a questionnaire its name; why a trial was aborted.
-        answers: by item; None for an item that was left out.
+        who: the participant; for a trial all participants.
+        number: the trial that the event belongs to, precedes or follows.
+        unix_s: the time by the machine's clock, s.
+        text: the name of a questionnaire, or why a trial was aborted.
+        answers: the answers by item; None for a missing answer.
     """
 
     cell: str
@@ -60,12 +62,12 @@ class Note(msgspec.Struct, frozen=True):
 
 
 class ExperimentStatus(NamedTuple):
-    """How far an experiment is.
+    """The progress of an experiment.
 
     Attributes:
-        done: trials that are in the journal.
-        total: trials of the plan.
-        next: the first trial that is left; None: all are done.
+        done: number of trials in the journal.
+        total: number of trials of the plan.
+        next: the first trial that is not done; None if all are done.
     """
 
     done: int
@@ -77,9 +79,9 @@ class Experiment(Result):
     """An experiment in its folder.
 
     Attributes:
-        folder: where it is.
-        plan: its protocol and trials.
-        unit: whose a row of its table is: "pair" or "participant".
+        folder: the folder.
+        plan: the protocol and its trials.
+        unit: the subject of a table's row: "pair" or "participant".
     """
 
     def __init__(self, folder: Path, plan: ExperimentPlan) -> None:
@@ -89,18 +91,20 @@ class Experiment(Result):
         self._remedy = build_resume_hint("experiment", "run", str(folder))
 
     def open_trials(self, *, people: bool | None = None) -> RunJournal[TrialEntry]:
-        """Opens the journal of trials, to read it or to go on with people or synthetic
-        participants.
+        """Opens the journal of trials, to read or to continue the experiment.
+
+        Args:
+            people: whether people or synthetic participants continue it; None to read only.
 
         Raises:
-            UsageError: its trials are of the others.
+            UsageError: the finished trials are of the other kind of participants.
         """
         if people is not None and any(
-            one.people != people for one in self.read_entries().values()
+            entry.people != people for entry in self.read_entries().values()
         ):
-            whose = "synthetic participants: go on without" if people else "people: go on with"
+            kind = "synthetic participants: go on without" if people else "people: go on with"
             raise UsageError(
-                f"{self.folder}: its trials are of {whose} --live, or begin another experiment"
+                f"{self.folder}: its trials are of {kind} --live, or begin another experiment"
             )
         return RunJournal(
             self.folder / JOURNAL_FILE, self.plan.digest, TrialEntry, self._remedy
@@ -111,104 +115,126 @@ class Experiment(Result):
         return RunJournal(self.folder / NOTES_FILE, self.plan.digest, Note, self._remedy)
 
     def read_entries(self) -> dict[int, TrialEntry]:
-        """Returns the trials that are done, by number."""
+        """Returns the finished trials, by number."""
         with self.open_trials() as journal:
             return {entry.cell: entry for entry in journal.done.values()}
 
     def read_notes(self) -> list[Note]:
-        """Returns what happened with people besides, in order."""
+        """Returns the notes in order."""
         if not (self.folder / NOTES_FILE).exists():
             return []
         with self.open_notes() as journal:
             return list(journal.done.values())
 
     def list_choices(self) -> Choices:
-        """Returns what was chosen of the pairs of a staircase so far."""
+        """Returns the choices of the pairs of a staircase so far."""
         notes = self.read_notes() if self.plan.protocol.staircase else ()
         chosen = ((note.number, note.answers[CHOICE]) for note in notes if note.text == CHOICE)
         return {number: choice for number, choice in chosen if choice is not None}
 
-    def _choose(self, stairs: Staircase) -> None:
-        """Notes what synthetic participants choose, of all pairs: a function of the plan."""
-        chosen = dict[int, float]()
+    def _draw_choices(self, stairs: Staircase) -> None:
+        """Notes the choices of synthetic participants for all pairs, a function of the plan."""
+        choices = dict[int, float]()
         with self.open_notes() as notes:
             for step in self.plan.list_steps():
                 if step.form is None or step.form.name != CHOICE:
                     continue
-                last = step.planned
-                who = "-".join(step.planned.group)
-                right = self.plan.judge_choices(last, chosen)
-                more = 1 + (last.phase == COMPARISON)
-                choice = stairs.draw_choice(stairs.list_differences(right)[-1], more, last.seed)
-                chosen[last.number] = choice
-                answers: dict[str, float | None] = {CHOICE: choice}
-                notes.add(
-                    Note(f"{step.key} {who}", step.kind, who, last.number, 0.0, CHOICE, answers)
+                second = step.planned
+                right = self.plan.judge_choices(second, choices)
+                difference = stairs.list_differences(right)[-1]
+                comparison = 1 + (second.phase == COMPARISON)
+                choice = stairs.draw_choice(difference, comparison, second.seed)
+                choices[second.number] = choice
+                who = "-".join(second.group)
+                note = Note(
+                    cell=f"{step.key} {who}",
+                    kind=step.kind,
+                    who=who,
+                    number=second.number,
+                    unix_s=0.0,
+                    text=CHOICE,
+                    answers={CHOICE: choice},
                 )
+                notes.add(note)
 
     def status(self) -> ExperimentStatus:
-        """Returns how far it is."""
+        """Returns the progress of the experiment."""
         done = self.read_entries()
-        left = (one for one in self.plan.trials if one.number not in done)
-        return ExperimentStatus(len(done), len(self.plan.trials), next(left, None))
+        remaining = [trial for trial in self.plan.trials if trial.number not in done]
+        next_trial = remaining[0] if remaining else None
+        return ExperimentStatus(len(done), len(self.plan.trials), next_trial)
 
     def run(
         self, jobs: int | None = None, show: Progress = ignore_progress, on: Workers = None
     ) -> "Experiment":
-        """Makes the trials that are left, with synthetic participants, and writes the tables."""
+        """Runs the remaining trials with synthetic participants, and writes the tables.
+
+        Args:
+            jobs: the number of processes; None for one per core.
+            show: called with the numbers of finished and of all trials.
+            on: a Dask scheduler's address or an executor that runs the trials.
+        """
         logs = make_subfolder(self.folder / LOGS)
         plan = self.plan
         with self.open_trials(people=False) as journal:
             if plan.protocol.staircase is not None:
-                self._choose(plan.protocol.staircase)
+                self._draw_choices(plan.protocol.staircase)
             choices = self.list_choices()
             done = {entry.cell for entry in journal.done.values()}
-            left = [one for one in plan.trials if one.number not in done]
-            tasks = [
-                (plan.protocol, plan.find_scenario(one, choices).text, one, plan.digest, logs)
-                for one in left
-            ]
+            tasks = []
+            for trial in plan.trials:
+                if trial.number not in done:
+                    text = plan.find_scenario(trial, choices).text
+                    tasks.append((plan.protocol, text, trial, plan.digest, logs))
             with open_worker_pool(jobs, on, most=len(tasks) or 1, hint=self._remedy) as pool:
                 journal.run_pending(pool, run_trial, tasks, len(done), len(plan.trials), show)
         self.write_tables()
         return self
 
     def to_rows(self) -> list[dict[str, Any]]:
-        """Returns a row for each trial that is done, in the order of the plan."""
+        """Returns a row for each finished trial, in the order of the plan."""
         done = self.read_entries()
         choices = self.list_choices()
-        stairs = self.plan.protocol.staircase
-        return [
-            {
-                "trial_number": planned.number,
-                self.unit: "-".join(planned.group),
-                "condition": planned.condition,
-                "block": planned.block,
-                "trial": planned.trial,
-                "practice": int(planned.practice),
-                **({"phase": planned.phase} if planned.phase else {}),
-                **({} if stairs is None else self._tell_pair(planned, choices)),
-                "catch": int(planned.catch),
-                "people": int(entry.people),
-                "succeeded": int(entry.succeeded),
-                **entry.measures,
-                "log": f"{LOGS}/{planned.file}",
-                "log_sha256": entry.sha256,
-            }
-            for planned in self.plan.trials
-            if (entry := done.get(planned.number)) is not None
-        ]
+        rows = []
+        for planned in self.plan.trials:
+            entry = done.get(planned.number)
+            if entry is not None:
+                rows.append(self._describe_trial(planned, entry, choices))
+        return rows
 
-    def _tell_pair(self, planned: PlannedTrial, choices: Choices) -> dict[str, Any]:
+    def _describe_trial(
+        self, planned: PlannedTrial, entry: TrialEntry, choices: Choices
+    ) -> dict[str, Any]:
+        row: dict[str, Any] = {
+            "trial_number": planned.number,
+            self.unit: "-".join(planned.group),
+            "condition": planned.condition,
+            "block": planned.block,
+            "trial": planned.trial,
+            "practice": int(planned.practice),
+        }
+        if planned.phase:
+            row["phase"] = planned.phase
+        if self.plan.protocol.staircase is not None:
+            row |= self._describe_pair(planned, choices)
+        return {
+            **row,
+            "catch": int(planned.catch),
+            "people": int(entry.people),
+            "succeeded": int(entry.succeeded),
+            **entry.measures,
+            "log": f"{LOGS}/{planned.file}",
+            "log_sha256": entry.sha256,
+        }
+
+    def _describe_pair(self, planned: PlannedTrial, choices: Choices) -> dict[str, Any]:
         if planned.practice:
             return {"difference": None, "right": None}
         difference, right = self.plan.find_pair(planned, choices)
         return {"difference": difference, "right": None if right is None else int(right)}
 
     def list_answers(self) -> list[dict[str, Any]]:
-        """Returns a row for each item that somebody was asked; the value of a missing answer is
-        None.
-        """
+        """Returns a row for each item that was asked; the value of a missing answer is None."""
         return [
             {
                 **row,
@@ -217,56 +243,66 @@ class Experiment(Result):
                 "value": value,
                 "unix_s": note.unix_s,
             }
-            for row, note in self._list_answered()
+            for row, note in self._read_answer_notes()
             for item, value in note.answers.items()
         ]
 
     def list_scores(self) -> list[dict[str, Any]]:
-        """Returns a row for each questionnaire that somebody was asked, with its score by its
-        name.
+        """Returns a row for each answered questionnaire, with its score under its name.
 
         The score is None if an answer is missing.
         """
         forms = {form.name: find_form(form) for form in self.plan.protocol.questionnaires}
         return [
             {**row, note.text: forms[note.text].score(note.answers)}
-            for row, note in self._list_answered()
+            for row, note in self._read_answer_notes()
             if note.text in forms
         ]
 
-    def _list_answered(self) -> Iterator[tuple[dict[str, Any], Note]]:
-        """Yields whose answers of which block there are, and these."""
-        of = {
-            (one.group, one.block): one.condition for one in self.plan.trials if not one.catch
+    def _read_answer_notes(self) -> Iterator[tuple[dict[str, Any], Note]]:
+        """Yields the notes with answers, each with the first columns of its row."""
+        conditions = {
+            (trial.group, trial.block): trial.condition
+            for trial in self.plan.trials
+            if not trial.catch
         }
         for note in self.read_notes():
-            last = self.plan.trials[note.number - 1]
-            row = {self.unit: "-".join(last.group), "participant": note.who}
-            if note.answers:
-                yield (
-                    {**row, "condition": of[last.group, last.block], "block": last.block},
-                    note,
-                )
+            if not note.answers:
+                continue
+            trial = self.plan.trials[note.number - 1]
+            row = {
+                self.unit: "-".join(trial.group),
+                "participant": note.who,
+                "condition": conditions[trial.group, trial.block],
+                "block": trial.block,
+            }
+            yield row, note
 
     def write_tables(self) -> Path:
-        """Writes trials.csv, tidy: a row for each trial, with the digest of its log; returns
-        its path.
+        """Writes trials.csv, with a row for each trial and the digest of its log.
 
-        With people also questionnaires.csv, and events.csv: who agreed, and which trials were
-        aborted.
+        With people it also writes questionnaires.csv, and events.csv with the consents and the
+        aborted trials.
+
+        Returns:
+            The path of trials.csv.
         """
-        happened = [
+        events = [
             {
-                "unix_s": one.unix_s,
-                "event": one.kind,
-                "who": one.who,
-                "trial_number": one.number,
-                "text": one.text,
+                "unix_s": note.unix_s,
+                "event": note.kind,
+                "who": note.who,
+                "trial_number": note.number,
+                "text": note.text,
             }
-            for one in self.read_notes()
+            for note in self.read_notes()
         ]
-        tables = {"questionnaires.csv": self.list_answers(), "events.csv": happened}
-        for name, rows in {TRIALS_FILE: self.to_rows(), **tables}.items():
+        tables = {
+            TRIALS_FILE: self.to_rows(),
+            "questionnaires.csv": self.list_answers(),
+            "events.csv": events,
+        }
+        for name, rows in tables.items():
             if rows or name == TRIALS_FILE:
                 write_whole(
                     self.folder / name, encode_csv(rows), force=True, remedy=self._remedy
@@ -274,7 +310,7 @@ class Experiment(Result):
         return self.folder / TRIALS_FILE
 
     def to_dict(self) -> dict[str, Any]:
-        """Returns its plan and how far it is, as `trilat experiment status --json`."""
+        """Returns the plan and the progress, as `trilat experiment status --json` does."""
         status = self.status()
         protocol = self.plan.protocol
         return {
@@ -288,57 +324,55 @@ class Experiment(Result):
         }
 
     def blocks(self) -> Iterator[Block]:
-        """Yields its text: a row for each condition.
+        """Yields the text of the status, with a row for each condition.
 
-        A trial that was not completed has no completion time: of those there is a median, in
-        which it counts as longer than any.
+        The completion time is a median, in which a trial that was not completed counts as
+        longer than any other.
         """
         status = self.status()
         rows = [row for row in self.to_rows() if not (row["practice"] or row["catch"])]
-        yield (
-            f"{self.plan.protocol.name}: {status.done} of "
-            f"{count_nouns(status.total, 'trial')}, in {self.folder}"
-        )
+        total = count_nouns(status.total, "trial")
+        yield f"{self.plan.protocol.name}: {status.done} of {total}, in {self.folder}"
         table = []
         for condition in self.plan.protocol.conditions:
-            of = [row for row in rows if row["condition"] == condition]
-            if of:
-                completed = sum(map(is_completed, of))
-                means = [sum(row[key] for row in of) / len(of) for key in _SHOWN]
-                counts = str(len(of)), str(completed), _describe_median(of)
+            trials = [row for row in rows if row["condition"] == condition]
+            if trials:
+                completed = sum(map(is_completed, trials))
+                means = [
+                    sum(row[key] for row in trials) / len(trials) for key in _SHOWN_MEASURES
+                ]
+                counts = [str(len(trials)), str(completed), _describe_median(trials)]
                 table.append((condition, *counts, *(f"{mean:.3g}" for mean in means)))
-        heads = ("condition", "trials", "completed", "completion_s, median", *_SHOWN)
+        heads = ("condition", "trials", "completed", "completion_s, median", *_SHOWN_MEASURES)
         yield TextTable(heads, table, align="l" + "r" * (len(heads) - 1))
-        if status.next is not None:
-            yield f"next: trial {status.next.number}, {', '.join(status.next.group)}, {status.next.condition}"
-        yield from (
-            f"trial {note.number}, {note.who}, was aborted and is made again: {note.text}"
-            for note in self.read_notes()
-            if note.kind == "aborted"
-        )
+        if (trial := status.next) is not None:
+            yield f"next: trial {trial.number}, {', '.join(trial.group)}, {trial.condition}"
+        for note in self.read_notes():
+            if note.kind == "aborted":
+                trial_name = f"trial {note.number}, {note.who}"
+                yield f"{trial_name}, was aborted and is made again: {note.text}"
 
 
 def _describe_median(rows: list[dict[str, Any]]) -> str:
-    """Returns the median completion time of trials, s, or that it was not reached."""
+    """Returns the text of the median completion time of trials, s."""
     times_s = [row[COMPLETION] if is_completed(row) else math.inf for row in rows]
     median_s = find_median(times_s)
     return f"{median_s:.3g}" if math.isfinite(median_s) else "not reached"
 
 
-_SHOWN = ("error_end_mm", "error_rms_mm", "path_m", "sparc")
+_SHOWN_MEASURES = ("error_end_mm", "error_rms_mm", "path_m", "sparc")
 
 
 def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False) -> Path:
-    """Writes a protocol with comments, which runs as it is; the command is `trilat experiment
-    new`.
+    """Writes a protocol with comments, ready to run; as `trilat experiment new`.
 
     >>> tn.new_experiment("reaching.toml").name
     'reaching.toml'
 
     Args:
-        file: where it is written.
-        pair: true: of two people who hold a master each; false: of one.
-        force: whether it may replace a file.
+        file: the path of the protocol.
+        pair: whether two people hold a master each; otherwise one person does.
+        force: whether an existing file may be replaced.
 
     Raises:
         UsageError: the file exists.
@@ -353,20 +387,19 @@ def new_experiment(file: str | Path, *, pair: bool = False, force: bool = False)
 
 
 def check_experiment(file: str | Path) -> ExperimentPlan:
-    """Returns the plan of a protocol, if it can be carried out; the command is `trilat
-    experiment check`.
+    """Returns the plan of a protocol, if it can be carried out; as `trilat experiment check`.
 
     >>> len(tn.check_experiment(tn.new_experiment("reaching.toml")).trials)
     240
 
     Raises:
-        UsageError: it cannot; the error names everything that is wrong.
+        UsageError: it cannot be carried out; the error names everything that is wrong.
     """
     return plan_experiment(read_protocol(file), Path(file).parent)
 
 
 def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experiment:
-    """Returns an experiment in a new folder; by default the next free runs/experiment-NAME-N."""
+    """Returns an experiment in a new folder, by default runs/experiment-NAME-N."""
     plan = check_experiment(file)
     folder = make_results_folder(
         None if out is None else Path(out), f"experiment-{plan.protocol.name}", force=None
@@ -381,14 +414,13 @@ def begin_experiment(file: str | Path, out: str | Path | None = None) -> Experim
 
 
 def open_experiment(folder: str | Path) -> Experiment:
-    """Returns the experiment of a folder, as it was planned; the command is `trilat experiment
-    status`.
+    """Returns the experiment of a folder; as `trilat experiment status`.
 
     >>> tn.open_experiment("runs/experiment-reaching-001").status().done  # doctest: +SKIP
     240
 
     Raises:
-        UsageError: there is none, or its plan was changed.
+        UsageError: the folder holds no experiment, or its plan was changed.
     """
     path = Path(folder)
     try:
@@ -417,28 +449,29 @@ def run_experiment(
     on: Workers = None,
     progress: Callable[[int, int], None] = ignore_progress,
 ) -> Experiment:
-    """Runs an experiment with synthetic participants; the command is `trilat experiment run`.
+    """Runs an experiment with synthetic participants; as `trilat experiment run`.
 
-    >>> done = tn.run_experiment(tn.new_experiment("reaching.toml"), "reaching")  # doctest:
-    +SKIP
+    >>> done = tn.run_experiment(tn.new_experiment("reach.toml"), "reach")  # doctest: +SKIP
     >>> done.to_frame().groupby("condition").completion_s.mean()  # doctest: +SKIP
 
     Args:
-        source: the protocol's file, or the folder of an experiment that was begun: it goes on.
+        source: the file of a protocol, or the folder of an experiment to continue.
         out: the folder; by default the next free runs/experiment-NAME-N.
-        jobs: how many processes; None for one per core.
-        on: what runs the trials instead: a Dask scheduler's address or an executor.
-        progress: called with the trials done, and in all.
+        jobs: the number of processes; None for one per core.
+        on: a Dask scheduler's address or an executor that runs the trials.
+        progress: called with the numbers of finished and of all trials.
 
     Raises:
         UsageError: the protocol cannot be carried out, or the folder holds something else.
     """
-    begun = open_experiment(source) if Path(source).is_dir() else begin_experiment(source, out)
-    return begun.run(jobs, progress, on)
+    experiment = (
+        open_experiment(source) if Path(source).is_dir() else begin_experiment(source, out)
+    )
+    return experiment.run(jobs, progress, on)
 
 
 def list_log_problems(experiment: Experiment) -> Iterator[str]:
-    """Yields the trials that are done whose log is missing, or is not the one that they wrote."""
+    """Yields the finished trials whose log is missing or was changed."""
     done = experiment.read_entries()
     for planned in experiment.plan.trials:
         entry = done.get(planned.number)

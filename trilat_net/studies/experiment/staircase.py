@@ -1,13 +1,14 @@
-"""Adaptive staircases: pairs of trials, of which participants say in which one there was more
-of something.
+"""Adaptive staircases: pairs of trials, after each of which the participant compares the two.
 
-In one trial of a pair a key of the scenario has its standard value, in the other one more than
-that; which comes first is drawn. After `down` right answers in a row the difference is divided
-by a factor, after a wrong one multiplied by it (Levitt, 1971). It settles where both are
-equally likely: where the answer is right with probability 0.5^(1 / down), 0.707 for two.
+In one trial of a pair, a key of the scenario has its standard value, in the other a larger one;
+their order is drawn. After `down` right answers in a row the difference is divided by `factor`,
+and after a wrong answer multiplied by it (Levitt, 1971). The difference settles where both are
+equally likely, that is, where the probability of a right answer is 0.5^(1 / down): 0.707 for
+`down` = 2.
 
-Invariant: the differences of a block are a function of the protocol and of the answers to its
-pairs so far.
+Invariant:
+    - The differences of a block are a function of the protocol and of the answers to its pairs
+      so far.
 """
 
 from collections.abc import Sequence
@@ -18,27 +19,26 @@ import numpy as np
 from msgspec import Meta
 
 from ...fields import Frozen, Positive
-from .questionnaires import CHOICE, Questionnaire, Words
+from .questionnaires import CHOICE, Questionnaire, Text
 
 STANDARD = "standard"
 COMPARISON = "comparison"
-SKIPPED = 2
-"""So many reversals come before the difference is about where it settles."""
+SKIPPED_REVERSALS = 2
+"""Number of reversals before the difference is near its final value."""
 
 
 class Staircase(Frozen, frozen=True):
-    """A key of the scenario that is adapted to what a participant can tell, in each condition
-    by itself.
+    """A key of the scenario that is adapted to the participant's perception, in each condition.
 
     Attributes:
-        key: of the scenario.
-        start: the first difference, and the largest, in the key's unit.
-        standard: the value that is compared with.
-        factor: by which the difference changes.
-        down: right answers in a row after which it becomes less.
+        key: the key of the scenario.
+        start: the first difference, which is also the largest, in the key's unit.
+        standard: the value to compare with.
+        factor: the factor by which the difference changes.
+        down: the number of right answers in a row after which the difference decreases.
         asks: the question after each pair.
-        deviation: of what synthetic participants perceive, in the key's unit; None: a quarter
-            of `start`.
+        deviation: standard deviation of a synthetic participant's perception, in the key's
+            unit; None stands for a quarter of `start`.
     """
 
     key: str
@@ -46,29 +46,25 @@ class Staircase(Frozen, frozen=True):
     standard: float = 0.0
     factor: Annotated[float, Meta(gt=1.0, le=10.0)] = 1.5
     down: Annotated[int, Meta(ge=1, le=5)] = 2
-    asks: Words = "In which of the last two trials was it stronger?"
+    asks: Text = "In which of the last two trials was it stronger?"
     deviation: Positive | None = None
 
     @property
     def measure(self) -> str:
-        """The name of its threshold, with the key's unit, as threshold_delay_ms of
-        link.delay_ms.
-        """
+        """The threshold's name with its unit: threshold_delay_ms for link.delay_ms."""
         return "threshold_" + [part for part in self.key.split(".") if not part.isdigit()][-1]
 
     @property
     def form(self) -> Questionnaire:
-        """What is asked after each pair; the answer is 1 or 2."""
+        """The questionnaire after each pair; the answer is 1 or 2."""
         items = {CHOICE: self.asks}
         ends = ("the first", "the second")
         return Questionnaire(
             CHOICE, title="Which one?", items=items, low=ends[0], high=ends[1], most=2
         )
 
-    def _list_ways(self, right: Sequence[bool]) -> list[int]:
-        """Returns whether the difference becomes less, -1, or more, 1, after each answer; 0: it
-        stays.
-        """
+    def _list_directions(self, right: Sequence[bool]) -> list[int]:
+        """Returns the direction after each answer: -1 down, 1 up, or 0 for no change."""
         ways = list[int]()
         in_row = 0
         for is_right in right:
@@ -77,47 +73,58 @@ class Staircase(Frozen, frozen=True):
         return ways
 
     def list_differences(self, right: Sequence[bool]) -> list[float]:
-        """Returns the difference in each pair and the next one, by which answers so far were
-        right.
+        """Returns the difference of each pair, and of the next one.
+
+        Args:
+            right: whether each answer so far was right.
         """
         differences = [self.start]
-        for way in self._list_ways(right):
+        for way in self._list_directions(right):
             differences.append(min(differences[-1] * self.factor**way, self.start))
         return differences
 
     def find_threshold(self, right: Sequence[bool]) -> float | None:
-        """Returns the geometric mean of the differences where the staircase turned, in the
-        key's unit.
+        """Returns the threshold, in the key's unit: the geometric mean of the reversals.
 
-        The first two turns do not count, nor the third of an odd number; None: less than two
-        are left.
+        The first two reversals do not count, and neither does the third of an odd number.
+        Returns None if fewer than two are left.
+
+        Args:
+            right: whether each answer was right.
         """
-        ways = zip(self.list_differences(right), self._list_ways(right), strict=False)
-        changes = [(difference, way) for difference, way in ways if way]
-        turns = [here for (_, before), (here, way) in pairwise(changes) if way != before]
-        kept = turns[SKIPPED + len(turns) % 2 :]
-        return float(np.exp(np.mean(np.log(kept)))) if kept else None
+        pairs = zip(self.list_differences(right), self._list_directions(right), strict=False)
+        changes = [(difference, direction) for difference, direction in pairs if direction]
+        reversals = [
+            difference
+            for (_, previous), (difference, direction) in pairwise(changes)
+            if direction != previous
+        ]
+        counted = reversals[SKIPPED_REVERSALS + len(reversals) % 2 :]
+        return float(np.exp(np.mean(np.log(counted)))) if counted else None
 
     def draw_choice(self, difference: float, comparison: int, seed: int) -> int:
-        """Returns the trial, 1 or 2, that a synthetic participant chooses, of whom `comparison`
-        had more.
+        """Returns the trial of a pair, 1 or 2, that a synthetic participant chooses.
 
-        It perceives each with a normal error, so that it is right with probability
-        Phi(difference / (sqrt(2) deviation)) (Green and Swets, 1966).
+        The participant perceives each trial with a normal error, so that the choice is right
+        with probability Phi(difference / (sqrt(2) deviation)) (Green and Swets, 1966).
+
+        Args:
+            difference: the difference of the pair, in the key's unit.
+            comparison: the trial with the larger value, 1 or 2.
+            seed: the seed of the choice.
         """
         deviation = self.deviation or self.start / 4.0
-        perceived = (
-            difference
-            + 2.0**0.5 * deviation * np.random.default_rng([seed, 2]).standard_normal()
-        )
-        return comparison if perceived > 0.0 else 3 - comparison
+        error = 2.0**0.5 * deviation * np.random.default_rng([seed, 2]).standard_normal()
+        return comparison if difference + error > 0.0 else 3 - comparison
 
     def describe(self) -> str:
-        """Returns it in a sentence of a methods paragraph."""
+        """Returns the procedure as a sentence of a methods paragraph."""
+        right_percent = 100.0 * 0.5 ** (1.0 / self.down)
         return (
-            f"{self.key} was adapted in a two-interval forced choice against {self.standard:g}: from a "
-            f"difference of {self.start:g}, divided by {self.factor:g} after {self.down} right answers in a "
-            f"row and multiplied by it after a wrong one (Levitt, 1971); a threshold, of "
-            f"{100.0 * 0.5 ** (1.0 / self.down):.1f} % right answers, is the geometric mean of the "
-            f"differences at its reversals but the first {SKIPPED}"
+            f"{self.key} was adapted in a two-interval forced choice against "
+            f"{self.standard:g}: from a difference of {self.start:g}, divided by "
+            f"{self.factor:g} after {self.down} right answers in a row and multiplied by it "
+            "after a wrong one (Levitt, 1971); a "
+            f"threshold, of {right_percent:.1f} % right answers, is the geometric mean of the "
+            f"differences at its reversals but the first {SKIPPED_REVERSALS}"
         )

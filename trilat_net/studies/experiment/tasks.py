@@ -47,7 +47,7 @@ class TrialTask(Frozen, frozen=True, tag_field="kind"):
 
     @property
     def has_limit(self) -> bool:
-        """Whether a trial that lasts `longest_s` has failed; otherwise every trial lasts that long."""
+        """Whether a trial fails after `longest_s`; otherwise every trial lasts that long."""
         return True
 
     @property
@@ -125,7 +125,7 @@ class TrialGoal:
         return abs(self.lead - (user != is_handed_over)) > 0.05
 
     def find_corridor(self, t_s: float) -> tuple[Array, float] | None:  # noqa: ARG002 - there is none
-        """Returns the corridor to the target that nobody may leave; None if there is no corridor.
+        """Returns the corridor to the target, which nobody may leave; None without a corridor.
 
         Args:
             t_s: time since the epoch, s.
@@ -219,7 +219,7 @@ class ReachTrial(TrialTask, frozen=True, tag="reach"):
         return self.timeout_s + (self.handover_s + self.ramp_s)
 
     def make_goal(self, start_m: Array, number: int, seed: int) -> TrialGoal:  # noqa: ARG002 - the order is fixed
-        """Returns the goal of a trial: a target of the ring, and the next one for a handover."""
+        """Returns the goal of a trial: a target of the ring, and the next target as well."""
         targets_m = [self._ring_target_m(start_m, number + n) for n in (0, 1)]
         return _ReachGoal(self, start_m, targets_m)
 
@@ -422,7 +422,7 @@ class _TrackGoal(TrialGoal):
         self._phases = phases
 
     def measure(self, after_s: Array, position_m: Array, force_n: Array) -> dict[str, float]:  # noqa: ARG002
-        """Returns on whose target the slave was, if two are shown: 1 the first user's, 0 the other's."""
+        """Returns whose target the slave followed: 1 the first user's, 0 the second user's."""
         if not self._task.needs_pair:
             return {}
         middle_m = np.array([self._find_target_m(after, None) for after in after_s.tolist()])

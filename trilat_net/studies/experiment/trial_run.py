@@ -144,7 +144,7 @@ class ExperimentTrial:
         self._rows = build_arm_rows(self.scenario, self.slave)
 
     def _set_authority(self, scenario: Scenario) -> Scenario:
-        """Returns the scenario with the users' authority over the slave as the trial defines it.
+        """Returns the scenario with the trial's authority of the users over the slave.
 
         The two users share the sum of their dominance factors; a handover exchanges the parts.
         """
@@ -280,7 +280,7 @@ class ExperimentTrial:
         return {name: value for name, value in measures.items() if value is not None}
 
     def _measure_motion(self, log: Log, ended_s: float) -> dict[str, float]:
-        """Returns the measures of the slave's motion, from the target's appearance to the end."""
+        """Returns the measures of the slave's motion after the target has appeared."""
         goal = self.make_goal()
         part = log[self.slave]
         rows, positions, velocities, rate_hz = self._measure_path(part, goal.appears_s, ended_s)
