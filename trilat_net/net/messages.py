@@ -86,11 +86,10 @@ Speeds = Annotated[list[float], _unit("rad/s", "joint velocities")]
 Torques = Annotated[list[float], _unit("N m", "joint torques")]
 
 
-# Logs contain the docstrings of `State`, `LinkStats`, `Event` and `RecorderStats` in their
-# schemas: changing these docstrings changes the bytes of logs.
+# The docstrings of `State`, `LinkStats`, `Event` and `RecorderStats` are part of the schemas that
+# logs contain, so they stay byte for byte as they were published.
 class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """The complete record of one tick of one site; what each vector means stands at
-    `core.tick.Output`.
+    """The complete record of one tick of one site; what each vector means stands at `core.tick.Output`.
 
     Attributes:
         v: version of this schema.
@@ -108,29 +107,25 @@ class State(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         tau_x: exogenous torque as Eq. (8) subtracts it.
         theta_hat: estimate of theta, Eq. (24).
         used: per peer the tick of the sample in use, -1 before the first.
-        rx: arrivals in the order accepted: index of the peer among the sender's peers, its
-            tick, its one-way delay in us by the offset in force (before version 2: the age of
-            its nominal stamp).
+        rx: arrivals in the order accepted: index of the peer among the sender's peers, its tick, its one-way
+            delay in us by the offset in force (before version 2: the age of its nominal stamp).
         rx_crc: CRC-32 of those arrivals as the step took them in.
         cmd: commands taken in, each the JSON of a `scenario.timeline.Change`.
         mem: what the site remembers besides, see `core.tick.Output`.
         late_us: wake-up minus deadline of this tick.
         busy_us: computing time of the tick before.
-        sent_ns: when it was sent: the sender's clock as it runs, never slewed, ns since the
-            epoch on it.
-        echo: of each peer the newest sample that this tick took in: index of the peer, its
-            tick, and its arrival on the same clock as `sent_ns`.
-        x: in task space the coordinates that the sites exchange; in joint space these are left
-            out.
+        sent_ns: when it was sent: the sender's clock as it runs, never slewed, ns since the epoch on it.
+        echo: of each peer the newest sample that this tick took in: index of the peer, its tick, and its
+            arrival on the same clock as `sent_ns`.
+        x: in task space the coordinates that the sites exchange; in joint space these are left out.
         xd: their derivatives.
         wrench: exogenous torque in those coordinates.
-        ch: what the site's law sends besides, see `core.law_channel`; left out if it sends
-            nothing.
-        hand: what somebody who holds the arm does: grip from 0 to 1, number of the newest
-            message (-1 without), who holds it (0: nobody), target, its velocity, see
-            `core.live_hand`; left out without a live hand.
-        bodies: poses of the bodies of its plant, seven numbers each: x, y, z in the arm's base
-            frame, m, and the unit quaternion w, x, y, z; left out without any.
+        ch: what the site's law sends besides, see `core.law_channel`; left out if it sends nothing.
+        hand: what somebody who holds the arm does: grip from 0 to 1, number of the newest message (-1
+            without), who holds it (0: nobody), target, its velocity, see `core.live_hand`; left out without
+            a live hand.
+        bodies: poses of the bodies of its plant, seven numbers each: x, y, z in the arm's base frame, m, and
+            the unit quaternion w, x, y, z; left out without any.
     """
 
     v: int
@@ -201,8 +196,7 @@ class LinkStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         duplicate: per peer, those that came twice.
         refused: per peer, those whose stamp was out of range.
         lost: per peer, those that the link's model lost.
-        superseded: per peer, those never used because a newer one was released before or with
-            them.
+        superseded: per peer, those never used because a newer one was released before or with them.
         copies: per peer, duplicates that the link's model made.
         dropped: messages that were none of ours or overflowed, by reason.
         late_max_us: largest lateness of a wake-up since the last statistics.
@@ -210,12 +204,11 @@ class LinkStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
         overruns: ticks since the start whose work began after the next one was due.
         offset_us: per peer, its clock minus the own one, as in force.
         bound_us: per peer, how far that is from the truth at most.
-        delay_us: per peer, one-way delay: median since the last statistics; -1 where nothing
-            came.
+        delay_us: per peer, one-way delay: median since the last statistics; -1 where nothing came.
         delay_max_us: per peer, its largest.
         rtt_us: per peer, smallest round trip since the last statistics; -1 where none was made.
-        clock_faults: per peer, since the start: samples that came before they were sent, beyond
-            the bound, and windows that contradict those before.
+        clock_faults: per peer, since the start: samples that came before they were sent, beyond the bound,
+            and windows that contradict those before.
         grid_error_us: how late the own grid of ticks is against the leader's.
         slew_ppb: by how much it lags the own clock to follow the leader's, ns/s.
     """
@@ -257,11 +250,10 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         v: version of this schema.
         member: who says it: a site, or "recorder".
         boot: the sender's process start.
-        kind: "epoch", "ready", "start", "late", "lost", "back", "diverged", "end", "stored",
-            "refused", "setup", "mode", "change", "clock", "clock fault", "failed", "law",
-            "arm", "hand", "mark"; where sites come and go "left", "coming", "admit", "last",
-            "join", "unheard", "heard"; of a site that does not go to its peers "waiting", of
-            ticks that it did not make "overrun".
+        kind: "epoch", "ready", "start", "late", "lost", "back", "diverged", "end", "stored", "refused",
+            "setup", "mode", "change", "clock", "clock fault", "failed", "law", "arm", "hand",
+            "mark"; where sites come and go "left", "coming", "admit", "last", "join", "unheard", "heard";
+            of a site that does not go to its peers "waiting", of ticks that it did not make "overrun".
         text: the sentence.
         t_ns: nominal time, ns since the epoch; -1 before it.
         attempt: number of the announcement that it belongs to.
@@ -269,18 +261,15 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
         epoch_unix_ns: the epoch in Unix time.
         clock: identity of that monotonic clock.
         boots: members of the session and their boots.
-        about: the member that it concerns; of "end" whose end it was, "" if it was planned or
-            asked for.
-        ticks: how many ticks; of "clock" the tick from which on it holds; of "coming", "admit"
-            and "join" the first tick of the site that comes; of "last" how many the start
-            before it made at least.
+        about: the member that it concerns; of "end" whose end it was, "" if it was planned or asked for.
+        ticks: how many ticks; of "clock" the tick from which on it holds; of "coming", "admit" and "join" the
+            first tick of the site that comes; of "last" how many the start before it made at least.
         command: the change that was taken in, as the record of tick `ticks` names it.
         clocks: per member the identity of its clock.
         epochs: per member the epoch on its own clock.
-        offset_ns: of "clock": the clock of `about` minus the own one, at that tick; of "clock
-            fault" by how much a sample came before it was sent, or 0.
-        bound_ns: how far that offset is from the truth at most, for a second from there; then
-            it grows.
+        offset_ns: of "clock": the clock of `about` minus the own one, at that tick; of "clock fault" by how
+            much a sample came before it was sent, or 0.
+        bound_ns: how far that offset is from the truth at most, for a second from there; then it grows.
         drift_ppb: by how much the offset grows, ns/s.
         drift_bound_ppb: how far that is from the truth at most.
         n: which event of this boot it is, from 0; -1 before version 3.
@@ -310,15 +299,13 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
 
 class RecorderStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """What a recorder knows of its own work, once a second; what is counted, is since its
-    start.
+    """What a recorder knows of its own work, once a second; what is counted, is since its start.
 
     Attributes:
         v: version of this schema.
         boot: the recorder's process start.
         t_ns: when, ns since the epoch, on its own clock.
-        expected: per channel (as in "m1/state") the messages that there should be by now, as
-            far as known.
+        expected: per channel (as in "m1/state") the messages that there should be by now, as far as known.
         received: those that are in the file.
         missing: those that are not.
         gaps: the missing ones as ranges of numbers, "first-last", at most twenty.
@@ -330,8 +317,7 @@ class RecorderStats(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fi
         dropped: messages that were none of the session's, by reason.
         queued: messages that wait to be written.
         written_bytes: size of the file.
-        flush_max_us: the longest that handing it to the operating system has taken since the
-            last statistics.
+        flush_max_us: the longest that handing it to the operating system has taken since the last statistics.
         mono_ns: the recorder's monotonic clock.
         unix_ns: its wall clock at that instant.
     """
