@@ -22,7 +22,7 @@ NOUNS = " ".join(
 ).split()
 """What texts of the program count."""
 NOT_A_COUNT = re.compile(
-    r"[A-Z_][A-Z_.0-9]*$|place$|name|owner$|record\.id$|site$|_link\(|rate_hz$|session$|wanted$"
+    r"[A-Z_][A-Z_.0-9]*$|place$|name|owner$|record\.id$|site$|_link\(|rate_hz$|session$|wanted$|endpoint$"
 )
 """Values before a word such as "changes" that are no numbers, and constants, which are above 1."""
 

@@ -211,7 +211,7 @@ def list_bag(log: Log, motions: dict[str, Motion], folder: Path) -> Iterator[Ser
 class Topic(list[bytes]):
     """A topic to which somebody listens."""
 
-    heard = True
+    has_subscribers = True
     put = list.append
 
 

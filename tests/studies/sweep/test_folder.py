@@ -220,7 +220,7 @@ def test_a_run_refused_by_a_full_disk_is_not_done(path: Path) -> None:
         with Path("/dev/full").open("ab", buffering=0) as full:
             journal._file = full
             with pytest.raises(
-                LogRefused, match=r"No space left on device.*make room, and go on with"
+                LogRefused, match=r"No space left on device.*make room, and continue with"
             ) as found:
                 journal.add(FIVE[1])
         journal._file = whole

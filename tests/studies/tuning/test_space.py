@@ -155,7 +155,8 @@ def test_what_cannot_be_tuned_is_refused(law: str, facts: list[str]) -> None:
 
 def test_force_reflection_is_refused_for_three_sites_with_the_reason() -> None:
     with pytest.raises(
-        ScenarioError, match="between one master and one slave; this has 3 sites, 2 of them"
+        ScenarioError,
+        match="between one master and one slave; this scenario has 3 sites, 2 of them",
     ):
         select_search_spaces(["p_d", "p_f"], load_scenario("free"))
     assert [space.law for space in select_search_spaces(["p_f"], load_scenario("contact"))] == [

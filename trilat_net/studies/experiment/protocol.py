@@ -100,7 +100,7 @@ class Protocol(Frozen, frozen=True):
         users: the sites that participants hold; two of them are held by a pair.
         participants: how many, or their pseudonyms.
         design: how the order of conditions is balanced over participants, see
-            `order_conditions`.
+            docs/experiments.md.
         trials: trials of a block that count; a block is all trials of one condition.
         practice: trials before those, which do not.
         foreperiod_s: range of the time from the begin of a trial until its target appears, s;
