@@ -173,7 +173,7 @@ def _record(
             found.frames["experimenter"].append({**every, **frame, **added, "takes_part": True})
             found.frames["watcher"].append({**every, **frame, **added, "takes_part": False})
             found.frames["user"].append({**every, **known, **nothing, "takes_part": True})
-            about, narrow = pages.describe(), pages.describe_narrowed()
+            about, narrow = pages.describe(), pages.describe_session_as_user()
             for role, of in (("experimenter", about), ("watcher", about), ("user", narrow)):
                 site = found.user if role == "user" else ""
                 who = {"role": role, "as": site, "ends": role == "experimenter"}
