@@ -1,3 +1,1 @@
-"""The live driver: one operating-system process per manipulator joins a session, runs its loop
-and leaves.
-"""
+"""The live driver: a process per site joins a session, runs the site's loop, and leaves."""

@@ -623,11 +623,11 @@ class RunningSite:
         monitor.watch(self._publisher, self._t_ns)
         if topics.RECORDER in monitor.boots or monitor.recorders:
             self._await_recorders()
-        count_executed_ticks = count_nouns(self._ticks, "tick")
+        ticks = count_nouns(self._ticks, "tick")
         counts = parts.stats.dropped.items()
         dropped = ", ".join(f"{count} {reason}" for reason, count in counts)
         parts.say(
-            f"{count_executed_ticks}, {parts.stats.overruns} of them late by a period or more"
+            f"{ticks}, {parts.stats.overruns} of them late by a period or more"
             + (f"; dropped: {dropped}" if dropped else "")
         )
         if self._failure is not None:
@@ -636,7 +636,7 @@ class RunningSite:
             raise RunFailed(f"{parts.name} ended because {monitor.ended_by}")
         if not code and self._departures:
             raise PeerLeft(
-                f"{parts.name} made {count_executed_ticks}; {self._departures}, and did not come back"
+                f"{parts.name} made {ticks}; {self._departures}, and did not come back"
             )
         return code
 

@@ -1,1 +1,1 @@
-"""Play a log on the network again: the same bytes at the same times, in a session of its own."""
+"""Play a log on the network again, in a new session: the same bytes at the same times."""

@@ -38,7 +38,7 @@ class RepeatedQuery:
         self._pending: deque[tuple[int, Inbox]] = deque(maxlen=QUERIES_KEPT)
 
     def repeat(self, period_ns: int = QUERY_PERIOD_NS) -> bool:
-        """Sends the query if a period has passed since the last; returns True if it was sent."""
+        """Sends the query if a period has passed since the last; True if it was sent."""
         now_ns = self._clock.monotonic_ns()
         is_due = not self._pending or now_ns - self._pending[-1][0] >= period_ns
         if is_due:
