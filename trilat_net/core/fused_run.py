@@ -484,6 +484,7 @@ def finish_site(
         record=record,
     )
     _record_sent(site[0], i, record, laws)
+    site_sums: SumsRow = sums[i]  # one view for both: a view of a row costs time
     _update_peaks(
         row=record,
         t_ns=t_ns,
@@ -491,7 +492,7 @@ def finish_site(
         s=site[0],
         progress=site_progress,
         peaks=peaks[i],
-        sums=sums[i],
+        sums=site_sums,
     )
     _update_sums(
         k=k,
@@ -501,7 +502,7 @@ def finish_site(
         actors=arrays.actors[i],
         table=arrays.table,
         row=record,
-        sums=sums[i],
+        sums=site_sums,
     )
     site_progress.tick = k + 1
     if k + 1 < site_progress.ticks:
@@ -510,43 +511,6 @@ def finish_site(
         site_progress.t_ns = NEVER_NS
     mode: int = site[0].mode
     return mode
-
-
-@leaf
-def _step_site(
-    i: int,
-    settled_rad: float,
-    progress: RowArray,
-    next_samples: IntArray,
-    sent: RecentRecords,
-    feed: ReplayedInputs,
-    peaks: Array,
-    sums: RowArray,
-    arrays: SiteArrays,
-    chain: RowArray | None,
-    laws: LawArrays | None,
-) -> int:
-    """Makes the next tick of site i, and returns the site's mode."""
-    sense_site(
-        i=i,
-        progress=progress,
-        next_samples=next_samples,
-        sent=sent,
-        feed=feed,
-        arrays=arrays,
-        chain=chain,
-    )
-    return finish_site(
-        i=i,
-        settled_rad=settled_rad,
-        progress=progress,
-        sent=sent,
-        peaks=peaks,
-        sums=sums,
-        arrays=arrays,
-        chain=chain,
-        laws=laws,
-    )
 
 
 @leaf
@@ -594,13 +558,20 @@ def run_until(
                 continue
             # Two calls, because Numba needs one type of `chain` in each.
             if chains is None:
-                mode = _step_site(
+                sense_site(
                     i=i,
-                    settled_rad=settled_rad,
                     progress=progress,
                     next_samples=next_samples,
                     sent=sent,
                     feed=feed,
+                    arrays=arrays,
+                    chain=None,
+                )
+                mode = finish_site(
+                    i=i,
+                    settled_rad=settled_rad,
+                    progress=progress,
+                    sent=sent,
                     peaks=peaks,
                     sums=sums,
                     arrays=arrays,
@@ -608,17 +579,25 @@ def run_until(
                     laws=laws,
                 )
             else:
-                mode = _step_site(
+                chain = chains[i, : arrays.site[i, 0].joints]
+                sense_site(
                     i=i,
-                    settled_rad=settled_rad,
                     progress=progress,
                     next_samples=next_samples,
                     sent=sent,
                     feed=feed,
+                    arrays=arrays,
+                    chain=chain,
+                )
+                mode = finish_site(
+                    i=i,
+                    settled_rad=settled_rad,
+                    progress=progress,
+                    sent=sent,
                     peaks=peaks,
                     sums=sums,
                     arrays=arrays,
-                    chain=chains[i, : arrays.site[i, 0].joints],
+                    chain=chain,
                     laws=laws,
                 )
             if mode == _DIVERGED:
