@@ -1,7 +1,10 @@
 """Text of a stability certificate, for the terminal and the report page.
 
-Invariant: both show the same sentences; the verdict comes first, and the listed energies add
-up.
+Invariant:
+    - The terminal and the page show the same sentences.
+    - The verdict comes first.
+    - The listed energies add up: V at the end is V at the start plus all other entries, up to
+      the entries too small to be listed.
 """
 
 from collections.abc import Iterator
@@ -19,100 +22,110 @@ from ..errors import count_nouns
 from .result_text import MARKS, Block, MarkedText, TextTable
 
 MIN_ENERGY_SHARE = 1e-6
-"""Smaller shares of the largest energy are not listed."""
+"""Smallest listed energy, as a share of the largest energy."""
 MAX_LISTED_LINKS = 6
-"""Links that are listed one by one."""
+"""Largest number of links listed one by one; the energies of more links are summed."""
 _SOURCE_NAMES = {
     "rule": "rule for stale peers",
     "shares": "change of shares",
     "estimates": "box, or wrong estimates",
 }
-
+"""Texts of the sources of energy other than links, by their names in a balance."""
 
 _HOLDS = {True: "holds", False: "fails", None: "not told"}
 
 
-def compose_certificate(found: Certificate) -> Iterator[Block]:
-    """Yields the judgement with what it rests on, the premises, and the energies."""
-    for line in describe_certificate(found):
+def compose_certificate(certificate: Certificate) -> Iterator[Block]:
+    """Yields the judgement and its grounds, then tables of the premises and the energies."""
+    for line in describe_certificate(certificate):
         yield MarkedText(MARKS[line.mark], line.text)
-    observed = found.observed
-    premises = [*found.premises, *(() if observed is None else observed.premises)]
+    observed = certificate.observed
+    premises = list(certificate.premises)
+    if observed is not None:
+        premises += observed.premises
     rows = [(premise.name, _HOLDS[premise.holds], premise.text) for premise in premises]
     yield ""
-    yield TextTable(
-        ("premise", "", "found"), rows, styles={"holds": "green", "fails": "yellow"}
-    )
+    styles = {"holds": "green", "fails": "yellow"}
+    yield TextTable(("premise", "", "found"), rows, styles=styles)
     if observed is not None and observed.least:
         least = [
             (name, f"{amount_j:.4g}", f"{at_s:.4g}") for name, amount_j, at_s in observed.least
         ]
         yield ""
         yield TextTable(("energy of the laws", "least J", "at s"), least, align="lrr")
-    if found.balance is None:
+    if certificate.balance is None:
         return
-    energies = [(name, f"{amount:.4g}") for name, amount in list_energies(found.balance)]
+    energies = [(name, f"{amount:.4g}") for name, amount in list_energies(certificate.balance)]
     yield ""
     yield TextTable(("energy", "J"), energies, align="lr")
 
 
-def compose_twins(found: PushedTwins) -> Iterator[Block]:
-    """Yields for which sizes a push is linear, and what became of each push."""
-    if found.linear is not None or not found.growth.pushes:
-        yield found.headline()
-    yield from map(found.describe, found.growth.pushes)
-    if not found.growth.same_platform:
-        yield "note: executed again, its last bits are not those of the records: another platform, or version"
+def compose_twins(twins: PushedTwins) -> Iterator[Block]:
+    """Yields the sizes for which a push acts linearly, and a line on each push."""
+    if twins.linear is not None or not twins.growth.pushes:
+        yield twins.headline()
+    yield from map(twins.describe, twins.growth.pushes)
+    if not twins.growth.same_platform:
+        cause = "another platform, or version"
+        yield f"note: executed again, its last bits are not those of the records: {cause}"
 
 
 class CertificateLine(NamedTuple):
     """One sentence of a certificate.
 
     Attributes:
-        mark: "ok": it supports the run; "FAIL": it speaks against it; "open": it decides
-            nothing; or "note".
+        mark: "ok" for a sentence that supports the stability of the run, "FAIL" for one against
+            stability, "open" for one that leaves the question open, or "note".
+        text: the sentence.
     """
 
     mark: str
     text: str
 
 
-def describe_certificate(found: Certificate) -> list[CertificateLine]:
-    """Returns the judgement, and then what it rests on: V, the end of the run, the balance, the
-    roots.
+def describe_certificate(certificate: Certificate) -> list[CertificateLine]:
+    """Returns the judgement and then its grounds, each as a marked sentence.
+
+    The grounds are V, the end of the run, the energy balance, the energy of the laws, the
+    roots, the twins that were pushed, and the log.
     """
-    finding = found.verdict.finding
-    broken = finding is StabilityFinding.BROKEN
-    stable = "FAIL" if broken else _JUDGEMENT[found.stability]
-    verdict = "FAIL" if broken else "ok" if found.bounded_by_v else "open"
-    lines = [(stable, describe_judgement(found)), (verdict, found.verdict.text)]
-    lines.append((_JUDGEMENT[found.end.stability], f"e and qd: {found.end.text}"))
-    if found.balance is not None:
+    finding = certificate.verdict.finding
+    if finding is StabilityFinding.BROKEN:
+        stability_mark = "FAIL"
+        verdict_mark = "FAIL"
+    else:
+        stability_mark = _JUDGEMENT[certificate.stability]
+        verdict_mark = "ok" if certificate.bounded_by_v else "open"
+    lines = [(stability_mark, describe_judgement(certificate))]
+    lines.append((verdict_mark, certificate.verdict.text))
+    lines.append((_JUDGEMENT[certificate.end.stability], f"e and qd: {certificate.end.text}"))
+    if certificate.balance is not None:
         mark = _BALANCE.get(finding, "ok")
-        lines.append((mark, f"energy balance: {describe_balance(found.balance)}"))
-    if found.observed is not None:
-        lines.append((_OBSERVED[found.observed.finding], found.observed.text))
-    if found.roots is not None:
-        doubtful = not found.roots.exact and found.roots.verdict == "stable"
-        lines.append(
-            ("note" if doubtful else _ROOTS.get(found.roots.verdict, "note"), found.roots.text)
-        )
-    if found.twins is not None:
-        lines.append((_mark_twins(found.twins), found.twins.text))
-    intact = "open" if found.evidence.reasons else "ok"
-    mark = intact if found.evidence.integrity.passed else "FAIL"
-    lines.append((mark, f"log: {found.evidence.text}"))
-    if found.paper_balance is not None and found.paper_weights_rise is not None:
-        rise_j = found.paper_weights_rise.amount
-        largest_j = found.paper_balance.V.max()
-        risen = f"V would have risen by {rise_j:.3g} J of {largest_j:.4g} J"
-        lines.append(("note", f"with the paper's weights, ones, {risen} (docs/errata.md, 6)"))
-    return [CertificateLine(*line) for line in lines]
+        lines.append((mark, f"energy balance: {describe_balance(certificate.balance)}"))
+    if certificate.observed is not None:
+        lines.append((_OBSERVED[certificate.observed.finding], certificate.observed.text))
+    if certificate.roots is not None:
+        verdict = certificate.roots.verdict
+        # roots that are not exact cannot show stability
+        doubtful = not certificate.roots.exact and verdict == "stable"
+        mark = "note" if doubtful else _ROOTS.get(verdict, "note")
+        lines.append((mark, certificate.roots.text))
+    if certificate.twins is not None:
+        lines.append((_mark_twins(certificate.twins), certificate.twins.text))
+    intact = "open" if certificate.evidence.reasons else "ok"
+    mark = intact if certificate.evidence.integrity.passed else "FAIL"
+    lines.append((mark, f"log: {certificate.evidence.text}"))
+    if certificate.paper_balance is not None and certificate.paper_weights_rise is not None:
+        rise_j = certificate.paper_weights_rise.amount
+        largest_j = certificate.paper_balance.V.max()
+        rise = f"V would have risen by {rise_j:.3g} J of {largest_j:.4g} J"
+        lines.append(("note", f"with the paper's weights, ones, {rise} (docs/errata.md, 6)"))
+    return [CertificateLine(mark, text) for mark, text in lines]
 
 
-def describe_judgement(found: Certificate) -> str:
-    """Returns the judgement in one line: the word, how the run ended, and what leaves it open."""
-    return "; ".join([found.headline(), *found.reasons])
+def describe_judgement(certificate: Certificate) -> str:
+    """Returns the judgement in one line: its headline, and the reasons that leave it open."""
+    return "; ".join([certificate.headline(), *certificate.reasons])
 
 
 _JUDGEMENT = {Stability.STABLE: "ok", Stability.NOT_STABLE: "FAIL", Stability.OPEN: "open"}
@@ -135,43 +148,45 @@ def _mark_twins(twins: TwinGrowth) -> str:
 
 
 def describe_balance(balance: EnergyBalance) -> str:
-    """Returns the residual of the balance, in words."""
-    residual, rest = (float(np.abs(x).max()) for x in (balance.residual, balance.unexplained))
+    """Returns a sentence on how closely the energy balance closes."""
+    residual_j = float(np.abs(balance.residual).max())
+    unexplained_j = float(np.abs(balance.unexplained).max())
     scale = balance.scale
     if scale <= ZERO_ENERGY_J:
         return "there is no energy in this run"
-    text = f"closes to {residual / scale:.1e} of the largest energy, {scale:.4g} J"
-    if rest >= residual:
+    text = f"closes to {residual_j / scale:.1e} of the largest energy, {scale:.4g} J"
+    if unexplained_j >= residual_j:
         return text
-    return f"{text}; to {rest / scale:.1e} once the controller's sampling is booked"
+    return f"{text}; to {unexplained_j / scale:.1e} once the controller's sampling is booked"
 
 
 def list_energies(balance: EnergyBalance) -> list[tuple[str, float]]:
-    """Returns V at the start, the energies that changed it, and V at the end, J; tiny ones are
-    left out.
+    """Returns V at the start, the energies that changed V, and V at the end, in J.
+
+    Energies below `MIN_ENERGY_SHARE` of the largest energy are left out.
     """
-    links = {name: x for name, x in balance.work.items() if "->" in name}
-    given = {name: x for name, x in balance.work.items() if name not in links}
+    links = {name: work for name, work in balance.work.items() if "->" in name}
+    sources = {name: work for name, work in balance.work.items() if "->" not in name}
     if len(links) > MAX_LISTED_LINKS:
-        links = {f"{count_nouns(len(links), 'link')}": np.sum(list(links.values()), axis=0)}
+        links = {count_nouns(len(links), "link"): np.sum(list(links.values()), axis=0)}
     gained = sum(balance.work.values())
     lost = sum(balance.dissipation.values())
     rest = balance.V - balance.V[0] - (gained - lost + balance.sampling - balance.transfer)
-    entries = {
-        **{f"taken: {name}": -values for name, values in balance.dissipation.items()},
-        **{
-            f"given: {_SOURCE_NAMES.get(name, name)}": values
-            for name, values in (given | links).items()
-        },
-        "given: sampling of the controller": balance.sampling,
-        "left by beta": -balance.transfer,
-        "unexplained" if balance.judged.all() else "in gaps, or unexplained": rest,
-    }
-    least = MIN_ENERGY_SHARE * balance.scale + ZERO_ENERGY_J
-    shown = [(name, float(x[-1])) for name, x in entries.items() if np.abs(x).max() > least]
-    ends = (float(x) if x > ZERO_ENERGY_J else 0.0 for x in (balance.V[0], balance.V[-1]))
-    first, last = (
-        (f"V at {t_s:.4g} s", x)
-        for t_s, x in zip((balance.t_s[0], balance.t_s[-1]), ends, strict=True)
-    )
-    return [first, *shown, last]
+    entries = {f"taken: {name}": -energy for name, energy in balance.dissipation.items()}
+    for name, energy in (sources | links).items():
+        entries[f"given: {_SOURCE_NAMES.get(name, name)}"] = energy
+    entries["given: sampling of the controller"] = balance.sampling
+    entries["left by beta"] = -balance.transfer
+    entries["unexplained" if balance.judged.all() else "in gaps, or unexplained"] = rest
+    least_j = MIN_ENERGY_SHARE * balance.scale + ZERO_ENERGY_J
+    listed = [_describe_v(balance, 0)]
+    for name, energy in entries.items():
+        if np.abs(energy).max() > least_j:
+            listed.append((name, float(energy[-1])))
+    return [*listed, _describe_v(balance, -1)]
+
+
+def _describe_v(balance: EnergyBalance, index: int) -> tuple[str, float]:
+    energy_j = balance.V[index]
+    shown_j = float(energy_j) if energy_j > ZERO_ENERGY_J else 0.0
+    return f"V at {balance.t_s[index]:.4g} s", shown_j

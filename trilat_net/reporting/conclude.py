@@ -1,8 +1,8 @@
-"""The report of a finished run: checks, figures, page, summary lines, a table with a row per
-site.
+"""Conclusion of a finished run: its checks, figures, page, summary and table of sites.
 
-Invariant: every claim rests on an execution made just now, in another process while figures are
-drawn.
+Invariant:
+    - Every claim rests on a new execution of the log, made for this conclusion.
+    - The execution runs in another process while the figures are drawn.
 """
 
 from collections.abc import Iterator
@@ -31,10 +31,15 @@ from .summary_text import format_run_lines
 
 @dataclass(frozen=True, repr=False)
 class Conclusion(CheckReport):
-    """A finished run: its judgement, checks, a row per site, lines on links, changes, modes and
-    clocks.
+    """The conclusion of a finished run.
 
-    `paths` are the log's files, and those that were written.
+    Attributes:
+        verdict: the judgement of the run's stability.
+        table: a row per site.
+        notes: lines on user laws, arms, links, changes, modes and clocks, and on the
+            certificate.
+        findings: the checks of the log.
+        paths: the files of the log, and the files that were written.
     """
 
     verdict: CertificateLine
@@ -44,11 +49,12 @@ class Conclusion(CheckReport):
     paths: list[Path]
 
     def blocks(self) -> Iterator[Block]:
-        """Yields its text."""
+        """Yields the verdict, the checks, the table of sites, the notes and the files."""
         yield MarkedText(MARKS[self.verdict.mark], f"stability: {self.verdict.text}")
-        for line in self.findings:
-            mark = "ok" if line.passed else "FAIL" if line.judged else "open"
-            yield MarkedText(MARKS[mark], f"{line.check}: {line.text}")
+        for finding in self.findings:
+            failed = "FAIL" if finding.judged else "open"
+            mark = "ok" if finding.passed else failed
+            yield MarkedText(MARKS[mark], f"{finding.check}: {finding.text}")
         yield self.table
         yield from self.notes
         yield from (f"  {path}" for path in self.paths if path != self.page)
@@ -56,13 +62,13 @@ class Conclusion(CheckReport):
 
     @property
     def page(self) -> Path:
-        """The report, which is to be opened first."""
+        """The page of the report; without a page, the first path."""
         return next((path for path in self.paths if path.suffix == ".html"), self.paths[0])
 
     def headline(self) -> str:
-        """Returns whether every check passed, and where the page is."""
-        words = {0: "passed", CodeWithheld.exit_code: "not all was judged"}
-        return f"{words.get(self.exit_code, 'FAILED')}; {self.page}"
+        """Returns the result of the checks, and the path of the page."""
+        results = {0: "passed", CodeWithheld.exit_code: "not all was judged"}
+        return f"{results.get(self.exit_code, 'FAILED')}; {self.page}"
 
     def to_rows(self) -> list[dict[str, str]]:
         """Returns a row per site."""
@@ -72,8 +78,13 @@ class Conclusion(CheckReport):
         """Returns plain values, with the keys of `trilat report --json`."""
         checks = [finding.to_row() for finding in self.findings]
         paths = [path.as_posix() for path in self.paths]
-        found = {"passed": self.passed, "verdict": self.verdict.text, "notes": self.notes}
-        return {**found, "checks": checks, "paths": paths}
+        return {
+            "passed": self.passed,
+            "verdict": self.verdict.text,
+            "notes": self.notes,
+            "checks": checks,
+            "paths": paths,
+        }
 
 
 def conclude(
@@ -84,19 +95,26 @@ def conclude(
     min_coverage: float = MIN_COVERAGE,
     png: bool = False,
 ) -> Conclusion:
-    """Verifies a log from a file, and writes page and summary, with `png` figures, into a
-    folder that exists.
+    """Verifies a log, and writes its page and summary into a folder.
+
+    Args:
+        log: a log that was opened from files.
+        folder: an existing folder.
+        progress: called with (done, total) while figures are drawn.
+        min_coverage: smallest share of every site's ticks that must be judged.
+        png: True to write the figures as PNG files too.
 
     Raises:
         LogError: a record cannot be read.
-        RunFailed: the process that executes the log was ended.
+        RunFailed: the process that executes the log was terminated.
     """
     # Matplotlib takes a second, and `verify` needs none of it
     from .figures.registry import write_report_figures
     from .page import write_report
 
-    lines: list[Finding] = []
-    with worker_pool(1) as pool:  # two cores: the log is executed while its figures are drawn
+    findings: list[Finding] = []
+    # uses two cores: the log is executed while its figures are drawn
+    with worker_pool(1) as pool:
         checking = pool.submit(check_log_files, log.sources, min_coverage, dict(allowed_code))
         twin = _run_without_operators(log)
         certificate = certify_run(log, min_coverage=min_coverage)
@@ -104,43 +122,43 @@ def conclude(
 
         def verdicts() -> Iterator[Finding]:
             try:
-                lines.extend(checking.result())
+                findings.extend(checking.result())
             except BrokenProcessPool:
                 raise RunFailed(
                     "the process that executes the log again was ended; try again"
                 ) from None
-            yield from lines
+            yield from findings
 
-        figures = (
-            write_report_figures(
+        figures: list[Path] = []
+        if png:
+            figures = write_report_figures(
                 log=log, folder=folder, twin=twin, progress=progress, pushed=certificate.twins
             )
-            if png
-            else []
-        )
-        made = write_report(
+        report = write_report(
             log, folder, twin=twin, certificate=certificate, verdicts=verdicts()
         )
     heads = (*_HEADERS, f"max|e| end {shared_unit(log)}")
     table = TextTable(heads, [_site_row(log, site) for site in log.sites], align="lr")
-    paths = [*map(Path, log.sources), *made, *figures]
-    return Conclusion(describe_certificate(certificate)[0], table, notes, lines, paths)
+    return Conclusion(
+        verdict=describe_certificate(certificate)[0],
+        table=table,
+        notes=notes,
+        findings=findings,
+        paths=[*map(Path, log.sources), *report, *figures],
+    )
 
 
 def _run_without_operators(log: Log) -> Log | None:
-    """Returns the same run without operators; None if it would be the same, or cannot be run."""
-    # so would the twin, or hang
+    """Returns the same run without operators; None if it would not differ, or cannot run."""
+    # the twin of a run that failed would fail too, or hang
     broke_off = any(event.kind == "failed" for event in log.events)
     pushed = any(site.hands for site in log.scenario.sites.values())
     if broke_off or log.scenario.external or not pushed:
         return None
     try:
         return simulate_without_operators(log)
-    # a law from outside that may not run, or fails: the check says so
-    except (
-        ScenarioError,
-        LawFailed,
-    ):
+    # a user law fails or is not allowed to run: the check of the log reports this
+    except (ScenarioError, LawFailed):
         return None
 
 
@@ -148,11 +166,13 @@ _HEADERS = ("site", "records", "missing", "late p50 us", "p99", "max", "busy p50
 
 
 def _site_row(log: Log, site: str) -> tuple[str, ...]:
-    part = log[site]
-    if not len(part):
+    records = log[site]
+    if not len(records):
         return (site, "0", *("",) * (len(_HEADERS) - 1))
-    missing = max(log.last_ticks[site], part.last_tick) + 1 - len(part) - log.absent_ticks(site)
-    late = np.percentile(part.late_us, (50, 99, 100))
-    busy = np.percentile(part.busy_us, (50, 99)) if len(part) > 1 else (0, 0)
-    numbers = (*(f"{value:.0f}" for value in (*late, *busy)), f"{np.abs(part.e[-1]).max():.2e}")
-    return (site, str(len(part)), str(missing), *numbers)
+    ticks = max(log.last_ticks[site], records.last_tick) + 1
+    missing = ticks - len(records) - log.absent_ticks(site)
+    late_us = np.percentile(records.late_us, (50, 99, 100))
+    busy_us = np.percentile(records.busy_us, (50, 99)) if len(records) > 1 else (0, 0)
+    times = [f"{time_us:.0f}" for time_us in (*late_us, *busy_us)]
+    last_error = np.abs(records.e[-1]).max()
+    return (site, str(len(records)), str(missing), *times, f"{last_error:.2e}")

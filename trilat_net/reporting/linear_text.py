@@ -1,8 +1,11 @@
-"""A linear analysis as terminal text: equilibrium, delays, root table, verdict, delay margin
-and ports.
+"""Text of a linear analysis for the terminal.
 
-Invariant: numbers have four digits and their units; roots that are zero by structure are
-counted, not listed.
+The text has the equilibrium, the delays in use, a table of the rightmost roots, the verdict,
+the delay margin, the ports, and the edges of stability over a scenario key.
+
+Invariant:
+    - Every number has its unit.
+    - Roots that are zero by structure are counted, not listed.
 """
 
 import math
@@ -23,47 +26,49 @@ from .result_text import Block, MarkedText, TextTable
 _COLOURS = {"stable": "green", "unstable": "red", "at the edge": "yellow"}
 
 
-def compose_linear(found: LinearAnalysis) -> Iterator[Block]:
-    """Yields equilibrium, delays, roots, verdict, margin and notes, then the ports, then the
-    edges.
-    """
-    yield from (*describe_equilibrium(found), *describe_effective_delays(found), "")
-    yield tabulate_roots(found)
-    yield describe_zero_roots(found)
-    verdict, _, rest = describe_linear_verdict(found).partition(": ")
+def compose_linear(analysis: LinearAnalysis) -> Iterator[Block]:
+    """Yields equilibrium, delays, roots, verdict, margin, notes, ports and edges, in order."""
+    yield from describe_equilibrium(analysis)
+    yield from describe_effective_delays(analysis)
+    yield ""
+    yield tabulate_roots(analysis)
+    yield describe_zero_roots(analysis)
+    verdict, _, rest = describe_linear_verdict(analysis).partition(": ")
     yield MarkedText(f"[{_COLOURS[verdict]}]{verdict}[/]:", rest)
-    yield f"delay margin, continuous loop, one delay on all links: {found.margin.description}"
-    yield from (f"note: {note}" for note in found.notes)
-    if found.ports is not None:
-        yield from describe_ports(found.ports)
-    yield from (_describe_scan(scan, found.scenario.name) for scan in found.scans)
+    margin = analysis.margin.description
+    yield f"delay margin, continuous loop, one delay on all links: {margin}"
+    yield from (f"note: {note}" for note in analysis.notes)
+    if analysis.ports is not None:
+        yield from describe_ports(analysis.ports)
+    yield from (_describe_scan(scan, analysis.scenario.name) for scan in analysis.scans)
 
 
 def _describe_scan(scan: EdgeScan, name: str) -> str:
-    edges = [
-        f"{'stable' if one.stable_above else 'unstable'} from {one.value:.6g} on "
-        f"({one.omega_rad_s:.4g} rad/s)"
-        for one in scan.edges
-    ]
-    found = ", ".join(edges) or f"stability of {name} does not change"
-    return f"{scan.key} from {scan.low:g} to {scan.high:g}: {found}"
+    """Returns a line on the values of a key at which the stability of a scenario changes."""
+    edges = []
+    for edge in scan.edges:
+        state = "stable" if edge.stable_above else "unstable"
+        edges.append(f"{state} from {edge.value:.6g} on ({edge.omega_rad_s:.4g} rad/s)")
+    result = ", ".join(edges) or f"stability of {name} does not change"
+    return f"{scan.key} from {scan.low:g} to {scan.high:g}: {result}"
 
 
 def describe_equilibrium(analysis: LinearAnalysis) -> Iterator[str]:
-    """Yields the equilibrium and the way it was found."""
+    """Yields how the equilibrium was computed, its residual, and the pose of each site."""
     rest = analysis.rest
     yield f"rest: {rest.how}; residual {rest.residual:.1g}"
     sites = analysis.conditions.sites
     angles = [q[: site.layout.joints] for site, q in zip(sites, rest.q, strict=True)]
+    # half a unit of the last digit that is shown
     if not sites[0].layout.task and float(np.ptp(rest.q, axis=0).max()) < 5e-5:
         yield f"  all sites at ({_list_numbers(angles[0])}) rad"
         return
     for site, q, pose in zip(sites, angles, analysis.end_effectors, strict=True):
-        at = (
-            f", its end effector at ({_list_numbers(pose)}) m{' and rad' * (len(pose) > 3)}"
-            * bool(len(pose))
-        )
-        yield f"  {site.name} at ({_list_numbers(q)}) rad{at}"
+        text = f"  {site.name} at ({_list_numbers(q)}) rad"
+        if len(pose):
+            units = "m and rad" if len(pose) > 3 else "m"
+            text += f", its end effector at ({_list_numbers(pose)}) {units}"
+        yield text
 
 
 def _list_numbers(values: Array) -> str:
@@ -71,24 +76,25 @@ def _list_numbers(values: Array) -> str:
 
 
 def describe_effective_delays(analysis: LinearAnalysis) -> Iterator[str]:
-    """Yields the effective delays, in one line if they are equal; the means of those that vary."""
+    """Yields the delays in use, in one line if all are equal; of varying delays the means."""
     names = analysis.scenario.names
     age_s = analysis.conditions.age_s
-    what = "mean delay in use" if analysis.conditions.varying else "delay in use"
+    quantity = "mean delay in use" if analysis.conditions.varying else "delay in use"
     links = list(zip(*np.nonzero(analysis.conditions.alpha), strict=True))
     values = {float(age_s[i, j]) for i, j in links}
     if len(values) == 1:
-        yield f"{what} on every link: {1e3 * values.pop():.4g} ms"
+        yield f"{quantity} on every link: {1e3 * values.pop():.4g} ms"
         return
     for i, j in links:
-        yield f"{what} on {names[j]}->{names[i]}: {1e3 * age_s[i, j]:.4g} ms"
+        yield f"{quantity} on {names[j]}->{names[i]}: {1e3 * age_s[i, j]:.4g} ms"
 
 
 def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
-    """Returns the rightmost roots, with those of the sampled loop next to them if any differs.
+    """Returns a table of the rightmost roots of the continuous loop, with their modes.
 
-    Those of the sampled loop alone where ticks differ from each other: the continuous loop has
-    mean delays.
+    If a root of the sampled loop differs, the table also has the roots of the sampled loop.
+    If the delays differ from tick to tick, the table has the roots of the sampled loop alone,
+    because the continuous loop only knows mean delays.
     """
     spanned = analysis.decisive.span_s is not None
     roots = analysis.decisive.roots if spanned else analysis.continuous.roots
@@ -96,63 +102,70 @@ def tabulate_roots(analysis: LinearAnalysis) -> TextTable:
     differ = any(other is not None for other in sampled)
     rows = []
     for root, other in zip(roots, sampled, strict=True):
-        numbers = (
+        # the imaginary part of a real root may be -0.0, which would be shown as "-0"
+        row = [
             f"{root.s.real:.4g}",
             f"{root.s.imag:.4g}" if root.s.imag else "0",
             f"{root.s.imag / (2.0 * math.pi):.4g}" if root.s.imag else "0",
             f"{root.damping:.4g}",
             str(root.multiplicity),
-        )
-        other_s = (
-            ("same", "same")
-            if other is None
-            else (f"{other.s.real:.4g}", f"{other.s.imag:.4g}")
-        )
-        rows.append((*numbers, *(other_s if differ else ()), root.description))
-    computed = ("re as computed", "im as computed") if differ else ()
-    heads = ("re 1/s", "im rad/s", "Hz", "damping", "modes", *computed, "what moves")
+        ]
+        if differ and other is None:
+            row += ["same", "same"]
+        elif other is not None:
+            row += [f"{other.s.real:.4g}", f"{other.s.imag:.4g}"]
+        rows.append([*row, root.description])
+    heads = ["re 1/s", "im rad/s", "Hz", "damping", "modes"]
+    if differ:
+        heads += ["re as computed", "im as computed"]
+    heads.append("what moves")
     return TextTable(heads, rows, align="r" * (len(heads) - 1) + "l")
 
 
 def describe_zero_roots(analysis: LinearAnalysis) -> str:
-    """Returns the number of roots that are zero by structure, in words."""
+    """Returns a sentence on the number and origin of the roots that are zero by structure."""
     count = analysis.decisive.zeros
     if not count:
         return "no root at zero"
-    are = "root is" if count == 1 else "roots are"
-    free = ", joints that the task leaves free" * analysis.conditions.sites[0].layout.task
-    return (
-        f"{count} {are} zero by structure: shared poses{free}, and estimates without excitation"
-    )
+    subject = "root is" if count == 1 else "roots are"
+    origins = "shared poses"
+    if analysis.conditions.sites[0].layout.task:
+        origins += ", joints that the task leaves free"
+    return f"{count} {subject} zero by structure: {origins}, and estimates without excitation"
 
 
 def describe_linear_verdict(analysis: LinearAnalysis) -> str:
     """Returns the verdict with the growth rate and frequency of the rightmost root."""
     rightmost = analysis.decisive.rightmost
     drifting = analysis.decisive.drifting
-    keeps = f"{drifting} {'motions keep their' if drifting > 1 else 'motion keeps its'} speed"
+    motions = "motions keep their" if drifting > 1 else "motion keeps its"
+    drift = f"{drifting} {motions} speed"
     if rightmost is None:
-        return f"{analysis.verdict}: {keeps if drifting else 'nothing moves'}"
-    rate = f"exp({rightmost.s.real:.4g} t / s)"
-    at = f" at {rightmost.s.imag:.4g} rad/s" if rightmost.s.imag else ""
-    computed = analysis.decisive.basis or " tick by tick"
-    which = "" if analysis.sampled is None else f", as computed{computed.removeprefix(',')}"
-    slowest = f"{keeps}, and the slowest of the others" if drifting else "the slowest motion"
-    return f"{analysis.verdict}: {slowest} goes as {rate}{at}{which}"
+        return f"{analysis.verdict}: {drift if drifting else 'nothing moves'}"
+    growth = f"exp({rightmost.s.real:.4g} t / s)"
+    if rightmost.s.imag:
+        growth += f" at {rightmost.s.imag:.4g} rad/s"
+    if analysis.sampled is not None:
+        basis = analysis.decisive.basis or " tick by tick"
+        growth += f", as computed{basis.removeprefix(',')}"
+    slowest = f"{drift}, and the slowest of the others" if drifting else "the slowest motion"
+    return f"{analysis.verdict}: {slowest} goes as {growth}"
 
 
 _SHOWN_BANDS = 3
+"""Largest number of listed frequency bands."""
 _JOINTS_BY_LINE = 2
+"""Largest number of joints for which every failing two-port has a line of its own."""
 WEIGHTS_ALIKE = 1e-9
+"""Largest difference of weights that count as equal."""
 
 
 def describe_ports(ports: PortAnalysis) -> list[str]:
-    """Returns a port analysis as lines."""
+    """Returns the lines on passivity, absolute stability and transparency of the ports."""
     low, high = ports.band_hz
-    lines = [
-        f"Ports of {', '.join(ports.sites)}, operators and environments off, {low:g}-{high:g} Hz "
-        "(a grid refined at minima: evidence, no proof)"
-    ]
+    conditions = f"operators and environments off, {low:g}-{high:g} Hz"
+    grid = "(a grid refined at minima: evidence, no proof)"
+    lines = [f"Ports of {', '.join(ports.sites)}, {conditions} {grid}"]
     if ports.resolved_hz < high:
         beyond = f"above {ports.resolved_hz:.3g} Hz"
         lines.append(f"  {beyond} the grid does not follow the phase of the longest delay")
@@ -168,8 +181,8 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
     kind = ports.kind
     whole = _describe_passivity(ports.velocity, unit, kind)
     lines.append(f"  operators passive in {ports.speed}, coupled or not: {whole}")
-    for joint, one in ports.joints.items():
-        alone = _describe_passivity(one, ports.impedance_unit(joint), kind)
+    for joint, passivity in ports.joints.items():
+        alone = _describe_passivity(passivity, ports.impedance_unit(joint), kind)
         lines.append(f"    {ports.name_port(joint)} alone: {alone}")
     if ports.proof is not None:
         proof = _describe_proof(ports, ports.proof)
@@ -181,17 +194,19 @@ def describe_ports(ports: PortAnalysis) -> list[str]:
     lines += [f"    Llewellyn, {text}" for text in _describe_two_ports(ports)]
     if ports.measured is not None:
         bands = ports.measured.below
-        found = (
-            f"not shown {_list_bands(bands)}, where they damp too little" if bands else "stable"
-        )
-        lines.append(f"  the measured operators at the masters, any at each: {found}")
+        result = "stable"
+        if bands:
+            result = f"not shown {_list_bands(bands)}, where they damp too little"
+        lines.append(f"  the measured operators at the masters, any at each: {result}")
     if ports.clamped_verdict == "unstable":
         clamped = ports.transparency[0].other_site
         return [
             *lines,
             f"  with {clamped} clamped the loop is unstable: it has no steady impedance",
         ]
-    return [*lines, *(f"  {_describe_transparency(ports, one)}" for one in ports.transparency)]
+    for transparency in ports.transparency:
+        lines.append(f"  {_describe_transparency(ports, transparency)}")
+    return lines
 
 
 def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
@@ -206,77 +221,93 @@ def _describe_proof(ports: PortAnalysis, proof: Passivity) -> str:
     )
 
 
-def _describe_passivity(one: Passivity, unit: str = "", kind: str = "") -> str:
-    """Returns a passivity in words; with a unit, also the damping that each joint or axis
-    lacks.
+def _describe_passivity(passivity: Passivity, unit: str = "", kind: str = "") -> str:
+    """Returns a sentence on passivity; with a unit, also the damping that a port lacks.
+
+    Args:
+        passivity: the result for one port or for all ports.
+        unit: the unit of the lacking damping; "" to leave the damping out.
+        kind: "joint" or "axis", the kind of the ports.
     """
-    if one.passive:
+    if passivity.passive:
         return "passive"
-    minima = one.minima
+    minima = passivity.minima
     least = f"least eigenvalue {minima.least:.3g} at {minima.least_hz:.3g} Hz"
     text = f"not passive {_list_bands(minima.below)}; {least}"
     if not unit:
         return text
-    if math.isinf(one.lacking_nm_s_rad):
-        return f"{text}; no damping at the {'axes' if kind == 'axis' else 'joints'} would make it so"
-    return f"{text}; {one.lacking_nm_s_rad:.3g} {unit} more at each {kind} would make it so"
+    if math.isinf(passivity.lacking_nm_s_rad):
+        plural = "axes" if kind == "axis" else "joints"
+        return f"{text}; no damping at the {plural} would make it so"
+    damping = f"{passivity.lacking_nm_s_rad:.3g} {unit}"
+    return f"{text}; {damping} more at each {kind} would make it so"
 
 
 def _list_bands(bands: tuple[FrequencyBand, ...]) -> str:
     shown = [f"{band.from_hz:.3g}-{band.to_hz:.3g}" for band in bands[:_SHOWN_BANDS]]
-    more = (
-        f" and {count_nouns(len(bands) - _SHOWN_BANDS, 'range')} more"
-        if len(bands) > _SHOWN_BANDS
-        else ""
-    )
-    return f"at {', '.join(shown)} Hz{more}"
+    text = f"at {', '.join(shown)} Hz"
+    if len(bands) > _SHOWN_BANDS:
+        text += f" and {count_nouns(len(bands) - _SHOWN_BANDS, 'range')} more"
+    return text
 
 
 def _describe_absolute_stability(ports: PortAnalysis) -> str:
     minima = ports.absolute
     if not minima.below:
         return "stable"
-    can = "some make" if len(ports.sites) <= 3 else "some may make"
+    operators = "some make" if len(ports.sites) <= 3 else "some may make"
     margin = f"margin {minima.least:.3g} at {minima.least_hz:.3g} Hz"
-    return f"{can} it unstable {_list_bands(minima.below)}; {margin}"
+    return f"{operators} it unstable {_list_bands(minima.below)}; {margin}"
 
 
 def _describe_two_ports(ports: PortAnalysis) -> list[str]:
-    failing = [one for one in ports.two_ports if one.minima.below]
-    holding = len(ports.two_ports) - len(failing)
-    third = (
-        ", the third site free or clamped"
-        if any(one.clamped for one in ports.two_ports)
-        else ""
-    )
-    every = f"every pair and {ports.kind}{third}" if not failing else "the others"
+    """Returns a line per failing two-port or group of them, and a line on those that hold."""
+    failing = [two_port for two_port in ports.two_ports if two_port.minima.below]
+    # for arms of many joints, the failing two-ports of a pair of sites share a line
     groups: dict[tuple[object, ...], list[TwoPort]] = {}
-    for one in failing:  # of arms of many joints those of one pair share a line
-        joint = one.joint if len(ports.joints) <= _JOINTS_BY_LINE else ""
-        groups.setdefault((one.sites, one.clamped, joint), []).append(one)
-    lines = []
-    for group in groups.values():
-        worst = min(group, key=lambda one: one.minima.least)
-        sites, _, clamped, minima = worst
-        joints = ", ".join(str(ports.axes.get(one.joint, one.joint)) for one in group)
-        bands = [b for one in group for b in one.minima.below]
-        within = (
-            f"within {min(b.from_hz for b in bands):.3g}-{max(b.to_hz for b in bands):.3g} Hz"
-        )
-        which = f"{' and '.join(sites)}{f', {clamped} clamped' if clamped else ''}, {ports.kind} {joints}"
-        least = f"least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
-        lines.append(
-            f"{which}: fails {_list_bands(minima.below) if len(group) == 1 else within}; {least}"
-        )
-    return [*lines, *([f"{every}: holds ({holding} two-ports)"] if holding else [])]
+    for two_port in failing:
+        joint = two_port.joint if len(ports.joints) <= _JOINTS_BY_LINE else ""
+        groups.setdefault((two_port.sites, two_port.clamped, joint), []).append(two_port)
+    lines = [_describe_failing(ports, group) for group in groups.values()]
+    holding = len(ports.two_ports) - len(failing)
+    if not holding:
+        return lines
+    subject = "the others"
+    if not failing:
+        subject = f"every pair and {ports.kind}"
+        if any(two_port.clamped for two_port in ports.two_ports):
+            subject += ", the third site free or clamped"
+    return [*lines, f"{subject}: holds ({holding} two-ports)"]
 
 
-def _describe_transparency(ports: PortAnalysis, one: Transparency) -> str:
-    unit = ports.impedance_unit(one.joint)
-    free, clamped = one.interpolate_magnitudes(QUOTED_AT_HZ)
-    low, high = one.band_hz
+def _describe_failing(ports: PortAnalysis, group: list[TwoPort]) -> str:
+    """Returns a line on failing two-ports of the same sites, with the least of their minima."""
+    worst = min(group, key=lambda two_port: two_port.minima.least)
+    minima = worst.minima
+    joints = [str(ports.axes.get(two_port.joint, two_port.joint)) for two_port in group]
+    subject = " and ".join(worst.sites)
+    if worst.clamped:
+        subject += f", {worst.clamped} clamped"
+    subject += f", {ports.kind} {', '.join(joints)}"
+    if len(group) == 1:
+        failure = _list_bands(minima.below)
+    else:
+        bands = [band for two_port in group for band in two_port.minima.below]
+        from_hz = min(band.from_hz for band in bands)
+        to_hz = max(band.to_hz for band in bands)
+        failure = f"within {from_hz:.3g}-{to_hz:.3g} Hz"
+    return f"{subject}: fails {failure}; least {minima.least:.3g} at {minima.least_hz:.3g} Hz"
+
+
+def _describe_transparency(ports: PortAnalysis, transparency: Transparency) -> str:
+    """Returns a sentence on the impedance felt with the other site free and clamped."""
+    unit = ports.impedance_unit(transparency.joint)
+    port = ports.name_port(transparency.joint)
+    free, clamped = transparency.interpolate_magnitudes(QUOTED_AT_HZ)
+    low_hz, high_hz = transparency.band_hz
     return (
-        f"{one.operator_site} feels of {one.other_site}, {ports.name_port(one.joint)}: {free:.4g} {unit} free and {clamped:.4g} "
-        f"clamped at {QUOTED_AT_HZ:g} Hz; over {low:g}-{high:g} Hz the ratio is {one.ratio_db:.3g} dB, the "
-        f"difference {one.difference_nm_s_rad:.3g} {unit}"
+        f"{transparency.operator_site} feels of {transparency.other_site}, {port}: "
+        f"{free:.4g} {unit} free and {clamped:.4g} clamped at {QUOTED_AT_HZ:g} Hz; "
+        f"over {low_hz:g}-{high_hz:g} Hz the ratio is {transparency.ratio_db:.3g} dB, "
+        f"the difference {transparency.difference_nm_s_rad:.3g} {unit}"
     )

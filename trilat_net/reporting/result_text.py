@@ -1,10 +1,12 @@
-"""The text of results: composed of lines and tables once, for the terminal, as plain text and
-as HTML.
+"""Text of results as a list of blocks, which are shown on the terminal, as text or as HTML.
 
-Invariant: all three have the same blocks in the same order. Results of `studies` compose their
-own; those of the rooms below have a module here.
+A block is a line, a marked line (`MarkedText`) or a table (`TextTable`). Results of `studies`
+compose their blocks in a method `blocks`. For the results of the packages below, which do not
+know about text, `_COMPOSERS` names a function in this folder.
 
-Every cell of a table is text already, and all forms show the same cells in the same order.
+Invariant:
+    - The terminal, the plain text and the HTML have the same blocks in the same order.
+    - Every cell of a table is text. All three forms show the same cells in the same order.
 """
 
 import re
@@ -26,12 +28,12 @@ _COLOURS = {"ok": "green", "warn": "yellow", "open": "yellow", "fail": "red", "F
 MARKS = {word: f"[{colour}]{word:<4}[/{colour}]" for word, colour in _COLOURS.items()} | {
     "note": "note"
 }
-"""Of findings, by their state."""
-
+"""Marks in Rich's markup, by the state of a finding."""
 
 HASH = re.compile(r"\b(?=[0-9a-f]*[a-f])(?=[0-9a-f]*[0-9])[0-9a-f]{12,64}\b")
-"""A hash in hexadecimal digits, or the beginning of one: it stays on one line, so that it can
-be copied.
+"""Pattern of a hash in hexadecimal digits, or of the first 12 or more digits of a hash.
+
+A hash is kept on one line so that it can be copied.
 """
 
 
@@ -44,14 +46,15 @@ class TextTable(NamedTuple):
     """A table of texts.
 
     Attributes:
-        headers: one per column; all empty for a table without a header line.
-        rows: one text per column each. A shorter row leaves its last cells empty; a row of one
-            text in a wider table is the heading of a group of rows.
-        align: a letter per column, "l" for words and "r" for numbers; the last one holds for
-            all columns that follow.
-        units: one per column, appended to its header; "" for none. May be shorter than
-            `headers`.
-        styles: on a terminal, styles of cells by their texts, as in {"fails": "yellow"}.
+        headers: a text per column; all empty for a table without a header line.
+        rows: lists of a text per column. A shorter row leaves its last cells empty. A row of
+            a single text in a wider table is the heading of a group of rows.
+        align: a letter per column, "l" for texts and "r" for numbers. The last letter also
+            holds for all further columns.
+        units: a unit per column, appended to the header; "" for a column without a unit. May
+            be shorter than `headers`.
+        styles: the styles of cells on a terminal, by the text of the cell, as in
+            {"fails": "yellow"}.
     """
 
     headers: Sequence[str]
@@ -74,19 +77,20 @@ class TextTable(NamedTuple):
         return [letter == "r" for letter in self.align.ljust(len(self.headers), self.align[-1])]
 
     def rich(self) -> "Table":
-        """Returns it for a Rich console: no borders, cells folded where the terminal is too
-        narrow.
+        """Returns the table for a Rich console, without borders.
+
+        Cells are folded if the terminal is too narrow, except cells that hold only hashes.
         """
         from rich.table import Table
 
         table = Table(box=None, pad_edge=False, show_header=any(self.titles))
-        for n, (title, right) in enumerate(zip(self.titles, self.to_the_right, strict=True)):
-            cells = [row[n] for row in self.rows if n < len(row)]
-            widest = max(
-                (len(found) for cell in cells for found in HASH.findall(cell)), default=None
-            )
+        columns = zip(self.titles, self.to_the_right, strict=True)
+        for index, (title, right) in enumerate(columns):
+            cells = [row[index] for row in self.rows if index < len(row)]
+            hash_widths = [len(digits) for cell in cells for digits in HASH.findall(cell)]
+            widest = max(hash_widths, default=None)
             side: Any = "right" if right else "left"
-            # Rich narrows columns that may wrap before it looks at the least widths of the others.
+            # Rich narrows columns that may wrap before it respects the least widths of others
             holds_hashes = widest is not None and all(len(cell) <= widest for cell in cells)
             table.add_column(
                 Text(sanitize(title)),
@@ -96,57 +100,63 @@ class TextTable(NamedTuple):
                 no_wrap=holds_hashes,
             )
         for row in self.rows:
-            heading = "bold" if len(row) == 1 < len(self.headers) else ""
-            table.add_row(
-                *(Text(sanitize(cell), style=self.styles.get(cell, heading)) for cell in row)
-            )
+            is_heading = len(row) == 1 < len(self.headers)
+            default = "bold" if is_heading else ""
+            texts = [Text(sanitize(cell), style=self.styles.get(cell, default)) for cell in row]
+            table.add_row(*texts)
         return table
 
     def markdown(self) -> str:
-        """Returns it in Markdown."""
+        """Returns the table in Markdown."""
         rule = ["--:" if right else "---" for right in self.to_the_right]
-        blank = [""] * len(self.headers)
-        cells = (self.titles, rule, *([*row, *blank[len(row) :]] for row in self.rows))
-        return "\n".join(
-            f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in row)} |"
-            for row in cells
-        )
+        rows = [self.titles, rule]
+        for row in self.rows:
+            missing = len(self.headers) - len(row)
+            rows.append([*row, *[""] * missing])
+        lines = []
+        for row in rows:
+            cells = [cell.replace("|", "\\|") for cell in row]
+            lines.append(f"| {' | '.join(cells)} |")
+        return "\n".join(lines)
 
     def html(self) -> str:
-        """Returns it in HTML."""
+        """Returns the table in HTML."""
         sides = ["right" if right else "left" for right in self.to_the_right]
 
-        def line(cells: Sequence[str], kind: str) -> str:
-            pairs = zip(cells, sides, strict=False)
-            made = (
-                f'<{kind} style="text-align:{side}">{escape_text(cell)}</{kind}>'
-                for cell, side in pairs
-            )
-            return f"<tr>{''.join(made)}</tr>"
+        def render_row(cells: Sequence[str], tag: str) -> str:
+            columns = [
+                f'<{tag} style="text-align:{side}">{escape_text(cell)}</{tag}>'
+                for cell, side in zip(cells, sides, strict=False)
+            ]
+            return f"<tr>{''.join(columns)}</tr>"
 
-        head = f"<thead>{line(self.titles, 'th')}</thead>" if any(self.titles) else ""
-        return f"<table>{head}<tbody>{''.join(line(row, 'td') for row in self.rows)}</tbody></table>"
+        head = f"<thead>{render_row(self.titles, 'th')}</thead>" if any(self.titles) else ""
+        body = "".join(render_row(row, "td") for row in self.rows)
+        return f"<table>{head}<tbody>{body}</tbody></table>"
 
     def lines(self) -> list[str]:
-        """Returns its lines with columns aligned by spaces; the first holds the headers, if
-        there are any.
+        """Returns the lines of the table, with columns aligned by spaces.
+
+        The first line holds the headers, unless all headers are empty.
         """
         table = [self.titles, *self.rows] if any(self.titles) else self.rows
-        widths = [
-            max((len(row[n]) for row in table if n < len(row)), default=0)
-            for n in range(len(self.headers))
-        ]
-        return [
-            "  ".join(
+        widths = []
+        for index in range(len(self.headers)):
+            lengths = [len(row[index]) for row in table if index < len(row)]
+            widths.append(max(lengths, default=0))
+        lines = []
+        for row in table:
+            columns = zip(row, widths, self.to_the_right, strict=False)
+            cells = [
                 cell.rjust(width) if right else cell.ljust(width)
-                for cell, width, right in zip(row, widths, self.to_the_right, strict=False)
-            ).rstrip()
-            for row in table
-        ]
+                for cell, width, right in columns
+            ]
+            lines.append("  ".join(cells).rstrip())
+        return lines
 
 
 def format_number(value: float | None, digits: int = 3) -> str:
-    """Returns a number as a cell of a table shows it; a dash for None."""
+    """Returns a number as a cell of a table, or a dash for None."""
     return "-" if value is None else f"{value:.{digits}g}"
 
 
@@ -154,7 +164,7 @@ class MarkedText(NamedTuple):
     """A line behind a mark.
 
     Attributes:
-        mark: in Rich's markup, as in "[green]ok[/green]"; "" for none.
+        mark: the mark in Rich's markup, as in "[green]ok[/green]", or "".
         text: the line.
         failed: True if a command prints it to standard error.
     """
@@ -164,11 +174,11 @@ class MarkedText(NamedTuple):
     failed: bool = False
 
     def lines(self) -> list[str]:
-        """Returns it without colours, as a line."""
+        """Returns a list of one line, without colours."""
         return [f"{Text.from_markup(self.mark).plain} {self.text}" if self.mark else self.text]
 
     def html(self) -> str:
-        """Returns it in HTML."""
+        """Returns the line in HTML."""
         text = escape_text(sanitize(self.lines()[0], MAX_LETTERS))
         return f'<div style="white-space:pre-wrap">{text or "&nbsp;"}</div>'
 
@@ -192,17 +202,19 @@ _COMPOSERS = {
     "PushedTwins": "certificate_text:compose_twins",
     "Rerun": "summary_text:compose_rerun",
 }
-"""By type what composes its text."""
+"""Functions that compose the text of results, as "module:function", by class name."""
 
 
 def compose(result: Result) -> list[MarkedText | TextTable]:
     """Returns the lines and tables of a result, in order."""
-    own = getattr(result, "blocks", None)
-    if own is None:
-        known = next(one.__name__ for one in type(result).__mro__ if one.__name__ in _COMPOSERS)
-        module, _, name = _COMPOSERS[known].partition(":")
-        own = partial(getattr(import_module(f"{__package__}.{module}"), name), result)
-    blocks: Iterable[Block] = own()
+    compose_blocks = getattr(result, "blocks", None)
+    if compose_blocks is None:
+        classes = [cls.__name__ for cls in type(result).__mro__]
+        known = next(name for name in classes if name in _COMPOSERS)
+        module, _, function = _COMPOSERS[known].partition(":")
+        composer = getattr(import_module(f"{__package__}.{module}"), function)
+        compose_blocks = partial(composer, result)
+    blocks: Iterable[Block] = compose_blocks()
     return [MarkedText("", block) if isinstance(block, str) else block for block in blocks]
 
 
@@ -213,5 +225,5 @@ def summarize(result: Result) -> str:
 
 
 def render_html(result: Result) -> str:
-    """Returns a result as HTML, with its tables as such."""
+    """Returns a result as HTML, with HTML tables."""
     return "\n".join(block.html() for block in compose(result))

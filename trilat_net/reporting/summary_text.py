@@ -1,11 +1,13 @@
-"""What is found of a run, as text: its summary and its metrics, the checks of its log, a
-recovery, a rerun.
+"""Text of the results about a run: its summary, metrics, log checks, recovery and rerun.
 
-The summary has links, changes, modes, clocks, and messages of user laws and arms. What was
-measured of a running session, and of this machine, is here too.
+The summary lists links, changes, modes, clocks, and messages of user laws and arms. The module
+also composes the text of the measurements of a running session (`compose_ping`,
+`compose_topic_delays`) and of this machine (`compose_doctor`, `compose_benchmark`).
 
-Invariant: a link with one constant delay and no loss gets no line. A dash stands for a missing
-number of a metric; if there could be one, its reason is given below.
+Invariant:
+    - A link with one constant delay and no loss gets no line.
+    - A dash stands for a missing number of a metric. If the metric applies there, the reason
+      is written below the tables.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -28,21 +30,23 @@ from .result_text import MARKS, Block, MarkedText, TextTable
 from .terminal_output import sanitize
 
 MOST_LINES = 12
-"""Lines of each kind; summary.json has the rest."""
+"""Largest number of lines of each kind; summary.json has the rest."""
 MOST_LINE_CHARACTERS = 400
+"""Largest length of a message of a user law or an external arm."""
 OUTSIDE_EVENT_KINDS = ("failed", "law", "arm")
 """Kinds of the events about user laws and external arms."""
 _MAX_PLACES = 10
-"""Places of a failed check that are listed; the JSON has all."""
+"""Largest number of listed places of a failed check; the JSON has all."""
 _MAX_LOSSES = 10
-"""Losses that are listed."""
+"""Largest number of listed losses of a recovery; the JSON has all."""
 _NO_NUMBER = "–"
+"""Cell of a missing number."""
 _MAX_FREQUENCIES = 16
-"""Frequencies of one response that are listed; the JSON has all."""
+"""Largest number of listed frequencies of a response; the JSON has all."""
 
 
 def compose_log(log: Log) -> Iterator[Block]:
-    """Yields the session, a row per site, and what else there is to say of the run."""
+    """Yields the session, a table with a row per site, and the lines of `format_run_lines`."""
     yield log.headline()
     rows = [
         [
@@ -59,11 +63,10 @@ def compose_log(log: Log) -> Iterator[Block]:
 
 
 def format_run_lines(log: Log) -> list[str]:
-    """Returns the lines of a run besides its numbers: user laws, links, changes, modes and
-    clocks.
+    """Returns the lines on alarms, user laws and arms, links, changes, modes and clocks.
 
     Raises:
-        LogError: a record names a change that is none.
+        LogError: a record names a change that does not exist.
     """
     return [
         *_first([f"*** {alarm}" for alarm in list_alarms(log)]),
@@ -77,25 +80,29 @@ def format_run_lines(log: Log) -> list[str]:
 
 def format_outside_lines(log: Log) -> list[str]:
     """Returns the messages about user laws and external arms, as lines of bounded length."""
-    texts = (e.text[:MOST_LINE_CHARACTERS] for e in log.events if e.kind in OUTSIDE_EVENT_KINDS)
-    return _first(
-        ["".join(letter if letter.isprintable() else " " for letter in text) for text in texts]
-    )
+    lines = []
+    for event in log.events:
+        if event.kind in OUTSIDE_EVENT_KINDS:
+            text = event.text[:MOST_LINE_CHARACTERS]
+            lines.append("".join(letter if letter.isprintable() else " " for letter in text))
+    return _first(lines)
 
 
 def format_link_lines(log: Log) -> list[str]:
-    """Returns a line per link that is not stated as constant without loss, or was not so."""
+    """Returns a line per link that was stated or observed with varying delay or loss."""
     lines = []
-    for use in (use for use in link_summary.summarise_links(log) if not use.plain):
+    for use in link_summary.summarise_links(log):
+        if use.plain:
+            continue
         measured = any(state.link.measured for state in use.stated)
-        parts = [
-            f"link {use.name}: {'' if measured else 'stated '}{format_stated_models(use.stated)}"
-        ]
+        origin = "" if measured else "stated "
+        parts = [f"link {use.name}: {origin}{format_stated_models(use.stated)}"]
         if use.one_way_us is not None and measured:
             parts.append(f"one way {_ms(use.one_way_us, 1e-3)}")
-        parts.append(
-            "no sample in use" if use.age_ms is None else f"effective {_ms(use.age_ms)}"
-        )
+        if use.age_ms is None:
+            parts.append("no sample in use")
+        else:
+            parts.append(f"effective {_ms(use.age_ms)}")
         if use.counts is not None:
             parts.append(_losses(use, use.counts))
         lines.append("; ".join(parts))
@@ -103,7 +110,7 @@ def format_link_lines(log: Log) -> list[str]:
 
 
 def format_change_lines(log: Log) -> list[str]:
-    """Returns a line for each order to a site, and each change of a link or of a site's shares."""
+    """Returns a line per command to a site and per change of a link or of a site's shares."""
     lines = []
     for changed in list_changes(log):
         tick = changed.taken_at_tick
@@ -113,20 +120,24 @@ def format_change_lines(log: Log) -> list[str]:
 
 
 def format_mode_lines(log: Log) -> list[str]:
-    """Returns a line per site that held, braked or returned."""
+    """Returns a line per site that held, braked or returned, with the times."""
     lines = []
     for site in log.sites:
-        if found := find_mode_intervals(log[site]):
-            words = [
-                f"{s.meaning.did} {s.from_s:.3f}-{s.to_s:.3f} s" for s in found[:MOST_LINES]
-            ]
-            more = [f"and {len(found) - MOST_LINES} more"] if len(found) > MOST_LINES else []
-            lines.append(f"{site}: {', '.join([*words, *more])}")
+        intervals = find_mode_intervals(log[site])
+        if not intervals:
+            continue
+        parts = []
+        for interval in intervals[:MOST_LINES]:
+            period = f"{interval.from_s:.3f}-{interval.to_s:.3f} s"
+            parts.append(f"{interval.meaning.did} {period}")
+        if len(intervals) > MOST_LINES:
+            parts.append(f"and {len(intervals) - MOST_LINES} more")
+        lines.append(f"{site}: {', '.join(parts)}")
     return lines
 
 
 def format_clock_lines(log: Log) -> list[str]:
-    """Returns a line per link between two clocks."""
+    """Returns a line per link whose two sites have different clocks."""
     lines = []
     for site in log.sites:
         for peer in log[site].peers:
@@ -137,31 +148,33 @@ def format_clock_lines(log: Log) -> list[str]:
 
 
 def format_stated_models(states: Sequence[StatedModel]) -> str:
-    """Returns the stated models of a link; of many changes the last one."""
+    """Returns the stated models of a link as text; of three or more, the first and the last."""
     first, *later = states
-    words = [first.link.describe()]
+    parts = [first.link.describe()]
     if len(later) > 2:
-        words.append(f"{count_nouns(len(later) - 1, 'change')}")
+        parts.append(f"{count_nouns(len(later) - 1, 'change')}")
         later = later[-1:]
-    words += [f"{link.describe()} from {from_s:g} s on" for from_s, link in later]
-    return ", then ".join(words)
+    parts += [f"{link.describe()} from {from_s:g} s on" for from_s, link in later]
+    return ", then ".join(parts)
 
 
 def format_clock(use: link_summary.ClockSummary) -> str:
-    """Returns offset, bound and drift of a clock in a few words."""
+    """Returns the offset, bound, drift and faults of a clock as text."""
     known = f"known to {use.bound_us} us (p50 {use.bound_p50_us:.0f}, max {use.bound_max_us})"
-    words = [f"{use.offset_us / 1e3:+.3f} ms at the end, {known}"]
+    parts = [f"{use.offset_us / 1e3:+.3f} ms at the end, {known}"]
     if use.drift_ppm is not None:
-        words.append(f"drift {use.drift_ppm:+.2f} ppm")
+        parts.append(f"drift {use.drift_ppm:+.2f} ppm")
     if use.faults:
         early = "sample came before it was sent", "samples came before they were sent"
-        words.append(f"{count_nouns(use.faults, *early)}: a clock has stepped")
-    return ", ".join(words)
+        parts.append(f"{count_nouns(use.faults, *early)}: a clock has stepped")
+    return ", ".join(parts)
 
 
 def _ms(spread: link_summary.ValueStatistics, factor: float = 1.0) -> str:
-    values = (spread.mean, spread.deviation, spread.p99, spread.max)
-    mean, deviation, p99, largest = (_number(factor * value) for value in values)
+    mean = _number(factor * spread.mean)
+    deviation = _number(factor * spread.deviation)
+    p99 = _number(factor * spread.p99)
+    largest = _number(factor * spread.max)
     return f"{mean} +- {deviation} ms (p99 {p99}, max {largest})"
 
 
@@ -178,78 +191,79 @@ def _losses(use: link_summary.LinkSummary, counts: link_summary.SampleCounts) ->
         "duplicates": counts.duplicate + counts.copies,
     }
     judged = max(counts.judged, 1)
-    words = [
-        f"{name} {count} ({100 * count / judged:.3g} %)"
-        for name, count in losses.items()
-        if count
-    ]
+    parts = []
+    for name, count in losses.items():
+        if count:
+            parts.append(f"{name} {count} ({100 * count / judged:.3g} %)")
+    # shorter bursts would be shown as "1 in a row"
     if use.burst is not None and use.burst > 1.005:
-        words.append(f"{_number(use.burst)} in a row")
-    return ", ".join(words) or "nothing lost"
+        parts.append(f"{_number(use.burst)} in a row")
+    return ", ".join(parts) or "nothing lost"
 
 
 def _first(lines: list[str]) -> list[str]:
     more = len(lines) - MOST_LINES
-    return (
-        lines
-        if more <= 0
-        else [*lines[:MOST_LINES], f"and {more} more of this kind: see summary.json"]
-    )
+    if more <= 0:
+        return lines
+    return [*lines[:MOST_LINES], f"and {more} more of this kind: see summary.json"]
 
 
-def compose_verification(found: LogCheckReport) -> Iterator[Block]:
-    """Yields a line per check, and of a log that passed those of its run."""
-    for line in found.findings:
-        yield MarkedText("", f"{line.check}: {line.text}", failed=not line.passed)
-    if found.passed:
-        yield from format_run_lines(found.log)
+def compose_verification(report: LogCheckReport) -> Iterator[Block]:
+    """Yields a line per check; if all checks passed, also the lines of `format_run_lines`."""
+    for finding in report.findings:
+        yield MarkedText("", f"{finding.check}: {finding.text}", failed=not finding.passed)
+    if report.passed:
+        yield from format_run_lines(report.log)
 
 
-def compose_log_check(found: LogCheckResult) -> Iterator[Block]:
-    """Yields a line per check, and the places where it failed."""
-    for finding in found.findings:
+def compose_log_check(report: LogCheckResult) -> Iterator[Block]:
+    """Yields a line per check, and the places where the check failed."""
+    for finding in report.findings:
         mark = MARKS["ok" if finding.passed else "FAIL"]
         yield MarkedText(mark, f"{finding.check:<9}  {finding.text}")
+        # a single place that the text of the check names is not repeated
         if finding.wrong == 1 and str(finding.places[0]) in finding.text:
             continue
         for place in finding.places[:_MAX_PLACES]:
-            where = f"{place.file}: " if len(found.files) > 1 and place.file else ""
-            yield f"       {where}{place}"
+            file = f"{place.file}: " if len(report.files) > 1 and place.file else ""
+            yield f"       {file}{place}"
         if finding.wrong > _MAX_PLACES:
-            yield f"       and {finding.wrong - _MAX_PLACES} more; --json names {len(finding.places)}"
+            more = finding.wrong - _MAX_PLACES
+            yield f"       and {more} more; --json names {len(finding.places)}"
 
 
-def compose_recovery(found: Recovery) -> Iterator[Block]:
-    """Yields what was recovered and what was lost."""
-    how = "was finished" if found.finished else "was not finished"
-    yield f"{found.output}: made of {found.path}, which {how}"
+def compose_recovery(recovery: Recovery) -> Iterator[Block]:
+    """Yields the recovered file, and a table of the recovered and the lost records."""
+    state = "was finished" if recovery.finished else "was not finished"
+    yield f"{recovery.output}: made of {recovery.path}, which {state}"
     rows = []
-    if there := found.coverage.judged:
-        rows.append(("records", ", ".join(f"{site} {count}" for site, count in there.items())))
-        rows.append(("of the run", str(found.coverage)))
-        rows.append(("source", f"digest chain {found.chain}"))
-    rows.append(("messages", f"{found.messages} in {found.duration_s:.3f} s"))
-    lists = [("lost", found.lost)]
-    if found.coverage.expected:  # else nothing tells which records there should be
-        lists.append(("missing", found.missing))
+    record_counts = recovery.coverage.judged
+    if record_counts:
+        counts = ", ".join(f"{site} {count}" for site, count in record_counts.items())
+        rows.append(("records", counts))
+        rows.append(("of the run", str(recovery.coverage)))
+        rows.append(("source", f"digest chain {recovery.chain}"))
+    rows.append(("messages", f"{recovery.messages} in {recovery.duration_s:.3f} s"))
+    lists = [("lost", recovery.lost)]
+    # without a number of expected records nothing can be called missing
+    if recovery.coverage.expected:
+        lists.append(("missing", recovery.missing))
     for name, lines in lists:
-        rows += [
-            ("" if n else name, text)
-            for n, text in enumerate(lines[:_MAX_LOSSES] or ["nothing"])
-        ]
+        first, *others = lines[:_MAX_LOSSES] or ["nothing"]
+        rows.append((name, first))
+        rows += [("", text) for text in others]
         if len(lines) > _MAX_LOSSES:
             rows.append(("", f"and {len(lines) - _MAX_LOSSES} more; --json lists all"))
     yield TextTable(("", ""), [(f"  {name}", text) for name, text in rows])
 
 
-def compose_rerun(again: Rerun) -> Iterator[Block]:
-    """Yields what was executed with which changes, a table of the sites, and the other effects."""
-    asked = again.request
-    others = f"; {', '.join(asked.recorded)} as recorded" if asked.recorded else ""
-    yield f"{asked.mode}: {', '.join(asked.replaced)} executed afresh{others}"
-    for line in describe_rerun_changes(asked) or [
-        "nothing is changed: this is the experiment of the log"
-    ]:
+def compose_rerun(rerun: Rerun) -> Iterator[Block]:
+    """Yields the executed sites, the changes, a table of the sites, and other effects."""
+    request = rerun.request
+    recorded = f"; {', '.join(request.recorded)} as recorded" if request.recorded else ""
+    yield f"{request.mode}: {', '.join(request.replaced)} executed afresh{recorded}"
+    changes = describe_rerun_changes(request)
+    for line in changes or ["nothing is changed: this is the experiment of the log"]:
         yield f"  {line}"
     headers = (
         "ticks",
@@ -262,75 +276,77 @@ def compose_rerun(again: Rerun) -> Iterator[Block]:
         "here",
     )
     rows = []
-    for effect in again.sites.values():
+    for effect in rerun.sites.values():
         cells = []
         for pair in (effect.error_rms_rad, effect.error_max_rad, effect.torque_max_nm):
             cells += ["", ""] if pair is None else [f"{value:#.3g}" for value in pair]
         rows.append([effect.site, str(effect.executed), str(effect.identical), *cells])
     yield TextTable(("site", *headers), rows, align="lr")
-    yield from _describe_effects(again)
-    yield from (f"note: {note}" for note in again.notes)
+    yield from _describe_effects(rerun)
+    yield from (f"note: {note}" for note in rerun.notes)
 
 
-def _describe_effects(again: Rerun) -> list[str]:
+def _describe_effects(rerun: Rerun) -> list[str]:
     lines = []
-    for effect in again.sites.values():
+    for effect in rerun.sites.values():
         if effect.q_max_rad:
             most = effect.q_max_rad
             at_s = effect.q_max_at_s
             rms = effect.q_rms_rad
-            lines.append(
-                f"{effect.site}: q is up to {most:.3g} rad off the log, at {at_s:.3f} s; {rms:.3g} rad rms"
-            )
+            largest = f"q is up to {most:.3g} rad off the log, at {at_s:.3f} s"
+            lines.append(f"{effect.site}: {largest}; {rms:.3g} rad rms")
         if effect.first is not None:
             first = effect.first
-            at_s = first.tick / again.request.scenario.sites[effect.site].rate_hz
-            was, now = _values(first.logged, first.computed)
-            where = f"tick {first.tick} ({at_s:.3f} s)"
-            lines.append(
-                f"{effect.site}: the first difference is at {where}: {first.field} was {was}, is {now}"
-            )
+            at_s = first.tick / rerun.request.scenario.sites[effect.site].rate_hz
+            logged, computed = _values(first.logged, first.computed)
+            when = f"tick {first.tick} ({at_s:.3f} s)"
+            change = f"{first.field} was {logged}, is {computed}"
+            lines.append(f"{effect.site}: the first difference is at {when}: {change}")
         if effect.diverged_at_s is not None:
             lines.append(
                 f"{effect.site}: diverged at {effect.diverged_at_s:.3f} s and ends there"
             )
-    for link in (link for link in again.links.values() if link.differs):
+    for link in rerun.links.values():
+        if not link.differs:
+            continue
         before, after = (
-            f"{mean:.4g} ms old on average, {most:.4g} ms at most"
-            for mean, most in zip(link.age_mean_ms, link.age_max_ms, strict=True)
+            f"{mean:.4g} ms old on average, {largest:.4g} ms at most"
+            for mean, largest in zip(link.age_mean_ms, link.age_max_ms, strict=True)
         )
         lines.append(f"link {link.link}: samples in use were {before}; are {after}")
     return lines
 
 
 def _values(before: object, after: object) -> tuple[str, str]:
-    short = tuple(
-        f"{value:.6g}" if isinstance(value, float) else str(value) for value in (before, after)
-    )
-    return (short[0], short[1]) if short[0] != short[1] else (repr(before), repr(after))
+    """Returns two different values as texts that differ: in full if six digits are the same."""
+    short_before = f"{before:.6g}" if isinstance(before, float) else str(before)
+    short_after = f"{after:.6g}" if isinstance(after, float) else str(after)
+    if short_before == short_after:
+        return repr(before), repr(after)
+    return short_before, short_after
 
 
-def compose_doctor(found: Result) -> Iterator[Block]:
+def compose_doctor(report: Result) -> Iterator[Block]:
     """Yields a line per finding."""
-    for finding in found.to_dict()["findings"]:
+    for finding in report.to_dict()["findings"]:
         yield MarkedText(MARKS[finding["state"]], f"{finding['check']:<10}  {finding['text']}")
 
 
-def compose_ping(found: Result) -> Iterator[Block]:
-    """Yields the members with round trips and clocks, and the links as the sites measure them."""
-    facts = found.to_dict()
+def compose_ping(report: Result) -> Iterator[Block]:
+    """Yields tables of the members (round trips, clocks) and of the links between sites."""
+    facts = report.to_dict()
     members = facts["members"]
     links = facts["links"]
     state = "runs" if any(member["running"] for member in members) else "waits for its members"
-    yield f"session {facts['session']} {state}; times in us; a clock is the one there minus the one here"
+    clock_note = "a clock is the one there minus the one here"
+    yield f"session {facts['session']} {state}; times in us; {clock_note}"
     rows = []
     for member in members:
         rtt = member.get("rtt_us", {})
-        numbers = [*(rtt.get(name) for name in ("min", "p50", "p99")), member.get("jitter_us")]
-        times = ("" if number is None else f"{number:.0f}" for number in numbers)
-        rows.append(
-            [member["member"], member["host"], str(member["answers"]), *times, _clock(member)]
-        )
+        times_us = [rtt.get("min"), rtt.get("p50"), rtt.get("p99"), member.get("jitter_us")]
+        times = ["" if time_us is None else f"{time_us:.0f}" for time_us in times_us]
+        answers = str(member["answers"])
+        rows.append([member["member"], member["host"], answers, *times, _clock(member)])
     headers = ("member", "host", "answers", "rtt min", "p50", "p99", "jitter", "clock")
     yield TextTable(headers, rows, align="llrrrrrl")
     if links:
@@ -346,29 +362,31 @@ def compose_ping(found: Result) -> Iterator[Block]:
 
 
 _BARS = " ▁▂▃▄▅▆▇█"
+"""Bars of a histogram in text, by their height in eighths."""
 
 
-def compose_topic_delays(found: Result) -> Iterator[Block]:
-    """Yields a row per publisher, and how its delays are spread from the least to the largest."""
-    facts = found.to_dict()
-    yield f"/{facts['topic']}, {facts['lasted_s']:.3g} s; times in us, from sending to arrival here"
+def compose_topic_delays(report: Result) -> Iterator[Block]:
+    """Yields a row per publisher, with a histogram from its least to its largest delay."""
+    facts = report.to_dict()
+    lasted = f"{facts['lasted_s']:.3g} s"
+    yield f"/{facts['topic']}, {lasted}; times in us, from sending to arrival here"
     rows = []
     least = 0.0
-    for one in facts["publishers"]:
-        times = one["delay_us"]
-        counts = one["histogram"]["counts"]
+    for publisher in facts["publishers"]:
+        delays_us = publisher["delay_us"]
+        counts = publisher["histogram"]["counts"]
+        # rounded up, so that a single message is seen
         bars = "".join(_BARS[-(-8 * count // max(counts))] for count in counts)
-        numbers = [str(one["messages"]), str(one["lost"]), f"{one['rate_hz']:.1f}"]
-        rows.append(
-            [
-                one["gid"][:8],
-                one["type"],
-                *numbers,
-                *(f"{times[name]:.0f}" for name in times),
-                bars,
-            ]
-        )
-        least = min(least, times["min"])
+        cells = [
+            publisher["gid"][:8],
+            publisher["type"],
+            str(publisher["messages"]),
+            str(publisher["lost"]),
+            f"{publisher['rate_hz']:.1f}",
+        ]
+        cells += [f"{delay_us:.0f}" for delay_us in delays_us.values()]
+        rows.append([*cells, bars])
+        least = min(least, delays_us["min"])
     headers = (
         "publisher",
         "type",
@@ -395,9 +413,9 @@ def _clock(member: dict[str, Any]) -> str:
     return f"{member['offset_ns'] / 1e9:.6f} s +- {member['bound_us']:.0f}"
 
 
-def compose_benchmark(found: Result) -> Iterator[Block]:
-    """Yields a row per size, rate and transport, and per transport whether that is good enough."""
-    facts = found.to_dict()
+def compose_benchmark(benchmark: Result) -> Iterator[Block]:
+    """Yields a row per size, rate and transport, and a judgement of each transport."""
+    facts = benchmark.to_dict()
     needs = facts["needs"]
     name = facts["scenario"]
     yield "one way is half a round trip, the far end's handling with it; times in us"
@@ -405,165 +423,182 @@ def compose_benchmark(found: Result) -> Iterator[Block]:
     for row in facts["rows"]:
         times = row["one_way_us"] or {}
         shown = [f"{times[key]:.0f}" if key in times else "" for key in ("p50", "p99", "max")]
-        own = (row["bytes"], row["rate_hz"]) == (needs["sample_bytes"], needs["rate_hz"])
+        same_size = row["bytes"] == needs["sample_bytes"]
+        same_rate = row["rate_hz"] == needs["rate_hz"]
+        scenario = name if same_size and same_rate else ""
         counts = [row["bytes"], f"{row['rate_hz']:g}", row["sent"], row["lost"]]
-        rows.append([row["transport"], *map(str, counts), *shown, name if own else ""])
+        rows.append([row["transport"], *map(str, counts), *shown, scenario])
     headers = ("transport", "bytes", "rate", "sent", "lost", "p50", "p99", "max", "is that of")
     yield TextTable(headers, rows, align="lrrrrrrrl", units=("", "", "Hz"))
     yield f"{name}: {needs['words']}"
-    for one in facts["transports"]:
-        yield MarkedText(
-            MARKS["ok" if one["good"] else "fail"],
-            f"{one['transport']}: {_judgement(one, needs)}",
-        )
+    for transport in facts["transports"]:
+        mark = MARKS["ok" if transport["good"] else "fail"]
+        yield MarkedText(mark, f"{transport['transport']}: {_judgement(transport, needs)}")
 
 
-def _judgement(one: dict[str, Any], needs: dict[str, Any]) -> str:
-    if one["p99_ms"] is None:
+def _judgement(transport: dict[str, Any], needs: dict[str, Any]) -> str:
+    if transport["p99_ms"] is None:
         return "nothing came back"
-    parts = [f"p99 {one['p99_ms']:.3g} ms"]
+    parts = [f"p99 {transport['p99_ms']:.3g} ms"]
     if needs["held_ms"]:
-        held = f"the {needs['held_ms']:g} ms for which links hold samples"
-        parts[0] += f" {'hides in' if one['hidden'] else 'exceeds'} {held}"
-    parts.append(f"samples are in use {one['age_ms']:.4g} ms old")
-    if one["spare_ms"] is not None:
-        parts.append(f"{one['spare_ms']:.4g} ms to spare")
+        relation = "hides in" if transport["hidden"] else "exceeds"
+        parts[0] += f" {relation} the {needs['held_ms']:g} ms for which links hold samples"
+    parts.append(f"samples are in use {transport['age_ms']:.4g} ms old")
+    if transport["spare_ms"] is not None:
+        parts.append(f"{transport['spare_ms']:.4g} ms to spare")
     elif needs["stable_ms"] is not None:
         parts.append("at which the loop is not stable")
-    if one["lost_share"]:
-        parts.append(f"{100 * one['lost_share']:.3g} % lost")
-    parts.append(f"a play-out of {one['playout_ms']} ms would hold every one of these samples")
+    if transport["lost_share"]:
+        parts.append(f"{100 * transport['lost_share']:.3g} % lost")
+    parts.append(
+        f"a play-out of {transport['playout_ms']} ms would hold every one of these samples"
+    )
     return ", ".join(parts[:-1]) + "; " + parts[-1]
 
 
-def compose_metrics(found: LogMetrics) -> Iterator[Block]:
-    """Yields a table per group and kind of place, statics, impedances, and reasons of missing
-    numbers.
+def compose_metrics(metrics: LogMetrics) -> Iterator[Block]:
+    """Yields the tables of metrics, statics and impedances, then reasons of missing numbers.
+
+    Metrics have a table per group of quantities and kind of place: run, site, link or wall.
     """
     reasons: dict[str, list[str]] = {}
-    for (group, _), members in groupby(quantities(), key=lambda one: (one.group, one.of)):
-        yield from _compose_group(group, list(members), found, reasons)
-    yield from _compose_statics(found)
-    yield from _compose_impedance(found)
-    for why, where in reasons.items():
-        yield _explain_missing(sanitize(", ".join(where)), why)
+    by_table = groupby(quantities(), key=lambda quantity: (quantity.group, quantity.of))
+    for (group, _), members in by_table:
+        yield from _compose_group(group, list(members), metrics, reasons)
+    yield from _compose_statics(metrics)
+    yield from _compose_impedance(metrics)
+    for reason, missing in reasons.items():
+        yield _explain_missing(sanitize(", ".join(missing)), reason)
 
 
-def _explain_missing(what: str, why: str) -> MarkedText:
-    return MarkedText(f"[bold]{_NO_NUMBER}[/bold]", f"{what}: {sanitize(why)}")
+def _explain_missing(subject: str, reason: str) -> MarkedText:
+    return MarkedText(f"[bold]{_NO_NUMBER}[/bold]", f"{subject}: {sanitize(reason)}")
 
 
 def _compose_group(
-    group: str, members: Sequence[Quantity], found: LogMetrics, reasons: dict[str, list[str]]
+    group: str, members: Sequence[Quantity], metrics: LogMetrics, reasons: dict[str, list[str]]
 ) -> Iterator[Block]:
-    """Yields a row per quantity and a column per place that apply; collects reasons of missing
-    numbers.
+    """Yields a table with a row per quantity and a column per place, for those that apply.
+
+    Args:
+        group: the heading of the table.
+        members: the quantities of the group.
+        metrics: their values.
+        reasons: receives the names of missing numbers, by the reason.
     """
-    rows = {quantity: found.values_of(quantity) for quantity in members}
-    could = {
-        q: places for q, places in rows.items() if any(one.applies for one in places.values())
+    values = {quantity: metrics.values_of(quantity) for quantity in members}
+    applicable = {
+        quantity: by_place
+        for quantity, by_place in values.items()
+        if any(metric.applies for metric in by_place.values())
     }
-    names = [
-        name
-        for name in next(iter(rows.values()))
-        if any(places[name].applies for places in could.values())
+    places = [
+        place
+        for place in next(iter(values.values()))
+        if any(by_place[place].applies for by_place in applicable.values())
     ]
-    if not names:
-        return
-    cells = [
-        [q.name, q.unit, *(_write_metric(places[name]) for name in names)]
-        for q, places in could.items()
-    ]
-    yield from _tabulate([group, "", *names], cells, words=2)
-    for quantity, places in could.items():
-        for name in names:
-            if places[name].value is None and places[name].applies:
-                where = f"{quantity.name} of {name}" if name else quantity.name
-                reasons.setdefault(places[name].why, []).append(where)
-
-
-def _compose_statics(found: LogMetrics) -> Iterator[Block]:
-    if found.sharing_ratios:
-        joint, nm = ("axis", found.unit("N m", 1)) if found.axes else ("joint", "N m")
-        heads = ("at rest", joint, "ON the arm of", nm, "felt at", nm, "expected", "off")
-        rows = []
-        for pair in found.sharing_ratios:
-            pushed = f"{pair.pushed}{' (wall)' if pair.by_wall else ''}"
-            off = _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.3g} %"
-            when = f"{pair.from_s:.1f} - {pair.to_s:.1f} s"
-            which = found.label(pair.joint)
-            row = [when, which, pushed, _write_value(pair.pushed_nm)]
-            rows.append(
-                [
-                    *row,
-                    pair.holds,
-                    _write_value(pair.felt_nm),
-                    _write_metric(pair.expected_nm),
-                    off,
-                ]
-            )
-        yield from _tabulate(heads, rows, words=1)
-        for why in dict.fromkeys(pair.expected_nm.why for pair in found.sharing_ratios):
-            if why:
-                yield _explain_missing("nothing is expected", why)
-    if found.stiffness:
-        rows = []
-        for one in found.stiffness:
-            stiffness = (
-                _NO_NUMBER
-                if one.stiffness_nm_rad is None
-                else _write_value(one.stiffness_nm_rad)
-            )
-            row = [f"{one.from_s:.1f} to {one.to_s:.1f} s", found.label(one.joint), one.site]
-            rows.append(
-                [*row, _write_value(one.torque_nm), _write_value(one.angle_rad), stiffness]
-            )
-        nm, rad, ratio = (found.unit(unit, 1) for unit in ("N m", "rad", "N m/rad"))
-        joint = "axis" if found.axes else "joint"
-        yield from _tabulate(
-            ("stiffness felt", joint, "by", f"{nm} more", f"{rad} further", ratio),
-            rows,
-            words=1,
-        )
-
-
-def _compose_impedance(found: LogMetrics) -> Iterator[Block]:
-    if not found.responses:
+    if not places:
         return
     rows = []
-    for one in found.responses:
-        where = f"{'along' if found.axes else 'joint'} {found.label(one.joint)}"
-        what = f"{one.kind}{f' of {one.of}' if one.of else ''} at {one.at}, {where}"
-        step = -(-len(one.spectrum) // _MAX_FREQUENCIES) or 1
-        for n, ratio in enumerate(
-            one.spectrum[::step] if len(one.spectrum) > 1 else [one.ratio]
-        ):
-            head = ["" if n else what, found.unit(one.unit, one.joint)]
+    for quantity, by_place in applicable.items():
+        numbers = [_write_metric(by_place[place]) for place in places]
+        rows.append([quantity.name, quantity.unit, *numbers])
+    yield from _tabulate([group, "", *places], rows, text_columns=2)
+    for quantity, by_place in applicable.items():
+        for place in places:
+            metric = by_place[place]
+            if metric.value is None and metric.applies:
+                name = f"{quantity.name} of {place}" if place else quantity.name
+                reasons.setdefault(metric.why, []).append(name)
+
+
+def _compose_statics(metrics: LogMetrics) -> Iterator[Block]:
+    if metrics.sharing_ratios:
+        joint, nm = ("axis", metrics.unit("N m", 1)) if metrics.axes else ("joint", "N m")
+        heads = ("at rest", joint, "ON the arm of", nm, "felt at", nm, "expected", "off")
+        rows = []
+        for pair in metrics.sharing_ratios:
+            pushed = f"{pair.pushed}{' (wall)' if pair.by_wall else ''}"
+            row = [
+                f"{pair.from_s:.1f} - {pair.to_s:.1f} s",
+                metrics.label(pair.joint),
+                pushed,
+                _write_value(pair.pushed_nm),
+                pair.holds,
+                _write_value(pair.felt_nm),
+                _write_metric(pair.expected_nm),
+                _NO_NUMBER if pair.off is None else f"{100.0 * pair.off:.3g} %",
+            ]
+            rows.append(row)
+        yield from _tabulate(heads, rows, text_columns=1)
+        for reason in dict.fromkeys(pair.expected_nm.why for pair in metrics.sharing_ratios):
+            if reason:
+                yield _explain_missing("nothing is expected", reason)
+    if metrics.stiffness:
+        rows = []
+        for felt in metrics.stiffness:
+            stiffness = _NO_NUMBER
+            if felt.stiffness_nm_rad is not None:
+                stiffness = _write_value(felt.stiffness_nm_rad)
+            row = [
+                f"{felt.from_s:.1f} to {felt.to_s:.1f} s",
+                metrics.label(felt.joint),
+                felt.site,
+                _write_value(felt.torque_nm),
+                _write_value(felt.angle_rad),
+                stiffness,
+            ]
+            rows.append(row)
+        nm = metrics.unit("N m", 1)
+        rad = metrics.unit("rad", 1)
+        ratio = metrics.unit("N m/rad", 1)
+        joint = "axis" if metrics.axes else "joint"
+        heads = ("stiffness felt", joint, "by", f"{nm} more", f"{rad} further", ratio)
+        yield from _tabulate(heads, rows, text_columns=1)
+
+
+def _compose_impedance(metrics: LogMetrics) -> Iterator[Block]:
+    if not metrics.responses:
+        return
+    rows = []
+    for response in metrics.responses:
+        axis = f"{'along' if metrics.axes else 'joint'} {metrics.label(response.joint)}"
+        source = f" of {response.of}" if response.of else ""
+        title = f"{response.kind}{source} at {response.at}, {axis}"
+        unit = metrics.unit(response.unit, response.joint)
+        # rounded up: at most _MAX_FREQUENCIES ratios are listed
+        step = -(-len(response.spectrum) // _MAX_FREQUENCIES) or 1
+        ratios = response.spectrum[::step] if len(response.spectrum) > 1 else [response.ratio]
+        for index, ratio in enumerate(ratios):
+            head = ["" if index else title, unit]
             if ratio.gain is None:
                 rows.append([*head, "", "", "", "", ratio.why])
                 continue
             numbers = (ratio.frequency_hz, ratio.gain, ratio.phase_rad, ratio.coherence)
+            cells = [_write_value(value or 0.0) for value in numbers]
             error = _NO_NUMBER if ratio.error is None else f"{100.0 * ratio.error:.1g} %"
-            rows.append(
-                [*head, *(_write_value(value or 0.0) for value in numbers), f"+- {error}"]
-            )
-    yield from _tabulate(
-        ["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""], rows, words=2
-    )
+            rows.append([*head, *cells, f"+- {error}"])
+    heads = ["felt over frequency", "", "Hz", "gain", "phase rad", "coherence", ""]
+    yield from _tabulate(heads, rows, text_columns=2)
 
 
-def _write_metric(one: Metric) -> str:
-    return _NO_NUMBER if one.value is None else _write_value(one.value)
+def _write_metric(metric: Metric) -> str:
+    return _NO_NUMBER if metric.value is None else _write_value(metric.value)
 
 
 def _write_value(value: float) -> str:
-    return f"{value:.0f}" if value == int(value) and abs(value) < 1e6 else f"{value:.4g}"
+    is_whole = value == int(value) and abs(value) < 1e6
+    return f"{value:.0f}" if is_whole else f"{value:.4g}"
 
 
 def _tabulate(
-    heads: Sequence[str], rows: Iterable[Sequence[str]], words: int
+    heads: Sequence[str], rows: Iterable[Sequence[str]], text_columns: int
 ) -> Iterator[Block]:
-    """Yields a table and an empty line; its first columns hold words, the others numbers."""
-    align = "l" * words + "r" * (len(heads) - words - 1) + ("r" if heads[-1] else "l")
+    """Yields a table and an empty line; the first `text_columns` columns align to the left.
+
+    The other columns hold numbers, except a last column without a header.
+    """
+    last = "r" if heads[-1] else "l"
+    align = "l" * text_columns + "r" * (len(heads) - text_columns - 1) + last
     yield TextTable(heads, list(rows), align)
     yield ""
