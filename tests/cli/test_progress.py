@@ -36,7 +36,7 @@ def test_no_bar_is_drawn_off_a_terminal_or_at_once(
 def test_what_takes_long_has_a_bar_that_goes_away(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = terminal(monkeypatch, interactive=True)
     monkeypatch.setattr(terminal_output, "PATIENCE_S", -1.0)
-    monkeypatch.setattr(terminal_output, "_EVERY_S", -1.0)
+    monkeypatch.setattr(terminal_output, "_REDRAW_PERIOD_S", -1.0)
     work()
     text = stream.getvalue()
     assert "reading run.mcap" in text

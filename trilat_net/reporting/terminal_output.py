@@ -1,10 +1,11 @@
-"""Terminal output that commands share: consoles, lines, tables, progress bar, opening of a log
-with warnings.
+"""Terminal output shared by the commands: consoles, lines, tables, progress bar and warnings.
 
-Invariants: no control characters reach a terminal, whoever wrote a text: `TextConsole` and
-`print_line` escape them; text from a file or a peer passes `sanitize` besides, which bounds its
-length. Library code knows nothing of the bar; it calls a function with (done, total). Imports
-only Rich at the top, so that `trilat --help` stays fast.
+Invariant:
+    - No control character reaches a terminal, whatever the origin of a text: `TextConsole` and
+      `print_line` escape control characters.
+    - Text from a file or a peer also passes `sanitize`, which limits its length.
+    - Library code does not know the progress bar: it calls a function with (done, total).
+    - The top of the module imports only Rich, so that `trilat --help` stays fast.
 """
 
 import json
@@ -31,22 +32,23 @@ if TYPE_CHECKING:
 _CONTROLS = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u00ad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
 )
-"""What moves a cursor, rings, colours, or turns the direction of writing; no line ends and
-tabs.
+"""Characters that move the cursor, ring, colour, or change the direction of writing.
+
+Line feeds and tabs are not among them.
 """
 
 
 def escape_controls(text: str) -> str:
-    """Returns a text whose control characters are written out, as in U+001B."""
-    return _CONTROLS.sub(lambda found: f"<U+{ord(found[0]):04X}>", text)
+    """Returns a text with its control characters written out, as in <U+001B>."""
+    return _CONTROLS.sub(lambda match: f"<U+{ord(match[0]):04X}>", text)
 
 
 class TextConsole(Console):
-    """A console on which texts, also those of tables, have no effect but that of their letters."""
+    """A console that writes out the control characters of all texts, also those of tables."""
 
-    def render_str(self, text: str, **how: Any) -> Text:
-        """Returns a text as it is shown; its controls are written out."""
-        return super().render_str(escape_controls(text), **how)
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Returns a text as the console shows it, with control characters written out."""
+        return super().render_str(escape_controls(text), **options)
 
 
 out = TextConsole(highlight=False)
@@ -54,17 +56,18 @@ err = TextConsole(stderr=True, highlight=False)
 
 PATIENCE_S = 1.0
 """Time until a progress bar appears, s."""
-_EVERY_S = 0.1
+_REDRAW_PERIOD_S = 0.1
+"""Shortest time between two drawings of a progress bar, s."""
 _MAX_DAMAGED = 3
-"""Damaged parts that are listed."""
+"""Largest number of listed damaged parts of a log."""
 MAX_LETTERS = 4000
-"""Of a line."""
+"""Largest length of a printed line."""
 _PIPE_WIDTH = 160
-"""Columns that output has at least where it is no terminal."""
+"""Least width of tables, in characters, when the output is not a terminal."""
 
 
 def sanitize(text: object, most: int = 300) -> str:
-    """Returns a text for a terminal: no control characters, at most `most` letters."""
+    """Returns a printable text for a terminal, cut off after `most` characters."""
     plain = "".join(
         letter if letter.isprintable() else "\ufffd" for letter in str(text)[: most + 1]
     )
@@ -72,7 +75,7 @@ def sanitize(text: object, most: int = 300) -> str:
 
 
 def print_text(text: object, console: Console = out, head: str = "") -> None:
-    """Prints a line as it is, sanitized, behind a head."""
+    """Prints a sanitized line behind a head, without interpreting markup."""
     console.print(head + sanitize(text, MAX_LETTERS), markup=False, soft_wrap=True)
 
 
@@ -87,7 +90,7 @@ def print_error(text: object) -> None:
 
 
 def print_marked(mark: str, text: object) -> None:
-    """Prints a line behind a mark, which is of Rich's markup."""
+    """Prints a line behind a mark, which is in Rich's markup."""
     out.print(f"{mark} {escape(sanitize(text, MAX_LETTERS))}", soft_wrap=True)
 
 
@@ -98,36 +101,43 @@ def print_texts(texts: Iterable[object]) -> None:
 
 
 def print_paths(paths: Iterable[Path]) -> None:
-    """Prints the files that were written, a line each."""
+    """Prints a line per written file."""
     print_texts(f"  {path}" for path in paths)
 
 
 def print_json(value: Any) -> None:
-    """Prints JSON; NaN is an error."""
+    """Prints a value as JSON.
+
+    Raises:
+        ValueError: the value holds NaN or an infinite number.
+    """
     text = json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False)
-    print_line(_CONTROLS.sub(lambda found: f"\\u{ord(found[0]):04x}", text))
+    print_line(_CONTROLS.sub(lambda match: f"\\u{ord(match[0]):04x}", text))
 
 
 def print_line(text: str) -> None:
-    """Prints a line at once, for programs that read the output."""
+    """Prints and flushes a line, for programs that read the output."""
     sys.stdout.write(escape_controls(text) + "\n")
     sys.stdout.flush()
 
 
 def print_table(table: "TextTable") -> None:
-    """Prints a table."""
-    wide = TextConsole(file=out.file, width=max(out.width, _PIPE_WIDTH), highlight=False)
-    (out if out.is_terminal else wide).print(table.rich())
+    """Prints a table, at least `_PIPE_WIDTH` wide if the output is not a terminal."""
+    console = out
+    if not out.is_terminal:
+        width = max(out.width, _PIPE_WIDTH)
+        console = TextConsole(file=out.file, width=width, highlight=False)
+    console.print(table.rich())
 
 
-def print_result(found: "Result", *, as_json: bool = False) -> None:
+def print_result(result: "Result", *, as_json: bool = False) -> None:
     """Prints a result: its text, or its values as JSON."""
     if as_json:
-        print_json(found.to_dict())
+        print_json(result.to_dict())
         return
     from .result_text import TextTable, compose
 
-    for block in compose(found):
+    for block in compose(result):
         if isinstance(block, TextTable):
             print_table(block)
         elif block.mark:
@@ -138,7 +148,7 @@ def print_result(found: "Result", *, as_json: bool = False) -> None:
 
 @contextmanager
 def lines_aside(aside: bool) -> Iterator[None]:
-    """Prints what would go to standard output to standard error, where that is for JSON."""
+    """Redirects standard output to standard error, if `aside`: to keep the output for JSON."""
     with redirect_stdout(sys.stderr) if aside else nullcontext():
         yield
 
@@ -146,10 +156,15 @@ def lines_aside(aside: bool) -> Iterator[None]:
 def conclude_files(
     paths: Sequence[Path], folder: Path, *, as_json: bool = False, png: bool = False
 ) -> "tuple[Log, Conclusion]":
-    """Checks a log that was just recorded, writes its report into a folder and prints the
-    conclusion.
+    """Checks a log that was just recorded, writes its report and prints the conclusion.
 
-    Interrupted, it says how to do that later.
+    If the user interrupts the drawing, a note gives the command that draws the report later.
+
+    Args:
+        paths: the files of the log.
+        folder: the folder of the report.
+        as_json: True to print the conclusion as JSON.
+        png: True to write the figures as PNG files too.
     """
     from .conclude import conclude
 
@@ -161,8 +176,8 @@ def conclude_files(
             conclusion = conclude(log, folder, progress, png=png)
     except KeyboardInterrupt:
         files = join_arguments(map(str, paths))
-        later = f"trilat report {files} -o {join_arguments([str(folder)])} --force"
-        print_note(f"the log is kept: {files}; its report can be drawn later: {later}")
+        command = f"trilat report {files} -o {join_arguments([str(folder)])} --force"
+        print_note(f"the log is kept: {files}; its report can be drawn later: {command}")
         raise
     print_result(conclusion, as_json=as_json)
     return log, conclusion
@@ -170,8 +185,10 @@ def conclude_files(
 
 @contextmanager
 def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
-    """Yields a function to call with (done, total) at any rate; it draws on a terminal, after a
-    second.
+    """Yields a function that draws a progress bar when it is called with (done, total).
+
+    The function may be called at any rate. The bar appears after `PATIENCE_S`, and only on a
+    terminal.
     """
     if not err.is_interactive:
         yield lambda _done, _total: None
@@ -184,17 +201,25 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
         TimeRemainingColumn,
     )
 
-    columns = (BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
-    name = TextColumn("{task.description}", markup=False)
-    display = Progress(name, *columns, console=err, transient=True, auto_refresh=False)
+    display = Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        console=err,
+        transient=True,
+        auto_refresh=False,
+    )
     task = display.add_task(label, total=None)
-    began_s = display.get_time()
-    drawn_s = began_s
+    start_s = display.get_time()
+    drawn_s = start_s
 
     def show(done: int, total: int) -> None:
         nonlocal drawn_s
         now_s = display.get_time()
-        if now_s - began_s < PATIENCE_S or now_s - drawn_s < _EVERY_S:
+        if now_s - start_s < PATIENCE_S:
+            return
+        if now_s - drawn_s < _REDRAW_PERIOD_S:
             return
         drawn_s = now_s
         display.start()
@@ -207,11 +232,15 @@ def progress_bar(label: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
-    """Returns the log in a file, or in the files that are its parts, as `open_log`, and warns
-    of damage.
+    """Opens a log from its files with a progress bar, and warns of damage.
+
+    Args:
+        first: the file of the log, or its first part.
+        *more: the other parts.
+        **allowed: further options of `open_log`.
 
     Raises:
-        LogError: one is missing, is no MCAP file, or no log of trilat-net.
+        LogError: a file is missing, is not an MCAP file, or is not a log of trilat-net.
     """
     from ..log.log_reader import open_log
 
@@ -222,7 +251,7 @@ def open_with_progress(first: Path, *more: Path, **allowed: Any) -> "Log":
 
 
 def warn_of_damage(log: "Log") -> None:
-    """Warns of what a log lacks, and says what to do."""
+    """Warns of damaged parts of a log, with the command that recovers the rest."""
     for path in log.sources:
         warn_if_unfinished(Path(path))
     for problem in (*log.damaged[:_MAX_DAMAGED], *log.unreadable[:_MAX_DAMAGED]):
@@ -230,27 +259,26 @@ def warn_of_damage(log: "Log") -> None:
     if log.damaged:
         rest = len(log.damaged) - _MAX_DAMAGED
         unlisted = f"and {rest} more damaged parts; " if rest > 0 else ""
-        print_note(
-            f"{unlisted}make a whole file of everything that can be read: trilat log recover FILE"
-        )
+        advice = "make a whole file of everything that can be read: trilat log recover FILE"
+        print_note(f"{unlisted}{advice}")
 
 
 def warn_user_laws(log: "Log") -> None:
-    """Warns of code outside the log, which an execution of the log runs, or may not run."""
+    """Warns of the user laws that an execution of the log runs or is not allowed to run."""
     from ..scenario.code_consent import find_user_laws
 
     for law in find_user_laws(log.scenario):
-        print_note(
-            f"executing this log runs code from outside: {law}" if law.allowed else str(law)
-        )
+        if law.allowed:
+            print_note(f"executing this log runs code from outside: {law}")
+        else:
+            print_note(law)
 
 
 def warn_if_unfinished(path: Path) -> None:
-    """Warns of a file that does not end as a finished one does, with the command that mends it,
-    if one can.
+    """Warns of a file without a proper end, with the command that recovers its contents.
 
     Raises:
-        LogError: it cannot be read.
+        LogError: the file cannot be read.
     """
     from ..files import reading
     from ..log.mcap_records import RecordScanner
@@ -262,10 +290,10 @@ def warn_if_unfinished(path: Path) -> None:
             return
         survey = RecoverySurvey(scanner)
     if scanner.finished:
+        trailing = count_nouns(scanner.trailing, "byte follows", "bytes follow")
         print_note(
-            f"{path}: was finished, and "
-            f"{count_nouns(scanner.trailing, 'byte follows', 'bytes follow')} its end mark, which other "
-            f"programs may refuse; make a file without them with: trilat log recover {path}"
+            f"{path}: was finished, and {trailing} its end mark, which other programs may "
+            f"refuse; make a file without them with: trilat log recover {path}"
         )
     elif survey.why_empty:
         print_note(f"{path}: nothing in it can be recovered: {survey.why_empty}")

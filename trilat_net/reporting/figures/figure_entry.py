@@ -1,10 +1,10 @@
-"""How a function becomes a figure of a log: its name, what is in it, and when there is nothing
-to show.
+"""Register functions that draw figures of a log, with names, contents and conditions.
 
     @draws("positions", "actual and desired angles (Fig. 4)", in_report=True)
     def draw_positions(log, form): ...
 
-Invariant: whoever knows figures finds them here, in the order in which a paper has them.
+Invariant:
+    - `list_figures` lists all registered figures in the order in which a paper has them.
 """
 
 from collections.abc import Callable
@@ -21,8 +21,14 @@ Drawing = TypeVar("Drawing", bound=Callable[..., Figure])
 
 
 class FigureEntry(NamedTuple):
-    """A figure: what is in it, what draws it, and what returns why a log has nothing to show in
-    it, or "".
+    """A registered figure.
+
+    Attributes:
+        about: description of the contents.
+        draw: function that draws the figure.
+        absent: function that returns the reason why the figure of a log would be empty; "" if
+            there is something to draw.
+        in_report: True if the report has the figure.
     """
 
     about: str
@@ -33,26 +39,34 @@ class FigureEntry(NamedTuple):
 
 _ENTRIES: dict[str, FigureEntry] = {}
 _SHOWN = (
-    "overview", "operation", "operator_torques", "positions", "tracking_errors", "settling", "phase",
-    "parameter_estimates", "control_torques", "hands_moved", "contact", "authority", "certificate",
-    "observed_energy", "twins", "arms", "paths", "sample_age", "delay_distributions", "loop_timing",
+    "overview", "operation", "operator_torques", "positions", "tracking_errors", "settling",
+    "phase", "parameter_estimates", "control_torques", "hands_moved", "contact", "authority",
+    "certificate", "observed_energy", "twins", "arms", "paths", "sample_age",
+    "delay_distributions", "loop_timing",
 )  # fmt: skip
-"""The order of a paper; others follow."""
+"""Names of figures in the order of a paper; other figures follow."""
 
 
 def draws(
     name: str, about: str, absent: Absent = lambda _: "", *, in_report: bool = False
 ) -> Callable[[Drawing], Drawing]:
-    """Declares that a function of a log and a figure size draws the figure of a name.
+    """Returns a decorator that registers a function of a log and a size as a figure.
+
+    Args:
+        name: name of the figure.
+        about: description of the contents.
+        absent: function that returns the reason why the figure of a log would be empty.
+        in_report: True if the report has the figure.
 
     Raises:
-        ValueError: another function draws it.
+        ValueError: the figure is already registered.
     """
 
     def declare(draw: Drawing) -> Drawing:
-        if other := _ENTRIES.get(name):
-            homes = f"{other.draw.__module__} and {draw.__module__}"
-            raise ValueError(f"figure {name} has two definitions, in {homes}")
+        other = _ENTRIES.get(name)
+        if other is not None:
+            modules = f"{other.draw.__module__} and {draw.__module__}"
+            raise ValueError(f"figure {name} has two definitions, in {modules}")
         _ENTRIES[name] = FigureEntry(about, draw, absent, in_report)
         return draw
 
@@ -60,13 +74,12 @@ def draws(
 
 
 def unless(shows: Callable[[Log], object], reason: str) -> Absent:
-    """Returns what says the reason for which a log has nothing to show, unless `shows` is true
-    of it.
-    """
+    """Returns a function that returns `reason` for a log for which `shows` is false."""
     return lambda log: "" if shows(log) else reason
 
 
 def list_figures() -> dict[str, FigureEntry]:
     """Returns all figures by name, in the order in which a paper has them."""
-    place = {name: n for n, name in enumerate(_SHOWN)}
-    return dict(sorted(_ENTRIES.items(), key=lambda entry: place.get(entry[0], len(place))))
+    ranks = {name: rank for rank, name in enumerate(_SHOWN)}
+    names = sorted(_ENTRIES, key=lambda name: ranks.get(name, len(ranks)))
+    return {name: _ENTRIES[name] for name in names}
