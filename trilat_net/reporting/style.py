@@ -1,12 +1,13 @@
-"""Style of all figures: colours per site, line styles, axes, legends, and files that are equal
-byte for byte.
+"""Style of all figures: colours per site, line styles, axes, legends and file formats.
 
-Sites beyond the palette differ by dashes. A figure over the time of a run has panels, a line
-per site, event markers, time axis and legend.
+Sites beyond the number of colours differ by dashes. A figure over the time of a run
+(`TimeFigure`) has panels, a line per site, event markers, a time axis and a legend. The markers
+show when a site held, braked or returned, and when changes were applied.
 
-Invariant: matplotlib's global state stays unchanged. Equal figures give equal bytes: files hold
-no date, and fonts are embedded as TrueType. A run without events has figures without markers;
-these show hold, brake and return of sites and applied changes.
+Invariant:
+    - Matplotlib's global state stays unchanged.
+    - Equal figures give equal bytes: files hold no date, and fonts are embedded as TrueType.
+    - Figures of a run without events have no markers.
 """
 
 import base64
@@ -41,21 +42,21 @@ from .appearance import REPORT_SIZE, SITE_COLOURS, FigureSize, list_site_colours
 
 AxesGrid = NDArray[np.object_]
 LegendEntries = Sequence[tuple[str, dict[str, Any]]]
-"""Texts, each with the options of its line."""
+"""Entries of a legend: a text and the options of its line."""
 
 DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))
 REFERENCE = "#333333"
 FAINT = "#8c8c8c"
 
 LIMIT_LINE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (4, 2)), "linewidth": 0.8}
-"""The line of what is desired, true, stated or allowed."""
+"""Options of the line of a desired, true, stated or allowed value."""
 
 REPORT_DPI = REPORT_SIZE.dpi
 _NOTEBOOK_DPI = 200
 _LEAST_RANGE = 1e-9
-"""Of values; less is rounding."""
+"""Smallest range of plotted values that is not rounding alone."""
 BUCKETS_PER_PANEL = 700
-"""Per panel: half a page is 700 pixels wide."""
+"""Buckets of the decimation of a panel: half a page is 700 pixels wide."""
 
 _STYLE_SHEET = resources.files("trilat_net.reporting") / "assets" / "figures.mplstyle"
 _RC: Any = {
@@ -72,16 +73,23 @@ _NARROW_RC: Any = {
 
 @contextmanager
 def styled_figure(form: FigureSize, height_in: float) -> Iterator[Figure]:
-    """Yields an empty figure of a size, to be drawn in the style of all figures; outside,
-    nothing changes.
+    """Yields an empty figure, to be drawn within the context in the style of all figures.
+
+    Args:
+        form: width of the figure and sizes of its texts.
+        height_in: height of the figure, in inches.
     """
-    sizes: Any = {f"{axis}tick.labelsize": form.tick_pt for axis in "xy"}
-    with mpl.rc_context({**_RC, **sizes, **(_NARROW_RC if form.narrow else {})}):
+    settings: Any = dict(_RC)
+    settings["xtick.labelsize"] = form.tick_pt
+    settings["ytick.labelsize"] = form.tick_pt
+    if form.narrow:
+        settings.update(_NARROW_RC)
+    with mpl.rc_context(settings):
         yield NotebookFigure(figsize=(form.width_in, height_in), layout="constrained")
 
 
 class NotebookFigure(Figure):
-    """A figure that shows itself in a notebook, where matplotlib alone prints how large it is."""
+    """A figure that a notebook shows as a picture instead of the text of its size."""
 
     def _repr_png_(self) -> bytes:
         drawing = io.BytesIO()
@@ -90,7 +98,7 @@ class NotebookFigure(Figure):
         return drawing.getvalue()
 
     def _repr_html_(self) -> str:
-        # two pixels of the picture for one of the page
+        # sharp on a screen of high density: two pixels of the picture per pixel of the page
         width = round(self.get_figwidth() * _NOTEBOOK_DPI / 2)
         picture = base64.b64encode(self._repr_png_()).decode()
         return f'<img alt="figure" width="{width}" src="data:image/png;base64,{picture}">'
@@ -108,66 +116,83 @@ def site_colour(log: Log, site: str) -> str:
 
 
 def site_line(log: Log, site: str, width: float | None = None) -> dict[str, Any]:
-    """Returns the options of a site's line, `width` pt wide, solid until the colours are used
-    up.
+    """Returns the options of the line of a site.
 
-    Without a width sites share a panel: later ones are thinner, so that lines on top of each
-    other all show.
+    Lines are solid until every colour is used; then the same colours return with dashes.
+
+    Args:
+        log: the log with the site.
+        site: name of the site.
+        width: width of the line, in pt. None if all sites share a panel: later sites then have
+            thinner lines, so that equal lines all stay visible.
     """
     index = log.sites.index(site)
-    width = 2.0 - 1.2 * index / (len(log.sites) - 1) if width is None else width
+    if width is None:
+        width = 2.0 - 1.2 * index / (len(log.sites) - 1)
     dashes = DASHES[index // len(SITE_COLOURS) % len(DASHES)]
     return {"color": site_colour(log, site), "linestyle": dashes, "linewidth": width}
 
 
 def site_title(log: Log, site: str) -> str:
-    """Returns the name of a site in legends: with its role."""
+    """Returns the name of a site with its role, for legends."""
     return f"{site} ({log.scenario.sites[site].role})"
 
 
 def plot_decimated(axes: Axes, tick: Ints, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws values over ticks and their times, s, each of shape (K,), decimated with all
-    extremes.
+    """Draws a signal over time, decimated so that all extremes stay visible.
+
+    Args:
+        axes: the panel.
+        tick: ticks of the values, shape (K,).
+        t_s: times of the values, s, shape (K,).
+        values: the values, shape (K,).
+        **options: options of the line.
     """
     trace = decimate(tick, t_s, values[:, np.newaxis], BUCKETS_PER_PANEL)
     axes.plot(trace.t_s, trace.values[:, 0], **options)
 
 
 def positive(values: Array) -> Array:
-    """Returns what a logarithmic axis can show of values; NaN for the others."""
+    """Returns the positive values, for a logarithmic axis, and NaN in place of the others."""
     return np.where(values > 0.0, values, np.nan)
 
 
 SPREAD_BUCKETS = 120
+"""Number of intervals of time for which `plot_spread` draws a median and a band."""
 SPREAD: dict[str, Any] = {"color": FAINT, "alpha": 0.35, "linewidth": 6.0}
-"""The line that stands for a spread in a legend."""
+"""Options of the line that represents the band of a spread in a legend."""
 
 
 def plot_spread(axes: Axes, t_s: Array, values: Array, **options: Any) -> None:
-    """Draws what is up and down all the time as a median within a band from the least to the
-    largest.
+    """Draws a fluctuating signal as its median within a band from its least to largest value.
+
+    Args:
+        axes: the panel.
+        t_s: times of the values, s, shape (K,).
+        values: the values, shape (K,).
+        **options: options of the line of the median, with a "color".
     """
-    parts = [
-        part for part in np.array_split(np.arange(len(values)), SPREAD_BUCKETS) if len(part)
-    ]
-    at_s = np.array([t_s[part].mean() for part in parts])
-    low, middle, high = (
-        np.array(
-            [
-                found(values[part]) if np.isfinite(values[part]).any() else np.nan
-                for part in parts
-            ]
-        )
-        for found in (np.nanmin, np.nanmedian, np.nanmax)
-    )
+    buckets = np.array_split(np.arange(len(values)), SPREAD_BUCKETS)
+    rows = []
+    for bucket in buckets:
+        if not len(bucket):
+            continue
+        part = values[bucket]
+        # numpy warns of buckets without a number
+        if np.isfinite(part).any():
+            spread = (np.nanmin(part), np.nanmedian(part), np.nanmax(part))
+        else:
+            spread = (np.nan, np.nan, np.nan)
+        rows.append((t_s[bucket].mean(), *spread))
+    middle_s, low, median, high = np.array(rows).reshape(-1, 4).T
     axes.fill_between(
-        at_s, low, high, color=options["color"], alpha=SPREAD["alpha"], linewidth=0.0
+        middle_s, low, high, color=options["color"], alpha=SPREAD["alpha"], linewidth=0.0
     )
-    axes.plot(at_s, middle, **options)
+    axes.plot(middle_s, median, **options)
 
 
 def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
-    """Labels a logarithmic axis with plain numbers: these steps of every decade, and no others."""
+    """Labels a logarithmic axis with plain numbers, at the given steps of each decade."""
     axis.set_major_locator(LogLocator(subs=steps))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_locator(LogLocator(subs=range(1, 10)))
@@ -175,47 +200,51 @@ def set_plain_log_axis(axis: Axis, steps: Sequence[float] = (1.0, 2.0, 5.0)) -> 
 
 
 def name_joints(log: Log) -> list[str]:
-    """Returns the titles of the joints: numbers, and names if all arms are chains with the same
-    ones.
-    """
+    """Returns the titles of the joints: numbers, with names if all chains have equal names."""
     arms = [log.scenario.arms[site] for site in log.sites]
-    most = max(arms, key=lambda arm: arm.counts.joints)
-    if most.chain is None or len({arm.joint_names for arm in arms}) > 1:
-        return [f"joint {n + 1}" for n in range(most.counts.joints)]
-    units = most.joint_units("rad")
-    titles = [f"{n}: {name}" for n, name in enumerate(most.joint_names, 1)]
-    return [
-        title + " (m, N)" * (unit == "m") for title, unit in zip(titles, units, strict=True)
-    ]
+    longest = max(arms, key=lambda arm: arm.counts.joints)
+    if longest.chain is None or len({arm.joint_names for arm in arms}) > 1:
+        return [f"joint {number}" for number in range(1, longest.counts.joints + 1)]
+    titles = []
+    names = zip(longest.joint_names, longest.joint_units("rad"), strict=True)
+    for number, (name, unit) in enumerate(names, 1):
+        quantity = " (m, N)" if unit == "m" else ""
+        titles.append(f"{number}: {name}{quantity}")
+    return titles
 
 
 def name_shared(log: Log) -> list[str]:
-    """Returns the titles of what sites share: joints, or axes of the task."""
+    """Returns the titles of the shared coordinates: joints, or axes of the task."""
     arm = log.scenario.arms[log.sites[0]]
-    return [*TASK_AXES[: arm.counts.shared]] if arm.shares_pose else name_joints(log)
+    return list(TASK_AXES[: arm.counts.shared]) if arm.shares_pose else name_joints(log)
 
 
 def title_joints(log: Log, row: Sequence[Axes], titles: Sequence[str] = ()) -> None:
-    """Titles panels, one per joint, or with other titles."""
+    """Titles a row of panels with `titles`, or with the names of the joints."""
     for title, axes in zip(titles or name_joints(log), row, strict=True):
         axes.set_title(title)
 
 
 def label_row(axes: Axes, text: str, form: FigureSize) -> None:
-    """Writes beside the first panel of a low row what the row shows."""
+    """Labels a low row of panels beside its first panel, `axes`."""
     axes.set_ylabel("\n".join(textwrap.wrap(text, 12)), fontsize=form.tick_pt)
 
 
 def flatten_rounding(axes: Axes) -> None:
-    """Widens the axis of values that differ by rounding alone."""
+    """Widens the value axis of a panel whose values differ by rounding alone."""
     low, high = axes.get_ylim()
     if high - low < _LEAST_RANGE:
         axes.set_ylim(low - 0.05, high + 0.05)
 
 
 class JointPanels(NamedTuple):
-    """Panels of a figure, one per joint in rows of `columns`, the lowest of every column, and a
-    wide one.
+    """Panels of a figure of joints.
+
+    Attributes:
+        joints: a panel per joint.
+        columns: number of panels in a row.
+        lowest: the lowest panel of each column.
+        below: a panel over the whole width below the others, or None.
     """
 
     joints: list[Axes]
@@ -225,85 +254,86 @@ class JointPanels(NamedTuple):
 
 
 def arrange_joints(joints: int, narrow: bool) -> list[list[str]]:
-    """Returns rows of places for a panel per joint: their numbers, and "." for a place that
-    stays empty.
-    """
+    """Returns the rows of a grid of panels: numbers of joints, and "." for an empty cell."""
     choices = (2,) if narrow or joints == 2 else (3, 4)
+    # fewest rows, then fewest empty cells
     columns = min(choices, key=lambda count: (-(-joints // count), -joints % count))
-    places = [str(n) if n < joints else "." for n in range(-(-joints // columns) * columns)]
-    return [places[first : first + columns] for first in range(0, len(places), columns)]
+    empty = -joints % columns
+    cells = [*map(str, range(joints)), *["."] * empty]
+    return [cells[first : first + columns] for first in range(0, len(cells), columns)]
 
 
 def add_joint_panels(
     figure: Figure, joints: int, form: FigureSize, below: str = ""
 ) -> JointPanels:
-    """Returns a panel per joint, and below them a wide one if it has a name.
+    """Returns a panel per joint, and if `below` names one, a wide panel below them.
 
-    Two joints share their axis of values; of more, each has its own, since wrists bear less
-    than shoulders.
+    Two joints share their axis of values. More joints have an axis each, because the torques
+    of wrists are smaller than those of shoulders.
     """
     grid = arrange_joints(joints, form.narrow)
     columns = len(grid[0])
-    rows = [*grid, *([[below] * columns] if below else [])]
+    rows = list(grid)
+    if below:
+        rows.append([below] * columns)
     panels: dict[str, Axes] = figure.subplot_mosaic([[*row] for row in rows])
-    made = [panels[str(n)] for n in range(joints)]
-    for upper, lower in zip(made, made[columns:], strict=False):
+    joint_panels = [panels[str(joint)] for joint in range(joints)]
+    for upper, lower in zip(joint_panels, joint_panels[columns:], strict=False):
         upper.sharex(lower)
         upper.tick_params(labelbottom=False)
     if joints == 2:
-        made[1].sharey(made[0])
-        made[1].tick_params(labelleft=False)
-    return JointPanels(made, columns, made[-columns:], panels.get(below))
+        joint_panels[1].sharey(joint_panels[0])
+        joint_panels[1].tick_params(labelleft=False)
+    return JointPanels(joint_panels, columns, joint_panels[-columns:], panels.get(below))
 
 
 def typeset(text: str) -> str:
-    """Returns a text of the terminal with the signs that type has."""
+    """Returns a text of the terminal with typographic signs: ± and →."""
     return text.replace("+-", "±").replace("->", " → ")
 
 
 def typeset_unit(unit: str) -> str:
-    """Returns a unit with the signs that type has."""
+    """Returns a unit with typographic signs: ²."""
     return unit.replace("^2", "²")
 
 
 def typeset_symbol(parameter: str) -> str:
-    """Returns the name of a link's parameter with its index below: "mc_x", "Ixx"."""
-    stem, index = (
-        (parameter[:1], parameter[1:])
-        if parameter[0] == "I"
-        else (parameter[:2], parameter[3:])
-    )
+    """Returns an inertial parameter, such as "mc_x" or "Ixx", with its index as a subscript."""
+    if parameter[0] == "I":
+        stem = parameter[:1]
+        index = parameter[1:]
+    else:
+        stem = parameter[:2]
+        index = parameter[3:]
     return f"${stem.strip()}_{{{index}}}$" if index else f"${stem}$"
 
 
 def add_legend(figure: Figure, entries: LegendEntries, **options: Any) -> None:
-    """Puts a legend of lines above the panels, see `place_legend`."""
-    place_legend(
-        figure, [Line2D([], [], label=text, **line) for text, line in entries], **options
-    )
+    """Adds a legend of lines above the panels, see `place_legend`."""
+    handles = [Line2D([], [], label=text, **line) for text, line in entries]
+    place_legend(figure, handles, **options)
 
 
 def place_legend(figure: Figure, handles: Sequence[Any], **options: Any) -> None:
-    """Puts handles above the panels, where they hide nothing, in as many columns as there is
-    room for.
-    """
+    """Adds a legend above the panels, in as many columns, at most 6, as fit the figure."""
     renderer = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
     for columns in range(min(len(handles), 6), 0, -1):
-        made = figure.legend(
+        legend = figure.legend(
             handles=handles, loc="outside upper center", ncols=columns, **options
         )
-        if columns == 1 or made.get_window_extent(renderer).width <= figure.bbox.width:
+        width = legend.get_window_extent(renderer).width
+        if columns == 1 or width <= figure.bbox.width:
             return
-        made.remove()
+        legend.remove()
 
 
 def site_legend_entries(log: Log, sites: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
     """Returns the entries of a legend of sites."""
-    return [(site_title(log, s), site_line(log, s)) for s in sites]
+    return [(site_title(log, site), site_line(log, site)) for site in sites]
 
 
 def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
-    """Returns a figure that consists of a text: why there is nothing to draw."""
+    """Returns a figure that only shows a text, the reason why there is nothing to draw."""
     with styled_figure(form, 1.0) as figure:
         lines = "\n".join(textwrap.wrap(text, round(17 * form.width_in)))
         figure.text(0.5, 0.5, lines, ha="center", va="center", color=REFERENCE)
@@ -311,7 +341,7 @@ def empty_figure(text: str, form: FigureSize = REPORT_SIZE) -> Figure:
 
 
 def annotate_empty_panel(axes: Axes, text: str) -> None:
-    """Writes into an empty panel why it is empty."""
+    """Writes the reason why a panel is empty into the panel."""
     axes.text(0.5, 0.5, text, ha="center", va="center", color=FAINT, transform=axes.transAxes)
 
 
@@ -331,12 +361,16 @@ _UNDATED: dict[str, dict[str, Any]] = {
 
 
 def write_figure(drawn: Figure, path: Path, dpi: int) -> None:
-    """Writes a figure in the format of the path's suffix, of `FIGURE_FORMATS`; `dpi` is that of
-    a .png.
+    """Writes a figure to a file.
+
+    Args:
+        drawn: the figure.
+        path: the file; its suffix is the format, one of `FIGURE_FORMATS`.
+        dpi: resolution of a .png file.
 
     Raises:
-        UsageError: it cannot be made.
-        LogRefused: the disk refused it.
+        UsageError: the file cannot be created.
+        LogRefused: the disk refused the data.
     """
     drawing = io.BytesIO()
     kind = path.suffix.removeprefix(".").lower()
@@ -346,15 +380,17 @@ def write_figure(drawn: Figure, path: Path, dpi: int) -> None:
 
 
 MOST_EXPLAINED_CHANGES = 12
-"""Changes that a figure explains; the page lists all of them."""
+"""Largest number of changes explained in a figure; the page lists all changes."""
 
 SiteSignal = Callable[[str], tuple[Ints, Array, Array]]
-"""Ticks, shape (K,), times, shape (K,), s, and values, shape (K, J), of a site."""
+"""Function of a site that returns ticks (K,), times in s (K,), and values (K, J)."""
 
-_AWAY = 0.22
-_BACK = 0.09
+_HOLD_ALPHA = 0.22
+"""Opacity of the shading while a site holds or brakes."""
+_RETURN_ALPHA = 0.09
+"""Opacity of the shading while a site returns."""
 _LETTERS_PER_IN = 120.0
-"""Of 1 pt type, on the average."""
+"""Average number of letters per inch of a font of 1 pt."""
 _CHANGE: dict[str, Any] = {"color": REFERENCE, "linestyle": (0, (1, 1.5)), "linewidth": 0.7}
 _NUMBER: dict[str, Any] = {
     "xytext": (1.5, -0.5),
@@ -371,19 +407,24 @@ _NUMBER: dict[str, Any] = {
 
 
 def site_records(log: Log, values: Callable[[SiteLog], Array]) -> SiteSignal:
-    """Returns the signal of all sites whose values follow from their records."""
+    """Returns the signal of the sites with `values` computed from the records of a site."""
     return lambda site: (log[site].tick, log[site].t_s, values(log[site]))
 
 
 @contextmanager
 def time_figure(log: Log, form: FigureSize, height_in: float) -> Iterator["TimeFigure"]:
-    """Yields an empty figure in the style of all figures."""
+    """Yields an empty figure of a log over time, see `styled_figure`."""
     with styled_figure(form, height_in) as figure:
         yield TimeFigure(log, form, figure)
 
 
 class TimeFigure:
-    """A figure of a log over time."""
+    """A figure of a log over time.
+
+    Attributes:
+        log: the log.
+        figure: the Matplotlib figure.
+    """
 
     def __init__(self, log: Log, form: FigureSize, figure: Figure) -> None:
         self.log = log
@@ -395,19 +436,26 @@ class TimeFigure:
     def trace(
         self, axes: Axes, site: str, values: Array, width: float | None = None, **options: Any
     ) -> None:
-        """Draws values over the records of a site, shape (K,); `options` replace those of the
-        site's line.
+        """Draws values over the records of a site.
+
+        Args:
+            axes: the panel.
+            site: name of the site.
+            values: a value per record, shape (K,).
+            width: see `site_line`.
+            **options: options of the line, which replace those of the site.
         """
-        part = self.log[site]
+        records = self.log[site]
         line = {**site_line(self.log, site, width), **options}
-        plot_decimated(axes, part.tick, part.t_s, values, **line)
+        plot_decimated(axes, records.tick, records.t_s, values, **line)
 
     def joint_row(self, row: Sequence[Axes], sites: Sequence[str], signal: SiteSignal) -> None:
-        """Draws a signal of sites: a panel per joint, a line per site, markers."""
+        """Draws a signal of sites with markers: a panel per joint, a line per site."""
         for site in sites:
             tick, t_s, values = signal(site)
-            for axes, one in zip(row, values.T, strict=False):
-                plot_decimated(axes, tick, t_s, one, **site_line(self.log, site))
+            line = site_line(self.log, site)
+            for axes, joint_values in zip(row, values.T, strict=False):
+                plot_decimated(axes, tick, t_s, joint_values, **line)
         for axes in row:
             self.mark(axes, sites)
             if len(row) > 2:
@@ -416,25 +464,36 @@ class TimeFigure:
     def mark(
         self, axes: Axes, sites: Sequence[str], link: str = "", *, numbered: bool = True
     ) -> None:
-        """Marks a panel: shaded in the color of a site while it does not follow its peers,
-        lines at changes.
+        """Marks events in a panel.
 
-        Changes are those that the sites carried out, or of these those of one link.
+        The panel is shaded in the color of a site while the site does not follow its peers, and
+        has a vertical line at each change that the sites applied.
+
+        Args:
+            axes: the panel.
+            sites: the sites whose events are marked.
+            link: a link, to mark changes of this link alone; "" for all changes.
+            numbered: True to write the number of each change.
         """
         for site in sites:
             colour = site_colour(self.log, site)
             for mode, from_s, to_s in self._modes[site]:
-                depth = _BACK if mode == "return" else _AWAY
-                axes.axvspan(from_s, to_s, color=colour, alpha=depth, linewidth=0.0, zorder=0.5)
-        for n, changed in self._changes:
+                alpha = _RETURN_ALPHA if mode == "return" else _HOLD_ALPHA
+                axes.axvspan(from_s, to_s, color=colour, alpha=alpha, linewidth=0.0, zorder=0.5)
+        # x in s, y as a share of the height of the panel
+        transform = axes.get_xaxis_transform()
+        for number, changed in self._changes:
             if changed.site not in sites or (link and changed.change.link != link):
                 continue
             at_s = changed.change.at_s
-            place = axes.get_xaxis_transform()
             axes.axvline(at_s, zorder=0.6, **_CHANGE)
             if numbered:
                 axes.annotate(
-                    str(n), (at_s, 1.0), xycoords=place, fontsize=self._small_pt, **_NUMBER
+                    text=str(number),
+                    xy=(at_s, 1.0),
+                    xycoords=transform,
+                    fontsize=self._small_pt,
+                    **_NUMBER,
                 )
 
     def finish(
@@ -445,34 +504,53 @@ class TimeFigure:
         links: bool = False,
         title: str = "",
     ) -> None:
-        """Gives the lowest panels their time axis, the figure its legend, and explains its
-        markers.
+        """Adds the time axes, the legend, and the explanation of the markers.
 
-        With `links`, only changes of links are marked; the title stands above the legend.
+        Args:
+            lowest: the lowest panels, which have a time axis.
+            entries: the entries of the legend.
+            links: True if only changes of links are marked.
+            title: a title of the legend; "" for no title.
         """
         for axes in lowest:
             axes.set_xlabel("time (s)")
             axes.set_xlim(0.0, recorded_end_s(self.log))
-        add_legend(
-            self.figure, entries, **({"title": title, "title_fontsize": 8.0} if title else {})
-        )
-        marked = [(n, c) for n, c in self._changes if c.change.link or not links]
-        words = [f"{n}: {c.subject} {c.text}" for n, c in marked[:MOST_EXPLAINED_CHANGES]]
-        if len(marked) > MOST_EXPLAINED_CHANGES:
-            words.append(f"and {len(marked) - MOST_EXPLAINED_CHANGES} more")
+        if title:
+            add_legend(self.figure, entries, title=title, title_fontsize=8.0)
+        else:
+            add_legend(self.figure, entries)
         letters = int(_LETTERS_PER_IN * self.figure.get_figwidth() / self._small_pt)
-        lines = textwrap.wrap(f"Changes: {'; '.join(words)}", letters) if words else []
-        modes = {
-            interval.meaning for intervals in self._modes.values() for interval in intervals
-        }
-        if modes:
-            told = {
-                one: " (lighter)" if one.mode is Mode.RETURN else "" for one in sorted(modes)
-            }
-            doing = ", ".join(one.does + how for one, how in told.items())
-            lines += textwrap.wrap(f"Shaded in the color of a site: it {doing}", letters)
+        sentences = [self._explain_changes(links=links), self._explain_shading()]
+        lines = [line for sentence in sentences for line in textwrap.wrap(sentence, letters)]
         if lines:
             text = typeset("\n".join(lines))
             self.figure.supxlabel(
                 text, x=0.01, ha="left", fontsize=self._small_pt, color=REFERENCE
             )
+
+    def _explain_changes(self, *, links: bool) -> str:
+        """Returns a sentence on the numbered changes, of links alone with `links`, or ""."""
+        marked = [
+            f"{number}: {changed.subject} {changed.text}"
+            for number, changed in self._changes
+            if changed.change.link or not links
+        ]
+        if not marked:
+            return ""
+        parts = marked[:MOST_EXPLAINED_CHANGES]
+        if len(marked) > MOST_EXPLAINED_CHANGES:
+            parts.append(f"and {len(marked) - MOST_EXPLAINED_CHANGES} more")
+        return f"Changes: {'; '.join(parts)}"
+
+    def _explain_shading(self) -> str:
+        """Returns a sentence on the modes of the sites that are shaded, or ""."""
+        meanings = {
+            interval.meaning for intervals in self._modes.values() for interval in intervals
+        }
+        if not meanings:
+            return ""
+        parts = []
+        for meaning in sorted(meanings):
+            shade = " (lighter)" if meaning.mode is Mode.RETURN else ""
+            parts.append(f"{meaning.does}{shade}")
+        return f"Shaded in the color of a site: it {', '.join(parts)}"
