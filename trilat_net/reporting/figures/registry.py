@@ -2,8 +2,10 @@
 
     trilat_net.figure(log, "settling").savefig("settling.pdf")
 
-Invariant: a figure is a function of a log and a figure size; equal logs give equal bytes.
-Whatever a file of this folder draws belongs to it.
+Invariant:
+    - A figure is a function of a log and a figure size.
+    - Equal logs give equal bytes.
+    - Every figure drawn by a module of this folder is in the registry.
 """
 
 import pkgutil
@@ -27,11 +29,12 @@ from .joint_motion import draw_operator_displacement
 from .run_overview import draw_overlay
 from .twin_differences import draw_twins
 
-for _found in pkgutil.iter_modules(import_module(__package__).__path__):
-    import_module(f"{__package__}.{_found.name}")
+# the modules register their figures when they are imported
+for _module in pkgutil.iter_modules(import_module(__package__).__path__):
+    import_module(f"{__package__}.{_module.name}")
 
 FIGURES = list_figures()
-"""By name, in the order in which a paper has them."""
+"""All figures by name, in the order in which a paper has them."""
 
 
 def figure(
@@ -39,13 +42,14 @@ def figure(
 ) -> Figure:
     """Returns a figure of a log for a paper, one of `FIGURES`: 3.5 or 7 in wide, type 8 pt.
 
-    It shows itself in a notebook. The command is `trilat figure`.
+    A notebook shows the figure as a picture. The command is `trilat figure`.
 
     >>> drawn = tn.figure(tn.simulate("two_sites", duration_s=0.1), "positions")
     >>> drawn.savefig("positions.pdf")
 
     Raises:
-        UsageError: there is no such figure or width, or the log has nothing to show in it.
+        UsageError: the figure or the width does not exist, or the log has nothing to show in
+            the figure.
     """
     form = make_print_size(width_in)
     opened = log if isinstance(log, Log) else open_log(log)
@@ -67,15 +71,20 @@ def write_figures(
     force: bool = False,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Writes figures of a log into a folder, which is made if it does not exist, and returns
-    the paths.
+    """Writes figures of a log into a folder and returns the paths of the files.
 
-    Without names these are all for which the log has something to show. They are 3.5 or 7 in
-    wide; `progress` is called with the number of figures that are drawn, and of all.
+    Args:
+        log: the log.
+        folder: the folder, created if it does not exist.
+        names: names of figures; empty for all figures for which the log has something to show.
+        width_in: width of the figures, 3.5 or 7 in.
+        formats: formats of the files, of `FIGURE_FORMATS`.
+        force: True to overwrite existing files.
+        progress: called with the number of drawn figures and the number of all figures.
 
     Raises:
-        UsageError: there is no such figure, width or format, the log has nothing to show in it,
-            or a file exists.
+        UsageError: a figure, the width or a format does not exist, the log has nothing to show
+            in a figure, or a file exists.
     """
     form = make_print_size(width_in)
     wanted = list(dict.fromkeys(names)) or list_drawable_figures(log)
@@ -93,11 +102,18 @@ def write_overlay(
     formats: Sequence[str] = FIGURE_FORMATS[:2],
     force: bool = False,
 ) -> list[Path]:
-    """Writes several logs over one another, by their names in the legend, as overlay.pdf and so
-    on.
+    """Writes a figure of several logs in the same panels, as overlay.pdf and other formats.
+
+    Args:
+        logs: the logs by their names in the legend.
+        folder: the folder, created if it does not exist.
+        width_in: width of the figure, 3.5 or 7 in.
+        formats: formats of the files, of `FIGURE_FORMATS`.
+        force: True to overwrite existing files.
 
     Raises:
-        UsageError: there is no such width or format, the logs differ in kind, or a file exists.
+        UsageError: the width or a format does not exist, the logs differ in kind, or a file
+            exists.
     """
     form = make_print_size(width_in)
     chosen = {"overlay": partial(draw_overlay, logs, form)}
@@ -111,11 +127,17 @@ def write_report_figures(
     progress: Progress | None = None,
     pushed: TwinGrowth | None = None,
 ) -> list[Path]:
-    """Writes the figures of the report for which a log has something to show, and returns the
-    paths.
+    """Writes the figures of the report and returns the paths of the files.
 
-    Earlier figures in the folder are replaced. Without `twin`, the same experiment without
-    operators, `hands_moved` is left out. Twins that are given are not made again.
+    Figures for which the log has nothing to show are left out. Earlier figures in the folder
+    are replaced.
+
+    Args:
+        log: the log.
+        folder: the folder, created if it does not exist.
+        twin: the same experiment without operators; None to leave out `hands_moved`.
+        progress: called with the number of drawn figures and the number of all figures.
+        pushed: growth of pushed twins that were already computed; None to compute it.
     """
     chosen: dict[str, Callable[[], Figure]] = {
         name: partial(FIGURES[name].draw, log, REPORT_SIZE)
@@ -142,23 +164,25 @@ def _write(
     *,
     force: bool = True,
 ) -> list[Path]:
-    """Writes figures by their names; refuses what can be refused before it draws the first."""
+    """Writes figures by name, after checking all formats and files before the first drawing."""
     kinds = list(dict.fromkeys(formats))
-    if strange := [kind for kind in kinds if kind not in FIGURE_FORMATS]:
-        raise UsageError(
-            f"a figure is written as {', '.join(FIGURE_FORMATS)}, not as {strange[0]!r}"
-        )
-    for path in (folder / f"{name}.{kind}" for name in chosen for kind in kinds):
-        refuse_existing(path, force=force)
+    for kind in kinds:
+        if kind not in FIGURE_FORMATS:
+            known = ", ".join(FIGURE_FORMATS)
+            raise UsageError(f"a figure is written as {known}, not as {kind!r}")
+    for name in chosen:
+        for kind in kinds:
+            refuse_existing(folder / f"{name}.{kind}", force=force)
     paths = []
-    for n, (name, draw) in enumerate(chosen.items()):
+    for drawn_count, (name, draw) in enumerate(chosen.items()):
         if progress is not None:
-            progress(n, len(chosen))
+            progress(drawn_count, len(chosen))
         drawn = draw()
         make_folder(folder)
         for kind in kinds:
-            paths.append(folder / f"{name}.{kind}")
-            write_figure(drawn, paths[-1], form.dpi)
+            path = folder / f"{name}.{kind}"
+            paths.append(path)
+            write_figure(drawn, path, form.dpi)
     return paths
 
 
@@ -166,6 +190,8 @@ def _find_figure(log: Log, name: str) -> FigureEntry:
     if name not in FIGURES:
         hint = suggest_nearest(name, list(FIGURES)) or f"; there are {', '.join(FIGURES)}"
         raise UsageError(f"no figure {name!r}{hint}")
-    if why := FIGURES[name].absent(log):
-        raise UsageError(f"{name}: nothing to show: {why}")
-    return FIGURES[name]
+    entry = FIGURES[name]
+    reason = entry.absent(log)
+    if reason:
+        raise UsageError(f"{name}: nothing to show: {reason}")
+    return entry
